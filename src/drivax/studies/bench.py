@@ -1,7 +1,7 @@
-"""How fast the simulator steps on this machine: as a whole, by part, and by what is measured.
+"""Speed of the simulator on this machine: as a whole, by part, and by set of metrics.
 
 Every device steps its share of the environments. A CPU is one device unless :func:`use_all_cores` makes each core one,
-which is faster: most operations of a step are too small to be worth dividing between cores.
+which is faster: most operations of a step are too small to divide between cores.
 """
 
 from __future__ import annotations
@@ -38,12 +38,11 @@ from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
 
-#: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table; the
-#: larger ones only where they are the best.
+#: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table; larger sizes only if fastest.
 METRIC_SETS, BATCHES, LARGER = ("none", "training", "full"), (32, 128), (256, 512, 1024)
-#: Environments of which the compiler counts operations and bytes.
+#: Number of environments for which the compiler counts operations and bytes.
 _COUNTED = 16384
-#: Actions, observations and frame; and the carry: states, which episodes ended, rewards, and the former.
+#: Actions, observations and frame; and the carry of the loop: states, which episodes ended, rewards, and those.
 _Driven = tuple[Array, Mapping[str, Array], Frame]
 _Carry = tuple[SimState, Bool[Array, " B"], Float[Array, " B"], _Driven]
 
@@ -68,21 +67,21 @@ class BenchConfig:
 
 
 def use_all_cores() -> None:
-    """Makes every core that this process may use a device of its own; without effect once JAX has started."""
+    """Make every core of this process a JAX device; without effect once JAX has started."""
     with suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
 
 
 def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:
-    """Times stepping with resets, observation, reward and metrics, driven by IDM, and each part alone.
+    """Time steps with resets, observation, reward and metrics, driven by IDM, and each part alone.
 
     Args:
-        bank: Distinct scenarios; every episode that ends begins another at random.
+        bank: Distinct scenarios; when an episode ends, a random one starts.
         config: Sizes.
 
     Returns:
-        The contract of ``drivax bench --json``: ``by_part`` in microseconds per environment and step, ``cost_by_part``
-        in operations and bytes, by the compiler's own count of the part compiled alone.
+        The object of ``drivax bench --json``: ``by_part`` in microseconds per environment and step, ``cost_by_part`` in
+        operations and bytes as counted by the compiler for the part alone.
     """
     config = config or BenchConfig()
     simulator, bank = _simulator(bank, config)
@@ -109,11 +108,11 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
 
 
 def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:
-    """Steps per second by set of metrics and batch size, relative to the full set at batch 32 (as the published table).
+    """Measure steps per second by set of metrics and batch size, relative to the full set at batch 32 (as published).
 
     Returns:
-        The contract of ``drivax bench --metrics --json``: ``rows`` of ``metrics``, ``batch``, ``best`` (no other size
-        is as fast), ``steps_per_second`` and ``relative``. A larger size has a row where it is the best.
+        The object of ``drivax bench --metrics --json``: ``rows`` of ``metrics``, ``batch``, ``best`` (fastest size),
+        ``steps_per_second`` and ``relative``. A larger size has a row only if it is the fastest.
     """
     config = config or BenchConfig()
 
@@ -130,7 +129,7 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
 
 
 def metric_rows(speeds: Mapping[tuple[str, int], float]) -> list[dict[str, Any]]:
-    """The rows of :func:`bench_metrics` from steps per second by set of metrics and batch size."""
+    """Return the rows of :func:`bench_metrics` from steps per second by set of metrics and batch size."""
     base = speeds["full", BATCHES[0]]
     rows = []
     for metrics in METRIC_SETS:
@@ -148,11 +147,11 @@ class Program:
     """A compiled program that steps a batch.
 
     Attributes:
-        run: Steps it; what it returns must be waited for.
-        steps: Environment steps of a run that count; those that only begin an episode do not.
-        compile_seconds: From the traced function to the program.
-        state_bytes: State of one environment.
-        temporary_bytes: What the program needs in addition to bank and states, per environment.
+        run: Runs it asynchronously.
+        steps: Environment steps of a run, without those that only reset.
+        compile_seconds: Time to compile.
+        state_bytes: Size of the state of one environment.
+        temporary_bytes: Temporary memory per environment.
     """
 
     run: Callable[[], Any]
@@ -163,14 +162,14 @@ class Program:
 
 
 def compiled(bank: ScenarioBank, config: BenchConfig) -> Program:
-    """One program that steps, resets, observes, rewards and judges a batch, driven by IDM."""
+    """Return a program that steps, resets, observes, rewards and evaluates a batch, driven by IDM."""
     simulator, bank = _simulator(bank, config)
     states = _states(simulator, bank, config.batch)
     keys = jax.random.split(jax.random.key(2), jax.device_count())
     carry = _carry(simulator, config, bank, states)
-    began = time.perf_counter()
+    started = time.perf_counter()
     program = _shared(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - started
     memory = program.memory_analysis()
     return Program(
         run=lambda: program(bank, carry, keys),
@@ -184,19 +183,21 @@ def compiled(bank: ScenarioBank, config: BenchConfig) -> Program:
 
 
 def steps_per_second(programs: Sequence[Program], repeats: int) -> list[float]:
-    """Environment steps per second of each program, medians of timings by turns."""
+    """Return the environment steps per second of each program: medians of alternating runs."""
     times: list[list[float]] = [[] for _ in programs]
     for turn in range(repeats + 1):
-        for program, seen in zip(programs, times, strict=True):
-            began = time.perf_counter()
+        for program, seconds in zip(programs, times, strict=True):
+            started = time.perf_counter()
             jax.block_until_ready(program.run())
             if turn:
-                seen.append(time.perf_counter() - began)
-    return [program.steps / statistics.median(seen) for program, seen in zip(programs, times, strict=True)]
+                seconds.append(time.perf_counter() - started)
+    return [
+        program.steps / statistics.median(seconds) for program, seconds in zip(programs, times, strict=True)
+    ]
 
 
 def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, ScenarioBank]:
-    """The simulator, and the bank on every device."""
+    """Return the simulator, and the bank on every device."""
     if config.batch % jax.device_count():
         raise UsageError(
             f"a batch of {config.batch} does not divide among {jax.device_count()} devices",
@@ -207,7 +208,7 @@ def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, Scen
 
 
 def spread(bank: ScenarioBank) -> ScenarioBank:
-    """The bank on every device; without cost where it is there already."""
+    """Return the bank on every device; free if it is there already."""
     return jax.device_put(bank, NamedSharding(_mesh(), PartitionSpec()))
 
 
@@ -227,7 +228,7 @@ def _mesh() -> Mesh:
 
 
 def _shared(function: Callable[..., Any]) -> Any:
-    """A program of bank, states and keys in which every device has its share of the states, and a key."""
+    """Return a program of bank, states and keys in which every device has its share of the states, and a key."""
     share = PartitionSpec("device")
     return jax.jit(
         jax.shard_map(
@@ -239,44 +240,44 @@ def _shared(function: Callable[..., Any]) -> Any:
 def _run(
     simulator: Simulator, config: BenchConfig, bank: ScenarioBank, carry: _Carry, keys: Array
 ) -> tuple[Any, Array]:
-    """Steps a batch; what was earned and is seen, so that nothing is optimised away, and how many were steps."""
+    """Step a batch; return all results, so that nothing is optimised away, and the number of steps."""
     key, batch = keys[0], carry[1].shape[0]
     step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0, 0))
 
-    def judged(states: SimState) -> Array:
+    def evaluated(states: SimState) -> Array:
         values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
         return jnp.sum(jnp.asarray([value.value for value in values.values()], jnp.float32))
 
-    def one(carry: _Carry, index: Int[Array, " B"]) -> tuple[_Carry, Array]:
-        states, over, total, (action, _, seen) = carry
+    def iteration(carry: _Carry, index: Int[Array, " B"]) -> tuple[_Carry, Array]:
+        states, over, total, (action, _, frame) = carry
         fresh = map_where(over, partial(simulator.new_episode, bank), index)
-        states, transition = step(bank, states, action, over, fresh, seen)
+        states, transition = step(bank, states, action, over, fresh, frame)
         done = transition.terminated | transition.truncated
         # As in training: metrics are computed when some episode of the batch ends.
-        total += jax.lax.cond(done.any(), judged, lambda _: jnp.zeros(()), states)
+        total += jax.lax.cond(done.any(), evaluated, lambda _: jnp.zeros(()), states)
         total += transition.reward
-        # Here, where all agents are at hand, and not at the beginning of the next round.
+        # Here, where the frame of all agents is at hand, and not at the start of the next iteration.
         return (states, done, total, _driven(simulator, config, bank, states)), (~over).sum()
 
     begins = jax.random.randint(key, (config.steps, batch), 0, len(bank))
-    (_, _, total, driven), alive = jax.lax.scan(one, carry, begins)
+    (_, _, total, driven), alive = jax.lax.scan(iteration, carry, begins)
     return (total, driven), alive.sum()[None]
 
 
 def _driven(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Driven:
-    """The driver's actions, the task's observations and all agents at the step."""
-    driver = IdmPlanner(config.task.actions)
+    """Return the planner's actions, the task's observations and the frame of all agents."""
+    planner = IdmPlanner(config.task.actions)
 
-    def one(state: SimState) -> _Driven:
+    def drive(state: SimState) -> _Driven:
         situation = simulator.situation(bank, state)
-        action, _ = driver.act((), bank, state, situation, None, jax.random.key(0))
+        action, _ = planner.act((), bank, state, situation, None, jax.random.key(0))
         return action, simulator.observe(bank, state.context), situation.surroundings.frame
 
-    return jax.vmap(one)(states)
+    return jax.vmap(drive)(states)
 
 
 def _carry(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Carry:
-    """Before the first round, in which every episode begins, nothing is driven or seen."""
+    """Return the carry before the first iteration, in which every episode starts."""
     driven = jax.eval_shape(lambda: _driven(simulator, config, bank, states))
     driven = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), driven)
     begins = jnp.ones(config.batch, bool), jnp.zeros(config.batch)
@@ -287,7 +288,7 @@ Part = Callable[[ScenarioBank, SimState], Any]
 
 
 def without_grid(bank: ScenarioBank) -> ScenarioBank:
-    """The same bank with a grid of one cell, which is read whole: every query measures every segment once."""
+    """Return the bank with a grid of one cell, so that every query visits every segment once."""
     n = len(bank)
     return replace(
         bank,
@@ -298,7 +299,7 @@ def without_grid(bank: ScenarioBank) -> ScenarioBank:
 
 
 def _parts(simulator: Simulator) -> Mapping[str, Part]:
-    """Parts of a step, unbatched; each alone, so what they share is counted in each."""
+    """Return the parts of a step, unbatched; work that parts share is counted in each."""
 
     def frame(bank: ScenarioBank, state: SimState) -> Any:
         return simulator.frame(bank, state.context, alone(state.context), 0)
@@ -328,10 +329,9 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
         return time_to_collision(frame(bank, state), state.context.slot, state.contacts == Contact.IGNORED)
 
     def metrics(bank: ScenarioBank, state: SimState) -> Any:
-        found = simulator.situation(
-            bank, state
-        )  # no metric here looks at its surroundings, so they cost nothing
-        return episode_add(state.episode, found, state.start, jnp.zeros((), bool))
+        # No metric here reads the surroundings, so they are not computed.
+        situation = simulator.situation(bank, state)
+        return episode_add(state.episode, situation, state.start, jnp.zeros((), bool))
 
     return {
         "dynamics": lambda bank, state: bicycle(state.context.history[-1], jnp.ones(()), jnp.full((), 0.1)),
@@ -353,50 +353,43 @@ def _total(part: Part, bank: ScenarioBank, state: SimState) -> Array:
     return sum((jnp.sum(leaf, dtype=jnp.float32) for leaf in leaves), start=jnp.zeros(()))
 
 
-def _rounds(config: BenchConfig, part: Part) -> Callable[[ScenarioBank, SimState], Array]:
-    """A program that computes one part again and again."""
-
-    def many(bank: ScenarioBank, states: SimState, _: Any) -> Array:
-        def one(shift: Array, _: None) -> tuple[Array, None]:
-            seen = jax.vmap(lambda state, by: _total(part, bank, _shifted(state, by)))(states, shift)
-            # The next round depends on this one, so that nothing is taken out of the loop.
-            return shift + 1e-20 * jnp.where(jnp.isfinite(seen), seen, 0.0), None
-
-        return jax.lax.scan(one, jnp.zeros(states.start.shape), None, config.steps)[0]
-
-    program = _shared(many)
-    return lambda bank, states: program(bank, states, None)
-
-
 def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimState) -> float:
-    """Microseconds per environment and step of one part."""
-    many = _rounds(config, part)
-    return _median(lambda: many(bank, states), config.repeats) / config.steps / config.batch * 1e6
+    """Return the microseconds per environment and step of a part."""
+
+    def repeated(bank: ScenarioBank, states: SimState, _: Any) -> Array:
+        def iteration(shift: Array, _: None) -> tuple[Array, None]:
+            totals = jax.vmap(lambda state, by: _total(part, bank, _shifted(state, by)))(states, shift)
+            # Iterations depend on each other, so that nothing is moved out of the loop.
+            return shift + 1e-20 * jnp.where(jnp.isfinite(totals), totals, 0.0), None
+
+        return jax.lax.scan(iteration, jnp.zeros(states.start.shape), None, config.steps)[0]
+
+    program = _shared(repeated)
+    return _median(lambda: program(bank, states, None), config.repeats) / config.steps / config.batch * 1e6
 
 
 def _shifted(state: SimState, by: Array) -> SimState:
-    """The same state, which the compiler cannot know: ``by`` is far too small to move anything."""
+    """Return the same state, moved by a distance that only the compiler notices."""
     context = state.context
     moved = replace(context, history=context.history + by, index=context.index + by.astype(jnp.int32))
     return replace(state, context=moved)
 
 
 def _cost(part: Part, bank: ScenarioBank, states: SimState) -> dict[str, float]:
-    """Operations and bytes read and written of one part, per environment, as the compiler counts them.
+    """Return a part's operations and bytes per environment as the compiler counts them.
 
-    It counts an indexed array as read whole, so it is asked about very many environments in one scenario: what is left
-    per environment are the rows that are taken from the bank, and everything that is made of them.
+    It counts an indexed array as read whole; with very many environments in one scenario, only the rows that are read
+    remain.
     """
 
-    def like(leaf: Array, rows: int) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((rows, *leaf.shape[1:]), leaf.dtype)
+    def with_rows(tree: Any, rows: int) -> Any:
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((rows, *leaf.shape[1:]), leaf.dtype), tree)
 
-    one = jax.tree.map(lambda leaf: like(leaf, 1), bank)
-    many = jax.tree.map(lambda leaf: like(leaf, _COUNTED), states)
-    counted = jax.jit(jax.vmap(part, in_axes=(None, 0))).lower(one, many).compile().cost_analysis() or {}
+    program = jax.jit(jax.vmap(part, in_axes=(None, 0)))
+    counts = program.lower(with_rows(bank, 1), with_rows(states, _COUNTED)).compile().cost_analysis() or {}
     return {
-        "operations": round(counted.get("flops", 0.0) / _COUNTED),
-        "bytes": round(counted.get("bytes accessed", 0.0) / _COUNTED),
+        "operations": round(counts.get("flops", 0.0) / _COUNTED),
+        "bytes": round(counts.get("bytes accessed", 0.0) / _COUNTED),
     }
 
 
@@ -404,7 +397,7 @@ def _median(call: Callable[[], Any], repeats: int) -> float:
     jax.block_until_ready(call())
     times = []
     for _ in range(repeats):
-        began = time.perf_counter()
+        started = time.perf_counter()
         jax.block_until_ready(call())
-        times.append(time.perf_counter() - began)
+        times.append(time.perf_counter() - started)
     return statistics.median(times)

@@ -1,4 +1,4 @@
-"""How large and how fast encoders are: parameters, time of a forward and of a backward pass per observation."""
+"""Size and speed of encoders: parameters, time of a forward and of a backward pass per observation."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from drivax.tasks.observations import PRESETS, ObservationConfig
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
 
-_Ours = MlpConfig | EntityConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig
-#: What is compared, by name: an encoder and its size. All but the MLP also in bfloat16, unless it is a mere variant.
-ENCODERS: dict[str, _Ours] = {
+_Encoder = MlpConfig | EntityConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig
+#: Encoders by name and size. All but the MLP are also timed in bfloat16.
+ENCODERS: dict[str, _Encoder] = {
     "mlp": MlpConfig(),
     "mlp rows": MlpConfig(rows=(64, 64)),
     "entity small": EntityConfig(),
@@ -43,24 +43,25 @@ ENCODERS: dict[str, _Ours] = {
     "wayformer small": WayformerConfig(),
     "wayformer published": WayformerConfig(size="published"),
 }
-VARIANTS: dict[str, _Ours] = {
+#: Variants, in float32 only.
+VARIANTS: dict[str, _Encoder] = {
     "wayformer small, early": WayformerConfig(fusion="early"),
     "wayformer small, hierarchical": WayformerConfig(fusion="hierarchical"),
     "wayformer small, factorised": WayformerConfig(factorised=True),
 }
-#: A timing takes so long at least, s: one call of a small encoder is too short for the clock.
+#: Shortest timing, s: one call of a small encoder is too short for the clock.
 _LEAST_S = 0.05
 
 
 @dataclass(frozen=True)
 class EncoderBench:
-    """What is timed.
+    """Settings of :func:`bench_encoders`.
 
     Attributes:
         only: Names of :data:`ENCODERS` and :data:`VARIANTS`; none: all.
-        batches: Observations of a forward pass; the last one's are also those of a backward pass.
-        repeats: Timings; the median counts.
-        observation: What is encoded.
+        batches: Batch sizes of the forward pass; the last one is also that of the backward pass.
+        repeats: Number of timings; the median is reported.
+        observation: The observation that is encoded.
     """
 
     only: tuple[str, ...] = ()
@@ -81,14 +82,14 @@ class EncoderBench:
 
 
 def bench_encoders(config: EncoderBench | None = None, *, times: bool = True) -> dict[str, Any]:
-    """Sizes and times of encoders.
+    """Measure sizes and times of encoders.
 
     Args:
-        config: Which, and how.
+        config: Settings.
         times: Whether to time them; sizes alone take no computation.
 
     Returns:
-        The contract of ``drivax bench --encoders --json``: ``observation`` with the shapes of the groups, ``device``,
+        The object of ``drivax bench --encoders --json``: ``observation`` with the shapes of the groups, ``device``,
         and ``rows`` of ``encoder``, ``dtype``, ``parameters``, ``width`` (of the embedding) and, in microseconds per
         observation, ``forward_us`` by batch and ``gradient_us``, a forward and a backward pass for all parameters at
         the last batch.
@@ -99,12 +100,12 @@ def bench_encoders(config: EncoderBench | None = None, *, times: bool = True) ->
     for name, encoder in (ENCODERS | VARIANTS).items():
         if config.only and name not in config.only:
             continue
-        kinds = {"float32": encoder}
+        dtypes = {"float32": encoder}
         if name in ENCODERS and not isinstance(encoder, MlpConfig):
-            kinds["bfloat16"] = replace(encoder, dtype="bfloat16")
-        for dtype, one in kinds.items():
-            row = {"encoder": name, "dtype": dtype} | encoder_sizes(one, spec)
-            rows.append(row | (_times(one, spec, config) if times else {}))
+            dtypes["bfloat16"] = replace(encoder, dtype="bfloat16")
+        for dtype, network in dtypes.items():
+            row = {"encoder": name, "dtype": dtype} | encoder_sizes(network, spec)
+            rows.append(row | (_times(network, spec, config) if times else {}))
     return {
         "observation": {group: list(shape) for group, shape in spec.items()},
         "device": jax.devices()[0].device_kind,
@@ -114,25 +115,27 @@ def bench_encoders(config: EncoderBench | None = None, *, times: bool = True) ->
 
 
 def observation_shapes(config: ObservationConfig) -> dict[str, tuple[int, ...]]:
-    """Shapes of one observation, by group."""
+    """Return the shapes of an observation, by group."""
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(seed=0, index=0))])
     return Driving(Simulator(Task(observation=config))).shapes(bank)
 
 
 def encoder_sizes(config: EncoderConfig, spec: GroupSpec) -> dict[str, int]:
-    """Number of parameters and width of the embedding; nothing is computed."""
+    """Return the number of parameters and the width of the embedding."""
     encoder: Any = nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0)))
     leaves = jax.tree.leaves(nnx.state(encoder, nnx.Param))
     return {"parameters": sum(leaf.size for leaf in leaves), "width": encoder.width}
 
 
 def random_observations(spec: GroupSpec, batch: int) -> dict[str, Array]:
-    """Observations of noise in which about half of the rows are there."""
+    """Return observations of noise; about half of the rows are valid."""
     rng = np.random.default_rng(0)
     noise = {
         name: rng.normal(size=(batch, *shape)).astype(np.float32) for name, shape in sorted(spec.items())
     }
-    return {name: jnp.asarray(one > 0 if name.endswith("_mask") else one) for name, one in noise.items()}
+    return {
+        name: jnp.asarray(values > 0 if name.endswith("_mask") else values) for name, values in noise.items()
+    }
 
 
 def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[str, Any]:
@@ -159,14 +162,14 @@ def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[
 
 
 def _microseconds(function: Any, parameters: Any, groups: dict[str, Array], repeats: int) -> float:
-    """Time per observation; the median of the repeats, after one that compiles and one that says how often to call."""
+    """Return the median time per observation, after a call that compiles and a call that sets how many are timed."""
     batch = next(iter(groups.values())).shape[0]
 
     def seconds(calls: int) -> float:
-        began = time.perf_counter()
+        started = time.perf_counter()
         for _ in range(calls):
             jax.block_until_ready(function(parameters, groups))
-        return (time.perf_counter() - began) / calls
+        return (time.perf_counter() - started) / calls
 
     seconds(1)
     calls = math.ceil(_LEAST_S / seconds(1))

@@ -1,8 +1,7 @@
-"""The main job on the built-in world: generate, train, evaluate, report."""
+"""The whole pipeline on the built-in world: generate, train, evaluate, report."""
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
 from drivax.evaluation.run_evaluation import EvaluationConfig, format_summary, run_evaluation
 from drivax.evaluation.tables import paired_differences
-from drivax.files import write_text
+from drivax.files import write_json
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
@@ -30,7 +29,7 @@ from drivax.tracking.run_folder import describe_run
 
 #: Planners that the trained policy is compared with.
 REFERENCES = ("expert", "constant_velocity", "idm")
-#: Metrics that the demo compares in pairs.
+#: Metrics of the paired comparison.
 _COMPARED = ("success", "vmax_score")
 #: Training and held-out sets draw their maps from different seeds.
 _TRAINING_SEED, _HELD_OUT_SEED = 0, 1_000_000
@@ -41,8 +40,8 @@ class DemoConfig:
     """Sizes of the demo.
 
     Attributes:
-        training: Scenarios to train on.
-        held_out: Scenarios to evaluate on.
+        training: Number of training scenarios.
+        held_out: Number of test scenarios.
         preset: Training configuration.
         overrides: Changes to it, as on the command line.
         workers: Processes that generate; one per CPU core by default.
@@ -57,18 +56,18 @@ class DemoConfig:
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo made: the report, the table of planners, and paired differences to the policy."""
+    """Result of the demo: the report, a summary of each planner, and paired differences to the policy."""
 
     report: Path
     summaries: list[dict[str, Any]]
     differences: dict[str, dict[str, dict[str, float | int | None]]]
 
     def as_json(self) -> dict[str, Any]:
-        """Summaries, paired differences to the policy, and what made them."""
+        """Return summaries, paired differences to the policy, and versions."""
         return {"summaries": self.summaries, "policy_minus": self.differences, **describe_run()}
 
     def text(self) -> str:
-        """The table, and one line per comparison."""
+        """Return the table, and one line per comparison."""
         lines = [format_summary(self.summaries), ""]
         for planner, metrics in self.differences.items():
             for name, difference in metrics.items():
@@ -83,17 +82,17 @@ class Demo:
 def run_demo(
     out: Path,
     config: DemoConfig | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
     *,
     overwrite: bool = False,
 ) -> Demo:
-    """Generates both sets, trains, evaluates all planners and writes the report.
+    """Generate both sets, train, evaluate all planners and write the report.
 
     Args:
         out: Folder for sets, runs and ``report.html``.
         config: Sizes.
-        say: Called with a line before each stage.
-        overwrite: Replace what a former demo left in ``out``.
+        log: Called with a line before each stage.
+        overwrite: Replace the output of an earlier demo in ``out``.
 
     Raises:
         UsageError: ``out`` exists and ``overwrite`` is not given.
@@ -102,13 +101,13 @@ def run_demo(
     if out.exists() and any(out.iterdir()) and not overwrite:
         raise UsageError("exists already", file=out, cure="choose another --out or pass --overwrite")
     out.mkdir(parents=True, exist_ok=True)
-    say(f"1/4  {config.training} training and {config.held_out} held-out scenarios of the built-in world")
+    log(f"1/4  {config.training} training and {config.held_out} held-out scenarios of the built-in world")
     training = _scenarios(out / "sets" / "train", config.training, _TRAINING_SEED, config)
     held_out = _scenarios(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
-    say("2/4  training PPO")
+    log("2/4  training PPO")
     training_config = settings.load(TrainConfig, config.preset, list(config.overrides))
     run = train(training_config, training, out / "training" / "policy", overwrite=True).path
-    say("3/4  driving the held-out scenarios")
+    log("3/4  evaluating on the held-out scenarios")
     runs, results = [], {}
     planners: dict[str, tuple[Planner, Task]] = {name: (make_planner(name), Task()) for name in REFERENCES}
     planners["policy"] = load_policy(run, ScenarioBank.from_scenarios(held_out[:1]))
@@ -118,7 +117,7 @@ def run_demo(
         named = EvaluationConfig(planner=name if name in REFERENCES else str(run), task=task)
         results[name] = run_evaluation(named, planner, held_out, folder, overwrite=True)
         runs.append(folder)
-    say("4/4  writing the report")
+    log("4/4  writing the report")
     report = write_report([run, *runs], out / "report.html", overwrite=True)
     policy = results["policy"]
     differences = {
@@ -126,7 +125,7 @@ def run_demo(
         for name in REFERENCES
     }
     demo = Demo(report, [result.summary() for result in results.values()], differences)
-    write_text(out / "demo.json", json.dumps(demo.as_json(), indent=1) + "\n")
+    write_json(out / "demo.json", demo.as_json())
     return demo
 
 
