@@ -1,0 +1,575 @@
+"""nuPlan's closed-loop score as its devkit computes it, from stored motions, in float64.
+
+Every function follows one metric of nuplan-devkit 1.2 (``planning/metrics/evaluation_metrics``), quirks included: the
+first sample counts, agents that overlap ego from the start count as collisions, and comfort has no logged past.
+``nuplan_score`` is our own definition of the same score (semantics, Metrics).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float64, Int
+
+from drivax.metrics.comfort import (
+    JERK_MAGNITUDE_MPS3,
+    JERK_MPS3,
+    LATERAL_MPS2,
+    LONGITUDINAL_MPS2,
+    YAW_ACCELERATION_RPS2,
+    YAW_RATE_RPS,
+    savgol_matrix,
+)
+from drivax.metrics.scores import NUPLAN_WEIGHTS
+from drivax.scenario.schema import DT_S, AgentKind
+
+#: Rear axle to centre of nuPlan's car (Chrysler Pacifica), m.
+REAR_AXLE_M = 1.461
+#: Order of corners: front left, rear left, rear right, front right, as shares of half the box.
+_CORNERS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+_STOPPED_MPS, _TTC_STOPPED_MPS = 0.05, 0.005
+_AHEAD_DEG, _BEHIND_DEG = 30.0, 150.0
+_TTC_STEP_S, _TTC_HORIZON_S, _TTC_LEAST_S = 0.1, 3.0, 0.95
+_OUTSIDE_M, _OVERSPEED_MPS, _LEAST_PROGRESS_M = 0.3, 2.23, 2.0
+_AGAINST_M, _FAR_AGAINST_M, _DIRECTION_S = 2.0, 6.0, 1.0
+#: A connector that ego has just left is kept within this distance, m.
+_STILL_ON_M = 5.0
+_EGO_STOPPED, _TRACK_STOPPED, _FRONT, _REAR, _LATERAL = range(5)
+
+
+@dataclass(frozen=True)
+class EgoMotion:
+    """Motion of ego's box, one row per sample.
+
+    Attributes:
+        xy: Centre, m.
+        heading: Heading, rad.
+        speed: Speed of the centre, m/s.
+        acceleration: Acceleration of the rear axle along the heading, m/s2.
+        yaw_rate: Yaw rate, rad/s.
+        yaw_acceleration: Yaw acceleration, rad/s2.
+        size_m: Length and width.
+        rear_axle_m: Distance of the rear axle behind the centre.
+        dt_s: Time between samples.
+    """
+
+    xy: Float64[np.ndarray, "t 2"]
+    heading: Float64[np.ndarray, " t"]
+    speed: Float64[np.ndarray, " t"]
+    acceleration: Float64[np.ndarray, " t"]
+    yaw_rate: Float64[np.ndarray, " t"]
+    yaw_acceleration: Float64[np.ndarray, " t"]
+    size_m: tuple[float, float]
+    rear_axle_m: float = REAR_AXLE_M
+    dt_s: float = DT_S
+
+    @cached_property
+    def corners(self) -> Float64[np.ndarray, "t 4 2"]:
+        """Corners of the box."""
+        return _corners(self.xy, self.heading, np.array(self.size_m))
+
+    @cached_property
+    def rear_axle(self) -> Float64[np.ndarray, "t 2"]:
+        """Centre of the rear axle."""
+        return self.xy - self.rear_axle_m * _directions(self.heading)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Motion of the other agents.
+
+    Attributes:
+        xy: Centres, m.
+        heading: Headings, rad.
+        speed: Speeds, m/s; 0 for static objects.
+        present: Whether an agent is in the sample.
+        size_m: Length and width of each.
+        kind: :class:`~drivax.scenario.schema.AgentKind` of each.
+    """
+
+    xy: Float64[np.ndarray, "t a 2"]
+    heading: Float64[np.ndarray, "t a"]
+    speed: Float64[np.ndarray, "t a"]
+    present: Bool[np.ndarray, "t a"]
+    size_m: Float64[np.ndarray, "a 2"]
+    kind: Int[np.ndarray, " a"]
+
+    @cached_property
+    def corners(self) -> Float64[np.ndarray, "t a 4 2"]:
+        """Corners of the boxes."""
+        return _corners(self.xy, self.heading, self.size_m)
+
+
+@dataclass(frozen=True)
+class RoadObject:
+    """A lane or a lane connector.
+
+    Attributes:
+        polygon: Its area.
+        line: Its centre line.
+        block: Its roadblock.
+        limit_mps: Speed limit; None if unknown.
+        connector: Whether it is a connector.
+        successors: Indices of the objects that follow.
+        predecessors: Indices of the objects before.
+    """
+
+    polygon: Any
+    line: Any
+    block: int
+    limit_mps: float | None = None
+    connector: bool = False
+    successors: tuple[int, ...] = ()
+    predecessors: tuple[int, ...] = ()
+
+
+Points = Float64[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True)
+class Road:
+    """The map.
+
+    Attributes:
+        objects: Lanes and connectors.
+        outside_m: Distance of points outside the drivable area (0 inside).
+        intersection: Whether points are in an intersection.
+    """
+
+    objects: Sequence[RoadObject]
+    outside_m: Callable[[Points], Float64[np.ndarray, " n"]]
+    intersection: Callable[[Points], Bool[np.ndarray, " n"]] = lambda points: np.zeros(len(points), bool)
+
+    def containing(self, points: Points) -> Bool[np.ndarray, "n o"]:
+        """Return which objects contain each point."""
+        inside = [shapely.contains_xy(each.polygon, points[:, 0], points[:, 1]) for each in self.objects]
+        return np.stack(inside, axis=1) if inside else np.zeros((len(points), 0), bool)
+
+    @cached_property
+    def blocks(self) -> Mapping[int, Any]:
+        """Area of each roadblock."""
+        members: dict[int, list[Any]] = {}
+        for each in self.objects:
+            members.setdefault(each.block, []).append(each.polygon)
+        return {block: shapely.unary_union(polygons) for block, polygons in members.items()}
+
+
+@dataclass(frozen=True)
+class Collision:
+    """The first contact with an agent.
+
+    Attributes:
+        sample: Its sample.
+        agent: Index of the agent.
+        type: 0 ego stopped, 1 agent stopped, 2 front, 3 rear, 4 lateral.
+        at_fault: Whether ego is at fault.
+    """
+
+    sample: int
+    agent: int
+    type: int
+    at_fault: bool
+
+
+@dataclass(frozen=True)
+class Comfort:
+    """Filtered series of an episode and their verdicts: ``lon``, ``lat``, ``lonjerk``, ``jerk``, ``yaw``, ``yawacc``.
+
+    Attributes:
+        series: Values of each sample.
+        within: Whether all samples are within the limits.
+    """
+
+    series: Mapping[str, Float64[np.ndarray, " t"]]
+    within: Mapping[str, bool]
+
+
+@dataclass(frozen=True)
+class DevkitVerdict:
+    """Terms of the devkit's score.
+
+    Attributes:
+        score: The closed-loop score.
+        fault_score: 1 without at-fault collisions, 0.5 after one with a static object, else 0.
+        drivable: No corner 0.3 m or more outside the drivable area.
+        direction: 1, 0.5 or 0: less than 2 m, less than 6 m, or more against traffic within a second.
+        making_progress: Progress ratio of at least 0.2.
+        ttc_ok: Time to collision always at least 0.95 s.
+        progress: Progress ratio along the expert's route.
+        speed: Speed-limit compliance.
+        comfortable: All six series within their limits.
+        collisions: First contacts.
+        ttc_s: Time to collision of each sample, inf if there is none within 3 s.
+        in_lane: Samples in which all corners are in one lane, or in connected ones.
+        backward_m: Farthest way against traffic within a second, at most 0.
+        progress_m: Progress of the expert and of ego.
+        comfort: Comfort in detail.
+    """
+
+    score: float
+    fault_score: float
+    drivable: float
+    direction: float
+    making_progress: float
+    ttc_ok: float
+    progress: float
+    speed: float
+    comfortable: float
+    collisions: tuple[Collision, ...] = field(repr=False)
+    ttc_s: Float64[np.ndarray, " t"] = field(repr=False)
+    in_lane: Bool[np.ndarray, " t"] = field(repr=False)
+    backward_m: float
+    progress_m: tuple[float, float]
+    comfort: Comfort = field(repr=False)
+
+
+def devkit_verdict(ego: EgoMotion, tracks: Tracks, road: Road, expert_xy: Points) -> DevkitVerdict:
+    """Evaluate an episode.
+
+    Args:
+        ego: Motion of ego.
+        tracks: Motion of the others in the same samples.
+        road: The map.
+        expert_xy: Centres of the logged ego.
+    """
+    in_lane = _in_one_lane(ego, road)
+    collisions = _collisions(ego, tracks, in_lane)
+    ttc_s = _time_to_collision(ego, tracks, road, in_lane, collisions)
+    driven = _route(road, ego.xy)
+    backward_m = _backward(road, driven, ego)
+    progress_m = _progress(road, expert_xy, ego.xy)
+    comfort = comfort_series(ego)
+    terms = {
+        "fault_score": _fault_score(collisions, tracks),
+        "drivable": float(_stays_on_road(ego, road, driven)),
+        "direction": 1.0 if -backward_m < _AGAINST_M else 0.5 if -backward_m < _FAR_AGAINST_M else 0.0,
+        "ttc_ok": float(ttc_s.min() >= _TTC_LEAST_S),
+        "progress": 1.0 if progress_m is None else _progress_ratio(*progress_m),
+        "speed": _speed_compliance(road, driven, ego.speed),
+        "comfortable": float(all(comfort.within.values())),
+    }
+    terms["making_progress"] = float(terms["progress"] >= 0.2)
+    weights = dict(zip(("ttc_ok", "progress", "speed", "comfortable"), NUPLAN_WEIGHTS.values(), strict=True))
+    mean = sum(weight * terms[name] for name, weight in weights.items()) / sum(weights.values())
+    gates = ("fault_score", "drivable", "direction", "making_progress")
+    return DevkitVerdict(
+        score=mean * float(np.prod([terms[name] for name in gates])),
+        collisions=collisions, ttc_s=ttc_s, in_lane=in_lane, backward_m=backward_m,
+        progress_m=progress_m or (0.0, 0.0), comfort=comfort, **terms,
+    )  # fmt: skip
+
+
+def comfort_series(ego: EgoMotion) -> Comfort:
+    """Return the six comfort series (``ego_is_comfortable``).
+
+    The acceleration of the centre adds both terms of the yawing frame along the car's axis, so that the lateral one is
+    always 0, and jerk magnitude is of the rear axle; yaw rate and yaw acceleration have windows of 5 samples.
+    """
+    samples = len(ego.heading)
+    along = ego.acceleration + ego.rear_axle_m * (ego.yaw_rate**2 + ego.yaw_acceleration)
+
+    def filtered(values: Float64[np.ndarray, " t"], window: int, order: int, derivative: int) -> Any:
+        matrix = savgol_matrix(samples, min(window, samples), order, derivative)
+        return np.round(matrix @ values / ego.dt_s**derivative, 8)
+
+    heading, smooth = np.unwrap(ego.heading), filtered(along, 8, 2, 0)
+    series = {
+        "lon": smooth,
+        "lat": np.zeros(samples),
+        "lonjerk": filtered(smooth, 15, 2, 1),
+        "jerk": filtered(filtered(np.abs(ego.acceleration), 8, 2, 0), 15, 2, 1),
+        "yaw": filtered(heading, 5, 2, 1),
+        "yawacc": filtered(heading, 5, 3, 2),
+    }
+    limits = (LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS2)
+    bounds = (LONGITUDINAL_MPS2, *((-limit, limit) for limit in limits))
+    within = {
+        name: bool((low < values).all() and (values < high).all())
+        for (name, values), (low, high) in zip(series.items(), bounds, strict=True)
+    }
+    return Comfort(series, within)
+
+
+def _directions(heading: Any) -> Float64[np.ndarray, "*n 2"]:
+    return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+
+
+def _corners(
+    xy: Float64[np.ndarray, "*n 2"], heading: Float64[np.ndarray, "*n"], size: Float64[np.ndarray, "*a 2"]
+) -> Float64[np.ndarray, "*n 4 2"]:
+    ahead = _directions(heading)
+    axes = np.stack([ahead, np.stack([-ahead[..., 1], ahead[..., 0]], axis=-1)], axis=-2)
+    return xy[..., None, :] + (_CORNERS * size[..., None, :]) @ axes
+
+
+def _angle_deg(
+    origin: Float64[np.ndarray, " 2"], heading: float, xy: Float64[np.ndarray, "a 2"]
+) -> Float64[np.ndarray, " a"]:
+    """Return the angle between a heading and the direction from a point to others."""
+    offset = xy - origin
+    distance = np.maximum(np.hypot(*offset.T), 1e-12)
+    return np.degrees(np.arccos(np.clip(offset @ _directions(heading) / distance, -1.0, 1.0)))
+
+
+def _in_one_lane(ego: EgoMotion, road: Road) -> Bool[np.ndarray, " t"]:
+    """Return whether all corners are in one lane, or in lanes that follow each other (``ego_lane_change``)."""
+    inside = road.containing(ego.corners.reshape(-1, 2)).reshape(len(ego.xy), 4, -1)
+    result, candidates = np.zeros(len(ego.xy), bool), set[int]()
+    for sample, corners in enumerate(inside):
+        found: list[set[int]] = []
+        for corner in corners:
+            known = _candidates(road, corner, candidates)
+            found.append(known or _current(road, corner))
+            # As in the devkit: only in the second sample a corner's lanes become candidates of the next corners.
+            candidates |= found[-1] if sample == 1 and not known else set()
+        result[sample] = all(found) and _common_or_connected(road, found)
+        candidates = set().union(*found)
+    return result
+
+
+def _current(road: Road, inside: Bool[np.ndarray, " o"]) -> set[int]:
+    """Return the lane of a point, else the connectors (``get_current_route_objects``)."""
+    found = np.flatnonzero(inside).tolist()
+    lanes = [index for index in found if not road.objects[index].connector]
+    return set(lanes[:1] or found)
+
+
+def _candidates(road: Road, inside: Bool[np.ndarray, " o"], candidates: set[int]) -> set[int]:
+    """Return the candidates that contain a point, or those that follow a single one."""
+    found = {index for index in candidates if inside[index]}
+    if not found and len(candidates) == 1:
+        (only,) = candidates
+        found = {index for index in road.objects[only].successors if inside[index]}
+    return found
+
+
+def _common_or_connected(road: Road, corners: Sequence[set[int]]) -> bool:
+    if set.intersection(*corners):
+        return True
+    front_left, rear_left, rear_right, front_right = (
+        side
+        | {
+            n
+            for index in side
+            for n in (road.objects[index].successors if rear else road.objects[index].predecessors)
+        }
+        for side, rear in zip(corners, (False, True, True, False), strict=True)
+    )
+    rears = corners[1] & rear_right or corners[2] & rear_left
+    return bool(rears and front_left & rear_right & front_right & rear_left)
+
+
+def _collisions(ego: EgoMotion, tracks: Tracks, in_lane: Bool[np.ndarray, " t"]) -> tuple[Collision, ...]:
+    """Return the first contact with every agent and its type (``no_ego_at_fault_collisions``)."""
+    ego_boxes: Any = shapely.polygons(ego.corners)
+    boxes: Any = shapely.polygons(tracks.corners)
+    touches = shapely.intersects(ego_boxes[:, None], boxes) & tracks.present
+    fronts: Any = shapely.linestrings(ego.corners[:, [0, 3]])
+    collisions = []
+    for agent in np.flatnonzero(touches.any(axis=0)).tolist():
+        sample = int(touches[:, agent].argmax())
+        angle = _angle_deg(ego.rear_axle[sample], ego.heading[sample], tracks.xy[sample, agent][None])[0]
+        if abs(ego.speed[sample]) <= _STOPPED_MPS:
+            kind = _EGO_STOPPED
+        elif tracks.speed[sample, agent] <= _STOPPED_MPS:
+            kind = _TRACK_STOPPED
+        elif angle > _BEHIND_DEG:
+            kind = _REAR
+        elif shapely.intersects(fronts[sample], boxes[sample, agent]):
+            kind = _FRONT
+        else:
+            kind = _LATERAL
+        fault = kind in (_TRACK_STOPPED, _FRONT) or (kind == _LATERAL and not in_lane[sample])
+        collisions.append(Collision(sample, agent, kind, fault))
+    return tuple(sorted(collisions, key=lambda each: each.sample))
+
+
+def _fault_score(collisions: Sequence[Collision], tracks: Tracks) -> float:
+    """Return 1 - n/2 for n static objects hit at fault, 0 after a fault with a road user."""
+    static = [
+        tracks.kind[each.agent] in (AgentKind.STATIC, AgentKind.OTHER) for each in collisions if each.at_fault
+    ]
+    return max(0.0, 1.0 - sum(static) / 2) if all(static) else 0.0
+
+
+def _time_to_collision(
+    ego: EgoMotion,
+    tracks: Tracks,
+    road: Road,
+    in_lane: Bool[np.ndarray, " t"],
+    collisions: Sequence[Collision],
+) -> Float64[np.ndarray, " t"]:
+    """Return the time to collision of every sample at constant velocities (``time_to_collision_within_bound``)."""
+    times = np.full(len(ego.xy), np.inf)
+    faults = {each.sample for each in collisions if each.at_fault}
+    hit = np.full(len(tracks.kind), len(ego.xy))
+    for each in collisions:
+        hit[each.agent] = each.sample
+    everywhere = ~in_lane | road.intersection(ego.rear_axle)
+    ahead_s = np.arange(_TTC_STEP_S, _TTC_HORIZON_S, _TTC_STEP_S)
+    for sample in range(len(ego.xy)):
+        if sample in faults:
+            times[sample] = 0.0
+        elif abs(ego.speed[sample]) > _TTC_STOPPED_MPS:
+            angle = _angle_deg(ego.rear_axle[sample], ego.heading[sample], tracks.xy[sample])
+            relevant = (angle < _AHEAD_DEG) | (everywhere[sample] & (angle <= _BEHIND_DEG))
+            agents = np.flatnonzero(relevant & tracks.present[sample] & (hit > sample))
+            own = _swept(ego.corners[sample], ego.heading[sample], abs(ego.speed[sample]), ahead_s)
+            others = _swept(
+                tracks.corners[sample, agents],
+                tracks.heading[sample, agents],
+                tracks.speed[sample, agents],
+                ahead_s,
+            )
+            meets = (
+                shapely.intersects(own, others).any(axis=0) if len(agents) else np.zeros(len(ahead_s), bool)
+            )
+            if meets.any():
+                times[sample] = ahead_s[meets.argmax()]
+    return times
+
+
+def _swept(
+    corners: Float64[np.ndarray, "*a 4 2"], heading: Any, speed: Any, times: Float64[np.ndarray, " k"]
+) -> Any:
+    """Return the boxes moved along their headings to every time."""
+    way = _directions(heading) * np.asarray(speed)[..., None]
+    return shapely.polygons(corners[..., None, :, :] + times[:, None, None] * way[..., None, None, :])
+
+
+def _stays_on_road(ego: EgoMotion, road: Road, driven: Sequence[Sequence[int]]) -> bool:
+    """Return whether no corner is 0.3 m or more outside (``drivable_area_compliance``).
+
+    A corner may also be within 0.3 m of the lanes of ego's centre.
+    """
+    outside_m = road.outside_m(ego.corners.reshape(-1, 2)).reshape(-1, 4)
+    for sample, corner in np.argwhere(outside_m >= _OUTSIDE_M):
+        point = shapely.points(ego.corners[sample, corner])
+        lanes = [road.objects[index].polygon for index in driven[sample]]
+        if not any(shapely.distance(lane, point) < _OUTSIDE_M for lane in lanes):
+            return False
+    return True
+
+
+def _route(road: Road, points: Points) -> list[list[int]]:
+    """Return the lane or the connectors of each point, with its history (``get_route``)."""
+    inside, crossing = road.containing(points), road.intersection(points)
+    route: list[list[int]] = []
+    current: list[int] = []
+    for sample, found in enumerate(inside):
+        current = sorted(_candidates(road, found, set(current))) if current else []
+        if not current:
+            current = sorted(_current(road, found))
+            connects = bool(current) and road.objects[current[0]].connector
+            last = route[-1] if sample > 1 else []
+            if last and road.objects[last[0]].connector and (connects or (not current and crossing[sample])):
+                point = shapely.points(points[sample])
+                near = [n for n in last if shapely.distance(road.objects[n].polygon, point) < _STILL_ON_M]
+                current = near or current
+        route.append(current)
+    return _without_extra_connectors(road, route)
+
+
+def _without_extra_connectors(road: Road, route: list[list[int]]) -> list[list[int]]:
+    """Where several connectors overlap, keep those by which the route goes on."""
+    result = list(route)
+    for sample in range(len(result) - 2, -1, -1):
+        here, after = result[sample], result[sample + 1]
+        if len(here) <= 1:
+            continue
+        if len(here) > len(after) and set(after) <= set(here):
+            result[sample] = after
+        if after and not road.objects[after[0]].connector:
+            entering = [index for index in here if index in road.objects[after[0]].predecessors]
+            result[sample] = entering or result[sample]
+    return result
+
+
+def _backward(road: Road, driven: Sequence[Sequence[int]], ego: EgoMotion) -> float:
+    """Return the farthest way against traffic within a second (``driving_direction_compliance``), at most 0."""
+    progress = np.zeros(len(ego.xy))
+    last, before = (driven[0][0] if driven[0] else None), None
+    for sample, here in enumerate(driven):
+        if not here:
+            continue
+        if here[0] == last:
+            at = _along(road.objects[here[0]].line, ego.xy[sample])
+            # As in the devkit: a position at the very start of a line counts as no progress.
+            progress[sample] = at - before if before is not None and at else 0.0
+            before = at
+        else:
+            last, before = here[0], None
+    samples = round(_DIRECTION_S / ego.dt_s)
+    sums = [progress[max(0, end - samples) : end + 1].sum() for end in range(len(progress))]
+    return -abs(float(min(sums)))
+
+
+def _along(line: Any, point: Float64[np.ndarray, " 2"]) -> float:
+    return float(shapely.line_locate_point(line, shapely.points(point)))
+
+
+def _progress(road: Road, expert_xy: Points, ego_xy: Points) -> tuple[float, float] | None:
+    """Return the progress of expert and ego along the expert's roadblocks; None without a route."""
+    pairs: list[tuple[int, Any]] = []
+    for here in _route(road, expert_xy):
+        if here and (not pairs or road.objects[here[0]].block != pairs[-1][0]):
+            pairs.append((road.objects[here[0]].block, road.objects[here[0]].line))
+    if not pairs:
+        return None
+    return _block_progress(road, pairs, expert_xy), _block_progress(road, pairs, ego_xy)
+
+
+def _block_progress(road: Road, pairs: Sequence[tuple[int, Any]], points: Points) -> float:
+    """Return the way along the base lines of a chain of roadblocks (``ego_progress_along_expert_route``)."""
+    at, total = 0, 0.0
+    before = _along(pairs[0][1], points[0])
+    for x, y in points[1:]:
+        ahead = at
+        skipped = 0.0
+        while ahead < len(pairs) and not shapely.contains_xy(road.blocks[pairs[ahead][0]], x, y):
+            ahead += 1
+            if at + 1 < ahead < len(pairs):
+                line, previous, following = (pairs[index][1] for index in (ahead - 1, ahead - 2, ahead))
+                skipped += _along(line, _end(following, 0)) - _along(line, _end(previous, -1))
+        if ahead == len(pairs):
+            continue
+        here = _along(pairs[ahead][1], np.array([x, y]))
+        if ahead == at:
+            total += here - before
+        else:
+            left_m = shapely.length(pairs[at][1]) - before
+            total += left_m + skipped + here - _along(pairs[ahead][1], _end(pairs[at][1], -1))
+        at, before = ahead, here
+    return float(total)
+
+
+def _end(line: Any, index: int) -> Float64[np.ndarray, " 2"]:
+    return shapely.get_coordinates(line)[index]
+
+
+def _progress_ratio(expert_m: float, ego_m: float) -> float:
+    if ego_m < -_LEAST_PROGRESS_M:
+        return 0.0
+    return min(1.0, max(ego_m, _LEAST_PROGRESS_M) / max(expert_m, _LEAST_PROGRESS_M))
+
+
+def _speed_compliance(road: Road, driven: Sequence[Sequence[int]], speed: Float64[np.ndarray, " t"]) -> float:
+    """Return 1 less the mean speeding over 2.23 m/s (``speed_limit_compliance``).
+
+    A connector has the highest limit of the lanes that it joins; samples without a lane, or where a limit is unknown,
+    count as 0.
+    """
+    over = np.zeros(len(speed))
+    for sample, here in enumerate(driven):
+        lanes = [road.objects[index] for index in here]
+        if lanes and lanes[0].connector:
+            lanes = [road.objects[n] for each in lanes for n in (*each.successors, *each.predecessors)]
+        limits = [lane.limit_mps for lane in lanes]
+        if limits and all(limits):
+            over[sample] = max(0.0, speed[sample] - max(limit for limit in limits if limit))
+    return max(0.0, 1.0 - over.sum() / (_OVERSPEED_MPS * max(len(speed) - 1, 1)))
