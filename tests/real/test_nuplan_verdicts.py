@@ -22,7 +22,7 @@ KINDS = {
 SIZE_M, WIDTH_M, BEGIN_M, END_M = (5.176, 2.297), 3.7, -150.0, 350.0
 #: What six decimals of the motion make of the filtered series.
 ROUNDED = 2.5e-5
-NOWHERE = Road((), lambda points: np.zeros(len(points)))
+NOWHERE = Road((), lambda ego: np.zeros((len(ego.xy), 4)))
 X, Y, HEADING, SPEED, ACCELERATION, YAW_RATE = 4, 5, 2, 6, 7, 8
 
 
@@ -42,7 +42,7 @@ def road_of(scene):
         line = shapely.linestrings(ends[::-1] if back else ends)
         lanes.append(RoadObject(area, line, block if scene["two_way"] else 0, scene["limit"]))
     area = shapely.box(BEGIN_M, -WIDTH_M / 2, END_M, 1.5 * WIDTH_M)
-    return Road(lanes, lambda points: shapely.distance(area, shapely.points(points)))
+    return Road(lanes, lambda ego: shapely.distance(area, shapely.points(ego.corners)))
 
 
 def ego_of(rows, past):

@@ -59,6 +59,7 @@ COMMANDS = {
     "evaluate": Command(
         "drivax.cli.evaluate", "Evaluate", "evaluate a planner on a scenario set", overrides=True
     ),
+    "judge": Command("drivax.cli.judge", "Judge", "evaluate a run again by the rules of another program"),
     "compare": Command(
         "drivax.cli.compare", "Compare", "test whether one planner is better than another", overrides=True
     ),

@@ -11,7 +11,7 @@ import tyro
 
 from drivax import settings
 from drivax.api import find_planner, load
-from drivax.cli import record_of
+from drivax.cli import judge, record_of
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.run_evaluation import (
     EvaluationConfig,
@@ -26,6 +26,9 @@ from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.store import ScenarioSet
 from drivax.tasks.task import Task
 from drivax.tracking.zoo import zoo
+
+#: Profile among the metrics: computed from the finished episodes.
+_DEVKIT = "devkit"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,21 +65,24 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     """Evaluate, then print the headline metrics and crashes."""
     # Refuse unknown names before the long work.
     traffic = find_traffic(args.traffic)
-    select_metrics(args.metrics)
+    metrics = tuple(name for name in args.metrics if name != _DEVKIT)
+    select_metrics(metrics)
     requested = _task(overrides)
     data = ScenarioSet.open(args.data)
     some = load(args.data, 1, filters=args.filter, scenarios=args.scenarios)
     planner, task = find_planner(args.planner, some.bank, args.sample, requested)
-    config = record_of(EvaluationConfig, args, task=task)
+    config = record_of(EvaluationConfig, args, task=task, metrics=metrics)
     results = run_evaluation(
         config, planner, data, args.out, traffic=traffic, sizes=some.sizes, overwrite=args.overwrite
     )
     print(format_summary([results.summary()]))
-    if args.metrics:
-        print(format_metrics(results.summary(), args.metrics))
+    if metrics:
+        print(format_metrics(results.summary(), metrics))
     if crashes := format_crashes(results):
         print(crashes)
     print(f"wrote {args.out}")
+    if _DEVKIT in args.metrics:
+        judge.run(judge.Judge(args.out, data=args.data))
     return 0
 
 

@@ -137,12 +137,12 @@ class Road:
 
     Attributes:
         objects: Lanes and connectors.
-        outside_m: Distance of points outside the drivable area (0 inside).
+        outside_m: Distance of ego's corners outside the drivable area (0 or less inside).
         intersection: Whether points are in an intersection.
     """
 
     objects: Sequence[RoadObject]
-    outside_m: Callable[[Points], Float64[np.ndarray, " n"]]
+    outside_m: Callable[[EgoMotion], Float64[np.ndarray, "t 4"]]
     intersection: Callable[[Points], Bool[np.ndarray, " n"]] = lambda points: np.zeros(len(points), bool)
 
     def containing(self, points: Points) -> Bool[np.ndarray, "n o"]:
@@ -447,8 +447,7 @@ def _stays_on_road(ego: EgoMotion, road: Road, driven: Sequence[Sequence[int]]) 
 
     A corner may also be within 0.3 m of the lanes of ego's centre.
     """
-    outside_m = road.outside_m(ego.corners.reshape(-1, 2)).reshape(-1, 4)
-    for sample, corner in np.argwhere(outside_m >= _OUTSIDE_M):
+    for sample, corner in np.argwhere(road.outside_m(ego) >= _OUTSIDE_M):
         point = shapely.points(ego.corners[sample, corner])
         lanes = [road.objects[index].polygon for index in driven[sample]]
         if not any(shapely.distance(lane, point) < _OUTSIDE_M for lane in lanes):

@@ -50,7 +50,8 @@ class EvaluationConfig:
         scenarios: Only scenarios with these ids, or with the ids in a file, one per line.
         limit: Only the first N scenarios that remain after filtering.
         metrics: Metrics to print in addition to the headline: a set (training, full), names, or module:name of your
-            own (docs/guide/custom.md). All built-in metrics are always computed and written.
+            own (docs/guide/custom.md). All built-in metrics are always computed and written. On the command line devkit
+            adds nuPlan's score as its devkit computes it (drivax judge).
         seed: Seed of all random numbers: noisy starts and planners that sample.
         sample: Let a trained policy sample its actions instead of taking the mode.
         batch: Scenarios loaded at a time; as many as memory allows by default. Results do not depend on it.

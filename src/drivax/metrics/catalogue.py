@@ -218,14 +218,14 @@ METRICS: dict[str, Metric] = {
         _score(vmax_score, False), VMAX_INPUTS, "high", "safety gates times ttc, progress, speed, lanes and comfort",
         label="V-Max score", headline=11, **_SCORE),
     "nuplan_score": _computed(
-        _score(nuplan_score, False), NUPLAN_INPUTS, "high", "nuPlan's closed-loop score",
-        label="nuPlan score", headline=12, **_SCORE),
+        _score(nuplan_score, False), NUPLAN_INPUTS, "high", "nuPlan's closed-loop score by our definitions",
+        label="nuPlan-style score", headline=12, **_SCORE),
     "vmax_score_partial": _computed(
         _score(vmax_score, True), VMAX_INPUTS, "high", "vmax_score where an input is undefined",
         label="partial V-Max score", **_SCORE),
     "nuplan_score_partial": _computed(
         _score(nuplan_score, True), NUPLAN_INPUTS, "high", "nuplan_score where an input is undefined",
-        label="partial nuPlan score", **_SCORE),
+        label="partial nuPlan-style score", **_SCORE),
     "collision": _accumulated("collision", "any", "-", "low", "boxes overlap", headline=4, **_RATE),
     "at_fault_collision": _accumulated(
         "at_fault_collision", "any", "-", "low", "a collision that is ego's fault by nuPlan's rules",

@@ -1,0 +1,46 @@
+"""``drivax judge``: evaluate stored episodes again, by the rules of another program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Evaluate the episodes of a run by the rules of another program, without driving them again.
+
+    devkit: nuPlan's closed-loop score as its devkit computes it. RUN/devkit.csv holds both scores of every episode, all
+    their terms, and which of them differ (docs/guide/metrics.md says why).
+
+    Example: drivax judge runs/idm --profile devkit
+    """
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Run folder written by drivax evaluate."""
+    profile: Literal["devkit"] = "devkit"
+    """The rules."""
+    data: Path | None = None
+    """Scenario set of the run, if it has moved since."""
+    overwrite: bool = False
+    """Replace the table of an earlier call."""
+
+
+def run(args: Judge) -> int:
+    """Evaluate, write the table, and print means of both definitions."""
+    from drivax.evaluation.episode_table import EpisodeTable
+    from drivax.evaluation.profiles import FILE, devkit_rows, format_rows, write_rows
+    from drivax.files import check_output
+    from drivax.tracking.progress import Progress
+
+    table, out = EpisodeTable.read(args.run), args.run / FILE
+    check_output(out, args.overwrite)
+    with Progress("evaluating", "episodes", len(table)) as bar:
+        rows = devkit_rows(table, table.open_set(args.data), lambda done, _: bar.update(done))
+    write_rows(rows, out)
+    print(format_rows(rows))
+    print(f"wrote {out}")
+    return 0

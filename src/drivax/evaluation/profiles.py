@@ -1,0 +1,267 @@
+"""Evaluate stored episodes by the rules of another program.
+
+The only profile is ``devkit``: nuPlan's closed-loop score as its devkit computes it (:mod:`drivax.evaluation.devkit`).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import shapely
+from jaxtyping import Array, Float
+
+from drivax.evaluation.devkit import DevkitVerdict, EgoMotion, Road, RoadObject, Tracks, devkit_verdict
+from drivax.evaluation.episode_table import EpisodeTable, Trajectories
+from drivax.evaluation.traffic_trajectories import unpacked
+from drivax.files import write_text
+from drivax.geometry.boxes import corners
+from drivax.scenario.bank.queries import LEVEL_M, around_lanes, offroad_distance
+from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M, ScenarioBank, Sizes
+from drivax.scenario.schema import DT_S, Scenario
+from drivax.scenario.store import ScenarioSet
+from drivax.table import Cell, Column, Table
+
+#: Our metric of each term of the devkit's score.
+TERMS = {
+    "score": "nuplan_score", "fault_score": "at_fault_collision", "drivable": "offroad", "direction": "direction",
+    "making_progress": "making_progress", "ttc_ok": "ttc_ok", "progress": "progress_ratio",
+    "speed": "speed_compliance", "comfortable": "comfortable",
+}  # fmt: skip
+#: Terms that are 1 less our metric.
+_NEGATED = ("fault_score", "drivable")
+#: Terms count as different beyond this.
+_DIFFERENT = 0.005
+FILE = "devkit.csv"
+
+
+@dataclass(frozen=True)
+class ProfileRow:
+    """An episode by both definitions.
+
+    Attributes:
+        dataset: Data set of the scenario.
+        scenario_id: Id of the scenario.
+        ours: Our value of each term (:data:`TERMS`), NaN where it is undefined.
+        devkit: The devkit's.
+    """
+
+    dataset: str
+    scenario_id: str
+    ours: dict[str, float]
+    devkit: dict[str, float]
+
+    @property
+    def differing(self) -> tuple[str, ...]:
+        """Terms that differ, the score left out."""
+        return tuple(
+            name
+            for name in TERMS
+            if name != "score" and abs(self.ours[name] - self.devkit[name]) > _DIFFERENT
+        )
+
+
+def devkit_rows(
+    table: EpisodeTable, data: ScenarioSet, progress: Callable[[int, int], None] = lambda done, total: None
+) -> list[ProfileRow]:
+    """Evaluate every episode of a table by the devkit's rules.
+
+    Our maps hold lane centre lines and road edges: lanes are strips of their width, the drivable area ends at the
+    edges, and connectors stand for intersections. Agents on another level of the road are left out.
+
+    Args:
+        table: Episodes with trajectories.
+        data: The scenario set that was evaluated.
+        progress: Called with (done, total) after every episode.
+    """
+    rows = {(entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(data.entries)}
+    sizes, result = Sizes.used(data), []
+    for number, key in enumerate(table.scenarios):
+        scenario = data[rows[key]]
+        verdict = devkit_episode(scenario, table.trajectories, number, sizes)
+        ours = {
+            name: 1.0 - value if name in _NEGATED else value
+            for name, metric in TERMS.items()
+            for value in (float(table.metrics[metric][number]),)
+        }
+        result.append(ProfileRow(*key, ours, {name: float(getattr(verdict, name)) for name in TERMS}))
+        progress(number + 1, len(table))
+    return result
+
+
+def devkit_episode(scenario: Scenario, driven: Trajectories, row: int, sizes: Sizes) -> DevkitVerdict:
+    """Evaluate one episode by the devkit's rules.
+
+    Args:
+        scenario: Its scenario.
+        driven: Trajectories of the evaluation.
+        row: The episode.
+        sizes: Sizes of the set's banks.
+    """
+    start = int(driven.start[row])
+    steps = slice(start, int(scenario.steps))
+    ego = _ego(scenario, driven.ego[row, : steps.stop - start].astype(np.float64), start)
+    valid = scenario.agent_valid[steps, 0]
+    expert = scenario.agent_xy[steps, 0][valid].astype(np.float64)
+    others = None if driven.others is None else unpacked(driven.others[row, : steps.stop - start])
+    return devkit_verdict(ego, _tracks(scenario, steps, others), _road(scenario, steps, sizes), expert)
+
+
+def write_rows(rows: Sequence[ProfileRow], path: Path) -> None:
+    """Write both definitions of every episode, and the terms that differ, as CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    columns = (f"{side}_{name}" for name in TERMS for side in ("drivax", "devkit"))
+    writer.writerow(["dataset", "scenario_id", *columns, "differ"])
+    for row in rows:
+        values = (value for name in TERMS for value in (row.ours[name], row.devkit[name]))
+        cells = ("" if np.isnan(value) else f"{value:.6g}" for value in values)
+        writer.writerow([row.dataset, row.scenario_id, *cells, " ".join(row.differing)])
+    write_text(path, text.getvalue())
+
+
+def format_rows(rows: Sequence[ProfileRow]) -> str:
+    """Return a table of both definitions: means of each term and the number of episodes that differ in it."""
+    lines = []
+    for name, metric in TERMS.items():
+        pairs = np.array([(row.ours[name], row.devkit[name]) for row in rows])
+        means = [
+            f"{pairs[~np.isnan(side), n].mean():.3f}" if (~np.isnan(side)).any() else ""
+            for n, side in enumerate(pairs.T)
+        ]
+        differ = int((np.abs(pairs[:, 0] - pairs[:, 1]) > _DIFFERENT).sum())
+        term = f"1 - {metric}" if name in _NEGATED else metric
+        lines.append((Cell(name), Cell(term), *map(Cell, means), Cell(f"{differ:,}")))
+    columns = (
+        Column("devkit's term", label=True),
+        Column("ours", left=True),
+        *map(Column, ("drivax", "devkit", "differ in")),
+    )
+    return Table("profile", columns, tuple(lines)).text()
+
+
+def _ego(scenario: Scenario, motion: Float[np.ndarray[Any, Any], "t 4"], start: int) -> EgoMotion:
+    """Ego's motion: acceleration over the last step (the first one logged), yaw rate over the next."""
+    x, y, heading, speed = motion.T
+    before = max(start - 1, 0)
+    logged = (
+        float(np.hypot(*scenario.agent_velocity[before, 0])) if scenario.agent_valid[before, 0] else speed[0]
+    )
+    turned = np.diff(np.unwrap(heading))
+    yaw_rate = np.append(turned, turned[-1:]) / DT_S if len(turned) else np.zeros(1)
+    length, width = scenario.agent_size[0, :2].astype(np.float64)
+    return EgoMotion(
+        np.stack([x, y], axis=-1), heading, np.abs(speed), np.diff(speed, prepend=logged) / DT_S, yaw_rate,
+        np.diff(yaw_rate, prepend=yaw_rate[:1]) / DT_S, (float(length), float(width)),
+    )  # fmt: skip
+
+
+def _tracks(scenario: Scenario, steps: slice, others: Float[np.ndarray[Any, Any], "t A 3"] | None) -> Tracks:
+    """The other agents: moving ones where traffic put them, and parked ones."""
+    count = steps.stop - steps.start
+    xy, heading = scenario.agent_xy[steps, 1:], scenario.agent_heading[steps, 1:]
+    velocity, present = scenario.agent_velocity[steps, 1:], scenario.agent_valid[steps, 1:].copy()
+    if others is not None:
+        agents = others[:, 1 : xy.shape[1] + 1].astype(np.float64)
+        xy, heading, present = agents[..., :2], agents[..., 2], ~np.isnan(agents[..., 0])
+        velocity = np.diff(xy, axis=0, prepend=xy[:1] - DT_S * velocity[:1]) / DT_S
+    ground = scenario.agent_z[steps, :1]
+    present &= np.abs(scenario.agent_z[steps, 1:] - ground) <= LEVEL_M
+    parked = scenario.parked_valid[steps] & (np.abs(scenario.parked_z - ground) <= LEVEL_M)
+    static = np.broadcast_to(scenario.parked_xy, (count, *scenario.parked_xy.shape))
+    present = np.concatenate([present, parked], axis=1)
+    there = present.any(axis=0)
+    return Tracks(
+        np.nan_to_num(np.concatenate([xy, static], axis=1)[:, there]).astype(np.float64),
+        np.nan_to_num(
+            np.concatenate([heading, np.broadcast_to(scenario.parked_heading, parked.shape)], axis=1)[
+                :, there
+            ]
+        ).astype(np.float64),
+        np.concatenate([np.hypot(velocity[..., 0], velocity[..., 1]), np.zeros(parked.shape)], axis=1)[
+            :, there
+        ].astype(np.float64),
+        present[:, there],
+        np.concatenate([scenario.agent_size[1:, :2], scenario.parked_size[:, :2]])[there].astype(np.float64),
+        np.concatenate([scenario.agent_kind[1:], scenario.parked_kind])[there],
+    )
+
+
+def _road(scenario: Scenario, steps: slice, sizes: Sizes) -> Road:
+    objects = _objects(scenario)
+    crossing = shapely.unary_union([each.polygon for each in objects if each.connector])
+    bank = ScenarioBank.from_scenarios([scenario], trim=sizes)
+    z = jnp.asarray(scenario.agent_z[steps, 0] - scenario.agent_size[0, 2] / 2)
+
+    def outside_m(ego: EgoMotion) -> np.ndarray[Any, Any]:
+        pose = np.stack([*ego.xy.T, np.cos(ego.heading), np.sin(ego.heading)], axis=-1)
+        box = np.concatenate([pose, np.broadcast_to(ego.size_m, (len(pose), 2))], axis=-1)
+        return np.asarray(_beyond_edges(bank, jnp.asarray(box, jnp.float32), z), np.float64)
+
+    return Road(objects, outside_m, lambda points: shapely.contains_xy(crossing, points[:, 0], points[:, 1]))
+
+
+@jax.jit
+def _beyond_edges(
+    bank: ScenarioBank, boxes: Float[Array, "t 6"], z: Float[Array, " t"]
+) -> Float[Array, "t 4"]:
+    """Distance of the corners of boxes beyond the road edges, in the devkit's order."""
+    index = jnp.zeros((), jnp.int32)
+
+    def beyond(box: Float[Array, " 6"], ground: Float[Array, ""]) -> Float[Array, " 4"]:
+        points = corners(box)
+        near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
+        return offroad_distance(bank, index, box[:2], points, near, ground)[jnp.array([0, 3, 2, 1])]
+
+    return jax.vmap(beyond)(boxes, z)
+
+
+def _objects(scenario: Scenario) -> list[RoadObject]:
+    """Lanes and connectors, in the order of the lane graph; those without segments have an empty area."""
+    count = int((scenario.lane_id >= 0).sum())
+    first, last = (int(end) for end in scenario.segment_blocks[1:3])
+    lane, at = scenario.segment_lane[first:last], scenario.segment_start_m[first:last]
+    blocks = _blocks(scenario, count)
+    objects = []
+    for index in range(count):
+        own = first + np.flatnonzero(lane == index)[np.argsort(at[lane == index], kind="stable")]
+        points = np.concatenate([scenario.segment_a[own, :2], scenario.segment_b[own[-1:], :2]]).astype(
+            np.float64
+        )
+        line: Any = shapely.linestrings(points) if len(own) else shapely.LineString()
+        width, limit = float(scenario.lane_width[index]), float(scenario.lane_limit[index])
+        half = (width if width > 0 else DEFAULT_LANE_WIDTH_M) / 2
+        links = (scenario.lane_successor[index], scenario.lane_predecessor[index])
+        objects.append(
+            RoadObject(
+                line.buffer(half, cap_style="flat"), line, blocks[index], limit if limit > 0 else None,
+                bool(scenario.lane_interpolating[index]),
+                *(tuple(other for other in linked.tolist() if 0 <= other < count) for linked in links),
+            )
+        )  # fmt: skip
+    return objects
+
+
+def _blocks(scenario: Scenario, count: int) -> list[int]:
+    """Roadblock of every lane: parallel lanes, and connectors between the same two blocks, share one."""
+    blocks = list(range(count))
+    for index in range(count):
+        for other in (int(scenario.lane_left[index]), int(scenario.lane_right[index])):
+            if 0 <= other < count and not scenario.lane_interpolating[index]:
+                low, high = sorted((blocks[index], blocks[other]))
+                blocks = [low if block == high else block for block in blocks]
+    pairs: dict[tuple[int, int], int] = {}
+    for index in np.flatnonzero(scenario.lane_interpolating[:count]).tolist():
+        before, after = (
+            int(links[index, 0]) for links in (scenario.lane_predecessor, scenario.lane_successor)
+        )
+        if min(before, after) >= 0:
+            blocks[index] = pairs.setdefault((blocks[before], blocks[after]), index)
+    return blocks

@@ -1,0 +1,76 @@
+"""Stored episodes by the devkit's rules: what is read off a scenario and a run, and the table of both definitions."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+
+from drivax.cli import main
+from drivax.evaluation.profiles import TERMS, ProfileRow, _objects, devkit_rows, format_rows, write_rows
+from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
+from drivax.planners.catalogue import make_planner
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from scenes import SMALL, car, straight_road
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """One drive with a free road, one with a standing car in ego's lane."""
+    path = tmp_path_factory.mktemp("profiles") / "set"
+    with ScenarioWriter(path, SMALL) as writer:
+        for name, cars in (("free", []), ("blocked", [car(x=60.0, speed=0.0)])):
+            drive = straight_road([car(speed=8.0), *cars])
+            writer.add(assemble(replace(drive, scenario_id=name, segment=name), SMALL))
+    return ScenarioSet.open(path)
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "constant"
+    return run_evaluation(
+        EvaluationConfig("constant_velocity"), make_planner("constant_velocity"), data, out
+    ), out
+
+
+def test_lanes_become_strips_of_their_width(data):
+    scenario = data[0]
+    for index, lane in enumerate(_objects(scenario)):
+        assert lane.line.length == pytest.approx(float(scenario.lane_length[index]), rel=1e-3)
+        width = float(scenario.lane_width[index])
+        assert lane.polygon.area == pytest.approx(lane.line.length * (width if width > 0 else 3.7), rel=1e-3)
+        assert shapely.contains_xy(lane.polygon, *lane.line.interpolate(5.0).coords[0])
+
+
+def test_hitting_a_standing_car_is_at_fault_by_both_definitions(data, run):
+    table, _ = run
+    free, blocked = devkit_rows(table, data)
+    assert (free.scenario_id, blocked.scenario_id) == ("free", "blocked")
+    assert free.devkit["score"] == pytest.approx(1.0) == free.ours["score"] and not free.differing
+    assert blocked.devkit["fault_score"] == blocked.ours["fault_score"] == 0.0
+    assert blocked.devkit["ttc_ok"] == blocked.devkit["score"] == 0.0
+
+
+def test_judge_writes_and_prints_both_definitions(data, run, capsys):
+    _, out = run
+    assert main(["judge", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "nuplan_score" in printed and "differ in" in printed and f"wrote {out / 'devkit.csv'}" in printed
+    rows = list(csv.DictReader((out / "devkit.csv").read_text().splitlines()))
+    assert [row["scenario_id"] for row in rows] == ["free", "blocked"]
+    assert (rows[1]["drivax_fault_score"], rows[1]["devkit_fault_score"]) == ("0", "0")
+    assert main(["judge", str(out)]) == 2
+    assert "pass --overwrite" in capsys.readouterr().err
+    assert main(["judge", str(out), "--overwrite"]) == 0
+
+
+def test_undefined_terms_are_empty_and_differ_from_nothing(tmp_path):
+    terms = dict.fromkeys(TERMS, 1.0)
+    row = ProfileRow("drivax", "a", terms | {"speed": np.nan, "ttc_ok": 0.0}, terms)
+    assert row.differing == ("ttc_ok",)
+    write_rows([row], tmp_path / "devkit.csv")
+    (stored,) = csv.DictReader((tmp_path / "devkit.csv").read_text().splitlines())
+    assert stored["drivax_speed"] == "" and stored["differ"] == "ttc_ok"
+    assert "1 - offroad" in format_rows([row])
