@@ -18,10 +18,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from datasets.samples import nuplan as sample
-from drivax.datasets.nuplan import log as nuplan_log
-from drivax.datasets.nuplan.log import TimeLine, pieces, yaw_of
+from drivax.datasets.nuplan import reader as nuplan_reader
 from drivax.datasets.nuplan.map import feature_id
-from drivax.datasets.nuplan.reader import NuPlan
+from drivax.datasets.nuplan.reader import NuPlan, TimeLine, pieces, yaw_of
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording, windows
@@ -378,8 +377,8 @@ def test_logs_of_ten_hertz_are_taken_whole(tmp_path):
 def test_recordings_come_one_by_one(log, monkeypatch):
     """A log is never in memory as a whole: the second scene is read when it is asked for."""
     asked = []
-    whole = nuplan_log.tracks
-    monkeypatch.setattr(nuplan_log, "tracks", lambda *given: asked.append(given[2].name) or whole(*given))
+    whole = nuplan_reader.tracks
+    monkeypatch.setattr(nuplan_reader, "tracks", lambda *given: asked.append(given[1].name) or whole(*given))
     reading = NuPlan().read(log)
     next(reading)
     assert len(asked) == 1
@@ -433,7 +432,7 @@ def test_other_scenes_survive_a_damaged_one(tmp_path):
 
 
 def test_too_many_tracks_are_refused_before_they_take_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(nuplan_log, "_MOST_CELLS", 1000)
+    monkeypatch.setattr(nuplan_reader, "_MOST_CELLS", 1000)
     (bad,) = NuPlan().read(sample.write(tmp_path))
     assert isinstance(bad, BadRecord) and "12 tracks in 96 steps" in bad.problem
 

@@ -15,9 +15,7 @@ import shapely
 
 from datasets.samples import nuplan as sample
 from drivax.datasets.nuplan import map as nuplan_map
-from drivax.datasets.nuplan import map_features as nuplan_features
-from drivax.datasets.nuplan.map import city_map, corridor, feature_id, find_map
-from drivax.datasets.nuplan.map_features import features_around
+from drivax.datasets.nuplan.map import city_map, corridor, feature_id, features_around, find_map
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import LANE_KINDS, RoadKind
 
@@ -391,7 +389,7 @@ def test_feature_ids_are_distinct():
 
 @pytest.mark.parametrize("name", ["shapely", "pyproj"])
 def test_missing_packages_are_named_with_the_extra_that_brings_them(city, monkeypatch, name):
-    nuplan_features._transformer.cache_clear()
+    nuplan_map._transformer.cache_clear()
     monkeypatch.setitem(sys.modules, name, None)  # makes its import fail
     with pytest.raises(UsageError, match=f"{name} is not installed; pip install 'drivax\\[maps\\]'"):
         features_around(city, DRIVE)
