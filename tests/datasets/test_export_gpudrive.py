@@ -10,8 +10,8 @@ import pytest
 from datasets.samples import womd_scenario
 from datasets.test_export_recording import assert_same_map
 from drivax.datasets import gpudrive
-from drivax.datasets.export.gpudrive import file_name, gpudrive_scene
 from drivax.datasets.export.recording import restore
+from drivax.datasets.gpudrive import file_name, gpudrive_scene
 from drivax.datasets.womd import scenario_reader as protos
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind, Flag, RoadKind

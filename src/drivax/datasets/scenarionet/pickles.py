@@ -1,7 +1,7 @@
 """Pickles read as data, without running code: numbers, texts, containers and NumPy arrays; and checks of their values.
 
-Refusing names (``Unpickler.find_class``) is not enough: Python's unpickler grows its memo to any index in a damaged file,
-allocates arrays before it reads their data, and overflows the stack on deeply nested keys. So the operations, split by
+Refusing names (``Unpickler.find_class``) is not enough: the memo of Python's unpickler grows to any index in the file,
+arrays are allocated before their data is read, and deeply nested keys overflow the stack. So the operations, split by
 the standard library's disassembler, are carried out here, each checked against the size of the file.
 """
 
