@@ -1,9 +1,9 @@
-"""Rules of pure functions that all checks share, and their error messages."""
+"""Rules of pure functions, which all checks share, and their error messages."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -16,6 +16,12 @@ from drivax.errors import DrivaxError
 CLOSE, TURNED = 1e-4, 5e-3
 #: Share of moments at which a threshold may flip in a rotated world.
 _FLIPS = 0.05
+#: Changes of a world that must not change results, and cures; ``worlds`` has them for banks and frames in this order.
+_VARIANTS = (
+    ("the rows of absent agents change", "mask with frame.valid first"),
+    ("empty slots are added", "mask with frame.valid, also before a mean"),
+    ("the order of agents changes", "let no result depend on a slot: sort by distance, or reduce over all"),
+)
 _PYTHON = (
     jax.errors.TracerBoolConversionError,
     jax.errors.TracerArrayConversionError,
@@ -26,15 +32,11 @@ _PYTHON = (
 
 
 class BrokenContract(DrivaxError, AssertionError):
-    """A component breaks a rule; one line with the rule and the cure."""
+    """A component breaks a rule; the message names the rule and the cure."""
 
 
 def expect(condition: Any, problem: str, cure: str) -> None:
-    """Raise unless a condition holds.
-
-    Raises:
-        BrokenContract: ``condition`` is false.
-    """
+    """Raise :class:`BrokenContract` unless a condition holds."""
     if not condition:
         raise BrokenContract(problem, cure=cure)
 
@@ -51,17 +53,18 @@ def _tracing_errors(what: str) -> Iterator[None]:
         ) from error
 
 
-def compiled(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result of a function under ``jit``, freshly traced, as numpy arrays.
+def form(leaf: Any) -> str:
+    """Return type and shape of an array, as in ``float32[3, 2]``."""
+    return f"{leaf.dtype}{list(leaf.shape)}"
 
-    Raises:
-        BrokenContract: The function cannot be compiled.
-    """
-    return program(what, function)(*arguments)
+
+def layout(tree: Any) -> Any:
+    """Return structure, types and shapes of a tree, to compare."""
+    return jax.tree.structure(tree), [form(leaf) for leaf in jax.tree.leaves(tree)]
 
 
 def program(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a jitted function with numpy results; calls raise :class:`BrokenContract` if it cannot be compiled."""
+    """Return a freshly jitted function with numpy results; it raises :class:`BrokenContract` if tracing fails."""
     run = jax.jit(lambda *values: function(*values))
 
     def call(*arguments: Any) -> Any:
@@ -72,11 +75,7 @@ def program(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def forms(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the shapes and types of a function's results.
-
-    Raises:
-        BrokenContract: The function cannot be compiled.
-    """
+    """Return the shapes and types of a function's results; raise :class:`BrokenContract` if tracing fails."""
     with _tracing_errors(what):
         return jax.eval_shape(function, *arguments)
 
@@ -94,26 +93,18 @@ class Program:
         self, what: str, function: Callable[..., Any], in_axes: tuple[int | None, ...] = (0,)
     ) -> None:
         self.what, self.function, self.in_axes = what, function, in_axes
-        self._run = self._compiled()
-
-    def _compiled(self) -> Callable[..., Any]:
-        batched = jax.vmap(self.function, self.in_axes)
-        return jax.jit(lambda *arguments: batched(*arguments))
+        self._batched = jax.vmap(function, in_axes)
+        self._run = program(what, self._batched)
 
     def __call__(self, *arguments: Any) -> Any:
-        """Return the results for all rows as numpy arrays.
-
-        Raises:
-            BrokenContract: The function cannot be compiled.
-        """
-        with _tracing_errors(self.what):
-            return jax.device_get(self._run(*arguments))
+        """Return the results for all rows as numpy arrays."""
+        return self._run(*arguments)
 
     def check_pure(self, *arguments: Any) -> Any:
         """Check that results do not depend on compilation, batching or repetition, and return them."""
         what, results = self.what, self(*arguments)
         expect(
-            same(results, jax.device_get(self._compiled()(*arguments)), 0.0),
+            same(results, program(what, self._batched)(*arguments), 0.0),
             f"{what} is not deterministic",
             "take randomness from a key, and keep no state between calls",
         )
@@ -121,7 +112,7 @@ class Program:
         row = [value if axis is None else jax.tree.map(lambda leaf: leaf[0], value) for value, axis in pairs]
         first = jax.tree.map(lambda leaf: leaf[0], results)
         expect(
-            same(first, compiled(what, self.function, *row), CLOSE),
+            same(first, program(what, self.function)(*row), CLOSE),
             f"{what} differs in a batch",
             "write it for one agent in one scenario; vmap adds the batch",
         )
@@ -139,18 +130,27 @@ def check_numbers(what: str, values: Any, reads: str = "a division, a root or a 
         broken = ~np.isfinite(leaf)
         if broken.any():
             rows = broken.reshape(len(leaf), -1).any(axis=1) if leaf.ndim else broken[None]
-            raise BrokenContract(
-                f"{what} is not finite at {int(rows.sum())} of {len(rows)} moments",
-                cure=f"guard {reads} with jnp.where on its input",
-            )
+            problem = f"{what} is not finite at {int(rows.sum())} of {len(rows)} moments"
+            raise BrokenContract(problem, cure=f"guard {reads} with jnp.where on its input")
+
+
+def check_variants(
+    what: str, results: Any, variants: Sequence[Any], run: Callable[[Callable[..., Any]], Any]
+) -> None:
+    """Check that results do not depend on the rows of absent agents, padding, and the order of agents.
+
+    Args:
+        what: Name in messages.
+        results: Results in the world itself.
+        variants: ``worlds.BANK_VARIANTS`` or ``worlds.FRAME_VARIANTS``.
+        run: Returns the results in a variant.
+    """
+    for variant, (cause, cure) in zip(variants, _VARIANTS, strict=True):
+        check_same(what, results, run(variant), cause, cure)
 
 
 def check_same(what: str, result: Any, changed: Any, cause: str, cure: str) -> None:
-    """Check that two results agree at all moments.
-
-    Raises:
-        BrokenContract: They differ; ``cause`` completes "changes when".
-    """
+    """Check that two results agree at all moments; ``cause`` completes "changes when"."""
     expect(same(result, changed, CLOSE), f"{what} changes when {cause}", cure)
 
 
@@ -183,6 +183,6 @@ def check_scalar(what: str, value: Any) -> None:
     leaf = np.asarray(value)
     expect(
         leaf.ndim == 1 and leaf.dtype == jnp.float32,
-        f"{what} gives {leaf.dtype}{list(leaf.shape[1:])} instead of one float32 number",
+        f"{what} gives {form(leaf[0])} instead of one float32 number",
         "reduce it to a scalar, and convert booleans with .astype(jnp.float32)",
     )
