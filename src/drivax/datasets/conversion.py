@@ -139,13 +139,7 @@ def _attempt(call: Callable[[], _Result], path: Path, record: str) -> _Result | 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a conversion is about to do.
-
-    Attributes:
-        data: The files.
-        estimate: Expected size of the set.
-        written: Number of scenarios that an interrupted conversion has written already.
-    """
+    """Files to convert, expected size, and number of scenarios that an interrupted conversion has written already."""
 
     data: Survey
     estimate: Estimate
@@ -282,7 +276,9 @@ class _Sink:
         for note in writer.notes:
             self.place = tuple(note["place"])
             self.filtered = note["filtered"]
-            self.skipped += [_bad_record(data, row) for row in note["skipped"]]
+            for row in note["skipped"]:
+                file = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
+                self.skipped.append(BadRecord(file, row["record"], row["problem"], row["cure"]))
         self._noted = len(self.skipped)
         if options.strict and self.skipped:
             raise self.skipped[0].error()
@@ -374,11 +370,6 @@ class _Sink:
 def _row(data: Survey, bad: BadRecord) -> dict[str, Any]:
     """A bad record as JSON values."""
     return {"file": data.relative(bad.file), "record": bad.record, "problem": bad.problem, "cure": bad.cure}
-
-
-def _bad_record(data: Survey, row: dict[str, Any]) -> BadRecord:
-    file = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
-    return BadRecord(file, row["record"], row["problem"], row["cure"])
 
 
 def _drain(

@@ -349,7 +349,15 @@ def gpudrive_scene(scenario: Scenario, name: str) -> dict[str, Any]:
         "name": name,
         "scenario_id": recording.scenario_id,
         "objects": [_object(recording, row) for row in rows],
-        "roads": [_road(feature) for feature in recording.features],
+        "roads": [
+            {
+                "geometry": _points(feature.points),
+                "type": _ROAD_TYPES[feature.kind],
+                "map_element_id": int(feature.kind),
+                "id": feature.feature_id,
+            }
+            for feature in recording.features
+        ],
         "tl_states": {str(light.lane_id): _light(light) for light in recording.lights},
         "metadata": {
             "sdc_track_index": place[recording.ego],
@@ -383,15 +391,6 @@ def _object(recording: Recording, row: int) -> dict[str, Any]:
         "type": _AGENT_TYPES.get(AgentKind(int(tracks.kind[row])), "other"),
         "id": int(tracks.track_id[row]),
         "mark_as_expert": False,
-    }
-
-
-def _road(feature: MapFeature) -> dict[str, Any]:
-    return {
-        "geometry": _points(feature.points),
-        "type": _ROAD_TYPES[feature.kind],
-        "map_element_id": int(feature.kind),
-        "id": feature.feature_id,
     }
 
 

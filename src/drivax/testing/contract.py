@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from drivax.errors import DrivaxError
+from drivax.plugins import find_named
 
 #: Tolerances: sums in another order; maps rotated in float32.
 CLOSE, TURNED = 1e-4, 5e-3
@@ -23,7 +23,6 @@ _VARIANTS = (
     ("the order of agents changes", "let no result depend on a slot: sort by distance, or reduce over all"),
 )
 _PYTHON = (
-    jax.errors.TracerBoolConversionError,
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
     jax.errors.ConcretizationTypeError,
@@ -41,16 +40,21 @@ def expect(condition: Any, problem: str, cure: str) -> None:
         raise BrokenContract(problem, cure=cure)
 
 
+def instance(component: Any) -> Any:
+    """Return a component, also from its class or a dotted name of either."""
+    component = find_named(component) if isinstance(component, str) else component
+    return component() if isinstance(component, type) else component
+
+
 @contextlib.contextmanager
 def _tracing_errors(what: str) -> Iterator[None]:
     """Turn JAX's tracing errors into one line."""
     try:
         yield
     except _PYTHON as error:
-        raise BrokenContract(
-            f"{what} cannot be compiled: Python needs the value of a traced array",
-            cure="use jnp.where instead of if, and jnp instead of numpy, float() or int()",
-        ) from error
+        problem = f"{what} cannot be compiled: Python needs the value of a traced array"
+        cure = "use jnp.where instead of if, and jnp instead of numpy, float() or int()"
+        raise BrokenContract(problem, cure=cure) from error
 
 
 def form(leaf: Any) -> str:
@@ -81,13 +85,7 @@ def forms(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 class Program:
-    """A function of one row, batched and compiled.
-
-    Args:
-        what: Name in messages.
-        function: The function.
-        in_axes: 0 for batched arguments, None for shared ones.
-    """
+    """A function of one row, named ``what`` in messages, batched (``in_axes`` of ``jax.vmap``) and compiled."""
 
     def __init__(
         self, what: str, function: Callable[..., Any], in_axes: tuple[int | None, ...] = (0,)
@@ -137,14 +135,7 @@ def check_numbers(what: str, values: Any, reads: str = "a division, a root or a 
 def check_variants(
     what: str, results: Any, variants: Sequence[Any], run: Callable[[Callable[..., Any]], Any]
 ) -> None:
-    """Check that results do not depend on the rows of absent agents, padding, and the order of agents.
-
-    Args:
-        what: Name in messages.
-        results: Results in the world itself.
-        variants: ``worlds.BANK_VARIANTS`` or ``worlds.FRAME_VARIANTS``.
-        run: Returns the results in a variant.
-    """
+    """Check that ``run`` gives the same results in ``worlds.BANK_VARIANTS`` or ``worlds.FRAME_VARIANTS``."""
     for variant, (cause, cure) in zip(variants, _VARIANTS, strict=True):
         check_same(what, results, run(variant), cause, cure)
 
@@ -171,18 +162,7 @@ def same(left: Any, right: Any, tolerance: float) -> bool:
     """Whether two trees have equal structure and shapes, and values within a tolerance."""
     if jax.tree.structure(left) != jax.tree.structure(right):
         return False
-    pairs = zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True)
     return all(
         np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True)
-        for a, b in pairs
-    )
-
-
-def check_scalar(what: str, value: Any) -> None:
-    """Check that each row is one float32 number."""
-    leaf = np.asarray(value)
-    expect(
-        leaf.ndim == 1 and leaf.dtype == jnp.float32,
-        f"{what} gives {form(leaf[0])} instead of one float32 number",
-        "reduce it to a scalar, and convert booleans with .astype(jnp.float32)",
+        for a, b in zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True)
     )

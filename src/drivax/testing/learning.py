@@ -13,13 +13,12 @@ from drivax.learning.algorithm import AlgorithmConfig, Learner, LearnerState, tr
 from drivax.learning.driving import Driving
 from drivax.networks.encoders import EncoderConfig
 from drivax.planners.planner import Planner
-from drivax.plugins import find_named
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from drivax.testing import worlds
-from drivax.testing.contract import CLOSE, check_numbers, expect, form, layout, program, same
+from drivax.testing.contract import CLOSE, check_numbers, expect, form, instance, layout, program, same
 
 #: Groups with one and two row axes, with and without masks; the second set has fewer groups, one without rows.
 _SPECS = (
@@ -38,20 +37,13 @@ _ITERATIONS = 4
 
 
 def check_encoder(config: EncoderConfig | str) -> None:
-    """Check an encoder.
+    """Check an encoder by its settings or their dotted name; raise :class:`BrokenContract` if it breaks a rule.
 
     It builds for any groups, including one without rows. It embeds an observation or a batch as ``[..., width]``
     float32, compiled or not. Its parameters follow from the key and are its only state. Values and gradients are
     finite, also with all rows masked. Masked rows have no effect, valid rows do.
-
-    Args:
-        config: The encoder's settings, or the dotted name of such a class or instance.
-
-    Raises:
-        BrokenContract: It breaks a rule; the message names rule and cure.
     """
-    settings: Any = find_named(config) if isinstance(config, str) else config
-    settings = settings() if isinstance(settings, type) else settings
+    settings = instance(config)
     what = f"encoder {type(settings).__name__}"
     expect(isinstance(settings, EncoderConfig), f"{what} has no build(spec, rngs)", "see EncoderConfig")
     close = _COARSE if getattr(settings, "dtype", "") == "bfloat16" else CLOSE
@@ -113,50 +105,44 @@ def _check_rows(what: str, forms: tuple[Any, Any], batch: Any, embedding: Any, c
 
 
 def _check_masks(what: str, run: Any, batch: Any, embedding: Any, close: float) -> None:
-    masked = [name for name in batch if f"{name}_mask" in batch]
-    scattered, empty = dict(batch), dict(batch)
-    for name in masked:
-        there = batch[f"{name}_mask"][..., None]
-        scattered[name] = jnp.where(there, batch[name], worlds.GARBAGE)
-        empty[f"{name}_mask"] = jnp.zeros_like(batch[f"{name}_mask"])
-    changed = run(scattered)
+    scattered = {
+        name: jnp.where(batch[f"{name}_mask"][..., None], rows, worlds.GARBAGE)
+        for name, rows in batch.items()
+        if f"{name}_mask" in batch
+    }
     expect(
-        same(embedding, changed, close),
+        same(embedding, run(batch | scattered), close),
         f"{what} changes with masked rows",
         "use jnp.where(mask[..., None], rows, 0) first, and mask after each bias",
     )
-    check_numbers(f"{what} without rows", run(empty), "a mean or softmax over no rows")
+    check_numbers(f"{what} without rows", run(_without_rows(batch)), "a mean or softmax over no rows")
+
+
+def _without_rows(batch: Any) -> dict[str, Any]:
+    return {n: jnp.zeros_like(value) if n.endswith("_mask") else value for n, value in batch.items()}
 
 
 def _check_gradients(what: str, encoder: Any, batch: Any) -> None:
     graph, parameters = nnx.split(encoder)
-    empty = {n: jnp.zeros_like(v) if n.endswith("_mask") else v for n, v in batch.items()}
 
     def loss(parameters: Any, batch: Any) -> Any:
         return jnp.mean(nnx.merge(graph, parameters)(batch) ** 2)
 
     run = program(what, jax.grad(loss))
-    for groups in (batch, empty):
+    for groups in (batch, _without_rows(batch)):
         gradient = run(parameters, groups)
         finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
         expect(finite, f"{what} has non-finite gradients", "guard roots and divisions on their input")
 
 
 def check_algorithm(config: AlgorithmConfig | str) -> None:
-    """Check an algorithm.
+    """Check an algorithm by its settings or their dotted name; raise :class:`BrokenContract` if it breaks a rule.
 
     Its learner has a state with ``parameters`` and ``iteration`` of constant structure, shapes and types. Iterations
     are pure, bit-for-bit repeatable after storing the state, change the parameters and log finite numbers. The planner
     acts within [-1, 1], deterministically by the mode. Use small sizes: the check runs three iterations.
-
-    Args:
-        config: The algorithm's settings, or the dotted name of such a class or instance.
-
-    Raises:
-        BrokenContract: It breaks a rule; the message names rule and cure.
     """
-    settings: Any = find_named(config) if isinstance(config, str) else config
-    settings = settings() if isinstance(settings, type) else settings
+    settings = instance(config)
     what = f"algorithm {type(settings).__name__}"
     valid = isinstance(settings, AlgorithmConfig)
     expect(valid, f"{what} lacks build or steps_per_iteration", "see AlgorithmConfig")

@@ -52,7 +52,7 @@ _STATE_BYTES = 16_000
 
 
 def check_planner(planner: Planner | str, *, task: Task | None = None, privileged: bool = False) -> None:
-    """Check a planner.
+    """Check a planner; raise :class:`BrokenContract` if it breaks a rule.
 
     Its actions are finite and have the task's shape; its carry keeps its shape. Actions do not depend on batching,
     repetition, rotation and shift of the world, the order of agents, padding, rows of absent agents, or the log's
@@ -62,9 +62,6 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
         planner: The planner, its name, or its dotted name.
         task: The planner's task; the default task otherwise.
         privileged: Whether it may read the log's future.
-
-    Raises:
-        BrokenContract: It breaks a rule; the message names rule and cure.
     """
     planner = make_planner(planner) if isinstance(planner, str) else planner
     valid = isinstance(planner, Planner) and not isinstance(planner, type)
@@ -142,17 +139,11 @@ class _Seen:
 
 
 def check_traffic(traffic: Traffic | str) -> None:
-    """Check a traffic model.
+    """Check a traffic model, its name or dotted name; raise :class:`BrokenContract` if it breaks a rule.
 
     Its state keeps its shape and is small. Its rows are like ``bank.agents``: finite, unit directions, valid 0 or 1.
     Past rows are repeated unchanged; no agent jumps. It does not depend on compilation, batching, rotation and shift
     of the world, the order of agents, padding, or rows of absent agents.
-
-    Args:
-        traffic: The model, its name, or the dotted name of such a class.
-
-    Raises:
-        BrokenContract: It breaks a rule; the message names rule and cure.
     """
     traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
     what = f"traffic {traffic.name!r}"
@@ -204,10 +195,8 @@ def _moved(traffic: Traffic) -> Callable[[ScenarioBank, Any], _Seen]:
 def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
     simulator = Simulator(Task(), traffic)
 
-    def first_rows(bank: ScenarioBank) -> Any:
-        return traffic.agents(bank, simulator.context(bank, 0, _START), 0)
-
-    rows, shape = jax.eval_shape(first_rows, bank), bank.agents.shape[2:]
+    shape = bank.agents.shape[2:]
+    rows = jax.eval_shape(lambda bank: traffic.agents(bank, simulator.context(bank, 0, _START), 0), bank)
     expect(
         rows.shape == shape and rows.dtype == jnp.float32,
         f"{what} gives {form(rows)} as the rows of {shape[0]} agents",

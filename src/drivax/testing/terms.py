@@ -26,11 +26,11 @@ from drivax.testing.contract import (
     Program,
     check_numbers,
     check_same,
-    check_scalar,
     check_turned,
     check_variants,
     expect,
     form,
+    instance,
 )  # fmt: skip
 from drivax.testing.worlds import ANGLE, Moments
 
@@ -41,20 +41,13 @@ _NOW = 45
 
 
 def check_reward(term: Term | str) -> None:
-    """Check a reward term.
+    """Check a reward term or its dotted name; raise :class:`BrokenContract` if it breaks a rule.
 
     It is a pure function of facts before, facts now and surroundings, and one finite float32 number. It does not
     depend on compilation, batching, rotation and shift of the world, the order of agents, padding, or rows of absent
     agents.
-
-    Args:
-        term: The term, or its dotted name.
-
-    Raises:
-        BrokenContract: It breaks a rule; the message names rule and cure.
     """
-    function: Any = find_named(term) if isinstance(term, str) else term
-    function = function() if isinstance(function, type) else function
+    function = instance(term)
 
     def value(moment: Moments) -> Any:
         return function(moment.before, moment.situation.facts, moment.situation.surroundings)
@@ -63,17 +56,11 @@ def check_reward(term: Term | str) -> None:
 
 
 def check_metric(metric: Metric | str) -> None:
-    """Check a metric.
+    """Check a metric or its dotted name; raise :class:`BrokenContract` if it breaks a rule.
 
     Its step value is a number and whether it is defined, under the rules of :func:`check_reward` where it is defined.
     It declares all facts that it reads, has unit, direction and text, and computes a finite ``Value`` at the end of an
     episode where it is defined.
-
-    Args:
-        metric: The metric, or its dotted name.
-
-    Raises:
-        BrokenContract: It breaks a rule; the message names rule and cure.
     """
     what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.definition!r}"
     spec: Any = find_named(metric) if isinstance(metric, str) else metric
@@ -96,17 +83,11 @@ def check_metric(metric: Metric | str) -> None:
 
 
 def check_feature(feature: Feature | str) -> None:
-    """Check an observation feature.
+    """Check an observation feature or its dotted name; raise :class:`BrokenContract` if it breaks a rule.
 
     It is a pure function of bank, context and frames: finite float32 up to 100 with features last, or a pair of those
     and a mask over rows. It does not depend on compilation, batching, the log's future, rotation and shift of the
     world, the order of agents, padding, or rows of absent agents.
-
-    Args:
-        feature: The feature, or its dotted name.
-
-    Raises:
-        BrokenContract: It breaks a rule; the message names rule and cure.
     """
     function: Any = find_named(feature) if isinstance(feature, str) else feature
     group = OwnGroup(function)
@@ -155,12 +136,14 @@ def _check_form(what: str, rows: Any) -> None:
 def _check_moments(what: str, value: Callable[[Moments], Any], delayed: bool = False) -> None:
     moments, program = worlds.moments(), Program(what, value)
     results = program.check_pure(moments)
-    number = results[0] if isinstance(results, tuple) else results
+    number = np.asarray(results[0] if isinstance(results, tuple) else results)
     if delayed:
         problem = f"{what} is delayed but returns no row of numbers"
-        expect(np.asarray(number).ndim == 2, problem, "return one number and one mask entry per step")
+        expect(number.ndim == 2, problem, "return one number and one mask entry per step")
     else:
-        check_scalar(what, number)
+        problem = f"{what} gives {form(number[0])} instead of one float32 number"
+        cure = "reduce it to a scalar, and convert booleans with .astype(jnp.float32)"
+        expect(number.ndim == 1 and number.dtype == jnp.float32, problem, cure)
     frame = moments.situation.surroundings.frame
 
     def changed(change: Callable[[Frame], Frame]) -> Any:

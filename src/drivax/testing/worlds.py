@@ -46,13 +46,7 @@ _CAPACITY = replace(CAPACITIES["default"], name="testing", agents=40, parked=24)
 
 @record
 class Moments:
-    """Measured moments, one per row.
-
-    Attributes:
-        before: Facts of the step before.
-        situation: The situation now.
-        start: Step at which the episode began.
-    """
+    """Facts of the step before, the situation now, and the first step of the episode; one moment per row."""
 
     before: Facts
     situation: Situation

@@ -281,16 +281,13 @@ def _paths(scenario: Scenario, numbers: Mapping[int, int], shift: _Array, form: 
         begin = min(int(np.hypot(*(line[:, :2] - log[0]).T).argmin()), count - 2)
         points, index = resample(line[begin:], form.spacing_m, form.points)
         lanes = scenario.route_lane[row, begin:count][index]
+        ids = np.where(lanes >= 0, scenario.lane_id[lanes], -1).tolist()
         size = len(points)
         xyz[number, :size] = points + shift
-        lane[number, :size] = [_lane_number(scenario, int(i), numbers) for i in lanes]
+        lane[number, :size] = [numbers.get(lane_id, -1) for lane_id in ids]
         arc[number, :size] = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
         valid[number, :size] = 1
         _, distance = project(points[:, :2], log)
         on_route[number] = number == 0 or (distance <= _ON_ROUTE_M).mean() >= _ON_ROUTE_SHARE
     columns = {"xyz": xyz, "id": lane, "arc_length": arc, "valid": valid, "on_route": on_route}
     return {f"path_samples/{name}": column for name, column in columns.items()}
-
-
-def _lane_number(scenario: Scenario, lane: int, numbers: Mapping[int, int]) -> int:
-    return numbers.get(int(scenario.lane_id[lane]), -1) if lane >= 0 else -1

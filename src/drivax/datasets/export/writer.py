@@ -62,14 +62,7 @@ class Export:
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written.
-
-    Attributes:
-        path: The folder.
-        scenarios: Number of scenarios.
-        files: Number of files that hold them.
-        lost: Nonzero counts of what does not fit the format, by name.
-    """
+    """The written folder, numbers of scenarios and of their files, and nonzero counts of what did not fit by name."""
 
     path: Path
     scenarios: int
@@ -81,12 +74,6 @@ def export(
     set_path: str | Path, out: str | Path, options: Export | None = None, progress: Progress | None = None
 ) -> Exported:
     """Write scenarios of a set in another format or as a new set, which appears under ``out`` when it is complete.
-
-    Args:
-        set_path: Scenario set to read.
-        out: Folder to create.
-        options: What to export and how; by default everything, as a set.
-        progress: Called with (scenarios done, scenarios).
 
     Raises:
         DataError: The set is damaged, an id is not in it, or no scenario is selected.
@@ -127,7 +114,7 @@ def write_part(
 
     Args:
         opened: The set.
-        rows: Its rows to write, in this order.
+        rows: Rows of the set, in the order of the new one.
         out: Folder to create.
         overwrite: Replace an existing scenario set; other folders are never replaced.
         progress: Called with (scenarios done, scenarios).

@@ -27,6 +27,7 @@ from drivax.scenario.schema import RoadKind
 
 Array = np.ndarray[Any, Any]
 
+_DRIVABLE = ("road_segments", "intersections", "generic_drivable_areas", "carpark_areas")
 #: Layers that are read and their columns. The order gives the numbers of the layers in feature ids.
 LAYERS: Mapping[str, tuple[str, ...]] = {
     "lanes_polygons": (
@@ -38,10 +39,7 @@ LAYERS: Mapping[str, tuple[str, ...]] = {
     "stop_polygons": ("stop_polygon_type_fid",),
     "baseline_paths": ("lane_fid", "lane_connector_fid"),
     "gen_lane_connectors_scaled_width_polygons": ("lane_connector_fid", "left_boundary_fid", "right_boundary_fid"),
-    "road_segments": (),
-    "intersections": (),
-    "generic_drivable_areas": (),
-    "carpark_areas": (),
+    **dict.fromkeys(_DRIVABLE, ()),
 }  # fmt: skip
 _NEEDED = ("baseline_paths", "lanes_polygons", "lane_connectors")
 NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), start=1)}
@@ -49,7 +47,6 @@ NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), s
 _UNPACKED, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
 _FASTEST_MPS = 60.0
 CURE = "download the nuPlan maps again"
-_DRIVABLE = ("road_segments", "intersections", "generic_drivable_areas", "carpark_areas")
 #: Decoded around ego's drive: 100 m that are kept, and space for routes that lead further.
 MARGIN_M = 250.0
 #: A feature near the drive that reaches further than this from it is damaged.

@@ -123,13 +123,7 @@ class NuPlan:
 
 @dataclass(frozen=True)
 class TimeLine:
-    """The lidar sweeps of a log in order of time.
-
-    Attributes:
-        tokens: Token of each sweep.
-        time_us: Microseconds.
-        scenes: Token of the scene of each sweep, None where it has none.
-    """
+    """Tokens, times and scene tokens (None without a scene) of the lidar sweeps of a log, in order of time."""
 
     tokens: tuple[Any, ...]
     time_us: Int64[np.ndarray, " sweep"]
@@ -155,12 +149,8 @@ class Piece:
     own: tuple[int, int]
 
 
-@dataclass(frozen=True)
-class Agents:
-    """The kind and number of every track of a log, by token."""
-
-    kinds: Mapping[Any, AgentKind]
-    numbers: Mapping[Any, int]
+#: Number and kind of every track of a log by token.
+_Agents = Mapping[Any, tuple[int, AgentKind]]
 
 
 @dataclass(frozen=True)
@@ -213,7 +203,8 @@ def pieces(line: TimeLine) -> list[Piece]:
                 continue
             scene = line.scenes[sweeps[begin]]
             number = counts[scene] = counts.get(scene, 0) + 1
-            name = _hexadecimal(scene) + (f".{number}" if number > 1 else "")
+            name = scene.hex() if isinstance(scene, bytes) and 0 < len(scene) <= 16 else "no-scene"
+            name += f".{number}" if number > 1 else ""
             own = int(sweeps[begin]), int(sweeps[end - 1]) + step
             recordings.append(Piece(name, scene, sweeps[part], own))
     return recordings
@@ -226,9 +217,8 @@ def _every(time_us: Int64[np.ndarray, " sweep"]) -> int:
         return 2
     if 90_000 <= usual <= 110_000:
         return 1
-    raise DataError(
-        f"lidar sweeps come every {usual / 1e3:.0f} ms, not every 50 or 100 ms", cure="use an unaltered log"
-    )
+    problem = f"lidar sweeps come every {usual / 1e3:.0f} ms, not every 50 or 100 ms"
+    raise DataError(problem, cure="use an unaltered log")
 
 
 def _scenes(line: TimeLine, sweeps: Int64[np.ndarray, " step"]) -> list[tuple[int, int]]:
@@ -240,10 +230,6 @@ def _scenes(line: TimeLine, sweeps: Int64[np.ndarray, " step"]) -> list[tuple[in
         for begin, end in zip(begins, (*begins[1:], len(scenes)), strict=True)
         for start in range(begin, end, _LONGEST_PIECE)
     ]
-
-
-def _hexadecimal(token: Any) -> str:
-    return token.hex() if isinstance(token, bytes) and 0 < len(token) <= 16 else "no-scene"
 
 
 def _numbers(rows: Sequence[Sequence[Any]], width: int, what: str) -> Float64[np.ndarray, "row column"]:
@@ -260,20 +246,20 @@ def _check(values: Float64[np.ndarray, "*shape"], most: float, what: str) -> Non
         raise DataError(f"{what} is missing or absurd", cure=_CURE)
 
 
-def agents(database: Database) -> Agents:
-    """Return kinds and numbers of a log's tracks; numbers count from 1 in order of the table."""
+def agents(database: Database) -> _Agents:
+    """Return numbers (from 1 in order of the table) and kinds of a log's tracks by token."""
     rows = database.rows(
         "SELECT t.token, c.name FROM track AS t LEFT JOIN category AS c ON c.token = t.category_token ORDER BY t.rowid"
     )
     kinds = {token: _KINDS.get(name, AgentKind.OTHER) for token, name in rows}
-    return Agents(kinds, {token: number for number, token in enumerate(kinds, start=1)})
+    return {token: (number, kind) for number, (token, kind) in enumerate(kinds.items(), start=1)}
 
 
-def tracks(log: Log, piece: Piece, known: Agents) -> tuple[Tracks, int]:
+def tracks(log: Log, piece: Piece, known: _Agents) -> tuple[Tracks, int]:
     """Return the tracks of a piece, ego in row 0, and the number of boxes without a track."""
     steps = len(piece.sweeps)
     boxes, owners, left_out = _boxes(log, piece, known)
-    tokens = sorted({owner for _, owner in owners}, key=lambda token: known.numbers[token])
+    tokens = sorted({owner for _, owner in owners}, key=lambda token: known[token][0])
     if (len(tokens) + 1) * steps > _MOST_CELLS:
         raise DataError(f"{len(tokens)} tracks in {steps} steps", cure=_CURE)
     rows = {token: row for row, token in enumerate(tokens, start=1)}
@@ -283,6 +269,7 @@ def tracks(log: Log, piece: Piece, known: Agents) -> tuple[Tracks, int]:
     if owners:
         at = np.array([(rows[owner], step) for step, owner in owners]).T
         table[at[0], at[1]], valid[at[0], at[1]] = boxes, True
+    entries = [(EGO_TRACK_ID, AgentKind.VEHICLE), *(known[token] for token in tokens)]
     states = Tracks(
         xy=table[..., 0:2].copy(),
         z=table[..., 2].copy(),
@@ -290,8 +277,8 @@ def tracks(log: Log, piece: Piece, known: Agents) -> tuple[Tracks, int]:
         size=table[..., 4:7].copy(),
         velocity=table[..., 7:9].copy(),
         valid=valid,
-        kind=np.array([AgentKind.VEHICLE, *(known.kinds[token] for token in tokens)], np.int8),
-        track_id=np.array([EGO_TRACK_ID, *(known.numbers[token] for token in tokens)], np.int64),
+        kind=np.array([kind for _, kind in entries], np.int8),
+        track_id=np.array([number for number, _ in entries], np.int64),
     )
     return states, left_out
 
@@ -342,12 +329,12 @@ def _observed(log: Log, piece: Piece, table: str, columns: str) -> list[tuple[An
 
 
 def _boxes(
-    log: Log, piece: Piece, known: Agents
+    log: Log, piece: Piece, known: _Agents
 ) -> tuple[Float64[np.ndarray, "box 9"], list[tuple[int, Any]], int]:
     """Boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track), and how many have no track."""
     columns = "track_token, x, y, z, yaw, length, width, height, vx, vy"
     rows = _observed(log, piece, "lidar_box", columns)
-    kept = [row for row in rows if row[1] in known.kinds]
+    kept = [row for row in rows if row[1] in known]
     boxes = _numbers([row[2:] for row in kept], 9, "lidar_box")
     # Static things have no velocity, and the size of a few is unknown.
     boxes[:, 4:9] = np.where(np.isnan(boxes[:, 4:9]), 0.0, boxes[:, 4:9])
@@ -374,25 +361,23 @@ def _roadblocks(log: Log, piece: Piece) -> list[int]:
     return [int(word) for word in words if word.isascii() and word.isdigit() and len(word) < 19]
 
 
-def _recording(log: Log, piece: Piece, known: Agents, city: City) -> Recording:
+def _recording(log: Log, piece: Piece, known: _Agents, city: City) -> Recording:
     if len(piece.sweeps) <= CURRENT_STEP:
-        raise DataError(
-            f"{len(piece.sweeps)} steps without a gap, fewer than {CURRENT_STEP + 1}", cure="skip this record"
-        )
+        problem = f"{len(piece.sweeps)} steps without a gap, fewer than {CURRENT_STEP + 1}"
+        raise DataError(problem, cure="skip this record")
     states, boxes = tracks(log, piece, known)
     features, lost = features_around(city, states.xy[0])
     states, features = flatten(states, features)
     lights, unlit = _lights(log, piece, city, features)
     lanes = {feature.feature_id for feature in features}
     route, unknown = corridor(city, _roadblocks(log, piece))
-    types = _scenario_types(log, piece)
+    types, time_us = _scenario_types(log, piece), log.line.time_us
     tags = {"source_format": FORMAT} | parsing.place_tags(log.map_name)
     return Recording(
         scenario_id=piece.name,
         dataset=DATASET,
         segment=log.name,
-        timestamps_s=(log.line.time_us[piece.sweeps] - log.line.time_us[0])
-        * 1e-6,  # by the clock of the lidar
+        timestamps_s=(time_us[piece.sweeps] - time_us[0]) * 1e-6,
         current_step=CURRENT_STEP,
         ego=0,
         tracks=states,

@@ -59,11 +59,8 @@ _FARTHEST_M, _LONGEST_M = 1e5, 2e6
 def outlines_on_left(lines: Sequence[Array]) -> list[Array]:
     """Orient the outline of drivable space: exteriors anticlockwise, holes clockwise.
 
-    Rings do not cross, so one inside an even number of others is an exterior, else a hole. A line that is no ring
-    (a clipped outline) is reversed: GEOS, which makes these outlines, runs clockwise around areas.
-
-    Args:
-        lines: Points of the rings, metres; the first point is repeated at the end.
+    Rings repeat their first point and do not cross, so one inside an even number of others is an exterior, else a hole.
+    A line that is no ring (a clipped outline) is reversed: GEOS makes outlines that run clockwise around areas.
     """
     ring = [len(points) >= 4 and bool((points[0, :2] == points[-1, :2]).all()) for points in lines]
     rings = [points[:, :2] for points, closed in zip(lines, ring, strict=True) if closed]
@@ -132,14 +129,7 @@ def _votes(edge: Array, points: Array) -> int:
 
 @dataclass(frozen=True)
 class RoadMap:
-    """The map of a file.
-
-    Attributes:
-        features: The features; dangling links are left out.
-        names: Numbers of the features' names.
-        flat: Whether the file has no heights.
-        lost: Counts of what was left out.
-    """
+    """Features without dangling links, numbers of their names, whether the file lacks heights, and counts of losses."""
 
     features: tuple[MapFeature, ...]
     names: Names
@@ -159,12 +149,9 @@ class _Reading:
 
 
 def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
-    """Read ``map_features``.
+    """Read ``map_features``; ``around`` is a position (x, y) of ego, metres.
 
-    Args:
-        table: Features by name.
-        dataset: Original data set; decides which limits and which orientation of edges are used.
-        around: A position (x, y) of ego, metres.
+    The original data set decides which speed limits and which orientation of edges are used.
 
     Raises:
         DataError: The map is too large.
@@ -272,14 +259,11 @@ def _width(body: Mapping[Any, Any]) -> float | None:
 
 def _links(value: Any, reading: _Reading) -> tuple[int, ...]:
     """Numbers of linked features, which files name by number, text or a dictionary with ``feature_id``."""
-    links = []
-    for item in items(value):
-        link = reading.names.get(item.get("feature_id") if isinstance(item, dict) else item)
-        if link is None:
-            reading.lost["dangling_links"] += 1
-        else:
-            links.append(link)
-    return tuple(links)
+    names = [item.get("feature_id") if isinstance(item, dict) else item for item in items(value)]
+    links = tuple(link for name in names if (link := reading.names.get(name)) is not None)
+    if len(links) < len(names):
+        reading.lost["dangling_links"] += len(names) - len(links)
+    return links
 
 
 def third_column_is_heading(lanes: Sequence[Array]) -> bool:

@@ -19,7 +19,6 @@ import numpy as np
 from drivax.datasets import parsing
 from drivax.datasets.elevation import flatten, lift
 from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M
-from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.datasets.scenarionet import pickles
 from drivax.datasets.scenarionet.map import RoadMap, road_map
@@ -166,6 +165,8 @@ def decode(tree: Any) -> Recording:
     lost = Counter({**roads.lost, "one_point_features": parsing.one_point_features(roads.features)})
     lights = _lights(mapping(tree, "dynamic_map_states"), steps, dataset, roads, lost)
     tracks, features = _with_heights(tracks, roads)
+    tags = {"source_format": _NAME} | parsing.place_tags(text(metadata.get("map")))
+    kind = text(metadata.get("scenario_type")) or None
     return Recording(
         scenario_id=identity,
         dataset=dataset,
@@ -178,7 +179,7 @@ def decode(tree: Any) -> Recording:
         lights=lights,
         to_predict=_named_rows(metadata.get("tracks_to_predict"), rows),
         of_interest=_named_rows(metadata.get("objects_of_interest"), rows),
-        tags=_tags(metadata),
+        tags=tags | ({} if kind is None else {"scenario_types": kind[:64]}),
         lost=parsing.nonzero(**lost),
         flags=flags,
         split_gap_m=_WOMD_GAP_M if dataset == "womd" else None,
@@ -211,13 +212,7 @@ def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
 
 
 def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> Tracks:
-    """Read ``tracks``. Invalid states become zeros; a velocity that the file lacks is zero.
-
-    Args:
-        table: Tracks by name, in order.
-        names: Their numbers.
-        ego: Row of ego.
-    """
+    """Read ``tracks``. Invalid states become zeros; a velocity that the file lacks is zero."""
     titles = [f"track {name[:40]!r}" for name in table]
     bodies = [mapping({"": body}, "", f"tracks[{name[:40]!r}]") for name, body in table.items()]
     states = [mapping(body, "state", title) for title, body in zip(titles, bodies, strict=True)]
@@ -239,14 +234,19 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> Tracks:
         stacked[name][~valid] = 0.0
         parsing.check_within(limit, stacked[name])
     size = np.concatenate([stacked[name] for name in ("length", "width", "height")], axis=-1)
+    longest, widest, _ = size[ego].max(axis=0)
+    if longest < widest:  # nuScenes files have a car 1.73 m long and 4.08 m wide
+        size[ego] = size[ego][:, [1, 0, 2]]
     return Tracks(
         xy=stacked["position"][..., :2].copy(),
         z=stacked["position"][..., 2].copy(),
         heading=np.where(valid, wrap(stacked["heading"][..., 0]), 0.0),
         velocity=stacked["velocity"][..., :2].copy(),
-        size=_long_ego(size, ego),
+        size=size,
         valid=valid,
-        kind=np.array([_kind(body) for body in bodies], np.int8),
+        kind=np.array(
+            [_AGENTS.get(text(body.get("type")) or "", AgentKind.OTHER) for body in bodies], np.int8
+        ),
         track_id=np.array([names.get(name) for name in table], np.int64),
     )
 
@@ -263,19 +263,6 @@ def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array
     if values.ndim != 2 or values.shape[1] not in _COLUMNS[name][0]:
         raise DataError(f"{what} has a {name} of shape {values.shape}", cure=SKIP)
     return values
-
-
-def _kind(body: Mapping[Any, Any]) -> AgentKind:
-    kind = body.get("type")
-    return _AGENTS.get(kind, AgentKind.OTHER) if isinstance(kind, str) else AgentKind.OTHER
-
-
-def _long_ego(size: Array, ego: int) -> Array:
-    """Sizes with ego's length and width swapped back: nuScenes files have a car 1.73 m long and 4.08 m wide."""
-    own = size[ego].max(axis=0)
-    if own[0] < own[1]:
-        size[ego] = size[ego][:, [1, 0, 2]]
-    return size
 
 
 def velocity_is_missing(tracks: Tracks) -> bool:
@@ -341,13 +328,6 @@ def _named_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
     names = list(value) if isinstance(value, dict) else items(value)
     numbers = (rows.get(name) for item in names if (name := text(item)) is not None)
     return tuple(row for row in numbers if row is not None)
-
-
-def _tags(metadata: Mapping[Any, Any]) -> dict[str, str]:
-    tags = {"source_format": _NAME} | place_tags(text(metadata.get("map")))
-    if kind := text(metadata.get("scenario_type")):
-        tags["scenario_types"] = kind[:64]
-    return tags
 
 
 def _lights(
