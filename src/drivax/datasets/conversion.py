@@ -345,7 +345,7 @@ class _Sink:
         seen: set[tuple[str, str]] = set()
         for item, (file, _) in batch:
             if isinstance(item, Scenario):
-                key = bytes(item.record["dataset"][()]).decode(), item.id
+                key = item.text("dataset"), item.id
                 if key in self._writer or key in seen:
                     problem, cure = "the scenario is in the set already", "give each file once"
                     item = BadRecord(self._data.inputs[file].path, item.id, problem, cure)

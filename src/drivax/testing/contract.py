@@ -101,24 +101,17 @@ class Program:
     def check_pure(self, *arguments: Any) -> Any:
         """Check that results do not depend on compilation, batching or repetition, and return them."""
         what, results = self.what, self(*arguments)
-        expect(
-            same(results, program(what, self._batched)(*arguments), 0.0),
-            f"{what} is not deterministic",
-            "take randomness from a key, and keep no state between calls",
-        )
+        repeated = same(results, program(what, self._batched)(*arguments), 0.0)
+        cure = "take randomness from a key, and keep no state between calls"
+        expect(repeated, f"{what} is not deterministic", cure)
         pairs = zip(arguments, self.in_axes, strict=True)
         row = [value if axis is None else jax.tree.map(lambda leaf: leaf[0], value) for value, axis in pairs]
         first = jax.tree.map(lambda leaf: leaf[0], results)
-        expect(
-            same(first, program(what, self.function)(*row), CLOSE),
-            f"{what} differs in a batch",
-            "write it for one agent in one scenario; vmap adds the batch",
-        )
-        expect(
-            same(first, jax.device_get(self.function(*row)), CLOSE),
-            f"{what} differs when compiled",
-            "let the result depend on the arguments only",
-        )
+        single = same(first, program(what, self.function)(*row), CLOSE)
+        cure = "write it for one agent in one scenario; vmap adds the batch"
+        expect(single, f"{what} differs in a batch", cure)
+        eager = same(first, jax.device_get(self.function(*row)), CLOSE)
+        expect(eager, f"{what} differs when compiled", "let the result depend on the arguments only")
         return results
 
 

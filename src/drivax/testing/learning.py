@@ -53,11 +53,9 @@ def check_encoder(config: EncoderConfig | str) -> None:
         run = program(what, encoder)
         embedding = run(batch)
         width = getattr(encoder, "width", None)
-        expect(
-            embedding.shape == (_BATCH, width) and embedding.dtype == jnp.float32,
-            f"{what} embeds {_BATCH} observations as {form(embedding)} with width {width}",
-            "return [*batch, width] float32, and set width",
-        )
+        valid = embedding.shape == (_BATCH, width) and embedding.dtype == jnp.float32
+        problem = f"{what} embeds {_BATCH} observations as {form(embedding)} with width {width}"
+        expect(valid, problem, "return [*batch, width] float32, and set width")
         check_numbers(what, embedding)
         _check_state(what, settings, spec, encoder)
         _check_rows(what, (encoder if number == 0 else run, run), batch, embedding, close)
@@ -84,22 +82,16 @@ def _check_state(what: str, config: EncoderConfig, spec: Any, encoder: Any) -> N
         "keep nnx.Param only: no dropout, no running means",
     )
     again = jax.tree.leaves(nnx.state(config.build(spec, nnx.Rngs(0)), nnx.Param))
-    expect(
-        same(jax.device_get(parameters), jax.device_get(again), 0.0),
-        f"{what} has other initial parameters every time",
-        "draw them from rngs",
-    )
+    repeated = same(jax.device_get(parameters), jax.device_get(again), 0.0)
+    expect(repeated, f"{what} has other initial parameters every time", "draw them from rngs")
 
 
 def _check_rows(what: str, forms: tuple[Any, Any], batch: Any, embedding: Any, close: float) -> None:
     """Check one observation, alone and in a batch of batches of one, compiled and not."""
     single, (encoder, run) = jax.tree.map(lambda leaf: leaf[0], batch), forms
     for result in (encoder(single), run(jax.tree.map(lambda leaf: leaf[None, None], single))[0, 0]):
-        expect(
-            same(embedding[0], jax.device_get(result), close),
-            f"{what} differs in a batch",
-            "use the last axes; any axes may lead",
-        )
+        valid = same(embedding[0], jax.device_get(result), close)
+        expect(valid, f"{what} differs in a batch", "use the last axes; any axes may lead")
     spread = np.abs(embedding - embedding[:1]).max()
     expect(spread > 0, f"{what} embeds all observations equally", "let it read the groups")
 
@@ -110,11 +102,8 @@ def _check_masks(what: str, run: Any, batch: Any, embedding: Any, close: float) 
         for name, rows in batch.items()
         if f"{name}_mask" in batch
     }
-    expect(
-        same(embedding, run(batch | scattered), close),
-        f"{what} changes with masked rows",
-        "use jnp.where(mask[..., None], rows, 0) first, and mask after each bias",
-    )
+    cure = "use jnp.where(mask[..., None], rows, 0) first, and mask after each bias"
+    expect(same(embedding, run(batch | scattered), close), f"{what} changes with masked rows", cure)
     check_numbers(f"{what} without rows", run(_without_rows(batch)), "a mean or softmax over no rows")
 
 
@@ -147,11 +136,8 @@ def check_algorithm(config: AlgorithmConfig | str) -> None:
     valid = isinstance(settings, AlgorithmConfig)
     expect(valid, f"{what} lacks build or steps_per_iteration", "see AlgorithmConfig")
     steps = settings.steps_per_iteration
-    expect(
-        isinstance(steps, int) and steps > 0,
-        f"{what} counts {steps!r} steps per iteration",
-        "count environment steps as a whole number",
-    )
+    valid = isinstance(steps, int) and steps > 0
+    expect(valid, f"{what} counts {steps!r} steps per iteration", "count environment steps as a whole number")
     bank, simulator = worlds.worlds(), Simulator(_TASK)
     environment = Driving(simulator)
     learner = settings.build(environment, bank, _ITERATIONS)
@@ -165,35 +151,23 @@ def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
     first = init(data, jax.random.key(0))
     valid = isinstance(first, LearnerState)
     expect(valid, f"{what} has a state without parameters or iteration", "add these fields")
-    expect(
-        layout(jax.eval_shape(learner.init, data, jax.random.key(1))) == layout(first),
-        f"{what} has a state whose shape depends on the key",
-        "let shapes depend on the configuration only",
-    )
-    next_state, _ = jax.eval_shape(learner.iterate, data, first)
+    valid = layout(jax.eval_shape(learner.init, data, jax.random.key(1))) == layout(first)
+    cure = "let shapes depend on the configuration only"
+    expect(valid, f"{what} has a state whose shape depends on the key", cure)
+    valid = layout(jax.eval_shape(learner.iterate, data, first)[0]) == layout(first)
     cure = "return the same record with the same shapes and types"
-    expect(
-        layout(next_state) == layout(first), f"{what} changes the shape of its state in an iteration", cure
-    )
+    expect(valid, f"{what} changes the shape of its state in an iteration", cure)
     stored = jax.tree.map(jnp.copy, first)  # survives the donation of the state
     second, logs = iterate(data, first)
-    expect(
-        int(second.iteration) == int(stored.iteration) + 1,
-        f"{what} counts from iteration {int(stored.iteration)} to {int(second.iteration)}",
-        "add one",
-    )
-    expect(
-        not same(jax.device_get(second.parameters), jax.device_get(stored.parameters), 0.0),
-        f"{what} learns nothing in an iteration",
-        "return the new parameters",
-    )
+    before, after = int(stored.iteration), int(second.iteration)
+    expect(after == before + 1, f"{what} counts from iteration {before} to {after}", "add one")
+    idle = same(jax.device_get(second.parameters), jax.device_get(stored.parameters), 0.0)
+    expect(not idle, f"{what} learns nothing in an iteration", "return the new parameters")
     _check_logs(what, logs)
     again, _ = iterate(data, jax.tree.map(jnp.copy, stored))
-    expect(
-        same(_numbers(again), _numbers(second), 0.0),
-        f"{what} does not repeat an iteration bit for bit",
-        "keep keys and all other inputs of an iteration in the state",
-    )
+    valid = same(_numbers(again), _numbers(second), 0.0)
+    cure = "keep keys and all other inputs of an iteration in the state"
+    expect(valid, f"{what} does not repeat an iteration bit for bit", cure)
     third, logs = iterate(data, second)
     _check_logs(what, logs)
     check_numbers(what, [np.atleast_1d(leaf) for leaf in jax.tree.leaves(_numbers(third.parameters))])
@@ -202,11 +176,8 @@ def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
 
 def _check_logs(what: str, logs: dict[str, Any]) -> None:
     for name, value in logs.items():
-        expect(
-            np.shape(value) == () and np.isfinite(value),
-            f"{what} logs {name!r} as {np.asarray(value)}",
-            "log finite numbers without axes",
-        )
+        valid = np.shape(value) == () and np.isfinite(value)
+        expect(valid, f"{what} logs {name!r} as {np.asarray(value)}", "log finite numbers without axes")
 
 
 def _check_planner(
@@ -224,15 +195,10 @@ def _check_planner(
         planner = learner.planner(parameters, "checked", samples)
         expect(isinstance(planner, Planner), f"{what} returns no Planner", "see planners.planner.Planner")
         first, second = (np.asarray(act(planner, bank, key)) for key in keys)
-        expect(
-            first.shape == (2,) and np.isfinite(first).all() and (np.abs(first) <= 1.0).all(),
-            f"{what} returns action {first}",
-            "return two numbers in [-1, 1]",
-        )
-        if not samples:
-            expect(
-                (first == second).all(), f"{what} uses randomness in its mode", "use the key only to sample"
-            )
+        valid = first.shape == (2,) and np.isfinite(first).all() and (np.abs(first) <= 1.0).all()
+        expect(valid, f"{what} returns action {first}", "return two numbers in [-1, 1]")
+        valid = samples or (first == second).all()
+        expect(valid, f"{what} uses randomness in its mode", "use the key only to sample")
 
 
 def _numbers(tree: Any) -> Any:

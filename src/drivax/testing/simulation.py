@@ -77,11 +77,8 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
     check_numbers(what, actions)
     check_numbers(what, run(worlds.without_others(bank), index, step))
     single = program(what, actions_of)(bank, jnp.asarray(index[0]), jnp.asarray(step[0]))
-    expect(
-        same(actions[0], single, CLOSE),
-        f"{what} differs in a batch or is not deterministic",
-        "write it for one agent in one scenario, take randomness from the key, and keep no state between calls",
-    )
+    cure = "write it for one agent in one scenario, take randomness from the key, and keep no state between calls"
+    expect(same(actions[0], single, CLOSE), f"{what} differs in a batch or is not deterministic", cure)
     check_variants(what, actions, worlds.BANK_VARIANTS, lambda change: run(change(bank), index, step))
     check_turned(what, actions, run(worlds.worlds(ANGLE), index, step))
     if not privileged:
@@ -197,11 +194,9 @@ def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
 
     shape = bank.agents.shape[2:]
     rows = jax.eval_shape(lambda bank: traffic.agents(bank, simulator.context(bank, 0, _START), 0), bank)
-    expect(
-        rows.shape == shape and rows.dtype == jnp.float32,
-        f"{what} gives {form(rows)} as the rows of {shape[0]} agents",
-        "return float32 rows like bank.agents[index, step]",
-    )
+    problem = f"{what} gives {form(rows)} as the rows of {shape[0]} agents"
+    cure = "return float32 rows like bank.agents[index, step]"
+    expect(rows.shape == shape and rows.dtype == jnp.float32, problem, cure)
 
     def states(bank: ScenarioBank) -> tuple[Any, Any]:
         context = simulator.context(bank, 0, _START)
@@ -223,24 +218,18 @@ def _check_rows(what: str, seen: _Seen) -> None:
     expect(np.isin(valid, (0.0, 1.0)).all(), f"{what} has fractional valid", "let valid be 0 or 1")
     there = valid > 0
     length = np.hypot(rows[..., 3], rows[..., 4])
-    expect(
-        np.allclose(length[there], 1.0, atol=1e-3),
-        f"{what} has directions of length {length[there].min():.3g} to {length[there].max():.3g}",
-        "columns 3 and 4 are cosine and sine of the heading",
-    )
-    expect(
-        (remembered[..., AgentColumn.VALID] == valid).all()
-        and np.allclose(remembered[there], rows[there], rtol=CLOSE, atol=1e-2),
-        f"{what} changes past rows",
-        "let agents(bank, context, back) return all agents 'back' steps ago",
-    )
+    unit = np.allclose(length[there], 1.0, atol=1e-3)
+    problem = f"{what} has directions of length {length[there].min():.3g} to {length[there].max():.3g}"
+    expect(unit, problem, "columns 3 and 4 are cosine and sine of the heading")
+    kept = (remembered[..., AgentColumn.VALID] == valid).all()
+    kept = kept and np.allclose(remembered[there], rows[there], rtol=CLOSE, atol=1e-2)
+    cure = "let agents(bank, context, back) return all agents 'back' steps ago"
+    expect(kept, f"{what} changes past rows", cure)
     both = there[:, 1:] & there[:, :-1]
     jump = np.linalg.norm(np.diff(rows[..., :2], axis=1), axis=-1)[both]
-    expect(
-        (jump <= _JUMP_M).all(),
-        f"{what} moves an agent by {jump.max(initial=0.0):.1f} m in a step",
-        "a step lasts 0.1 s; a slot is invalid before another agent takes it",
-    )
+    problem = f"{what} moves an agent by {jump.max(initial=0.0):.1f} m in a step"
+    cure = "a step lasts 0.1 s; a slot is invalid before another agent takes it"
+    expect((jump <= _JUMP_M).all(), problem, cure)
 
 
 def _from_ego(seen: _Seen) -> Any:

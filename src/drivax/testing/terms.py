@@ -121,16 +121,13 @@ def check_feature(feature: Feature | str) -> None:
 def _check_form(what: str, rows: Any) -> None:
     """Check shapes and types, while tracing."""
     value, mask = rows if isinstance(rows, tuple) else (rows, None)
-    expect(
-        value.dtype == jnp.float32 and value.ndim >= 1,
-        f"{what} gives {form(value)} for a context",
-        "return float32 with features on the last axis",
-    )
-    expect(
-        mask is None or (mask.dtype == bool and mask.shape == value.shape[:-1] and mask.ndim > 0),
-        f"{what} gives {'' if mask is None else form(mask)} as the mask of {list(value.shape)}",
-        "return one boolean per row",
-    )
+    valid = value.dtype == jnp.float32 and value.ndim >= 1
+    cure = "return float32 with features on the last axis"
+    expect(valid, f"{what} gives {form(value)} for a context", cure)
+    if mask is not None:
+        valid = mask.dtype == bool and mask.shape == value.shape[:-1] and mask.ndim > 0
+        problem = f"{what} gives {form(mask)} as the mask of {list(value.shape)}"
+        expect(valid, problem, "return one boolean per row")
 
 
 def _check_moments(what: str, value: Callable[[Moments], Any], delayed: bool = False) -> None:
@@ -181,9 +178,7 @@ def _check_computed(what: str, metric: Metric) -> None:
     for defined in (True, False):
         rows = (jnp.arange(12) % len(bank), jnp.linspace(0.0, 1.0, 12), jnp.full(12, defined))
         result = program.check_pure(*rows) if defined else program(*rows)
-        expect(
-            isinstance(result, Value) and result.value.shape == (12,) and result.defined.dtype == bool,
-            f"{what} does not compute a Value of one number and one boolean",
-            "return drivax.metrics.scores.Value(number, defined)",
-        )
+        valid = isinstance(result, Value) and result.value.shape == (12,) and result.defined.dtype == bool
+        cure = "return drivax.metrics.scores.Value(number, defined)"
+        expect(valid, f"{what} does not compute a Value of one number and one boolean", cure)
         check_numbers(what, jax.tree.map(lambda leaf, d=result.defined: np.where(d, leaf, 0.0), result.value))

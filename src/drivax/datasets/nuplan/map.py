@@ -268,13 +268,10 @@ def corridor(city: City, ids: Sequence[int]) -> tuple[tuple[int, ...], int]:
 
     Groups of lanes and of connectors share the list; an id that both have means the lanes, as in the devkit.
     """
-    lane_ids: dict[int, None] = {}
-    unknown = 0
-    for number in ids:
-        lanes = city.roadblocks.get(("lane", number)) or city.roadblocks.get(("connector", number))
-        unknown += lanes is None
-        lane_ids.update(dict.fromkeys(lanes or ()))
-    return tuple(lane_ids), unknown
+    blocks = city.roadblocks
+    groups = [blocks.get(("lane", number)) or blocks.get(("connector", number)) for number in ids]
+    lanes = dict.fromkeys(lane for group in groups for lane in group or ())
+    return tuple(lanes), sum(group is None for group in groups)
 
 
 def features_around(
@@ -294,9 +291,8 @@ def features_around(
     except shapely.errors.ShapelyError as error:
         raise DataError(f"shapely cannot use a geometry ({error})", file=city.path, cure=CURE) from error
     if not any(feature.kind == RoadKind.LANE_SURFACE for feature in features):
-        raise DataError(
-            f"no lane of the map {city.path} lies within {MARGIN_M:.0f} m of the drive", cure=CURE
-        )
+        problem = f"no lane of the map {city.path} lies within {MARGIN_M:.0f} m of the drive"
+        raise DataError(problem, cure=CURE)
     features += road_edges(areas, feature_id("road_edges", 0))
     return tuple(features), parsing.nonzero(map_geometries=len(around.damaged), lanes=around.pointless)
 
