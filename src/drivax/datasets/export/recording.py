@@ -34,7 +34,8 @@ def restore(scenario: Scenario) -> Recording:
     largest = max(int(scenario.feature_id.max(initial=0)), int(scenario.lane_id.max(initial=0)))
     fresh = itertools.count(largest + 1)
     features = (*_features(scenario, fresh), *_stop_signs(scenario, fresh))
-    moving, parked = _used_slots(scenario)
+    masks = scenario.agent_valid, scenario.parked_valid
+    moving, parked = (np.flatnonzero(mask.any(axis=0)) for mask in masks)
     marks = scenario.agent_flags[moving]
     return Recording(
         scenario_id=scenario.id,
@@ -51,13 +52,6 @@ def restore(scenario: Scenario) -> Recording:
         of_interest=tuple(np.flatnonzero(marks & INTEREST_BIT).tolist()),
         tags=scenario.tags,
         flags=Flag(scenario.has & _READERS_FLAGS),
-    )
-
-
-def _used_slots(scenario: Scenario) -> tuple[_Array, _Array]:
-    """Slots of the moving and of the parked block that are used."""
-    return tuple(
-        np.flatnonzero(scenario.record[name].any(axis=0)) for name in ("agent_valid", "parked_valid")
     )
 
 

@@ -55,7 +55,10 @@ _FARTHEST_M = 20_000.0
 _WIDTHS_M = (1.5, 10.0)
 _WIDTH_PLACES = (0.1, 0.3, 0.5, 0.7, 0.9)
 #: Boundary types that are painted, as far as public readers of the format agree; 1 and 3 are not painted.
-_LINES = {0: RoadKind.LINE_BROKEN_SINGLE_WHITE, 2: RoadKind.LINE_SOLID_SINGLE_WHITE}
+_LINES: Mapping[int | None, RoadKind] = {
+    0: RoadKind.LINE_BROKEN_SINGLE_WHITE,
+    2: RoadKind.LINE_SOLID_SINGLE_WHITE,
+}
 _UNPAINTED = (1, 3)
 _STOP_SIGN = 1
 
@@ -344,7 +347,7 @@ class _Around:
         far = ~(np.abs(xy - self._middle) <= self._reach).all(axis=1)  # NaN compares false
         bad = np.bincount(owner[far], minlength=len(shapes)) > 0
         bad |= np.bincount(owner, minlength=len(shapes)) == 0
-        self.damaged.update((name, rows[i]) for i in np.flatnonzero(bad))
+        self.damaged.update((name, rows[i]) for i in np.flatnonzero(bad).tolist())
         kept = np.asarray(shapes).copy()
         kept[bad] = None
         shapely.set_coordinates(kept, xy[~bad[owner]])
@@ -435,9 +438,10 @@ def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float
     pairs = [[known.get(fid, -1) for fid in lane.boundaries] for lane in lanes]
     rows = np.array(pairs, np.int64).reshape(-1, 2)
     used = np.unique(rows[rows >= 0])
-    lines = np.append(around.shapes("boundaries", used.tolist()), None)
+    nothing = np.array(None, dtype=object)
+    lines = np.append(around.shapes("boundaries", used.tolist()), nothing)
     sides = lines[np.where(rows >= 0, np.searchsorted(used, rows), -1)]
-    along = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, None)
+    along = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, nothing)
     places = shapely.line_interpolate_point(along[:, None], _WIDTH_PLACES, normalized=True)
     gaps = shapely.distance(places[:, None], sides[:, :, None])
     low, high = _WIDTHS_M
