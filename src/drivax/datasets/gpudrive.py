@@ -29,7 +29,7 @@ from drivax.scenario.schema import (
     LightState,
     RoadKind,
     Scenario,
-)  # fmt: skip
+)
 
 _Array = np.ndarray[Any, Any]
 

@@ -38,7 +38,7 @@ from drivax.testing.contract import (
     layout,
     program,
     same,
-)  # fmt: skip
+)
 from drivax.testing.worlds import ANGLE
 
 #: Steps at which the planner starts; step after whose successor the log is changed.

@@ -31,7 +31,7 @@ from drivax.testing.contract import (
     expect,
     form,
     instance,
-)  # fmt: skip
+)
 from drivax.testing.worlds import ANGLE, Moments
 
 #: Bound of features: the Gymnasium adapter clips there.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from drivax.scenario.schema import (
     AgentKind,
     RoadKind,
     Scenario,
-)  # fmt: skip
+)
 
 _Array = np.ndarray[Any, Any]
 
@@ -78,7 +78,7 @@ def tf_example(
     order = _order(tracks, recording)
     lost["agents"] += max(len(order) - AGENTS, 0)
     micros = np.round(np.arange(STEPS) * float(scenario.dt_s) * 1e6).astype(np.int64)
-    numbers = _numbers([feature.feature_id for feature in recording.features], recording)
+    numbers = _numbers(recording)
     features = {"scenario/id": recording.scenario_id.encode()}
     features |= _states(tracks, order[:AGENTS], micros, origin) | _marks(tracks, recording, order[:AGENTS])
     features |= _lights(recording, numbers, micros, origin, lost)
@@ -101,8 +101,7 @@ def _over_time(recording: Recording) -> tuple[Tracks, Counter[str]]:
     index = np.clip(steps, 0, tracks.valid.shape[1] - 1)
     timed = {name: getattr(tracks, name)[:, index] for name in ("xy", "z", "heading", "velocity", "size")}
     valid = tracks.valid[:, index] & known
-    cut = Tracks(**timed, valid=valid, kind=tracks.kind, track_id=tracks.track_id)
-    return cut, Counter(steps=int(tracks.valid.shape[1] - known.sum()))
+    return replace(tracks, **timed, valid=valid), Counter(steps=int(tracks.valid.shape[1] - known.sum()))
 
 
 def _steps(recording: Recording) -> tuple[_Array, _Array]:
@@ -188,8 +187,9 @@ def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Ar
     return {f"state/{name}": _padded(column, AGENTS) for name, column in columns.items()}
 
 
-def _numbers(ids: list[int], recording: Recording) -> dict[int, int]:
+def _numbers(recording: Recording) -> dict[int, int]:
     """Written ids of map features by their ids."""
+    ids = [feature.feature_id for feature in recording.features]
     used = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
     fit = all(0 <= number < _INT_ID_END for number in used)
     return {number: number if fit else row for row, number in enumerate(used)}

@@ -253,17 +253,15 @@ def _connectors(layers: Mapping[str, Layer], baselines: Mapping[int, int]) -> It
         before, after = _lane_id("lanes_polygons", leave), _lane_id("lanes_polygons", enter)
         if number is None or number not in baselines:
             continue
-        yield (
-            number,
-            Lane(
-                baseline=baselines[number],
-                roadblock=None if block is None else ("connector", block),
-                limit_mps=_limit(limit),
-                boundaries=sides.get(whole(fid), (None, None)),
-                successors=[] if after is None else [after],
-                predecessors=[] if before is None else [before],
-            ),
+        lane = Lane(
+            baseline=baselines[number],
+            roadblock=None if block is None else ("connector", block),
+            limit_mps=_limit(limit),
+            boundaries=sides.get(whole(fid), (None, None)),
+            successors=[] if after is None else [after],
+            predecessors=[] if before is None else [before],
         )
+        yield number, lane
 
 
 def corridor(city: City, ids: Sequence[int]) -> tuple[tuple[int, ...], int]:
