@@ -183,7 +183,9 @@ class Judge:
                     if a not in judged:
                         fresh.append(a)
                     judged.add(a)
-            found = {a: self.fault_and_kind(a, t, places[t][0] or places[t][3]) for a in fresh}
+            found = {
+                a: self.fault_and_kind(a, t, places[t][0] or places[t][1] or places[t][3]) for a in fresh
+            }
             for a, (own, _) in found.items():
                 if own:
                     code[a] = "own fault"
@@ -242,14 +244,21 @@ class Judge:
         along = np.diff(speed) / DT
         lateral = (speed[1:] + speed[:-1]) / 2 * np.diff(heading) / DT
         turn = heading[1:]
-        lat = np.abs(savgol_filter(lateral, 8, 2))
-        magnitude = np.abs(savgol_filter(np.hypot(along, lateral), 15, 2, deriv=1, delta=DT))
-        smooth = savgol_filter(along, 8, 2)
+
+        def smoothed(signal):
+            # A sample before the first keeps the windows of the steps that matter away from SciPy's edge.
+            return savgol_filter(np.concatenate([[0.0], signal]), 8, 2)[1:]
+
+        def jerk(signal):
+            return np.abs(savgol_filter(smoothed(signal), 15, 2, deriv=1, delta=DT))
+
+        lat, smooth = np.abs(smoothed(lateral)), smoothed(along)
+        magnitude = jerk(np.hypot(along, lateral))
         excess = np.max([
             smooth / 2.40, smooth / -4.05, lat / 4.89, magnitude / 8.37,
-            np.abs(savgol_filter(along, 15, 2, deriv=1, delta=DT)) / 4.13,
-            np.abs(savgol_filter(turn, 15, 2, deriv=1, delta=DT)) / 0.95,
-            np.abs(savgol_filter(turn, 15, 3, deriv=2, delta=DT)) / 1.93,
+            jerk(along) / 4.13,
+            np.abs(savgol_filter(turn, 5, 2, deriv=1, delta=DT)) / 0.95,
+            np.abs(savgol_filter(turn, 5, 3, deriv=2, delta=DT)) / 1.93,
         ], axis=0)[START:]  # fmt: skip
         if (np.abs(excess - 1) < 2e-3).any():
             self.ambiguous = True

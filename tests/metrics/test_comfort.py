@@ -7,8 +7,9 @@ import pytest
 from scipy.signal import savgol_filter
 
 from drivax.metrics.comfort import (
-    TAIL,
-    WINDOW,
+    SMOOTH,
+    YAW_ACCELERATION,
+    YAW_RATE,
     check_comfort,
     check_trip_comfort,
     savgol_matrix,
@@ -16,24 +17,25 @@ from drivax.metrics.comfort import (
 )
 
 
-@pytest.mark.parametrize(("window", "order", "derivative"), [(8, 2, 0), (15, 2, 1), (15, 3, 2)])
+@pytest.mark.parametrize(("window", "order", "derivative"), [SMOOTH, YAW_RATE, YAW_ACCELERATION])
 def test_tail_operator_is_scipys_filter(window, order, derivative):
     signal = np.random.default_rng(0).normal(size=60)
     whole = savgol_filter(signal, window, order, deriv=derivative)
     for end in (40, 50):
-        tail = savgol_tail_matrix(window, order, derivative) @ signal[end - WINDOW : end]
+        tail = savgol_tail_matrix(window, order, derivative) @ signal[end - 22 : end]
         cut = savgol_filter(signal[:end], window, order, deriv=derivative)
-        np.testing.assert_allclose(tail, cut[-TAIL:], atol=1e-9)
-        np.testing.assert_allclose(tail[0], whole[end - TAIL], atol=1e-9)
+        np.testing.assert_allclose(tail, cut[-19:], atol=1e-9)
+        settled = len(tail) - window // 2
+        np.testing.assert_allclose(tail[:settled], whole[end - 19 : end][:settled], atol=1e-9)
     operator = savgol_matrix(41, window, order, derivative)
     whole = savgol_filter(signal[:41], window, order, deriv=derivative)
     np.testing.assert_allclose(operator @ signal[:41], whole, atol=1e-9)
 
 
 def histories(speed, heading):
-    """The 16-row history at every step of a long signal."""
+    """The 23-row history at every step of a long signal."""
     motion = np.stack([0 * speed, 0 * speed, heading, speed], -1).astype(np.float32)
-    return np.stack([motion[t - 15 : t + 1] for t in range(15, len(speed))])
+    return np.stack([motion[t - 22 : t + 1] for t in range(22, len(speed))])
 
 
 def test_judgement_equals_limits_on_scipys_signals():
@@ -44,36 +46,41 @@ def test_judgement_equals_limits_on_scipys_signals():
     judged = jax.vmap(check_comfort)(jnp.asarray(histories(speed, heading)))
     a = np.diff(speed) / 0.1
     lateral = (speed[1:] + speed[:-1]) / 2 * np.diff(heading) / 0.1
-    smooth = savgol_filter(a, 8, 2)
+
+    # A sample before the first, so that the windows of the steps that are evaluated are not at SciPy's edge.
+    def smoothed(signal):
+        return savgol_filter(np.concatenate([[0.0], signal]), 8, 2)[1:]
+
+    smooth = smoothed(a)
     fine = (smooth >= -4.05) & (smooth <= 2.40)
-    fine &= np.abs(savgol_filter(lateral, 8, 2)) <= 4.89
-    fine &= np.abs(savgol_filter(a, 15, 2, deriv=1, delta=0.1)) <= 4.13
-    fine &= np.abs(savgol_filter(np.hypot(a, lateral), 15, 2, deriv=1, delta=0.1)) <= 8.37
+    fine &= np.abs(smoothed(lateral)) <= 4.89
+    fine &= np.abs(savgol_filter(smooth, 15, 2, deriv=1, delta=0.1)) <= 4.13
+    magnitude = savgol_filter(smoothed(np.hypot(a, lateral)), 15, 2, deriv=1, delta=0.1)
+    fine &= np.abs(magnitude) <= 8.37
     # The filters of the running version see accelerations from step 1 on, and headings from the same step.
     turn = heading[1:]
-    fine &= np.abs(savgol_filter(turn, 15, 2, deriv=1, delta=0.1)) <= 0.95
-    fine &= np.abs(savgol_filter(turn, 15, 3, deriv=2, delta=0.1)) <= 1.93
-    # History at step t judges step t - 7; the last one judges eight steps at once.
+    fine &= np.abs(savgol_filter(turn, 5, 2, deriv=1, delta=0.1)) <= 0.95
+    fine &= np.abs(savgol_filter(turn, 5, 3, deriv=2, delta=0.1)) <= 1.93
+    # A history at step t evaluates step t - 11; the last one evaluates twelve steps at once.
     running = np.concatenate([np.asarray(judged.comfortable[:-1, 0]), np.asarray(judged.comfortable[-1])])
-    expected = fine[7:]
+    expected = fine[10:]
     assert 0.2 < expected.mean() < 0.98
     np.testing.assert_array_equal(running, expected)
     motion = jnp.asarray(np.stack([0 * speed, 0 * speed, heading, speed], -1), jnp.float32)
     whole = jax.jit(check_trip_comfort)(motion)
     np.testing.assert_array_equal(whole.comfortable, expected)
-    magnitude = np.abs(savgol_filter(np.hypot(a, lateral), 15, 2, deriv=1, delta=0.1))
-    np.testing.assert_allclose(whole.jerk_mps3, magnitude[7:], rtol=1e-3, atol=5e-3)
+    np.testing.assert_allclose(whole.jerk_mps3, np.abs(magnitude[10:]), rtol=1e-3, atol=5e-3)
 
 
 def test_lateral_acceleration_can_fail():
     # 10 m/s at 0.5 rad/s is 5 m/s2: over the limit of 4.89.
-    heading = np.arange(16) * 0.05
-    judged = check_comfort(jnp.asarray(histories(np.full(16, 10.0), heading)[0]))
+    heading = np.arange(23) * 0.05
+    judged = check_comfort(jnp.asarray(histories(np.full(23, 10.0), heading)[0]))
     assert not bool(judged.comfortable.any())
     np.testing.assert_allclose(judged.lateral_mps2, 5.0, rtol=1e-3)
 
 
 def test_a_heading_that_wraps_is_no_discomfort():
-    heading = (np.linspace(np.pi - 0.1, np.pi + 0.1, 16) + np.pi) % (2 * np.pi) - np.pi
-    judged = check_comfort(jnp.asarray(histories(np.full(16, 5.0), heading)[0]))
+    heading = (np.linspace(np.pi - 0.1, np.pi + 0.1, 23) + np.pi) % (2 * np.pi) - np.pi
+    judged = check_comfort(jnp.asarray(histories(np.full(23, 5.0), heading)[0]))
     assert bool(judged.comfortable.all())

@@ -115,10 +115,10 @@ def comfortable_by_scipy(motion, acceleration):
     along = smooth(acceleration, 8, 2)
     fine = along.min() >= -4.05 and along.max() <= 2.40
     fine &= np.abs(smooth(lateral, 8, 2)).max() <= 4.89
-    fine &= np.abs(smooth(acceleration, 15, 2, 1)).max() <= 4.13
-    fine &= np.abs(smooth(magnitude, 15, 2, 1)).max() <= 8.37
-    fine &= np.abs(smooth(yaw, 15, 2, 1)).max() <= 0.95
-    return fine & (np.abs(smooth(yaw, 15, 3, 2)).max() <= 1.93)
+    fine &= np.abs(smooth(along, 15, 2, 1)).max() <= 4.13
+    fine &= np.abs(smooth(smooth(magnitude, 8, 2), 15, 2, 1)).max() <= 8.37
+    fine &= np.abs(smooth(yaw, 5, 2, 1)).max() <= 0.95
+    return fine & (np.abs(smooth(yaw, 5, 3, 2)).max() <= 1.93)
 
 
 def test_comfort_is_that_of_scipy():

@@ -32,8 +32,9 @@ def test_signals_equal_scipy_savgol_filter():
     np.testing.assert_allclose(
         found["acceleration"][1:], savgol_filter(along, 8, 2, mode="interp"), atol=1e-9
     )
-    np.testing.assert_allclose(found["jerk"][1:], savgol_filter(along, 15, 2, 1, delta=0.1), atol=1e-9)
-    rate = savgol_filter(heading[1:], 15, 2, 1, delta=0.1)
+    jerk = savgol_filter(savgol_filter(along, 8, 2), 15, 2, 1, delta=0.1)
+    np.testing.assert_allclose(found["jerk"][1:], jerk, atol=1e-9)
+    rate = savgol_filter(heading[1:], 5, 2, 1, delta=0.1)
     np.testing.assert_allclose(found["yaw_rate"][1:], rate, atol=1e-9)
     middle = (path[1:, 3] + path[:-1, 3]) / 2
     np.testing.assert_allclose(found["curvature"][1:], rate / middle, atol=1e-9)
@@ -42,7 +43,7 @@ def test_signals_equal_scipy_savgol_filter():
 def test_lateral_acceleration_equals_the_comfort_metric():
     path = wavy().astype(np.float32)
     judged = np.asarray(check_trip_comfort(jnp.asarray(path)).lateral_mps2)
-    np.testing.assert_allclose(np.abs(signals(path)["lateral"][9:]), judged[1:], atol=2e-3)
+    np.testing.assert_allclose(np.abs(signals(path)["lateral"][12:]), judged[1:], atol=2e-3)
 
 
 def test_circle_has_constant_curvature():

@@ -70,7 +70,7 @@ def test_a_state_is_small(simulator, world):
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
     facts = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state.facts))
     context = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state.context))
-    assert size <= 4096 and facts <= 256 and context <= 300
+    assert size <= 4096 and facts <= 256 and context <= 400
 
 
 def test_collision_with_a_stopped_car(simulator):

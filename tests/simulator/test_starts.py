@@ -19,6 +19,7 @@ from drivax.simulator.dynamics import GRIP_MPS2, command_between
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.traffic.override import OverrideTraffic, with_override
+from drivax.simulator.types import HISTORY
 from drivax.tasks.task import Task
 from scenes import LANE_M, SMALL, bank_of, car, straight_road
 
@@ -130,12 +131,12 @@ def test_fewer_steps_where_the_log_does_not_reach_back(open_road):
         history = np.asarray(noisy(open_road, step, keys(64)).history)
         old = np.asarray(first.history)[driven:]
         np.testing.assert_allclose(
-            history[:, : 16 - driven], np.broadcast_to(old, (64, *old.shape)), atol=1e-4
+            history[:, : HISTORY - driven], np.broadcast_to(old, (64, *old.shape)), atol=1e-4
         )
     late = bank_of(straight_road([car(0, 0.9, 0, 6, steps=range(6, 91))]))
     history = np.asarray(noisy(late, 10, keys(64)).history)
-    assert np.ptp(history[:, 11], axis=0).max() < 1e-4, "before step 6 nobody knows the agent"
-    assert np.ptp(history[:, 12:, 1], axis=0).max() > 1e-4
+    assert np.ptp(history[:, 18], axis=0).max() < 1e-4, "before step 6 nobody knows the agent"
+    assert np.ptp(history[:, 19:, 1], axis=0).max() > 1e-4
 
 
 def test_a_start_depends_on_its_key_only(open_road):
@@ -149,7 +150,7 @@ def test_a_noisy_start_without_a_key_is_refused(open_road):
         NOISY.reset(open_road, 0)
 
 
-@pytest.mark.parametrize("options", [{"steps": 16}, {"steps": 0}, {"strong": 1.5}, {"tries": 0}])
+@pytest.mark.parametrize("options", [{"steps": HISTORY}, {"steps": 0}, {"strong": 1.5}, {"tries": 0}])
 def test_invalid_settings_are_refused(options):
     with pytest.raises(UsageError):
         NoisyStart(**options)

@@ -17,11 +17,15 @@ import shapely
 from jaxtyping import Bool, Float64, Int
 
 from drivax.metrics.comfort import (
+    JERK,
     JERK_MAGNITUDE_MPS3,
     JERK_MPS3,
     LATERAL_MPS2,
     LONGITUDINAL_MPS2,
+    SMOOTH,
+    YAW_ACCELERATION,
     YAW_ACCELERATION_RPS2,
+    YAW_RATE,
     YAW_RATE_RPS,
     savgol_matrix,
 )
@@ -273,18 +277,19 @@ def comfort_series(ego: EgoMotion) -> Comfort:
     samples = len(ego.heading)
     along = ego.acceleration + ego.rear_axle_m * (ego.yaw_rate**2 + ego.yaw_acceleration)
 
-    def filtered(values: Float64[np.ndarray, " t"], window: int, order: int, derivative: int) -> Any:
-        matrix = savgol_matrix(samples, min(window, samples), order, derivative)
+    def filtered(values: Float64[np.ndarray, " t"], window: tuple[int, int, int]) -> Any:
+        width, order, derivative = window
+        matrix = savgol_matrix(samples, min(width, samples), order, derivative)
         return np.round(matrix @ values / ego.dt_s**derivative, 8)
 
-    heading, smooth = np.unwrap(ego.heading), filtered(along, 8, 2, 0)
+    heading, smooth = np.unwrap(ego.heading), filtered(along, SMOOTH)
     series = {
         "lon": smooth,
         "lat": np.zeros(samples),
-        "lonjerk": filtered(smooth, 15, 2, 1),
-        "jerk": filtered(filtered(np.abs(ego.acceleration), 8, 2, 0), 15, 2, 1),
-        "yaw": filtered(heading, 5, 2, 1),
-        "yawacc": filtered(heading, 5, 3, 2),
+        "lonjerk": filtered(smooth, JERK),
+        "jerk": filtered(filtered(np.abs(ego.acceleration), SMOOTH), JERK),
+        "yaw": filtered(heading, YAW_RATE),
+        "yawacc": filtered(heading, YAW_ACCELERATION),
     }
     limits = (LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS2)
     bounds = (LONGITUDINAL_MPS2, *((-limit, limit) for limit in limits))

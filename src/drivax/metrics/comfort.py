@@ -1,8 +1,9 @@
 """Comfort by nuPlan's limits and Savitzky-Golay windows, one step at a time.
 
-A window of 15 samples is centred 7 steps back, so a simulation evaluates step t - 7 at step t and the last eight
-steps when the episode ends; the edge is SciPy's ``interp`` mode. The result equals ``scipy.signal.savgol_filter`` over
-the whole episode (tests).
+Jerk is the derivative over 15 samples of accelerations that are smoothed over 8, so a simulation evaluates step t - 11
+at step t and the last twelve steps when the episode ends; the edge is SciPy's ``interp`` mode. The result equals
+``scipy.signal.savgol_filter`` over the whole episode (tests). Windows and orders are those that nuPlan's devkit uses
+(decision 0011).
 """
 
 from __future__ import annotations
@@ -19,8 +20,12 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
 
-#: Samples of a comfort window, and how many trailing steps are evaluated at once when an episode ends.
-WINDOW, TAIL = 15, 8
+#: Samples of the window of jerk, and how many trailing steps are evaluated at once when an episode ends.
+WINDOW, TAIL = 15, 12
+#: Windows, orders and derivatives: smoothed acceleration, jerk of it, yaw rate, yaw acceleration.
+SMOOTH, JERK, YAW_RATE, YAW_ACCELERATION = (8, 2, 0), (15, 2, 1), (5, 2, 1), (5, 3, 2)
+#: Accelerations that the last steps depend on, and the first of them whose smoothed value does not change any more.
+_SAMPLES, _SETTLED = 23, 4
 #: nuPlan's closed-loop limits: m/s2, m/s2, m/s3, m/s3, rad/s, rad/s2.
 LONGITUDINAL_MPS2 = (-4.05, 2.40)
 LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS2 = (
@@ -34,11 +39,12 @@ LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS
 
 @cache
 def savgol_tail_matrix(window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
-    """The Savitzky-Golay filter as a matrix ``[8, 15]`` from the last 15 samples to the values at the last 8.
+    """The Savitzky-Golay filter as a matrix ``[19, 22]`` from the last 22 samples to the values at the last 19.
 
     Row 0 is an interior point; the last ``window // 2`` rows are read off the last window's polynomial.
     """
-    return savgol_matrix(WINDOW, window, order, derivative)[-TAIL:]
+    # A sample before the first keeps its even window an interior one.
+    return savgol_matrix(_SAMPLES, window, order, derivative)[_SETTLED:, 1:]
 
 
 @cache
@@ -76,41 +82,48 @@ class ComfortSteps:
 
 
 def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
-    """Evaluate every step of a trip (x, y, heading, speed; at least 16 rows) from row 8 on, for plots and tables.
+    """Evaluate every step of a trip (x, y, heading, speed; at least 23 rows) from row 11 on, for plots and tables.
 
-    An episode evaluates the same, step by step; nothing before row 8 can be evaluated as a centred window asks for.
+    An episode evaluates the same, step by step; nothing before row 11 can be evaluated as a centred window asks for.
     """
-    rows = WINDOW + 1
-    windows = jnp.arange(len(motion) - rows + 1)[:, None] + jnp.arange(rows)
+    windows = jnp.arange(len(motion) - _SAMPLES + 1)[:, None] + jnp.arange(_SAMPLES)
     judged = jax.vmap(check_comfort)(motion[windows])
     return jax.tree.map(lambda part: jnp.concatenate([part[:-1, 0], part[-1]]), judged)
 
 
-def check_comfort(history: Float[Array, "16 4"]) -> ComfortSteps:
-    """Evaluate the last eight steps of a motion history (x, y, heading, speed) against the limits.
+def check_comfort(history: Float[Array, "history 4"]) -> ComfortSteps:
+    """Evaluate the last twelve steps of a motion history (23 rows of x, y, heading, speed) against the limits.
 
-    Row 0, seven steps back, is final; the later rows are what SciPy's edge mode would say if the history ended now.
+    Row 0, eleven steps back, is final; the later rows are what SciPy's edge mode would say if the history ended now.
     """
     speed = history[:, 3]
     turned = wrap(history[1:, 2] - history[:-1, 2])
-    heading = jnp.cumsum(turned)
     along = (speed[1:] - speed[:-1]) / DT_S
     lateral = (speed[1:] + speed[:-1]) / 2 * turned / DT_S
 
-    def filtered(signal: Array, window: int, order: int, derivative: int) -> Array:
-        return (
-            jnp.asarray(savgol_tail_matrix(window, order, derivative), jnp.float32)
-            @ signal
-            / DT_S**derivative
-        )
+    def filtered(signal: Array, window: tuple[int, int, int]) -> Array:
+        matrix = jnp.asarray(savgol_tail_matrix(*window), jnp.float32)
+        return matrix @ signal / DT_S ** window[2]
 
-    smooth_along, smooth_lateral = filtered(along, 8, 2, 0), filtered(lateral, 8, 2, 0)
-    jerk = filtered(along, 15, 2, 1)
-    magnitude = filtered(jnp.sqrt(along**2 + lateral**2 + 1e-12), 15, 2, 1)
-    yaw_rate, yaw_acceleration = filtered(heading, 15, 2, 1), filtered(heading, 15, 3, 2)
+    def jerk(smoothed: Array) -> Array:
+        matrix = savgol_matrix(_SAMPLES, *JERK)[-TAIL:, _SETTLED:]
+        return jnp.asarray(matrix, jnp.float32) @ smoothed / DT_S
+
+    smooth_along, smooth_lateral = filtered(along, SMOOTH), filtered(lateral, SMOOTH)
+    magnitude = jerk(filtered(jnp.sqrt(along**2 + lateral**2 + 1e-12), SMOOTH))
+    heading = jnp.cumsum(turned)
+    smooth_along, smooth_lateral, yaw_rate, yaw_acceleration = (
+        values[-TAIL:]
+        for values in (
+            smooth_along,
+            smooth_lateral,
+            filtered(heading, YAW_RATE),
+            filtered(heading, YAW_ACCELERATION),
+        )
+    )
     fine = (smooth_along >= LONGITUDINAL_MPS2[0]) & (smooth_along <= LONGITUDINAL_MPS2[1])
     fine &= jnp.abs(smooth_lateral) <= LATERAL_MPS2
-    fine &= jnp.abs(jerk) <= JERK_MPS3
+    fine &= jnp.abs(jerk(filtered(along, SMOOTH))) <= JERK_MPS3
     fine &= jnp.abs(magnitude) <= JERK_MAGNITUDE_MPS3
     fine &= jnp.abs(yaw_rate) <= YAW_RATE_RPS
     fine &= jnp.abs(yaw_acceleration) <= YAW_ACCELERATION_RPS2

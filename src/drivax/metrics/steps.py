@@ -41,8 +41,8 @@ class Moment:
         return self.situation.facts
 
     @cached_property
-    def comfort(self) -> tuple[ComfortSteps, Bool[Array, " 8"]]:
-        """The last eight steps, and which of them are evaluated now: the oldest, and all at the end."""
+    def comfort(self) -> tuple[ComfortSteps, Bool[Array, " tail"]]:
+        """The last twelve steps, and which of them are evaluated now: the oldest, and all at the end."""
         step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
         return check_comfort(self.situation.context.history), counts

@@ -9,15 +9,17 @@ from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import light_crossing
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import LightState
-from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext, LightMemory
+from drivax.simulator.types import MOTION_SPEED, AgentContext, LightMemory
 
 #: A stop before a right turn on red: slower than this, this near, within this many steps.
 _PAUSE_MPS, _PAUSE_M, PAUSE_STEPS = 0.5, 3.0, 30
+#: Steps of the history in which a stop before the episode is looked for.
+_REMEMBERED = 16
 #: Off the route, which of the lights it crossed an agent obeyed is evaluated by its heading this many steps later.
 JUDGED_AFTER = 20
 
 
-def _fronts(context: AgentContext, length_m: Float[Array, ""]) -> Float[Array, "16 2"]:
+def _fronts(context: AgentContext, length_m: Float[Array, ""]) -> Float[Array, "history 2"]:
     """Front bumper at every step of the context's history."""
     past = context.history
     ahead = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
@@ -30,10 +32,10 @@ def remember_lights(bank: ScenarioBank, context: AgentContext) -> LightMemory:
     ground = context.z - bank.height_m(context.index, context.slot) / 2
     pause = jnp.full(bank.light_line.shape[2], PAUSE_STEPS + 1, jnp.int32)
     fronts = _fronts(context, length)
-    for age in range(HISTORY - 1, -1, -1):
-        front = fronts[HISTORY - 1 - age]
+    for age in range(_REMEMBERED - 1, -1, -1):
+        front = fronts[-1 - age]
         _, before_m = light_crossing(bank, context.index, front, front, ground)
-        stands = context.history[HISTORY - 1 - age, MOTION_SPEED] < _PAUSE_MPS
+        stands = context.history[-1 - age, MOTION_SPEED] < _PAUSE_MPS
         pause = jnp.where(stands & (before_m >= 0.0) & (before_m < _PAUSE_M), age, pause)
     return LightMemory(pause.astype(jnp.int8), jnp.zeros_like(pause, jnp.int8))
 

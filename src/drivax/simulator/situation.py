@@ -50,6 +50,8 @@ from drivax.simulator.types import (
 
 #: Lights of the route count while the agent is within this distance of it, m.
 _ON_ROUTE_M = 2.0
+#: How far back a lane change at the start of an episode is looked for, steps.
+_ENTRY_STEPS = 16
 #: Facts that need fault classification, and those that need contacts.
 _FAULTS = frozenset({"at_fault", "collision_type", "ttc_s"})
 _CONTACTS = _FAULTS | {"collision", "ignored", "gap_m"}
@@ -76,7 +78,9 @@ def measure(
     beyond, left_map, offroad = _off_the_road(bank, context.index, me, ground, lanes)
     z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
     context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
-    codes, fault, kind, ttc = _touch(context, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
+    # Off the map a lateral hit is a fault as it is off the road.
+    beyond_road = lanes.leaving_lane | (beyond > OFFROAD_TOLERANCE_M)
+    codes, fault, kind, ttc = _touch(context, frame, previous, contacts, beyond_road, reads)
     routed = ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
     red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
     if "red_light" in reads:
@@ -187,8 +191,8 @@ def _requested(
     if reads & _PASSAGES:
         ground, me = _ground(bank, context, frame), frame.box[context.slot]
         if strand is None:
-            # An agent that changes lanes at the start comes from its pose 1.5 s ago.
-            x, y, psi = context.history[0, : MOTION_HEADING + 1]
+            # An agent that changes lanes at the start comes from its pose 15 steps ago.
+            x, y, psi = context.history[-_ENTRY_STEPS, : MOTION_HEADING + 1]
             heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
             strand = lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
         passage = lane_passage(bank, context.index, me[:2], me[2:4], ground, strand)
@@ -220,7 +224,7 @@ def _speed(frame: Frame) -> Float[Array, " S"]:
     return norm(frame.velocity)
 
 
-def _rates(history: Float[Array, "16 4"]) -> tuple[Scalar, Scalar, Scalar]:
+def _rates(history: Float[Array, "history 4"]) -> tuple[Scalar, Scalar, Scalar]:
     """Causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
     speed, heading = history[:, 3], history[:, 2]
     acceleration = (speed[-1] - speed[-6]) / (5 * DT_S)

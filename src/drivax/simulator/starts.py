@@ -46,8 +46,8 @@ class Start(Protocol):
     def begin(
         self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
         agents: Float[Array, "A 8"], key: Any,
-    ) -> tuple[Float[Array, "16 4"], Scalar]:  # fmt: skip
-        """Return the motions of the 16 steps up to ``step``, and the arc length along the route at ``step``.
+    ) -> tuple[Float[Array, "history 4"], Scalar]:  # fmt: skip
+        """Return the motions of the steps up to ``step``, and the arc length along the route at ``step``.
 
         ``agents`` are the rows of all moving agents at ``step``, from the traffic model.
         """
@@ -61,7 +61,7 @@ class LogStart:
     def begin(
         self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
         agents: Any = None, key: Any = None,
-    ) -> tuple[Float[Array, "16 4"], Scalar]:  # fmt: skip
+    ) -> tuple[Float[Array, "history 4"], Scalar]:  # fmt: skip
         """Return the logged motion; needs no key."""
         return logged_history(bank, index, step, slot), bank.log_progress[index, step]
 
@@ -96,7 +96,7 @@ class NoisyStart:
     def begin(
         self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
         agents: Float[Array, "A 8"], key: Any,
-    ) -> tuple[Float[Array, "16 4"], Scalar]:  # fmt: skip
+    ) -> tuple[Float[Array, "history 4"], Scalar]:  # fmt: skip
         """Return the first acceptable of ``tries`` draws.
 
         Raises:
@@ -112,7 +112,7 @@ class NoisyStart:
         count = jnp.cumprod(known.astype(jnp.int32)).sum()
         base = logged_history(bank, index, step - count, slot)
 
-        def draw_history(key: Array) -> tuple[Float[Array, "16 4"], Bool[Array, ""]]:
+        def draw_history(key: Array) -> tuple[Float[Array, "history 4"], Bool[Array, ""]]:
             history = self._driven(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
             return history, _acceptable(bank, index, step, slot, agents, history)
 
@@ -136,8 +136,8 @@ class NoisyStart:
         return self.scale * _ACCELERATION * share, self.scale * _CURVATURE * bound * turn
 
     def _driven(
-        self, history: Float[Array, "16 4"], count: Integer, acceleration: Scalar, curvature: Scalar
-    ) -> Float[Array, "16 4"]:
+        self, history: Float[Array, "history 4"], count: Integer, acceleration: Scalar, curvature: Scalar
+    ) -> Float[Array, "history 4"]:
         """Return a history after ``count`` steps of one action."""
 
         def advance(history: Array, place: Array) -> tuple[Array, None]:
@@ -153,7 +153,7 @@ def _acceptable(
     step: Integer,
     slot: Integer,
     agents: Float[Array, "A 8"],
-    history: Float[Array, "16 4"],
+    history: Float[Array, "history 4"],
 ) -> Bool[Array, ""]:
     """Whether an agent with this history touches none of the others and is on the road at ``step``."""
     zero, z = jnp.zeros(()), bank.agents[index, step, slot, AgentColumn.Z]

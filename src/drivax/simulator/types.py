@@ -12,8 +12,8 @@ from drivax.scenario.bank.queries import LaneHits, RouteHit
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 
-#: Steps of recent motion in a context: the 15 accelerations of the comfort window need 16 speeds.
-HISTORY = 16
+#: Steps of recent motion in a context: comfort is a window of 15 accelerations, each smoothed over 8.
+HISTORY = 23
 MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
 
 
@@ -25,7 +25,7 @@ class AgentContext:
         index: Row of the bank.
         step: Time step t in the log.
         slot: Slot of the driven agent (0: ego).
-        history: x, y, heading, speed of the driven agent over the last 16 steps; the last row is now.
+        history: x, y, heading, speed of the driven agent over the last 23 steps; the last row is now.
         action: Last executed action, within bounds and actuator rates; D numbers (2 by default).
         route_m: Arc length along the route to the goal, m; never decreases.
         z: Height of the box centre, m; follows the nearest lane.
@@ -35,7 +35,7 @@ class AgentContext:
     index: Int[Array, "*batch"]
     step: Int[Array, "*batch"]
     slot: Int[Array, "*batch"]
-    history: Float[Array, "*batch 16 4"]
+    history: Float[Array, "*batch history 4"]
     action: Float[Array, "*batch D"]
     route_m: Float[Array, "*batch"]
     z: Float[Array, "*batch"]
@@ -243,7 +243,7 @@ class Task(Protocol):
         """Return the executed action for a requested ``action``, given the ``last`` executed one."""
         ...
 
-    def first_action(self, history: Float[Array, "16 4"], length: Any) -> Float[Array, " D"]:
+    def first_action(self, history: Float[Array, "history 4"], length: Any) -> Float[Array, " D"]:
         """Return the previous action at the start of an episode; its size is that of every action."""
         ...
 

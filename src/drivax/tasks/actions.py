@@ -103,7 +103,7 @@ class Physical:
         """Return the largest curvature, 1/m."""
         return self._curvature(jnp.asarray(self.steering), length_m)
 
-    def first(self, history: Float[Array, "16 4"], length_m: Any) -> Float[Array, " 2"]:
+    def first(self, history: Float[Array, "history 4"], length_m: Any) -> Float[Array, " 2"]:
         """Return the last action at the start of an episode: zero, or that of the log if actuator rates are limited."""
         if self.jerk_mps3 is None and self.steering_rate is None:
             return jnp.zeros(2)
@@ -262,7 +262,7 @@ class DeltaLocal:
         """Return the largest curvature: unlimited, 1/m."""
         return jnp.inf
 
-    def first(self, history: Float[Array, "16 4"], length_m: Any) -> Float[Array, " 3"]:
+    def first(self, history: Float[Array, "history 4"], length_m: Any) -> Float[Array, " 3"]:
         """Return zeros."""
         return jnp.zeros(3)
 
@@ -319,7 +319,7 @@ class DirectState:
         """Return the largest curvature: unlimited, 1/m."""
         return jnp.inf
 
-    def first(self, history: Float[Array, "16 4"], length_m: Any) -> Float[Array, " 4"]:
+    def first(self, history: Float[Array, "history 4"], length_m: Any) -> Float[Array, " 4"]:
         """Return the current motion."""
         return history[-1]
 

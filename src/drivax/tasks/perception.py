@@ -29,6 +29,8 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 #: What the key of a step is folded with, by what is drawn from it.
+#: Added to step numbers, since keys are folded with numbers from 0 on.
+_BEFORE = 16
 _DROPPED, _MOVED, _DROPPED_LIGHTS, _MOVED_LIGHTS, _MOVED_ROAD = range(5)
 
 
@@ -169,7 +171,7 @@ def moved_road(
 
 def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: int = 0) -> Array:
     key = jax.random.key(config.seed)
-    for number in (bank.identity[context.index], context.step - back + HISTORY, context.slot):
+    for number in (bank.identity[context.index], context.step - back + _BEFORE, context.slot):
         key = jax.random.fold_in(key, number)
     return key
 

@@ -62,7 +62,7 @@ class Task:
         """Return the executed action, within bounds and actuator rates."""
         return self.actions.actuated(motion, action, last)
 
-    def first_action(self, history: Float[Array, "16 4"], length: Any) -> Float[Array, " D"]:
+    def first_action(self, history: Float[Array, "history 4"], length: Any) -> Float[Array, " D"]:
         """Return the last action at the start of an episode."""
         return self.actions.first(history, length)
 

@@ -14,11 +14,15 @@ from jaxtyping import Array, Bool, Float
 from drivax.geometry.boxes import LENGTH, corners
 from drivax.geometry.vectors import norm, wrap
 from drivax.metrics.comfort import (
+    JERK,
     JERK_MAGNITUDE_MPS3,
     JERK_MPS3,
     LATERAL_MPS2,
     LONGITUDINAL_MPS2,
+    SMOOTH,
+    YAW_ACCELERATION,
     YAW_ACCELERATION_RPS2,
+    YAW_RATE,
     YAW_RATE_RPS,
     savgol_matrix,
 )
@@ -244,14 +248,17 @@ def is_comfortable(
     lateral = motion[:, MOTION_SPEED] * rates
     magnitude = jnp.sqrt(acceleration**2 + lateral**2 + 1e-12)
 
-    def within(signal: Array, window: int, order: int, derivative: int, least: float, most: float) -> Array:
-        operator = jnp.asarray(savgol_matrix(steps, window, order, derivative), jnp.float32)
-        smooth = operator @ signal / DT_S**derivative
-        return ((smooth >= least) & (smooth <= most)).all()
+    def filtered(signal: Array, window: tuple[int, int, int]) -> Array:
+        return jnp.asarray(savgol_matrix(steps, *window), jnp.float32) @ signal / DT_S ** window[2]
 
-    fine = within(acceleration, 8, 2, 0, *LONGITUDINAL_MPS2)
-    fine &= within(lateral, 8, 2, 0, -LATERAL_MPS2, LATERAL_MPS2)
-    fine &= within(acceleration, 15, 2, 1, -JERK_MPS3, JERK_MPS3)
-    fine &= within(magnitude, 15, 2, 1, -JERK_MAGNITUDE_MPS3, JERK_MAGNITUDE_MPS3)
-    fine &= within(heading, 15, 2, 1, -YAW_RATE_RPS, YAW_RATE_RPS)
-    return fine & within(heading, 15, 3, 2, -YAW_ACCELERATION_RPS2, YAW_ACCELERATION_RPS2)
+    smooth = filtered(acceleration, SMOOTH)
+    fine = ((smooth >= LONGITUDINAL_MPS2[0]) & (smooth <= LONGITUDINAL_MPS2[1])).all()
+    for values, limit in (
+        (filtered(lateral, SMOOTH), LATERAL_MPS2),
+        (filtered(smooth, JERK), JERK_MPS3),
+        (filtered(filtered(magnitude, SMOOTH), JERK), JERK_MAGNITUDE_MPS3),
+        (filtered(heading, YAW_RATE), YAW_RATE_RPS),
+        (filtered(heading, YAW_ACCELERATION), YAW_ACCELERATION_RPS2),
+    ):
+        fine &= (jnp.abs(values) <= limit).all()
+    return fine

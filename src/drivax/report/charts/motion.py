@@ -10,10 +10,13 @@ from jaxtyping import Float
 
 from drivax.geometry.vectors import wrap
 from drivax.metrics.comfort import (
+    JERK,
     JERK_MPS3,
     LATERAL_MPS2,
     LONGITUDINAL_MPS2,
+    SMOOTH,
     WINDOW,
+    YAW_RATE,
     YAW_RATE_RPS,
     savgol_matrix,
 )
@@ -61,8 +64,8 @@ COMMANDED = len(COMMANDS)
 def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
     """Return the signals of a path by name, differentiated and filtered like the comfort metrics.
 
-    Savitzky-Golay windows of nuPlan: accelerations 8/2, jerk and yaw rate 15/2 (``metrics.comfort``). Curvature is yaw
-    rate over speed. The 7 steps at either end have values of the first or last window's polynomial. Values are NaN
+    Windows as in ``metrics.comfort``: accelerations 8/2, jerk 15/2 of them, yaw rate 5/2. Curvature is yaw rate over
+    speed. The 7 steps at either end have values of the first or last window's polynomial. Values are NaN
     outside of the last unbroken stretch of the path, at its first step, and, except for speed, throughout if it has
     fewer than 16 steps.
 
@@ -83,11 +86,11 @@ def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
     turned = np.asarray(wrap(np.diff(path[:, 2])))
     along, middle = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
     samples = end - first - 1
-    smooth, slope = savgol_matrix(samples, 8, 2, 0), savgol_matrix(samples, WINDOW, 2, 1) / DT_S
-    rate = slope @ np.cumsum(turned)
+    smooth = savgol_matrix(samples, *SMOOTH)
+    rate = savgol_matrix(samples, *YAW_RATE) @ np.cumsum(turned) / DT_S
     values["acceleration"][at] = smooth @ along
     values["lateral"][at] = smooth @ (middle * turned / DT_S)
-    values["jerk"][at] = slope @ along
+    values["jerk"][at] = savgol_matrix(samples, *JERK) @ smooth @ along / DT_S
     values["yaw_rate"][at] = rate
     values["curvature"][at] = np.where(middle >= _CURVED_MPS, rate / np.maximum(middle, _CURVED_MPS), np.nan)
     return values

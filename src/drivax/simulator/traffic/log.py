@@ -37,8 +37,8 @@ class LogTraffic:
         return bank.agents[context.index, jnp.clip(context.step - back, 0, bank.steps - 1)]
 
 
-def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Float[Array, "16 4"]:
-    """The last 16 logged motions of a slot up to ``step``.
+def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Float[Array, "history 4"]:
+    """The logged motions of a slot up to ``step``, as many as a context holds.
 
     Where the log does not reach back (before its start, or before the agent appeared) the motion is extended
     backwards at the velocity of the earliest known step.
