@@ -1,0 +1,129 @@
+"""Our metrics and the devkit profile against figures of nuPlan's devkit on made-up scenes.
+
+python -m experiments.data.nuplan --data ../shared/data [--write]     (--write stores the result and the page)
+python -m experiments.data.nuplan --table                             (what is stored, into the page)
+
+Every scene becomes a scenario whose logged ego is the scene's motion, so that the planner `expert` replays it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.evaluation.runner import evaluate
+from drivax.planners.catalogue import make_planner
+from drivax.scenario.arrays import scenario_from_arrays
+from drivax.scenario.schema import DT_S, Scenario
+from experiments.learning.tables import table
+from experiments.repository import DOCS, RESULTS
+
+RESULT = RESULTS / "nuplan.json"
+PAGE = DOCS / "results" / "nuplan.md"
+BEGIN, END = "<!-- nuplan.py: begin -->", "<!-- nuplan.py: end -->"
+_WIDTH_M, _BEGIN_M, _END_M, _CAR_M = 3.7, -150.0, 350.0, (5.176, 2.297, 1.777)
+#: Our metric of each of the devkit's verdicts; the first two are 1 less ours.
+METRICS = {
+    "fault_score": "at_fault_collision", "drivable": "offroad", "ttc_ok": "ttc_ok", "direction": "direction",
+    "speed": "speed_compliance", "comfortable": "comfortable",
+}  # fmt: skip
+#: Speed compliance agrees within this.
+_AGREES = 0.005
+
+
+def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
+    """The scene as a scenario: ego replays its motion, the others keep their velocity."""
+    rows = np.concatenate([np.array(scene["past"])[:-1], np.array(scene["ego"])])
+    time_s = DT_S * (np.arange(len(rows)) - 10)
+    agents = scene["agents"]
+    way = [agent["v"] * np.array([np.cos(agent["h"]), np.sin(agent["h"])]) for agent in agents]
+    xy = [np.array([agent["x"], agent["y"]]) + time_s[:, None] * step for agent, step in zip(agents, way, strict=True)]
+    heading = np.stack([rows[:, 2], *(np.full(len(rows), agent["h"]) for agent in agents)])
+    velocity = rows[:, 6:7] * np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], axis=-1)
+    ends = [[_BEGIN_M, 0.0], [_END_M, 0.0]]
+    other = [[_BEGIN_M, _WIDTH_M], [_END_M, _WIDTH_M]]
+    lane = {"limit_mps": scene["limit"], "width_m": _WIDTH_M}
+    beside = {} if scene["two_way"] else {"left": [1]}, {} if scene["two_way"] else {"right": [0]}
+    half = _WIDTH_M / 2
+    edge = [[_BEGIN_M, -half], [_END_M, -half], [_END_M, 3 * half], [_BEGIN_M, 3 * half], [_BEGIN_M, -half]]
+    return scenario_from_arrays(
+        name,
+        {
+            "xy": np.stack([rows[:, 4:6], *xy]),
+            "heading": heading,
+            "velocity": np.stack([velocity, *(np.broadcast_to(step, (len(rows), 2)) for step in way)]),
+            "valid": np.ones(heading.shape, bool),
+            "size": np.array([_CAR_M, *([*agent["size"], 1.5] for agent in agents)]),
+            "kind": ["vehicle", *(agent["kind"] for agent in agents)],
+        },
+        {
+            "lanes": [
+                {"points": ends, **lane, **beside[0]},
+                {"points": other[::-1] if scene["two_way"] else other, **lane, **beside[1]},
+            ],
+            "edges": [edge],
+        },
+        route=[0],
+        dataset="nuplan-devkit",
+    )
+
+
+def measured(data: Path) -> dict[str, Any]:
+    """Of each group of scenes, in how many every metric agrees with the devkit."""
+    groups = json.loads(gzip.decompress((data / "nuplan_metrics" / "verdicts.json.gz").read_bytes()))
+    counts: dict[str, Any] = {}
+    for group, scenes in groups.items():
+        scenarios = [scenario(scene, f"{group}-{number}") for number, scene in enumerate(scenes)]
+        metrics = evaluate(make_planner("expert"), scenarios).metrics
+        counts[group] = {"scenes": len(scenes)}
+        for name, metric in METRICS.items():
+            values = metrics[metric]
+            ours = 1.0 - values if name in ("fault_score", "drivable") else values
+            theirs = np.array([_verdict(scene["devkit"], name) for scene in scenes])
+            counts[group][name] = int((np.abs(ours - theirs) <= _AGREES).sum())
+    return counts
+
+
+def _verdict(devkit: Mapping[str, Any], name: str) -> float:
+    return float(devkit["comfort"]["comfortable"] if name == "comfortable" else devkit[name])
+
+
+def shown(result: Mapping[str, Mapping[str, Mapping[str, int]]]) -> str:
+    """The counts of every stored state, in Markdown."""
+    groups = list(next(iter(result.values())))
+    heads = ["metric", "ours", *(f"{group}, {state}" for group in groups for state in result)]
+    rows = [
+        [name, metric]
+        + [f"{result[state][group][name]} of {result[state][group]['scenes']}" for group in groups for state in result]
+        for name, metric in METRICS.items()
+    ]
+    return "\n".join(table(heads, rows))
+
+
+def main() -> None:
+    """Measure, store, and fill the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--state", default="now", help="name of the state of the code, stored beside others")
+    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--table", action="store_true")
+    args = parser.parse_args()
+    result = json.loads(RESULT.read_text()) if RESULT.exists() else {}
+    if not args.table:
+        result[args.state] = measured(args.data)
+        print(json.dumps(result[args.state], indent=1))
+        if not args.write:
+            return
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    before, rest = PAGE.read_text().split(BEGIN)
+    PAGE.write_text(f"{before}{BEGIN}\n\n{shown(result)}\n\n{END}{rest.split(END)[1]}")
+
+
+if __name__ == "__main__":
+    main()
