@@ -1,4 +1,4 @@
-"""Conversion: order, skipping, strictness, limits, audit, workers, and that nothing partial is left."""
+"""Conversion: order, skipped records, strictness, limits, audit, workers, and resuming."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from drivax.scenario.store import ScenarioSet
 
 @pytest.fixture
 def folder(wire, write_records, tmp_path):
-    """Three files: two good records; good, damaged, good; a duplicate and a record of the other form."""
+    """Three files: two good records; good, damaged, good; a duplicate and a record of the other format."""
     write_records("src/a.tfrecord", wire.scenario("a0"), wire.scenario("a1"))
     bad = bytearray(wire.frame(wire.scenario("b1")))
     bad[100] ^= 8
@@ -63,7 +63,7 @@ def test_converts_in_order_and_reports_what_it_skipped(folder, tmp_path):
     assert calls[-1] == (3, 3, 4) and [call[0] for call in calls] == sorted(call[0] for call in calls)
 
 
-def test_scenario_holds_what_the_file_says(folder, tmp_path, wire):
+def test_scenario_holds_the_content_of_the_file(folder, tmp_path, wire):
     convert(folder / "a.tfrecord", tmp_path / "set")
     scenario = ScenarioSet.open(tmp_path / "set")[0]
     assert isinstance(scenario, Scenario)
@@ -112,7 +112,7 @@ def test_audit_is_stored_with_its_scenario(folder, tmp_path):
     assert batches == [4]  # audited together, not one by one
 
 
-def test_audit_that_forgets_one_is_refused(folder, tmp_path):
+def test_audit_without_a_scenario_is_refused(folder, tmp_path):
     with pytest.raises(ValueError, match="zip"):
         convert(folder, tmp_path / "set", audit=lambda scenarios: [])
     assert leftovers(tmp_path) == ["src"]
@@ -128,7 +128,7 @@ def test_overwrite(folder, tmp_path):
     assert leftovers(tmp_path) == ["set", "src"]
 
 
-def test_nothing_convertible_names_the_first_cause(wire, write_records, tmp_path):
+def test_error_names_the_first_cause_if_nothing_is_converted(wire, write_records, tmp_path):
     single = write_records("src/only.tfrecord", wire.scenario(sdc=wire.whole(6, 40)))
     with pytest.raises(
         DataError, match=r"only\.tfrecord: record 0: sdc_track_index names track 40"
@@ -141,7 +141,7 @@ def test_nothing_convertible_names_the_first_cause(wire, write_records, tmp_path
     assert leftovers(tmp_path) == ["src"]
 
 
-def test_wrong_format_is_refused_with_the_right_one(folder, tmp_path):
+def test_wrong_format_is_refused_with_the_right_name(folder, tmp_path):
     with pytest.raises(DataError, match="use --format womd-scenario"):
         convert(folder / "a.tfrecord", tmp_path / "set", Conversion(format="womd-example", strict=True))
 
@@ -159,7 +159,7 @@ def test_wrong_format_is_refused_with_the_right_one(folder, tmp_path):
         Conversion(filters=("colour=red",)),
     ],
 )
-def test_options_that_cannot_be_meant(options, folder, tmp_path):
+def test_invalid_options_are_refused(options, folder, tmp_path):
     with pytest.raises(UsageError) as caught:
         convert(folder, tmp_path / "set", options)
     assert caught.value.cure
@@ -174,7 +174,7 @@ def test_recording_that_cannot_be_assembled_is_a_bad_record(wire, write_records)
     assert isinstance(good, Scenario)
 
 
-def test_unexpected_failure_is_a_bad_record_too(wire, write_records, monkeypatch):
+def test_unexpected_failure_is_a_bad_record(wire, write_records, monkeypatch):
     def fail(*_):
         raise IndexError("off by one")
 
@@ -221,7 +221,7 @@ def drivax_process(*call, **options):
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds child processes in /proc")
-def test_an_interrupt_that_reaches_workers_first_is_one(wire, write_records, tmp_path):
+def test_interrupt_that_reaches_workers_first_is_an_interrupt(wire, write_records, tmp_path):
     shard = write_records("src/0.tfrecord", wire.scenario()).read_bytes() * 300
     (tmp_path / "src" / "0.tfrecord").write_bytes(shard)
     (tmp_path / "src" / "1.tfrecord").write_bytes(shard)
@@ -300,7 +300,7 @@ GOOD = [number for number in range(30) if number % 10 != 3]
         ({"limit": 5}, GOOD[:5], 0),
     ],
 )
-def test_filters_apply_to_what_the_audit_found(thirty, tmp_path, shard_size, options, kept, filtered):
+def test_filters_apply_to_findings_of_the_audit(thirty, tmp_path, shard_size, options, kept, filtered):
     result = convert(thirty, tmp_path / "set", Conversion(shard_size=shard_size, **options), audit=numbered)
     assert ids(tmp_path / "set") == kept
     manifest = json.loads((tmp_path / "set" / "manifest.json").read_text())
@@ -311,13 +311,13 @@ def test_filters_apply_to_what_the_audit_found(thirty, tmp_path, shard_size, opt
     )
 
 
-def test_filters_that_nothing_satisfies(thirty, tmp_path):
+def test_filters_that_no_scenario_satisfies(thirty, tmp_path):
     with pytest.raises(DataError, match="none of the 27 scenarios satisfies the filters; use wider"):
         convert(thirty, tmp_path / "set", Conversion(filters=("audit.distance_m>99",)), audit=numbered)
     assert leftovers(tmp_path) == ["src"]
 
 
-def test_manifest_tells_what_was_read_and_what_was_skipped(thirty, tmp_path):
+def test_manifest_lists_read_and_skipped_files(thirty, tmp_path):
     convert(thirty, tmp_path / "set", Conversion(split="50/30/20"))
     source = json.loads((tmp_path / "set" / "manifest.json").read_text())["source"]
     assert (source["folder"], source["files"], source["formats"]) == ("src", 3, {"womd-scenario": 3})
@@ -348,7 +348,7 @@ def test_stride(wire, write_records, tmp_path):
     assert plans[0].estimate.scenarios == 9
 
 
-def test_routes_are_handed_on(folder, tmp_path, monkeypatch):
+def test_route_style_is_passed_on(folder, tmp_path, monkeypatch):
     asked = []
 
     def remember(recording, capacity, routes):
@@ -455,7 +455,7 @@ def every_file(folder):
 @pytest.mark.parametrize(
     ("workers", "filtered", "deaths"), [(1, "all", (6, 13, 14, 26)), (2, "filtered", (6, 14))]
 )
-def test_killed_at_given_moments_and_continued_to_the_same_bytes(
+def test_killed_at_given_moments_and_resumed_to_the_same_bytes(
     thirty, tmp_path, program, workers, filtered, deaths
 ):
     assert program(thirty, tmp_path / "whole", 1, filtered=filtered).wait(60) == 0
@@ -470,7 +470,7 @@ def test_killed_at_given_moments_and_continued_to_the_same_bytes(
     assert leftovers(tmp_path) == ["program.py", "said", "set", "src", "whole"]
 
 
-def test_killed_at_random_moments_and_continued_to_the_same_bytes(thirty, tmp_path, program):
+def test_killed_at_random_moments_and_resumed_to_the_same_bytes(thirty, tmp_path, program):
     assert program(thirty, tmp_path / "whole").wait(60) == 0
     moments = random.Random(time.time_ns())
     killed = 0
@@ -490,7 +490,7 @@ def test_killed_at_random_moments_and_continued_to_the_same_bytes(thirty, tmp_pa
     assert every_file(tmp_path / "set") == every_file(tmp_path / "whole")
 
 
-def test_continuing_says_what_is_there_and_reads_only_the_rest(thirty, tmp_path):
+def test_resuming_reports_written_scenarios_and_reads_the_rest(thirty, tmp_path):
     options = Conversion(shard_size=4)
 
     def stop(done, files, scenarios):
@@ -525,7 +525,7 @@ def test_skipped_records_of_an_earlier_run_count_under_strict(thirty, tmp_path):
         convert(thirty, tmp_path / "set", Conversion(shard_size=4, strict=True))
 
 
-def test_other_data_or_options_are_not_continued(thirty, tmp_path):
+def test_other_data_or_options_are_not_resumed(thirty, tmp_path):
     def stop(done, files, scenarios):
         if scenarios == 14:
             raise KeyboardInterrupt
@@ -588,7 +588,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-def test_command_says_what_it_wrote_and_what_it_skipped(folder, tmp_path, capsys):
+def test_command_reports_written_and_skipped_records(folder, tmp_path, capsys):
     (folder / "notes.txt").write_text("not a recording")
     assert main(["convert", str(folder), str(tmp_path / "set"), "--workers", "1"]) == 0
     out, err = capsys.readouterr()
@@ -604,7 +604,7 @@ def test_command_says_what_it_wrote_and_what_it_skipped(folder, tmp_path, capsys
     assert f"{folder / 'b.tfrecord'}: record 1: the payload is damaged" in lines[0]
 
 
-def test_command_says_that_it_can_be_continued(thirty, tmp_path, capsys, monkeypatch):
+def test_command_says_that_it_can_be_resumed(thirty, tmp_path, capsys, monkeypatch):
     def interrupted(src, out, options, progress, audit, announce):
         def stop(done, files, scenarios):
             if scenarios == 14:
@@ -641,7 +641,7 @@ def test_command_usage_errors(folder, tmp_path, flags, capsys):
     assert capsys.readouterr().err
 
 
-def test_inspect_json_is_the_contract(folder, tmp_path, capsys):
+def test_inspect_json_has_the_documented_fields(folder, tmp_path, capsys):
     convert(folder, tmp_path / "set")
     assert main(["inspect", str(tmp_path / "set"), "--json"]) == 0
     scenarios = json.loads(capsys.readouterr().out)["scenarios"]

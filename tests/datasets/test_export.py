@@ -1,4 +1,4 @@
-"""``drivax export``: which scenarios, in which files, and that nothing partial is left."""
+"""``drivax export``: selection, files, and clean failures."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def listing(path) -> list[str]:
     return sorted(inside.name for inside in path.iterdir())
 
 
-def test_a_set_again_bit_for_bit(stored, tmp_path):
+def test_exported_set_is_equal_bit_for_bit(stored, tmp_path):
     whole, part = ScenarioSet.open(stored), tmp_path / "part"
     done = export(stored, part, Export(filters=("audit.clean=true", "dataset=one")))
     again = ScenarioSet.open(part)
@@ -59,7 +59,7 @@ def test_a_set_again_bit_for_bit(stored, tmp_path):
     assert listing(tmp_path) == ["part"]
 
 
-def test_everything_again_has_the_same_data(stored, tmp_path):
+def test_export_of_all_scenarios_keeps_the_data(stored, tmp_path):
     export(stored, tmp_path / "all")
     np.testing.assert_array_equal(
         ScenarioSet.open(tmp_path / "all").records(range(5)), ScenarioSet.open(stored).records(range(5))
@@ -137,7 +137,7 @@ def test_gpudrive_files(stored, tmp_path):
     assert json.loads((tmp_path / "json" / names[1]).read_text())["name"] == names[1]
 
 
-def test_the_bytes_are_always_the_same(stored, tmp_path):
+def test_export_is_deterministic(stored, tmp_path):
     for name in ("set", "tfexample", "gpudrive"):
         digests = []
         for folder in ("x", "y"):
@@ -148,7 +148,7 @@ def test_the_bytes_are_always_the_same(stored, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["tfexample", "gpudrive", "set"])
-def test_what_exists_is_replaced_only_when_asked_and_when_it_is_an_export(stored, tmp_path, name):
+def test_only_exports_are_overwritten_and_only_on_request(stored, tmp_path, name):
     options = Export(format=name, limit=1)
     export(stored, tmp_path / "out", options)
     before = listing(tmp_path / "out")
@@ -170,7 +170,7 @@ def test_a_set_cannot_replace_itself(stored):
 
 
 @pytest.mark.parametrize("name", ["tfexample", "gpudrive", "set"])
-def test_nothing_is_left_of_a_failure(stored, tmp_path, name):
+def test_failed_export_leaves_nothing(stored, tmp_path, name):
     def stop(done: int, total: int) -> None:
         if done == 2:
             raise KeyboardInterrupt
@@ -180,7 +180,7 @@ def test_nothing_is_left_of_a_failure(stored, tmp_path, name):
     assert listing(tmp_path) == []
 
 
-def test_a_damaged_record_is_named(stored, tmp_path):
+def test_damaged_record_is_reported(stored, tmp_path):
     export(stored, tmp_path / "copy")
     shard = tmp_path / "copy" / "shard-00000.npy"
     data = bytearray(shard.read_bytes())
@@ -204,12 +204,12 @@ def test_a_damaged_record_is_named(stored, tmp_path):
 
 
 @pytest.mark.parametrize("options", [Export(limit=0), Export(shard_size=0)])
-def test_options_that_cannot_be_meant(stored, tmp_path, options):
+def test_invalid_options_are_refused(stored, tmp_path, options):
     with pytest.raises(UsageError, match="is 0"):
         export(stored, tmp_path / "out", options)
 
 
-def test_the_command(stored, tmp_path, capsys):
+def test_command_exports_selected_scenarios(stored, tmp_path, capsys):
     (tmp_path / "ids.txt").write_text("one\ta\nb\nc\nd\n")
     command = ["export", str(stored), str(tmp_path / "out"), "--ids", str(tmp_path / "ids.txt")]
     more = ["--filter", "dataset=one", "--filter", "audit.clean=true"]
@@ -223,7 +223,7 @@ def test_the_command(stored, tmp_path, capsys):
     assert "4 scenarios in 4 files" in capsys.readouterr().out
 
 
-def test_the_command_says_what_was_lost(stored, tmp_path, capsys, monkeypatch):
+def test_command_reports_losses(stored, tmp_path, capsys, monkeypatch):
     def crowded(scenario, paths):
         features, lost = real(scenario, paths)
         return features, lost + type(lost)(agents=3)

@@ -1,4 +1,4 @@
-"""GPUDrive JSON as it is written, and the way round through drivax's own reader."""
+"""Exported GPUDrive JSON, and round trips through drivax's own reader."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from datasets.samples import womd_scenario
 from datasets.test_export_recording import assert_same_map
 from drivax.datasets import gpudrive
-from drivax.datasets.export.gpudrive import file_name, gpudrive_scene
 from drivax.datasets.export.recording import restore
+from drivax.datasets.gpudrive import file_name, gpudrive_scene
 from drivax.datasets.womd import scenario_reader as protos
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
@@ -25,7 +25,7 @@ def source():
 
 @pytest.fixture(scope="module")
 def scene(source):
-    """As another program sees it: through text, with nothing that JSON does not have."""
+    """The scene after a round trip through strict JSON text."""
     text = json.dumps(gpudrive_scene(assemble(source), "x.json"), allow_nan=False)
     return json.loads(text)
 
@@ -79,7 +79,7 @@ def test_roads_and_lights(scene):
     assert scene["tl_states"]["2"]["state"] == ["stop"] * 50 + ["go"] * 41
 
 
-def test_file_names_begin_as_the_loader_wants():
+def test_file_names_have_the_prefix_that_the_loader_expects():
     assert file_name(12) == "tfrecord-00000-of-00001_12.json"
 
 
@@ -105,7 +105,7 @@ def round_trip(recording):
     return stored, back
 
 
-def test_the_way_round(source):
+def test_round_trip(source):
     stored, back = round_trip(source)
     assert_same_map(back, source, 0.1)
     again = assemble(back)
@@ -122,7 +122,7 @@ def test_far_from_the_origin_and_cones():
     assert back.tracks.kind.tolist() == [AgentKind.OTHER, AgentKind.VEHICLE]
 
 
-def test_the_way_round_of_real_files(real_data):
+def test_round_trip_of_real_files(real_data):
     for path in sorted((real_data / "gpudrive").glob("*.json")):
         (source,) = gpudrive.GpuDrive().read(path)
         _, back = round_trip(source)

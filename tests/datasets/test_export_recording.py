@@ -50,7 +50,7 @@ def farthest_m(lines, others, inside) -> float:
 
 
 def assert_same_map(kept, source, tolerance_m: float = 0.06):
-    """Near the ego's log every line lies on the source's of its kind, and nothing of them is missing."""
+    """Near ego's log the lines of each kind cover those of the source and nothing else."""
     tracks = source.tracks
     path = tracks.xy[source.ego, tracks.valid[source.ego]]
     near = shapely.box(*(path.min(axis=0) - CROPPED_M), *(path.max(axis=0) + CROPPED_M))
@@ -106,8 +106,8 @@ def test_far_from_the_origin_in_float64():
     assert_same_map(back, recording)
 
 
-def test_assembled_again_it_is_the_same_scenario():
-    """Lane graph, limits, lights, stop signs and marks survive; only what is measured from simplified lines moves."""
+def test_reassembled_scenario_is_the_same():
+    """Lane graph, limits, lights, stop signs and marks survive; only values measured from simplified lines change."""
     rows = np.array([[*driving(8.0)], [*driving(5.0, y=3.5)], [*np.tile((30.0, 0.0), (91, 1))]])
     recording = make_recording(
         features=(
@@ -137,7 +137,7 @@ def test_assembled_again_it_is_the_same_scenario():
         np.testing.assert_allclose(again.record[name], first.record[name], atol=1e-4, err_msg=name)
 
 
-def test_links_made_from_geometry_are_not_passed_off_as_the_source_s(scene):
+def test_links_made_from_geometry_are_left_out(scene):
     stored = assemble(scene)
     assert Flag.CHAINED_GRAPH in stored.has
     back = restore(stored)
@@ -145,7 +145,7 @@ def test_links_made_from_geometry_are_not_passed_off_as_the_source_s(scene):
     assert Flag.CHAINED_GRAPH in assemble(back).has
 
 
-def test_a_feature_that_the_crop_cut_comes_in_pieces_with_ids_of_their_own():
+def test_pieces_of_a_cropped_feature_have_own_ids():
     loop = line((-80, -3), (80, -3), (80, -150), (90, -150), (90, -3), (95, -3), step=1.0)
     recording = make_recording((*straight_road(end=180.0), edge(7, loop)))
     stored = assemble(recording)
@@ -168,7 +168,7 @@ def test_features_without_a_row_in_the_table_are_joined_too():
     assert_same_map(back, recording)
 
 
-def test_a_light_whose_lane_the_map_lacks_gets_a_number_of_its_own():
+def test_light_without_a_lane_gets_an_own_id():
     recording = make_recording(
         lights=(light(77, 30.0, 0.0, np.full(91, 4)), light(1, 40.0, 0.0, np.full(91, 6)))
     )
@@ -189,7 +189,7 @@ def test_short_recordings_and_cones():
 
 
 def test_real_scene(real_data):
-    """Pictures of both look the same; here the numbers."""
+    """A real recording and its restored form agree."""
     (recording,) = GpuDrive().read(real_data / "gpudrive" / "tfrecord-00000-of-01000_325.json")
     stored = assemble(recording)
     back = restore(stored)

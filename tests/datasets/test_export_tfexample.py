@@ -1,4 +1,4 @@
-"""tf.Examples: names, types and shapes by a decoder of the wire format; rules of the data set; the way round."""
+"""tf.Examples: names, types and shapes by a decoder of the wire format; rules of the data set; round trips."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def test_all_features_of_the_data_set_and_of_scenariomax():
     assert len(layout(10, 300)) == 72 + 6  # data.md counts 72 in a real record
 
 
-def test_the_layout_is_that_of_a_real_record(real_data):
+def test_layout_equals_that_of_a_real_record(real_data):
     """Names, kinds and lengths; the real one is of version 1.0, with 20,000 points of map."""
     data = (real_data / "womd" / "motion_data_one_example.tfrecord").read_bytes()
     (size,) = struct.unpack_from("<Q", data)
@@ -201,7 +201,7 @@ def test_states(found, source):
     np.testing.assert_allclose(course, np.arctan2(0.25, 4.0), atol=1e-6)
 
 
-def test_what_is_not_valid_is_minus_one(found):
+def test_invalid_states_are_minus_one(found):
     invalid = over_time(found, "valid") == 0
     for name in (*STATE_FLOATS, "timestamp_micros"):
         assert (over_time(found, name)[invalid] == -1).all(), name
@@ -322,7 +322,7 @@ def test_only_paths_that_the_log_follows_are_on_the_route():
 
 
 def test_row_order_ego_then_to_predict_by_id_then_distance_then_the_rest():
-    """V-Max takes row 0 for the ego; all others stand in the data set's order."""
+    """V-Max takes row 0 for ego; all others are in the data set's order."""
     there = [(50, 0), (5, 3), (80, 0), (9, 3), (7, 3)]
     paths = np.array([driving(5.0), *(np.tile(np.array(place, float), (91, 1)) for place in there)])
     paths[1:, :, 0] += (np.arange(91) - 10) * 0.1  # they move, so that they are not parked
@@ -403,7 +403,7 @@ def test_item_20_short_recordings_have_no_future():
     assert Flag.NO_FUTURE in again.has
 
 
-def test_a_dense_map_is_sampled_more_widely_rather_than_cut_off():
+def test_dense_map_is_sampled_more_sparsely_and_not_cut_off():
     rows = [line((-90, y), (190, y), step=4.0) for y in np.linspace(-95, 95, 110)]
     features = [MapFeature(i + 10, RoadKind.LINE_UNKNOWN, row) for i, row in enumerate(rows)]
     stored = assemble(
@@ -451,7 +451,7 @@ def round_trip(recording, tolerance_m: float = 1e-3):
     return stored, back
 
 
-def test_the_way_round(source):
+def test_round_trip(source):
     stored, back = round_trip(source)
     assert_same_map(back, source, 0.1)
     again = assemble(back)
@@ -459,7 +459,7 @@ def test_the_way_round(source):
     assert again.overflow == stored.overflow
 
 
-def test_the_way_round_of_the_real_scene(real_data):
+def test_round_trip_of_a_real_scene(real_data):
     """And against the proto itself: moving agents to a millimetre, parked ones within the 0.3 m of their one pose."""
     (source,) = protos.WomdScenario().read(real_data / "womd" / "motion_data_one_scenario.tfrecord")
     stored, back = round_trip(source)
@@ -479,7 +479,7 @@ def test_the_way_round_of_the_real_scene(real_data):
     assert counts == {RoadKind.CROSSWALK: 4, RoadKind.STOP_SIGN: 8, RoadKind.SPEED_BUMP: 3}
 
 
-def test_the_way_round_of_real_gpudrive_and_example_files(real_data):
+def test_round_trip_of_real_gpudrive_and_example_files(real_data):
     from drivax.datasets.gpudrive import GpuDrive
 
     for path in sorted((real_data / "gpudrive").glob("*.json")):

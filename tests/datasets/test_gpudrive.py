@@ -1,4 +1,4 @@
-"""GPUDrive JSON: what is read, what is refused, and the real files."""
+"""The GPUDrive reader: content, refused files, and real files."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ def test_item_1_headings_are_wrapped(scene):
     np.testing.assert_allclose(decode(scene).tracks.heading[3], -math.pi / 2)
 
 
-def test_item_4_nothing_is_invented_where_steps_are_invalid(scene):
+def test_item_4_invalid_steps_stay_empty(scene):
     tracks = decode(scene).tracks
     for values in (tracks.xy, tracks.z, tracks.heading, tracks.velocity, tracks.size):
         assert not values[~tracks.valid].any()  # -10000 in the file
 
 
-def test_a_step_without_a_place_is_not_valid_whatever_the_file_says(scene):
+def test_steps_without_a_position_are_invalid(scene):
     scene["objects"][0]["valid"] = [True] * 91
     assert not decode(scene).tracks.valid[0, 30:36].any()
 
@@ -103,7 +103,7 @@ def test_road_codes(scene, code, word, kind):
     assert decode(scene).features[0].kind == kind
 
 
-def test_roads_of_no_known_kind_and_of_one_point_are_counted(scene):
+def test_unknown_and_one_point_roads_are_counted(scene):
     scene["roads"][0] |= {"map_element_id": 99, "type": "runway"}
     scene["roads"][3]["geometry"] = scene["roads"][3]["geometry"][:1]
     recording = decode(scene)
@@ -132,7 +132,7 @@ def test_item_5_jumps_split_dense_polylines_only(scene):
     assert (assemble(decode(scene)).feature_id == 8).sum() == 1
 
 
-def test_item_3_sizes_that_are_none_are_the_class_s(scene):
+def test_item_3_implausible_sizes_are_those_of_the_class(scene):
     scene["objects"][0] |= {"length": 0.0, "width": 1e-300, "height": 1e9}
     stored = assemble(decode(scene))
     row = stored.agent_id.tolist().index(78)
@@ -200,7 +200,7 @@ def broken(scene, *path, value):
         (("tl_states",), {"1": {"state": []}}, "no lists"),
     ],
 )
-def test_what_contradicts_itself_is_refused_in_one_line(tmp_path, path, value, said):
+def test_contradictions_are_refused_in_one_line(tmp_path, path, value, said):
     scene = sample.scene()
     broken(scene, *path, value=value)
     file = tmp_path / "tfrecord-00000-of-00001_0.json"
@@ -211,7 +211,7 @@ def test_what_contradicts_itself_is_refused_in_one_line(tmp_path, path, value, s
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"{", b"[[" * 100_000, b"\xff\xfe{}", b'{"a": 1}', b"null"])
-def test_files_that_are_no_scene(tmp_path, content):
+def test_other_files_are_refused(tmp_path, content):
     file = tmp_path / "tfrecord-00000-of-00001_0.json"
     file.write_bytes(content)
     (bad,) = GpuDrive().read(file)

@@ -1,4 +1,4 @@
-"""The nuPlan reader against the hand-made log: what is true of it is known in closed form."""
+"""The nuPlan reader against a hand-made log with known answers."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from datasets.samples import nuplan as sample
-from drivax.datasets.nuplan import log as nuplan_log
-from drivax.datasets.nuplan.log import TimeLine, pieces, yaw_of
+from drivax.datasets.nuplan import reader as nuplan_reader
 from drivax.datasets.nuplan.map import feature_id
-from drivax.datasets.nuplan.reader import NuPlan
+from drivax.datasets.nuplan.reader import NuPlan, TimeLine, pieces, yaw_of
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording, windows
@@ -66,7 +65,7 @@ def sweeps_of(recording: Recording) -> np.ndarray:
 # --- The file.
 
 
-def test_it_is_a_reader_that_recognises_logs_only(log, tmp_path):
+def test_reader_recognises_only_logs(log, tmp_path):
     reader = NuPlan()
     assert isinstance(reader, Reader)
     assert reader.recognise(log)
@@ -112,7 +111,7 @@ def test_identity(recordings):
         assert recording.lost == {}
 
 
-def test_every_second_sweep_by_the_clock_of_the_lidar(recordings):
+def test_every_second_sweep_is_read_with_the_time_of_the_lidar(recordings):
     """Item 16: 20 to 10 Hz by index. Item 23: times are those of the lidar, jitter included, not of ego poses."""
     for recording in recordings:
         sweeps = sweeps_of(recording)
@@ -214,7 +213,7 @@ def test_gaps_of_tracks_stay_gaps(recordings):
         assert not getattr(recording.tracks, name)[row][~seen].any()
 
 
-def test_everything_stands_on_one_plane(recordings):
+def test_map_and_agents_are_flat(recordings):
     """The map has no heights: boxes stand on z = 0 whatever the log says (607 m above the sea)."""
     tracks = recordings[0].tracks
     np.testing.assert_allclose(tracks.z[tracks.valid], tracks.size[..., 2][tracks.valid] / 2)
@@ -245,7 +244,7 @@ def test_unknown_sizes_and_velocities(tmp_path):
 
 
 def test_lights_by_connector(recordings):
-    """Item 10: keyed by the connector that they control, yellow mapped, -1 where the light is unobserved them."""
+    """Item 10: keyed by the connector that they control, yellow mapped, -1 where the light is unobserved."""
     states = {"red": LightState.STOP, "yellow": LightState.CAUTION, "green": LightState.GO}
     for recording in recordings:
         lights = {light.lane_id: light for light in recording.lights}
@@ -274,7 +273,7 @@ def test_lights_of_connectors_that_the_map_lacks_are_counted(tmp_path):
     assert feature_id("lane_connectors", sample.TURN) not in {light.lane_id for light in recording.lights}
 
 
-def test_scenario_types_of_the_own_part_of_a_scene(recordings):
+def test_scenario_types_come_from_the_scene_itself(recordings):
     assert recordings[0].tags["scenario_types"] == "high_magnitude_speed|starting_left_turn"
     assert recordings[1].tags["scenario_types"] == "near_construction_zone_sign"
 
@@ -298,7 +297,7 @@ def test_routes_that_are_missing_odd_or_separated_by_commas(tmp_path, text, coun
     assert recording.lost.get("roadblocks", 0) == unknown
 
 
-def test_a_scene_without_a_goal_or_without_a_row_of_its_own(tmp_path):
+def test_scenes_without_a_goal_or_without_a_table_row(tmp_path):
     path = sample.write_all(tmp_path, replace(sample.SMALL, goals=False))
     (recording,) = read(path)
     assert len(recording.route_corridor) == 4
@@ -367,7 +366,7 @@ def test_gaps_in_time_are_never_bridged(tmp_path):
     assert assemble(last).has & Flag.JITTERED_TIME
 
 
-def test_logs_of_ten_hertz_are_taken_whole(tmp_path):
+def test_ten_hertz_logs_are_not_subsampled(tmp_path):
     path = sample.write_full(tmp_path, missing=frozenset(range(1, 500, 2)))
     assert set(np.diff(sweeps_of(read(path)[0]))) == {2}
     other = sample.write_full(tmp_path / "b", missing=frozenset(s for s in range(500) if s % 10))
@@ -375,11 +374,11 @@ def test_logs_of_ten_hertz_are_taken_whole(tmp_path):
     assert isinstance(bad, BadRecord) and "every 500 ms" in bad.problem
 
 
-def test_recordings_come_one_by_one(log, monkeypatch):
-    """A log is never in memory as a whole: the second scene is read when it is asked for."""
+def test_recordings_are_read_lazily(log, monkeypatch):
+    """A log is never in memory as a whole: the second scene is read on request."""
     asked = []
-    whole = nuplan_log.tracks
-    monkeypatch.setattr(nuplan_log, "tracks", lambda *given: asked.append(given[2].name) or whole(*given))
+    whole = nuplan_reader.tracks
+    monkeypatch.setattr(nuplan_reader, "tracks", lambda *given: asked.append(given[1].name) or whole(*given))
     reading = NuPlan().read(log)
     next(reading)
     assert len(asked) == 1
@@ -414,7 +413,7 @@ def test_recordings_come_one_by_one(log, monkeypatch):
         ("ALTER TABLE lidar_box RENAME COLUMN yaw TO heading", "lidar_box has no column yaw"),
     ],
 )
-def test_damage_is_named_in_one_line(tmp_path, statement, problem):
+def test_damage_is_reported_in_one_line(tmp_path, statement, problem):
     path = sample.write(tmp_path)
     change(path, statement)
     (bad,) = NuPlan().read(path)
@@ -433,12 +432,12 @@ def test_other_scenes_survive_a_damaged_one(tmp_path):
 
 
 def test_too_many_tracks_are_refused_before_they_take_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(nuplan_log, "_MOST_CELLS", 1000)
+    monkeypatch.setattr(nuplan_reader, "_MOST_CELLS", 1000)
     (bad,) = NuPlan().read(sample.write(tmp_path))
     assert isinstance(bad, BadRecord) and "12 tracks in 96 steps" in bad.problem
 
 
-def test_an_index_that_leads_to_boxes_of_other_sweeps(tmp_path):
+def test_damaged_index_adds_no_boxes_of_other_sweeps(tmp_path):
     """Entries of an index out of order make SQLite return rows outside the query; they are left out."""
     path = sample.write(tmp_path)
     (whole,) = read(path)
@@ -456,7 +455,7 @@ def test_an_index_that_leads_to_boxes_of_other_sweeps(tmp_path):
     assert whole.tracks.valid.sum() - 1 in valid
 
 
-def test_a_missing_map_is_one_error_with_its_cure(log, tmp_path):
+def test_missing_map_is_one_error_with_a_cure(log, tmp_path):
     alone = tmp_path / log.name
     alone.write_bytes(log.read_bytes())
     (bad,) = NuPlan().read(alone)
@@ -475,7 +474,7 @@ def test_no_blob_is_unpickled(log):
     assert len(read(log)) == 2
 
 
-def test_logs_without_an_index_give_the_same(log, recordings, tmp_path):
+def test_recordings_do_not_depend_on_an_index(log, recordings, tmp_path):
     path = sample.write_full(tmp_path)
     change(path, "DROP INDEX box_of_sweep")
     for a, b in zip(read(path), recordings, strict=True):
@@ -491,7 +490,7 @@ def scenario(recordings):
     return assemble(next(windows(recordings[0])))
 
 
-def test_assembled(scenario):
+def test_assembled_flags_lanes_and_routes(scenario):
     assert scenario.id == sample.token("scene", 0).hex() + "@0"
     for flag in (Flag.LANE_GRAPH, Flag.SPEED_LIMITS, Flag.LIGHTS, Flag.ROUTE, Flag.CLOSED_EDGES):
         assert scenario.has & flag, flag
@@ -505,7 +504,7 @@ def test_assembled(scenario):
     assert (scenario.light_lane[:6] >= 0).all()
 
 
-def test_the_ego_drives_on_the_drivable_side(recordings):
+def test_ego_stays_on_the_drivable_side(recordings):
     """Item 7, on the whole drive: every corner of the ego's box lies inside the rings of the road edges."""
     for recording in recordings:
         rings = [f.points[:, :2] - ORIGIN for f in recording.features if f.kind == RoadKind.EDGE_BOUNDARY]
@@ -518,7 +517,7 @@ def test_the_ego_drives_on_the_drivable_side(recordings):
             assert shapely.contains_xy(road, corner).all()
 
 
-def test_a_route_follows_the_drive(scenario):
+def test_route_follows_the_log(scenario):
     """The corridor goes west, left, north; the first route stays within 1.5 m of the log."""
     points = int(scenario.route_points[0])
     line = shapely.LineString(scenario.route_xy[0, :points])

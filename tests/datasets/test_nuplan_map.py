@@ -1,4 +1,4 @@
-"""The map of nuPlan against the hand-made junction, whose geometry is known in metres."""
+"""The map of nuPlan against a hand-made junction with known geometry."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ import shapely
 
 from datasets.samples import nuplan as sample
 from drivax.datasets.nuplan import map as nuplan_map
-from drivax.datasets.nuplan import map_features as nuplan_features
-from drivax.datasets.nuplan.map import city_map, corridor, feature_id, find_map
-from drivax.datasets.nuplan.map_features import features_around
+from drivax.datasets.nuplan.map import city_map, corridor, feature_id, features_around, find_map
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import LANE_KINDS, RoadKind
 
@@ -91,7 +89,7 @@ def test_projection_against_kruegers_series(features):
         np.testing.assert_allclose(features[lane_id(number)].points[:, :2], expected, rtol=0.0, atol=1e-3)
 
 
-def test_lanes_keep_their_direction_and_place(features):
+def test_lanes_keep_direction_and_position(features):
     """Item 2: UTM coordinates survive in float64."""
     for number, xy in sample.lane_lines().items():
         np.testing.assert_allclose(local(features[lane_id(number)]), xy, atol=1e-5)
@@ -241,7 +239,7 @@ def test_corridor_of_roadblocks(city):
     assert unknown == 1
 
 
-def test_an_id_of_both_kinds_of_roadblock_means_the_lanes(tmp_path):
+def test_id_of_both_kinds_of_roadblock_means_the_lanes(tmp_path):
     layers = sample.map_layers()
     clash = sample.group_of(sample.IN["w"])
     shape, values = layers["lane_connectors"].rows[1]
@@ -250,7 +248,7 @@ def test_an_id_of_both_kinds_of_roadblock_means_the_lanes(tmp_path):
     assert lanes == (lane_id(sample.IN["w"]), lane_id(sample.SECOND))
 
 
-def test_only_what_is_near_is_decoded(city):
+def test_only_nearby_features_are_decoded(city):
     far, _ = features_around(city, ORIGIN + np.array([[400.0, 0.0], [410.0, 0.0]]))
     lanes = {feature.feature_id for feature in far if feature.kind in LANE_KINDS}
     assert lanes == {
@@ -261,7 +259,7 @@ def test_only_what_is_near_is_decoded(city):
         features_around(city, ORIGIN + np.array([[900.0, 0.0], [910.0, 0.0]]))
 
 
-def test_the_index_is_kept_until_the_file_changes(tmp_path):
+def test_index_is_cached_until_the_file_changes(tmp_path):
     first = written(tmp_path)
     assert city_map(first.path) is first
     layers = sample.map_layers()
@@ -284,7 +282,7 @@ def test_ids_as_floats_and_texts(tmp_path):
 
 
 def test_broken_geometries_are_counted(tmp_path):
-    """Item 6: lines of fewer than two points, and geometries that are none."""
+    """Item 6: lines of fewer than two points, and invalid geometries."""
     layers = sample.map_layers()
     rows = layers["baseline_paths"].rows
     point = sample.degrees(np.array([[10.0, 0.0], [10.0, 0.0]]))
@@ -333,7 +331,7 @@ def test_baselines_in_parts_are_joined(tmp_path):
         ("UPDATE meta SET value = 'epsg:32719'", "no lane of the map"),
     ],
 )
-def test_what_is_no_map_is_named(tmp_path, statement, problem):
+def test_invalid_maps_are_reported(tmp_path, statement, problem):
     path = tmp_path / "map.gpkg"
     sample.write_map(path, sample.map_layers())
     with closing(sqlite3.connect(path)) as db, db:
@@ -390,8 +388,8 @@ def test_feature_ids_are_distinct():
 
 
 @pytest.mark.parametrize("name", ["shapely", "pyproj"])
-def test_missing_packages_are_named_with_the_extra_that_brings_them(city, monkeypatch, name):
-    nuplan_features._transformer.cache_clear()
+def test_missing_packages_are_named_with_their_extra(city, monkeypatch, name):
+    nuplan_map._transformer.cache_clear()
     monkeypatch.setitem(sys.modules, name, None)  # makes its import fail
     with pytest.raises(UsageError, match=f"{name} is not installed; pip install 'drivax\\[maps\\]'"):
         features_around(city, DRIVE)

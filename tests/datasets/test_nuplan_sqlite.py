@@ -106,7 +106,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_is_no_geometry_is_none_and_lies_nowhere(tmp_path, name):
+def test_invalid_geometries_are_none_without_bounds(tmp_path, name):
     path = package(tmp_path / "map.gpkg")
     with closing(sqlite3.connect(path)) as db, db:
         db.execute("UPDATE things SET geom = ? WHERE fid = 20", (BAD[name],))
@@ -135,7 +135,7 @@ def test_nan_coordinates_raise_no_warning(tmp_path, envelope):
         assert len(geometries(database, layer, np.arange(5))) == 5
 
 
-def test_damaged_files_are_named(tmp_path):
+def test_damaged_files_are_reported(tmp_path):
     with pytest.raises(DataError, match="cannot be read"), open_database(tmp_path / "missing.gpkg"):
         pass
     other = tmp_path / "other.gpkg"
@@ -166,7 +166,7 @@ def test_missing_layers_tables_and_columns(tmp_path):
 
 
 def test_views_are_no_tables(tmp_path):
-    """A view can compute for ever; what is read must be stored."""
+    """A view can compute forever; only tables are read."""
     path = package(tmp_path / "map.gpkg")
     endless = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS fid FROM n"
     execute(path, f"CREATE VIEW endless AS {endless}")
@@ -196,15 +196,15 @@ def test_nothing_is_written_next_to_the_file(tmp_path):
     assert path.read_bytes() == before
 
 
-def test_names_with_characters_of_urls(tmp_path):
+def test_file_names_may_hold_url_characters(tmp_path):
     path = package(tmp_path / "50% of #1?.gpkg")
     with open_database(path) as database:
         layer = read_layer(database, "things")
     assert layer is not None and len(layer.fid) == 5
 
 
-def test_the_sample_is_a_geopackage_for_gdal_too(tmp_path):
-    """Where pyogrio happens to be installed, GDAL reads the hand-made map and agrees on every layer."""
+def test_gdal_reads_the_sample(tmp_path):
+    """If pyogrio is installed, GDAL reads the hand-made map and agrees on every layer."""
     pyogrio = pytest.importorskip("pyogrio")
     path = tmp_path / "map.gpkg"
     layers = sample.map_layers()

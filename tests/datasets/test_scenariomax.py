@@ -158,7 +158,7 @@ def test_map(recording):
     assert recording.lost == {"paths": 1, "lights_without_state": 1}
 
 
-def test_10_unknown_that_only_fills_is_no_light(recording):
+def test_10_lights_that_are_always_unknown_are_left_out(recording):
     """Check-list 10: lane 3 keeps its slot and its UNKNOWN, lane 4 was never known, padding is no lane."""
     (light,) = recording.lights
     assert light.lane_id == 3 and light.states.tolist() == [0] * 40 + [6] * 51
@@ -192,7 +192,7 @@ def test_describe_and_count(wire, write_records):
     assert [r.scenario_id for r in reader.read(path)] == ["sm_0001", "two"]
 
 
-def test_read_as_womd_padding_would_be_tracks(wire):
+def test_womd_reader_would_take_padding_for_tracks(wire):
     """Why the format is detected: WOMD's reader refuses or misreads what ScenarioMax writes."""
     with pytest.raises(DataError, match="names a track twice"):
         decode_womd(wire.scenariomax(**{"state/id": wire.floats([0, 1, 2, 0, 0])}))

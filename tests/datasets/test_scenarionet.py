@@ -138,7 +138,7 @@ def test_10_lights_are_by_lane_with_minus_one_where_unobserved(tree):
 
 
 def test_10_yellow_is_mapped_and_nuplan_lights_stand_at_the_line(tree):
-    """nuPlan's converter writes colours and a place 8 m behind the line."""
+    """nuPlan's converter writes colours and a stop point 8 m behind the line."""
     words = ["RED", "YELLOW", "GREEN", "UNKNOWN", "PURPLE"]
     states = [f"TRAFFIC_LIGHT_{word}" for word in words] + [None] * (sample.STEPS - 5)
     tree["dynamic_map_states"]["2"] |= {
@@ -253,7 +253,7 @@ def test_17_measured_velocity_is_kept(tree):
     np.testing.assert_array_equal(recording.tracks.velocity[0, 40], [8.5, 0.25])
 
 
-def test_the_ego_of_nuscenes_is_a_car_at_its_centre(tree):
+def test_ego_of_nuscenes_has_a_cars_size_and_box_centre(tree):
     """The converter swaps its length and width, and its poses are of the rear axle, 1.385 m behind the centre."""
     state = nuscenes(tree)["tracks"]["ego"]["state"]
     axle = state["position"][:, :2].astype(np.float64)
@@ -299,7 +299,7 @@ def test_argoverse_files_have_class_sizes_and_no_heights_of_agents(tree):
 
 
 def on_left(xy: np.ndarray, edges: list[MapFeature]) -> np.ndarray:
-    """Whether places are on the left of their nearest edge segment; at a vertex the more perpendicular one decides."""
+    """Whether points are left of their nearest edge segment; at a vertex the more perpendicular one decides."""
     a = np.concatenate([f.points[:-1, :2] for f in edges])
     b = np.concatenate([f.points[1:, :2] for f in edges])
     long = np.hypot(*(b - a).T) > 1e-9
@@ -320,7 +320,7 @@ def ring(x: float, y: float, half: float, clockwise: bool) -> np.ndarray:
 
 @pytest.mark.parametrize("clockwise", [False, True])
 def test_7_rings_in_rings_alternate(clockwise):
-    """Area, hole, area inside the hole, and a second area; whatever way they ran."""
+    """Area, hole, area inside the hole, and a second area, for any original orientation."""
     rings = [ring(0, 0, half, clockwise) for half in (50.0, 30.0, 10.0)] + [ring(200, 0, 5.0, clockwise)]
     shapely = pytest.importorskip("shapely")
     turned = outlines_on_left(rings)
@@ -383,7 +383,7 @@ def written(tree: Any, folder: Path, name: str = "sd_a.pkl") -> Path:
     return path
 
 
-def test_the_reader(tree, tmp_path):
+def test_reader_recognises_counts_reads_and_describes(tree, tmp_path):
     path = sample.write(tmp_path)
     reader = ScenarioNet()
     assert isinstance(reader, Reader) and reader.recognise(path) and reader.count(path) == 1
@@ -399,7 +399,7 @@ def test_the_reader(tree, tmp_path):
     assert not scenario.has & (Flag.CHAINED_GRAPH | Flag.NO_FUTURE)
 
 
-def test_the_description_says_what_is_missing(tree, tmp_path):
+def test_description_names_what_is_missing(tree, tmp_path):
     described = ScenarioNet().describe(written(nuscenes(tree), tmp_path))
     assert described.dataset == "nuScenes, by ScenarioNet"
     assert [note.split(":")[0] for note in described.notes] == [
@@ -455,7 +455,7 @@ BROKEN: dict[str, Callable[[dict[str, Any]], Any]] = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_contradictions_end_in_one_line(case, tree, tmp_path):
+def test_contradictions_are_reported_in_one_line(case, tree, tmp_path):
     BROKEN[case](tree)
     path = written(tree, tmp_path)
     (bad,) = ScenarioNet().read(path)
@@ -465,7 +465,7 @@ def test_contradictions_end_in_one_line(case, tree, tmp_path):
 
 
 @pytest.mark.parametrize("value", [None, [], "x", 3, {"a": 1}, np.zeros(3)])
-def test_files_of_other_things_end_in_one_line(value, tmp_path):
+def test_other_files_are_reported_in_one_line(value, tmp_path):
     (bad,) = ScenarioNet().read(written(value, tmp_path))
     assert isinstance(bad, BadRecord) and "no dictionary" in bad.problem
 
@@ -486,7 +486,7 @@ def test_broken_features_are_left_out_and_counted(tree):
     assert {1, 2, 8}.isdisjoint(by_id(recording))
 
 
-def test_18_one_array_in_many_places_is_refused(tree):
+def test_18_repeated_arrays_are_refused(tree):
     """A pickle holds it once; reading it for every lane would take forever."""
     wide = np.zeros(4_000_000, np.int8)
     for number in range(3000, 3020):
@@ -495,7 +495,7 @@ def test_18_one_array_in_many_places_is_refused(tree):
         decode(tree)
 
 
-def test_maps_without_end_are_refused(tree):
+def test_huge_maps_are_refused(tree):
     zigzag = np.zeros((1000, 3))
     zigzag[::2, 0], zigzag[:, 1] = 9e4, sample.Y
     tree["map_features"]["8"]["polyline"] = zigzag
@@ -503,7 +503,7 @@ def test_maps_without_end_are_refused(tree):
         decode(tree)
 
 
-def test_a_text_that_cannot_be_written_is_no_id(tree):
+def test_texts_without_utf8_encoding_are_no_ids(tree):
     tree["id"] = "\ud800"
     tree["metadata"]["id"] = "plain"
     assert decode(tree).scenario_id == "plain"
@@ -564,14 +564,14 @@ def test_real_velocities_are_those_of_the_motion(real):
     assert np.median(np.cos(course - tracks.heading)[fast]) > 0.99
 
 
-def test_real_lanes_run_as_their_third_column_says(real):
+def test_real_lanes_follow_the_heading_in_their_third_column(real):
     name, recording = real
     flat = all((f.points[:, 2] == 0).all() for f in recording.features)
     assert flat == (recording.dataset == "nuscenes") == ("waymo" not in name)
 
 
 def test_real_windows_replay_without_collision_and_off_road_step(real):
-    """The overpass too: a road above or below is no obstacle and no edge."""
+    """The overpass as well: a road above or below is no obstacle and no edge."""
     from drivax.evaluation.audit import audit
 
     scenarios = [assemble(window) for window in windows(real[1])]

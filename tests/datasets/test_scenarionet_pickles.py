@@ -1,4 +1,4 @@
-"""The data-only reader of pickles against Python's own, and against pickles that want more than data."""
+"""The data-only reader of pickles against Python's own, and against pickles that name more than data."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_objects_of_classes_are_refused():
 
 
 def array_pickle(shape: tuple[int, ...], content: bytes) -> bytes:
-    """An array that says it has a shape, over some bytes."""
+    """An array that claims a shape, over some bytes."""
     text = pickle.dumps(np.zeros(3), 2)
     data = np.zeros(3).tobytes()
     assert struct.pack("<B", 3) in text
@@ -156,7 +156,7 @@ HUGE = {
 
 
 @pytest.mark.parametrize("case", HUGE)
-def test_18_damage_ends_in_one_line_and_little_memory(case):
+def test_18_damage_is_one_error_and_takes_little_memory(case):
     data = HUGE[case]()
     tracemalloc.start()
     try:
@@ -169,12 +169,12 @@ def test_18_damage_ends_in_one_line_and_little_memory(case):
 
 
 def test_18_deep_keys_do_not_end_the_process():
-    """Hashing a tuple that is nested deeper than the stack ends Python itself."""
+    """Hashing a tuple that is nested deeper than the stack crashes Python."""
     with pytest.raises(DataError, match="a key of type tuple"):
         pickles.load(b"\x80\x04})" + b"\x85" * 50_000 + b"Ns.")
 
 
-def test_18_a_memo_of_four_billion_places_costs_nothing():
+def test_18_memo_index_of_four_billion_takes_no_memory():
     """The index of a memo is any 32-bit number; Python's unpickler makes room for all before it."""
     tracemalloc.start()
     assert pickles.load(b"\x80\x02Nr\xff\xff\xff\xffj\xff\xff\xff\xff\x86.") == (None, None)
@@ -201,7 +201,7 @@ def test_18_sizes_have_limits(monkeypatch):
 
 
 @given(st.data())
-def test_damaged_bytes_never_do_worse_than_an_error(data):
+def test_damaged_bytes_raise_only_data_errors(data):
     good = bytearray(pickle.dumps(VALUES, data.draw(st.integers(0, 5))))
     for _ in range(data.draw(st.integers(1, 4))):
         good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))

@@ -1,4 +1,4 @@
-"""Assembly of the real recordings at ``../shared/data``: what must hold on any real map."""
+"""Assembly of the real recordings at ``../shared/data``: properties of any real map."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ends(scenario, block):
     return (x[part].astype(np.float64) for x in (scenario.segment_a, scenario.segment_b))
 
 
-def test_every_track_is_placed(recording, scenario):
+def test_every_track_has_a_slot(recording, scenario):
     placed = {*scenario.agent_id[scenario.agent_id >= 0], *scenario.parked_id[scenario.parked_id >= 0]}
     seen = recording.tracks.valid.any(axis=1)
     assert placed == set(recording.tracks.track_id[seen].tolist())
@@ -105,7 +105,7 @@ def test_routes_are_a_metre_apart_and_pass_the_log(scenario):
 
 
 def test_other_vehicles_as_ego_have_routes(recording):
-    """A sweep over ten logged cars: those that end on a lane must have a route of lanes beside their log."""
+    """Each of ten logged cars that ends on a lane has a route of lanes along its log."""
     reach = 2.0 if recording.flags & Flag.LANE_GRAPH else 4.0  # a truncated map lacks lanes
     tracks, now = recording.tracks, recording.current_step
     rows = np.flatnonzero((tracks.kind == AgentKind.VEHICLE) & tracks.valid[:, now])[:40:4]

@@ -72,7 +72,7 @@ def test_jerk_of_a_recorded_drive_is_that_of_scipy(recording, bank):
 def test_three_commands_find_the_most_critical_scenarios(
     recordings, found, wanted, real_data, repository, tmp_path, monkeypatch
 ):
-    """The page for data engineers, command by command, on the recordings at hand."""
+    """The commands of the guide to critical scenarios, on the available recordings."""
     pytest.importorskip("google.protobuf", reason="needs the extra 'womd'")
     page = (repository / "docs/guide/critical-scenarios.md").read_text()
     block = page.split("```bash\n")[1].split("```")[0]
@@ -94,7 +94,7 @@ def test_three_commands_find_the_most_critical_scenarios(
 
 @pytest.mark.slow
 def test_members_score_logged_steps(real_data, tmp_path):
-    """An ensemble of two on a recorded drive, twice: both score alike."""
+    """Two copies of a recorded drive get equal scores from an ensemble of two."""
     pytest.importorskip("google.protobuf", reason="needs the extra 'womd'")
     with ScenarioWriter(tmp_path / "set", Capacity()) as writer:
         recorded = next(iter(WomdScenario().read(real_data / "womd/motion_data_one_scenario.tfrecord")))

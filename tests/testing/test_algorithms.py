@@ -1,4 +1,4 @@
-"""The free check of algorithms: an own one and PPO pass, and each rule has one that breaks it."""
+"""The check of algorithms: a custom one and PPO pass, and each rule has an algorithm that breaks it."""
 
 import re
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from drivax.testing import BrokenContract, check_algorithm
 
 @record
 class State:
-    """What a toy needs to continue."""
+    """State of the toy algorithm."""
 
     parameters: jax.Array
     iteration: jax.Array
@@ -28,7 +28,7 @@ class State:
 
 @dataclass(frozen=True)
 class Toy:
-    """Learns nothing about driving, with a fault."""
+    """An algorithm that ignores driving, with a fault."""
 
     fault: str = ""
 
@@ -103,7 +103,7 @@ def test_ppo_passes():
 
 
 def test_custom_algorithm_is_short(repository):
-    """The guide's takes at most 80 lines, whole."""
+    """The algorithm of the guide takes at most 80 lines."""
     guide = (repository / "docs" / "guide" / "custom.md").read_text()
     (code,) = re.findall(r"```python\n(# my_algorithm.py\n.*?)```", guide, re.S)
     assert "class ReinforceConfig" in code and len(code.splitlines()) <= 80

@@ -28,7 +28,7 @@ def refused(check, term, words):
 
 
 @pytest.mark.slow
-def test_check_worlds_cover_the_facts_of_terms():
+def test_worlds_cover_the_facts_of_terms():
     found = moments().situation
     facts = found.facts
     for name in ("collision", "offroad", "off_route", "ttc_defined", "straddling", "wrong_way"):
@@ -38,7 +38,7 @@ def test_check_worlds_cover_the_facts_of_terms():
 
 
 def some(names, *quick):
-    """Each compiles programs of its own: a few of them in the quick tests."""
+    """All names as parameters; all but a few are slow, because each compiles its own programs."""
     slow = [pytest.param(name, marks=pytest.mark.slow) for name in names if name not in quick]
     return [*quick, *slow]
 

@@ -75,9 +75,9 @@ def test_experts_pass_as_privileged_planners():
 @pytest.mark.parametrize(
     ("fault", "words"),
     {
-        "finite": "is not finite", "random": "or every time", "litter": "rows of absent agents change",
+        "finite": "is not finite", "random": "is not deterministic", "litter": "rows of absent agents change",
         "order": "order of agents changes", "padding": "empty slots are added", "turn": "rotated and shifted",
-        "future": "the log goes on in another way",
+        "future": "the log's future changes",
     }.items(),
 )  # fmt: skip
 def test_invalid_planners_fail(fault, words):

@@ -1,4 +1,4 @@
-"""The free check of traffic: ours and an own one pass, and each rule has one that breaks it."""
+"""The check of traffic: built-in and custom models pass, and each rule has a model that breaks it."""
 
 import itertools
 import re

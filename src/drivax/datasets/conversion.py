@@ -1,8 +1,8 @@
-"""Public data set -> scenario set: files are read and assembled in worker processes, written by one.
+"""Convert a public data set to a scenario set: worker processes read and assemble files, one process writes.
 
-The result does not depend on the number of workers, nor on how often the conversion was killed and restarted: files
-are taken in the order of their paths, records in file order, and a closed shard of the set is never touched again.
-Nothing here imports JAX, so that workers start in a fraction of a second; an audit that needs it is handed in.
+The result does not depend on the number of workers, nor on interruptions: files are taken in the order of their paths,
+records in file order, and a closed shard of the set never changes. Nothing here imports JAX, so workers start in a
+fraction of a second; an audit that needs it is passed in.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, TypeVar, get_args
 
 from drivax.datasets.estimate import Estimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, reader_named, survey
-from drivax.datasets.reader import BadRecord, Reader
+from drivax.datasets.reader import BadRecord
 from drivax.datasets.spool import converted_ahead
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.build.assemble import assemble
@@ -32,6 +32,14 @@ from drivax.scenario.select.splits import Shares, parse_shares
 from drivax.scenario.store import ScenarioWriter, manifest_entry
 
 _Result = TypeVar("_Result")
+#: Scenarios that are audited together.
+_BATCH = 64
+#: A scenario or bad record, and the place after it: file number, items read of that file.
+_Placed = tuple[Scenario | BadRecord, tuple[int, int]]
+#: Called with (files done, files, scenarios so far).
+Progress = Callable[[int, int, int], None]
+#: Returns the audit of each scenario as a dictionary.
+Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
 
 
 @dataclass(frozen=True)
@@ -65,18 +73,16 @@ class Conversion:
     shard_size: int = 512
 
     def check(self) -> None:
-        """Refuse options that cannot be meant.
+        """Check the options.
 
         Raises:
-            UsageError: The first of them.
+            UsageError: An option is invalid.
         """
         if self.format != AUTO:
             reader_named(self.format)
         for name, known in (("capacity", tuple(CAPACITIES)), ("routes", get_args(RouteStyle))):
-            if getattr(self, name) not in known:
-                raise UsageError(
-                    f"there is no {name} {getattr(self, name)!r}", cure=f"use one of {', '.join(known)}"
-                )
+            if (value := getattr(self, name)) not in known:
+                raise UsageError(f"there is no {name} {value!r}", cure=f"use one of {', '.join(known)}")
         for name in ("limit", "stride", "workers", "shard_size"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -91,18 +97,16 @@ class Conversion:
 
 
 def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadRecord]:
-    """The scenarios of one file in file order, and bad records in their places; at most ``limit`` scenarios.
+    """Yield the scenarios of one file in file order, without audit, and bad records in their places.
 
     Args:
         path: The file.
         options: ``format``, ``capacity``, ``routes``, ``stride`` and, without filters, ``limit`` are used.
-
-    Yields:
-        Assembled scenarios without audit, or what could not be read or assembled and why.
     """
-    reader = _reader(path, options.format)
-    if isinstance(reader, BadRecord):
-        yield reader
+    try:
+        reader = detect(path) if options.format == AUTO else reader_named(options.format)
+    except DataError as error:
+        yield BadRecord.of(error, path)
         return
     count = 0
     for item in reader.read(path):
@@ -111,13 +115,6 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
             count += isinstance(result, Scenario)
             if count == options.limit and not options.filters:
                 return
-
-
-def _reader(path: Path, name: str) -> Reader | BadRecord:
-    try:
-        return detect(path) if name == AUTO else reader_named(name)
-    except DataError as error:
-        return BadRecord.of(error, path)
 
 
 def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterator[Scenario | BadRecord]:
@@ -140,28 +137,9 @@ def _attempt(call: Callable[[], _Result], path: Path, record: str) -> _Result | 
         return BadRecord(path, record, problem, "report it with this file and record")
 
 
-__all__ = ["Conversion", "Converted", "Plan", "convert", "convert_file"]
-
-#: Scenarios that are audited together.
-_BATCH = 64
-
-#: A scenario or bad record, and the place after it: file number, items read of that file.
-_Placed = tuple[Scenario | BadRecord, tuple[int, int]]
-#: Called with (files done, files, scenarios so far).
-Progress = Callable[[int, int, int], None]
-#: Fills the audit of scenarios: one dictionary each.
-Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
-
-
 @dataclass(frozen=True)
 class Plan:
-    """What a conversion is about to do.
-
-    Attributes:
-        data: The files.
-        estimate: How large the set will be.
-        written: How many scenarios an earlier, interrupted conversion has written already.
-    """
+    """Files to convert, expected size, and number of scenarios that an interrupted conversion has written already."""
 
     data: Survey
     estimate: Estimate
@@ -174,13 +152,13 @@ class Converted:
 
     Attributes:
         path: The scenario set.
-        scenarios: How many it holds.
-        written: How many of them an earlier, interrupted conversion wrote.
-        files: How many files were read.
-        ignored: How many files of the folder are of no known format.
+        scenarios: Number of scenarios in it.
+        written: Number of those that an interrupted conversion wrote.
+        files: Number of files read.
+        ignored: Number of files of unknown format in the folder.
         formats: Number of files by format.
-        skipped: The records that could not be read or converted, duplicates included.
-        filtered: How many scenarios the filters left out.
+        skipped: Records that could not be read or converted, and duplicates.
+        filtered: Number of scenarios that the filters left out.
         seconds: Wall time.
     """
 
@@ -205,23 +183,23 @@ def convert(
 ) -> Converted:
     """Convert a file or folder of a public data set to a scenario set.
 
-    Recordings longer than 91 steps become windows. Records that cannot be read are skipped and reported. The set
-    appears under ``out`` when it is complete. A conversion that was killed is continued after its last closed shard
-    by one of the same data with the same options, to the same bytes.
+    Recordings longer than 91 steps become windows. Unreadable records are skipped and reported. The set appears under
+    ``out`` when it is complete. The same call resumes an interrupted conversion after its last closed shard, to the
+    same bytes.
 
     Args:
         src: A file, or a folder that is searched to any depth.
         out: The scenario set to write.
-        options: How.
+        options: How to convert.
         progress: Called after every scenario and every file.
-        audit: Called in this process with batches of scenarios; what it returns is stored with them.
+        audit: Called in this process with batches of scenarios; its results are stored with them.
         announce: Called once before the work begins.
 
     Raises:
-        UsageError: Options that cannot be meant, ``out`` exists, is being written, or was started with other options,
-            or a package that the format needs is missing.
+        UsageError: An option is invalid, ``out`` exists, is being written, or was started with other options, or a
+            package that the format needs is missing.
         DataError: ``src`` holds nothing that can be converted, the disk is too small, or with ``strict`` a record
-            cannot be read.
+            is unreadable.
     """
     options = options or Conversion()
     options.check()
@@ -243,15 +221,14 @@ def convert(
         if not len(writer):
             raise _nothing(data, sink)
         writer.source |= sink.left_out()
-    seconds = time.monotonic() - begin
     return Converted(
         Path(out), len(writer), written, done, data.ignored, dict(data.formats), tuple(sink.skipped),
-        sink.filtered, seconds,
+        sink.filtered, time.monotonic() - begin,
     )  # fmt: skip
 
 
 def _source(data: Survey, options: Conversion) -> dict[str, Any]:
-    """Where the set comes from, for its manifest."""
+    """Source of the set, for its manifest."""
     return {
         "command": "convert",
         "format": options.format,
@@ -263,7 +240,7 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 
 
 def _identity(data: Survey, options: Conversion, audited: bool) -> dict[str, Any]:
-    """All that the bytes of the set depend on; only a conversion with the same may continue another."""
+    """All that the bytes of the set depend on; only a conversion with the same identity resumes another."""
     digest = hashlib.sha256()
     for entry in data.inputs:
         digest.update(f"{data.relative(entry.path)}\t{entry.path.stat().st_size}\t{entry.format}\n".encode())
@@ -278,9 +255,9 @@ def _identity(data: Survey, options: Conversion, audited: bool) -> dict[str, Any
 
 
 class _Sink:
-    """Takes results in order: audits in batches, filters, leaves out duplicates, counts what is bad, writes the rest.
+    """Takes results in order: leaves out duplicates, audits in batches, filters, writes, and collects bad records.
 
-    Batches end where a shard ends: so does everything that depends on what came before.
+    Batches end where a shard ends, as they would after an interruption.
     """
 
     def __init__(
@@ -293,21 +270,22 @@ class _Sink:
         self._selection = Selection.parse(options.filters)
         self._waiting: list[_Placed] = []
         self._scenarios_waiting = 0
-        self._noted = 0
         self.skipped: list[BadRecord] = []
         self.filtered = 0
         self.place = (0, 0)
         for note in writer.notes:
             self.place = tuple(note["place"])
             self.filtered = note["filtered"]
-            self.skipped += [_bad_record(data, row) for row in note["skipped"]]
+            for row in note["skipped"]:
+                file = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
+                self.skipped.append(BadRecord(file, row["record"], row["problem"], row["cure"]))
         self._noted = len(self.skipped)
         if options.strict and self.skipped:
             raise self.skipped[0].error()
 
     @property
     def scenarios(self) -> int:
-        """Scenarios taken so far, those that wait included."""
+        """Number of scenarios taken so far, including those that wait."""
         return len(self._writer) + self._scenarios_waiting
 
     @property
@@ -316,7 +294,7 @@ class _Sink:
         return self._options.limit is not None and len(self._writer) >= self._options.limit
 
     def take(self, item: Scenario | BadRecord, place: tuple[int, int]) -> None:
-        """Keep a scenario, or note a bad record (fail, if strict)."""
+        """Keep a scenario or bad record; raise for a bad record if strict."""
         if isinstance(item, BadRecord) and self._options.strict:
             raise item.error()
         self._waiting.append((item, place))
@@ -325,15 +303,14 @@ class _Sink:
             self._write_batch()
 
     def flush(self) -> None:
-        """Audit and write what is waiting."""
+        """Audit and write all that wait."""
         while self._waiting and not self.full:
             self._write_batch()
 
     def left_out(self) -> dict[str, Any]:
-        """What is not in the set, for its manifest."""
+        """Records that are not in the set, for its manifest."""
         rows = [_row(self._data, bad) for bad in self.skipped]
-        for row in rows:
-            del row["cure"]
+        rows = [{name: value for name, value in row.items() if name != "cure"} for row in rows]
         return {"skipped": len(rows), "skipped_records": rows, "filtered": self.filtered}
 
     def _batch_size(self) -> int:
@@ -349,53 +326,45 @@ class _Sink:
         items = self._without_duplicates(batch)
         scenarios = [item for item in items if isinstance(item, Scenario)]
         findings = [{} for _ in scenarios] if self._audit is None else self._audit(scenarios)
-        audited = iter(
-            [replace(scenario, audit=finding) for scenario, finding in zip(scenarios, findings, strict=True)]
-        )
+        pairs = zip(scenarios, findings, strict=True)
+        audited = iter([replace(scenario, audit=finding) for scenario, finding in pairs])
         for number, item in enumerate(items):
             if isinstance(item, BadRecord):
-                self._skip(item)
+                if self._options.strict:
+                    raise item.error()
+                self.skipped.append(item)
             elif self._write(next(audited), batch[number][1]) or self.full:
-                # A shard is closed: the rest begins a new batch, as it would after a kill.
+                # A shard is closed: the rest begins a new batch.
                 self._waiting = batch[number + 1 :]
                 self._scenarios_waiting = sum(isinstance(item, Scenario) for item, _ in self._waiting)
                 return
 
     def _without_duplicates(self, batch: list[_Placed]) -> list[Scenario | BadRecord]:
-        """The items of a batch, with a bad record in the place of a scenario that is in the set or earlier in it."""
+        """The items of a batch, with bad records in place of duplicates."""
         items: list[Scenario | BadRecord] = []
         seen: set[tuple[str, str]] = set()
         for item, (file, _) in batch:
             if isinstance(item, Scenario):
-                key = bytes(item.record["dataset"][()]).decode(), item.id
+                key = item.text("dataset"), item.id
                 if key in self._writer or key in seen:
-                    path = self._data.inputs[file].path
-                    item = BadRecord(
-                        path, item.id, "the scenario is in the set already", "give each file once"
-                    )
-                else:
-                    seen.add(key)
+                    problem, cure = "the scenario is in the set already", "give each file once"
+                    item = BadRecord(self._data.inputs[file].path, item.id, problem, cure)
+                seen.add(key)
             items.append(item)
         return items
 
     def _write(self, scenario: Scenario, place: tuple[int, int]) -> bool:
-        """Write a scenario unless it is filtered out; whether that closed a shard."""
+        """Write a scenario unless it is filtered out; return whether that closed a shard."""
         if not self._selection.matches(manifest_entry(scenario)):
             self.filtered += 1
             return False
-        closes = self._writer.room == 1
-        self._writer.add(scenario, self._note(place) if closes else None)
-        return closes
-
-    def _note(self, place: tuple[int, int]) -> dict[str, Any]:
-        new, self._noted = self.skipped[self._noted :], len(self.skipped)
-        rows = [_row(self._data, bad) for bad in new]
-        return {"place": place, "filtered": self.filtered, "skipped": rows}
-
-    def _skip(self, bad: BadRecord) -> None:
-        if self._options.strict:
-            raise bad.error()
-        self.skipped.append(bad)
+        if self._writer.room > 1:
+            self._writer.add(scenario)
+            return False
+        rows = [_row(self._data, bad) for bad in self.skipped[self._noted :]]
+        self._noted = len(self.skipped)
+        self._writer.add(scenario, {"place": place, "filtered": self.filtered, "skipped": rows})
+        return True
 
 
 def _row(data: Survey, bad: BadRecord) -> dict[str, Any]:
@@ -403,15 +372,10 @@ def _row(data: Survey, bad: BadRecord) -> dict[str, Any]:
     return {"file": data.relative(bad.file), "record": bad.record, "problem": bad.problem, "cure": bad.cure}
 
 
-def _bad_record(data: Survey, row: dict[str, Any]) -> BadRecord:
-    file = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
-    return BadRecord(file, row["record"], row["problem"], row["cure"])
-
-
 def _drain(
     data: Survey, options: Conversion, sink: _Sink, writer: ScenarioWriter, progress: Progress | None
 ) -> int:
-    """Moves results into the sink until they or the limit end; returns the number of files read."""
+    """Move results into the sink until its limit; return the number of files read."""
     report = progress or (lambda done, total, scenarios: None)
     first, skip = sink.place
     total = len(data.inputs)
@@ -432,9 +396,8 @@ def _results(
     data: Survey, options: Conversion, first: int, folder: Path
 ) -> Generator[Iterator[Scenario | BadRecord], None, None]:
     """Scenarios and bad records of every file from number ``first`` on."""
-    tasks = [
-        (entry.path, replace(options, format=entry.format or options.format)) for entry in data.inputs[first:]
-    ]
+    inputs = data.inputs[first:]
+    tasks = [(entry.path, replace(options, format=entry.format or options.format)) for entry in inputs]
     if options.workers == 1 or len(tasks) <= 1:
         yield from (convert_file(*task) for task in tasks)
         return
@@ -442,18 +405,15 @@ def _results(
 
 
 def _nothing(data: Survey, sink: _Sink) -> DataError:
+    """The error for a conversion without scenarios."""
     if sink.filtered:
         problem = f"none of the {sink.filtered} scenarios satisfies the filters"
         return DataError(problem, file=data.root, cure="use wider filters")
     if not sink.skipped:
         return DataError("holds no recording", file=data.root, cure="look at it with drivax doctor")
-    first = sink.skipped[0]
-    if len(sink.skipped) == 1:
+    first, *others = sink.skipped
+    if not others:
         return first.error()
-    others = len(sink.skipped) - 1
-    return DataError(
-        f"{first.problem} (and none of the other {others} record{'s' if others > 1 else ''} could be converted)",
-        file=first.file,
-        record=first.record,
-        cure=first.cure,
-    )
+    records = f"{len(others)} record{'s' if len(others) > 1 else ''}"
+    problem = f"{first.problem} (and none of the other {records} could be converted)"
+    return replace(first, problem=problem).error()

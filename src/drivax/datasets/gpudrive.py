@@ -1,4 +1,4 @@
-"""Reader of GPUDrive's JSON files: scenes of the Waymo Open Motion Dataset, one file each.
+"""Reader and writer of GPUDrive's JSON files: scenes of the Waymo Open Motion Dataset, one file each.
 
 They hold tracks and map elements, but no lane graph, no speed limits and no lanes of stop signs; the published files
 also lack every scene with a traffic light.
@@ -14,29 +14,40 @@ from typing import Any
 import numpy as np
 
 from drivax.datasets import parsing
+from drivax.datasets.export.recording import restore
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, LightState, RoadKind
+from drivax.scenario.schema import (
+    CURRENT_STEP,
+    DT_S,
+    EDGE_KINDS,
+    LANE_KINDS,
+    LINE_KINDS,
+    AgentKind,
+    LightState,
+    RoadKind,
+    Scenario,
+)
 
 _Array = np.ndarray[Any, Any]
 
 _SKIP = "skip this file, or make it again from the Waymo protos"
-#: Published files have 1 to 10 MB; what is larger is none, and would need many times its size in memory.
+#: Published files have 1 to 10 MB; parsing takes many times the size in memory.
 _LARGEST_BYTES = 200_000_000
 _HEAD_BYTES = 4096
 _MOST_STEPS = 1000
-#: In place of what is not valid.
+#: Value of invalid states.
 _INVALID = -10_000.0
-#: Numbers beyond this (metres, m/s, radians) are damage.
+#: Largest plausible number (metres, m/s, radians).
 _LARGEST = 1e7
-#: Box sizes outside are none; the assembly takes the class's.
+#: Plausible box sizes; others are replaced by those of the class.
 _SMALLEST_SIZE_M, _LARGEST_SIZE_M = 0.01, 1000.0
-#: Ids fit into the 31 bits that the public tools give them.
+#: Public tools store ids in 31 bits.
 _ID_END = 2**31
 _AGENTS = {"vehicle": AgentKind.VEHICLE, "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST}
-#: Kind of a road whose ``map_element_id`` says nothing; the names of ``type``.
+#: Kind by ``type`` of a road without a known ``map_element_id``.
 _ROADS = {
     "lane": RoadKind.LANE_UNDEFINED,
     "road_line": RoadKind.LINE_UNKNOWN,
@@ -46,9 +57,18 @@ _ROADS = {
     "stop_sign": RoadKind.STOP_SIGN,
     "driveway": RoadKind.DRIVEWAY,
 }
+_AGENT_TYPES = {kind: name for name, kind in _AGENTS.items()}
+_ROAD_TYPES = {
+    **dict.fromkeys(LANE_KINDS, "lane"),
+    **dict.fromkeys(LINE_KINDS, "road_line"),
+    **dict.fromkeys(EDGE_KINDS, "road_edge"),
+    **{kind: name for name, kind in _ROADS.items()},
+}
 _KINDS = {int(kind): kind for kind in RoadKind}
 #: Points of the published files are 0.5 m apart; twice that is a jump where the map was clipped.
 _SPLIT_GAP_M, _DENSE_M = 1.0, 0.75
+#: Written decimals: a tenth of a millimetre.
+_DIGITS = 4
 
 
 @dataclass(frozen=True)
@@ -70,7 +90,7 @@ class GpuDrive:
         return head.lstrip().startswith(b"{") and (objects or (b'"roads"' in head and b'"geometry"' in head))
 
     def describe(self, path: Path) -> Description:
-        """What the file is."""
+        """Describe the content of the file."""
         recording = decode(_load(path))
         notes = [
             f"{len(recording.tracks.kind)} objects, {len(recording.features)} road elements",
@@ -83,11 +103,11 @@ class GpuDrive:
         return Description("Waymo Open Motion Dataset", "GPUDrive JSON", recordings=1, notes=tuple(notes))
 
     def count(self, path: Path) -> int:
-        """One scenario per file."""
+        """Return 1 for a scene: a file holds one scenario."""
         return int(self.recognise(path))
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recording of one file, or the bad record in its place."""
+        """Yield the recording of a file, or the bad record in its place."""
         try:
             yield decode(_load(path))
         except DataError as error:
@@ -100,20 +120,20 @@ def _load(path: Path) -> Any:
     except OSError as error:
         raise DataError(error.strerror or "cannot be opened", file=path, cure="check the path") from error
     if size > _LARGEST_BYTES:
-        raise DataError(
-            f"has {size:,} bytes, more than a GPUDrive scene",
-            file=path,
-            cure="name the folder of single scenes",
-        )
+        problem = f"has {size:,} bytes, more than a GPUDrive scene"
+        raise DataError(problem, file=path, cure="name the folder of single scenes")
     return parsing.load_json(path)
 
 
 def decode(scene: Any) -> Recording:
-    """The recording in a parsed GPUDrive scene.
+    """Return the recording in a parsed GPUDrive scene.
 
     Positions stay in WOMD's map frame, metres, float64; invalid steps (-10000 in the file) are zeros; steps are 0.1 s
-    apart, because the file has no timestamps; the current step is 10. ``goalPosition`` is an agent's last valid
-    position and therefore not kept, ``mark_as_expert`` (GPUDrive's choice of agents to replay) is dropped.
+    apart, because the file has no timestamps. ``goalPosition`` (an agent's last valid position) and ``mark_as_expert``
+    (agents that GPUDrive replays) are dropped.
+
+    Raises:
+        DataError: The scene is damaged.
     """
     if not isinstance(scene, Mapping):
         raise DataError("is no GPUDrive scene", cure=_SKIP)
@@ -132,6 +152,7 @@ def decode(scene: Any) -> Recording:
     if tracks.kind[ego] != AgentKind.VEHICLE:
         raise DataError(f"sdc_track_index names object {ego}, which is no vehicle", cure=_SKIP)
     features, unknown = _features(roads)
+    spacing = parsing.spacing_m(features)
     rows = {int(track): row for row, track in enumerate(tracks.track_id)}
     interest = [_whole(track, "objects_of_interest") for track in _listed(metadata, "objects_of_interest")]
     predicted = [
@@ -153,7 +174,8 @@ def decode(scene: Any) -> Recording:
         of_interest=tuple(rows[track] for track in interest if track in rows),
         tags={"source_format": "gpudrive"},
         lost=parsing.nonzero(unknown_roads=unknown, one_point_features=parsing.one_point_features(features)),
-        split_gap_m=_split_gap_m(features),
+        # In files whose points were thinned a jump looks like any other gap.
+        split_gap_m=_SPLIT_GAP_M if spacing is not None and spacing <= _DENSE_M else None,
     )
 
 
@@ -185,15 +207,15 @@ def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
     """Numbers of a list of dictionaries, ``[row, key]``."""
     try:
         table = np.array([[row[key] for key in keys] for row in rows], np.float64)
+        if table.size and table.shape != (len(rows), len(keys)):
+            raise ValueError("values are lists")
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise DataError(f"{what} is no list of numbers {', '.join(keys)}", cure=_SKIP) from error
-    if table.size and table.shape != (len(rows), len(keys)):
-        raise DataError(f"{what} is no list of numbers {', '.join(keys)}", cure=_SKIP)
     return table.reshape(-1, len(keys))
 
 
 def _columns(row: Any, names: Sequence[str], what: str) -> list[list[Any]]:
-    """Lists of one length that a dictionary holds."""
+    """Lists of equal length in a dictionary."""
     lists = [row.get(name) for name in names] if isinstance(row, Mapping) else []
     columns = [values for values in lists if isinstance(values, list)]
     if len(columns) < len(names) or len({len(values) for values in columns}) != 1:
@@ -202,7 +224,7 @@ def _columns(row: Any, names: Sequence[str], what: str) -> list[list[Any]]:
 
 
 def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
-    """Ids of objects or roads; their numbers where none has an id."""
+    """Ids of objects or roads; their indices where none has an id."""
     given = [row.get("id") for row in rows]
     if all(number is None for number in given):
         return list(range(len(given)))
@@ -214,8 +236,7 @@ def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
 
 def _tracks(objects: Sequence[Mapping[str, Any]]) -> Tracks:
     table, valid = _states(objects)
-    empty = (table[..., :2] == _INVALID).all(axis=-1)
-    valid &= ~empty
+    valid &= ~(table[..., :2] == _INVALID).all(axis=-1)
     table = np.where(valid[..., None], table, 0.0)
     if not (np.abs(table) <= _LARGEST).all():
         raise DataError("valid states hold numbers that are not finite or beyond reason", cure=_SKIP)
@@ -235,7 +256,7 @@ def _tracks(objects: Sequence[Mapping[str, Any]]) -> Tracks:
 
 
 def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:
-    """x, y, z, heading, vx, vy of every object and step, and which are valid."""
+    """x, y, z, heading, vx, vy of every object and step, and their mask."""
     if not objects:
         raise DataError("has no objects", cure=_SKIP)
     first = objects[0].get("valid")
@@ -249,18 +270,18 @@ def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:
         if len(position) != steps:
             raise DataError(f"object {row} has {len(position)} states, {steps} steps", cure=_SKIP)
         headings = [{"heading": value} for value in heading]
-        parts = (
+        columns = (
             _table(position, "xyz", f"the position of object {row}"),
             _table(headings, ("heading",), f"the heading of object {row}"),
             _table(velocity, "xy", f"the velocity of object {row}"),
         )
-        tables.append(np.concatenate(parts, axis=1))
+        tables.append(np.concatenate(columns, axis=1))
         marks.append([mark is True or mark == 1 for mark in valid])
     return np.stack(tables), np.array(marks, bool)
 
 
 def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...], int]:
-    """Map features in order of the file, and how many roads are of no known kind."""
+    """Map features in order of the file, and the number of roads of unknown kind."""
     ids = _ids(roads, "roads")
     features, unknown = [], 0
     for number, road in zip(ids, roads, strict=True):
@@ -277,21 +298,17 @@ def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...
     return tuple(features), unknown
 
 
-def _split_gap_m(features: Sequence[MapFeature]) -> float | None:
-    """Where to cut polylines; None for files whose points were thinned, where a jump looks like any other gap."""
-    spacing = parsing.spacing_m(features)
-    return _SPLIT_GAP_M if spacing is not None and spacing <= _DENSE_M else None
-
-
 def _lights(states: Any, steps: int) -> tuple[Light, ...]:
-    """Lights by lane: a dictionary of lists, one entry per observation."""
+    """Lights by lane, from a dictionary of lists with one entry per observation."""
     if not states:
         return ()
     if not isinstance(states, Mapping):
         raise DataError("tl_states is no dictionary of lanes", cure=_SKIP)
     lights = parsing.Lights(steps)
     for lane, seen in states.items():
-        lane_id, what = _lane_id(lane), f"tl_states of lane {str(lane)[:40]}"
+        if not (lane.isascii() and lane.isdigit() and len(lane) < 11):
+            raise DataError(f"tl_states names lane {lane[:40]!r}, which is no id", cure=_SKIP)
+        what = f"tl_states of lane {lane[:40]}"
         times, seen_states, *place = _columns(seen, ("time_index", "state", "x", "y", "z"), what)
         when = parsing.rows_within([_whole(step, what) for step in times], steps, what)
         rows = [dict(zip("xyz", point, strict=True)) for point in zip(*place, strict=True)]
@@ -299,20 +316,90 @@ def _lights(states: Any, steps: int) -> tuple[Light, ...]:
         if not (np.abs(points) <= _LARGEST).all():
             raise DataError(f"{what} is not at a finite place", cure=_SKIP)
         for step, state, point in zip(when, seen_states, points.tolist(), strict=True):
-            lights.observe(step, lane_id, _light_state(state), point)
+            lights.observe(step, int(lane), _light_state(state), point)
     return lights.collected()
 
 
-def _lane_id(lane: str) -> int:
-    if not (lane.isascii() and lane.isdigit() and len(lane) < 11):
-        raise DataError(f"tl_states names lane {lane[:40]!r}, which is no id", cure=_SKIP)
-    return int(lane)
-
-
 def _light_state(state: Any) -> int:
-    """A state by its word, as GPUDrive's converter writes it, or by WOMD's number; UNKNOWN otherwise."""
+    """A state by its name, as GPUDrive's converter writes it, or by WOMD's number; UNKNOWN otherwise."""
     word = str(state).upper()
     if word in LightState.__members__ and word != LightState.UNOBSERVED.name:
         return int(LightState[word])
     known = type(state) is int and LightState.UNKNOWN <= state <= LightState.FLASHING_CAUTION
     return state if known else int(LightState.UNKNOWN)
+
+
+def file_name(row: int) -> str:
+    """Return the file name of a scenario, with the prefix that GPUDrive's loader expects."""
+    return f"tfrecord-00000-of-00001_{row}.json"
+
+
+def gpudrive_scene(scenario: Scenario, name: str) -> dict[str, Any]:
+    """Return the scene of a scenario as plain JSON values.
+
+    Positions are in the source's frame, to a tenth of a millimetre; invalid steps are -10000. Ego is the last object,
+    as in the published files; ``mark_as_expert`` is false for all.
+    """
+    recording = restore(scenario)
+    count = len(recording.tracks.kind)
+    rows = [*(row for row in range(count) if row != recording.ego), recording.ego]
+    place = {row: number for number, row in enumerate(rows)}
+    ids = recording.tracks.track_id
+    return {
+        "name": name,
+        "scenario_id": recording.scenario_id,
+        "objects": [_object(recording, row) for row in rows],
+        "roads": [
+            {
+                "geometry": _points(feature.points),
+                "type": _ROAD_TYPES[feature.kind],
+                "map_element_id": int(feature.kind),
+                "id": feature.feature_id,
+            }
+            for feature in recording.features
+        ],
+        "tl_states": {str(light.lane_id): _light(light) for light in recording.lights},
+        "metadata": {
+            "sdc_track_index": place[recording.ego],
+            "objects_of_interest": [int(ids[row]) for row in recording.of_interest],
+            "tracks_to_predict": [
+                {"track_index": place[row], "difficulty": 0} for row in recording.to_predict
+            ],
+        },
+    }
+
+
+def _points(points: _Array) -> list[dict[str, float]]:
+    return [dict(zip("xyz", point, strict=False)) for point in np.round(points, _DIGITS).tolist()]
+
+
+def _object(recording: Recording, row: int) -> dict[str, Any]:
+    tracks = recording.tracks
+    valid = tracks.valid[row]
+    last = np.flatnonzero(valid)[-1]
+    position = np.column_stack((tracks.xy[row], tracks.z[row]))
+    length, width, height = tracks.size[row, last].tolist()
+    return {
+        "position": _points(np.where(valid[:, None], position, _INVALID)),
+        "width": width,
+        "length": length,
+        "height": height,
+        "heading": np.round(np.where(valid, tracks.heading[row], _INVALID), _DIGITS + 2).tolist(),
+        "velocity": _points(np.where(valid[:, None], tracks.velocity[row], _INVALID)),
+        "valid": valid.tolist(),
+        "goalPosition": _points(position[last : last + 1])[0],
+        "type": _AGENT_TYPES.get(AgentKind(int(tracks.kind[row])), "other"),
+        "id": int(tracks.track_id[row]),
+        "mark_as_expert": False,
+    }
+
+
+def _light(light: Light) -> dict[str, list[Any]]:
+    """One entry per observation, as GPUDrive's converter writes them."""
+    seen = np.flatnonzero(light.states >= 0)
+    (point,) = _points(light.stop_point[None])
+    return {
+        "state": [LightState(int(light.states[step])).name.lower() for step in seen],
+        **{axis: [value] * len(seen) for axis, value in point.items()},
+        "time_index": seen.tolist(),
+    }

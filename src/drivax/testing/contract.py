@@ -1,23 +1,28 @@
-"""Rules of pure functions that all checks share, and their error messages."""
+"""Rules of pure functions, which all checks share, and their error messages."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from drivax.errors import DrivaxError
+from drivax.plugins import find_named
 
 #: Tolerances: sums in another order; maps rotated in float32.
 CLOSE, TURNED = 1e-4, 5e-3
 #: Share of moments at which a threshold may flip in a rotated world.
 _FLIPS = 0.05
+#: Changes of a world that must not change results, and cures; ``worlds`` has them for banks and frames in this order.
+_VARIANTS = (
+    ("the rows of absent agents change", "mask with frame.valid first"),
+    ("empty slots are added", "mask with frame.valid, also before a mean"),
+    ("the order of agents changes", "let no result depend on a slot: sort by distance, or reduce over all"),
+)
 _PYTHON = (
-    jax.errors.TracerBoolConversionError,
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
     jax.errors.ConcretizationTypeError,
@@ -26,17 +31,19 @@ _PYTHON = (
 
 
 class BrokenContract(DrivaxError, AssertionError):
-    """A component breaks a rule; one line with the rule and the cure."""
+    """A component breaks a rule; the message names the rule and the cure."""
 
 
 def expect(condition: Any, problem: str, cure: str) -> None:
-    """Raise unless a condition holds.
-
-    Raises:
-        BrokenContract: ``condition`` is false.
-    """
+    """Raise :class:`BrokenContract` unless a condition holds."""
     if not condition:
         raise BrokenContract(problem, cure=cure)
+
+
+def instance(component: Any) -> Any:
+    """Return a component, also from its class or a dotted name of either."""
+    component = find_named(component) if isinstance(component, str) else component
+    return component() if isinstance(component, type) else component
 
 
 @contextlib.contextmanager
@@ -45,23 +52,23 @@ def _tracing_errors(what: str) -> Iterator[None]:
     try:
         yield
     except _PYTHON as error:
-        raise BrokenContract(
-            f"{what} cannot be compiled: Python needs the value of a traced array",
-            cure="use jnp.where instead of if, and jnp instead of numpy, float() or int()",
-        ) from error
+        problem = f"{what} cannot be compiled: Python needs the value of a traced array"
+        cure = "use jnp.where instead of if, and jnp instead of numpy, float() or int()"
+        raise BrokenContract(problem, cure=cure) from error
 
 
-def compiled(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result of a function under ``jit``, freshly traced, as numpy arrays.
+def form(leaf: Any) -> str:
+    """Return type and shape of an array, as in ``float32[3, 2]``."""
+    return f"{leaf.dtype}{list(leaf.shape)}"
 
-    Raises:
-        BrokenContract: The function cannot be compiled.
-    """
-    return program(what, function)(*arguments)
+
+def layout(tree: Any) -> Any:
+    """Return structure, types and shapes of a tree, to compare."""
+    return jax.tree.structure(tree), [form(leaf) for leaf in jax.tree.leaves(tree)]
 
 
 def program(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a jitted function with numpy results; calls raise :class:`BrokenContract` if it cannot be compiled."""
+    """Return a freshly jitted function with numpy results; it raises :class:`BrokenContract` if tracing fails."""
     run = jax.jit(lambda *values: function(*values))
 
     def call(*arguments: Any) -> Any:
@@ -72,64 +79,39 @@ def program(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def forms(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the shapes and types of a function's results.
-
-    Raises:
-        BrokenContract: The function cannot be compiled.
-    """
+    """Return the shapes and types of a function's results; raise :class:`BrokenContract` if tracing fails."""
     with _tracing_errors(what):
         return jax.eval_shape(function, *arguments)
 
 
 class Program:
-    """A function of one row, batched and compiled.
-
-    Args:
-        what: Name in messages.
-        function: The function.
-        in_axes: 0 for batched arguments, None for shared ones.
-    """
+    """A function of one row, named ``what`` in messages, batched (``in_axes`` of ``jax.vmap``) and compiled."""
 
     def __init__(
         self, what: str, function: Callable[..., Any], in_axes: tuple[int | None, ...] = (0,)
     ) -> None:
         self.what, self.function, self.in_axes = what, function, in_axes
-        self._run = self._compiled()
-
-    def _compiled(self) -> Callable[..., Any]:
-        batched = jax.vmap(self.function, self.in_axes)
-        return jax.jit(lambda *arguments: batched(*arguments))
+        self._batched = jax.vmap(function, in_axes)
+        self._run = program(what, self._batched)
 
     def __call__(self, *arguments: Any) -> Any:
-        """Return the results for all rows as numpy arrays.
-
-        Raises:
-            BrokenContract: The function cannot be compiled.
-        """
-        with _tracing_errors(self.what):
-            return jax.device_get(self._run(*arguments))
+        """Return the results for all rows as numpy arrays."""
+        return self._run(*arguments)
 
     def check_pure(self, *arguments: Any) -> Any:
         """Check that results do not depend on compilation, batching or repetition, and return them."""
         what, results = self.what, self(*arguments)
-        expect(
-            same(results, jax.device_get(self._compiled()(*arguments)), 0.0),
-            f"{what} is not deterministic",
-            "take randomness from a key, and keep no state between calls",
-        )
+        repeated = same(results, program(what, self._batched)(*arguments), 0.0)
+        cure = "take randomness from a key, and keep no state between calls"
+        expect(repeated, f"{what} is not deterministic", cure)
         pairs = zip(arguments, self.in_axes, strict=True)
         row = [value if axis is None else jax.tree.map(lambda leaf: leaf[0], value) for value, axis in pairs]
         first = jax.tree.map(lambda leaf: leaf[0], results)
-        expect(
-            same(first, compiled(what, self.function, *row), CLOSE),
-            f"{what} differs in a batch",
-            "write it for one agent in one scenario; vmap adds the batch",
-        )
-        expect(
-            same(first, jax.device_get(self.function(*row)), CLOSE),
-            f"{what} differs when compiled",
-            "let the result depend on the arguments only",
-        )
+        single = same(first, program(what, self.function)(*row), CLOSE)
+        cure = "write it for one agent in one scenario; vmap adds the batch"
+        expect(single, f"{what} differs in a batch", cure)
+        eager = same(first, jax.device_get(self.function(*row)), CLOSE)
+        expect(eager, f"{what} differs when compiled", "let the result depend on the arguments only")
         return results
 
 
@@ -139,18 +121,20 @@ def check_numbers(what: str, values: Any, reads: str = "a division, a root or a 
         broken = ~np.isfinite(leaf)
         if broken.any():
             rows = broken.reshape(len(leaf), -1).any(axis=1) if leaf.ndim else broken[None]
-            raise BrokenContract(
-                f"{what} is not finite at {int(rows.sum())} of {len(rows)} moments",
-                cure=f"guard {reads} with jnp.where on its input",
-            )
+            problem = f"{what} is not finite at {int(rows.sum())} of {len(rows)} moments"
+            raise BrokenContract(problem, cure=f"guard {reads} with jnp.where on its input")
+
+
+def check_variants(
+    what: str, results: Any, variants: Sequence[Any], run: Callable[[Callable[..., Any]], Any]
+) -> None:
+    """Check that ``run`` gives the same results in ``worlds.BANK_VARIANTS`` or ``worlds.FRAME_VARIANTS``."""
+    for variant, (cause, cure) in zip(variants, _VARIANTS, strict=True):
+        check_same(what, results, run(variant), cause, cure)
 
 
 def check_same(what: str, result: Any, changed: Any, cause: str, cure: str) -> None:
-    """Check that two results agree at all moments.
-
-    Raises:
-        BrokenContract: They differ; ``cause`` completes "changes when".
-    """
+    """Check that two results agree at all moments; ``cause`` completes "changes when"."""
     expect(same(result, changed, CLOSE), f"{what} changes when {cause}", cure)
 
 
@@ -171,18 +155,7 @@ def same(left: Any, right: Any, tolerance: float) -> bool:
     """Whether two trees have equal structure and shapes, and values within a tolerance."""
     if jax.tree.structure(left) != jax.tree.structure(right):
         return False
-    pairs = zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True)
     return all(
         np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True)
-        for a, b in pairs
-    )
-
-
-def check_scalar(what: str, value: Any) -> None:
-    """Check that each row is one float32 number."""
-    leaf = np.asarray(value)
-    expect(
-        leaf.ndim == 1 and leaf.dtype == jnp.float32,
-        f"{what} gives {leaf.dtype}{list(leaf.shape[1:])} instead of one float32 number",
-        "reduce it to a scalar, and convert booleans with .astype(jnp.float32)",
+        for a, b in zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True)
     )

@@ -1,4 +1,4 @@
-"""Checks of reward terms and metrics."""
+"""Checks of reward terms, metrics and observation features."""
 
 from __future__ import annotations
 
@@ -13,123 +13,152 @@ from drivax.metrics.catalogue import EpisodeEnd, Metric
 from drivax.metrics.scores import Value
 from drivax.metrics.steps import Moment
 from drivax.plugins import find_named
-from drivax.simulator.types import FACTS, ON_REQUEST
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.log import alone
+from drivax.simulator.types import FACTS, ON_REQUEST, AgentContext, Frame
+from drivax.tasks.observations import Feature, OwnGroup
 from drivax.tasks.own import name_of
 from drivax.tasks.rewards import Term
+from drivax.tasks.task import Task
 from drivax.testing import worlds
 from drivax.testing.contract import (
     Program,
     check_numbers,
     check_same,
-    check_scalar,
     check_turned,
+    check_variants,
     expect,
+    form,
+    instance,
 )
-from drivax.testing.worlds import Moments
+from drivax.testing.worlds import ANGLE, Moments
 
-#: Rotation of worlds, rad.
-ANGLE = 1.3
+#: Bound of features: the Gymnasium adapter clips there.
+LARGEST = 100.0
+#: Step after which the log is changed, to check that a feature does not see the future.
+_NOW = 45
 
 
 def check_reward(term: Term | str) -> None:
-    """Check a reward term.
+    """Check a reward term or its dotted name; raise :class:`BrokenContract` if it breaks a rule.
 
     It is a pure function of facts before, facts now and surroundings, and one finite float32 number. It does not
     depend on compilation, batching, rotation and shift of the world, the order of agents, padding, or rows of absent
     agents.
-
-    Args:
-        term: The term, or its dotted name.
-
-    Raises:
-        BrokenContract: It breaks a rule; the message names rule and cure.
     """
-    function: Any = find_named(term) if isinstance(term, str) else term
-    function = function() if isinstance(function, type) else function
-    what = f"reward term {name_of(function)!r}"
+    function = instance(term)
 
     def value(moment: Moments) -> Any:
         return function(moment.before, moment.situation.facts, moment.situation.surroundings)
 
-    _check_moments(what, value, check_scalar)
+    _check_moments(f"reward term {name_of(function)!r}", value)
 
 
 def check_metric(metric: Metric | str) -> None:
-    """Check a metric.
+    """Check a metric or its dotted name; raise :class:`BrokenContract` if it breaks a rule.
 
     Its step value is a number and whether it is defined, under the rules of :func:`check_reward` where it is defined.
     It declares all facts that it reads, has unit, direction and text, and computes a finite ``Value`` at the end of an
     episode where it is defined.
-
-    Args:
-        metric: The metric, or its dotted name.
-
-    Raises:
-        BrokenContract: It breaks a rule; the message names rule and cure.
     """
     what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.definition!r}"
     spec: Any = find_named(metric) if isinstance(metric, str) else metric
     expect(isinstance(spec, Metric), f"{what} is not a Metric", "see metrics.catalogue.Metric")
-    expect(
-        spec.unit and spec.definition,
-        f"{what} has no unit or definition",
-        "tables and reports print them; '-' is the unit of fractions",
-    )
+    cure = "tables and reports print them; '-' is the unit of fractions"
+    expect(spec.unit and spec.definition, f"{what} has no unit or definition", cure)
     if spec.step_value is not None:
         step = spec.step_value
 
         def value(moment: Moments) -> tuple[Any, Any]:
-            now = Moment(moment.situation, moment.start, jnp.ones((), bool))
-            number, defined = step.read(now)
+            number, defined = step.read(Moment(moment.situation, moment.start, jnp.ones((), bool)))
             number = jnp.asarray(number)
             defined = jnp.broadcast_to(jnp.asarray(defined, bool), number.shape)
             return jnp.where(defined, number.astype(jnp.float32), 0.0), defined
 
-        _check_moments(what, value, check_scalar if not step.delayed else _check_rows)
+        _check_moments(what, value, step.delayed)
         _check_reads(what, value, step.reads)
     if spec.compute is not None:
         _check_computed(what, spec)
 
 
-def _check_moments(
-    what: str, value: Callable[[Moments], Any], check_shape: Callable[[str, Any], None]
-) -> None:
+def check_feature(feature: Feature | str) -> None:
+    """Check an observation feature or its dotted name; raise :class:`BrokenContract` if it breaks a rule.
+
+    It is a pure function of bank, context and frames: finite float32 up to 100 with features last, or a pair of those
+    and a mask over rows. It does not depend on compilation, batching, the log's future, rotation and shift of the
+    world, the order of agents, padding, or rows of absent agents.
+    """
+    function: Any = find_named(feature) if isinstance(feature, str) else feature
+    group = OwnGroup(function)
+    what = f"observation feature {group.name!r}"
+    simulator = Simulator(Task())
+
+    def seen(bank: ScenarioBank, context: AgentContext) -> Any:
+        def frames(back: int) -> Frame:
+            return simulator.frame(bank, context, alone(context), back)
+
+        _check_form(what, function(bank, context, frames))
+        return group.observe(bank, context, frames)
+
+    program = Program(what, seen, (None, 0))
+    bank, contexts = worlds.worlds(), worlds.moments().situation.context
+    results = program.check_pure(bank, contexts)
+    check_numbers(what, results)
+    largest = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(results))
+    expect(largest <= LARGEST, f"{what} reaches {largest:g}", "scale it to about [-1, 1] (units: tasks.view)")
+    check_numbers(what, program(worlds.without_others(bank), contexts))
+    check_variants(what, results, worlds.BANK_VARIANTS, lambda change: program(change(bank), contexts))
+    present = np.asarray(contexts.step) == _NOW
+    later = program(worlds.other_future(bank, _NOW), contexts)
+    now, later = (jax.tree.map(lambda leaf: leaf[present], result) for result in (results, later))
+    cure = "read the context and its frames; of the bank only map, route 0, goal and the current step"
+    check_same(what, now, later, "the log's future changes", cure)
+    turned = program(worlds.worlds(ANGLE), worlds.moments(ANGLE).situation.context)
+    check_turned(what, results, turned)
+
+
+def _check_form(what: str, rows: Any) -> None:
+    """Check shapes and types, while tracing."""
+    value, mask = rows if isinstance(rows, tuple) else (rows, None)
+    valid = value.dtype == jnp.float32 and value.ndim >= 1
+    cure = "return float32 with features on the last axis"
+    expect(valid, f"{what} gives {form(value)} for a context", cure)
+    if mask is not None:
+        valid = mask.dtype == bool and mask.shape == value.shape[:-1] and mask.ndim > 0
+        problem = f"{what} gives {form(mask)} as the mask of {list(value.shape)}"
+        expect(valid, problem, "return one boolean per row")
+
+
+def _check_moments(what: str, value: Callable[[Moments], Any], delayed: bool = False) -> None:
     moments, program = worlds.moments(), Program(what, value)
     results = program.check_pure(moments)
-    check_shape(what, results[0] if isinstance(results, tuple) else results)
+    number = np.asarray(results[0] if isinstance(results, tuple) else results)
+    if delayed:
+        problem = f"{what} is delayed but returns no row of numbers"
+        expect(number.ndim == 2, problem, "return one number and one mask entry per step")
+    else:
+        problem = f"{what} gives {form(number[0])} instead of one float32 number"
+        cure = "reduce it to a scalar, and convert booleans with .astype(jnp.float32)"
+        expect(number.ndim == 1 and number.dtype == jnp.float32, problem, cure)
     frame = moments.situation.surroundings.frame
+
+    def changed(change: Callable[[Frame], Frame]) -> Any:
+        return program(worlds.with_frame(moments, change(frame)))
+
     check_numbers(what, results)
     check_numbers(what, program(worlds.extremes(moments)))
-    check_numbers(what, program(worlds.with_frame(moments, worlds.frame_without_others(frame))))
-    variants = (
-        (worlds.scattered_frame, "the rows of absent agents change", "mask with frame.valid first"),
-        (worlds.padded_frame, "empty slots are added", "mask with frame.valid, also before a mean"),
-        (
-            worlds.shuffled_frame,
-            "the order of agents changes",
-            "reduce over all of them; slot 0 is ego",
-        ),
-    )
-    for change, cause, cure in variants:
-        check_same(what, results, program(worlds.with_frame(moments, change(frame))), cause, cure)
+    check_numbers(what, changed(worlds.frame_without_others))
+    check_variants(what, results, worlds.FRAME_VARIANTS, changed)
     check_turned(what, results, program(worlds.moments(ANGLE)))
-
-
-def _check_rows(what: str, value: Any) -> None:
-    expect(
-        np.asarray(value).ndim == 2,
-        f"{what} is delayed but returns no row of numbers",
-        "return one number and one mask entry per step",
-    )
 
 
 def _check_reads(what: str, value: Callable[[Moments], Any], reads: frozenset[str]) -> None:
     """Check that a value computes without the facts that it does not declare."""
     unknown = sorted(reads - FACTS - ON_REQUEST)
     expect(not unknown, f"{what} reads unknown fact {unknown[:1]}", "see simulator.types.Facts")
-    moments = worlds.without_facts(worlds.moments(), reads)
     try:
-        Program(what, value)(moments)
+        Program(what, value)(worlds.without_facts(worlds.moments(), reads))
     except (AttributeError, TypeError, ValueError) as error:
         expect(False, f"{what} reads a fact that 'reads' does not declare ({error})", "add it to reads")
 
@@ -139,7 +168,6 @@ def _check_computed(what: str, metric: Metric) -> None:
     compute = metric.compute
     assert compute is not None
     bank = worlds.worlds()
-    grid = jnp.linspace(0.0, 1.0, 12)
 
     def value(row: Any, number: Any, defined: Any) -> Any:
         ending = EpisodeEnd(bank, row, jnp.asarray(10), jnp.asarray(80))
@@ -148,11 +176,9 @@ def _check_computed(what: str, metric: Metric) -> None:
 
     program = Program(what, value, (0, 0, 0))
     for defined in (True, False):
-        rows = (jnp.arange(12) % len(bank), grid, jnp.full(12, defined))
+        rows = (jnp.arange(12) % len(bank), jnp.linspace(0.0, 1.0, 12), jnp.full(12, defined))
         result = program.check_pure(*rows) if defined else program(*rows)
-        expect(
-            isinstance(result, Value) and result.value.shape == (12,) and result.defined.dtype == bool,
-            f"{what} does not compute a Value of one number and one boolean",
-            "return drivax.metrics.scores.Value(number, defined)",
-        )
+        valid = isinstance(result, Value) and result.value.shape == (12,) and result.defined.dtype == bool
+        cure = "return drivax.metrics.scores.Value(number, defined)"
+        expect(valid, f"{what} does not compute a Value of one number and one boolean", cure)
         check_numbers(what, jax.tree.map(lambda leaf, d=result.defined: np.where(d, leaf, 0.0), result.value))

@@ -1,6 +1,6 @@
 """Small worlds for checks, and variants of them that must not change results.
 
-Variants: rotation and shift of the map, order of agents, amount and content of padding, the future of the log.
+Variants: rotation and shift of the map, order of agents, size and content of padding, the future of the log.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.situation import measure
 from drivax.simulator.traffic.log import alone
-from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Frame, Situation, Surroundings
+from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Frame, Situation
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task
 
@@ -37,6 +37,8 @@ _RECORDINGS = (0, 6, 8)
 _STEPS = (30, 45, 60, 75)
 #: Offsets of ego from its log: to the left (m), heading (rad), factor of speed.
 _OFFSETS = ((0.0, 0.0, 1.0), (1.7, 0.2, 1.5), (-4.0, -0.3, 0.0), (3.6, 3.0, 1.0), (-9.0, 0.1, 2.5))
+#: Rotation of worlds, rad.
+ANGLE = 1.3
 #: Content of padding that must not matter.
 GARBAGE = 777.0
 _CAPACITY = replace(CAPACITIES["default"], name="testing", agents=40, parked=24)
@@ -44,13 +46,7 @@ _CAPACITY = replace(CAPACITIES["default"], name="testing", agents=40, parked=24)
 
 @record
 class Moments:
-    """Measured moments, one per row.
-
-    Attributes:
-        before: Facts of the step before.
-        situation: The situation now.
-        start: Step at which the episode began.
-    """
+    """Facts of the step before, the situation now, and the first step of the episode; one moment per row."""
 
     before: Facts
     situation: Situation
@@ -118,18 +114,18 @@ def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Si
     return measure(bank, context, now, previous, apart, remember_lights(bank, context), FACTS | ON_REQUEST)[0]
 
 
-def shuffled_frame(frame: Frame, seed: int = 0) -> Frame:
+def shuffled_frame(frame: Frame) -> Frame:
     """Permute the slots of agents; the driven agent stays in slot 0."""
-    order = order_of(frame.valid.shape[-1], seed)
+    order = order_of(frame.valid.shape[-1])
     return _of_agents(lambda leaf: leaf[:, order], frame)
 
 
-def padded_frame(frame: Frame, slots: int = 8) -> Frame:
+def padded_frame(frame: Frame) -> Frame:
     """Append empty slots with garbage."""
 
     def pad(leaf: Array) -> Array:
         fill = False if leaf.dtype == bool else GARBAGE
-        more = jnp.full((leaf.shape[0], slots, *leaf.shape[2:]), fill).astype(leaf.dtype)
+        more = jnp.full((leaf.shape[0], 8, *leaf.shape[2:]), fill).astype(leaf.dtype)
         return jnp.concatenate([leaf, more], axis=1)
 
     return _of_agents(pad, frame)
@@ -158,9 +154,8 @@ def _of_agents(change: Callable[[Array], Array], frame: Frame) -> Frame:
 
 def with_frame(moments: Moments, frame: Frame) -> Moments:
     """Replace the frames of moments."""
-    around = moments.situation.surroundings
-    around = Surroundings(frame, around.lanes, around.route)
-    return replace(moments, situation=Situation(moments.situation.context, moments.situation.facts, around))
+    around = replace(moments.situation.surroundings, frame=frame)
+    return replace(moments, situation=replace(moments.situation, surroundings=around))
 
 
 def extremes(moments: Moments) -> Moments:
@@ -178,20 +173,19 @@ def without_facts(moments: Moments, reads: frozenset[str]) -> Moments:
     """Remove all facts but these."""
 
     def only(facts: Facts) -> Facts:
+        # replace() would check the types of the fields.
         return jax.tree_util.tree_map_with_path(
             lambda path, fact: fact if path[0].name in reads else None, facts
         )
 
-    situation = Situation(
-        moments.situation.context, only(moments.situation.facts), moments.situation.surroundings
-    )
-    return Moments(only(moments.before), situation, moments.start)
+    situation = replace(moments.situation, facts=only(moments.situation.facts))
+    return replace(moments, before=only(moments.before), situation=situation)
 
 
-def shuffled(bank: ScenarioBank, seed: int = 0) -> ScenarioBank:
+def shuffled(bank: ScenarioBank) -> ScenarioBank:
     """Permute the slots of agents; ego stays in slot 0."""
-    moving = order_of(bank.agents.shape[2], seed)
-    parked = np.random.default_rng(seed).permutation(np.arange(len(moving), bank.parked.shape[1]))
+    moving = order_of(bank.agents.shape[2])
+    parked = np.random.default_rng(0).permutation(np.arange(len(moving), bank.parked.shape[1]))
     slots = np.concatenate([moving, parked])
     return replace(
         bank,
@@ -232,7 +226,7 @@ def without_others(bank: ScenarioBank) -> ScenarioBank:
 
 
 def other_future(bank: ScenarioBank, step: int) -> ScenarioBank:
-    """Change the log after ``step``: other motions and lights, no log path. Route and goal stay: ego knows them."""
+    """Change the log after ``step``: other motions and lights, no log path. Ego knows route and goal, so they stay."""
     later = jnp.arange(bank.steps) > step
     moved = bank.agents.at[..., AgentColumn.XY].add(13.0).at[..., AgentColumn.VELOCITY].multiply(-1.0)
     moved = moved.at[..., AgentColumn.VALID].set(1.0 - bank.agents[..., AgentColumn.VALID])
@@ -248,7 +242,11 @@ def other_future(bank: ScenarioBank, step: int) -> ScenarioBank:
     )
 
 
-def order_of(slots: int, seed: int = 0) -> Any:
+def order_of(slots: int) -> Any:
     """Return the former slot of each slot of a permuted world."""
-    order = np.random.default_rng(seed).permutation(np.arange(1, slots))
-    return np.concatenate([[0], order])
+    return np.append(0, np.random.default_rng(0).permutation(np.arange(1, slots)))
+
+
+#: Variants of banks and frames in the order of ``contract.check_variants``.
+BANK_VARIANTS = (scattered, padded, shuffled)
+FRAME_VARIANTS = (scattered_frame, padded_frame, shuffled_frame)

@@ -1,18 +1,18 @@
-"""Scenarios as tf.Examples of the Waymo Open Motion Dataset: what Waymax and V-Max read.
+"""Scenarios as tf.Examples of the Waymo Open Motion Dataset, which Waymax and V-Max read.
 
-Names, types, shapes and the value -1 for what is missing are those of the motion dataset (waymo.com/open/data/motion/
-tfexample); ``path_samples`` and ``roadgraph_samples/speed_limit`` are those of ScenarioMax, which V-Max trains on.
+Names, types, shapes and -1 for missing values are those of the motion dataset (waymo.com/open/data/motion/tfexample);
+``path_samples`` and ``roadgraph_samples/speed_limit`` are those of ScenarioMax, which V-Max trains on.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from drivax.datasets.export.recording import restore
 from drivax.datasets.parsing import MPS_PER_MPH
@@ -34,20 +34,20 @@ _Array = np.ndarray[Any, Any]
 
 AGENTS, LIGHTS, POINTS = 128, 16, 30_000
 _SPANS = {"past": slice(0, 10), "current": slice(10, 11), "future": slice(11, STEPS)}
-#: Tracks to predict that come before all others.
+#: Most tracks to predict that come before all others.
 _FIRST = 8
-#: Just under 1 m, so that rounding never makes a gap of more: readers cut polylines there.
+#: Just under 1 m, so that rounding makes no longer gap, where readers cut polylines.
 _SPACING_M = 0.998
-#: Absolute coordinates are written up to here, where float32 is exact to half a millimetre.
+#: Largest absolute coordinate that is written; up to it float32 is exact to half a millimetre.
 _ABSOLUTE_M = 16_384.0
-#: float32 holds whole numbers up to here.
+#: Ends of the whole numbers that float32 and int32 hold.
 _FLOAT_ID_END, _INT_ID_END = 2**24, 2**31
-#: Order of the official writer; what is later is cut off first by readers that take fewer points.
+#: Order of the official writer; readers that take fewer points cut off the end.
 _ORDER = (
     *LANE_KINDS, *LINE_KINDS, RoadKind.STOP_SIGN, RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, *EDGE_KINDS,
     RoadKind.DRIVEWAY,
 )  # fmt: skip
-#: A path is on the route where the log keeps this near to it for most of its steps.
+#: A path is on the route if the log is this close to it for this share of its steps.
 _ON_ROUTE_M, _ON_ROUTE_SHARE = 1.5, 0.95
 
 
@@ -66,15 +66,11 @@ PATHS = {"vmax": Paths(10, 300, 1.0), "published": Paths(10, 500, 0.5)}
 def tf_example(
     scenario: Scenario, paths: Paths = PATHS["vmax"]
 ) -> tuple[dict[str, bytes | _Array], Counter[str]]:
-    """The features of one scenario by name, and what did not fit by name.
+    """Return the features of a scenario and counts of what did not fit, both by name.
 
-    Coordinates are the source's own (float32, as in the data set) where all are below 16,384 m, else relative to the
-    ego at the current step: UTM coordinates would be rounded to half a metre. Ids that their type cannot hold exactly
-    (agents: float32, map: int32) are replaced by running numbers.
-
-    Args:
-        scenario: Any stored scenario.
-        paths: Form of ``path_samples``.
+    Coordinates are the source's (float32, as in the data set) where all are below 16,384 m, else relative to ego at the
+    current step: UTM coordinates would be rounded to half a metre. Ids that their type cannot hold exactly (agents:
+    float32, map: int32) are replaced by running numbers.
     """
     recording = restore(scenario)
     tracks, lost = _over_time(recording)
@@ -82,7 +78,7 @@ def tf_example(
     order = _order(tracks, recording)
     lost["agents"] += max(len(order) - AGENTS, 0)
     micros = np.round(np.arange(STEPS) * float(scenario.dt_s) * 1e6).astype(np.int64)
-    numbers = _numbers([feature.feature_id for feature in recording.features], recording)
+    numbers = _numbers(recording)
     features = {"scenario/id": recording.scenario_id.encode()}
     features |= _states(tracks, order[:AGENTS], micros, origin) | _marks(tracks, recording, order[:AGENTS])
     features |= _lights(recording, numbers, micros, origin, lost)
@@ -92,29 +88,33 @@ def tf_example(
 
 
 def _origin(recording: Recording, local: _Array) -> _Array:
-    """What is subtracted from the source's coordinates."""
-    points = [recording.tracks.xy[recording.tracks.valid]] + [f.points[:, :2] for f in recording.features]
-    largest = max(float(np.abs(part).max(initial=0.0)) for part in points)
+    """The point that is subtracted from the source's coordinates."""
+    points = [recording.tracks.xy[recording.tracks.valid], *(f.points[:, :2] for f in recording.features)]
+    largest = max(float(np.abs(xy).max(initial=0.0)) for xy in points)
     return np.zeros(3) if largest < _ABSOLUTE_M else np.asarray(local, np.float64)
 
 
 def _over_time(recording: Recording) -> tuple[Tracks, Counter[str]]:
-    """Tracks over the 91 steps around the current one; steps that the recording lacks are not valid."""
+    """Tracks over the 91 steps around the current one, and the number of other steps; missing steps are not valid."""
     tracks = recording.tracks
-    steps = recording.current_step - CURRENT_STEP + np.arange(STEPS)
-    known = (steps >= 0) & (steps < tracks.valid.shape[1])
+    steps, known = _steps(recording)
     index = np.clip(steps, 0, tracks.valid.shape[1] - 1)
     timed = {name: getattr(tracks, name)[:, index] for name in ("xy", "z", "heading", "velocity", "size")}
     valid = tracks.valid[:, index] & known
-    cut = Tracks(**timed, valid=valid, kind=tracks.kind, track_id=tracks.track_id)
-    return cut, Counter(steps=int(tracks.valid.shape[1] - known.sum()))
+    return replace(tracks, **timed, valid=valid), Counter(steps=int(tracks.valid.shape[1] - known.sum()))
+
+
+def _steps(recording: Recording) -> tuple[_Array, _Array]:
+    """Steps of the recording around the current one, and whether it has them."""
+    steps = recording.current_step - CURRENT_STEP + np.arange(STEPS)
+    return steps, (steps >= 0) & (steps < len(recording.timestamps_s))
 
 
 def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
-    """Rows in the order of the file: the ego, then the data set's order.
+    """Rows in the order of the file: ego, which V-Max reads from row 0, then the data set's order.
 
-    There: up to 8 tracks to predict by id, then those that are valid now by their distance from the ego, then all
-    others, those with most valid steps first. The ego stands in front of them all because V-Max takes row 0 for it.
+    That is: up to 8 tracks to predict by id, then those that are valid now by their distance from ego, then all
+    others, those with most valid steps first.
     """
     now = tracks.valid[:, CURRENT_STEP]
     predicted = [row for row in recording.to_predict if now[row] and row != recording.ego]
@@ -128,11 +128,19 @@ def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
     return order[tracks.valid[order].any(axis=1)]
 
 
-def _padded(values: _Array, rows: int) -> _Array:
-    """The array with rows of -1 appended."""
-    out = np.full((rows, *values.shape[1:]), -1, values.dtype)
+def _padded(values: _Array, rows: int, fill: int = -1) -> _Array:
+    out = np.full((rows, *values.shape[1:]), fill, values.dtype)
     out[: len(values)] = values
     return out
+
+
+def _by_span(prefix: str, table: Mapping[str, _Array], axis: int) -> dict[str, _Array]:
+    """Columns cut into past, current step and future along their time axis."""
+    return {
+        f"{prefix}/{span}/{name}": column[(slice(None),) * axis + (steps,)]
+        for span, steps in _SPANS.items()
+        for name, column in table.items()
+    }
 
 
 def _states(tracks: Tracks, order: _Array, micros: _Array, origin: _Array) -> dict[str, _Array]:
@@ -153,38 +161,35 @@ def _states(tracks: Tracks, order: _Array, micros: _Array, origin: _Array) -> di
         "timestamp_micros": np.broadcast_to(micros, valid.shape),
     }
     table = {name: _padded(np.where(valid, column, -1), AGENTS) for name, column in columns.items()}
-    table["valid"] = np.maximum(_padded(valid.astype(np.int64), AGENTS), 0)
-    return {
-        f"state/{span}/{name}": column[:, part]
-        for span, part in _SPANS.items()
-        for name, column in table.items()
-    }
+    table["valid"] = _padded(valid.astype(np.int64), AGENTS, 0)
+    return _by_span("state", table, axis=1)
 
 
 def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Array]:
-    """What is said about each row once; -1 in rows without an agent."""
+    """Features of agents that do not change over time; -1 in rows without an agent."""
     ids = tracks.track_id[order]
     if ids.max(initial=0) >= _FLOAT_ID_END:
         ids = np.arange(len(order))
     # The data set has no class for cones and barriers.
     kinds = np.where(tracks.kind[order] == AgentKind.STATIC, AgentKind.OTHER, tracks.kind[order])
 
-    def marked(rows: tuple[int, ...]) -> _Array:
-        return np.isin(order, rows).astype(np.int64)
-
+    marks = {
+        "is_sdc": (recording.ego,),
+        "tracks_to_predict": recording.to_predict,
+        "objects_of_interest": recording.of_interest,
+        "difficulty_level": (),
+    }
     columns = {
         "id": ids.astype(np.float32),
         "type": kinds.astype(np.float32),
-        "is_sdc": marked((recording.ego,)),
-        "tracks_to_predict": marked(recording.to_predict),
-        "objects_of_interest": marked(recording.of_interest),
-        "difficulty_level": np.zeros(len(order), np.int64),
+        **{name: np.isin(order, rows).astype(np.int64) for name, rows in marks.items()},
     }
     return {f"state/{name}": _padded(column, AGENTS) for name, column in columns.items()}
 
 
-def _numbers(ids: list[int], recording: Recording) -> dict[int, int]:
-    """Ids of map features as they are written."""
+def _numbers(recording: Recording) -> dict[int, int]:
+    """Written ids of map features by their ids."""
+    ids = [feature.feature_id for feature in recording.features]
     used = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
     fit = all(0 <= number < _INT_ID_END for number in used)
     return {number: number if fit else row for row, number in enumerate(used)}
@@ -193,11 +198,10 @@ def _numbers(ids: list[int], recording: Recording) -> dict[int, int]:
 def _lights(
     recording: Recording, numbers: Mapping[int, int], micros: _Array, origin: _Array, lost: Counter[str]
 ) -> dict[str, _Array]:
-    """Lights in slots, time-major; up to 16 keep their slot, of more the nearest that are observed at a step."""
+    """Lights in slots, time-major; up to 16 keep their slot, of more the first that are observed at a step."""
     lights = recording.lights
-    steps = recording.current_step - CURRENT_STEP + np.arange(STEPS)
+    steps, known = _steps(recording)
     states = np.full((STEPS, max(len(lights), LIGHTS)), -1, np.int64)
-    known = (steps >= 0) & (steps < len(recording.timestamps_s))
     for column, light in enumerate(lights):
         states[known, column] = light.states[steps[known]]
     slot = np.broadcast_to(np.arange(LIGHTS), (STEPS, LIGHTS))
@@ -216,11 +220,7 @@ def _lights(
         **{axis: np.where(seen, point[slot, i], -1.0) for i, axis in enumerate("xyz")},
         "timestamp_micros": micros,
     }
-    return {
-        f"traffic_light_state/{span}/{name}": column[part]
-        for span, part in _SPANS.items()
-        for name, column in table.items()
-    }
+    return _by_span("traffic_light_state", table, axis=0)
 
 
 def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _Array) -> dict[str, _Array]:
@@ -240,15 +240,14 @@ def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _
         "id": np.repeat([numbers[f.feature_id] for f in ordered], counts).astype(np.int64)[:, None],
         "type": np.repeat([int(f.kind) for f in ordered], counts).astype(np.int64)[:, None],
         "speed_limit": np.repeat(limits, counts).astype(np.float64),
-        "valid": np.ones((sum(counts), 1), np.int64),
     }
     table = {f"roadgraph_samples/{name}": _padded(column, POINTS) for name, column in columns.items()}
-    table["roadgraph_samples/valid"] = np.maximum(table["roadgraph_samples/valid"], 0)
-    return table
+    valid = np.ones((sum(counts), 1), np.int64)
+    return {**table, "roadgraph_samples/valid": _padded(valid, POINTS, 0)}
 
 
 def _dense(feature: MapFeature, spacing_m: float) -> _Array:
-    """A feature's points with others between them, so that none is further from the next; polygons closed."""
+    """Points along a feature at most ``spacing_m`` apart, its own included; polygons are closed."""
     points = feature.points
     if feature.kind in POLYGON_KINDS:
         points = np.concatenate((points, points[:1]))
@@ -267,45 +266,28 @@ def _directions(line: _Array) -> _Array:
 
 
 def _paths(scenario: Scenario, numbers: Mapping[int, int], shift: _Array, form: Paths) -> dict[str, _Array]:
-    """Routes from where the logged ego was first seen; the route to the goal first and on the route.
+    """Routes from ego's first logged position; the route to the goal first and on the route.
 
-    The log's own route (stored row 1) knows the future and is left out, unless no lane leads to the goal: then it is
-    row 0.
+    The log route (stored row 1) is privileged and left out, unless no lane leads to the goal: then it is row 0.
     """
     shape = (form.count, form.points)
     xyz, lane = np.full((*shape, 3), -1.0), np.full(shape, -1, np.int64)
     arc, valid, on_route = np.zeros(shape), np.zeros(shape, np.int64), np.zeros((form.count, 1), np.int64)
-    seen = scenario.agent_valid[:, 0]
-    log = np.column_stack((scenario.agent_xy[seen, 0], scenario.agent_z[seen, 0])).astype(np.float64)
+    log = scenario.agent_xy[scenario.agent_valid[:, 0], 0].astype(np.float64)
     used = [row for row in np.flatnonzero(scenario.route_points > 1) if row != 1][: form.count]
     for number, row in enumerate(used):
         count = int(scenario.route_points[row])
-        line = np.column_stack((scenario.route_xy[row, :count], scenario.route_z[row, :count])).astype(
-            np.float64
-        )
-        begin = min(int(np.hypot(*(line[:, :2] - log[0, :2]).T).argmin()), count - 2)
+        line = np.column_stack((scenario.route_xy[row], scenario.route_z[row]))[:count].astype(np.float64)
+        begin = min(int(np.hypot(*(line[:, :2] - log[0]).T).argmin()), count - 2)
         points, index = resample(line[begin:], form.spacing_m, form.points)
         lanes = scenario.route_lane[row, begin:count][index]
+        ids = np.where(lanes >= 0, scenario.lane_id[lanes], -1).tolist()
         size = len(points)
         xyz[number, :size] = points + shift
-        lane[number, :size] = [_lane_number(scenario, int(i), numbers) for i in lanes]
+        lane[number, :size] = [numbers.get(lane_id, -1) for lane_id in ids]
         arc[number, :size] = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
         valid[number, :size] = 1
-        on_route[number] = number == 0 or _follows(log[:, :2], points[:, :2])
-    return {
-        "path_samples/xyz": xyz,
-        "path_samples/id": lane,
-        "path_samples/arc_length": arc,
-        "path_samples/valid": valid,
-        "path_samples/on_route": on_route,
-    }
-
-
-def _lane_number(scenario: Scenario, lane: int, numbers: Mapping[int, int]) -> int:
-    return numbers.get(int(scenario.lane_id[lane]), -1) if lane >= 0 else -1
-
-
-def _follows(log: Float[_Array, "step 2"], path: Float[_Array, "point 2"]) -> bool:
-    """Whether the log keeps to the path."""
-    _, distance = project(path, log)
-    return bool((distance <= _ON_ROUTE_M).mean() >= _ON_ROUTE_SHARE)
+        _, distance = project(points[:, :2], log)
+        on_route[number] = number == 0 or (distance <= _ON_ROUTE_M).mean() >= _ON_ROUTE_SHARE
+    columns = {"xyz": xyz, "id": lane, "arc_length": arc, "valid": valid, "on_route": on_route}
+    return {f"path_samples/{name}": column for name, column in columns.items()}

@@ -1,4 +1,4 @@
-"""Scenario sets written for others: a part of a set as a set again, tf.Examples, GPUDrive JSON."""
+"""Export of scenario sets: a part of a set as a set, tf.Examples or GPUDrive JSON."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-from drivax.datasets.export import gpudrive as export_gpudrive
-from drivax.datasets.export.gpudrive import gpudrive_scene
 from drivax.datasets.export.tfexample import PATHS, tf_example
+from drivax.datasets.gpudrive import file_name, gpudrive_scene
 from drivax.datasets.womd.tfrecord import example, shard_name, write_record
 from drivax.errors import UsageError
 from drivax.files import PartialFolder, check_output, sync_and_close, write_json
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
-#: What an export in another format says about itself.
+#: Description of an export in another format.
 NOTE = "export.json"
-
 #: Called with (scenarios done, scenarios).
 Progress = Callable[[int, int], None]
-Format = Literal["set", "tfexample", "gpudrive"]
+#: The file of every scenario, and counts of what did not fit.
+_Written = tuple[list[str], Counter[str]]
 
 
 @dataclass(frozen=True)
@@ -32,16 +31,16 @@ class Export:
     """What to export and how.
 
     Attributes:
-        format: ``set`` (a scenario set again), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
+        format: ``set`` (a scenario set), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
         filters: Conditions that all must hold (``scenario.select.selection``).
-        ids: File of scenario ids, one a line, or ``dataset<TAB>id``; None for all.
+        ids: File of scenario ids, one a line, or ``dataset<TAB>id``; None: all.
         limit: Write only the first of the selected scenarios; None: all.
         paths: Form of ``path_samples`` in tf.Examples, a name in ``export.tfexample.PATHS``.
         shard_size: Scenarios per TFRecord shard.
         overwrite: Replace an earlier export of the same kind; other folders are never replaced.
     """
 
-    format: Format = "set"
+    format: Literal["set", "tfexample", "gpudrive"] = "set"
     filters: tuple[str, ...] = ()
     ids: Path | None = None
     limit: int | None = None
@@ -50,10 +49,10 @@ class Export:
     overwrite: bool = False
 
     def check(self) -> None:
-        """Refuses options that cannot be meant.
+        """Check the options.
 
         Raises:
-            UsageError: The first of them.
+            UsageError: An option is invalid.
         """
         for name in ("limit", "shard_size"):
             value = getattr(self, name)
@@ -63,14 +62,7 @@ class Export:
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written.
-
-    Attributes:
-        path: The folder.
-        scenarios: How many scenarios.
-        files: How many files hold them.
-        lost: What the format has no room for, by name; only what is not zero.
-    """
+    """The written folder, numbers of scenarios and of their files, and nonzero counts of what did not fit by name."""
 
     path: Path
     scenarios: int
@@ -81,19 +73,11 @@ class Exported:
 def export(
     set_path: str | Path, out: str | Path, options: Export | None = None, progress: Progress | None = None
 ) -> Exported:
-    """Write scenarios of a set in another format, or as a set of their own.
-
-    The export appears under ``out`` when it is complete.
-
-    Args:
-        set_path: Scenario set to read.
-        out: Folder to create.
-        options: What to export and how; everything, as a set, by default.
-        progress: Called with (scenarios done, scenarios).
+    """Write scenarios of a set in another format or as a new set, which appears under ``out`` when it is complete.
 
     Raises:
         DataError: The set is damaged, an id is not in it, or no scenario is selected.
-        UsageError: An option cannot be meant, or ``out`` exists.
+        UsageError: An option is invalid, or ``out`` exists.
     """
     options, out = options or Export(), Path(out)
     options.check()
@@ -107,9 +91,10 @@ def export(
     partial = PartialFolder(out)
     partial.open()
     try:
-        files, lost = write(_Work(opened, rows, partial.content, out.name, options, progress))
-        write_json(partial.content / NOTE, _note(opened, rows, files, +lost, options.format))
-        _refuse_existing(out, options)  # someone may have written it in the meantime
+        work = _Work(opened, rows, partial.content, out.name, options, progress)
+        files, lost = write(work)
+        write_json(partial.content / NOTE, _note(work, files, +lost))
+        _refuse_existing(out, options)  # another process may have written it in the meantime
         partial.publish()
     finally:
         partial.close()
@@ -125,16 +110,16 @@ def write_part(
     chosen_by: Mapping[str, Any] | None = None,
     further: Callable[[Path], None] | None = None,
 ) -> Exported:
-    """Some scenarios of a set as a set of their own: the records as they are, with their entries.
+    """Write scenarios of a set as a new set: records and entries unchanged.
 
     Args:
         opened: The set.
-        rows: Which, in the order in which they are written.
+        rows: Rows of the set, in the order of the new one.
         out: Folder to create.
         overwrite: Replace an existing scenario set; other folders are never replaced.
         progress: Called with (scenarios done, scenarios).
-        chosen_by: What the manifest says about how they were chosen, as plain JSON values.
-        further: Called with the folder of the whole set before it gets its name, to write what else it shall hold.
+        chosen_by: Entries of the manifest that say how the rows were chosen, as plain JSON values.
+        further: Called with the folder of the complete set before it gets its name, to add files.
 
     Raises:
         UsageError: ``out`` exists, or is the set that is read.
@@ -151,31 +136,14 @@ def write_part(
 
 
 def refuse_part(opened: ScenarioSet, out: Path) -> None:
-    """Refuses to write a part of a set over the set.
-
-    Raises:
-        UsageError: ``out`` is the set that is read.
-    """
+    """Raise a UsageError if ``out`` is the set that is read."""
     if out.exists() and out.resolve() == opened.path.resolve():
         raise UsageError("is the set that is read", file=out, cure="choose another name")
 
 
-#: The file of every scenario, and what did not fit.
-_Written = tuple[list[str], Counter[str]]
-
-
 @dataclass(frozen=True)
 class _Work:
-    """Scenarios to write and where.
-
-    Attributes:
-        opened: The set.
-        rows: Its rows to write.
-        folder: Folder for the files.
-        name: Name that the folder will have.
-        options: How to write.
-        progress: Called with (scenarios done, scenarios).
-    """
+    """Rows of a set to write into a folder that will get a name."""
 
     opened: ScenarioSet
     rows: Sequence[int]
@@ -184,17 +152,14 @@ class _Work:
     options: Export
     progress: Progress | None
 
-    def tell(self, done: int) -> None:
-        """Report progress."""
+    def report(self, done: int) -> None:
         if self.progress is not None:
             self.progress(done, len(self.rows))
 
 
 def _write_examples(work: _Work) -> _Written:
-    """TFRecord shards of tf.Examples."""
-    lost: Counter[str] = Counter()
-    files: list[str] = []
-    size = work.options.shard_size
+    """Write TFRecord shards of tf.Examples."""
+    lost, files, size = Counter[str](), list[str](), work.options.shard_size
     shards = -(-len(work.rows) // size)
     for number in range(shards):
         path = work.folder / shard_name(work.name, number, shards)
@@ -204,47 +169,41 @@ def _write_examples(work: _Work) -> _Written:
                 write_record(file, example(features))
                 lost.update(missing)
                 files.append(path.name)
-                work.tell(len(files))
+                work.report(len(files))
             sync_and_close(file)
     return files, lost
 
 
 def _write_scenes(work: _Work) -> _Written:
-    """One JSON file per scenario."""
-    files: list[str] = []
-    for number, row in enumerate(work.rows):
-        name = export_gpudrive.file_name(number)
+    """Write one JSON file per scenario."""
+    files = [file_name(number) for number in range(len(work.rows))]
+    for done, (row, name) in enumerate(zip(work.rows, files, strict=True), start=1):
         scene = gpudrive_scene(work.opened[row], name)
         with (work.folder / name).open("wb") as file:
             file.write(json.dumps(scene, allow_nan=False).encode())
             sync_and_close(file)
-        files.append(name)
-        work.tell(len(files))
+        work.report(done)
     return files, Counter()
 
 
-def _note(
-    opened: ScenarioSet, rows: Sequence[int], files: Sequence[str], lost: Mapping[str, int], name: str
-) -> dict[str, Any]:
-    """Says what the export is: neither format keeps data set and segment, and shards hide which scenario is where."""
-    names = ("scenario_id", "dataset", "segment")
-    entries = [opened.entries[row] for row in rows]
+def _note(work: _Work, files: Sequence[str], lost: Mapping[str, int]) -> dict[str, Any]:
+    """The description: neither format keeps data set and segment, nor says which scenario is in which shard."""
+    opened, names = work.opened, ("scenario_id", "dataset", "segment")
     return {
         "drivax_version": metadata.version("drivax"),
-        "format": name,
+        "format": work.options.format,
         "set": {"name": opened.path.name, "hash": opened.hash, "source": opened.manifest["source"]},
         "lost": dict(lost),
         "scenarios": [
-            {**{key: entry[key] for key in names}, "file": file}
-            for entry, file in zip(entries, files, strict=True)
+            {**{key: opened.entries[row][key] for key in names}, "file": file}
+            for row, file in zip(work.rows, files, strict=True)
         ],
     }
 
 
 def _refuse_existing(out: Path, options: Export) -> None:
-    if not out.exists() and not out.is_symlink():
-        return
-    if out.is_dir() and not any(out.iterdir()):
+    empty = out.is_dir() and not any(out.iterdir())
+    if empty or not (out.exists() or out.is_symlink()):
         return
     if not (out / NOTE).is_file():
         raise UsageError("exists and is no export", file=out, cure="choose another name")

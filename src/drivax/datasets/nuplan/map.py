@@ -1,4 +1,4 @@
-"""The GeoPackage maps of nuPlan: found on disk, and indexed once per city: all but the geometries.
+"""The GeoPackage maps of nuPlan: found on disk, indexed once per city, decoded and projected around a drive.
 
 Feature ids of the layers overlap, so a feature is (layer, fid); both are packed into one number.
 """
@@ -9,15 +9,25 @@ import functools
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from drivax.datasets import parsing
-from drivax.datasets.nuplan.sqlite import Database, Layer, open_database, read_layer
-from drivax.errors import DataError
+import numpy as np
+from jaxtyping import Float64
 
+from drivax.datasets import parsing
+from drivax.datasets.nuplan.sqlite import Database, Layer, geometries, open_database, read_layer
+from drivax.datasets.parsing import import_extra
+from drivax.datasets.road_edges import Area, road_edges
+from drivax.errors import DataError
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import RoadKind
+
+Array = np.ndarray[Any, Any]
+
+_DRIVABLE = ("road_segments", "intersections", "generic_drivable_areas", "carpark_areas")
 #: Layers that are read and their columns. The order gives the numbers of the layers in feature ids.
 LAYERS: Mapping[str, tuple[str, ...]] = {
     "lanes_polygons": (
@@ -29,10 +39,7 @@ LAYERS: Mapping[str, tuple[str, ...]] = {
     "stop_polygons": ("stop_polygon_type_fid",),
     "baseline_paths": ("lane_fid", "lane_connector_fid"),
     "gen_lane_connectors_scaled_width_polygons": ("lane_connector_fid", "left_boundary_fid", "right_boundary_fid"),
-    "road_segments": (),
-    "intersections": (),
-    "generic_drivable_areas": (),
-    "carpark_areas": (),
+    **dict.fromkeys(_DRIVABLE, ()),
 }  # fmt: skip
 _NEEDED = ("baseline_paths", "lanes_polygons", "lane_connectors")
 NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), start=1)}
@@ -40,28 +47,38 @@ NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), s
 _UNPACKED, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
 _FASTEST_MPS = 60.0
 CURE = "download the nuPlan maps again"
+#: Decoded around ego's drive: 100 m that are kept, and space for routes that lead further.
+MARGIN_M = 250.0
+#: A feature near the drive that reaches further than this from it is damaged.
+_FARTHEST_M = 20_000.0
+#: Plausible distances between boundaries, metres.
+_WIDTHS_M = (1.5, 10.0)
+_WIDTH_PLACES = (0.1, 0.3, 0.5, 0.7, 0.9)
+#: Boundary types that are painted, as far as public readers of the format agree; 1 and 3 are not painted.
+_LINES: Mapping[int | None, RoadKind] = {
+    0: RoadKind.LINE_BROKEN_SINGLE_WHITE,
+    2: RoadKind.LINE_SOLID_SINGLE_WHITE,
+}
+_UNPAINTED = (1, 3)
+_STOP_SIGN = 1
 
 
 def feature_id(layer: str, fid: int) -> int:
-    """One number for a feature of a layer; distinct for all layers and fids."""
+    """Pack layer and fid of a feature into one number."""
     return NUMBERS[layer] << 32 | fid
 
 
 def find_map(log: Path, name: str) -> Path:
-    """The GeoPackage of a named map.
+    """Return the GeoPackage of a named map.
 
-    Looked for in ``maps``, or in ``nuplan-maps-v1.0`` as the archive unpacks it, next to the log or next to any folder
-    above it, then where the environment variable ``NUPLAN_MAPS_ROOT`` of the nuPlan devkit points.
+    Looks in ``maps``, or in ``nuplan-maps-v1.0`` as the archive unpacks it, next to the log or next to any folder
+    above it, then in the nuPlan devkit's ``NUPLAN_MAPS_ROOT``.
     """
     listing = _listing(log)
     known = parsing.load_json(listing)
     entry = known.get(name) if isinstance(known, dict) else None
     version = entry.get("version") if isinstance(entry, dict) else None
-    if (
-        not isinstance(version, str)
-        or not re.fullmatch(r"[\w.-]+", version)
-        or not re.fullmatch(r"[\w.-]+", name)
-    ):
+    if not isinstance(version, str) or not all(re.fullmatch(r"[\w.-]+", word) for word in (version, name)):
         raise DataError(f"lists no map {name[:80]!r}", file=listing, cure=CURE)
     path = listing.parent / name / version / "map.gpkg"
     if not path.is_file():
@@ -87,7 +104,7 @@ def _listing(log: Path) -> Path:
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane or a lane connector, its geometry aside. Ids are packed feature ids; boundaries are fids."""
+    """A lane or lane connector without its geometry. Ids are packed feature ids; boundaries are fids."""
 
     baseline: int
     roadblock: tuple[str, int] | None
@@ -101,12 +118,12 @@ class Lane:
 
 @dataclass(frozen=True)
 class City:
-    """The index of one map: everything but geometries.
+    """A map without its geometries.
 
     Attributes:
         path: The GeoPackage.
-        epsg: The projected system that logs use.
-        layers: The layers that the file has.
+        epsg: The projected system of the logs.
+        layers: The layers by name.
         lanes: Lanes and connectors by packed id.
         roadblocks: Packed ids of the lanes of each roadblock, by (``lane`` or ``connector``, fid).
         boundary_rows: Row in the layer of boundaries by fid.
@@ -121,7 +138,7 @@ class City:
 
 
 def city_map(path: Path) -> City:
-    """The index of a map, kept between calls as long as the file does not change."""
+    """Return the index of a map, cached until the file changes."""
     state = path.stat()
     return _city(path, state.st_mtime_ns, state.st_size)
 
@@ -154,7 +171,7 @@ def _projected(database: Database) -> int:
 
 
 def whole(value: Any) -> int | None:
-    """A feature id or an enumeration: files hold them as integers, floats and texts. None where it is none."""
+    """A feature id or enumeration, which files hold as integers, floats or texts; None for anything else."""
     if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 11:
         value = int(value)
     if isinstance(value, float) and value.is_integer():
@@ -163,11 +180,16 @@ def whole(value: Any) -> int | None:
 
 
 def _limit(value: Any) -> float | None:
-    """A limit in m/s; files may hold it as a text, like ids. None where it is missing or no limit of a road."""
+    """A limit in m/s, also from a text; None where it is missing or not plausible."""
     if isinstance(value, str) and re.fullmatch(r"\d{1,3}(\.\d{1,20})?", value):
         value = float(value)
     good = isinstance(value, int | float) and math.isfinite(value) and 0.0 < value <= _FASTEST_MPS
     return float(value) if good else None
+
+
+def _lane_id(layer: str, value: Any) -> int | None:
+    fid = whole(value)
+    return None if fid is None else feature_id(layer, fid)
 
 
 def _table(layer: Layer | None, *columns: str) -> Iterator[tuple[Any, ...]]:
@@ -181,21 +203,16 @@ def _lanes(layers: Mapping[str, Layer]) -> dict[int, Lane]:
     """Lanes and connectors that have a baseline, linked; links may dangle."""
     baselines: dict[int, int] = {}
     for row, (_, lane, connector) in enumerate(_table(layers["baseline_paths"], *LAYERS["baseline_paths"])):
-        if (number := whole(lane)) is not None:
-            baselines.setdefault(feature_id("lanes_polygons", number), row)
-        elif (number := whole(connector)) is not None:
-            baselines.setdefault(feature_id("lane_connectors", number), row)
+        owner = _lane_id("lanes_polygons", lane) or _lane_id("lane_connectors", connector)
+        if owner is not None:
+            baselines.setdefault(owner, row)
     lanes = _plain_lanes(layers["lanes_polygons"], baselines)
-    for number, before, after, connector in _connectors(layers, baselines):
+    for number, connector in _connectors(layers, baselines):
         lanes[number] = connector
-        if before is not None:
-            connector.predecessors.append(before)
-            if before in lanes:
-                lanes[before].successors.append(number)
-        if after is not None:
-            connector.successors.append(after)
-            if after in lanes:
-                lanes[after].predecessors.append(number)
+        for before in lanes.keys() & connector.predecessors:
+            lanes[before].successors.append(number)
+        for after in lanes.keys() & connector.successors:
+            lanes[after].predecessors.append(number)
     return lanes
 
 
@@ -205,9 +222,8 @@ def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
     places: dict[tuple[int, int], int] = {}
     slots: dict[int, tuple[int, int]] = {}
     for fid, lane, group, index, left, right, limit in _table(layer, *LAYERS["lanes_polygons"]):
-        own = whole(fid if lane is None else lane)
-        number = -1 if own is None else feature_id("lanes_polygons", own)
-        if number not in baselines or number in lanes:
+        number = _lane_id("lanes_polygons", fid if lane is None else lane)
+        if number is None or number not in baselines or number in lanes:
             continue
         block, slot = whole(group), whole(index)
         lanes[number] = Lane(
@@ -225,45 +241,240 @@ def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
     return lanes
 
 
-def _connectors(
-    layers: Mapping[str, Layer], baselines: Mapping[int, int]
-) -> Iterator[tuple[int, int | None, int | None, Lane]]:
-    """Connectors: id, the lane before (``exit_lane_fid``: where one leaves it) and the lane after."""
-    shapes = layers.get("gen_lane_connectors_scaled_width_polygons")
+def _connectors(layers: Mapping[str, Layer], baselines: Mapping[int, int]) -> Iterator[tuple[int, Lane]]:
+    """Connectors by packed id; the lane before one is its ``exit_lane_fid``, where one leaves that lane."""
+    name = "gen_lane_connectors_scaled_width_polygons"
     sides = {
         whole(connector): (whole(left), whole(right))
-        for _, connector, left, right in _table(
-            shapes, "lane_connector_fid", "left_boundary_fid", "right_boundary_fid"
-        )
+        for _, connector, left, right in _table(layers.get(name), *LAYERS[name])
     }
     for fid, leave, enter, group, limit in _table(layers["lane_connectors"], *LAYERS["lane_connectors"]):
-        own, before, after, block = whole(fid), whole(leave), whole(enter), whole(group)
-        number = -1 if own is None else feature_id("lane_connectors", own)
-        if number not in baselines:
+        number, block = _lane_id("lane_connectors", fid), whole(group)
+        before, after = _lane_id("lanes_polygons", leave), _lane_id("lanes_polygons", enter)
+        if number is None or number not in baselines:
             continue
         lane = Lane(
             baseline=baselines[number],
             roadblock=None if block is None else ("connector", block),
             limit_mps=_limit(limit),
-            boundaries=sides.get(own, (None, None)),
+            boundaries=sides.get(whole(fid), (None, None)),
+            successors=[] if after is None else [after],
+            predecessors=[] if before is None else [before],
         )
-        yield (
-            number,
-            None if before is None else feature_id("lanes_polygons", before),
-            None if after is None else feature_id("lanes_polygons", after),
-            lane,
-        )
+        yield number, lane
 
 
 def corridor(city: City, ids: Sequence[int]) -> tuple[tuple[int, ...], int]:
-    """Lanes and connectors of a route's roadblocks, and how many of the roadblocks the map does not know.
+    """Lanes and connectors of a route's roadblocks, and the number of roadblocks that the map lacks.
 
     Groups of lanes and of connectors share the list; an id that both have means the lanes, as in the devkit.
     """
-    lane_ids: dict[int, None] = {}
-    unknown = 0
-    for number in ids:
-        lanes = city.roadblocks.get(("lane", number)) or city.roadblocks.get(("connector", number))
-        unknown += lanes is None
-        lane_ids.update(dict.fromkeys(lanes or ()))
-    return tuple(lane_ids), unknown
+    blocks = city.roadblocks
+    groups = [blocks.get(("lane", number)) or blocks.get(("connector", number)) for number in ids]
+    lanes = dict.fromkeys(lane for group in groups for lane in group or ())
+    return tuple(lanes), sum(group is None for group in groups)
+
+
+def features_around(
+    city: City, xy: Float64[np.ndarray, "point 2"]
+) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
+    """Map features within ``MARGIN_M`` of the bounding box of a drive, in the system of the logs, z = 0.
+
+    Returns:
+        The features, and counts of what could not be used: damaged geometries, baselines without a direction.
+    """
+    shapely = import_extra("shapely")
+    try:
+        with open_database(city.path) as database:
+            around = _Around(city, database, (*xy.min(axis=0), *xy.max(axis=0)))
+            features = [*_lane_features(around), *_line_features(around), *_polygon_features(around)]
+            areas = list(_areas(around))
+    except shapely.errors.ShapelyError as error:
+        raise DataError(f"shapely cannot use a geometry ({error})", file=city.path, cure=CURE) from error
+    if not any(feature.kind == RoadKind.LANE_SURFACE for feature in features):
+        problem = f"no lane of the map {city.path} lies within {MARGIN_M:.0f} m of the drive"
+        raise DataError(problem, cure=CURE)
+    features += road_edges(areas, feature_id("road_edges", 0))
+    return tuple(features), parsing.nonzero(map_geometries=len(around.damaged), lanes=around.pointless)
+
+
+class _Around:
+    """Decodes the map around a drive; counts what it cannot use."""
+
+    def __init__(self, city: City, database: Database, drive: tuple[float, ...]) -> None:
+        self.city = city
+        self.pointless = 0
+        self.damaged: set[tuple[str, int]] = set()
+        self._database = database
+        west, south, east, north = drive
+        self._box = west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
+        self._middle = np.array([(west + east) / 2, (south + north) / 2])
+        self._reach = _FARTHEST_M + max(east - west, north - south)
+
+    def near(self, name: str) -> list[int]:
+        """Rows of a layer whose bounds touch the box."""
+        layer = self.city.layers.get(name)
+        if layer is None:
+            return []
+        forward = _transformer(layer.epsg, self.city.epsg)
+        return layer.touching(forward.transform_bounds(*self._box, direction="INVERSE")).tolist()
+
+    def types(self, name: str) -> dict[int, int | None]:
+        """Types of the features around the drive by row, for a layer whose only column is the type."""
+        (column,) = LAYERS[name]
+        return {row: whole(self.city.layers[name].columns[column][row]) for row in self.near(name)}
+
+    @functools.cached_property
+    def baselines(self) -> tuple[list[int], Array]:
+        """Packed ids of the lanes around the drive, and their baselines."""
+        owners = {lane.baseline: number for number, lane in self.city.lanes.items()}
+        rows = [row for row in self.near("baseline_paths") if row in owners]
+        return [owners[row] for row in rows], self.shapes("baseline_paths", rows)
+
+    def shapes(self, name: str, rows: Sequence[int]) -> Array:
+        """Projected geometries of rows; None where one is damaged, empty or too far away."""
+        shapely = import_extra("shapely")
+        if not len(rows):
+            return np.zeros(0, dtype=object)
+        layer = self.city.layers[name]
+        with np.errstate(invalid="ignore"):  # coordinates that are NaN
+            shapes = shapely.force_2d(geometries(self._database, layer, np.array(rows, np.int64)))
+            xy, owner = shapely.get_coordinates(shapes, return_index=True)
+        forward = _transformer(layer.epsg, self.city.epsg)
+        xy = np.column_stack(forward.transform(xy[:, 0], xy[:, 1]))
+        far = ~(np.abs(xy - self._middle) <= self._reach).all(axis=1)  # NaN compares false
+        bad = np.bincount(owner[far], minlength=len(shapes)) > 0
+        bad |= np.bincount(owner, minlength=len(shapes)) == 0
+        self.damaged.update((name, rows[i]) for i in np.flatnonzero(bad).tolist())
+        kept = np.asarray(shapes).copy()
+        kept[bad] = None
+        shapely.set_coordinates(kept, xy[~bad[owner]])
+        return kept
+
+    def outlines(
+        self, name: str, rows: Sequence[int], outline: Callable[[Any], Array | None]
+    ) -> Iterator[tuple[int, int, Array]]:
+        """Row, packed id and points of geometries; those that have no outline are left out."""
+        for row, shape in zip(rows, self.shapes(name, rows), strict=True):
+            points, fid = outline(shape), whole(int(self.city.layers[name].fid[row]))
+            if points is not None and fid is not None:
+                yield row, feature_id(name, fid), points
+
+
+@functools.lru_cache(maxsize=8)
+def _transformer(source: int, target: int) -> Any:
+    """Projection between two EPSG systems, x (east) first."""
+    pyproj = import_extra("pyproj")
+    try:
+        systems = pyproj.CRS.from_epsg(source), pyproj.CRS.from_epsg(target)
+        if not systems[1].is_projected:
+            raise DataError(f"EPSG:{target} is no projected coordinate system", cure=CURE)
+        return pyproj.Transformer.from_crs(*systems, always_xy=True)
+    except pyproj.exceptions.ProjError as error:
+        problem = f"a coordinate system (EPSG:{source}, EPSG:{target}) is unknown"
+        raise DataError(problem, cure=CURE) from error
+
+
+def _line(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
+    """Points of a line, z = 0, without repeated ones; None where there are fewer than two or the line is in parts."""
+    shapely = import_extra("shapely")
+    if shape is not None and shape.geom_type == "MultiLineString":
+        shape = shapely.line_merge(shape)
+    if shape is None or shape.geom_type != "LineString":
+        return None
+    return _distinct(shapely.get_coordinates(shape))
+
+
+def _ring(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
+    """Outline of a polygon (of the largest part), its first point not repeated."""
+    shapely = import_extra("shapely")
+    parts = _polygons(shape)
+    if not parts:
+        return None
+    points = _distinct(shapely.get_coordinates(max(parts, key=shapely.area).exterior)[:-1])
+    return points if points is not None and len(points) >= 3 else None
+
+
+def _distinct(xy: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "kept 3"] | None:
+    moved = np.append(True, (np.diff(xy, axis=0) != 0.0).any(axis=1))
+    return np.pad(xy[moved], ((0, 0), (0, 1))) if moved.sum() >= 2 else None
+
+
+def _polygons(shape: Any) -> list[Any]:
+    parts = () if shape is None else import_extra("shapely").get_parts(shape)
+    return [part for part in parts if part.geom_type == "Polygon"]
+
+
+def _lane_features(around: _Around) -> Iterator[MapFeature]:
+    """Lanes and connectors with their links, limits and widths."""
+    city = around.city
+    numbers, shapes = around.baselines
+    widths = _widths(around, [city.lanes[number] for number in numbers], shapes)
+    for number, shape, width in zip(numbers, shapes, widths, strict=True):
+        points, lane = _line(shape), city.lanes[number]
+        if points is None:
+            around.pointless += shape is not None
+            continue
+        yield MapFeature(
+            feature_id=number,
+            kind=RoadKind.LANE_SURFACE,
+            points=points,
+            limit_mps=lane.limit_mps,
+            width_m=width,
+            successors=tuple(lane.successors),
+            predecessors=tuple(lane.predecessors),
+            left_neighbours=() if lane.left is None else (lane.left,),
+            right_neighbours=() if lane.right is None else (lane.right,),
+            interpolating=number >> 32 == NUMBERS["lane_connectors"],
+        )
+
+
+def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float | None]:
+    """Width of each lane: the median, over five places, of the distances to both boundaries added up."""
+    shapely = import_extra("shapely")
+    known = around.city.boundary_rows
+    pairs = [[known.get(fid, -1) for fid in lane.boundaries] for lane in lanes]
+    rows = np.array(pairs, np.int64).reshape(-1, 2)
+    used = np.unique(rows[rows >= 0])
+    nothing = np.array(None, dtype=object)
+    lines = np.append(around.shapes("boundaries", used.tolist()), nothing)
+    sides = lines[np.where(rows >= 0, np.searchsorted(used, rows), -1)]
+    along = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, nothing)
+    places = shapely.line_interpolate_point(along[:, None], _WIDTH_PLACES, normalized=True)
+    gaps = shapely.distance(places[:, None], sides[:, :, None])
+    low, high = _WIDTHS_M
+    widths = np.median(gaps.sum(axis=1), axis=1)
+    return [float(width) if low <= width <= high else None for width in widths]
+
+
+def _line_features(around: _Around) -> Iterator[MapFeature]:
+    """Painted boundaries of lanes."""
+    types = {row: kind for row, kind in around.types("boundaries").items() if kind not in _UNPAINTED}
+    for row, number, points in around.outlines("boundaries", list(types), _line):
+        yield MapFeature(number, _LINES.get(types[row], RoadKind.LINE_UNKNOWN), points)
+
+
+def _polygon_features(around: _Around) -> Iterator[MapFeature]:
+    """Crosswalks, and stop signs with the lanes whose baselines cross their stop polygons."""
+    shapely = import_extra("shapely")
+    for _, number, points in around.outlines("crosswalks", around.near("crosswalks"), _ring):
+        yield MapFeature(number, RoadKind.CROSSWALK, points)
+    owners, baselines = around.baselines
+    tree = shapely.STRtree(baselines)
+    stops = [row for row, kind in around.types("stop_polygons").items() if kind == _STOP_SIGN]
+    for _, number, points in around.outlines("stop_polygons", stops, _ring):
+        polygon = shapely.Polygon(points[:, :2])
+        crossing = [owners[i] for i in sorted(tree.query(polygon, predicate="intersects").tolist())]
+        lanes = [lane for lane in crossing if lane >> 32 == NUMBERS["lanes_polygons"]] or crossing
+        middle = np.append(shapely.get_coordinates(polygon.centroid)[0], 0.0)[None]
+        yield MapFeature(number, RoadKind.STOP_SIGN, middle, lanes=tuple(lanes))
+
+
+def _areas(around: _Around) -> Iterator[Area]:
+    """Drivable polygons."""
+    shapely = import_extra("shapely")
+    for name in _DRIVABLE:
+        for part in (part for shape in around.shapes(name, around.near(name)) for part in _polygons(shape)):
+            if not part.is_empty:
+                holes = [shapely.get_coordinates(hole) for hole in part.interiors]
+                yield shapely.get_coordinates(part.exterior), holes

@@ -1,28 +1,66 @@
-"""Reader of nuPlan: SQLite logs and GeoPackage maps, version 1.1, without GDAL and without the devkit."""
+"""Reader of nuPlan: SQLite logs and GeoPackage maps, version 1.1, without GDAL and without the devkit.
+
+A log is cut at its scenes into recordings. BLOBs that hold pickles (calibrations) are not read.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
 
 from drivax.datasets import parsing
 from drivax.datasets.elevation import flatten
-from drivax.datasets.nuplan import log as nuplan_log
-from drivax.datasets.nuplan.log import Agents, Piece, TimeLine
-from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, find_map
-from drivax.datasets.nuplan.map_features import features_around
-from drivax.datasets.nuplan.sqlite import SQLITE_MAGIC, Database, open_database
-from drivax.datasets.parsing import place_tags
+from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, features_around, find_map
+from drivax.datasets.nuplan.sqlite import Database, open_database
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
-from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording
-from drivax.scenario.schema import CURRENT_STEP, STEPS
+from drivax.geometry.vectors import rotate, wrap
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import CURRENT_STEP, STEPS, AgentKind, LightState
 
-FORMAT = "nuplan"
-DATASET = "nuplan"
+FORMAT = DATASET = "nuplan"
 #: Tables that tell a nuPlan log from other SQLite files.
 _TELLING = ("lidar_pc", "lidar_box", "ego_pose", "scenario_tag")
+#: Tables and columns that are read; a file with all of these tables is a nuPlan log.
+TABLES: Mapping[str, tuple[str, ...]] = {
+    "log": ("logfile", "map_version"),
+    "lidar_pc": ("token", "ego_pose_token", "scene_token", "timestamp"),
+    "ego_pose": ("token", "x", "y", "qw", "qx", "qy", "qz", "vx", "vy", "angular_rate_z"),
+    "lidar_box": (
+        "lidar_pc_token", "track_token", "x", "y", "z", "yaw", "length", "width", "height", "vx", "vy",
+    ),
+    "track": ("token", "category_token"),
+    "category": ("token", "name"),
+    "scene": ("token", "roadblock_ids"),
+    "scenario_tag": ("lidar_pc_token", "type"),
+    "traffic_light_status": ("lidar_pc_token", "lane_connector_id", "status"),
+}  # fmt: skip
+#: Length, width and height of the ego (Chrysler Pacifica), metres.
+EGO_SIZE_M = (5.176, 2.297, 1.777)
+#: From the rear axle, where ego poses are, to the middle of the box: (front 4.049 m - rear 1.127 m) / 2.
+REAR_AXLE_TO_CENTRE_M = 1.461
+EGO_TRACK_ID = 0
+#: More than one missing lidar sweep is a gap; no recording spans a gap.
+_GAP_US = 120_000
+#: Longer scenes are read in pieces of this many steps, a multiple of the usual stride of windows.
+_LONGEST_PIECE = 400
+#: Largest plausible values: UTM coordinates, m/s, metres of a box, metres of ego between two steps.
+_FARTHEST_M, _FASTEST_MPS, _LONGEST_M, _LONGEST_STEP_M = 2e7, 300.0, 200.0, 20.0
+#: Most entries of an array of tracks by steps; real scenes have up to a thousand tracks.
+_MOST_CELLS = 2_000_000
+_CURE = "skip this record, or download the file again"
+_KINDS = {
+    "vehicle": AgentKind.VEHICLE,
+    "bicycle": AgentKind.CYCLIST,
+    "pedestrian": AgentKind.PEDESTRIAN,
+    **dict.fromkeys(("traffic_cone", "barrier", "czone_sign", "generic_object"), AgentKind.STATIC),
+}
+_LIGHT_STATES = {"green": LightState.GO, "yellow": LightState.CAUTION, "red": LightState.STOP}
 
 
 @dataclass(frozen=True)
@@ -36,21 +74,17 @@ class NuPlan:
     def recognise(self, path: Path) -> bool:
         """Whether the file is SQLite and has the tables of a nuPlan log."""
         try:
-            with path.open("rb") as file:
-                if file.read(len(SQLITE_MAGIC)) != SQLITE_MAGIC:
-                    return False
             with open_database(path) as database:
                 return all(database.columns(table) for table in _TELLING)
         except (OSError, DataError):
             return False
 
     def describe(self, path: Path) -> Description:
-        """What the log holds, and whether its map is there."""
+        """Describe the content of the log, and whether its map is present."""
         with open_database(path) as database:
             log = _open_log(database, path)
-            pieces = nuplan_log.pieces(log.line)
-        times = log.line.time_us
-        scenes = len({piece.scene for piece in pieces})
+        parts, times = pieces(log.line), log.line.time_us
+        scenes = len({piece.scene for piece in parts})
         notes = [
             f"map {log.map_name}",
             f"{(times[-1] - times[0]) * 1e-6:.0f} s of driving in {scenes} scenes",
@@ -61,27 +95,26 @@ class NuPlan:
         except DataError as error:
             missing = (f"maps/{log.map_name}/<version>/map.gpkg",)
             notes.append(str(error))
-        return Description("nuPlan", "SQLite log", None, len(pieces), tuple(notes), missing)
+        return Description("nuPlan", "SQLite log", None, len(parts), tuple(notes), missing)
 
     def count(self, path: Path) -> int:
-        """Number of windows of 91 steps at the usual stride; 0 where the log cannot be read."""
+        """Return the number of windows of 91 steps at the usual stride; 0 where the log is unreadable."""
         try:
             with open_database(path) as database:
-                pieces = nuplan_log.pieces(nuplan_log.time_line(database))
+                return sum(parsing.windows_of(len(piece.sweeps)) for piece in pieces(time_line(database)))
         except DataError:
             return 0
-        return sum(max(len(piece.sweeps) - STEPS, 0) // STRIDE + 1 for piece in pieces)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """One recording per scene in order of time, and in their place the scenes that cannot be read."""
+        """Yield one recording per scene in order of time, or a bad record in its place."""
         try:
             with open_database(path) as database:
                 log = _open_log(database, path)
                 city = city_map(find_map(path, log.map_name))
-                agents = nuplan_log.agents(database)
-                for piece in nuplan_log.pieces(log.line):
+                known = agents(database)
+                for piece in pieces(log.line):
                     try:
-                        yield _recording(log, piece, agents, city)
+                        yield _recording(log, piece, known, city)
                     except DataError as error:
                         yield BadRecord.of(error, path, piece.name)
         except DataError as error:
@@ -89,8 +122,40 @@ class NuPlan:
 
 
 @dataclass(frozen=True)
-class _Log:
-    """An open log: its name, the name of its map, its time line."""
+class TimeLine:
+    """Tokens, times and scene tokens (None without a scene) of the lidar sweeps of a log, in order of time."""
+
+    tokens: tuple[Any, ...]
+    time_us: Int64[np.ndarray, " sweep"]
+    scenes: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """The steps of one recording: those of a scene, up to 10 before and up to 80 after it.
+
+    So the current steps of its windows are the steps of the scene, and windows cross the borders of scenes.
+
+    Attributes:
+        name: Token of the scene in hexadecimal digits, and a number where the scene has several pieces.
+        scene: Token of the scene.
+        sweeps: Rows of the time line, one per step of 0.1 s.
+        own: Sweeps of the scene itself, first and one past the last.
+    """
+
+    name: str
+    scene: Any
+    sweeps: Int64[np.ndarray, " step"]
+    own: tuple[int, int]
+
+
+#: Number and kind of every track of a log by token.
+_Agents = Mapping[Any, tuple[int, AgentKind]]
+
+
+@dataclass(frozen=True)
+class Log:
+    """An open log: its name (the file's where it has none), the name of its map, its time line."""
 
     database: Database
     name: str
@@ -98,60 +163,244 @@ class _Log:
     line: TimeLine
 
 
-def _open_log(database: Database, path: Path) -> _Log:
-    for table, columns in nuplan_log.TABLES.items():
+def _open_log(database: Database, path: Path) -> Log:
+    for table, columns in TABLES.items():
         database.require(table, *columns)
-    name, map_name = nuplan_log.log_names(database, path)
-    return _Log(database, name, map_name, nuplan_log.time_line(database))
+    rows = database.rows("SELECT logfile, map_version FROM log")
+    if not rows or not isinstance(rows[0][1], str) or not rows[0][1]:
+        raise DataError("its table log names no map", file=path, cure="download the file again")
+    name, map_name = rows[0]
+    name = name if isinstance(name, str) and name else path.stem
+    return Log(database, name, map_name.removesuffix(".gpkg"), time_line(database))
 
 
-def _recording(log: _Log, piece: Piece, agents: Agents, city: City) -> Recording:
-    """The recording of one piece."""
+def time_line(database: Database) -> TimeLine:
+    """Return all lidar sweeps in order of time."""
+    rows = database.rows("SELECT token, timestamp, scene_token FROM lidar_pc ORDER BY timestamp")
+    if not rows:
+        raise DataError("has no lidar sweep", file=database.path, cure="download the file again")
+    if not all(isinstance(time, int) for _, time, _ in rows):
+        raise DataError("a lidar sweep has no timestamp", file=database.path, cure="download the file again")
+    tokens, times, scenes = zip(*rows, strict=True)
+    return TimeLine(tokens, np.array(times, np.int64), scenes)
+
+
+def pieces(line: TimeLine) -> list[Piece]:
+    """Cut a time line at gaps and scenes, and long scenes, into pieces of 10 Hz.
+
+    Of sweeps at 20 Hz every second one is taken, counted from the last gap. A remainder that is too short for a
+    window is left out: it is the future of the windows before.
+    """
+    recordings: list[Piece] = []
+    counts: dict[Any, int] = {}
+    step = _every(line.time_us)
+    ends = np.flatnonzero(np.diff(line.time_us) > _GAP_US) + 1
+    for first, last in zip((0, *ends), (*ends, len(line.tokens)), strict=True):
+        sweeps = np.arange(first, last, step)
+        for begin, end in _scenes(line, sweeps):
+            part = slice(max(begin - CURRENT_STEP, 0), min(end + STEPS - CURRENT_STEP - 1, len(sweeps)))
+            if part.stop - part.start < STEPS and (begin > 0 or len(sweeps) >= STEPS):
+                continue
+            scene = line.scenes[sweeps[begin]]
+            number = counts[scene] = counts.get(scene, 0) + 1
+            name = scene.hex() if isinstance(scene, bytes) and 0 < len(scene) <= 16 else "no-scene"
+            name += f".{number}" if number > 1 else ""
+            own = int(sweeps[begin]), int(sweeps[end - 1]) + step
+            recordings.append(Piece(name, scene, sweeps[part], own))
+    return recordings
+
+
+def _every(time_us: Int64[np.ndarray, " sweep"]) -> int:
+    """Number of sweeps per step of 10 Hz."""
+    usual = float(np.median(np.diff(time_us))) if len(time_us) > 1 else 1e5
+    if 40_000 <= usual <= 60_000:
+        return 2
+    if 90_000 <= usual <= 110_000:
+        return 1
+    problem = f"lidar sweeps come every {usual / 1e3:.0f} ms, not every 50 or 100 ms"
+    raise DataError(problem, cure="use an unaltered log")
+
+
+def _scenes(line: TimeLine, sweeps: Int64[np.ndarray, " step"]) -> list[tuple[int, int]]:
+    """Steps of each scene, first and one past the last; long scenes in pieces."""
+    scenes = [line.scenes[sweep] for sweep in sweeps]
+    begins = [step for step in range(len(scenes)) if step == 0 or scenes[step] != scenes[step - 1]]
+    return [
+        (start, min(start + _LONGEST_PIECE, end))
+        for begin, end in zip(begins, (*begins[1:], len(scenes)), strict=True)
+        for start in range(begin, end, _LONGEST_PIECE)
+    ]
+
+
+def _numbers(rows: Sequence[Sequence[Any]], width: int, what: str) -> Float64[np.ndarray, "row column"]:
+    """Rows of numbers; NaN where a cell is NULL."""
+    try:
+        return np.array(rows, dtype=np.float64).reshape(len(rows), width)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise DataError(f"{what} holds something that is no number", cure=_CURE) from error
+
+
+def _check(values: Float64[np.ndarray, "*shape"], most: float, what: str) -> None:
+    """Refuse numbers that are not finite or too large."""
+    if not (np.abs(values) <= most).all():  # NaN compares false
+        raise DataError(f"{what} is missing or absurd", cure=_CURE)
+
+
+def agents(database: Database) -> _Agents:
+    """Return numbers (from 1 in order of the table) and kinds of a log's tracks by token."""
+    rows = database.rows(
+        "SELECT t.token, c.name FROM track AS t LEFT JOIN category AS c ON c.token = t.category_token ORDER BY t.rowid"
+    )
+    kinds = {token: _KINDS.get(name, AgentKind.OTHER) for token, name in rows}
+    return {token: (number, kind) for number, (token, kind) in enumerate(kinds.items(), start=1)}
+
+
+def tracks(log: Log, piece: Piece, known: _Agents) -> tuple[Tracks, int]:
+    """Return the tracks of a piece, ego in row 0, and the number of boxes without a track."""
+    steps = len(piece.sweeps)
+    boxes, owners, left_out = _boxes(log, piece, known)
+    tokens = sorted({owner for _, owner in owners}, key=lambda token: known[token][0])
+    if (len(tokens) + 1) * steps > _MOST_CELLS:
+        raise DataError(f"{len(tokens)} tracks in {steps} steps", cure=_CURE)
+    rows = {token: row for row, token in enumerate(tokens, start=1)}
+    shape = (len(tokens) + 1, steps)
+    table, valid = np.zeros((*shape, 9)), np.zeros(shape, dtype=bool)
+    table[0], valid[0] = _ego(log, piece), True
+    if owners:
+        at = np.array([(rows[owner], step) for step, owner in owners]).T
+        table[at[0], at[1]], valid[at[0], at[1]] = boxes, True
+    entries = [(EGO_TRACK_ID, AgentKind.VEHICLE), *(known[token] for token in tokens)]
+    states = Tracks(
+        xy=table[..., 0:2].copy(),
+        z=table[..., 2].copy(),
+        heading=table[..., 3].copy(),
+        size=table[..., 4:7].copy(),
+        velocity=table[..., 7:9].copy(),
+        valid=valid,
+        kind=np.array([kind for _, kind in entries], np.int8),
+        track_id=np.array([number for number, _ in entries], np.int64),
+    )
+    return states, left_out
+
+
+def _ego(log: Log, piece: Piece) -> Float64[np.ndarray, "step 9"]:
+    """Box centre, z (0), heading, size and velocity of ego.
+
+    Poses are of the rear axle and velocities in ego's frame; in a turn the box centre moves sideways too:
+    v_centre = R(yaw) (vx, vy + yaw rate x 1.461 m).
+    """
+    tokens = [log.line.tokens[sweep] for sweep in piece.sweeps]
+    query = (
+        "SELECT p.token, e.x, e.y, e.qw, e.qx, e.qy, e.qz, e.vx, e.vy, e.angular_rate_z "
+        "FROM lidar_pc AS p JOIN ego_pose AS e ON e.token = p.ego_pose_token WHERE p.token IN"
+    )
+    by_token = {token: pose for token, *pose in log.database.rows_in(query, tokens)}
+    if missing := [token for token in tokens if token not in by_token]:
+        raise DataError(f"{len(missing)} sweeps have no ego pose", cure=_CURE)
+    pose = _numbers([by_token[token] for token in tokens], 9, "ego_pose")
+    _check(pose[:, 0:2], _FARTHEST_M, "an ego position")
+    _check(pose[:, 6:9], _FASTEST_MPS, "an ego velocity")
+    if (np.hypot(*np.diff(pose[:, 0:2], axis=0).T) > _LONGEST_STEP_M).any():
+        raise DataError("the ego jumps", cure=_CURE)
+    heading = yaw_of(pose[:, 2:6])
+    cos, sin = np.cos(heading), np.sin(heading)
+    centre = parsing.box_centre(pose[:, 0:2], heading, REAR_AXLE_TO_CENTRE_M)
+    moving = np.stack((pose[:, 6], pose[:, 7] + REAR_AXLE_TO_CENTRE_M * pose[:, 8]), axis=-1)
+    size = np.broadcast_to(EGO_SIZE_M, (len(pose), 3))
+    return np.column_stack((centre, np.zeros(len(pose)), heading, size, rotate(moving, cos, sin)))
+
+
+def yaw_of(quaternion: Float64[np.ndarray, "pose 4"]) -> Float64[np.ndarray, " pose"]:
+    """Return the yaw of quaternions (w, x, y, z), radians."""
+    w, x, y, z = quaternion.T
+    if not (np.abs(np.linalg.norm(np.clip(quaternion, -2.0, 2.0), axis=1) - 1.0) < 0.01).all():
+        raise DataError("an ego orientation is no unit quaternion", cure=_CURE)
+    return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def _observed(log: Log, piece: Piece, table: str, columns: str) -> list[tuple[Any, ...]]:
+    """Step and columns of all rows of a table that belong to sweeps of a piece, in order of steps."""
+    steps = {log.line.tokens[sweep]: step for step, sweep in enumerate(piece.sweeps)}
+    query = f"SELECT lidar_pc_token, {columns} FROM {table} WHERE lidar_pc_token IN"
+    rows = log.database.rows_in(query, list(steps))
+    # A damaged index leads to rows of other sweeps.
+    kept = [(steps[row[0]], *row[1:]) for row in rows if row[0] in steps]
+    return sorted(kept, key=lambda row: row[0])
+
+
+def _boxes(
+    log: Log, piece: Piece, known: _Agents
+) -> tuple[Float64[np.ndarray, "box 9"], list[tuple[int, Any]], int]:
+    """Boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track), and how many have no track."""
+    columns = "track_token, x, y, z, yaw, length, width, height, vx, vy"
+    rows = _observed(log, piece, "lidar_box", columns)
+    kept = [row for row in rows if row[1] in known]
+    boxes = _numbers([row[2:] for row in kept], 9, "lidar_box")
+    # Static things have no velocity, and the size of a few is unknown.
+    boxes[:, 4:9] = np.where(np.isnan(boxes[:, 4:9]), 0.0, boxes[:, 4:9])
+    _check(boxes[:, 0:3], _FARTHEST_M, "the position of a box")
+    _check(boxes[:, 3], 1e4, "the yaw of a box")
+    _check(boxes[:, 4:7], _LONGEST_M, "the size of a box")
+    _check(boxes[:, 7:9], _FASTEST_MPS, "the velocity of a box")
+    boxes[:, 3] = wrap(boxes[:, 3])
+    return boxes, [row[:2] for row in kept], len(rows) - len(kept)
+
+
+def _scenario_types(log: Log, piece: Piece) -> list[str]:
+    """Types of the scenario tags on any sweep of the scene itself, sorted."""
+    tokens = log.line.tokens[slice(*piece.own)]
+    rows = log.database.rows_in("SELECT DISTINCT type FROM scenario_tag WHERE lidar_pc_token IN", tokens)
+    return sorted({kind for (kind,) in rows if isinstance(kind, str) and kind})
+
+
+def _roadblocks(log: Log, piece: Piece) -> list[int]:
+    """Ids of the roadblocks of the scene's route, separated by spaces in the files, by commas in the documentation."""
+    rows = log.database.rows("SELECT roadblock_ids FROM scene WHERE token = ?", (piece.scene,))
+    text = rows[0][0] if rows else None
+    words = text.replace(",", " ").split() if isinstance(text, str) else ()
+    return [int(word) for word in words if word.isascii() and word.isdigit() and len(word) < 19]
+
+
+def _recording(log: Log, piece: Piece, known: _Agents, city: City) -> Recording:
     if len(piece.sweeps) <= CURRENT_STEP:
-        raise DataError(
-            f"{len(piece.sweeps)} steps without a gap, fewer than {CURRENT_STEP + 1}", cure="skip this record"
-        )
-    tracks, lost = nuplan_log.tracks(log.database, log.line, piece, agents)
-    features, lost_features = features_around(city, tracks.xy[0])
-    tracks, features = flatten(tracks, features)
-    lights, lost_lights = _lights(log, piece, city, features)
+        problem = f"{len(piece.sweeps)} steps without a gap, fewer than {CURRENT_STEP + 1}"
+        raise DataError(problem, cure="skip this record")
+    states, boxes = tracks(log, piece, known)
+    features, lost = features_around(city, states.xy[0])
+    states, features = flatten(states, features)
+    lights, unlit = _lights(log, piece, city, features)
     lanes = {feature.feature_id for feature in features}
-    route, unknown = corridor(city, nuplan_log.roadblocks(log.database, piece))
-    lost = {**lost, **lost_features, "lights": lost_lights, "roadblocks": unknown}
-    types = nuplan_log.scenario_types(log.database, log.line, piece)
-    tags = {"source_format": FORMAT} | place_tags(log.map_name)
+    route, unknown = corridor(city, _roadblocks(log, piece))
+    types, time_us = _scenario_types(log, piece), log.line.time_us
+    tags = {"source_format": FORMAT} | parsing.place_tags(log.map_name)
     return Recording(
         scenario_id=piece.name,
         dataset=DATASET,
         segment=log.name,
-        timestamps_s=nuplan_log.timestamps(log.line, piece),
+        timestamps_s=(time_us[piece.sweeps] - time_us[0]) * 1e-6,
         current_step=CURRENT_STEP,
         ego=0,
-        tracks=tracks,
+        tracks=states,
         features=features,
         lights=lights,
         route_corridor=tuple(lane for lane in route if lane in lanes),
         tags=tags | ({"scenario_types": "|".join(types)} if types else {}),
-        lost={name: count for name, count in lost.items() if count},
+        lost=parsing.nonzero(boxes_without_track=boxes, **lost, lights=unlit, roadblocks=unknown),
     )
 
 
 def _lights(
-    log: _Log, piece: Piece, city: City, features: tuple[MapFeature, ...]
+    log: Log, piece: Piece, city: City, features: tuple[MapFeature, ...]
 ) -> tuple[tuple[Light, ...], int]:
-    """Lights of the connectors around the drive, with stop points where connectors begin.
-
-    Returns:
-        The lights, and how many connectors with a light the whole map does not have.
-    """
+    """Lights of the connectors around the drive, which stop where these begin, and how many connectors are unknown."""
     starts = {feature.feature_id: feature.points[0].tolist() for feature in features}
     lights = parsing.Lights(len(piece.sweeps))
     unknown = set()
-    for step, connector, state in nuplan_log.light_states(log.database, log.line, piece):
+    for step, connector, status in _observed(log, piece, "traffic_light_status", "lane_connector_id, status"):
         good = isinstance(connector, int) and 0 <= connector < 2**32
         lane = feature_id("lane_connectors", connector) if good else -1
         if lane in starts:
-            lights.observe(step, lane, state, starts[lane])
+            lights.observe(step, lane, _LIGHT_STATES.get(status, LightState.UNKNOWN), starts[lane])
         elif lane not in city.lanes:
             unknown.add(connector)
     return lights.collected(), len(unknown)

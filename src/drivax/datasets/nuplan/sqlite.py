@@ -1,7 +1,6 @@
 """Untrusted SQLite files, opened read-only with bounded queries, and the layers of GeoPackages.
 
-A GeoPackage is a SQLite file whose geometries are BLOBs: a header of 8 bytes, an optional envelope, then WKB (OGC
-12-128r19, clause 2.1.3). So sqlite3 and shapely read it; no GDAL is needed.
+A geometry of a GeoPackage is a BLOB: a header of 8 bytes, an optional envelope, then WKB (OGC 12-128r19, clause 2.1.3).
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ from drivax.errors import DataError
 
 Array = np.ndarray[Any, Any]
 
-SQLITE_MAGIC = b"SQLite format 3\0"
+_MAGIC = b"SQLite format 3\0"
 _CURE = "download the file again"
-#: Longest text or BLOB that is believed, bytes; a damaged length must not allocate more.
+#: Longest accepted text or BLOB, bytes; a damaged length must not allocate more.
 _LONGEST_CELL = 1 << 26
-#: A query may take this many instructions of SQLite's machine per byte of the file (a full scan takes about 0.1),
-#: plus a million: a damaged tree that leads in circles ends.
+#: Limit of virtual machine instructions of a query: a million, plus 20 per byte of the file (a full scan takes about
+#: 0.1). It ends queries on damaged trees with cycles.
 _STEPS_PER_BYTE = 20
 _STEPS_AT_ONCE = 100_000
-#: Rows that one query names at most; old builds of SQLite take 999 parameters.
-_ROWS_AT_ONCE = 500
+#: Most parameters of a query; old builds of SQLite take 999.
+_VALUES_AT_ONCE = 500
 _GEOGRAPHIC = 4326
 #: Bytes of the envelope by its code: none, xy, xyz, xym, xyzm.
 _ENVELOPE_BYTES = (0, 32, 48, 48, 64)
@@ -52,24 +51,31 @@ class Database:
         return int(self._left < 0)
 
     def rows(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """All rows of a query."""
+        """Return all rows of a query."""
         self._left = 1_000_000 + _STEPS_PER_BYTE * self.path.stat().st_size
         try:
             return self._connection.execute(query, values).fetchall()
         except (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError) as error:
             raise DataError(f"SQLite cannot read it ({error})", file=self.path, cure=_CURE) from error
 
+    def rows_in(self, query: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
+        """Return all rows of a query that ends in ``IN``, for any number of values."""
+        rows = []
+        for start in range(0, len(values), _VALUES_AT_ONCE):
+            batch = values[start : start + _VALUES_AT_ONCE]
+            rows += self.rows(f"{query} ({', '.join('?' * len(batch))})", batch)
+        return rows
+
     def columns(self, table: str) -> frozenset[str]:
-        """Names of a table's columns; empty where there is no such table (views and virtual tables are none)."""
+        """Return the names of a table's columns; none where there is no such table (a view is none)."""
         real = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"
         if not self.rows(real, (table,)):
             return frozenset()
-        return frozenset(
-            str(name) for (name,) in self.rows("SELECT name FROM pragma_table_info(?)", (table,))
-        )
+        names = self.rows("SELECT name FROM pragma_table_info(?)", (table,))
+        return frozenset(str(name) for (name,) in names)
 
     def require(self, table: str, *columns: str) -> None:
-        """Check that a table has columns."""
+        """Raise a DataError unless a table has these columns."""
         present = self.columns(table)
         if not present:
             raise DataError(f"has no table {table}", file=self.path, cure=_CURE)
@@ -79,41 +85,37 @@ class Database:
 
 @contextlib.contextmanager
 def open_database(path: Path) -> Iterator[Database]:
-    """A SQLite file, opened read-only and as immutable: no lock, no journal, nothing is written next to it."""
+    """Open a SQLite file read-only and as immutable: no lock, no journal, nothing is written next to it."""
     try:
         with path.open("rb") as file:
-            head = file.read(len(SQLITE_MAGIC))
+            head = file.read(len(_MAGIC))
     except OSError as error:
         raise DataError(f"cannot be read ({error.strerror})", file=path, cure="check the path") from error
-    if head != SQLITE_MAGIC:
+    if head != _MAGIC:
         raise DataError("is no SQLite file", file=path, cure=_CURE)
     try:
         connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
     except sqlite3.Error as error:
         raise DataError(f"SQLite cannot open it ({error})", file=path, cure=_CURE) from error
     with contextlib.closing(connection):
-        connection.text_factory = _text
+        connection.text_factory = lambda value: value.decode("utf-8", "replace")
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_CELL)
         database = Database(path, connection)
         database.rows("PRAGMA trusted_schema = OFF")
         yield database
 
 
-def _text(value: bytes) -> str:
-    return value.decode("utf-8", "replace")
-
-
 @dataclass(frozen=True)
 class Layer:
-    """What a layer of a GeoPackage holds, its geometries aside.
+    """A layer of a GeoPackage without its geometries.
 
     Attributes:
-        name: Name of the table.
-        geometry: Name of the geometry column.
+        name: Table.
+        geometry: Geometry column.
         epsg: Coordinate reference system of the geometries.
         fid: Feature ids (row ids).
-        bounds: West, south, east, north in that system; NaN where a geometry cannot be read.
-        columns: Values of the columns that were asked for, None where the layer lacks the column.
+        bounds: West, south, east, north in that system; NaN where a geometry is unreadable.
+        columns: Values of the requested columns, None where the layer lacks a column.
     """
 
     name: str
@@ -124,14 +126,14 @@ class Layer:
     columns: Mapping[str, tuple[Any, ...]]
 
     def touching(self, box: tuple[float, float, float, float]) -> Int64[np.ndarray, " row"]:
-        """Rows whose bounds touch a box (west, south, east, north)."""
+        """Return the rows whose bounds touch a box (west, south, east, north)."""
         west, south, east, north = box
         low, high = self.bounds[:, :2], self.bounds[:, 2:]
         return np.flatnonzero((low <= (east, north)).all(axis=1) & (high >= (west, south)).all(axis=1))
 
 
 def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> Layer | None:
-    """The rows of a layer without their geometries; None where the GeoPackage has no such layer."""
+    """Read a layer without its geometries; None where the GeoPackage has no such layer."""
     present = database.columns(name)
     database.require("gpkg_geometry_columns", "table_name", "column_name", "srs_id")
     described = database.rows(
@@ -145,56 +147,39 @@ def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> La
     kept = [column for column in columns if column in present]
     listed = ", ".join(["rowid", f"substr({geometry}, 1, {_HEAD_BYTES})", *(f'"{c}"' for c in kept)])
     rows = database.rows(f"SELECT {listed} FROM {name} ORDER BY rowid")
-    fid = np.array([row[0] for row in rows], np.int64)
     values = {column: tuple(row[i + 2] for row in rows) for i, column in enumerate(kept)}
     layer = Layer(
         name=name,
         geometry=geometry,
         epsg=epsg if isinstance(epsg, int) and epsg > 0 else _GEOGRAPHIC,
-        fid=fid,
+        fid=np.array([row[0] for row in rows], np.int64),
         bounds=np.array([_envelope(row[1]) for row in rows], np.float64).reshape(-1, 4),
         columns={column: values.get(column, (None,) * len(rows)) for column in columns},
     )
-    _measure_bounds(database, layer)
+    unknown = np.flatnonzero(~np.isfinite(layer.bounds).all(axis=1))
+    if len(unknown):
+        shapes = geometries(database, layer, unknown)
+        with np.errstate(invalid="ignore"):
+            layer.bounds[unknown] = [(np.nan,) * 4 if shape is None else shape.bounds for shape in shapes]
     return layer
 
 
 def _envelope(head: Any) -> tuple[float, float, float, float]:
-    """Bounds from the header of a geometry BLOB, NaN where it has none."""
-    nothing = np.nan, np.nan, np.nan, np.nan
-    if (
-        not isinstance(head, bytes)
-        or len(head) < _HEAD_BYTES
-        or head[:2] != b"GP"
-        or not 1 <= head[3] >> 1 & 7 <= 4
-    ):
-        return nothing
+    """Bounds in the header of a geometry BLOB; NaN where it has none."""
+    complete = isinstance(head, bytes) and len(head) >= _HEAD_BYTES and head[:2] == b"GP"
+    if not complete or not 1 <= head[3] >> 1 & 7 <= 4:
+        return np.nan, np.nan, np.nan, np.nan
     west, east, south, north = struct.unpack_from("<4d" if head[3] & 1 else ">4d", head, 8)
     return west, south, east, north
 
 
-def _measure_bounds(database: Database, layer: Layer) -> None:
-    """Fills in the bounds of geometries that come without an envelope."""
-    rows = np.flatnonzero(~np.isfinite(layer.bounds).all(axis=1))
-    for start in range(0, len(rows), _ROWS_AT_ONCE):
-        part = rows[start : start + _ROWS_AT_ONCE]
-        shapes = geometries(database, layer, part)
-        with np.errstate(invalid="ignore"):
-            layer.bounds[part] = [(np.nan,) * 4 if shape is None else shape.bounds for shape in shapes]
-
-
 def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]) -> Array:
-    """Geometries of some rows as an array of shapely objects; None where one cannot be read."""
+    """Return the geometries of rows as an array of shapely objects; None where one is unreadable."""
     shapely = import_extra("shapely")
-    if not len(rows):
-        return np.zeros(0, dtype=object)
-    blob_by_fid: dict[int, bytes | None] = {}
-    for start in range(0, len(rows), _ROWS_AT_ONCE):
-        fids = [int(fid) for fid in layer.fid[rows[start : start + _ROWS_AT_ONCE]]]
-        marks = ", ".join("?" * len(fids))
-        query = f"SELECT rowid, {layer.geometry} FROM {layer.name} WHERE rowid IN ({marks})"
-        blob_by_fid.update((fid, _wkb(blob)) for fid, blob in database.rows(query, fids))
-    blobs = np.array([None, *(blob_by_fid.get(int(fid)) for fid in layer.fid[rows])], dtype=object)[1:]
+    fids = layer.fid[rows].tolist()
+    query = f"SELECT rowid, {layer.geometry} FROM {layer.name} WHERE rowid IN"
+    blob_by_fid = {fid: _wkb(blob) for fid, blob in database.rows_in(query, fids)}
+    blobs = np.array([None, *map(blob_by_fid.get, fids)], dtype=object)[1:]
     with np.errstate(invalid="ignore"):  # coordinates that are NaN
         try:
             return np.asarray(shapely.from_wkb(blobs, on_invalid="ignore"))
@@ -203,21 +188,17 @@ def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]
 
 
 def _decoded(blob: bytes | None) -> Any:
-    """One geometry; None where it cannot be read or is a curve."""
-    import shapely
-
-    try:
-        return shapely.from_wkb(blob, on_invalid="ignore")
-    except NotImplementedError:
-        return None
+    """One geometry; None where it is unreadable or a curve."""
+    with contextlib.suppress(NotImplementedError):
+        return import_extra("shapely").from_wkb(blob, on_invalid="ignore")
+    return None
 
 
 def _wkb(blob: Any) -> bytes | None:
     """The WKB in a geometry BLOB; None where it is none, empty, or of an extension."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None
-    flags = blob[3]
-    code = flags >> 1 & 7
-    if code >= len(_ENVELOPE_BYTES) or flags & 0b110000:
+    code = blob[3] >> 1 & 7
+    if code >= len(_ENVELOPE_BYTES) or blob[3] & 0b110000:
         return None
     return blob[8 + _ENVELOPE_BYTES[code] :]

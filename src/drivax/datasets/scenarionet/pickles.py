@@ -1,17 +1,17 @@
-"""Pickles read as data: numbers, texts, containers and NumPy arrays; whatever else one names is refused.
+"""Pickles read as data, without running code: numbers, texts, containers and NumPy arrays; and checks of their values.
 
-Python's own unpickler runs what a pickle asks for. Refusing names (``Unpickler.find_class``) is not enough: its memo
-grows to whatever index a damaged file holds, arrays are allocated before their data is seen, and deeply nested keys
-overflow the stack of the interpreter. So the operations, split by the standard library's disassembler, are carried
-out here, those that build data only, each checked against what the file really holds.
+Refusing names (``Unpickler.find_class``) is not enough: the memo of Python's unpickler grows to any index in the file,
+arrays are allocated before their data is read, and deeply nested keys overflow the stack. So the operations, split by
+the standard library's disassembler, are carried out here, each checked against the size of the file.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import pickletools
 import re
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,22 +19,32 @@ import numpy as np
 
 from drivax.errors import DataError
 
-#: More than this is no recorded scenario (real ones take 0.6 to 10 MB).
+Array = np.ndarray[Any, Any]
+
+SKIP = "skip this file, or generate it again"
+#: Numbers in one value, and in all values of one kind of one file.
+MOST_NUMBERS = 4_000_000
+_NUMBER = (int, float)
+#: Recorded scenarios have 0.6 to 10 MB.
 MOST_BYTES = 64 << 20
 MOST_OPERATIONS = 4_000_000
 MOST_AXES = 4
 _DAMAGED = "copy or generate the file again"
+_DISTRUST = "do not open this file with pickle: it could run anything"
 _TYPE_CODE = re.compile(r"[<>|=]?([biu]1|[iu][248]|f[248]|[SU]\d{1,4}|O8?)")
-#: Modules by their name today: Python 2 and NumPy before 2.0 used others.
+#: Modules of Python 2 and of NumPy before 2.0 by their present name.
 _MODULES = {"__builtin__": "builtins", "numpy.core.multiarray": "numpy._core.multiarray",
             "numpy.core.numeric": "numpy._core.numeric"}  # fmt: skip
 
 
 def load(data: bytes) -> Any:
-    """The content of a pickle of any protocol that holds data only.
+    """Return the content of a pickle of any protocol that holds data only.
 
-    Arrays are views of the file's bytes (those of booleans as uint8), arrays of objects with one axis become lists,
-    NumPy scalars Python numbers, and ordered or default dictionaries plain ones.
+    Arrays are views of the file's bytes (those of booleans as uint8); arrays of objects with one axis become lists,
+    NumPy scalars Python numbers, ordered and default dictionaries plain ones.
+
+    Raises:
+        DataError: It is damaged, too large, or names anything else.
     """
     if len(data) > MOST_BYTES:
         raise DataError(f"a pickle of {len(data) >> 20} MB", cure=f"drivax reads up to {MOST_BYTES >> 20} MB")
@@ -46,37 +56,22 @@ def load(data: bytes) -> Any:
             machine.run(operation.name, argument)
         (result,) = machine.stack
     except (ValueError, IndexError, KeyError, OverflowError) as error:
-        raise DataError(f"is a damaged pickle ({_one_line(error)})", cure=_DAMAGED) from error
+        reason = " ".join(str(error).split())[:100] or type(error).__name__
+        raise DataError(f"is a damaged pickle ({reason})", cure=_DAMAGED) from error
     return result
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:100] or type(error).__name__
 
 
 @dataclass(frozen=True)
 class _Global:
-    """Something that a pickle names."""
-
     name: str
 
 
 @dataclass
 class _Unbuilt:
-    """An array or array type of which a later operation brings the rest, and where it was noted until then."""
+    """An array or array type whose rest follows in a later operation, and its places in the memo."""
 
     finish: Callable[[Any], Any]
     places: list[int] = field(default_factory=list)
-
-
-def _global(module: str, name: str) -> _Global:
-    full = f"{_MODULES.get(module, module)}.{name}"
-    if full not in _NAMED and full not in _CALLED:
-        raise DataError(
-            f"names {full[:100]}, which is no data",
-            cure="do not open this file with pickle: it could run anything",
-        )
-    return _Global(full)
 
 
 class _Machine:
@@ -92,38 +87,39 @@ class _Machine:
         """Carry out one operation."""
         if name in _LITERALS:
             self.stack.append(argument)
-        elif name in _FRESH:
-            self.stack.append(_FRESH[name]())
-        elif name in _SKIPPED:
-            return
+        elif name in _MAKES:
+            count, make = _MAKES[name]
+            items = self._take(count)
+            self.stack.append(make(items))
+        elif name in _ADDS:
+            count, kind, add = _ADDS[name]
+            items = self._take(count)
+            if type(self.stack[-1]) is not kind:
+                raise ValueError(f"a {kind.__name__} was expected")
+            add(self.stack[-1], items)
         elif name in _OPERATIONS:
             _OPERATIONS[name](self, argument)
-        else:
-            raise DataError(
-                f"uses the pickle operation {name}, which data does not need",
-                cure="do not open this file with pickle: it could run anything",
-            )
+        elif name not in _SKIPPED:
+            problem = f"uses the pickle operation {name}, which data does not need"
+            raise DataError(problem, cure=_DISTRUST)
+
+    def _take(self, count: int | None) -> list[Any]:
+        """Remove the last items from the stack; all down to the mark where there is no count."""
+        if count is None:
+            items, self.stack = self.stack, self._below.pop()
+            return items
+        if len(self.stack) < count:
+            raise IndexError("the stack is empty")
+        items = self.stack[len(self.stack) - count :]
+        del self.stack[len(self.stack) - count :]
+        return items
 
     def _mark(self, argument: Any) -> None:
         self._below.append(self.stack)
         self.stack = []
 
-    def _from_mark(self) -> list[Any]:
-        items, self.stack = self.stack, self._below.pop()
-        return items
-
-    def _pop_mark(self, argument: Any) -> None:
-        self._from_mark()
-
     def _pop(self, argument: Any) -> None:
-        # On an empty stack POP removes the mark below it.
-        if self.stack:
-            self.stack.pop()
-        else:
-            self._from_mark()
-
-    def _duplicate(self, argument: Any) -> None:
-        self.stack.append(self.stack[-1])
+        self._take(1 if self.stack else None)  # on an empty stack POP removes the mark below it
 
     def _put(self, index: Any) -> None:
         place = len(self._memo) if index is None else index
@@ -131,86 +127,21 @@ class _Machine:
         if isinstance(top, _Unbuilt):
             top.places.append(place)
 
-    def _get(self, index: Any) -> None:
-        self.stack.append(self._memo[index])
-
-    def _last(self, count: int) -> tuple[Any, ...]:
-        if len(self.stack) < count:
-            raise IndexError("the stack is empty")
-        items = tuple(self.stack[-count:])
-        del self.stack[-count:]
-        return items
-
-    def _tuple(self, argument: Any) -> None:
-        items = tuple(self._from_mark())
-        self.stack.append(items)
-
-    def _tuple_1(self, argument: Any) -> None:
-        self.stack.append(self._last(1))
-
-    def _tuple_2(self, argument: Any) -> None:
-        self.stack.append(self._last(2))
-
-    def _tuple_3(self, argument: Any) -> None:
-        self.stack.append(self._last(3))
-
-    def _list(self, argument: Any) -> None:
-        items = self._from_mark()
-        self.stack.append(items)
-
-    def _dictionary(self, argument: Any) -> None:
-        items = self._from_mark()
-        self.stack.append({})
-        self._set(items)
-
-    def _frozen_set(self, argument: Any) -> None:
-        items = self._from_mark()
-        self.stack.append(frozenset(map(_key, items)))
-
-    def _append(self, argument: Any) -> None:
-        (item,) = self._last(1)
-        self._top(list).append(item)
-
-    def _appends(self, argument: Any) -> None:
-        items = self._from_mark()
-        self._top(list).extend(items)
-
-    def _set_item(self, argument: Any) -> None:
-        self._set(self._last(2))
-
-    def _set_items(self, argument: Any) -> None:
-        self._set(self._from_mark())
-
-    def _set(self, items: Any) -> None:
-        container = self._top(dict)
-        for key, value in zip(items[::2], items[1::2], strict=True):
-            container[_key(key)] = value
-
-    def _add_items(self, argument: Any) -> None:
-        items = self._from_mark()
-        self._top(set).update(map(_key, items))
-
-    def _top(self, kind: type[Any]) -> Any:
-        if type(self.stack[-1]) is not kind:
-            raise ValueError(f"a {kind.__name__} was expected")
-        return self.stack[-1]
-
-    def _name(self, argument: str) -> None:
-        module, _, name = argument.partition(" ")
-        self.stack.append(_global(module, name))
-
-    def _name_from_stack(self, argument: Any) -> None:
-        module, name = self._last(2)
+    def _name(self, argument: str | None) -> None:
+        module, name = self._take(2) if argument is None else argument.partition(" ")[::2]
         if not isinstance(module, str) or not isinstance(name, str):
             raise ValueError("a name that is no text")
-        self.stack.append(_global(module, name))
+        full = f"{_MODULES.get(module, module)}.{name}"
+        if full not in _NAMED and full not in _CALLED:
+            raise DataError(f"names {full[:100]}, which is no data", cure=_DISTRUST)
+        self.stack.append(_Global(full))
 
     def _call(self, argument: Any) -> None:
-        named, arguments = self._last(2)
+        named, arguments = self._take(2)
         make = _CALLED.get(named.name) if isinstance(named, _Global) else None
         if make is None or not isinstance(arguments, tuple):
             raise ValueError("a call of something else than a constructor")
-        # Calls copy what they are given, and the memo can give them the same thing again and again.
+        # Calls copy their arguments, and the memo can repeat the same argument.
         self._called_with += sum(len(part) for part in arguments if isinstance(part, Sized))
         if self._called_with > MOST_BYTES:
             raise ValueError("calls with more than the file holds")
@@ -220,7 +151,7 @@ class _Machine:
             raise ValueError(f"odd arguments for {named.name}") from error
 
     def _build(self, argument: Any) -> None:
-        (state,) = self._last(1)
+        (state,) = self._take(1)
         unbuilt = self.stack[-1]
         if not isinstance(unbuilt, _Unbuilt):
             raise ValueError("a state for something that has none")
@@ -229,25 +160,35 @@ class _Machine:
             self._memo[place] = built
 
 
-_OPERATIONS: dict[str, Callable[[_Machine, Any], None]] = {
-    "MARK": _Machine._mark, "POP": _Machine._pop, "POP_MARK": _Machine._pop_mark, "DUP": _Machine._duplicate,
-    "PUT": _Machine._put, "BINPUT": _Machine._put, "LONG_BINPUT": _Machine._put, "MEMOIZE": _Machine._put,
-    "GET": _Machine._get, "BINGET": _Machine._get, "LONG_BINGET": _Machine._get,
-    "TUPLE": _Machine._tuple, "TUPLE1": _Machine._tuple_1, "TUPLE2": _Machine._tuple_2,
-    "TUPLE3": _Machine._tuple_3, "LIST": _Machine._list, "DICT": _Machine._dictionary,
-    "FROZENSET": _Machine._frozen_set, "APPEND": _Machine._append, "APPENDS": _Machine._appends,
-    "SETITEM": _Machine._set_item, "SETITEMS": _Machine._set_items, "ADDITEMS": _Machine._add_items,
-    "GLOBAL": _Machine._name, "STACK_GLOBAL": _Machine._name_from_stack, "REDUCE": _Machine._call,
-    "BUILD": _Machine._build,
-}  # fmt: skip
+def _fill(container: dict[Any, Any], items: Sequence[Any]) -> dict[Any, Any]:
+    container.update((_key(key), value) for key, value in zip(items[::2], items[1::2], strict=True))
+    return container
+
+
 _LITERALS = frozenset((
     "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT", "STRING", "BINSTRING",
     "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES",
     "BINBYTES8", "BYTEARRAY8",
 ))  # fmt: skip
-_FRESH: dict[str, Callable[[], Any]] = {
-    "NONE": lambda: None, "NEWTRUE": lambda: True, "NEWFALSE": lambda: False, "EMPTY_LIST": list,
-    "EMPTY_TUPLE": tuple, "EMPTY_DICT": dict, "EMPTY_SET": set,
+#: Operations that make a value of the last items, of those above the mark without a number.
+_MAKES: dict[str, tuple[int | None, Callable[[list[Any]], Any]]] = {
+    "NONE": (0, lambda items: None), "NEWTRUE": (0, lambda items: True), "NEWFALSE": (0, lambda items: False),
+    "EMPTY_LIST": (0, list), "EMPTY_TUPLE": (0, tuple), "EMPTY_DICT": (0, dict), "EMPTY_SET": (0, set),
+    "TUPLE1": (1, tuple), "TUPLE2": (2, tuple), "TUPLE3": (3, tuple), "TUPLE": (None, tuple), "LIST": (None, list),
+    "DICT": (None, lambda items: _fill({}, items)), "FROZENSET": (None, lambda items: frozenset(map(_key, items))),
+}  # fmt: skip
+#: Operations that add items to a container of a type.
+_ADDS: dict[str, tuple[int | None, type[Any], Callable[[Any, list[Any]], Any]]] = {
+    "APPEND": (1, list, list.extend), "APPENDS": (None, list, list.extend),
+    "SETITEM": (2, dict, _fill), "SETITEMS": (None, dict, _fill),
+    "ADDITEMS": (None, set, lambda members, items: members.update(map(_key, items))),
+}  # fmt: skip
+_OPERATIONS: dict[str, Callable[[_Machine, Any], Any]] = {
+    "MARK": _Machine._mark, "POP": _Machine._pop, "POP_MARK": lambda machine, _: machine._take(None),
+    "DUP": lambda machine, _: machine.stack.append(machine.stack[-1]),
+    **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"), _Machine._put),
+    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda self, index: self.stack.append(self._memo[index])),
+    "GLOBAL": _Machine._name, "STACK_GLOBAL": _Machine._name, "REDUCE": _Machine._call, "BUILD": _Machine._build,
 }  # fmt: skip
 _SKIPPED = frozenset(("PROTO", "FRAME", "STOP"))
 
@@ -260,45 +201,38 @@ def _key(key: Any) -> Any:
     raise ValueError(f"a key of type {type(key).__name__}")
 
 
-def _items(items: Any = ()) -> list[Any]:
+def _members(items: Any = ()) -> list[Any]:
     if not isinstance(items, list | tuple | set | frozenset):
         raise ValueError("a container of something else than items")
     return list(items)
 
 
 def _new_dictionary(*arguments: Any) -> dict[Any, Any]:
-    """Of an ordered dictionary, or of a default dictionary, whose first argument makes defaults."""
+    """An ordered dictionary, or a default dictionary, whose first argument makes defaults."""
     pairs = [argument for argument in arguments if not isinstance(argument, _Global) and argument is not None]
-    return {_key(key): value for items in pairs for key, value in _items(items)}
+    return {_key(key): value for items in pairs for key, value in _members(items)}
 
 
 def _encoded(text: Any, encoding: Any = "latin1") -> bytes:
-    """How protocols up to 2 hold bytes."""
+    """Bytes, as protocols up to 2 hold them."""
     if not isinstance(text, str):
         raise ValueError("bytes of something else")
     return text.encode("latin1")
 
 
 def _type(code: Any, align: Any = False, copy: Any = False) -> _Unbuilt:
-    """An array type; the order of its bytes follows with its state."""
-    plain = _checked_type(code)
+    """An array type; its byte order follows with its state."""
+    if not isinstance(code, str) or not _TYPE_CODE.fullmatch(code):
+        raise ValueError(f"arrays of type {code[:20]!r}" if isinstance(code, str) else "arrays of no type")
+    plain = np.dtype(code)
 
     def finish(state: Any) -> np.dtype[Any]:
-        if (
-            not isinstance(state, tuple)
-            or state[2:5] != (None, None, None)
-            or state[1] not in ("<", ">", "|", "=")
-        ):
+        plain_state = isinstance(state, tuple) and state[2:5] == (None, None, None)
+        if not plain_state or state[1] not in ("<", ">", "|", "="):
             raise ValueError("an array type with fields")
         return plain.newbyteorder(state[1])
 
     return _Unbuilt(finish)
-
-
-def _checked_type(code: Any) -> np.dtype[Any]:
-    if not isinstance(code, str) or not _TYPE_CODE.fullmatch(code):
-        raise ValueError(f"arrays of type {code[:20]!r}" if isinstance(code, str) else "arrays of no type")
-    return np.dtype(code)
 
 
 def _empty_array(kind: Any, shape: Any, code: Any) -> _Unbuilt:
@@ -314,7 +248,7 @@ def _empty_array(kind: Any, shape: Any, code: Any) -> _Unbuilt:
 
 
 def _array(content: Any, dtype: Any, shape: Any, order: Any = "C") -> Any:
-    """An array over bytes that are there, so that no shape can ask for more memory than the file has."""
+    """An array over bytes of the file, so that no shape can ask for more memory than the file has."""
     if not isinstance(dtype, np.dtype) or not isinstance(shape, tuple) or len(shape) > MOST_AXES:
         raise ValueError("an array of odd shape or type")
     if any(type(size) is not int or not 0 <= size <= MOST_BYTES for size in shape):
@@ -340,12 +274,12 @@ def _scalar(dtype: Any, content: Any = b"") -> Any:
     return bool(value) if dtype.kind == "b" else value
 
 
-#: What a pickle may name without calling it.
+#: Names that may occur uncalled.
 _NAMED = frozenset((
     "numpy.ndarray", "builtins.int", "builtins.long", "builtins.float", "builtins.str", "builtins.unicode",
     "builtins.bool", "builtins.list", "builtins.dict", "builtins.tuple",
 ))  # fmt: skip
-#: What a pickle may call, and what is done instead.
+#: Constructors that may be called, and their substitutes.
 _CALLED: dict[str, Callable[..., Any]] = {
     "numpy._core.multiarray._reconstruct": _empty_array,
     "numpy._core.multiarray.scalar": _scalar,
@@ -353,18 +287,110 @@ _CALLED: dict[str, Callable[..., Any]] = {
     "numpy.dtype": _type,
     "collections.defaultdict": _new_dictionary,
     "collections.OrderedDict": _new_dictionary,
-    "builtins.set": lambda items=(): {_key(item) for item in _items(items)},
-    "builtins.frozenset": lambda items=(): frozenset(_key(item) for item in _items(items)),
-    "builtins.bytearray": lambda content=b"", encoding="latin1": bytes(_content(content)),
+    "builtins.set": lambda items=(): set(map(_key, _members(items))),
+    "builtins.frozenset": lambda items=(): frozenset(map(_key, _members(items))),
+    "builtins.bytearray": lambda content=b"", encoding="latin1": _content(content),
     "builtins.bytes": lambda content=b"": _content(content),
     "_codecs.encode": _encoded,
 }
 
 
 def _content(content: Any) -> bytes:
-    """The bytes of a bytes-like value; an integer, which would allocate that many, is refused."""
+    """Bytes of a bytes-like value; an integer, which would allocate that many, is refused."""
     if isinstance(content, str):
         return _encoded(content)
     if not isinstance(content, bytes | bytearray):
         raise ValueError("bytes of something else")
     return bytes(content)
+
+
+def mapping(parent: Any, name: str, what: str = "the file") -> Mapping[Any, Any]:
+    """Return the dictionary under a name."""
+    value = parent.get(name) if isinstance(parent, dict) else None
+    if not isinstance(value, dict):
+        raise DataError(f"{what} has no dictionary {name!r}", cure=SKIP)
+    return value
+
+
+def text(value: Any) -> str | None:
+    """Return a text that can be written as UTF-8, also of a whole number; None for anything else."""
+    if not isinstance(value, bool) and isinstance(value, str | int):
+        with contextlib.suppress(ValueError):  # a lone surrogate, or an integer of thousands of digits
+            return str(value).encode().decode()
+    return None
+
+
+def whole(value: Any) -> int | None:
+    """Return a whole number, also from a text; None for anything else."""
+    written = text(value)
+    return int(written) if written and written.isascii() and written.isdigit() and len(written) < 19 else None
+
+
+def number(value: Any) -> float | None:
+    """Return a number of at most 1e15; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, _NUMBER) or abs(value) > 1e15 or value != value:
+        return None
+    return float(value)
+
+
+def items(value: Any) -> Sequence[Any]:
+    """Return the items of a list, tuple, set or one-dimensional array; none for anything else."""
+    if isinstance(value, np.ndarray):
+        return value.tolist() if value.ndim == 1 else []
+    return list(value) if isinstance(value, list | tuple | set) else []
+
+
+def count_rows(value: Any) -> int:
+    """Return the number of rows of a list, tuple or array; 0 for anything else."""
+    has_rows = isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim)
+    return len(value) if has_rows else 0
+
+
+def extent(value: Any) -> int:
+    """Return the size of an array or the number of items of a list."""
+    return value.size if isinstance(value, np.ndarray) else count_rows(value)
+
+
+def floats(value: Any, what: str) -> Array:
+    """Return numbers, or rows of up to three numbers, as float64 from an array, list or tuple."""
+    if isinstance(value, np.ndarray):
+        narrow = value.ndim == 1 or (value.ndim == 2 and value.shape[1] <= 3)
+        if value.dtype.kind in "biuf" and narrow and len(value) <= MOST_NUMBERS:
+            with np.errstate(invalid="ignore"):  # damaged numbers may be signalling NaNs
+                return value.astype(np.float64)
+    elif isinstance(value, list | tuple) and len(value) <= MOST_NUMBERS:
+        try:
+            return np.array([_row(row) for row in value], dtype=np.float64)
+        except (ValueError, OverflowError, TypeError) as error:
+            raise DataError(f"{what} are not rows of numbers", cure=SKIP) from error
+    raise DataError(f"{what} are not numbers", cure=SKIP)
+
+
+def _row(row: Any) -> Any:
+    if isinstance(row, _NUMBER):
+        return row
+    if isinstance(row, np.ndarray) and row.dtype.kind in "biuf" and row.size <= 3:
+        return row
+    if isinstance(row, list | tuple) and len(row) <= 3 and all(isinstance(part, _NUMBER) for part in row):
+        return row
+    raise ValueError("no row of numbers")
+
+
+class Names:
+    """Distinct integers for the names of one file: their own where all are whole numbers, else their order.
+
+    Args:
+        names: All names, as texts.
+        bits: Own numbers must be below two to the power of this.
+    """
+
+    def __init__(self, names: Sequence[str], bits: int) -> None:
+        own = [whole(name) for name in names]
+        kept = [number for number in own if number is not None and number < 1 << bits]
+        numbers = kept if len(kept) == len(names) and len(set(kept)) == len(kept) else range(len(names))
+        self._numbers = dict(zip(names, numbers, strict=True))
+
+    def get(self, value: Any) -> int | None:
+        """Return the number of a name; None where the file has no such name."""
+        name = text(value)
+        return None if name is None else self._numbers.get(name)

@@ -1,11 +1,12 @@
 """Reader of ScenarioNet pickles: one recording per file, made from WOMD, nuScenes, nuPlan, Argoverse or MetaDrive.
 
-The dictionaries are those of MetaDrive's ``ScenarioDescription``. What their converters do to each data set is undone
-here as far as the file allows (docs/data/scenarionet.md).
+The dictionaries are those of MetaDrive's ``ScenarioDescription``. The reader undoes what their converters do to each
+data set as far as the file allows (docs/data/scenarionet.md).
 """
 
 from __future__ import annotations
 
+import contextlib
 import pickletools
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -18,15 +19,14 @@ import numpy as np
 from drivax.datasets import parsing
 from drivax.datasets.elevation import flatten, lift
 from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M
-from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.datasets.scenarionet import pickles
 from drivax.datasets.scenarionet.map import RoadMap, road_map
-from drivax.datasets.scenarionet.tracks import read_tracks, velocity_is_missing
-from drivax.datasets.scenarionet.values import SKIP, Names, floats, items, mapping, text, whole
+from drivax.datasets.scenarionet.pickles import SKIP, Names, count_rows, floats, items, mapping, text, whole
 from drivax.errors import DataError
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import CURRENT_STEP, DT_S, LANE_KINDS, Flag, LightState
+from drivax.scenario.schema import CURRENT_STEP, DT_S, LANE_KINDS, AgentKind, Flag, LightState
 
 Array = np.ndarray[Any, Any]
 
@@ -49,7 +49,24 @@ _STATES = {
     "TRAFFIC_LIGHT_GREEN": LightState.GO,
     "TRAFFIC_LIGHT_UNKNOWN": LightState.UNKNOWN,
 }
-_MOST_STATES = 2_000_000
+_MOST_LIGHT_STATES = 2_000_000
+_MOST_TRACK_STATES = 1_000_000
+_AGENTS = {
+    "VEHICLE": AgentKind.VEHICLE,
+    "PEDESTRIAN": AgentKind.PEDESTRIAN,
+    "CYCLIST": AgentKind.CYCLIST,
+    **dict.fromkeys(("TRAFFIC_CONE", "TRAFFIC_BARRIER", "TRAFFIC_OBJECT"), AgentKind.STATIC),
+}
+#: Possible numbers of columns of each state, and its largest plausible value: metres, radians, m/s.
+_COLUMNS = {
+    "position": ((2, 3), 1e7),
+    "heading": ((1,), 1e4),
+    "velocity": ((2, 3), 1e3),
+    **dict.fromkeys(("length", "width", "height"), ((1,), 1e3)),
+    "valid": ((1,), np.inf),
+}
+#: A longer last step is motion.
+_MOVED_M = 0.05
 #: A scenario file names its dictionaries within this many bytes.
 _HEAD_BYTES = 4096
 _SIGNS = (b"version", b"length")
@@ -58,7 +75,7 @@ _PARTS = (b"tracks", b"metadata", b"map_features", b"dynamic_map_states")
 
 @dataclass(frozen=True)
 class ScenarioNet:
-    """Reads ScenarioNet pickles without running them: a pickle that names anything but data is refused."""
+    """Reads ScenarioNet pickles without running them; one that names anything but data is refused."""
 
     name: str = _NAME
     patterns: tuple[str, ...] = ("sd_*.pkl", "[0-9]*.pkl")
@@ -66,19 +83,12 @@ class ScenarioNet:
 
     def recognise(self, path: Path) -> bool:
         """Whether it is a pickle that begins with the keys of a scenario."""
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEAD_BYTES)
-        except OSError:
-            return False
-        return (
-            head[:1] in (b"\x80", b"(", b"}")
-            and all(sign in head for sign in _SIGNS)
-            and any(part in head for part in _PARTS)
-        )
+        head = _head(path)
+        keys = all(sign in head for sign in _SIGNS) and any(part in head for part in _PARTS)
+        return head[:1] in (b"\x80", b"(", b"}") and keys
 
     def describe(self, path: Path) -> Description:
-        """Data set, version and length of the scenario, and what its map lacks."""
+        """Data set and version of the scenario, and what it lacks."""
         tree = _load(path)
         recording = decode(tree)
         lanes = [f for f in recording.features if f.kind in LANE_KINDS]
@@ -96,21 +106,24 @@ class ScenarioNet:
         )
 
     def count(self, path: Path) -> int:
-        """The number of windows, by the length that the file names at its beginning."""
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEAD_BYTES)
-        except OSError:
-            return 0
-        steps = _named_length(head)
+        """Return the number of windows, by the length that the file names at its beginning."""
+        steps = _named_length(_head(path))
         return 0 if steps is None else parsing.windows_of(steps)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recording of one file, or why it cannot be read."""
+        """Yield the recording of a file, or the bad record in its place."""
         try:
             yield decode(_load(path))
         except DataError as error:
             yield BadRecord.of(error, path)
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(_HEAD_BYTES)
+    except OSError:
+        return b""
 
 
 def _load(path: Path) -> Any:
@@ -125,20 +138,22 @@ def _load(path: Path) -> Any:
 def _named_length(head: bytes) -> int | None:
     """The value of the key ``length`` in the beginning of a pickle."""
     last = None
-    try:
+    with contextlib.suppress(ValueError):  # the beginning is cut anywhere
         for operation, argument, _ in pickletools.genops(head):
             if operation.name in ("MEMOIZE", "BINPUT", "LONG_BINPUT", "PUT"):
                 continue
             if last == "length":
                 return argument if type(argument) is int and 0 < argument < 1_000_000 else None
             last = argument
-    except ValueError:  # the beginning ends somewhere
-        return None
     return None
 
 
 def decode(tree: Any) -> Recording:
-    """The recording in a ScenarioNet dictionary, in the file's map frame, metres, float64."""
+    """Return the recording in a ScenarioNet dictionary, in the file's map frame, metres, float64.
+
+    Raises:
+        DataError: The dictionary is damaged.
+    """
     metadata = mapping(tree, "metadata")
     table = {name: body for key, body in mapping(tree, "tracks").items() if (name := text(key)) is not None}
     rows = {name: row for row, name in enumerate(table)}
@@ -150,6 +165,8 @@ def decode(tree: Any) -> Recording:
     lost = Counter({**roads.lost, "one_point_features": parsing.one_point_features(roads.features)})
     lights = _lights(mapping(tree, "dynamic_map_states"), steps, dataset, roads, lost)
     tracks, features = _with_heights(tracks, roads)
+    tags = {"source_format": _NAME} | parsing.place_tags(text(metadata.get("map")))
+    kind = text(metadata.get("scenario_type")) or None
     return Recording(
         scenario_id=identity,
         dataset=dataset,
@@ -162,7 +179,7 @@ def decode(tree: Any) -> Recording:
         lights=lights,
         to_predict=_named_rows(metadata.get("tracks_to_predict"), rows),
         of_interest=_named_rows(metadata.get("objects_of_interest"), rows),
-        tags=_tags(metadata),
+        tags=tags | ({} if kind is None else {"scenario_types": kind[:64]}),
         lost=parsing.nonzero(**lost),
         flags=flags,
         split_gap_m=_WOMD_GAP_M if dataset == "womd" else None,
@@ -194,11 +211,79 @@ def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
     raise DataError(f"the ego {(named or 'is not named')[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
 
 
+def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> Tracks:
+    """Read ``tracks``. Invalid states become zeros; a velocity that the file lacks is zero."""
+    titles = [f"track {name[:40]!r}" for name in table]
+    bodies = [mapping({"": body}, "", f"tracks[{name[:40]!r}]") for name, body in table.items()]
+    states = [mapping(body, "state", title) for title, body in zip(titles, bodies, strict=True)]
+    steps = count_rows(states[ego].get("position"))
+    if steps == 0 or steps * len(states) > _MOST_TRACK_STATES:
+        raise DataError(f"{len(states)} tracks of {steps} steps", cure=SKIP)
+    stacked = {name: np.zeros((len(states), steps, columns[-1])) for name, (columns, _) in _COLUMNS.items()}
+    for row, (title, state) in enumerate(zip(titles, states, strict=True)):
+        for name in _COLUMNS:
+            values = _series(state, name, steps, title)
+            if values is not None:
+                stacked[name][row, :, : values.shape[1]] = values
+            elif name in ("position", "heading"):
+                raise DataError(f"{title} has no {name}", cure=SKIP)
+            elif name == "valid":
+                stacked[name][row] = 1.0
+    valid = stacked["valid"][..., 0] > 0.5
+    for name, (_, limit) in _COLUMNS.items():
+        stacked[name][~valid] = 0.0
+        parsing.check_within(limit, stacked[name])
+    size = np.concatenate([stacked[name] for name in ("length", "width", "height")], axis=-1)
+    longest, widest, _ = size[ego].max(axis=0)
+    if longest < widest:  # nuScenes files have a car 1.73 m long and 4.08 m wide
+        size[ego] = size[ego][:, [1, 0, 2]]
+    return Tracks(
+        xy=stacked["position"][..., :2].copy(),
+        z=stacked["position"][..., 2].copy(),
+        heading=np.where(valid, wrap(stacked["heading"][..., 0]), 0.0),
+        velocity=stacked["velocity"][..., :2].copy(),
+        size=size,
+        valid=valid,
+        kind=np.array(
+            [_AGENTS.get(text(body.get("type")) or "", AgentKind.OTHER) for body in bodies], np.int8
+        ),
+        track_id=np.array([names.get(name) for name in table], np.int64),
+    )
+
+
+def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array | None:
+    """One state of one track as ``[time, column]``; None where it is missing."""
+    given = state.get(name)
+    if given is None:
+        return None
+    if count_rows(given) != steps:
+        raise DataError(f"{what} has {count_rows(given)} values of {name}, {steps} steps", cure=SKIP)
+    values = floats(given, f"{what}: {name}")
+    values = values[:, None] if values.ndim == 1 else values
+    if values.ndim != 2 or values.shape[1] not in _COLUMNS[name][0]:
+        raise DataError(f"{what} has a {name} of shape {values.shape}", cure=SKIP)
+    return values
+
+
+def velocity_is_missing(tracks: Tracks) -> bool:
+    """Whether the file has no velocities, or differences that are zero where moving tracks end, as for nuScenes."""
+    rows = np.arange(len(tracks.valid))
+    last = tracks.valid.shape[1] - 1 - np.argmax(tracks.valid[:, ::-1], axis=1)
+    before = np.maximum(last - 1, 0)
+    moved = np.hypot(*(tracks.xy[rows, last] - tracks.xy[rows, before]).T) > _MOVED_M
+    moved &= tracks.valid[rows, last] & tracks.valid[rows, before] & (last > before)
+    still = ~tracks.velocity[rows, last].any(axis=1)
+    return bool((moved & still).sum() * 2 > moved.sum())
+
+
 def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int) -> tuple[Tracks, Flag]:
-    """Tracks with positions of box centres and velocities that belong to them, and what had to be made up."""
+    """Tracks with box centres and their velocities, and flags for what had to be made up."""
     flags = Flag.DEFAULT_SIZES if dataset == "av2" else Flag.NONE
-    if dataset == "nuscenes":
-        tracks = _centred(tracks, ego)
+    if dataset == "nuscenes":  # poses of ego are of the rear axle
+        xy = tracks.xy.copy()
+        centres = parsing.box_centre(xy[ego], tracks.heading[ego], CENTRE_AHEAD_M)
+        xy[ego] = np.where(tracks.valid[ego, :, None], centres, 0.0)
+        tracks = replace(tracks, xy=xy)
     if velocity_is_missing(tracks):
         times = _timestamps(metadata, tracks.valid.shape[1])
         tracks = replace(tracks, velocity=parsing.differentiate(tracks.xy, tracks.valid, times))
@@ -206,16 +291,8 @@ def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int)
     return tracks, flags
 
 
-def _centred(tracks: Tracks, ego: int) -> Tracks:
-    """The ego at its box centre: nuScenes' poses are of the rear axle."""
-    heading, valid = tracks.heading[ego], tracks.valid[ego]
-    xy = tracks.xy.copy()
-    xy[ego] = np.where(valid[:, None], parsing.box_centre(xy[ego], heading, CENTRE_AHEAD_M), 0.0)
-    return replace(tracks, xy=xy)
-
-
 def _with_heights(tracks: Tracks, roads: RoadMap) -> tuple[Tracks, tuple[MapFeature, ...]]:
-    """Agents on the ground of the map, where one of them has no heights."""
+    """Agents on the ground of the map where tracks or map have no heights."""
     if roads.flat:
         return flatten(tracks, roads.features)
     if not tracks.z.any():
@@ -224,7 +301,7 @@ def _with_heights(tracks: Tracks, roads: RoadMap) -> tuple[Tracks, tuple[MapFeat
 
 
 def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
-    """Seconds of all steps; 10 Hz, as all converters write, where the file names none."""
+    """Seconds of all steps; 10 Hz where the file has no timestamps."""
     given = metadata.get("ts")
     if given is None:
         return np.arange(steps) * DT_S
@@ -237,7 +314,7 @@ def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
 
 
 def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
-    """The step at which the future begins; files of long recordings name none, or the first."""
+    """The current step; files of long recordings name none, or the first."""
     named = whole(metadata.get("current_time_index"))
     if named is None:
         return min(CURRENT_STEP, steps - 1)
@@ -247,24 +324,17 @@ def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
 
 
 def _named_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
-    """Rows of the tracks that a list of names, or a dictionary by name, is about; unknown names are left out."""
+    """Rows of the tracks in a list of names or a dictionary by name; unknown names are left out."""
     names = list(value) if isinstance(value, dict) else items(value)
     numbers = (rows.get(name) for item in names if (name := text(item)) is not None)
     return tuple(row for row in numbers if row is not None)
-
-
-def _tags(metadata: Mapping[Any, Any]) -> dict[str, str]:
-    tags = {"source_format": _NAME} | place_tags(text(metadata.get("map")))
-    if kind := text(metadata.get("scenario_type")):
-        tags["scenario_types"] = kind[:64]
-    return tags
 
 
 def _lights(
     table: Mapping[Any, Any], steps: int, dataset: str, roads: RoadMap, lost: Counter[str]
 ) -> tuple[Light, ...]:
     """Lights by lane. None in the file is a step without an observation."""
-    if len(table) * steps > _MOST_STATES:
+    if len(table) * steps > _MOST_LIGHT_STATES:
         raise DataError(f"{len(table)} lights of {steps} steps", cure=SKIP)
     starts = {f.feature_id: f.points[0] for f in roads.features if f.kind in LANE_KINDS}
     lights = parsing.Lights(steps)
@@ -278,7 +348,7 @@ def _lights(
         if lane is None or lane not in starts:
             lost["lights_without_lane"] += 1
             continue
-        # nuPlan's lights are given a place 8 m behind the line.
+        # The stop points of nuPlan's lights are 8 m behind the line.
         stop = None if dataset == "nuplan" else _stop_point(light.get("stop_point"), what)
         place = starts[lane] if stop is None else stop
         for step, state in enumerate(states):
@@ -288,11 +358,9 @@ def _lights(
 
 
 def _stop_point(value: Any, what: str) -> Array | None:
-    """A place with a height; None where the file has none."""
-    if value is None:
-        return None
-    point = floats(value, f"{what}: stop_point")
-    return point if point.shape == (3,) and (np.abs(point) < 1e7).all() else None
+    """A point with a height; None where the file has none."""
+    point = None if value is None else floats(value, f"{what}: stop_point")
+    return point if point is not None and point.shape == (3,) and (np.abs(point) < 1e7).all() else None
 
 
 def _state(state: Any) -> LightState:

@@ -1,0 +1,211 @@
+"""Checks of encoders and algorithms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from drivax.learning.algorithm import AlgorithmConfig, Learner, LearnerState, training_data
+from drivax.learning.driving import Driving
+from drivax.networks.encoders import EncoderConfig
+from drivax.planners.planner import Planner
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from drivax.testing import worlds
+from drivax.testing.contract import CLOSE, check_numbers, expect, form, instance, layout, program, same
+
+#: Groups with one and two row axes, with and without masks; the second set has fewer groups, one without rows.
+_SPECS = (
+    {
+        "agents": (4, 2, 3), "agents_mask": (4, 2), "ego": (2, 6), "ego_static": (4,), "route": (5, 5),
+        "route_mask": (5,),
+    },
+    {"ego": (1, 6), "lights": (2, 7), "lights_mask": (2,), "route": (0, 5), "route_mask": (0,)},
+)  # fmt: skip
+_BATCH = 6
+#: Tolerance with ``dtype: bfloat16``, which has eight significant bits.
+_COARSE = 5e-2
+#: A small observation: compiling takes most of the time of a check.
+_TASK = Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=3), metrics="training")
+_ITERATIONS = 4
+
+
+def check_encoder(config: EncoderConfig | str) -> None:
+    """Check an encoder by its settings or their dotted name; raise :class:`BrokenContract` if it breaks a rule.
+
+    It builds for any groups, including one without rows. It embeds an observation or a batch as ``[..., width]``
+    float32, compiled or not. Its parameters follow from the key and are its only state. Values and gradients are
+    finite, also with all rows masked. Masked rows have no effect, valid rows do.
+    """
+    settings = instance(config)
+    what = f"encoder {type(settings).__name__}"
+    expect(isinstance(settings, EncoderConfig), f"{what} has no build(spec, rngs)", "see EncoderConfig")
+    close = _COARSE if getattr(settings, "dtype", "") == "bfloat16" else CLOSE
+    for number, spec in enumerate(_SPECS):
+        encoder: Any = settings.build(spec, nnx.Rngs(0))
+        batch = _observations(spec, number)
+        run = program(what, encoder)
+        embedding = run(batch)
+        width = getattr(encoder, "width", None)
+        valid = embedding.shape == (_BATCH, width) and embedding.dtype == jnp.float32
+        problem = f"{what} embeds {_BATCH} observations as {form(embedding)} with width {width}"
+        expect(valid, problem, "return [*batch, width] float32, and set width")
+        check_numbers(what, embedding)
+        _check_state(what, settings, spec, encoder)
+        _check_rows(what, (encoder if number == 0 else run, run), batch, embedding, close)
+        _check_masks(what, run, batch, embedding, close)
+        _check_gradients(what, encoder, batch)
+
+
+def _observations(spec: Any, seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+
+    def draw(name: str, shape: tuple[int, ...]) -> Any:
+        if name.endswith("_mask"):
+            return jnp.asarray(rng.random((_BATCH, *shape)) < 0.6)
+        return jnp.asarray(rng.normal(size=(_BATCH, *shape)), jnp.float32)
+
+    return {name: draw(name, shape) for name, shape in spec.items()}
+
+
+def _check_state(what: str, config: EncoderConfig, spec: Any, encoder: Any) -> None:
+    kept, parameters = (jax.tree.leaves(nnx.state(encoder, *only)) for only in ((), (nnx.Param,)))
+    expect(
+        len(kept) == len(parameters) > 0,
+        f"{what} keeps {len(kept) - len(parameters)} variables that are not parameters, of {len(kept)}",
+        "keep nnx.Param only: no dropout, no running means",
+    )
+    again = jax.tree.leaves(nnx.state(config.build(spec, nnx.Rngs(0)), nnx.Param))
+    repeated = same(jax.device_get(parameters), jax.device_get(again), 0.0)
+    expect(repeated, f"{what} has other initial parameters every time", "draw them from rngs")
+
+
+def _check_rows(what: str, forms: tuple[Any, Any], batch: Any, embedding: Any, close: float) -> None:
+    """Check one observation, alone and in a batch of batches of one, compiled and not."""
+    single, (encoder, run) = jax.tree.map(lambda leaf: leaf[0], batch), forms
+    for result in (encoder(single), run(jax.tree.map(lambda leaf: leaf[None, None], single))[0, 0]):
+        valid = same(embedding[0], jax.device_get(result), close)
+        expect(valid, f"{what} differs in a batch", "use the last axes; any axes may lead")
+    spread = np.abs(embedding - embedding[:1]).max()
+    expect(spread > 0, f"{what} embeds all observations equally", "let it read the groups")
+
+
+def _check_masks(what: str, run: Any, batch: Any, embedding: Any, close: float) -> None:
+    scattered = {
+        name: jnp.where(batch[f"{name}_mask"][..., None], rows, worlds.GARBAGE)
+        for name, rows in batch.items()
+        if f"{name}_mask" in batch
+    }
+    cure = "use jnp.where(mask[..., None], rows, 0) first, and mask after each bias"
+    expect(same(embedding, run(batch | scattered), close), f"{what} changes with masked rows", cure)
+    check_numbers(f"{what} without rows", run(_without_rows(batch)), "a mean or softmax over no rows")
+
+
+def _without_rows(batch: Any) -> dict[str, Any]:
+    return {n: jnp.zeros_like(value) if n.endswith("_mask") else value for n, value in batch.items()}
+
+
+def _check_gradients(what: str, encoder: Any, batch: Any) -> None:
+    graph, parameters = nnx.split(encoder)
+
+    def loss(parameters: Any, batch: Any) -> Any:
+        return jnp.mean(nnx.merge(graph, parameters)(batch) ** 2)
+
+    run = program(what, jax.grad(loss))
+    for groups in (batch, _without_rows(batch)):
+        gradient = run(parameters, groups)
+        finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+        expect(finite, f"{what} has non-finite gradients", "guard roots and divisions on their input")
+
+
+def check_algorithm(config: AlgorithmConfig | str) -> None:
+    """Check an algorithm by its settings or their dotted name; raise :class:`BrokenContract` if it breaks a rule.
+
+    Its learner has a state with ``parameters`` and ``iteration`` of constant structure, shapes and types. Iterations
+    are pure, bit-for-bit repeatable after storing the state, change the parameters and log finite numbers. The planner
+    acts within [-1, 1], deterministically by the mode. Use small sizes: the check runs three iterations.
+    """
+    settings = instance(config)
+    what = f"algorithm {type(settings).__name__}"
+    valid = isinstance(settings, AlgorithmConfig)
+    expect(valid, f"{what} lacks build or steps_per_iteration", "see AlgorithmConfig")
+    steps = settings.steps_per_iteration
+    valid = isinstance(steps, int) and steps > 0
+    expect(valid, f"{what} counts {steps!r} steps per iteration", "count environment steps as a whole number")
+    bank, simulator = worlds.worlds(), Simulator(_TASK)
+    environment = Driving(simulator)
+    learner = settings.build(environment, bank, _ITERATIONS)
+    expect(isinstance(learner, Learner), f"{what} builds no Learner", "give it init, iterate and planner")
+    state = _check_iterations(what, learner, training_data(settings, environment, bank))
+    _check_planner(what, learner, bank, simulator, state.parameters)
+
+
+def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
+    init, iterate = jax.jit(learner.init), jax.jit(learner.iterate, donate_argnums=1)
+    first = init(data, jax.random.key(0))
+    valid = isinstance(first, LearnerState)
+    expect(valid, f"{what} has a state without parameters or iteration", "add these fields")
+    valid = layout(jax.eval_shape(learner.init, data, jax.random.key(1))) == layout(first)
+    cure = "let shapes depend on the configuration only"
+    expect(valid, f"{what} has a state whose shape depends on the key", cure)
+    valid = layout(jax.eval_shape(learner.iterate, data, first)[0]) == layout(first)
+    cure = "return the same record with the same shapes and types"
+    expect(valid, f"{what} changes the shape of its state in an iteration", cure)
+    stored = jax.tree.map(jnp.copy, first)  # survives the donation of the state
+    second, logs = iterate(data, first)
+    before, after = int(stored.iteration), int(second.iteration)
+    expect(after == before + 1, f"{what} counts from iteration {before} to {after}", "add one")
+    idle = same(jax.device_get(second.parameters), jax.device_get(stored.parameters), 0.0)
+    expect(not idle, f"{what} learns nothing in an iteration", "return the new parameters")
+    _check_logs(what, logs)
+    again, _ = iterate(data, jax.tree.map(jnp.copy, stored))
+    valid = same(_numbers(again), _numbers(second), 0.0)
+    cure = "keep keys and all other inputs of an iteration in the state"
+    expect(valid, f"{what} does not repeat an iteration bit for bit", cure)
+    third, logs = iterate(data, second)
+    _check_logs(what, logs)
+    check_numbers(what, [np.atleast_1d(leaf) for leaf in jax.tree.leaves(_numbers(third.parameters))])
+    return third
+
+
+def _check_logs(what: str, logs: dict[str, Any]) -> None:
+    for name, value in logs.items():
+        valid = np.shape(value) == () and np.isfinite(value)
+        expect(valid, f"{what} logs {name!r} as {np.asarray(value)}", "log finite numbers without axes")
+
+
+def _check_planner(
+    what: str, learner: Learner, bank: ScenarioBank, simulator: Simulator, parameters: Any
+) -> None:
+    @jax.jit
+    def act(planner: Any, bank: ScenarioBank, key: Any) -> Any:
+        state = simulator.reset(bank, 0)
+        carry = planner.init(bank, state, key)
+        situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.context)
+        return planner.act(carry, bank, state, situation, seen, key)[0]
+
+    keys = jax.random.key(0), jax.random.key(1)
+    for samples in (False, True):
+        planner = learner.planner(parameters, "checked", samples)
+        expect(isinstance(planner, Planner), f"{what} returns no Planner", "see planners.planner.Planner")
+        first, second = (np.asarray(act(planner, bank, key)) for key in keys)
+        valid = first.shape == (2,) and np.isfinite(first).all() and (np.abs(first) <= 1.0).all()
+        expect(valid, f"{what} returns action {first}", "return two numbers in [-1, 1]")
+        valid = samples or (first == second).all()
+        expect(valid, f"{what} uses randomness in its mode", "use the key only to sample")
+
+
+def _numbers(tree: Any) -> Any:
+    """Return all leaves on the host, random keys as numbers."""
+
+    def number(leaf: Any) -> Any:
+        key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(leaf) if key else leaf)
+
+    return jax.tree.map(number, tree)
