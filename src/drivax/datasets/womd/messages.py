@@ -22,75 +22,52 @@ from drivax.errors import DataError
 #: (name, number, type): ``*`` marks a repeated field, ``?`` a member of the message's one-of ``kind``.
 _Field = tuple[str, int, str]
 
+
+def _fields(text: str) -> tuple[_Field, ...]:
+    """Fields written as ``name number type``, separated by commas."""
+    parts = (field.split() for field in text.split(","))
+    return tuple((name, int(number), kind) for name, number, kind in parts)
+
+
 #: Messages of the Scenario proto. States and points of polylines are kept as bytes (:func:`read_table` reads them).
 MESSAGES: dict[str, tuple[_Field, ...]] = {
-    "Scenario": (
-        ("timestamps_seconds", 1, "double*"),
-        ("tracks", 2, "Track*"),
-        ("objects_of_interest", 4, "int32*"),
-        ("scenario_id", 5, "string"),
-        ("sdc_track_index", 6, "int32"),
-        ("dynamic_map_states", 7, "DynamicMapState*"),
-        ("map_features", 8, "MapFeature*"),
-        ("current_time_index", 10, "int32"),
-        ("tracks_to_predict", 11, "RequiredPrediction*"),
+    "Scenario": _fields(
+        "timestamps_seconds 1 double*, tracks 2 Track*, objects_of_interest 4 int32*, scenario_id 5 string,"
+        "sdc_track_index 6 int32, dynamic_map_states 7 DynamicMapState*, map_features 8 MapFeature*,"
+        "current_time_index 10 int32, tracks_to_predict 11 RequiredPrediction*"
     ),
-    "RequiredPrediction": (("track_index", 1, "int32"), ("difficulty", 2, "int32")),
-    "Track": (("id", 1, "int32"), ("object_type", 2, "int32"), ("states", 3, "bytes*")),
-    "ObjectState": (
-        ("center_x", 2, "double"),
-        ("center_y", 3, "double"),
-        ("center_z", 4, "double"),
-        ("length", 5, "float"),
-        ("width", 6, "float"),
-        ("height", 7, "float"),
-        ("heading", 8, "float"),
-        ("velocity_x", 9, "float"),
-        ("velocity_y", 10, "float"),
-        ("valid", 11, "bool"),
+    "RequiredPrediction": _fields("track_index 1 int32, difficulty 2 int32"),
+    "Track": _fields("id 1 int32, object_type 2 int32, states 3 bytes*"),
+    "ObjectState": _fields(
+        "center_x 2 double, center_y 3 double, center_z 4 double, length 5 float, width 6 float, height 7 float,"
+        "heading 8 float, velocity_x 9 float, velocity_y 10 float, valid 11 bool"
     ),
-    "DynamicMapState": (("lane_states", 1, "LaneState*"),),
-    "LaneState": (("lane", 1, "int64"), ("state", 2, "int32"), ("stop_point", 3, "MapPoint")),
-    "MapPoint": (("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")),
-    "MapFeature": (
-        ("id", 1, "int64"),
-        ("lane", 3, "Lane?"),
-        ("road_line", 4, "Polyline?"),
-        ("road_edge", 5, "Polyline?"),
-        ("stop_sign", 7, "StopSign?"),
-        ("crosswalk", 8, "Polygon?"),
-        ("speed_bump", 9, "Polygon?"),
-        ("driveway", 10, "Polygon?"),
+    "DynamicMapState": _fields("lane_states 1 LaneState*"),
+    "LaneState": _fields("lane 1 int64, state 2 int32, stop_point 3 MapPoint"),
+    "MapPoint": _fields("x 1 double, y 2 double, z 3 double"),
+    "MapFeature": _fields(
+        "id 1 int64, lane 3 Lane?, road_line 4 Polyline?, road_edge 5 Polyline?, stop_sign 7 StopSign?,"
+        "crosswalk 8 Polygon?, speed_bump 9 Polygon?, driveway 10 Polygon?"
     ),
-    "Lane": (
-        ("speed_limit_mph", 1, "double"),
-        ("type", 2, "int32"),
-        ("interpolating", 3, "bool"),
-        ("polyline", 8, "bytes*"),
-        ("entry_lanes", 9, "int64*"),
-        ("exit_lanes", 10, "int64*"),
-        ("left_neighbors", 11, "LaneNeighbor*"),
-        ("right_neighbors", 12, "LaneNeighbor*"),
+    "Lane": _fields(
+        "speed_limit_mph 1 double, type 2 int32, interpolating 3 bool, polyline 8 bytes*, entry_lanes 9 int64*,"
+        "exit_lanes 10 int64*, left_neighbors 11 LaneNeighbor*, right_neighbors 12 LaneNeighbor*"
     ),
-    "LaneNeighbor": (("feature_id", 1, "int64"),),
-    "Polyline": (("type", 1, "int32"), ("polyline", 2, "bytes*")),
-    "StopSign": (("lane", 1, "int64*"), ("position", 2, "bytes")),
-    "Polygon": (("polygon", 1, "bytes*"),),
+    "LaneNeighbor": _fields("feature_id 1 int64"),
+    "Polyline": _fields("type 1 int32, polyline 2 bytes*"),
+    "StopSign": _fields("lane 1 int64*, position 2 bytes"),
+    "Polygon": _fields("polygon 1 bytes*"),
 }
 
 #: A map field is on the wire a repeated message of key and value; lists are packed or not, parsers take both.
 _EXAMPLE: dict[str, tuple[_Field, ...]] = {
-    "Example": (("features", 1, "Features"),),
-    "Features": (("feature", 1, "Entry*"),),
-    "Entry": (("key", 1, "string"), ("value", 2, "Feature")),
-    "Feature": (
-        ("bytes_list", 1, "BytesList?"),
-        ("float_list", 2, "FloatList?"),
-        ("int64_list", 3, "Int64List?"),
-    ),
-    "BytesList": (("value", 1, "bytes*"),),
-    "FloatList": (("value", 1, "float*"),),
-    "Int64List": (("value", 1, "int64*"),),
+    "Example": _fields("features 1 Features"),
+    "Features": _fields("feature 1 Entry*"),
+    "Entry": _fields("key 1 string, value 2 Feature"),
+    "Feature": _fields("bytes_list 1 BytesList?, float_list 2 FloatList?, int64_list 3 Int64List?"),
+    "BytesList": _fields("value 1 bytes*"),
+    "FloatList": _fields("value 1 float*"),
+    "Int64List": _fields("value 1 int64*"),
 }
 
 _PACKAGES = {"drivax.womd": MESSAGES, "drivax.example": _EXAMPLE}
@@ -158,39 +135,26 @@ _WIRE = {"double": (1, "<f8"), "float": (5, "<f4"), "bool": (0, "u1")}
 
 @dataclass(frozen=True)
 class Numbers:
-    """A message of numbers.
-
-    Attributes:
-        name: Its name.
-        fields: Name, number and type (``double``, ``float``, ``bool``) of every field, in the order of columns.
-        forms: Which fields (by column) may be there together and are read fast, in order of their numbers.
-    """
+    """A message of numbers: its name, and which of its fields may be there together and are read fast."""
 
     name: str
-    fields: tuple[tuple[str, int, str], ...]
-    forms: tuple[tuple[int, ...], ...]
+    forms: tuple[tuple[str, ...], ...]
 
-    @classmethod
-    def of(cls, name: str, forms: Sequence[Sequence[str]]) -> Numbers:
-        """The message of this name, with forms by the names of their fields."""
-        fields = MESSAGES[name]
-        columns = {field: column for column, (field, _, _) in enumerate(fields)}
-        return cls(name, fields, tuple(tuple(columns[field] for field in form) for form in forms))
+    @property
+    def fields(self) -> tuple[_Field, ...]:
+        """Every field, in the order of columns."""
+        return MESSAGES[self.name]
 
 
 @cache
-def _layouts(numbers: Numbers) -> tuple[tuple[np.dtype[Any], tuple[int, ...]], ...]:
-    """Packed record types of every form in both orders, with its columns."""
-    layouts = []
-    for form in numbers.forms:
-        for order in (form, form[::-1]):
-            parts = []
-            for column in order:
-                _, number, kind = numbers.fields[column]
-                parts += [(f"tag{column}", "u1"), (str(column), _WIRE[kind][1])]
-                assert number << 3 | _WIRE[kind][0] < 128, "a tag of one byte"
-            layouts.append((np.dtype(parts), order))
-    return tuple(layouts)
+def _layouts(numbers: Numbers) -> tuple[np.dtype[Any], ...]:
+    """Packed record types of every form in both orders: each field after its tag of one byte, ``#name``."""
+    types = {name: _WIRE[kind][1] for name, _, kind in numbers.fields}
+    orders = [order for form in numbers.forms for order in (form, form[::-1])]
+    return tuple(
+        np.dtype([column for name in order for column in ((f"#{name}", "u1"), (name, types[name]))])
+        for order in orders
+    )
 
 
 def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, "message field"]:
@@ -198,21 +162,21 @@ def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, 
     out = np.zeros((len(blobs), len(numbers.fields)))
     todo = np.ones(len(blobs), dtype=bool)
     sizes = np.fromiter(map(len, blobs), np.int64, len(blobs))
-    for layout, columns in _layouts(numbers):
+    for layout in _layouts(numbers):
         rows = np.flatnonzero(todo & (sizes == layout.itemsize))
         if not rows.size:
             continue
         whole = rows.size == len(blobs)
         records = np.frombuffer(b"".join(blobs if whole else [blobs[row] for row in rows.tolist()]), layout)
+        present = [(i, *field) for i, field in enumerate(numbers.fields) if field[0] in (layout.names or ())]
         same = np.ones(len(rows), dtype=bool)
-        for column in columns:
-            _, number, kind = numbers.fields[column]
-            same &= records[f"tag{column}"] == number << 3 | _WIRE[kind][0]
+        for _, name, number, kind in present:
+            same &= records[f"#{name}"] == number << 3 | _WIRE[kind][0]
             if kind == "bool":
-                same &= records[str(column)] < 2
+                same &= records[name] < 2
         with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
-            for column in columns:
-                out[rows[same], column] = records[str(column)][same]
+            for column, name, *_ in present:
+                out[rows[same], column] = records[name][same]
         todo[rows[same]] = False
     for row in np.flatnonzero(todo).tolist():
         out[row] = read_one(blobs[row], numbers)
@@ -229,5 +193,7 @@ def read_one(blob: bytes, numbers: Numbers) -> list[float]:
     return [float(getattr(message, name)) for name, _, _ in numbers.fields]
 
 
-STATES = Numbers.of("ObjectState", [[name for name, _, _ in MESSAGES["ObjectState"]], ["center_z", "valid"]])
-POINTS = Numbers.of("MapPoint", ["xyz"])
+STATES = Numbers(
+    "ObjectState", (tuple(name for name, _, _ in MESSAGES["ObjectState"]), ("center_z", "valid"))
+)
+POINTS = Numbers("MapPoint", (("x", "y", "z"),))
