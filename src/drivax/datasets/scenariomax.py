@@ -1,9 +1,9 @@
 """Reader of ScenarioMax's tf.Examples in TFRecord files, the ones that V-Max reads.
 
-They have WOMD's layout (``womd.tf_example``) with differences: the ego is row 0 and ids are renumbered from 0, padding
-looks like tracks, there are no times, speeds or courses, limits come with the map's points in mph, lights keep their
-slot and are UNKNOWN where nothing was known, and ten paths of the ego are included. Where the data came from (WOMD,
-nuPlan, nuScenes, ...) is not in the file.
+They have WOMD's layout (``womd.example_reader``) with differences: the ego is row 0 and ids are renumbered from 0,
+padding looks like tracks, there are no times, speeds or courses, limits come with the map's points in mph, lights keep
+their slot and are UNKNOWN where nothing was known, and ten paths of the ego are included. Where the data came from
+(WOMD, nuPlan, nuScenes, ...) is not in the file.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
+from drivax.datasets.womd import example_reader as tf_example
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd import tf_example
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.scenario.recording import Light, Recording, Tracks
 from drivax.scenario.schema import Flag, LightState

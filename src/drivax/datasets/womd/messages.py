@@ -8,9 +8,10 @@ in a descriptor pool of their own and so never clash with an installed ``waymo-o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from jaxtyping import Float64
 from drivax.datasets.parsing import import_extra
 from drivax.errors import DataError
 
+SKIP = "skip this record, or download the file again"
+_Array = np.ndarray[Any, Any]
 #: (name, number, type): ``*`` marks a repeated field, ``?`` a member of the message's one-of ``kind``.
 _Field = tuple[str, int, str]
 
@@ -128,7 +131,6 @@ def _declare(message: Any, fields: tuple[_Field, ...], package: str) -> None:
             field.type = getattr(field, f"TYPE_{plain.upper()}")
 
 
-_Array = np.ndarray[Any, Any]
 #: Wire types of protocol buffers and what numpy reads there; a bool is a varint of one byte.
 _WIRE = {"double": (1, "<f8"), "float": (5, "<f4"), "bool": (0, "u1")}
 
@@ -187,9 +189,7 @@ def read_one(blob: bytes, numbers: Numbers) -> list[float]:
     """One row as protobuf reads it."""
     message = parse(scenario_class(numbers.name), blob)
     if message is None:
-        raise DataError(
-            f"a message {numbers.name} is damaged", cure="skip this record, or download the file again"
-        )
+        raise DataError(f"a message {numbers.name} is damaged", cure=SKIP)
     return [float(getattr(message, name)) for name, _, _ in numbers.fields]
 
 
@@ -197,3 +197,87 @@ STATES = Numbers(
     "ObjectState", (tuple(name for name, _, _ in MESSAGES["ObjectState"]), ("center_z", "valid"))
 )
 POINTS = Numbers("MapPoint", (("x", "y", "z"),))
+
+
+def features_of(payload: bytes) -> Features:
+    """The features in a serialised tf.Example."""
+    message = parse(example_class(), payload)
+    if message is None or not message.features.feature:
+        raise DataError("the payload is not a tf.Example", cure=SKIP)
+    return Features(message)
+
+
+class Features:
+    """The features of one tf.Example by name; float lists (float32 in the file) become float64, int64 lists int64."""
+
+    def __init__(self, message: Any) -> None:
+        self._values: Mapping[str, Any] = {entry.key: entry.value for entry in message.features.feature}
+
+    def _list(self, name: str) -> tuple[str | None, Sequence[Any]]:
+        """Which list holds a feature, and its values."""
+        value = self._values.get(name)
+        kind = None if value is None else value.WhichOneof("kind")
+        return kind, () if kind is None else getattr(value, kind).value
+
+    def has(self, name: str) -> bool:
+        """Whether the feature exists and is not empty."""
+        return len(self._list(name)[1]) > 0
+
+    def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> _Array:
+        """A numeric feature in a shape that its size must match."""
+        kind, listed = self._list(name)
+        if kind not in ("float_list", "int64_list"):
+            raise DataError(f"numeric feature {name} is missing", cure=SKIP)
+        dtype = np.float64 if kind == "float_list" else np.int64
+        with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
+            values = np.array(listed, dtype)
+        if shape is None:
+            return values
+        count = int(np.prod(shape))
+        if values.size != count:
+            raise DataError(f"feature {name} has {values.size} values, not {count}", cure=SKIP)
+        return values.reshape(shape)
+
+    def integers(self, name: str, shape: tuple[int, ...] | None = None) -> _Array:
+        """A feature that must be stored as integers: floats would round the ids of lanes."""
+        values = self.numbers(name, shape)
+        if values.dtype != np.int64:
+            raise DataError(f"feature {name} holds floats, not integers", cure=SKIP)
+        return values
+
+    def rows(self, name: str, used: _Array) -> _Array:
+        """A feature with one value per track, for the rows used; zeros if the file lacks it."""
+        if not self.has(name):
+            return np.zeros(used.size, np.int64)
+        return self.numbers(name, (self.numbers("state/id").size,))[used]
+
+    def marked(self, name: str, used: _Array) -> tuple[int, ...]:
+        """Rows among those used whose value is 1."""
+        return tuple(np.flatnonzero(self.rows(name, used) == 1).tolist())
+
+    def scenario_id(self, payload: bytes) -> str:
+        """The scenario's id, or the first 16 digits of the payload's SHA-256 if the file has none."""
+        value = self._values.get("scenario/id")
+        text = "" if value is None else b"".join(value.bytes_list.value[:1]).decode("ascii", "replace")
+        return text or hashlib.sha256(payload).hexdigest()[:16]
+
+    @cached_property
+    def spans(self) -> dict[str, int]:
+        """Steps of past, current and future; the future of the test split is missing or invalid throughout."""
+        tracks = max(self.numbers("state/id").size, 1)
+        steps = {}
+        for span in ("past", "current", "future"):
+            name = f"state/{span}/valid"
+            present = self.has(name) and (span != "future" or bool((self.numbers(name) == 1).any()))
+            steps[span] = self.numbers(name).size // tracks if present else 0
+        if steps["current"] != 1:
+            raise DataError(f"state/current holds {steps['current']} steps, not 1", cure=SKIP)
+        return steps
+
+    def over_time(self, name: str, used: _Array) -> _Array:
+        """``state/{past,current,future}/<name>`` joined, of the rows used: ``[track, time]``."""
+        count = self.numbers("state/id").size
+        spans = [(span, steps) for span, steps in self.spans.items() if steps]
+        return np.concatenate(
+            [self.numbers(f"state/{span}/{name}", (count, steps))[used] for span, steps in spans], axis=1
+        )

@@ -10,11 +10,11 @@ import numpy as np
 
 from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord
-from drivax.datasets.womd.messages import example_class, parse, scenario_class
-from drivax.datasets.womd.tf_example import Features, is_motion
+from drivax.datasets.womd.messages import Features, example_class, parse, scenario_class
 from drivax.datasets.womd.tfrecord import count_records, looks_framed, read_records
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.recording import Recording
+from drivax.scenario.schema import AgentKind
 
 DATASET = "womd"
 FULL_NAME = "Waymo Open Motion Dataset"
@@ -33,7 +33,7 @@ _SIGNS = 2
 def flavour(payload: bytes) -> str | None:
     """The format of a record's payload by its content, None where it is no form of motion data that is known."""
     example = parse(example_class(), payload)
-    if example is not None and is_motion(example):
+    if example is not None and any(entry.key == "state/current/x" for entry in example.features.feature):
         return SCENARIOMAX_FORMAT if scenariomax_signs(Features(example)) >= _SIGNS else EXAMPLE_FORMAT
     scenario = parse(scenario_class(), payload)
     if scenario is not None and scenario.scenario_id and scenario.tracks:
@@ -132,6 +132,11 @@ class TfRecordReader:
         return DataError(
             f"holds {_CONTENTS[other]}, not {_CONTENTS[self.name]}", cure=f"use --format {other}"
         )
+
+
+def agent_kind(code: int) -> AgentKind:
+    """The class of a WOMD object type; 0 (unset) and codes of later versions count as other."""
+    return AgentKind(code) if 1 <= code <= 4 else AgentKind.OTHER
 
 
 def notes_of(recording: Recording) -> tuple[str, ...]:

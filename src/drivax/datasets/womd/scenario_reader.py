@@ -13,8 +13,7 @@ from jaxtyping import Float64
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd.messages import POINTS, STATES, parse, read_table, scenario_class
-from drivax.datasets.womd.tf_example import agent_kind
+from drivax.datasets.womd.messages import POINTS, SKIP, STATES, parse, read_table, scenario_class
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -23,7 +22,6 @@ from drivax.scenario.schema import LANE_KINDS, RoadKind
 
 #: Points are 0.5 m apart; twice that is a jump where the map was clipped, not road.
 _SPLIT_GAP_M = 1.0
-_SKIP = "skip this record, or download the file again"
 _POLYGONS = {
     "crosswalk": RoadKind.CROSSWALK,
     "speed_bump": RoadKind.SPEED_BUMP,
@@ -69,7 +67,7 @@ def decode(payload: bytes) -> Recording:
     """
     message = parse(scenario_class(), payload)
     if message is None or not message.scenario_id:
-        raise DataError("the payload is not a WOMD Scenario proto", cure=_SKIP)
+        raise DataError("the payload is not a WOMD Scenario proto", cure=SKIP)
     steps = len(message.timestamps_seconds)
     _check(message, steps)
     features, lost = _features(message.map_features)
@@ -99,20 +97,20 @@ def decode(payload: bytes) -> Recording:
 
 def _check(message: Any, steps: int) -> None:
     if not isinstance(message.scenario_id, str):  # protobuf gives bytes where a string is no UTF-8
-        raise DataError("scenario_id is no text", cure=_SKIP)
+        raise DataError("scenario_id is no text", cure=SKIP)
     if steps == 0 or not message.tracks:
-        raise DataError("the scenario has no steps or no tracks", cure=_SKIP)
+        raise DataError("the scenario has no steps or no tracks", cure=SKIP)
     if not 0 <= message.current_time_index < steps:
-        raise DataError(f"current_time_index is {message.current_time_index} of {steps} steps", cure=_SKIP)
+        raise DataError(f"current_time_index is {message.current_time_index} of {steps} steps", cure=SKIP)
     parsing.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
     if len(message.dynamic_map_states) > steps:
-        raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=_SKIP)
+        raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=SKIP)
     seen = set()
     for track in message.tracks:
         if len(track.states) != steps:
-            raise DataError(f"track {track.id} has {len(track.states)} states, {steps} steps", cure=_SKIP)
+            raise DataError(f"track {track.id} has {len(track.states)} states, {steps} steps", cure=SKIP)
         if track.id in seen:
-            raise DataError(f"two tracks have the id {track.id}", cure=_SKIP)
+            raise DataError(f"two tracks have the id {track.id}", cure=SKIP)
         seen.add(track.id)
 
 
@@ -129,7 +127,7 @@ def _tracks(tracks: Any, steps: int) -> Tracks:
         heading=np.where(valid, wrap(table[..., 6]), 0.0),
         velocity=table[..., 7:9].copy(),
         valid=valid,
-        kind=np.array([agent_kind(track.object_type) for track in tracks], np.int8),
+        kind=np.array([womd.agent_kind(track.object_type) for track in tracks], np.int8),
         track_id=np.array([track.id for track in tracks], np.int64),
     )
 
