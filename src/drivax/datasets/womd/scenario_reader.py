@@ -22,11 +22,7 @@ from drivax.scenario.schema import LANE_KINDS, RoadKind
 
 #: Points are 0.5 m apart; twice that is a jump where the map was clipped, not road.
 _SPLIT_GAP_M = 1.0
-_POLYGONS = {
-    "crosswalk": RoadKind.CROSSWALK,
-    "speed_bump": RoadKind.SPEED_BUMP,
-    "driveway": RoadKind.DRIVEWAY,
-}
+_POLYGONS = {kind: RoadKind[kind.upper()] for kind in ("crosswalk", "speed_bump", "driveway")}
 _Points = Float64[np.ndarray, "point 3"]
 
 
@@ -37,11 +33,11 @@ class WomdScenario(womd.TfRecordReader):
     name: str = womd.SCENARIO_FORMAT
 
     def decode(self, payload: bytes) -> Recording:
-        """Return the recording in a payload."""
+        """The recording in a payload."""
         return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by kinds of features, length, lane graph, lights."""
+        """What the first record shows: version by kinds of features, lane graph, lights."""
         recording = self.first(path)
         lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
         linked = any(lane.successors or lane.predecessors for lane in lanes)
@@ -49,21 +45,16 @@ class WomdScenario(womd.TfRecordReader):
         if not linked:
             notes.append("no lane graph in the first record: lanes are chained by geometry")
         driveways = any(feature.kind == RoadKind.DRIVEWAY for feature in recording.features)
-        return Description(
-            dataset=womd.FULL_NAME,
-            flavour="Scenario protos in TFRecord",
-            version="1.2 or later" if driveways else "1.1 or later" if linked else None,
-            recordings=count_records(path),
-            notes=tuple(notes),
-        )
+        version = "1.2 or later" if driveways else "1.1 or later" if linked else None
+        flavour = "Scenario protos in TFRecord"
+        return Description(womd.FULL_NAME, flavour, version, count_records(path), tuple(notes))
 
 
 def decode(payload: bytes) -> Recording:
     """The recording in a serialised ``Scenario``.
 
-    Positions stay in the proto's map frame, metres, float64. Headings are wrapped (the files hold up to 10 rad),
-    invalid states are zeros (the files keep a z there), speed limits are m/s and None where the file says 0.
-    Links to lanes that the file does not hold are kept.
+    Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad), invalid
+    states are zeros (files keep a z there), speed limits are m/s, None for 0. Dangling links are kept.
     """
     message = parse(scenario_class(), payload)
     if message is None or not message.scenario_id:
@@ -83,9 +74,7 @@ def decode(payload: bytes) -> Recording:
         features=features,
         lights=_lights(message.dynamic_map_states, steps),
         to_predict=parsing.rows_within(
-            [prediction.track_index for prediction in message.tracks_to_predict],
-            len(message.tracks),
-            "tracks_to_predict",
+            [track.track_index for track in message.tracks_to_predict], len(rows), "tracks_to_predict"
         ),
         # These are track ids, tracks_to_predict are rows.
         of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
@@ -143,8 +132,7 @@ def _lights(states: Any, steps: int) -> tuple[Light, ...]:
 
 def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
     """The map's features, and how many were left out for what reason."""
-    ids: set[int] = set()
-    parts: list[tuple[int, str, Any, Sequence[bytes]]] = []
+    kept: dict[int, tuple[str, Any, Sequence[bytes]]] = {}
     unknown = twice = empty = 0
     for message in messages:
         kind = message.WhichOneof("kind")
@@ -155,16 +143,15 @@ def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
         blobs = _blobs(kind, body)
         if not blobs:
             empty += 1
-        elif message.id in ids:
+        elif message.id in kept:
             twice += 1
         else:
-            ids.add(message.id)
-            parts.append((message.id, kind, body, blobs))
-    points = read_table([blob for *_, blobs in parts for blob in blobs], POINTS)
-    ends = np.cumsum([len(blobs) for *_, blobs in parts])[:-1] if parts else []
+            kept[message.id] = kind, body, blobs
+    points = read_table([blob for *_, blobs in kept.values() for blob in blobs], POINTS)
+    ends = np.cumsum([len(blobs) for *_, blobs in kept.values()], dtype=np.int64)[:-1]
     features = tuple(
         _feature(feature_id, kind, body, line.copy())
-        for (feature_id, kind, body, _), line in zip(parts, np.split(points, ends), strict=False)
+        for (feature_id, (kind, body, _)), line in zip(kept.items(), np.split(points, ends), strict=False)
     )
     lost = parsing.nonzero(
         unknown_features=unknown,
