@@ -73,7 +73,16 @@ _EXAMPLE: dict[str, tuple[_Field, ...]] = {
     "Int64List": _fields("value 1 int64*"),
 }
 
-_PACKAGES = {"drivax.womd": MESSAGES, "drivax.example": _EXAMPLE}
+#: Of the Waymo perception and end-to-end driving data sets, what tells them from motion data.
+_CAMERA: dict[str, tuple[_Field, ...]] = {
+    "Context": _fields("name 1 bytes"),
+    "Frame": _fields(
+        "context 1 Context, timestamp_micros 2 int64, pose 3 bytes, images 4 bytes*, lasers 5 bytes*"
+    ),
+    "E2EDFrame": _fields("frame 1 Frame, future_states 2 bytes, past_states 3 bytes"),
+}
+
+_PACKAGES = {"drivax.womd": MESSAGES, "drivax.example": _EXAMPLE, "drivax.camera": _CAMERA}
 
 
 def scenario_class(name: str = "Scenario") -> Any:
@@ -84,6 +93,11 @@ def scenario_class(name: str = "Scenario") -> Any:
 def example_class() -> Any:
     """The message class of a ``tf.Example``, its map of features declared as repeated entries."""
     return _class("drivax.example", "Example")
+
+
+def camera_class(name: str) -> Any:
+    """The message class of a ``Frame`` of the Waymo perception data set, or of an ``E2EDFrame``."""
+    return _class("drivax.camera", name)
 
 
 def parse(message_class: Any, payload: bytes) -> Any | None:
