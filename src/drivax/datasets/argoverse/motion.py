@@ -26,8 +26,7 @@ from drivax.datasets.argoverse.tables import (
     has_magic,
     read_table,
 )
-from drivax.datasets.elevation import lift
-from drivax.datasets.parsing import place_tags
+from drivax.datasets.parsing import lift, place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap

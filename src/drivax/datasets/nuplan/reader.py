@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivax.datasets import parsing
-from drivax.datasets.elevation import flatten
 from drivax.datasets.nuplan import log as nuplan_log
 from drivax.datasets.nuplan.log import Agents, Piece, TimeLine
 from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, find_map
 from drivax.datasets.nuplan.map_features import features_around
 from drivax.datasets.nuplan.sqlite import SQLITE_MAGIC, Database, open_database
-from drivax.datasets.parsing import place_tags
+from drivax.datasets.parsing import flatten, place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from drivax.datasets.elevation import flatten
 from drivax.datasets.nuscenes.map import city
 from drivax.datasets.nuscenes.tables import Scene, Tables, has_annotations, scene_rows
-from drivax.datasets.parsing import box_centre, check_finite, place_tags, windows_of
+from drivax.datasets.parsing import box_centre, check_finite, flatten, place_tags, windows_of
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
