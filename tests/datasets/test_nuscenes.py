@@ -12,8 +12,15 @@ from scipy.integrate import solve_ivp
 from datasets.samples import nuscenes as sample
 from drivax.datasets.nuscenes import map as nuscenes_map
 from drivax.datasets.nuscenes.map import Box
-from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M, EGO_SIZE_M, NuScenes, interpolate
-from drivax.datasets.nuscenes.tables import kind_of, rows, yaw
+from drivax.datasets.nuscenes.reader import (
+    CENTRE_AHEAD_M,
+    EGO_SIZE_M,
+    NuScenes,
+    interpolate,
+    kind_of,
+    rows,
+    yaw,
+)
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
