@@ -364,7 +364,7 @@ def test_other_flavour_names_the_cure(wire, write_records):
 
 
 def test_missing_protobuf_names_the_extra(wire, hide_packages):
-    messages._class.cache_clear()
+    messages.message_class.cache_clear()
     messages._pool.cache_clear()
     hide_packages("google.protobuf")
     with pytest.raises(UsageError, match=r"pip install 'drivax\[womd\]'"):

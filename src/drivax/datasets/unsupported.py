@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from drivax.datasets.womd.messages import camera_class, example_class, parse
+from drivax.datasets.womd.messages import parse
 from drivax.datasets.womd.tfrecord import read_records
 from drivax.errors import DataError, UsageError
 from drivax.scenario.store import MANIFEST
@@ -108,7 +108,7 @@ def _tfrecord(path: Path) -> DataError:
 
 def _is_frame(payload: bytes) -> bool:
     """Whether it is a ``Frame`` of WOMD perception."""
-    frame = parse(camera_class("Frame"), payload)
+    frame = parse("Frame", payload)
     if frame is None or not frame.HasField("timestamp_micros"):
         return False
     named = frame.context.HasField("name") and frame.context.name.isascii()
@@ -117,7 +117,7 @@ def _is_frame(payload: bytes) -> bool:
 
 def _is_end_to_end(payload: bytes) -> bool:
     """Whether it is an ``E2EDFrame``: a ``Frame`` with past or future states of the ego."""
-    message = parse(camera_class("E2EDFrame"), payload)
+    message = parse("E2EDFrame", payload)
     if message is None or not (message.HasField("future_states") or message.HasField("past_states")):
         return False
     frame = message.frame
@@ -126,7 +126,7 @@ def _is_end_to_end(payload: bytes) -> bool:
 
 def _is_example(payload: bytes) -> bool:
     """Whether it is a ``tf.Example`` with some feature."""
-    message = parse(example_class(), payload)
+    message = parse("Example", payload)
     entries = () if message is None else message.features.feature
     return any(entry.HasField("key") and entry.HasField("value") for entry in entries)
 

@@ -32,8 +32,8 @@ def _fields(text: str) -> tuple[_Field, ...]:
     return tuple((name, int(number), kind) for name, number, kind in parts)
 
 
-#: Messages of the Scenario proto. States and points of polylines are kept as bytes (:func:`read_table` reads them).
-MESSAGES: dict[str, tuple[_Field, ...]] = {
+_MESSAGES: dict[str, tuple[_Field, ...]] = {
+    # The Scenario proto; states and points of polylines are kept as bytes (:func:`read_table` reads them).
     "Scenario": _fields(
         "timestamps_seconds 1 double*, tracks 2 Track*, objects_of_interest 4 int32*, scenario_id 5 string,"
         "sdc_track_index 6 int32, dynamic_map_states 7 DynamicMapState*, map_features 8 MapFeature*,"
@@ -60,10 +60,7 @@ MESSAGES: dict[str, tuple[_Field, ...]] = {
     "Polyline": _fields("type 1 int32, polyline 2 bytes*"),
     "StopSign": _fields("lane 1 int64*, position 2 bytes"),
     "Polygon": _fields("polygon 1 bytes*"),
-}
-
-#: A map field is on the wire a repeated message of key and value; lists are packed or not, parsers take both.
-_EXAMPLE: dict[str, tuple[_Field, ...]] = {
+    # tf.Example; a map field is on the wire a repeated message of key and value. Parsers take lists packed or not.
     "Example": _fields("features 1 Features"),
     "Features": _fields("feature 1 Entry*"),
     "Entry": _fields("key 1 string, value 2 Feature"),
@@ -71,10 +68,7 @@ _EXAMPLE: dict[str, tuple[_Field, ...]] = {
     "BytesList": _fields("value 1 bytes*"),
     "FloatList": _fields("value 1 float*"),
     "Int64List": _fields("value 1 int64*"),
-}
-
-#: Of the Waymo perception and end-to-end driving data sets, what tells them from motion data.
-_CAMERA: dict[str, tuple[_Field, ...]] = {
+    # What tells the Waymo perception and end-to-end driving data sets from motion data.
     "Context": _fields("name 1 bytes"),
     "Frame": _fields(
         "context 1 Context, timestamp_micros 2 int64, pose 3 bytes, images 4 bytes*, lasers 5 bytes*"
@@ -82,55 +76,39 @@ _CAMERA: dict[str, tuple[_Field, ...]] = {
     "E2EDFrame": _fields("frame 1 Frame, future_states 2 bytes, past_states 3 bytes"),
 }
 
-_PACKAGES = {"drivax.womd": MESSAGES, "drivax.example": _EXAMPLE, "drivax.camera": _CAMERA}
+_PACKAGE = "drivax"
 
 
-def scenario_class(name: str = "Scenario") -> Any:
-    """The message class of a WOMD ``Scenario``, or of one of its parts."""
-    return _class("drivax.womd", name)
-
-
-def example_class() -> Any:
-    """The message class of a ``tf.Example``, its map of features declared as repeated entries."""
-    return _class("drivax.example", "Example")
-
-
-def camera_class(name: str) -> Any:
-    """The message class of a ``Frame`` of the Waymo perception data set, or of an ``E2EDFrame``."""
-    return _class("drivax.camera", name)
-
-
-def parse(message_class: Any, payload: bytes) -> Any | None:
-    """The message in a payload, or None where the payload is not such a message."""
+def parse(name: str, payload: bytes) -> Any | None:
+    """The message of this name in a payload, or None if the payload is no such message."""
+    message = message_class(name)
     from google.protobuf.message import DecodeError
 
     try:
-        return message_class.FromString(payload)
+        return message.FromString(payload)
     except DecodeError:
         return None
 
 
 @cache
-def _class(package: str, name: str) -> Any:
-    descriptor = _pool(package).FindMessageTypeByName(f"{package}.{name}")
-    from google.protobuf import message_factory
-
-    return message_factory.GetMessageClass(descriptor)
+def message_class(name: str) -> Any:
+    """The class of a message: ``Scenario``, ``Example`` (its map of features as repeated entries), ..."""
+    descriptor = _pool().FindMessageTypeByName(f"{_PACKAGE}.{name}")
+    return import_extra("google.protobuf.message_factory").GetMessageClass(descriptor)
 
 
 @cache
-def _pool(package: str) -> Any:
+def _pool() -> Any:
     descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2")
-    descriptor_pool = import_extra("google.protobuf.descriptor_pool")
-    file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto2")
-    for message_name, fields in _PACKAGES[package].items():
-        _declare(file.message_type.add(name=message_name), fields, package)
-    pool = descriptor_pool.DescriptorPool()
+    file = descriptor_pb2.FileDescriptorProto(name="drivax.proto", package=_PACKAGE, syntax="proto2")
+    for name, fields in _MESSAGES.items():
+        _declare(file.message_type.add(name=name), fields)
+    pool = import_extra("google.protobuf.descriptor_pool").DescriptorPool()
     pool.Add(file)
     return pool
 
 
-def _declare(message: Any, fields: tuple[_Field, ...], package: str) -> None:
+def _declare(message: Any, fields: tuple[_Field, ...]) -> None:
     if any(kind.endswith("?") for _, _, kind in fields):
         message.oneof_decl.add(name="kind")
     for name, number, kind in fields:
@@ -140,7 +118,7 @@ def _declare(message: Any, fields: tuple[_Field, ...], package: str) -> None:
             field.oneof_index = 0
         plain = kind.rstrip("*?")
         if plain[0].isupper():
-            field.type, field.type_name = field.TYPE_MESSAGE, f".{package}.{plain}"
+            field.type, field.type_name = field.TYPE_MESSAGE, f".{_PACKAGE}.{plain}"
         else:
             field.type = getattr(field, f"TYPE_{plain.upper()}")
 
@@ -159,7 +137,7 @@ class Numbers:
     @property
     def fields(self) -> tuple[_Field, ...]:
         """Every field, in the order of columns."""
-        return MESSAGES[self.name]
+        return _MESSAGES[self.name]
 
 
 @cache
@@ -201,21 +179,21 @@ def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, 
 
 def read_one(blob: bytes, numbers: Numbers) -> list[float]:
     """One row as protobuf reads it."""
-    message = parse(scenario_class(numbers.name), blob)
+    message = parse(numbers.name, blob)
     if message is None:
         raise DataError(f"a message {numbers.name} is damaged", cure=SKIP)
     return [float(getattr(message, name)) for name, _, _ in numbers.fields]
 
 
 STATES = Numbers(
-    "ObjectState", (tuple(name for name, _, _ in MESSAGES["ObjectState"]), ("center_z", "valid"))
+    "ObjectState", (tuple(name for name, _, _ in _MESSAGES["ObjectState"]), ("center_z", "valid"))
 )
 POINTS = Numbers("MapPoint", (("x", "y", "z"),))
 
 
 def features_of(payload: bytes) -> Features:
     """The features in a serialised tf.Example."""
-    message = parse(example_class(), payload)
+    message = parse("Example", payload)
     if message is None or not message.features.feature:
         raise DataError("the payload is not a tf.Example", cure=SKIP)
     return Features(message)

@@ -11,7 +11,7 @@ import numpy as np
 
 from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord
-from drivax.datasets.womd.messages import Features, example_class, parse, scenario_class
+from drivax.datasets.womd.messages import Features, parse
 from drivax.datasets.womd.tfrecord import count_records, looks_framed, read_records
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.recording import Recording
@@ -33,10 +33,10 @@ _SIGNS = 2
 
 def flavour(payload: bytes) -> str | None:
     """The format of a record's payload by its content, None if it is no known motion data."""
-    example = parse(example_class(), payload)
+    example = parse("Example", payload)
     if example is not None and any(entry.key == "state/current/x" for entry in example.features.feature):
         return SCENARIOMAX_FORMAT if scenariomax_signs(Features(example)) >= _SIGNS else EXAMPLE_FORMAT
-    scenario = parse(scenario_class(), payload)
+    scenario = parse("Scenario", payload)
     if scenario is not None and scenario.scenario_id and scenario.tracks:
         return SCENARIO_FORMAT
     return None

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd.messages import POINTS, SKIP, STATES, parse, read_table, scenario_class
+from drivax.datasets.womd.messages import POINTS, SKIP, STATES, parse, read_table
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -56,7 +56,7 @@ def decode(payload: bytes) -> Recording:
     Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad), invalid
     states are zeros (files keep a z there), speed limits are m/s, None for 0. Dangling links are kept.
     """
-    message = parse(scenario_class(), payload)
+    message = parse("Scenario", payload)
     if message is None or not message.scenario_id:
         raise DataError("the payload is not a WOMD Scenario proto", cure=SKIP)
     steps = len(message.timestamps_seconds)
