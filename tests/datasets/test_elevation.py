@@ -47,7 +47,7 @@ def test_the_nearest_line_decides():
     np.testing.assert_allclose(lifted.z[0, :2], [5.8, 21.8], atol=0.05)
 
 
-def test_against_brute_force():
+def test_heights_equal_brute_force():
     rng = np.random.default_rng(3)
     features = [
         MapFeature(i, RoadKind.LINE_UNKNOWN, np.cumsum(rng.uniform(-9, 9, (5, 3)) * [1, 1, 0.1], axis=0))
@@ -75,7 +75,7 @@ def test_without_a_map_agents_stand_at_zero():
     np.testing.assert_array_equal(lift(tracks([[5, 0], [0, 0]]), []).z, [[0.8, 0.0]])
 
 
-def test_a_map_of_absurd_length_does_not_cost_memory(monkeypatch):
+def test_a_map_of_absurd_length_costs_no_memory(monkeypatch):
     monkeypatch.setattr(parsing, "MOST_SAMPLES", 50)
     far = MapFeature(1, RoadKind.LANE_SURFACE, np.array([[0.0, 0, 0], [1e7, 0, 10]]))
     assert len(parsing._samples([far])) <= 52

@@ -156,7 +156,7 @@ def test_twenty_second_file_becomes_windows(wire, write_records):
     assert WomdScenario().count(path) == len(parts)
 
 
-def test_no_lights_no_map(wire):
+def test_lights_and_map_may_be_missing(wire):
     recording = decode(wire.scenario(lights=b"", map=b""))
     assert recording.features == () and recording.lights == () and recording.lost == {}
     assert not assemble(recording).has & (Flag.LIGHTS | Flag.LANE_GRAPH)

@@ -40,7 +40,8 @@ def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
     shapely = import_extra("shapely")
     rings = [ring for exterior, holes in areas for ring in (exterior, *holes)]
     if not all((np.abs(ring) < _FARTHEST_M).all() for ring in rings):  # NaN compares false
-        raise DataError("a drivable area has a point that is nowhere", cure=_AGAIN)
+        problem = f"a drivable area has a point that is not finite or beyond {_FARTHEST_M:g} m"
+        raise DataError(problem, cure=_AGAIN)
     try:
         union = shapely.union_all([polygon for area in areas for polygon in _polygons(shapely, area)])
         # Mitred corners return to their place.
