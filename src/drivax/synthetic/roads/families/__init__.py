@@ -7,7 +7,6 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from drivax.synthetic.roads.families.corridor import Corridor
-from drivax.synthetic.roads.families.highway import Highway
 from drivax.synthetic.roads.families.junctions import (
     AllWayStop,
     SignalisedJunction,
@@ -18,6 +17,7 @@ from drivax.synthetic.roads.families.roundabout import Roundabout
 from drivax.synthetic.roads.families.streets import (
     STRAIGHT_ROAD,
     CurvedRoad,
+    Highway,
     LaneDrop,
     MidblockCrosswalk,
     ParkedStreet,
