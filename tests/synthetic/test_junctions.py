@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import Capacity, RoadKind
-from drivax.synthetic.roads.families.corridor import Corridor
 from drivax.synthetic.roads.families.junction_layout import CrossSection, Geometry
 from drivax.synthetic.roads.families.junctions import (
     AllWayStop,
+    Corridor,
     SignalisedJunction,
     TJunction,
     UnprotectedLeft,

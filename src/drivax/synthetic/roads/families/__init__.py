@@ -6,9 +6,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from drivax.synthetic.roads.families.corridor import Corridor
 from drivax.synthetic.roads.families.junctions import (
     AllWayStop,
+    Corridor,
     SignalisedJunction,
     TJunction,
     UnprotectedLeft,
@@ -55,20 +55,3 @@ FAMILIES: tuple[RoadFamily, ...] = (
     MidblockCrosswalk(),
     ParkedStreet(),
 )
-
-__all__ = [
-    "FAMILIES",
-    "STRAIGHT_ROAD",
-    "AllWayStop",
-    "Corridor",
-    "CurvedRoad",
-    "Highway",
-    "LaneDrop",
-    "MidblockCrosswalk",
-    "ParkedStreet",
-    "RoadFamily",
-    "Roundabout",
-    "SignalisedJunction",
-    "TJunction",
-    "UnprotectedLeft",
-]
