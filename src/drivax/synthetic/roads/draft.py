@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from drivax.synthetic.roads.signals import SignalPlan
 
 @dataclass
 class Draft:
-    """Lanes and lines of a future :class:`~drivax.synthetic.roads.network.RoadNetwork`."""
+    """Features of a future :class:`~drivax.synthetic.roads.network.RoadNetwork`."""
 
     lanes: list[Lane] = field(default_factory=list)
     edges: list[Line] = field(default_factory=list)
@@ -62,18 +62,8 @@ class Draft:
         self, family: str, starts: tuple[Start, ...], signals: SignalPlan | None = None
     ) -> RoadNetwork:
         """Return the finished network."""
-        return RoadNetwork(
-            family=family,
-            lanes=tuple(self.lanes),
-            edges=tuple(self.edges),
-            markings=tuple(self.markings),
-            crosswalks=tuple(self.crosswalks),
-            signals=signals,
-            starts=starts,
-            crossings=tuple(self.crossings),
-            walks=tuple(self.walks),
-            bays=tuple(self.bays),
-        )
+        features = {item.name: tuple(getattr(self, item.name)) for item in fields(self)}
+        return RoadNetwork(family, starts=starts, signals=signals, **features)
 
 
 def points(*poses: Pose) -> Float64[np.ndarray, "pose 2"]:

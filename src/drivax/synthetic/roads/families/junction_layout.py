@@ -25,6 +25,7 @@ from drivax.synthetic.roads.curves import (
     join_curves,
     resample,
     straight,
+    tangent_lengths,
     winding,
 )
 from drivax.synthetic.roads.draft import Draft, points, ring
@@ -220,13 +221,9 @@ def draw_street(
 
 def _intersection(right: Arm, left: Arm) -> tuple[float, float]:
     """Distances along both middle lines of the intersection of an arm's left edge and the next arm's right edge."""
-    a, b = right.base, left.base
-    sin = math.sin(b.heading - a.heading)
-    start, end = a.aside(right.street.left_m), b.aside(-left.street.right_m)
-    dx, dy = end.x - start.x, end.y - start.y
-    along_a = (dx * math.sin(b.heading) - dy * math.cos(b.heading)) / sin
-    along_b = (dx * math.sin(a.heading) - dy * math.cos(a.heading)) / sin
-    return along_a, along_b
+    start, end = right.base.aside(right.street.left_m), left.base.aside(-left.street.right_m)
+    mine, behind = tangent_lengths(start, end, math.sin(end.heading - start.heading))
+    return mine, -behind
 
 
 def open_approach(rng: np.random.Generator, draft: Draft, arm: Arm, mouth_m: float, reach: Reach) -> Approach:
