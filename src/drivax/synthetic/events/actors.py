@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -44,11 +45,7 @@ def walk(
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]] | None:
     """Distance and speed of a walk from rest at time 0 to rest; None where it is too short to reach its speed.
 
-    Args:
-        distance_m: Length of the walk.
-        speed_mps: Speed in between.
-        rates_mps2: Acceleration and deceleration.
-        times_s: Times.
+    ``rates_mps2`` are acceleration and deceleration.
     """
     gain, loss = rates_mps2
     stopping = speed_mps**2 / (2 * loss)
@@ -58,11 +55,6 @@ def walk(
     gone, up = speed_change(0.0, speed_mps, gain, np.minimum(times_s, slows))
     more, down = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
     return gone + more, np.where(times_s < slows, up, down)
-
-
-def smooth_step(times_s: Float64[np.ndarray, " k"], lasts_s: float) -> Float64[np.ndarray, " k"]:
-    """Quintic step from 0 to 1 within a duration; speed and acceleration vanish at both ends."""
-    return curves.smooth_step(times_s / lasts_s)
 
 
 def along_track(
@@ -106,24 +98,27 @@ def along_curve(
     size_m: tuple[float, float, float],
 ) -> Scripted:
     """Actor that drives along a curve and is valid while it is on it."""
-    arc = curve.arc_m
-    xy = np.stack([np.interp(distance_m, arc, curve.xy[:, k]) for k in (0, 1)], axis=-1)
+    xy, heading = curve.at(distance_m)
     speed = np.maximum(np.gradient(distance_m, DT_S), 0.0)
-    valid = (distance_m >= size_m[0] / 2) & (distance_m <= arc[-1] - size_m[0] / 2)
-    return Scripted(kind, size_m, xy, np.interp(distance_m, arc, curve.heading), speed, valid)
+    valid = (distance_m >= size_m[0] / 2) & (distance_m <= curve.arc_m[-1] - size_m[0] / 2)
+    return Scripted(kind, size_m, xy, heading, speed, valid)
+
+
+def user_of(motion: Motion, row: int) -> Scripted:
+    """Trajectory of a user of the traffic."""
+    length, width, height = map(float, motion.size_m[row])
+    track = motion.xy[row], motion.heading[row], motion.speed[row], motion.valid[row].copy()
+    return Scripted(AgentKind(int(motion.kind[row])), (length, width, height), *track)
 
 
 def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
     """Vehicle of the traffic that brakes from a step to a halt on its path."""
-    xy, heading = motion.xy[row], np.unwrap(motion.heading[row])
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
-    times = DT_S * (np.arange(len(xy)) - step)
-    speed = float(motion.speed[row, step])
-    gone, slower = speed_change(speed, 0.0, braking_mps2, times)
+    user = user_of(motion, row)
+    arc = Curve(user.xy, user.heading).arc_m
+    times = DT_S * (np.arange(len(arc)) - step)
+    gone, slower = speed_change(float(user.speed[step]), 0.0, braking_mps2, times)
     at = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
     grows = np.concatenate([[True], np.diff(arc) > 1e-6])
-    moved = np.stack([np.interp(at, arc[grows], xy[grows, k]) for k in (0, 1)], axis=-1)
-    turned = np.interp(at, arc[grows], heading[grows])
-    speeds = np.where(times < 0, motion.speed[row], np.minimum(slower, motion.speed[row]))
-    size = (float(motion.size_m[row, 0]), float(motion.size_m[row, 1]), float(motion.size_m[row, 2]))
-    return Scripted(AgentKind(int(motion.kind[row])), size, moved, turned, speeds, motion.valid[row].copy())
+    heading = np.interp(at, arc[grows], np.unwrap(user.heading)[grows])
+    speed = np.where(times < 0, user.speed, np.minimum(slower, user.speed))
+    return replace(user, xy=curves.interpolate(at, arc[grows], user.xy[grows]), heading=heading, speed=speed)

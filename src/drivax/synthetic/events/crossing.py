@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64
@@ -47,26 +46,19 @@ class _ActorPath:
     def through(cls, view: EgoView, connector: int, rng: np.random.Generator) -> _ActorPath:
         """Draw a path through a connector."""
         lanes = view.roles.network.lanes
-        before, after = (
-            _chain(lanes, connector, -1, _FROM_M, rng),
-            _chain(lanes, connector, 1, _BEYOND_M, rng),
-        )
+        before = _chain(lanes, connector, -1, _FROM_M, rng)
+        after = _chain(lanes, connector, 1, _BEYOND_M, rng)
         ahead = [lanes[i].curve for i in reversed(before)]
         line = sum(float(curve.arc_m[-1]) for curve in ahead)
         curve = join_curves(*ahead, lanes[connector].curve, *(lanes[i].curve for i in after))
         limit = lanes[before[0]].limit_mps if before else lanes[connector].limit_mps
         return cls(curve, line, limit)
 
-    @cached_property
-    def arc_m(self) -> Float64[np.ndarray, " point"]:
-        """Distance along the curve at its samples."""
-        return self.curve.arc_m
-
     def distances(
         self, fastest_mps: float, times_s: Float64[np.ndarray, " time"]
     ) -> Float64[np.ndarray, " time"]:
         """Distance along the path at times; the front reaches the line at time 0, and bends limit the speed."""
-        arc = self.arc_m
+        arc = self.curve.arc_m
         rate = np.abs(
             np.gradient(self.curve.heading, np.maximum.accumulate(arc + 1e-9 * np.arange(len(arc))))
         )

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS
 from drivax.simulator.idm import idm_acceleration
-from drivax.synthetic.roads.curves import STEP_M
+from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate, normals
 from drivax.synthetic.traffic.roles import Motion, Roles
 
 #: Earliest and latest first step of an event, and the step before which its actor blocks ego's path.
@@ -52,8 +52,7 @@ class Track:
         share = place - index
         heading = self.heading[index] + share * (self.heading[index + 1] - self.heading[index])
         xy = self.xy[index] + share[..., None] * (self.xy[index + 1] - self.xy[index])
-        normal = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
-        return xy + np.asarray(left_m)[..., None] * normal, heading
+        return xy + np.asarray(left_m)[..., None] * normals(heading), heading
 
     def place(self, station: float) -> tuple[Float64[np.ndarray, " 2"], float]:
         """Position and heading at one station."""
@@ -74,7 +73,7 @@ class Track:
 def ego_track(motion: Motion) -> Track:
     """Return the track of row 0: its trace, the rest of its path, then straight on."""
     xy, heading = motion.xy[0], np.unwrap(motion.heading[0])
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    arc = Curve(xy, heading).arc_m
     moved = np.concatenate([[True], np.diff(arc) > 1e-3])
     # Rounding must not move an ego at rest.
     points, turned, along = xy[moved], heading[moved], arc[moved]
@@ -91,8 +90,7 @@ def ego_track(motion: Motion) -> Track:
     points = np.concatenate([points, [points[-1] + 300.0 * out]])
     turned, along = np.append(turned, turned[-1]), np.append(along, along[-1] + 300.0)
     station = np.arange(0.0, arc[-1] + _BEYOND_M, STEP_M)
-    sampled = np.stack([np.interp(station, along, points[:, k]) for k in (0, 1)], axis=-1)
-    return Track(sampled, np.interp(station, along, turned), arc)
+    return Track(interpolate(station, along, points), np.interp(station, along, turned), arc)
 
 
 @dataclass(frozen=True)
@@ -210,14 +208,15 @@ class EgoView:
     def connectors(self) -> list[int]:
         """Connectors on ego's path during the recording and right after it."""
         begin, end = self.track.at[self.first_step + EARLIEST], self.track.at[self.last_step] + 30.0
-        lanes = {self.lane_at(station) for station in np.arange(begin, end, 3.0).tolist()}
-        return sorted(i for i in lanes if i >= 0 and self.roles.network.lanes[i].connector)
+        return self._connectors_between(begin, end, 3.0)
 
     def meets_junction(self, low_m: float, high_m: float) -> bool:
         """Whether ego's path has a junction between two stations; scripted actors do not obey its rules."""
-        lanes = self.roles.network.lanes
-        passed = {self.lane_at(station) for station in np.arange(low_m, high_m + 4.0, 4.0).tolist()}
-        return any(lanes[lane].connector for lane in passed if lane >= 0)
+        return bool(self._connectors_between(low_m, high_m + 4.0, 4.0))
+
+    def _connectors_between(self, low_m: float, high_m: float, step_m: float) -> list[int]:
+        lanes = {self.lane_at(station) for station in np.arange(low_m, high_m, step_m).tolist()}
+        return sorted(i for i in lanes if i >= 0 and self.roles.network.lanes[i].connector)
 
     def on_path(self, step: int) -> tuple[Float64[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
         """Stations of all vehicles at a step, and whether they drive on ego's path (False for ego itself)."""

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Bool
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_track, smooth_step, speed_change
+from drivax.synthetic.events.actors import CAR_M, along_track, speed_change
 from drivax.synthetic.events.destinations import Destination, open_road
 from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
 from drivax.synthetic.events.kinds import EventKind, Proposal
-from drivax.synthetic.roads.curves import STEP_M
+from drivax.synthetic.roads.curves import STEP_M, smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Staging
 
@@ -109,7 +109,7 @@ class CutIn:
         if adjacent is None or view.meets_junction(start, float(station[view.last_step])):
             return None
         aside, valid = adjacent
-        left = side * aside * (1.0 - smooth_step(times, lasts))
+        left = side * aside * (1.0 - smooth_step(times / lasts))
         adversary = along_track(view.track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
         if not adversary.valid[view.first_step : step + 1].all():
             return None

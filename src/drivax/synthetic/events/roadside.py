@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_track, scripted_motion, smooth_step, travel_s, walk
+from drivax.synthetic.events.actors import CAR_M, along_track, scripted_motion, travel_s, walk
 from drivax.synthetic.events.adversary import waiting_room
 from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
 from drivax.synthetic.events.kinds import EventKind, Proposal
+from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
@@ -275,7 +276,7 @@ class WrongWayCyclist:
         # Share of the swing back after which ego's lane is clear.
         share = (half + outer) / (outer - inner) if outer < inner else 1.0
         begin_back = clear - _time_of_share(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
-        swing = smooth_step(times, self.swing_s) - smooth_step(times - begin_back, self.swing_s)
+        swing = smooth_step(times / self.swing_s) - smooth_step((times - begin_back) / self.swing_s)
         if begin_back < self.swing_s * 0.6:
             return None
         left = outer + (inner - outer) * swing
@@ -291,4 +292,4 @@ class WrongWayCyclist:
 def _time_of_share(share: float) -> float:
     """Inverse of the smooth step: the share of its duration at which it reaches a share."""
     t = np.linspace(0.0, 1.0, 201)
-    return float(np.interp(share, smooth_step(t, 1.0), t))
+    return float(np.interp(share, smooth_step(t), t))
