@@ -20,8 +20,7 @@ from drivax.synthetic.events import (
     possible,
 )
 from drivax.synthetic.events.adversary import required_deceleration, vehicles_that_cross, waiting_room
-from drivax.synthetic.events.leading import required_by_leader
-from drivax.synthetic.events.merging import cut_in_gap
+from drivax.synthetic.events.leading import cut_in_gap, required_by_leader
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
 from .event_scenes import (

@@ -18,7 +18,7 @@ from drivax.synthetic.events.adversary import (
 )
 from drivax.synthetic.events.destinations import Destination
 from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, EgoView
-from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
+from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventScript, Proposal
 from drivax.synthetic.roads.curves import Curve, join_curves
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
@@ -95,7 +95,7 @@ def _straight_on(lane: Lane) -> bool:
 
 
 @dataclass(frozen=True)
-class CrossTraffic:
+class CrossTraffic(EventScript):
     """A vehicle crosses ego's path in a junction although ego has right of way.
 
     Attributes:
@@ -108,17 +108,8 @@ class CrossTraffic:
     speed_share: tuple[float, float] = (0.7, 1.1)
     arrival_s: tuple[float, float] = (2.5, 5.5)
 
-    @property
-    def kind(self) -> EventKind:
-        """See :class:`EventScript`."""
-        return EventKind.TURN_CONFLICT if self.turning else EventKind.RED_LIGHT_RUNNER
-
-    def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`."""
-        return bool(self.destinations(network))
-
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """See :class:`DestinationScript`: stop lines of connectors that actors may cross."""
+        """See :class:`EventScript`: stop lines of connectors that actors may cross."""
         if network.signals is None and not self.turning:
             return ()
         return tuple(

@@ -12,7 +12,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.actors import CAR_M, along_track, scripted_motion, travel_s, walk
 from drivax.synthetic.events.adversary import waiting_room
 from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
-from drivax.synthetic.events.kinds import EventKind, Proposal
+from drivax.synthetic.events.kinds import EventScript, Proposal
 from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Scripted, Staging
@@ -26,8 +26,10 @@ _START_MPS2 = 3.0
 _ROLLING_MPS2 = 6.0
 
 
-def _has_streets(network: RoadNetwork) -> bool:
-    return any(lane.limit_mps <= _STREET_MPS for lane in network.lanes)
+class _StreetScript(EventScript):
+    def possible(self, network: RoadNetwork) -> bool:
+        """See :class:`EventScript`: on networks with streets."""
+        return any(lane.limit_mps <= _STREET_MPS for lane in network.lanes)
 
 
 def _is_open_street(view: EgoView, station: float) -> bool:
@@ -50,7 +52,7 @@ def _crossing_actor(
 
 
 @dataclass(frozen=True)
-class Jaywalker:
+class Jaywalker(_StreetScript):
     """A pedestrian crosses the road away from crossings.
 
     Attributes:
@@ -61,14 +63,9 @@ class Jaywalker:
     hidden: bool = False
     speed_mps: tuple[float, float] = (1.3, 3.0)
 
-    @property
-    def kind(self) -> EventKind:
-        """See :class:`EventScript`."""
-        return EventKind.FROM_BEHIND_PARKED if self.hidden else EventKind.JAYWALKER
-
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        return bool(network.bays) if self.hidden else _has_streets(network)
+        return bool(network.bays) if self.hidden else super().possible(network)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
@@ -152,7 +149,7 @@ class Jaywalker:
 
 
 @dataclass(frozen=True)
-class LaneBlocked:
+class LaneBlocked(EventScript):
     """An object rolls from the roadside into ego's lane and stays there.
 
     Attributes:
@@ -160,7 +157,6 @@ class LaneBlocked:
     """
 
     speed_mps: tuple[float, float] = (2.5, 7.0)
-    kind: EventKind = EventKind.LANE_BLOCKED
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`: on all roads."""
@@ -193,7 +189,7 @@ class LaneBlocked:
 
 
 @dataclass(frozen=True)
-class ReversingCar:
+class ReversingCar(_StreetScript):
     """A car backs out of a driveway into ego's lane and stops there.
 
     Attributes:
@@ -203,11 +199,6 @@ class ReversingCar:
 
     speed_mps: tuple[float, float] = (2.0, 4.0)
     gain_mps2: float = 3.0
-    kind: EventKind = EventKind.REVERSING_CAR
-
-    def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`."""
-        return _has_streets(network)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
@@ -238,7 +229,7 @@ class ReversingCar:
 
 
 @dataclass(frozen=True)
-class WrongWayCyclist:
+class WrongWayCyclist(_StreetScript):
     """An oncoming cyclist at the edge of ego's side swings out into ego's lane for a while.
 
     Attributes:
@@ -250,11 +241,6 @@ class WrongWayCyclist:
     speed_mps: tuple[float, float] = (3.5, 6.5)
     out_s: tuple[float, float] = (2.0, 3.2)
     swing_s: float = 1.6
-    kind: EventKind = EventKind.WRONG_WAY_CYCLIST
-
-    def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`."""
-        return _has_streets(network)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
