@@ -63,7 +63,6 @@ def along_track(
     left_m: Float64[np.ndarray, " time"],
     kind: AgentKind,
     size_m: tuple[float, float, float],
-    *,
     valid: Bool[np.ndarray, " time"],
 ) -> Scripted:
     """Actor at stations and lateral offsets of ego's path, headed along its motion."""

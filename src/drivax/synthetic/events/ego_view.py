@@ -131,6 +131,10 @@ class EgoView:
         """Ego's length, width, height."""
         return self.motion.size_m[0]
 
+    def at_step(self, step: int) -> tuple[float, float]:
+        """Station and speed of ego at a step."""
+        return float(self.track.at[step]), float(self.motion.speed[0, step])
+
     def draw_step(self, rng: np.random.Generator) -> int | None:
         """Draw a step at which an event may begin and ego is not slow; None without one."""
         steps = np.arange(self.first_step + EARLIEST, self.first_step + LATEST + 1)

@@ -97,9 +97,8 @@ class LeadBrakes(EventScript):
         tailgating = float(rng.uniform(*self.tailgating_s))
         if step is None:
             return None
-        motion, own = view.motion, float(view.track.at[step])
+        motion, (own, speed) = view.motion, view.at_step(step)
         station, on = view.on_path(step)
-        speed = float(motion.speed[0, step])
         followers: tuple[int, ...] = ()
         tailgates: tuple[Tailgate, ...] = ()
         if self.tailgater:
@@ -188,7 +187,7 @@ def _propose_leader(
     if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
         return None
     valid, left = np.arange(view.steps) >= appears, np.zeros(view.steps)
-    adversary = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
+    adversary = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid)
     staging = replace(drives_on or Staging(), extras=(adversary,))
     required = severity(after, adversary, step + NOTICED)
     return Proposal(staging, required, adversary, step, last, None, others, after)
@@ -240,7 +239,7 @@ class CutIn(EventScript):
         braking, lasts = float(rng.uniform(*self.braking_mps2)), float(rng.uniform(*self.lasts_s))
         if step is None:
             return None
-        speed = float(view.motion.speed[0, step])
+        own, speed = view.at_step(step)
         before, after = (float(share) * speed for share in shares)
         after = min(after, before)
         slowed = max(after, before - braking * NOTICED_S)
@@ -251,7 +250,7 @@ class CutIn(EventScript):
         gap += NOTICED_S * (speed - (before + slowed) / 2)
         if not 0.5 <= gap <= 40.0:
             return None
-        start = float(view.track.at[step]) + gap + (view.ego_size_m[0] + CAR_M[0]) / 2
+        start = own + gap + (view.ego_size_m[0] + CAR_M[0]) / 2
         times = DT_S * (np.arange(view.steps) - step)
         gone, _ = speed_change(before, after, braking, times)
         station = start + gone
@@ -261,7 +260,7 @@ class CutIn(EventScript):
             return None
         aside, valid = adjacent
         left = side * aside * (1.0 - smooth_step(times / lasts))
-        adversary = along_track(view.track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
+        adversary = along_track(view.track, station, left, AgentKind.VEHICLE, CAR_M, valid)
         if not adversary.valid[view.first_step : step + 1].all():
             return None
         # The event ends when the actor has its new speed in the new lane.

@@ -38,6 +38,22 @@ def _is_open_street(view: EgoView, station: float) -> bool:
     return view.plain_road(station) and view.roles.network.lanes[lane].limit_mps <= _STREET_MPS
 
 
+def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: float) -> tuple[float, float]:
+    """Station of a lasting obstacle that requires a deceleration, and the time until ego would reach it, s."""
+    own, speed = view.at_step(step)
+    room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
+    return own + room + (view.ego_size_m[0] + length_m) / 2, room / speed
+
+
+def _entry(
+    view: EgoView, step: int, distance_m: float, pace_mps: float, rates_mps2: tuple[float, float]
+) -> tuple[Float64[np.ndarray, " time"], Float64[np.ndarray, " time"]] | None:
+    """Distance and speed of an obstacle that moves into ego's lane, braking harder where the distance is short."""
+    gain, loss = rates_mps2
+    times = DT_S * (np.arange(view.steps) - step)
+    return walk(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
+
+
 def _crossing_actor(
     view: EgoView,
     station: float,
@@ -83,12 +99,9 @@ class Jaywalker(_StreetScript):
         gait = walk(over, pace, (_START_MPS2, 2.0), times)
         if gait is None:
             return None
-        left = offset + side * gait[0]
-        adversary = _crossing_actor(view, station, left, AgentKind.PEDESTRIAN, _PERSON_M)
-        last = step + round(travel_s(over, pace, _START_MPS2) / DT_S)
-        return Proposal(
-            Staging(extras=(adversary,)), severity_mps2, adversary, step, min(last, view.last_step)
-        )
+        adversary = _crossing_actor(view, station, offset + side * gait[0], AgentKind.PEDESTRIAN, _PERSON_M)
+        last = min(step + round(travel_s(over, pace, _START_MPS2) / DT_S), view.last_step)
+        return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
     def _required_room(
         self, view: EgoView, offset: float, speed: float, pace: float, requested: float
@@ -108,7 +121,7 @@ class Jaywalker(_StreetScript):
         back = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
-        speed, own = float(view.motion.speed[0, step]), float(view.track.at[step])
+        own, speed = view.at_step(step)
         front = own + (view.ego_size_m[0] + _PERSON_M[1]) / 2
         station, offset = front + speed, 0.0
         # The distance of the kerb depends on the station, which depends on that distance: iterate twice.
@@ -127,8 +140,7 @@ class Jaywalker(_StreetScript):
     ) -> tuple[int, float, float] | None:
         if not view.roles.parked:
             return None
-        centres = np.array([car.xy[0] for car in view.roles.parked])
-        station, left = view.track.project(centres)
+        station, left = view.track.project(np.array([car.xy[0] for car in view.roles.parked]))
         steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST)
         speed = view.motion.speed[0, steps]
         near = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > view.track.at[steps[0]] + 6.0)
@@ -137,11 +149,9 @@ class Jaywalker(_StreetScript):
             line = float(station[car]) + view.roles.parked[car].size_m[0] / 2 + 0.55
             offset = float(left[car])
             front = view.track.at[steps] + (view.ego_size_m[0] + _PERSON_M[1]) / 2
-            needs = [
-                self._required_room(view, offset, float(v), pace, requested) if v > 4.0 else None
-                for v in speed
-            ]
-            off = np.array([math.inf if need is None else need for need in needs]) - (line - front)
+            rooms = [self._required_room(view, offset, float(v), pace, requested) for v in speed]
+            rooms = [math.inf if room is None else room for room in rooms]
+            off = np.where(speed > 4.0, rooms, math.inf) - (line - front)
             best = int(np.argmin(np.abs(off)))
             if abs(off[best]) < 0.08 * speed[best]:
                 return int(steps[best]), line, offset
@@ -169,19 +179,13 @@ class LaneBlocked(EventScript):
         out = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
-        speed = float(view.motion.speed[0, step])
-        room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
-        station = float(view.track.at[step]) + room + (view.ego_size_m[0] + _THING_M[0]) / 2
+        station, arrival_s = _blocked_station(view, step, severity_mps2, _THING_M[0])
         offset = view.edge_m(station, side) + out
         half = (view.ego_size_m[1] + _THING_M[1]) / 2
         if not offset < 9.0 or not view.plain_road(station):
             return None
-        if travel_s(offset - half, pace, _ROLLING_MPS2) > room / speed - 0.05:
-            return None
-        times = DT_S * (np.arange(view.steps) - step)
-        length = offset - rest
-        gait = walk(length, pace, (_ROLLING_MPS2, max(3.0, pace**2 / length)), times)
-        if gait is None:
+        gait = _entry(view, step, offset - rest, pace, (_ROLLING_MPS2, 3.0))
+        if gait is None or travel_s(offset - half, pace, _ROLLING_MPS2) > arrival_s - 0.05:
             return None
         left = side * (offset - gait[0])
         adversary = _crossing_actor(view, station, left, AgentKind.OTHER, _THING_M)
@@ -206,25 +210,18 @@ class ReversingCar(_StreetScript):
         into, back = float(rng.uniform(0.2, 1.2)), float(rng.uniform(-0.6, 0.4))
         if step is None:
             return None
-        speed = float(view.motion.speed[0, step])
-        room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
-        station = float(view.track.at[step]) + room + (view.ego_size_m[0] + CAR_M[1]) / 2
+        station, arrival_s = _blocked_station(view, step, severity_mps2, CAR_M[1])
         # The rear bumper starts near the right kerb and ends beyond the middle of ego's path.
         rear = view.edge_m(station, -1) + back
         if not 1.3 < rear < 7.0 or not _is_open_street(view, station):
             return None
-        half = view.ego_size_m[1] / 2
-        if travel_s(rear - half, pace, self.gain_mps2) > room / speed - 0.05:
+        gait = _entry(view, step, rear + into, pace, (self.gain_mps2, 2.5))
+        clears = view.ego_size_m[1] / 2
+        if gait is None or travel_s(rear - clears, pace, self.gain_mps2) > arrival_s - 0.05:
             return None
-        times = DT_S * (np.arange(view.steps) - step)
-        length = rear + into
-        gait = walk(length, pace, (self.gain_mps2, max(2.5, pace**2 / length)), times)
-        if gait is None:
-            return None
-        left = gait[0] - (rear + CAR_M[0] / 2)
-        xy, heading = view.track.pose(np.full(view.steps, station), left)
-        turned = heading - math.pi / 2
-        adversary = Scripted(AgentKind.VEHICLE, CAR_M, xy, turned, -gait[1], np.ones(view.steps, bool))
+        xy, heading = view.track.pose(np.full(view.steps, station), gait[0] - (rear + CAR_M[0] / 2))
+        valid = np.ones(view.steps, bool)
+        adversary = Scripted(AgentKind.VEHICLE, CAR_M, xy, heading - math.pi / 2, -gait[1], valid)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, view.last_step)
 
 
@@ -248,7 +245,7 @@ class WrongWayCyclist(_StreetScript):
         clear, inner = float(rng.uniform(*self.out_s)), float(rng.uniform(-0.9, -0.1))
         if step is None:
             return None
-        speed, own = float(view.motion.speed[0, step]), float(view.track.at[step])
+        own, speed = view.at_step(step)
         room = speed * NOTICED_S + waiting_room(speed, severity_mps2, clear - NOTICED_S)
         start = own + (view.ego_size_m[0] + _BICYCLE_M[0]) / 2 + room + pace * clear
         if not _is_open_street(view, own + room) or not _is_open_street(view, start):
@@ -266,13 +263,10 @@ class WrongWayCyclist(_StreetScript):
         if begin_back < self.swing_s * 0.6:
             return None
         left = outer + (inner - outer) * swing
-        station = start - pace * times
         valid = np.ones(view.steps, bool)
-        adversary = along_track(view.track, station, left, AgentKind.CYCLIST, _BICYCLE_M, valid=valid)
-        last = step + round((begin_back + self.swing_s) / DT_S)
-        return Proposal(
-            Staging(extras=(adversary,)), severity_mps2, adversary, step, min(last, view.last_step)
-        )
+        adversary = along_track(view.track, start - pace * times, left, AgentKind.CYCLIST, _BICYCLE_M, valid)
+        last = min(step + round((begin_back + self.swing_s) / DT_S), view.last_step)
+        return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
 
 def _time_of_share(share: float) -> float:
