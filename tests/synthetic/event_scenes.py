@@ -12,8 +12,7 @@ from drivax.synthetic.events import (
     EventKind,
 )
 from drivax.synthetic.roads.curves import Pose, straight, turn
-from drivax.synthetic.roads.draft import Draft
-from drivax.synthetic.roads.network import Control, Line, RoadNetwork
+from drivax.synthetic.roads.network import Control, Draft, Line, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import Sway, lane_path

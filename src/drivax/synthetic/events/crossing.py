@@ -59,9 +59,8 @@ class _ActorPath:
     ) -> Float64[np.ndarray, " time"]:
         """Distance along the path at times; the front reaches the line at time 0, and bends limit the speed."""
         arc = self.curve.arc_m
-        rate = np.abs(
-            np.gradient(self.curve.heading, np.maximum.accumulate(arc + 1e-9 * np.arange(len(arc))))
-        )
+        rising = np.maximum.accumulate(arc + 1e-9 * np.arange(len(arc)))
+        rate = np.abs(np.gradient(self.curve.heading, rising))
         smooth = np.convolve(np.pad(rate, 4, mode="edge"), np.full(9, 1 / 9), mode="valid")
         cap = np.minimum(fastest_mps**2, _LATERAL_MPS2 / np.maximum(smooth, 1e-6))
         ramp = 2 * _SLOWING_MPS2 * arc
@@ -120,8 +119,8 @@ class CrossTraffic(EventScript):
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        connectors = self._crossing_connectors(view)
-        share = float(rng.uniform(*self.speed_share))
+        network, share = view.roles.network, float(rng.uniform(*self.speed_share))
+        connectors = sorted({other for mine in view.connectors for other in self._conflicting(network, mine)})
         if not connectors:
             return None
         lane = int(rng.choice(connectors))
@@ -136,18 +135,11 @@ class CrossTraffic(EventScript):
         leaves = int(np.argmax(~np.isfinite(first_blocked(view, adversary, entry))[8:])) + 8 + entry
         # A queue at its light would block the actor.
         removed = vehicles_in_lane(view, adversary, entry + 5)
-        return Proposal(
+        staging, last = (
             Staging(extras=(adversary,), removed=removed),
-            required,
-            adversary,
-            entry - decides,
             min(max(leaves, entry + 10), view.last_step),
         )
-
-    def _crossing_connectors(self, view: EgoView) -> list[int]:
-        """Connectors of actors that cross a connector on ego's path."""
-        network = view.roles.network
-        return sorted({other for mine in view.connectors for other in self._conflicting(network, mine)})
+        return Proposal(staging, required, adversary, entry - decides, last)
 
     def _conflicting(self, network: RoadNetwork, mine: int) -> list[int]:
         """Connectors that cross a straight one and have to give way to it."""

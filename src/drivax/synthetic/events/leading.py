@@ -13,7 +13,7 @@ from drivax.synthetic.events.adversary import severity
 from drivax.synthetic.events.destinations import Destination, open_road
 from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED, NOTICED_S, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventScript, Proposal
-from drivax.synthetic.roads.curves import STEP_M, smooth_step
+from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Override, Staging, Tailgate
 
@@ -140,9 +140,7 @@ class StalledVehicle(EventScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
         step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
-        if step is None:
-            return None
-        return _propose_leader(view, step, headway, rng, None, ())
+        return None if step is None else _propose_leader(view, step, headway, rng, None, ())
 
 
 def _stands_until(speed_mps: float, severity_mps2: float) -> int:
@@ -160,13 +158,8 @@ def _propose_leader(
 ) -> Proposal | None:
     """Propose a new leader at ego's speed that brakes to a halt; None near junctions, or where it requires too little.
 
-    Args:
-        view: The scenario without it.
-        step: First step of braking.
-        headway_s: Time gap to an ego in free traffic.
-        rng: Source of randomness.
-        drives_on: Further staging of a car that drives on later; None: it stays.
-        others: Further actors.
+    ``headway_s`` is its time gap to an ego in free traffic; it drives on later, with this further staging, or stays
+    (None).
     """
     track, lead = view.track, float(view.motion.speed[0, step])
     lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
@@ -264,8 +257,7 @@ class CutIn(EventScript):
         if not adversary.valid[view.first_step : step + 1].all():
             return None
         # The event ends when the actor has its new speed in the new lane.
-        last = step + round(max(lasts, (before - after) / braking) / DT_S)
-        last = min(last, view.last_step)
+        last = min(step + round(max(lasts, (before - after) / braking) / DT_S), view.last_step)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, max(last, step + 1))
 
     def _before_an_end(self, view: EgoView, rng: np.random.Generator) -> tuple[int | None, int]:
@@ -285,12 +277,9 @@ class CutIn(EventScript):
         self, view: EgoView, station: np.ndarray, start: float, finish: float, side: int
     ) -> tuple[float, Bool[np.ndarray, " time"]] | None:
         """Lateral offset of the actor's lane, and the steps at which it exists next to ego's; None without one."""
+        lanes, lane, reach = view.roles.network.lanes, -1, finish
         low = max(0.0, float(station.min()))
-        places = np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0)
-        lane = -1
-        reach = finish
-        lanes = view.roles.network.lanes
-        for place in places.tolist():
+        for place in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():
             neighbour = view.neighbour(place, side)
             if neighbour < 0:
                 break
@@ -306,7 +295,4 @@ class CutIn(EventScript):
                 return None
         here = view.track.place(start)[0]
         apart = float(np.min(np.hypot(*(lanes[view.neighbour(start, side)].curve.xy - here).T)))
-        aside = max(apart, STEP_M)
-        if not 2.3 < aside < 5.0:
-            return None
-        return aside, station >= reach
+        return (apart, station >= reach) if 2.3 < apart < 5.0 else None

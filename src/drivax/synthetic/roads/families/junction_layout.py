@@ -28,8 +28,7 @@ from drivax.synthetic.roads.curves import (
     tangent_lengths,
     winding,
 )
-from drivax.synthetic.roads.draft import Draft, points, ring
-from drivax.synthetic.roads.network import Crossing, Line, Start
+from drivax.synthetic.roads.network import Crossing, Draft, Line, Start, points, ring
 from drivax.synthetic.roads.style import RoadStyle
 
 #: Distances from the mouth of the crossing's two sides and of the stop line, with a crosswalk and without, m.
@@ -389,20 +388,16 @@ def _add_crossings(draft: Draft, site: Site) -> None:
     """Add a crossing at the mouth of each approach, with a crosswalk where it is marked."""
     for i, approach in enumerate(site.approaches):
         street = approach.arm.street
-        near, far = (approach.arm.base.ahead(approach.mouth_m + metres) for metres in street.crossing_m)
+        left, right, (begin, end) = street.left_m, -street.right_m, street.crossing_m
+        near, far = (approach.arm.base.ahead(approach.mouth_m + metres) for metres in (begin, end))
         if street.marked:
-            left, right = street.left_m, -street.right_m
             draft.crosswalk(near.aside(left), far.aside(left), far.aside(right), near.aside(right))
-        width = street.crossing_m[1] - street.crossing_m[0]
-        middle = near.ahead(width / 2)
-        axis = points(middle.aside(street.left_m), middle.aside(-street.right_m))
-        draft.crossings.append(Crossing(axis, width, _crossed(draft, site, i), street.marked))
-
-
-def _crossed(draft: Draft, site: Site, i: int) -> tuple[tuple[int, float], ...]:
-    """Connectors that an approach's crossing crosses, and the distance along each, m."""
-    street = site.approaches[i].arm.street
-    inside = street.stop_line_m - sum(street.crossing_m) / 2
-    entering = [(move.lane, inside) for move in site.moves if move.arm == i]
-    leaving = [(move.lane, draft.lanes[move.lane].length_m - inside) for move in site.moves if move.to == i]
-    return (*entering, *leaving)
+        # Connectors begin and end at the stop line.
+        inside = street.stop_line_m - (begin + end) / 2
+        entering = [(move.lane, inside) for move in site.moves if move.arm == i]
+        leaving = [
+            (move.lane, draft.lanes[move.lane].length_m - inside) for move in site.moves if move.to == i
+        ]
+        middle = near.ahead((end - begin) / 2)
+        axis = points(middle.aside(left), middle.aside(right))
+        draft.crossings.append(Crossing(axis, end - begin, (*entering, *leaving), street.marked))

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Bool
 
 from drivax.synthetic.roads.curves import Curve, Pose, join_curves, straight, winding
-from drivax.synthetic.roads.draft import Draft
 from drivax.synthetic.roads.families.junction_layout import (
     Approach,
     Arm,
@@ -34,7 +33,7 @@ from drivax.synthetic.roads.families.junction_layout import (
     open_site,
     starts,
 )
-from drivax.synthetic.roads.network import Control, RoadNetwork
+from drivax.synthetic.roads.network import Control, Draft, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan, combine_plans, yellow_time_s
 from drivax.synthetic.roads.style import GRID, RoadStyle
 

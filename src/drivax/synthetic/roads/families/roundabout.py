@@ -25,9 +25,8 @@ from drivax.synthetic.roads.curves import (
     straight,
     winding,
 )
-from drivax.synthetic.roads.draft import Draft, points, ring
 from drivax.synthetic.roads.families.street_layout import CROSSWALK_M
-from drivax.synthetic.roads.network import Control, Crossing, Line, RoadNetwork, Start
+from drivax.synthetic.roads.network import Control, Crossing, Draft, Line, RoadNetwork, Start, points, ring
 from drivax.synthetic.roads.style import GRID, RoadStyle
 
 #: Least radius of the fillets of entries and exits, m.

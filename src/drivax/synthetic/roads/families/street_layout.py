@@ -11,8 +11,7 @@ from jaxtyping import Float64
 
 from drivax.scenario.schema import RoadKind
 from drivax.synthetic.roads.curves import STEP_M, Curve, Pose, smooth_step, winding
-from drivax.synthetic.roads.draft import Draft, points, ring
-from drivax.synthetic.roads.network import Bay, Crossing, Line, RoadNetwork, Start
+from drivax.synthetic.roads.network import Bay, Crossing, Draft, Line, RoadNetwork, Start, points, ring
 
 #: Width of a crosswalk, m.
 CROSSWALK_M = 3.2

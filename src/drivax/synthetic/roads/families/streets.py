@@ -10,9 +10,8 @@ from jaxtyping import Float64
 
 from drivax.scenario.schema import RoadKind
 from drivax.synthetic.roads.curves import STEP_M, Curve, from_curvature
-from drivax.synthetic.roads.draft import ring
 from drivax.synthetic.roads.families.street_layout import Street, StreetFamily, Strip, strips
-from drivax.synthetic.roads.network import Line, RoadNetwork, Start
+from drivax.synthetic.roads.network import Line, RoadNetwork, Start, ring
 from drivax.synthetic.roads.style import GRID, RoadStyle
 
 #: Lanes ahead, lanes the other way, and the share of that layout.
