@@ -1,4 +1,4 @@
-"""Interactive moments of a simulation: the steps from index a driver that only follows its leader would collide.
+"""Interactive moments of a simulation: the steps from which a driver that only follows its leader would collide.
 
 Recorded data sets are mined for interactions, since most driving is on empty roads. Here a reference driver that
 follows its leader and stops at red lights, but ignores all other agents, is rolled out from several steps of the same
@@ -53,13 +53,9 @@ def critical_steps(
     colour: Int8[np.ndarray, "time lane"],
     steps: Int64[np.ndarray, " start"],
 ) -> Bool[np.ndarray, " start"]:
-    """Whether the reference driver collides in the recordings that begin at some steps.
+    """Whether the reference driver collides in the recordings that begin at some steps, which are even.
 
-    Args:
-        network: The roads.
-        motion: Motion of all agents; row 0 is ego.
-        colour: Colours of the lights at each time.
-        steps: First steps of recordings, even numbers; the driver takes over ``CURRENT_STEP`` later.
+    The driver takes over from row 0 of the motion ``CURRENT_STEP`` later.
     """
     path, motion = motion.paths[0], motion.every(_STRIDE)
     others, colour, size_m = _project_others(path, motion), colour[::_STRIDE], motion.size_m[0, :2]

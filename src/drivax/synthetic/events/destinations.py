@@ -49,10 +49,7 @@ class Destination:
 class DestinationRoute:
     """A route past a destination, with the destination's ``alone`` and ``followed``.
 
-    Attributes:
-        start: Where ego is when the recording begins.
-        lanes: Lanes of the route; some lie behind ego.
-        place: Which of these the destination is on.
+    Some of its lanes lie behind ego's start, where the recording begins; the destination is on lane ``lanes[place]``.
     """
 
     start: Start

@@ -27,12 +27,7 @@ _SLOWEST_MPS = 4.0
 
 @dataclass(frozen=True)
 class Track:
-    """Ego's trace and the rest of its path as samples half a metre apart; stations are distances along it.
-
-    Attributes:
-        xy, heading: The samples.
-        at: Station of ego at each step, m.
-    """
+    """Ego's trace and the rest of its path as samples half a metre apart, and its station (distance along it), m."""
 
     xy: Float64[np.ndarray, "point 2"]
     heading: Float64[np.ndarray, " point"]
@@ -95,12 +90,7 @@ def ego_track(motion: Motion) -> Track:
 
 @dataclass(frozen=True)
 class EgoView:
-    """The scenario without the event.
-
-    Attributes:
-        motion: Motion of all agents; row 0 is ego.
-        first_step: Step of ``motion`` at which the recording begins.
-    """
+    """The scenario without the event; the recording begins at ``first_step`` of the motion, whose row 0 is ego."""
 
     roles: Roles
     motion: Motion

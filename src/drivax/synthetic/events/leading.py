@@ -76,9 +76,8 @@ class LeadBrakes(EventScript):
 
     Attributes:
         within_s: Largest time gap of an existing leader; else a new vehicle is added.
-        headway_s: Time gap of a new leader, low and high.
+        headway_s, tailgating_s: Time gaps of a new leader and of a tailgater, low and high.
         tailgater: Whether a vehicle behind ego follows it closely.
-        tailgating_s: Time gap of the tailgater, low and high.
     """
 
     within_s: float = 2.0
@@ -125,11 +124,7 @@ class LeadBrakes(EventScript):
 
 @dataclass(frozen=True)
 class StalledVehicle(EventScript):
-    """A car ahead of ego loses its power, comes to a halt and stays.
-
-    Attributes:
-        headway_s: Time gap to the car, low and high.
-    """
+    """A car ahead of ego, at a time gap of ``headway_s`` (low and high), loses its power, comes to a halt and stays."""
 
     headway_s: tuple[float, float] = (0.9, 1.4)
 
@@ -192,8 +187,7 @@ class CutIn(EventScript):
 
     Attributes:
         late_merge: Only where the actor's lane ends or leads off the road, shortly before its end.
-        speed_share: Speed of the actor before as a share of ego's, low and high.
-        slower_share: Speed of the actor afterwards as a share of ego's, low and high.
+        speed_share, slower_share: Speed of the actor before and afterwards as a share of ego's, low and high.
         braking_mps2: Deceleration of the actor, low and high.
         lasts_s: Duration of the lane change, low and high.
         before_end_m: Largest distance from the end of a late merge to the end of the lane.

@@ -69,12 +69,7 @@ def _crossing_actor(
 
 @dataclass(frozen=True)
 class Jaywalker(_StreetScript):
-    """A pedestrian crosses the road away from crossings.
-
-    Attributes:
-        hidden: From behind a parked car; else from the kerb.
-        speed_mps: Walking speed, low and high.
-    """
+    """A pedestrian crosses the road away from crossings: from behind a parked car (``hidden``), or from the kerb."""
 
     hidden: bool = False
     speed_mps: tuple[float, float] = (1.3, 3.0)
@@ -160,11 +155,7 @@ class Jaywalker(_StreetScript):
 
 @dataclass(frozen=True)
 class LaneBlocked(EventScript):
-    """An object rolls from the roadside into ego's lane and stays there.
-
-    Attributes:
-        speed_mps: Speed of the object, low and high.
-    """
+    """An object rolls from the roadside into ego's lane and stays there."""
 
     speed_mps: tuple[float, float] = (2.5, 7.0)
 
@@ -194,12 +185,7 @@ class LaneBlocked(EventScript):
 
 @dataclass(frozen=True)
 class ReversingCar(_StreetScript):
-    """A car backs out of a driveway into ego's lane and stops there.
-
-    Attributes:
-        speed_mps: Speed in reverse, low and high.
-        gain_mps2: Acceleration.
-    """
+    """A car backs out of a driveway into ego's lane and stops there."""
 
     speed_mps: tuple[float, float] = (2.0, 4.0)
     gain_mps2: float = 3.0
@@ -230,7 +216,6 @@ class WrongWayCyclist(_StreetScript):
     """An oncoming cyclist at the edge of ego's side swings out into ego's lane for a while.
 
     Attributes:
-        speed_mps: Speed, low and high.
         out_s: Time in ego's lane, low and high.
         swing_s: Duration of each swing.
     """

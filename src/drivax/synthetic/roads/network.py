@@ -102,12 +102,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Bay:
-    """Parking space inside the road's edges: its middle, heading and length.
-
-    Attributes:
-        lane: The adjacent lane, on which cars may be double-parked.
-        along_m: Distance along that lane of the bay's middle.
-    """
+    """Parking space inside the road's edges: its middle and length, the adjacent lane and the distance along it, m."""
 
     pose: Pose
     length_m: float

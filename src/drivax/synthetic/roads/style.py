@@ -10,13 +10,10 @@ class RoadStyle:
     """Statistics of a domain's roads.
 
     Attributes:
-        width_m: Width of lanes, low and high.
-        limits_mps: Speed limits of streets.
-        fast_limits_mps: Speed limits of highways.
-        shoulder_m: Drivable width beyond the outer lanes, low and high.
+        width_m, shoulder_m: Width of lanes, and drivable width beyond the outer ones, low and high.
+        limits_mps, fast_limits_mps: Speed limits of streets and of highways.
         curvature: Factor on the curvature of bends.
-        walk_share: Share of streets with sidewalks.
-        parking_share: Share of streets with bays, in families that have them.
+        walk_share, parking_share: Shares of streets with sidewalks, and of those of some families with bays.
     """
 
     width_m: tuple[float, float] = (3.35, 3.75)

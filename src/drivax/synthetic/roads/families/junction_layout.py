@@ -145,19 +145,18 @@ class Site:
 
 @dataclass(frozen=True)
 class Reach:
-    """Shape of arms beyond the stop line: straight first, then slightly bent.
-
-    Attributes:
-        arm_m: Length.
-        straight_m: Length of the straight part.
-        tightest_m: Radius of the tightest bend.
-        widest_turn: Largest difference of two headings, rad.
-    """
+    """Shape of arms beyond the stop line: straight first, then bent; headings differ by at most ``widest_turn``, rad."""
 
     arm_m: float = 230.0
     straight_m: float = 30.0
     tightest_m: float = 120.0
     widest_turn: float = math.radians(28.0)
+
+    def draw(self, rng: np.random.Generator, start: Pose) -> Curve:
+        """Draw the middle line of an arm."""
+        near, bends = straight(start, self.straight_m), self.arm_m - self.straight_m
+        shape = {"max_curvature": 1.0 / self.tightest_m, "max_turn": self.widest_turn}
+        return join_curves(near, winding(rng, bends, start=near.end, **shape))
 
 
 @dataclass(frozen=True)
@@ -165,11 +164,9 @@ class Geometry:
     """Geometry of a junction.
 
     Attributes:
-        skew: Largest deviation of an arm from its direction, rad.
-        offset_m: Largest lateral offset of an arm from the centre.
+        skew, offset_m: Largest deviation of an arm from its direction, rad, and from the centre.
         corner_m: Radius of the corners' kerbs, low and high.
         walk_m: Distance of sidewalks from the edge, low and high.
-        reach: Shape of the arms.
     """
 
     skew: float = math.radians(6.0)
@@ -227,15 +224,7 @@ def _intersection(right: Arm, left: Arm) -> tuple[float, float]:
 
 def open_approach(rng: np.random.Generator, draft: Draft, arm: Arm, mouth_m: float, reach: Reach) -> Approach:
     """Add an arm that leads off the map."""
-    near = straight(arm.base.ahead(mouth_m + arm.street.stop_line_m), reach.straight_m)
-    far = winding(
-        rng,
-        reach.arm_m - reach.straight_m,
-        max_curvature=1.0 / reach.tightest_m,
-        max_turn=reach.widest_turn,
-        start=near.end,
-    )
-    middle = join_curves(near, far)
+    middle = reach.draw(rng, arm.base.ahead(mouth_m + arm.street.stop_line_m))
     side = join_curves(straight(arm.base.ahead(mouth_m), arm.street.stop_line_m), middle)
     return Approach(arm, mouth_m, middle, side, *lay_lanes(draft, arm.street, middle))
 

@@ -147,7 +147,6 @@ class SignalisedJunction:
         left_lane_share: Share of left-turn lanes on streets with as many lanes inward as outward.
         protected_share: Share of streets with left-turn lanes whose left turns are protected.
         permissive_share: Share of the other streets whose left turns are permissive.
-        green_s: Green time of a phase, low and high.
     """
 
     geometry: Geometry = field(default_factory=Geometry)
@@ -192,7 +191,6 @@ class TJunction:
         stem_skew: Largest deviation of the stem from a right angle, rad.
         two_lane_share: Share of priority roads with two lanes per direction; half of these have a left-turn lane.
         stem_lanes_share: Share of stems with separate lanes for left and right turns.
-        stop_share: Share of stems with a stop sign; the others have a yield sign.
         marked_share: Share of priority roads with crosswalks; the stem has one twice as often.
     """
 
@@ -230,11 +228,7 @@ class TJunction:
 class AllWayStop:
     """Settings of the family ``all_way_stop``: two streets with stop signs on all approaches.
 
-    Attributes:
-        cross_skew: Largest deviation of the two streets from a right angle, rad.
-        two_lane_share: Share of streets with two lanes per direction.
-        fastest_mps: Highest limit of the streets, unless the domain has only higher ones.
-        marked_share: Share of junctions with crosswalks.
+    Limits are at most ``fastest_mps``, unless the domain has only higher ones.
     """
 
     geometry: Geometry = field(default_factory=lambda: Geometry(corner_m=(5.0, 9.0)))
@@ -264,12 +258,8 @@ class AllWayStop:
 class UnprotectedLeft:
     """Settings of the family ``unprotected_left``: left-turn lanes that yield to oncoming traffic.
 
-    Either the lights are green for both directions at the same time, or the road has priority over side streets.
-
-    Attributes:
-        cross_skew: Largest deviation of the two streets from a right angle, rad.
-        signal_share: Share of junctions with lights.
-        green_s: Green time of a phase, low and high; long enough to wait for a gap.
+    Either the lights are green for both directions at the same time, long enough to wait for a gap, or the road has
+    priority over side streets.
     """
 
     geometry: Geometry = field(
@@ -349,11 +339,8 @@ class Corridor:
     Attributes:
         side_reach: Shape of side roads: nearly straight, so that those of both junctions stay apart.
         between_m: Length of the road between the stop lines of both junctions, low and high.
-        two_lane_share: Share of main roads with two lanes per direction.
         left_lane_share: Share of left-turn lanes at lights of two-lane roads.
         protected_share: Share of protected left turns at lights with left-turn lanes.
-        coordinated_share: Share of pairs of lights that are coordinated.
-        green_s: Green time of a phase, low and high.
     """
 
     geometry: Geometry = field(

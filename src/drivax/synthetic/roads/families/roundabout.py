@@ -22,9 +22,8 @@ from drivax.synthetic.roads.curves import (
     from_curvature,
     join_curves,
     smooth_step,
-    straight,
-    winding,
 )
+from drivax.synthetic.roads.families.junction_layout import Reach
 from drivax.synthetic.roads.families.street_layout import CROSSWALK_M
 from drivax.synthetic.roads.network import Control, Crossing, Draft, Line, RoadNetwork, Start, points, ring
 from drivax.synthetic.roads.style import GRID, RoadStyle
@@ -89,13 +88,9 @@ class Roundabout:
     Attributes:
         arm_m: Length of arms beyond the yield line.
         radius_m: Radius of the outer circle's lane centre with one lane and with two, low and high.
-        two_lane_share: Share of roundabouts with two lanes.
-        three_arm_share: Share of roundabouts with three arms.
         gap_m: Gap between the directions at the yield lines, low and high.
         skew: Largest deviation of an arm from an even division, rad, where room permits.
-        limit_mps: Highest limit of the arms.
-        circle_mps: Limit in the circle.
-        marked_share: Share of roundabouts with crosswalks.
+        limit_mps, circle_mps: Highest limit of the arms, and the limit in the circle.
     """
 
     arm_m: float = 230.0
@@ -157,9 +152,8 @@ class Roundabout:
 
     def _arm(self, rng: np.random.Generator, draft: Draft, plan: _Plan, heading: float) -> _Arm:
         """Add the lanes of an arm: straight near the circle, then slightly bent."""
-        near = straight(Pose(0.0, 0.0, heading).ahead(plan.yield_m), 50.0)
-        bends = {"max_curvature": 1 / 110, "max_turn": math.radians(24.0)}
-        middle = join_curves(near, winding(rng, self.arm_m - 50.0, start=near.end, **bends))
+        reach = Reach(self.arm_m, straight_m=50.0, tightest_m=110.0, widest_turn=math.radians(24.0))
+        middle = reach.draw(rng, Pose(0.0, 0.0, heading).ahead(plan.yield_m))
         spread = plan.spread_m(middle)
         inward, outward = [], []
         for j in range(len(plan.radius_m)):

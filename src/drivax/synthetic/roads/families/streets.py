@@ -91,7 +91,6 @@ class LaneDrop(StreetFamily):
     """Settings of the family ``lane_drop``: a road that loses a lane, right or left, or gains one.
 
     Attributes:
-        two_way_share: Share of two-way roads.
         left_share: Share of one-way roads on which the left lane ends.
         gain_share: Share of roads that gain a lane instead of losing one.
         taper_m: Length over which the road narrows beyond the lane's end, low and high.
@@ -139,9 +138,7 @@ class MidblockCrosswalk(StreetFamily):
     Attributes:
         crossing_m: Station of the first crossing, low and high; ego starts at 120 to 155 m.
         apart_m: Distance to a second crossing, low and high.
-        marked_share: Share of crossings with a crosswalk.
-        second_share: Share of streets with two crossings.
-        median_share: Share of two-way streets with a raised median.
+        marked_share, second_share: Shares of crossings with a crosswalk, and of streets with two crossings.
     """
 
     length_m: float = 560.0
@@ -182,11 +179,7 @@ class MidblockCrosswalk(StreetFamily):
 class ParkedStreet(StreetFamily):
     """Settings of the family ``parked_street``: a narrow street with parked cars along one or both sides.
 
-    Attributes:
-        one_way_share: Share of one-way streets.
-        both_sides_share: Share of streets with bays on both sides.
-        crossing_share: Share of streets with a crossing, half of them marked.
-        row_m: Width of a row of bays, low and high.
+    A share of the streets (``crossing_share``) has a crossing, half of these a crosswalk.
     """
 
     length_m: float = 480.0
@@ -245,10 +238,8 @@ class Highway(StreetFamily):
         shares: Shares of highways with an on-ramp, with an off-ramp and with both.
         two_way_share: Share of highways of two or three lanes with the other direction beyond a median.
         median_m: Width of that median, low and high.
-        shoulder_m: Drivable width beyond the outer lanes, low and high.
         ramp_m: Length of an on-ramp and of an off-ramp.
-        ramp_radius_m: Radius of a ramp's bend, low and high.
-        ramp_turn: Angle of a ramp's bend, rad, low and high.
+        ramp_radius_m, ramp_turn: Radius and angle (rad) of a ramp's bend, low and high.
         ramp_limit: Limit on ramps as a share of the highway's, low and high.
     """
 
