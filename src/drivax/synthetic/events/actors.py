@@ -14,12 +14,13 @@ from drivax.synthetic.roads import curves
 from drivax.synthetic.roads.curves import Curve
 from drivax.synthetic.traffic.roles import Motion, Scripted
 
+#: A number for each time; length, width and height, m.
+Times = Float64[np.ndarray, " time"]
+Size = tuple[float, float, float]
 CAR_M = (4.6, 1.85, 1.55)
 
 
-def speed_change(
-    first_mps: float, last_mps: float, rate_mps2: float, times_s: Float64[np.ndarray, " k"]
-) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
+def speed_change(first_mps: float, last_mps: float, rate_mps2: float, times_s: Times) -> tuple[Times, Times]:
     """Distance and speed of a change between constant speeds that starts at time 0 (distances before are negative)."""
     lasts = abs(last_mps - first_mps) / rate_mps2
     rate = math.copysign(rate_mps2, last_mps - first_mps)
@@ -38,11 +39,8 @@ def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
 
 
 def walk(
-    distance_m: float,
-    speed_mps: float,
-    rates_mps2: tuple[float, float],
-    times_s: Float64[np.ndarray, " k"],
-) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]] | None:
+    distance_m: float, speed_mps: float, rates_mps2: tuple[float, float], times_s: Times
+) -> tuple[Times, Times] | None:
     """Distance and speed of a walk from rest at time 0 to rest; None where it is too short to reach its speed.
 
     ``rates_mps2`` are acceleration and deceleration.
@@ -59,10 +57,10 @@ def walk(
 
 def along_track(
     track: Track,
-    station: Float64[np.ndarray, " time"],
-    left_m: Float64[np.ndarray, " time"],
+    station: Times,
+    left_m: Times,
     kind: AgentKind,
-    size_m: tuple[float, float, float],
+    size_m: Size,
     valid: Bool[np.ndarray, " time"],
 ) -> Scripted:
     """Actor at stations and lateral offsets of ego's path, headed along its motion."""
@@ -73,9 +71,9 @@ def along_track(
 
 def scripted_motion(
     xy: Float64[np.ndarray, "time 2"],
-    heading: Float64[np.ndarray, " time"],
+    heading: Times,
     kind: AgentKind,
-    size_m: tuple[float, float, float],
+    size_m: Size,
     valid: Bool[np.ndarray, " time"],
 ) -> Scripted:
     """Actor at positions, headed along its motion; at rest it keeps its last heading, or the given one."""
@@ -90,12 +88,7 @@ def scripted_motion(
     return Scripted(kind, size_m, xy, heading, speed, valid)
 
 
-def along_curve(
-    curve: Curve,
-    distance_m: Float64[np.ndarray, " time"],
-    kind: AgentKind,
-    size_m: tuple[float, float, float],
-) -> Scripted:
+def along_curve(curve: Curve, distance_m: Times, kind: AgentKind, size_m: Size) -> Scripted:
     """Actor that drives along a curve and is valid while it is on it."""
     xy, heading = curve.at(distance_m)
     speed = np.maximum(np.gradient(distance_m, DT_S), 0.0)

@@ -31,6 +31,9 @@ _SIDE_M, _STOP_SHORT_M = 0.3, 1.0
 _NEAR_M = 12.0
 #: Simulate every second step.
 _STRIDE = 2
+#: Steps and numbers, one for each start of the driver.
+_Steps = Int64[np.ndarray, " start"]
+_Floats = Float64[np.ndarray, " start"]
 
 
 @dataclass(frozen=True)
@@ -48,10 +51,7 @@ class _Others:
 
 
 def critical_steps(
-    network: RoadNetwork,
-    motion: Motion,
-    colour: Int8[np.ndarray, "time lane"],
-    steps: Int64[np.ndarray, " start"],
+    network: RoadNetwork, motion: Motion, colour: Int8[np.ndarray, "time lane"], steps: _Steps
 ) -> Bool[np.ndarray, " start"]:
     """Whether the reference driver collides in the recordings that begin at some steps, which are even.
 
@@ -107,11 +107,8 @@ def _project_others(path: Path, motion: Motion) -> _Others:
 
 
 def _leader(
-    others: _Others,
-    now: Int64[np.ndarray, " start"],
-    at: Float64[np.ndarray, " start"],
-    size_m: Float64[np.ndarray, " 2"],
-) -> tuple[Float64[np.ndarray, " start"], Float64[np.ndarray, " start"]]:
+    others: _Others, now: _Steps, at: _Floats, size_m: Float64[np.ndarray, " 2"]
+) -> tuple[_Floats, _Floats]:
     """Gap to the next agent ahead on the path, and its speed."""
     if not len(others.box):
         return np.full(len(at), np.inf), np.zeros(len(at))
@@ -124,11 +121,8 @@ def _leader(
 
 
 def _stop_line_m(
-    network: RoadNetwork,
-    path: Path,
-    colour: Int8[np.ndarray, "start lane"],
-    front: Float64[np.ndarray, " start"],
-) -> Float64[np.ndarray, " start"]:
+    network: RoadNetwork, path: Path, colour: Int8[np.ndarray, "start lane"], front: _Floats
+) -> _Floats:
     """Distance to the next stop line with a red or yellow light."""
     result = np.full(len(front), np.inf)
     for span in path.spans:
@@ -141,9 +135,9 @@ def _stop_line_m(
 
 def _hits(
     others: _Others,
-    now: Int64[np.ndarray, " start"],
+    now: _Steps,
     path: Path,
-    at: Float64[np.ndarray, " start"],
+    at: _Floats,
     size_m: Float64[np.ndarray, " 2"],
     behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:

@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_curve
+from drivax.synthetic.events.actors import CAR_M, Times, along_curve
 from drivax.synthetic.events.adversary import (
     comes_close,
     first_blocked,
@@ -54,9 +53,7 @@ class _ActorPath:
         limit = lanes[before[0]].limit_mps if before else lanes[connector].limit_mps
         return cls(curve, line, limit)
 
-    def distances(
-        self, fastest_mps: float, times_s: Float64[np.ndarray, " time"]
-    ) -> Float64[np.ndarray, " time"]:
+    def distances(self, fastest_mps: float, times_s: Times) -> Times:
         """Distance along the path at times; the front reaches the line at time 0, and bends limit the speed."""
         arc = self.curve.arc_m
         rising = np.maximum.accumulate(arc + 1e-9 * np.arange(len(arc)))

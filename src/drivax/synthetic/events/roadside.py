@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_track, scripted_motion, travel_s, walk
+from drivax.synthetic.events.actors import CAR_M, Size, Times, along_track, scripted_motion, travel_s, walk
 from drivax.synthetic.events.adversary import waiting_room
 from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
 from drivax.synthetic.events.kinds import EventScript, Proposal
@@ -47,20 +46,14 @@ def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: f
 
 def _entry(
     view: EgoView, step: int, distance_m: float, pace_mps: float, rates_mps2: tuple[float, float]
-) -> tuple[Float64[np.ndarray, " time"], Float64[np.ndarray, " time"]] | None:
+) -> tuple[Times, Times] | None:
     """Distance and speed of an obstacle that moves into ego's lane, braking harder where the distance is short."""
     gain, loss = rates_mps2
     times = DT_S * (np.arange(view.steps) - step)
     return walk(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
 
 
-def _crossing_actor(
-    view: EgoView,
-    station: float,
-    left_m: Float64[np.ndarray, " time"],
-    kind: AgentKind,
-    size: tuple[float, float, float],
-) -> Scripted:
+def _crossing_actor(view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size) -> Scripted:
     """Actor that moves at a right angle to ego's path at a station; at rest it faces the path."""
     xy, heading = view.track.pose(np.full(view.steps, station), left_m)
     toward = heading - math.copysign(math.pi / 2, float(left_m[0]))

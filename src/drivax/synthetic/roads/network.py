@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import combinations, permutations
@@ -146,7 +147,7 @@ class RoadNetwork:
         return {(a, b): _shared_length(self.lanes[a].curve, self.lanes[b].curve) for a, b in pairs}
 
 
-def conflicting(lanes: tuple[Lane, ...]) -> Bool[np.ndarray, "lane lane"]:
+def conflicting(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
     """See :attr:`RoadNetwork.conflicts`."""
     result = np.zeros((len(lanes), len(lanes)), bool)
     connectors = [i for i, lane in enumerate(lanes) if lane.connector]
@@ -194,14 +195,13 @@ class Draft:
 
     def link(self, before: int, after: int) -> None:
         """Make lane ``after`` a successor of lane ``before``."""
-        a, b = self.lanes[before], self.lanes[after]
-        self.lanes[before] = replace(a, successors=(*a.successors, after))
-        self.lanes[after] = replace(b, predecessors=(*b.predecessors, before))
+        self.change(before, successors=(*self.lanes[before].successors, after))
+        self.change(after, predecessors=(*self.lanes[after].predecessors, before))
 
     def link_neighbours(self, left: int, right: int) -> None:
         """Make two lanes of the same direction neighbours."""
-        self.lanes[left] = replace(self.lanes[left], right=right)
-        self.lanes[right] = replace(self.lanes[right], left=left)
+        self.change(left, right=right)
+        self.change(right, left=left)
 
     def mark(self, kind: RoadKind, curve: Curve) -> None:
         """Add a marking along a curve, sampled at about 1 m."""
@@ -210,10 +210,6 @@ class Draft:
     def crosswalk(self, *corners: Pose) -> None:
         """Add the outline of a crosswalk."""
         self.crosswalks.append(Line(RoadKind.CROSSWALK, points(*corners)))
-
-    def conflicts(self) -> Bool[np.ndarray, "lane lane"]:
-        """See :attr:`RoadNetwork.conflicts`, of the lanes so far."""
-        return conflicting(tuple(self.lanes))
 
     def network(
         self, family: str, starts: tuple[Start, ...], signals: SignalPlan | None = None

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+#: Lanes ahead (inward), lanes the other way (outward), and the share of that layout.
+Layouts = tuple[tuple[int, int, float], ...]
+
 
 @dataclass(frozen=True)
 class RoadStyle:
@@ -37,3 +42,9 @@ RING = RoadStyle(
     walk_share=0.95,
     parking_share=0.7,
 )
+
+
+def draw_layout(rng: np.random.Generator, layouts: Layouts) -> tuple[int, int]:
+    """Draw the numbers of lanes of a street."""
+    ahead, back, _ = layouts[rng.choice(len(layouts), p=[share for *_, share in layouts])]
+    return ahead, back

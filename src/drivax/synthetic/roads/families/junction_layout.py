@@ -145,7 +145,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Reach:
-    """Shape of arms beyond the stop line: straight first, then bent; headings differ by at most ``widest_turn``, rad."""
+    """Arms beyond the stop line: straight, then bent, with headings that differ by at most ``widest_turn`` (rad)."""
 
     arm_m: float = 230.0
     straight_m: float = 30.0

@@ -33,22 +33,19 @@ from drivax.synthetic.roads.families.junction_layout import (
     open_site,
     starts,
 )
-from drivax.synthetic.roads.network import Control, Draft, RoadNetwork
+from drivax.synthetic.roads.network import Control, Draft, RoadNetwork, conflicting
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan, combine_plans, yellow_time_s
-from drivax.synthetic.roads.style import GRID, RoadStyle
+from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
-#: Lanes inward and outward of a street, with the share of each layout. An extra lane inward is for turning left.
-_SIGNAL_LAYOUTS = ((1, 1), (2, 1), (2, 2), (3, 2))
-_SIGNAL_SHARES = (0.35, 0.15, 0.38, 0.12)
-#: Lanes inward and outward of the main road, with the share of each layout; the left one is for turning left.
-_LEFT_LAYOUTS = ((2, 1), (2, 2), (3, 2))
-_LEFT_SHARES = (0.4, 0.3, 0.3)
+#: Layouts of streets at lights; an extra lane inward is for turning left.
+_SIGNAL_LAYOUTS: Layouts = ((1, 1, 0.35), (2, 1, 0.15), (2, 2, 0.38), (3, 2, 0.12))
+#: Layouts of the main road at unprotected left turns; the left lane is for turning left.
+_LEFT_LAYOUTS: Layouts = ((2, 1, 0.4), (2, 2, 0.3), (3, 2, 0.3))
 #: The left-turn lane is this many times as likely to be ego's as another one.
 _LEFT_WEIGHT = 4
-#: Kinds of junctions and their shares.
-_LIGHTS, _TWO_STOPS, _SIDE_ROAD = "lights", "two_stops", "side_road"
-_KINDS = (_LIGHTS, _TWO_STOPS, _SIDE_ROAD)
-_SHARES = (0.5, 0.25, 0.25)
+#: Kinds of junctions in a corridor and their shares.
+_LIGHTS, _SIDE_ROAD = "lights", "side_road"
+_KINDS = {_LIGHTS: 0.5, "two_stops": 0.25, _SIDE_ROAD: 0.25}
 #: Weight of a start on the main road relative to one on a side road.
 _MAIN_WEIGHT = 3
 #: Length of the straight ends of the road between the junctions, m.
@@ -61,7 +58,7 @@ Conflicts = Bool[np.ndarray, "lane lane"]
 
 def set_priorities(draft: Draft, site: Site, major: Sequence[int], sign: Control) -> None:
     """Set the rules of a priority road: other approaches have a sign, left turns yield to oncoming traffic."""
-    conflicts = draft.conflicts()
+    conflicts = conflicting(draft.lanes)
     for move in site.moves:
         yields_to = _yields_to(move, site.moves, conflicts, major)
         unsigned = Control.YIELD if yields_to else Control.NONE
@@ -92,7 +89,7 @@ def set_lights(
 
     ``lefts`` has the left turns of both pairs of approaches, ``green_s`` the least and the largest green time.
     """
-    green, conflicts = [float(g) for g in rng.uniform(*green_s, size=4)], draft.conflicts()
+    green, conflicts = [float(g) for g in rng.uniform(*green_s, size=4)], conflicting(draft.lanes)
     groups: list[LightGroup] = []
     phases: list[tuple[int, ...]] = []
 
@@ -159,9 +156,16 @@ class SignalisedJunction:
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draw a junction."""
-        streets = [_draw_street(rng, style) for _ in range(2)]
+        streets = []
+        for _ in range(2):
+            layout = draw_layout(rng, _SIGNAL_LAYOUTS)
+            streets.append(draw_street(rng, style, layout, float(rng.choice(style.limits_mps))))
         draft, site = open_crossroads(rng, streets, self.geometry, self.cross_skew)
-        left_only = [_has_left_lane(street, rng, self.left_lane_share) for street in streets]
+        left_only = [
+            street.inward > street.outward
+            or (street.inward > 1 and bool(rng.random() < self.left_lane_share))
+            for street in streets
+        ]
         site = connect(draft, site, left_only * 2)
         finish_sites(rng, style, draft, (site,), {}, self.geometry)
         lefts = [
@@ -170,17 +174,6 @@ class SignalisedJunction:
         ]
         signals = set_lights(rng, draft, site, lefts, self.green_s)
         return draft.network(self.name, starts(draft, site.inward), signals)
-
-
-def _draw_street(rng: np.random.Generator, style: RoadStyle) -> CrossSection:
-    layout = _SIGNAL_LAYOUTS[rng.choice(len(_SIGNAL_LAYOUTS), p=_SIGNAL_SHARES)]
-    return draw_street(rng, style, layout, float(rng.choice(style.limits_mps)))
-
-
-def _has_left_lane(street: CrossSection, rng: np.random.Generator, share: float) -> bool:
-    if street.inward > street.outward:
-        return True
-    return street.inward > 1 and bool(rng.random() < share)
 
 
 @dataclass(frozen=True)
@@ -275,8 +268,7 @@ class UnprotectedLeft:
         lights = bool(rng.random() < self.signal_share)
         limit = float(rng.choice(style.limits_mps))
         slower = min(limit, float(rng.choice(style.limits_mps)))
-        layout = _LEFT_LAYOUTS[rng.choice(len(_LEFT_LAYOUTS), p=_LEFT_SHARES)]
-        main = draw_street(rng, style, layout, limit, lights)
+        main = draw_street(rng, style, draw_layout(rng, _LEFT_LAYOUTS), limit, lights)
         side = draw_street(rng, style, (1, 1), slower)
         draft, site = open_crossroads(rng, (main, side), self.geometry, self.cross_skew)
         site = connect(draft, site, (True, False) * 2)
@@ -379,7 +371,7 @@ class Corridor:
         return draft.network(self.name, starts(draft, chosen), self._signals(rng, plans, travel))
 
     def _plot(self, rng: np.random.Generator, style: RoadStyle, main: CrossSection) -> _Plot:
-        kind = _KINDS[rng.choice(len(_KINDS), p=_SHARES)]
+        kind = list(_KINDS)[rng.choice(len(_KINDS), p=list(_KINDS.values()))]
         marked = kind == _LIGHTS or bool(rng.random() < 0.4)
         slower = min(main.limit_mps, float(rng.choice(style.limits_mps)))
         side = draw_street(rng, style, (1, 1), slower, kind == _LIGHTS or bool(rng.random() < 0.6))

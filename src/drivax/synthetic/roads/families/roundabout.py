@@ -25,7 +25,17 @@ from drivax.synthetic.roads.curves import (
 )
 from drivax.synthetic.roads.families.junction_layout import Reach
 from drivax.synthetic.roads.families.street_layout import CROSSWALK_M
-from drivax.synthetic.roads.network import Control, Crossing, Draft, Line, RoadNetwork, Start, points, ring
+from drivax.synthetic.roads.network import (
+    Control,
+    Crossing,
+    Draft,
+    Line,
+    RoadNetwork,
+    Start,
+    conflicting,
+    points,
+    ring,
+)
 from drivax.synthetic.roads.style import GRID, RoadStyle
 
 #: Least radius of the fillets of entries and exits, m.
@@ -222,7 +232,7 @@ def _go_round(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> list
 
 def _set_priorities(draft: Draft) -> None:
     """Give circulating traffic right of way over entries, and over exits across the outer circle."""
-    lanes, conflicts = draft.lanes, draft.conflicts()
+    lanes, conflicts = draft.lanes, conflicting(draft.lanes)
     arcs = {i for i, lane in enumerate(lanes) if len(lane.predecessors) == 2}
     passes = {i for i, lane in enumerate(lanes) if {*lane.predecessors, *lane.successors} <= arcs}
     for i in range(len(lanes)):

@@ -12,23 +12,15 @@ from drivax.scenario.schema import RoadKind
 from drivax.synthetic.roads.curves import STEP_M, Curve, from_curvature
 from drivax.synthetic.roads.families.street_layout import Street, StreetFamily, Strip, strips
 from drivax.synthetic.roads.network import Line, RoadNetwork, Start, ring
-from drivax.synthetic.roads.style import GRID, RoadStyle
+from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
-#: Lanes ahead, lanes the other way, and the share of that layout.
-_Layouts = tuple[tuple[int, int, float], ...]
 #: Highest limit of curved roads with bays, m/s, and of streets with crosswalks, m/s.
 _PARKING_LIMIT_MPS, _CROSSING_LIMIT_MPS = 14.0, 17.0
-_CROSSWALK_LAYOUTS: _Layouts = ((1, 1, 0.45), (2, 2, 0.25), (2, 1, 0.1), (2, 0, 0.1), (1, 0, 0.1))
-
+_CROSSWALK_LAYOUTS: Layouts = ((1, 1, 0.45), (2, 2, 0.25), (2, 1, 0.1), (2, 0, 0.1), (1, 0, 0.1))
 #: Length over which a ramp's curvature rises and falls, m.
 _EASING_M = 40.0
 #: Drivable width left of a ramp's lane, m.
 _RAMP_SHOULDER_M = 0.7
-
-
-def _draw_layout(rng: np.random.Generator, layouts: _Layouts) -> tuple[int, int]:
-    ahead, back, _ = layouts[rng.choice(len(layouts), p=[share for *_, share in layouts])]
-    return ahead, back
 
 
 @dataclass(frozen=True)
@@ -42,7 +34,7 @@ class CurvedRoad(StreetFamily):
 
     tightest_m: tuple[float, float] = (30.0, 140.0)
     widest_turn: float = math.radians(150.0)
-    layouts: _Layouts = (
+    layouts: Layouts = (
         (1, 1, 0.28),
         (2, 0, 0.16),
         (2, 1, 0.12),
@@ -55,7 +47,7 @@ class CurvedRoad(StreetFamily):
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draw a road; ego starts in the second section of any lane ahead."""
-        ahead, back = _draw_layout(rng, self.layouts)
+        ahead, back = draw_layout(rng, self.layouts)
         middle = self.draw_middle(rng, style.curvature)
         limit = float(rng.choice(style.limits_mps))
         parking = limit < _PARKING_LIMIT_MPS and rng.random() < style.parking_share
@@ -152,7 +144,7 @@ class MidblockCrosswalk(StreetFamily):
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draw a street with sidewalks on both sides and one or two crossings."""
-        ahead, back = _draw_layout(rng, _CROSSWALK_LAYOUTS)
+        ahead, back = draw_layout(rng, _CROSSWALK_LAYOUTS)
         middle = self.draw_middle(rng, style.curvature)
         row = float(rng.uniform(2.1, 2.4)) if rng.random() < style.parking_share else 0.0
         street = Street(
