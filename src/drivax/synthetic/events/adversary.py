@@ -182,9 +182,7 @@ def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
     return tuple(np.unique(rows[row[hit]]).tolist())
 
 
-def enter_when_clear(
-    view: EgoView, extra: Scripted, until: int, removed: tuple[int, ...] = ()
-) -> Scripted | None:
+def enter_when_clear(view: EgoView, extra: Scripted, until: int, removed: tuple[int, ...]) -> Scripted | None:
     """Let a new actor appear when it has no collision ahead; None where it has, or where ego would see it appear.
 
     Other agents see it and keep behind it: only agents ahead of it and pedestrians count, until ego may meet it at step

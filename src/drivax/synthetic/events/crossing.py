@@ -132,10 +132,8 @@ class CrossTraffic(EventScript):
         leaves = int(np.argmax(~np.isfinite(first_blocked(view, adversary, entry))[8:])) + 8 + entry
         # A queue at its light would block the actor.
         removed = vehicles_in_lane(view, adversary, entry + 5)
-        staging, last = (
-            Staging(extras=(adversary,), removed=removed),
-            min(max(leaves, entry + 10), view.last_step),
-        )
+        last = min(max(leaves, entry + 10), view.last_step)
+        staging = Staging(extras=(adversary,), removed=removed)
         return Proposal(staging, required, adversary, entry - decides, last)
 
     def _conflicting(self, network: RoadNetwork, mine: int) -> list[int]:
@@ -160,7 +158,7 @@ class CrossTraffic(EventScript):
         self, view: EgoView, lane: int, path: _ActorPath, pace: tuple[float, int], requested: float
     ) -> tuple[int, Scripted, float] | None:
         """The entry step of the actor at which it requires about this deceleration, its motion, and its severity."""
-        (fastest, decides), steps, track = pace, np.arange(view.steps), view.track
+        (fastest, decides), steps = pace, np.arange(view.steps)
         first = view.first_step + EARLIEST + decides
         last = min(view.first_step + LATEST + decides, view.last_step - 15)
 
@@ -177,7 +175,7 @@ class CrossTraffic(EventScript):
             begin = entry - decides + NOTICED
             speed = float(view.motion.speed[0, begin])
             if speed > 4.0:
-                room = blocked[NOTICED:][: view.last_step + 1 - begin] - track.at[begin]
+                room = blocked[NOTICED:][: view.last_step + 1 - begin] - view.track.at[begin]
                 requires[entry] = required_by_samples(speed, room)
         low, high = SEVERITY_MPS2
         # The step at which the actor blocks ego's path, for each entry step.
@@ -197,5 +195,5 @@ class CrossTraffic(EventScript):
         if network.signals is None:
             return self.turning
         colour, _ = network.signals.colours(view.times_s, len(network.lanes))
-        seen = colour[entry - 12 : entry + 1, lane]
-        return bool(np.all(seen != Colour.RED)) if self.turning else bool(np.all(seen == Colour.RED))
+        red = colour[entry - 12 : entry + 1, lane] == Colour.RED
+        return not red.any() if self.turning else bool(red.all())

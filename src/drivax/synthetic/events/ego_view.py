@@ -191,8 +191,7 @@ class EgoView:
 
     def plain_road(self, station: float) -> bool:
         """Whether a station is on an ordinary lane, away from junctions and crosswalks."""
-        lane = self.lane_at(station)
-        network = self.roles.network
+        lane, network = self.lane_at(station), self.roles.network
         if lane < 0 or network.lanes[lane].connector:
             return False
         xy, _ = self.track.place(station)
@@ -225,12 +224,8 @@ class EgoView:
     def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
         """The scenario with a new leader, its rear bumper at stations from a step on: IDM slows ego behind it."""
         drivers, at, speed = self.roles.drivers.idm, self.track.at, self.motion.speed[0]
-        law = replace(
-            drivers,
-            headway_s=drivers.headway_s[:1],
-            acceleration_mps2=drivers.acceleration_mps2[:1],
-            comfortable_braking_mps2=drivers.comfortable_braking_mps2[:1],
-        )
+        names = ("headway_s", "acceleration_mps2", "comfortable_braking_mps2")
+        law = replace(drivers, **{name: getattr(drivers, name)[:1] for name in names})
         ahead = np.gradient(rear_m, DT_S)
         where, how = at.copy(), speed.copy()
         for t in range(since, self.steps - 1):
@@ -243,14 +238,9 @@ class EgoView:
             where[t + 1] = min(where[t] + moved, at[t + 1])
             how[t + 1] = min(after, (where[t + 1] - where[t]) / DT_S if where[t + 1] == at[t + 1] else after)
         xy, heading = self.track.pose(where)
-        motion = self.motion
-        changed = replace(
-            motion,
-            xy=np.concatenate([xy[None], motion.xy[1:]]),
-            heading=np.concatenate([heading[None], motion.heading[1:]]),
-            speed=np.concatenate([how[None], motion.speed[1:]]),
-        )
-        result = replace(self, motion=changed)
+        ego = {"xy": xy, "heading": heading, "speed": how}
+        rows = {k: np.concatenate([own[None], getattr(self.motion, k)[1:]]) for k, own in ego.items()}
+        result = replace(self, motion=replace(self.motion, **rows))
         # Only ego's stations change.
         result.__dict__["track"] = replace(self.track, at=where)
         return result

@@ -69,9 +69,8 @@ def set_priorities(draft: Draft, site: Site, major: Sequence[int], sign: Control
 class LeftTurns:
     """Phases of the left turns of two opposing approaches.
 
-    Attributes:
-        protected: In a phase of their own, with arrows, where possible.
-        permissive: Together with oncoming traffic, to which they yield; without either, one approach at a time.
+    Protected: in a phase of their own, with arrows, where possible. Permissive: together with oncoming traffic, to
+    which they yield. Neither: one approach at a time.
     """
 
     protected: bool
@@ -273,19 +272,14 @@ class UnprotectedLeft:
         draft, site = open_crossroads(rng, (main, side), self.geometry, self.cross_skew)
         site = connect(draft, site, (True, False) * 2)
         finish_sites(rng, style, draft, (site,), {}, self.geometry)
-        signals = None
+        signals, lefts = None, [LeftTurns(protected=False, permissive=True)] * 2
         if lights:
-            lefts = [LeftTurns(protected=False, permissive=True)] * 2
             signals = set_lights(rng, draft, site, lefts, self.green_s)
         else:
             set_priorities(draft, site, (0, 2), Control.STOP)
-        chosen = [
-            lane
-            for i in (0, 2)
-            for j, lane in enumerate(site.approaches[i].inward)
-            for _ in range(1 if j else _LEFT_WEIGHT)
-        ]
-        oncoming = tuple(lane for i in (0, 2) for lane in site.approaches[i].inward[1:])
+        inward = [site.approaches[i].inward for i in (0, 2)]
+        chosen = [lane for left, *others in inward for lane in [left] * _LEFT_WEIGHT + others]
+        oncoming = tuple(lane for lanes in inward for lane in lanes[1:])
         return replace(draft.network(self.name, starts(draft, chosen), signals), busy=oncoming)
 
 
@@ -385,14 +379,9 @@ class Corridor:
         return _Plot(kind, arms, self.geometry.mouths(rng, arms), left_only)
 
     def _between(self, rng: np.random.Generator, gate: Pose) -> Curve:
-        near = straight(gate, _STRAIGHT_M)
-        bent = winding(
-            rng,
-            float(rng.uniform(*self.between_m)) - 2 * _STRAIGHT_M,
-            max_curvature=1.0 / self.geometry.reach.tightest_m,
-            max_turn=math.radians(8.0),
-            start=near.end,
-        )
+        near, length = straight(gate, _STRAIGHT_M), float(rng.uniform(*self.between_m)) - 2 * _STRAIGHT_M
+        shape = {"max_curvature": 1.0 / self.geometry.reach.tightest_m, "max_turn": math.radians(8.0)}
+        bent = winding(rng, length, start=near.end, **shape)
         return join_curves(near, bent, straight(bent.end, _STRAIGHT_M))
 
     def _sites(
@@ -412,12 +401,12 @@ class Corridor:
         )
         sites = []
         for plot, first in zip(plots, shared, strict=True):
-            rest = []
+            approaches = [first]
             for i in range(1, len(plot.arms)):
                 reach = self.geometry.reach if i in plot.main else self.side_reach
-                rest.append(open_approach(rng, draft, plot.arms[i], plot.mouths[i], reach))
+                approaches.append(open_approach(rng, draft, plot.arms[i], plot.mouths[i], reach))
             left_only = [plot.left_only and i in plot.main for i in range(len(plot.arms))]
-            sites.append(connect(draft, Site((first, *rest)), left_only))
+            sites.append(connect(draft, Site(tuple(approaches)), left_only))
         return sites
 
     def _rules(self, rng: np.random.Generator, draft: Draft, plot: _Plot, site: Site) -> SignalPlan | None:

@@ -71,10 +71,6 @@ class _Plan:
     shoulder_m: float
     limit_mps: float
 
-    def aside_m(self, j: int) -> float:
-        """Distance from an arm's middle line to the centre of its lane ``j`` at the yield line."""
-        return self.gap_m / 2 + (j + 0.5) * self.width_m
-
     def spread_m(self, middle: Curve) -> Float64[np.ndarray, " point"]:
         """Half of the gap between the directions along an arm."""
         begin, end = _SPLITTER_M

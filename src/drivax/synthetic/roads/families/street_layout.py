@@ -193,11 +193,8 @@ class Street:
         left = [strip for strip in self.strips if strip.place > 0]
         kind, lines = RoadKind.LINE_SOLID_SINGLE_YELLOW, [self.middle]
         if one_way and left:
-            kind, first, last = (
-                RoadKind.LINE_BROKEN_SINGLE_WHITE,
-                max(s.first for s in left),
-                max(s.last for s in left),
-            )
+            kind = RoadKind.LINE_BROKEN_SINGLE_WHITE
+            first, last = max(s.first for s in left), max(s.last for s in left)
             lines = [self.middle.piece(self.cuts[first], self.cuts[last])]
         elif self.median_m and not one_way:
             lines = [self.middle.shifted(side * self.median_m / 2) for side in (-1, 1)]
@@ -216,11 +213,10 @@ class Street:
     def cross(self, at: int, marked: bool) -> None:
         """Add a crossing at a sample of the middle line, with a crosswalk where it is marked."""
         here, right, left = self.middle.pose(at), -self.edge_m[0][at], self.edge_m[1][at]
-        lanes = [
-            self._on_lane(*key, at) for key in self.lanes if self.cuts[key[1]] < at <= self.cuts[key[1] + 1]
-        ]
+        section = self._section(at)
+        lanes = tuple(self._on_lane(place, k, at) for place, k in self.lanes if k == section)
         axis = points(here.aside(right), here.aside(left))
-        self.draft.crossings.append(Crossing(axis, CROSSWALK_M, tuple(lanes), marked))
+        self.draft.crossings.append(Crossing(axis, CROSSWALK_M, lanes, marked))
         if marked:
             near, far = (here.ahead(CROSSWALK_M / 2 * sign) for sign in (-1.0, 1.0))
             self.draft.crosswalk(near.aside(right), near.aside(left), far.aside(left), far.aside(right))
@@ -230,6 +226,9 @@ class Street:
         lane = self.lanes[place, section]
         index = at - self.cuts[section] if self._forward(place) else self.cuts[section + 1] - at
         return lane, float(self.draft.lanes[lane].curve.arc_m[index])
+
+    def _section(self, at: int) -> int:
+        return next(k for k, last in enumerate(self.cuts[1:]) if at <= last)
 
     def _forward(self, place: int) -> bool:
         return next(strip.forward for strip in self.strips if strip.place == place)
@@ -256,14 +255,13 @@ class Street:
 
     def _bay(self, place: int, aside: float, at_m: float, length_m: float) -> None:
         at = round(at_m / STEP_M)
-        section = next(k for k, last in enumerate(self.cuts[1:]) if at <= last)
         pose = self.middle.pose(at).aside(aside)
         # Bays do not hide crossings.
         along = np.array([np.cos(pose.heading), np.sin(pose.heading)])
         to = [crossing.axis.mean(axis=0) - [pose.x, pose.y] for crossing in self.draft.crossings]
         if not any(np.hypot(*d) < 30.0 and abs(d @ along) < _BAY_CLEAR_M for d in to):
             pose = pose if self._forward(place) else pose.turned()
-            self.draft.bays.append(Bay(pose, length_m, *self._on_lane(place, section, at)))
+            self.draft.bays.append(Bay(pose, length_m, *self._on_lane(place, self._section(at), at)))
 
 
 @dataclass(frozen=True)
