@@ -16,8 +16,7 @@ from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAPACITIES, STEPS, RoadKind
 from drivax.simulator.simulator import Simulator
-from drivax.synthetic.roads.families.highway import Highway
-from drivax.synthetic.roads.families.streets import LaneDrop
+from drivax.synthetic.roads.families import Highway, LaneDrop
 from drivax.synthetic.roads.network import map_features
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
