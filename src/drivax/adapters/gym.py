@@ -216,12 +216,9 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own spelling)
 
     def __init__(
-        self,
-        data: Scenarios | str | Path | int = BUILT_IN,
-        task: Task | None = None,
-        render_mode: str | None = None,
-        traffic: str | Traffic = "log",
-    ) -> None:
+        self, data: Scenarios | str | Path | int = BUILT_IN, task: Task | None = None,
+        render_mode: str | None = None, traffic: str | Traffic = "log",
+    ) -> None:  # fmt: skip
         self._worlds = _Worlds(data, task, traffic)
         self._state: SimState | None = None
         self._row, self._path = 0, np.zeros((0, 4), np.float32)
@@ -303,13 +300,9 @@ class VectorDrivingEnv(VectorEnv):
     }  # fmt: skip
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        data: Scenarios | str | Path | int = BUILT_IN,
-        task: Task | None = None,
-        render_mode: str | None = None,
-        traffic: str | Traffic = "log",
-    ) -> None:
+        self, num_envs: int = 1, data: Scenarios | str | Path | int = BUILT_IN, task: Task | None = None,
+        render_mode: str | None = None, traffic: str | Traffic = "log",
+    ) -> None:  # fmt: skip
         self._worlds = _Worlds(data, task, traffic)
         self.num_envs = num_envs
         self.render_mode = _known(render_mode)

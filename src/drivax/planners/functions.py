@@ -48,14 +48,9 @@ class FunctionPlanner(Memoryless):
         return str(getattr(self.function, "__name__", type(self.function).__name__))
 
     def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
         """Return the function's action; NaN where it raised an error."""
         if not self.in_python:
             return jnp.asarray(self.function(situation, observation), jnp.float32), carry

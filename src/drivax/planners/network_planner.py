@@ -31,14 +31,9 @@ class NetworkPlanner(Memoryless):
     replays: bool = static(default=False)
 
     def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, "2"], Any]:
+    ) -> tuple[Float[Array, "2"], Any]:  # fmt: skip
         """The policy's action for the observation."""
         distribution = nnx.merge(self.graph, self.parameters)(observation)
         return distribution.action(distribution.sample(key)) if self.samples else distribution.mode(), carry

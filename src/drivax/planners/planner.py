@@ -35,14 +35,9 @@ class Planner(Protocol):
         ...
 
     def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
         """Return an action of the task's action space, which the simulator clips, and the carry of the next step."""
         ...
 
@@ -65,14 +60,9 @@ class RuleBased(Memoryless, ABC):
         """Return acceleration (m/s2) and curvature (1/m)."""
 
     def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
         """Return the action of the controls."""
         context = situation.context
         length_m = bank.length_m(context.index, context.slot)

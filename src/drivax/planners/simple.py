@@ -50,14 +50,9 @@ class Expert(Memoryless):
         return "expert" if self.replays else "expert_actions"
 
     def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
         """Return the action that follows the log."""
         return expert_action(bank, state.context, self.actions), carry
 
@@ -83,13 +78,8 @@ class RandomActions(Memoryless):
     replays: bool = static(default=False)
 
     def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
         """Return independent numbers in [-1, 1)."""
         return jax.random.uniform(key, state.context.action.shape, minval=-1.0, maxval=1.0), carry

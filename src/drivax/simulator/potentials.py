@@ -69,12 +69,9 @@ def collision_potential(frame: Frame, slot: Int[Array, ""], margin_m: float = 0.
 
 
 def offroad_potential(
-    bank: ScenarioBank,
-    index: Int[Array, ""],
-    box: Float[Array, " 6"],
-    ground: Float[Array, ""],
+    bank: ScenarioBank, index: Int[Array, ""], box: Float[Array, " 6"], ground: Float[Array, ""],
     margin_m: float = 0.5,
-) -> Float[Array, ""]:
+) -> Float[Array, ""]:  # fmt: skip
     """Potential of the road's edges for a box: the sum over its corners.
 
     Args:

@@ -174,14 +174,9 @@ class Simulator:
         return self.task.observe(bank, context, frames, frames(0))
 
     def step_or_reset(
-        self,
-        bank: ScenarioBank,
-        state: SimState,
-        action: Float[Array, " D"],
-        over: Bool[Array, ""],
-        fresh: EpisodeStart,
-        seen: Frame | None = None,
-    ) -> tuple[SimState, Transition]:
+        self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"], over: Bool[Array, ""],
+        fresh: EpisodeStart, seen: Frame | None = None,
+    ) -> tuple[SimState, Transition]:  # fmt: skip
         """Step, or start a new episode where the current one is ``over``.
 
         For collectors: the end of an episode costs one call that only resets, with a meaningless transition to mask. In
@@ -244,14 +239,9 @@ class Simulator:
         )
 
     def _settle(
-        self,
-        bank: ScenarioBank,
-        before: SimState,
-        moved: AgentContext,
-        driven: AgentContext,
-        seen: Frame,
+        self, bank: ScenarioBank, before: SimState, moved: AgentContext, driven: AgentContext, seen: Frame,
         action: Array,
-    ) -> tuple[SimState, Transition]:
+    ) -> tuple[SimState, Transition]:  # fmt: skip
         """Measure an agent after all agents have moved, and build the transition."""
         now = self.frame(bank, moved, driven, 0)
         situation, contacts, lights = measure(

@@ -166,13 +166,9 @@ def _touch(
 
 
 def _requested(
-    bank: ScenarioBank,
-    context: AgentContext,
-    frame: Frame,
-    codes: Int[Array, " S"],
-    reads: frozenset[str],
+    bank: ScenarioBank, context: AgentContext, frame: Frame, codes: Int[Array, " S"], reads: frozenset[str],
     strand: Any,
-) -> dict[str, Array]:
+) -> dict[str, Array]:  # fmt: skip
     """Return the facts measured on request; those outside ``reads`` are zero."""
     none, no = jnp.int16(-1), jnp.zeros((), bool)
     zero = jnp.zeros(())

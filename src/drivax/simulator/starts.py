@@ -148,13 +148,9 @@ class NoisyStart:
 
 
 def _acceptable(
-    bank: ScenarioBank,
-    index: Integer,
-    step: Integer,
-    slot: Integer,
-    agents: Float[Array, "A 8"],
+    bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Float[Array, "A 8"],
     history: Float[Array, "16 4"],
-) -> Bool[Array, ""]:
+) -> Bool[Array, ""]:  # fmt: skip
     """Whether an agent with this history touches none of the others and is on the road at ``step``."""
     zero, z = jnp.zeros(()), bank.agents[index, step, slot, AgentColumn.Z]
     context = AgentContext(index, step, slot, history, jnp.zeros(2), zero, z, ())

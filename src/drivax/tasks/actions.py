@@ -60,12 +60,9 @@ class Physical:
         return self._action(acceleration, self._steering(curvature, length_m))
 
     def expert(
-        self,
-        motion: Float[Array, " 4"],
-        target: Float[Array, " 4"],
-        beyond: Float[Array, " 4"],
+        self, motion: Float[Array, " 4"], target: Float[Array, " 4"], beyond: Float[Array, " 4"],
         length_m: Any,
-    ) -> Float[Array, " 2"]:
+    ) -> Float[Array, " 2"]:  # fmt: skip
         """Return the action that follows the log, from its motions one and two steps ahead; not clipped."""
         return self.action(motion, *follow(motion, target, beyond), length_m)
 
@@ -230,12 +227,9 @@ class DeltaLocal:
         return self._action(distance * jnp.stack([jnp.cos(turn / 2), jnp.sin(turn / 2)]), turn)
 
     def expert(
-        self,
-        motion: Float[Array, " 4"],
-        target: Float[Array, " 4"],
-        beyond: Float[Array, " 4"],
+        self, motion: Float[Array, " 4"], target: Float[Array, " 4"], beyond: Float[Array, " 4"],
         length_m: Any,
-    ) -> Float[Array, " 3"]:
+    ) -> Float[Array, " 3"]:  # fmt: skip
         """Return the displacement to the logged motion one step ahead; not clipped."""
         return self._action(*displacement(motion, target))
 
@@ -290,12 +284,9 @@ class DirectState:
         return bicycle(motion, acceleration, curvature)
 
     def expert(
-        self,
-        motion: Float[Array, " 4"],
-        target: Float[Array, " 4"],
-        beyond: Float[Array, " 4"],
+        self, motion: Float[Array, " 4"], target: Float[Array, " 4"], beyond: Float[Array, " 4"],
         length_m: Any,
-    ) -> Float[Array, " 4"]:
+    ) -> Float[Array, " 4"]:  # fmt: skip
         """Return the logged motion one step ahead."""
         return target
 

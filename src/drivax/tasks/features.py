@@ -48,11 +48,7 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
             "limit": ("", "known"),
             "curvature": ("",),
         },
-        "lights": {
-            "position": ("x", "y"),
-            "state": ("unknown", "green", "yellow", "red"),
-            "on_route": ("",),
-        },
+        "lights": {"position": ("x", "y"), "state": ("unknown", "green", "yellow", "red"), "on_route": ("",)},
         "route": {
             "position": ("x", "y"),
             "heading": ("sin", "cos"),

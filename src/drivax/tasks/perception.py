@@ -142,12 +142,9 @@ def in_view(
 
 
 def lights_seen(
-    config: Perception,
-    bank: ScenarioBank,
-    context: AgentContext,
-    distance_m: Float[Array, " L"],
+    config: Perception, bank: ScenarioBank, context: AgentContext, distance_m: Float[Array, " L"],
     back: int = 0,
-) -> Bool[Array, " L"]:
+) -> Bool[Array, " L"]:  # fmt: skip
     """Return which stop lines were seen ``back`` steps ago, at these distances."""
     key = jax.random.fold_in(_key(config, bank, context, back), _DROPPED_LIGHTS)
     return _reported(config, key, distance_m)

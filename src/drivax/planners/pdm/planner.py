@@ -150,14 +150,9 @@ class PdmPlanner:
         )
 
     def act(
-        self,
-        carry: Memory,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Memory, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, " D"], Memory]:
+    ) -> tuple[Float[Array, " D"], Memory]:  # fmt: skip
         """Return the first action of the best proposal, or brake."""
         context = situation.context
         motion, length = context.history[-1], situation.surroundings.frame.box[context.slot, LENGTH]

@@ -85,11 +85,9 @@ class OverrideTraffic:
 
 
 def with_override(
-    bank: ScenarioBank,
-    slots: Int[Array, "N K"],
-    motion: Float[Array, "N T K 4"],
+    bank: ScenarioBank, slots: Int[Array, "N K"], motion: Float[Array, "N T K 4"],
     valid: Bool[Array, "N T K"] | None = None,
-) -> ScenarioBank:
+) -> ScenarioBank:  # fmt: skip
     """The bank with given trajectories; heights are those of the nearest lane, from the logged one on.
 
     Differentiable with respect to ``motion``.
@@ -121,12 +119,9 @@ def with_override(
 
 
 def motions_of_actions(
-    bank: ScenarioBank,
-    slots: Int[Array, "N K"],
-    actions: Float[Array, "N steps K D"],
-    move: Move,
+    bank: ScenarioBank, slots: Int[Array, "N K"], actions: Float[Array, "N steps K D"], move: Move,
     begin: int = CURRENT_STEP,
-) -> Float[Array, "N T K 4"]:
+) -> Float[Array, "N T K 4"]:  # fmt: skip
     """Trajectories of agents that carry out given actions from step ``begin`` on; as logged until then.
 
     Differentiable with respect to ``actions``. Agents that were not seen at step ``begin`` begin where they were seen
