@@ -7,10 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from drivax.errors import UsageError
-from drivax.planners.idm import IdmPlanner
 from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
-from drivax.planners.simple import ConstantVelocity, Expert, RandomActions
+from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner, RandomActions
 from drivax.plugins import check_arguments, find_named, is_dotted
 from drivax.tasks.actions import ActionSpace
 
