@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array
@@ -62,14 +63,14 @@ class Memoryless:
         raise NotImplementedError
 
 
-class RuleBased(Memoryless):
+class RuleBased(Memoryless, ABC):
     """Base of planners that compute acceleration and curvature from the situation; records add ``actions``."""
 
     actions: ActionSpace
 
+    @abstractmethod
     def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Scalar, Scalar]:
         """Return acceleration (m/s2) and curvature (1/m)."""
-        raise NotImplementedError
 
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
         """Return the action of the controls."""

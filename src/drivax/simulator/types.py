@@ -17,7 +17,9 @@ HISTORY = 16
 #: x, y (m), heading (rad), speed (m/s, never negative).
 Motion = Float[Array, " 4"]
 MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
-#: The numbers of an action space.
+#: Motions of the last 16 steps, the present one last.
+History = Float[Array, "16 4"]
+#: D numbers of an action space.
 Action = Float[Array, " D"]
 
 
@@ -243,7 +245,7 @@ class Task(Protocol):
         """Return the executed action for a requested ``action``, given the ``last`` executed one."""
         ...
 
-    def first_action(self, history: Float[Array, "16 4"], length: Any) -> Action:
+    def first_action(self, history: History, length: Any) -> Action:
         """Return the previous action at the start of an episode; its size is that of every action."""
         ...
 
