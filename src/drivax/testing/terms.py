@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.metrics.catalogue import EpisodeEnd, Metric
-from drivax.metrics.scores import Value
-from drivax.metrics.steps import Moment
+from drivax.metrics.steps import Moment, Value
 from drivax.plugins import find_named
 from drivax.simulator.types import FACTS, ON_REQUEST
 from drivax.tasks.own import name_of
@@ -153,6 +152,6 @@ def _check_computed(what: str, metric: Metric) -> None:
         expect(
             isinstance(result, Value) and result.value.shape == (12,) and result.defined.dtype == bool,
             f"{what} does not compute a Value of one number and one boolean",
-            "return drivax.metrics.scores.Value(number, defined)",
+            "return drivax.metrics.steps.Value(number, defined)",
         )
         check_numbers(what, jax.tree.map(lambda leaf, d=result.defined: np.where(d, leaf, 0.0), result.value))
