@@ -231,8 +231,8 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         chosen = _option(options, "scenario")
         worlds = self._worlds
         self._row = int(self.np_random.integers(len(worlds.ids))) if chosen is None else worlds.row(chosen)
-        self._state, observation = _reset(worlds.simulator, worlds.bank, self._row)
-        self._path = _path_of(self._state.context)
+        state, observation = _reset(worlds.simulator, worlds.bank, self._row)
+        self._state, self._path = state, _path_of(state.context)
         return _plain(observation), {"scenario_id": worlds.ids[self._row]}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

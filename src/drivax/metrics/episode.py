@@ -49,17 +49,16 @@ class Episode:
     selection: MetricSelection = static()
 
 
-#: Accumulator of each operator.
-_ACCUMULATORS: dict[Operator, str] = {
-    "sum": "total", "mean": "total", "min": "low", "any": "high", "max": "high", "last": "last", "first": "first",
-    "worst_second": "worst",
+#: Operators that read each accumulator.
+_ACCUMULATORS: dict[str, tuple[Operator, ...]] = {
+    "total": ("sum", "mean"), "low": ("min",), "high": ("any", "max"), "last": ("last",), "first": ("first",),
+    "worst": ("worst_second",),
 }  # fmt: skip
 
 
 def _entries(selection: MetricSelection) -> dict[str, tuple[StepValue, ...]]:
     """Return the step values of each accumulator."""
-    names = dict.fromkeys(_ACCUMULATORS.values())
-    return {n: selection.step_values(*(o for o, name in _ACCUMULATORS.items() if name == n)) for n in names}
+    return {name: selection.step_values(*operators) for name, operators in _ACCUMULATORS.items()}
 
 
 def episode_start(metrics: MetricNames = "full") -> Episode:
@@ -169,9 +168,9 @@ def _has(bank: ScenarioBank, state: SimState, needs: Flag) -> Bool[Array, ""]:
 
 def _accumulated(episode: Episode, metric: Metric) -> Value:
     """Return an accumulated step value; undefined where no step defined it."""
-    if metric.step_value is None or metric.operator is None:
+    if metric.step_value is None:
         return Value(jnp.zeros(()), jnp.zeros((), bool))
-    accumulator = _ACCUMULATORS[metric.operator]
+    accumulator = next(name for name, operators in _ACCUMULATORS.items() if metric.operator in operators)
     row = _entries(episode.selection)[accumulator].index(metric.step_value)
     value = getattr(episode, accumulator)[row]
     if accumulator == "total":

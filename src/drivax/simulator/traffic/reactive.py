@@ -90,8 +90,9 @@ class IdmTraffic:
         now = reacts & (entry <= step)
         arc, speed = paths.log_arc[index, at, row], paths.log_speed[index, at, row]
         phase = jnp.where(reacts, jnp.where(now, DRIVES, WAITS), REPLAYS).astype(jnp.int8)
-        past = [jnp.broadcast_to(rows, (PAST, *rows.shape)) for rows in (arc, speed, now)]
-        return Reactive(step, phase, entry.astype(jnp.int16), *past, paths.overlaps[index, at, row])
+        arc, speed, there = (jnp.broadcast_to(rows, (PAST, *rows.shape)) for rows in (arc, speed, now))
+        ignored = paths.overlaps[index, at, row]
+        return Reactive(step, phase, entry.astype(jnp.int16), arc, speed, there, ignored)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Return rows of the moving slots ``back`` steps ago (at most 9): reacting agents simulated, others logged."""
@@ -124,8 +125,8 @@ class IdmTraffic:
         arc = jnp.where(drives, arc, movers.arc)
         speed = jnp.where(drives, speed, jnp.where(enters, _entry_speed(movers, ahead, driver), movers.speed))
         steps = ((now.arc, arc), (now.speed, speed), (now.there, phase == DRIVES))
-        past = [jnp.concatenate([rows[1:], row[None]]) for rows, row in steps]
-        return Reactive(now.begin, phase.astype(jnp.int8), now.entry, *past, ignored)
+        arc, speed, there = (jnp.concatenate([rows[1:], row[None]]) for rows, row in steps)
+        return Reactive(now.begin, phase.astype(jnp.int8), now.entry, arc, speed, there, ignored)
 
     def _class(self, bank: ScenarioBank, index: Any, slot: Int[Array, " R"]) -> Int[Array, " R"]:
         """Index of the driver parameters of each vehicle; -1 for none."""
