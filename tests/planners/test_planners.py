@@ -11,10 +11,9 @@ from flax import nnx
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.encoders import MlpConfig, group_spec
 from drivax.planners.catalogue import PLANNERS, make_planner
-from drivax.planners.idm import IdmPlanner
 from drivax.planners.network_planner import NetworkPlanner
 from drivax.planners.planner import Planner
-from drivax.planners.simple import RandomActions, expert_action, logged_motion
+from drivax.planners.simple import IdmPlanner, RandomActions, expert_action, logged_motion
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import PHYSICAL

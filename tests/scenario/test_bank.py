@@ -9,7 +9,7 @@ import pytest
 
 from drivax.errors import DataError, DrivaxError
 from drivax.evaluation.rollout import drive, judging
-from drivax.planners.idm import IdmPlanner
+from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Flag, Scenario

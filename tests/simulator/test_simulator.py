@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.rollout import drive, judging
-from drivax.planners.idm import IdmPlanner
-from drivax.planners.simple import ConstantVelocity, Expert
+from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.simulator.simulator import Simulator

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.simulator.simulator import Simulator
-from drivax.simulator.together import is_driven, slots_of
+from drivax.simulator.simulator import Simulator, is_driven, slots_of
 from drivax.simulator.traffic.agent_paths import AgentPaths
 from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import IdmTraffic

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Int16
 from drivax.evaluation.episode_table import FAILED
 from drivax.evaluation.traffic_trajectories import packed
 from drivax.metrics.episode import episode_metrics, event_steps
-from drivax.metrics.scores import Value
+from drivax.metrics.steps import Value
 from drivax.planners.planner import Planner
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.scenario_bank import ScenarioBank

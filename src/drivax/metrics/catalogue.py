@@ -1,4 +1,4 @@
-"""Specification of every episode metric: unit, direction, operator, label, definition and requirements."""
+"""Specification of every episode metric: unit, direction, operator, label, definition, requirements; and the scores."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from drivax.metrics.scores import NUPLAN_INPUTS, VMAX_INPUTS, Value, nuplan_score, vmax_score
-from drivax.metrics.steps import STEP_VALUES, StepValue
+from drivax.metrics.steps import STEP_VALUES, StepValue, Value
 from drivax.scenario.bank.queries import is_mapped
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import Flag
 from drivax.simulator.contact import TTC_HORIZON_S
 
-#: How the values of an episode's steps become one: ``worst_second`` is the largest sum over ten consecutive steps.
+#: How the step values of an episode are reduced: ``worst_second`` is the largest sum over ten consecutive steps.
 Operator = Literal["any", "sum", "mean", "min", "max", "last", "first", "worst_second"]
 #: ``rate``: 0 or 1 per episode (Wilson's interval); ``score``: from 0 to 1; ``code``: has no mean.
 Kind = Literal["rate", "score", "quantity", "code"]
@@ -26,7 +25,7 @@ Direction = Literal["low", "high", "-"]
 
 @dataclass(frozen=True)
 class Column:
-    """What tables and reports say about a column of ``episodes.csv``.
+    """Description of a column of ``episodes.csv`` for tables and reports.
 
     Attributes:
         unit: Unit, ``-`` for shares and booleans.
@@ -86,6 +85,14 @@ class EpisodeEnd:
 
 #: Values of the metrics that a metric is computed from, by name.
 Inputs = Mapping[str, Value]
+#: Weights of the two scores, and the metrics that multiply them.
+NUPLAN_WEIGHTS = {"ttc_ok": 5.0, "progress_ratio": 5.0, "speed_compliance": 4.0, "comfortable": 2.0}
+VMAX_WEIGHTS = {**NUPLAN_WEIGHTS, "lane_keeping": 3.0}
+NUPLAN_GATES = ("at_fault_collision", "offroad")
+VMAX_GATES = (*NUPLAN_GATES, "red_light")
+_PASSES = ("making_progress", "direction")
+NUPLAN_INPUTS = (*NUPLAN_WEIGHTS, *NUPLAN_GATES, *_PASSES)
+VMAX_INPUTS = (*VMAX_WEIGHTS, *VMAX_GATES, *_PASSES)
 #: Time to collision that counts as safe, and mean speeding at which compliance is 0 (nuPlan).
 _SAFE_TTC_S, _SPEEDING_MPS = 0.95, 2.23
 
@@ -178,6 +185,35 @@ def _success(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
 def _success_moving(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     moves = end.bank.log_ahead[end.index, end.start] > 5.0
     return Value(inputs["success"].value, inputs["success"].defined & moves)
+
+
+def score(metrics: Inputs, weights: Mapping[str, float], gates: tuple[str, ...]) -> tuple[Value, Value]:
+    """Return a full and a partial score: a weighted mean of metrics, times one minus each gate, progress and direction.
+
+    The full score is defined where every input is; the partial one where some input is undefined: undefined terms leave
+    the mean, undefined gates count as passed.
+    """
+    terms = jnp.stack([jnp.clip(metrics[name].value, 0.0, 1.0) for name in weights])
+    known = jnp.stack([metrics[name].defined for name in weights])
+    share = jnp.asarray(list(weights.values()))[(...,) + (None,) * (terms.ndim - 1)] * known
+    total = share.sum(axis=0)
+    mean = (share * terms).sum(axis=0) / jnp.maximum(total, 1e-9)
+    complete = known.all(axis=0)
+    factors = [(metrics[name].defined, 1.0 - metrics[name].value) for name in gates]
+    for defined, factor in factors + [(metrics[name].defined, metrics[name].value) for name in _PASSES]:
+        mean = mean * jnp.where(defined, factor, 1.0)
+        complete = complete & defined
+    return Value(mean, complete), Value(mean, ~complete & (total > 0))
+
+
+def nuplan_score(metrics: Inputs) -> tuple[Value, Value]:
+    """Return nuPlan's closed-loop score, full and partial."""
+    return score(metrics, NUPLAN_WEIGHTS, NUPLAN_GATES)
+
+
+def vmax_score(metrics: Inputs) -> tuple[Value, Value]:
+    """Return the V-Max score: nuPlan's terms and lane keeping, gated by red lights too; full and partial."""
+    return score(metrics, VMAX_WEIGHTS, VMAX_GATES)
 
 
 def _score(score: Callable[[Inputs], tuple[Value, Value]], partial: bool) -> Callable[..., Value]:

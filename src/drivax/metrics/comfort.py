@@ -23,18 +23,13 @@ from drivax.scenario.schema import DT_S
 WINDOW, TAIL = 15, 8
 #: nuPlan's closed-loop limits: m/s2, m/s2, m/s3, m/s3, rad/s, rad/s2.
 LONGITUDINAL_MPS2 = (-4.05, 2.40)
-LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS2 = (
-    4.89,
-    4.13,
-    8.37,
-    0.95,
-    1.93,
-)
+LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3 = 4.89, 4.13, 8.37
+YAW_RATE_RPS, YAW_ACCELERATION_RPS2 = 0.95, 1.93
 
 
 @cache
 def savgol_tail_matrix(window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
-    """The Savitzky-Golay filter as a matrix ``[8, 15]`` from the last 15 samples to the values at the last 8.
+    """Return the Savitzky-Golay filter as a matrix ``[8, 15]`` from the last 15 samples to the values at the last 8.
 
     Row 0 is an interior point; the last ``window // 2`` rows are read off the last window's polynomial.
     """
@@ -43,7 +38,7 @@ def savgol_tail_matrix(window: int, order: int, derivative: int) -> np.ndarray[A
 
 @cache
 def savgol_matrix(samples: int, window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
-    """The Savitzky-Golay filter of a number of samples as a matrix ``[samples, samples]``.
+    """Return the Savitzky-Golay filter of a number of samples as a matrix ``[samples, samples]``.
 
     Least-squares polynomial of ``order`` over ``window`` samples, differentiated ``derivative`` times per sample
     (Savitzky and Golay 1964). Rows near an end are read off the polynomial of the first or last window. As in SciPy,
@@ -60,7 +55,7 @@ def savgol_matrix(samples: int, window: int, order: int, derivative: int) -> np.
 
 
 def _weights(window: int, order: int, derivative: int, where: float) -> np.ndarray[Any, Any]:
-    """Weights that give the derivative of the fitted polynomial at sample position ``where``."""
+    """Return the weights of the derivative of the fitted polynomial at sample position ``where``."""
     powers = (np.arange(window) - where)[:, None] ** np.arange(order + 1)
     factorial = float(np.prod(np.arange(1, derivative + 1))) if derivative else 1.0
     return np.linalg.pinv(powers)[derivative] * factorial
@@ -68,7 +63,7 @@ def _weights(window: int, order: int, derivative: int, where: float) -> np.ndarr
 
 @record
 class ComfortSteps:
-    """Steps on end, oldest first: whether each is comfortable, and what was measured."""
+    """Comfort and measurements of consecutive steps, oldest first."""
 
     comfortable: Bool[Array, " steps"]
     jerk_mps3: Float[Array, " steps"]
@@ -76,20 +71,19 @@ class ComfortSteps:
 
 
 def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
-    """Evaluate every step of a trip (x, y, heading, speed; at least 16 rows) from row 8 on, for plots and tables.
+    """Evaluate a trip (x, y, heading, speed; at least 16 rows) from row 8 on, the first with a centred window.
 
-    An episode evaluates the same, step by step; nothing before row 8 can be evaluated as a centred window asks for.
+    For plots and tables; an episode evaluates the same steps one by one.
     """
-    rows = WINDOW + 1
-    windows = jnp.arange(len(motion) - rows + 1)[:, None] + jnp.arange(rows)
-    judged = jax.vmap(check_comfort)(motion[windows])
-    return jax.tree.map(lambda part: jnp.concatenate([part[:-1, 0], part[-1]]), judged)
+    windows = jnp.arange(len(motion) - WINDOW)[:, None] + jnp.arange(WINDOW + 1)
+    steps = jax.vmap(check_comfort)(motion[windows])
+    return jax.tree.map(lambda part: jnp.concatenate([part[:-1, 0], part[-1]]), steps)
 
 
 def check_comfort(history: Float[Array, "16 4"]) -> ComfortSteps:
     """Evaluate the last eight steps of a motion history (x, y, heading, speed) against the limits.
 
-    Row 0, seven steps back, is final; the later rows are what SciPy's edge mode would say if the history ended now.
+    Row 0, seven steps back, is final; the later rows are those of SciPy's edge mode if the history ended now.
     """
     speed = history[:, 3]
     turned = wrap(history[1:, 2] - history[:-1, 2])
@@ -98,20 +92,15 @@ def check_comfort(history: Float[Array, "16 4"]) -> ComfortSteps:
     lateral = (speed[1:] + speed[:-1]) / 2 * turned / DT_S
 
     def filtered(signal: Array, window: int, order: int, derivative: int) -> Array:
-        return (
-            jnp.asarray(savgol_tail_matrix(window, order, derivative), jnp.float32)
-            @ signal
-            / DT_S**derivative
-        )
+        matrix = jnp.asarray(savgol_tail_matrix(window, order, derivative), jnp.float32)
+        return matrix @ signal / DT_S**derivative
 
     smooth_along, smooth_lateral = filtered(along, 8, 2, 0), filtered(lateral, 8, 2, 0)
     jerk = filtered(along, 15, 2, 1)
     magnitude = filtered(jnp.sqrt(along**2 + lateral**2 + 1e-12), 15, 2, 1)
     yaw_rate, yaw_acceleration = filtered(heading, 15, 2, 1), filtered(heading, 15, 3, 2)
     fine = (smooth_along >= LONGITUDINAL_MPS2[0]) & (smooth_along <= LONGITUDINAL_MPS2[1])
-    fine &= jnp.abs(smooth_lateral) <= LATERAL_MPS2
-    fine &= jnp.abs(jerk) <= JERK_MPS3
-    fine &= jnp.abs(magnitude) <= JERK_MAGNITUDE_MPS3
-    fine &= jnp.abs(yaw_rate) <= YAW_RATE_RPS
+    fine &= (jnp.abs(smooth_lateral) <= LATERAL_MPS2) & (jnp.abs(jerk) <= JERK_MPS3)
+    fine &= (jnp.abs(magnitude) <= JERK_MAGNITUDE_MPS3) & (jnp.abs(yaw_rate) <= YAW_RATE_RPS)
     fine &= jnp.abs(yaw_acceleration) <= YAW_ACCELERATION_RPS2
     return ComfortSteps(fine, jnp.abs(magnitude), jnp.abs(smooth_lateral))

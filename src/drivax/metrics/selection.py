@@ -24,7 +24,7 @@ class MetricSelection:
     Attributes:
         names: The requested metrics.
         metrics: These and their inputs, inputs first.
-        reads: Facts that their step values read; all of them for the full set, which planners may read too.
+        reads: Facts that their step values read; all facts for the full set, for planners.
     """
 
     names: tuple[str, ...]
@@ -65,9 +65,8 @@ def select_metrics(names: MetricNames) -> MetricSelection:
     metrics: dict[str, Metric] = {}
     for name in requested:
         _add_with_inputs(name, METRICS | own, metrics)
-    reads = frozenset[str]().union(
-        *(m.step_value.reads for m in metrics.values() if m.step_value is not None)
-    )
+    values = [metric.step_value for metric in metrics.values() if metric.step_value is not None]
+    reads = frozenset[str]().union(*(value.reads for value in values))
     if set(METRICS) <= set(requested):
         reads |= FACTS
     return MetricSelection(tuple(requested), tuple(metrics.items()), reads)

@@ -18,7 +18,6 @@ from drivax.simulator.contact import Contact
 from drivax.simulator.lights import nothing_crossed, remember_lights
 from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
-from drivax.simulator.together import is_driven
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
 from drivax.simulator.types import (
     AgentContext,
@@ -117,7 +116,7 @@ class Simulator:
     def reset_together(
         self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP
     ) -> SimState:
-        """Return the stacked states of K agents of one scenario (``simulator.together.slots_of`` selects slots).
+        """Return the stacked states of K agents of one scenario, at slots from :func:`slots_of`.
 
         All start as logged: a noisy start supports a single driven agent.
         """
@@ -129,13 +128,8 @@ class Simulator:
     ) -> tuple[SimState, Transition]:
         """Drive K agents of one scenario; they see each other, and traffic sees them.
 
-        Args:
-            bank: The scenarios.
-            states: Stacked states. Slots beyond the moving agents are padding: never rewarded or terminated, with
-                undefined facts.
-            actions: One action per agent.
-            over: ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics. None means
-                no agent.
+        Slots beyond the moving agents are padding: never rewarded or terminated, with undefined facts. ``over`` is the
+        ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics.
         """
         first = jax.tree.map(lambda leaf: leaf[0], states.context)
         seen = self.frame(bank, first, states.context, 0)
@@ -174,27 +168,15 @@ class Simulator:
         return self.task.observe(bank, context, frames, frames(0))
 
     def step_or_reset(
-        self,
-        bank: ScenarioBank,
-        state: SimState,
-        action: Float[Array, " D"],
-        over: Bool[Array, ""],
-        fresh: EpisodeStart,
-        seen: Frame | None = None,
-    ) -> tuple[SimState, Transition]:
+        self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"], over: Bool[Array, ""],
+        fresh: EpisodeStart, seen: Frame | None = None,
+    ) -> tuple[SimState, Transition]:  # fmt: skip
         """Step, or start a new episode where the current one is ``over``.
 
         For collectors: the end of an episode costs one call that only resets, with a meaningless transition to mask. In
         exchange nothing is measured or observed twice, and a policy sees every state, final ones included, once.
-
-        Args:
-            bank: The scenarios.
-            state: The state.
-            action: Action of the agent where its episode continues.
-            over: Whether the episode has ended.
-            fresh: The :meth:`new_episode`; read only where ``over``, so a batch may compute it only there
-                (:func:`simulator.sparse.map_where`).
-            seen: ``now(bank, state.context)``, if already computed.
+        ``fresh`` (:meth:`new_episode`) is read only where ``over``: :func:`simulator.sparse.map_where` computes it only
+        there. ``seen`` is ``now(bank, state.context)``, if already computed.
         """
         seen = self.now(bank, state.context) if seen is None else seen
         moved = self._move(bank, state.context, seen, action, None)
@@ -208,7 +190,7 @@ class Simulator:
         )
         after, transition = self._settle(bank, before, context, alone(context), seen, action)
         first = self.task.episode_start()
-        episode = jax.tree.map(lambda new, old: jnp.where(over, new, old), first, after.episode)
+        episode = jax.tree.map(partial(jnp.where, over), first, after.episode)
         lights = jax.tree.map(partial(jnp.where, over), nothing_crossed(after.lights), after.lights)
         after = replace(after, episode=episode, lights=lights)
         flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
@@ -244,14 +226,9 @@ class Simulator:
         )
 
     def _settle(
-        self,
-        bank: ScenarioBank,
-        before: SimState,
-        moved: AgentContext,
-        driven: AgentContext,
-        seen: Frame,
+        self, bank: ScenarioBank, before: SimState, moved: AgentContext, driven: AgentContext, seen: Frame,
         action: Array,
-    ) -> tuple[SimState, Transition]:
+    ) -> tuple[SimState, Transition]:  # fmt: skip
         """Measure an agent after all agents have moved, and build the transition."""
         now = self.frame(bank, moved, driven, 0)
         situation, contacts, lights = measure(
@@ -264,3 +241,19 @@ class Simulator:
         after = SimState(situation.context, situation.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))
         return after, Transition(before, after, action, reward, terms, terminated, truncated)
+
+
+def slots_of(
+    bank: ScenarioBank, index: Any, mask: Bool[Array, " A"], count: int, step: Any = CURRENT_STEP
+) -> Int[Array, " K"]:
+    """Return ``count`` slots of the moving agents of a mask that the log has at ``step``.
+
+    Missing ones are padded with A (an empty slot); further agents are left to traffic.
+    """
+    there = mask & (bank.agents[index, step, :, AgentColumn.VALID] > 0)
+    return jnp.nonzero(there, size=count, fill_value=mask.shape[0])[0].astype(jnp.int32)
+
+
+def is_driven(bank: ScenarioBank, states: SimState) -> Bool[Array, " K"]:
+    """Mask of the states that belong to an agent; the others are padding."""
+    return states.context.slot < bank.agents.shape[2]

@@ -73,7 +73,7 @@ def measure(
     around = surroundings(bank, context, frame)
     lanes, route, me = around.lanes, around.route, frame.box[context.slot]
     ground = _ground(bank, context, frame)
-    beyond, left_map, offroad = _off_the_road(bank, context.index, me, ground, lanes)
+    beyond, left_map, offroad = off_the_road(bank, context.index, me, ground, lanes)
     z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
     context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
     codes, fault, kind, ttc = _touch(context, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
@@ -157,7 +157,8 @@ def _touch(
     if reads & _FAULTS:
         fresh = first_contacts(contacts, touching)
         speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
-        others_speed = jnp.maximum(_speed(frame), jnp.where(previous.valid, _speed(previous), 0.0))
+        others_speed = jnp.where(previous.valid, norm(previous.velocity), 0.0)
+        others_speed = jnp.maximum(norm(frame.velocity), others_speed)
         fault, kind = classify_contacts(frame, context.slot, fresh, speed, others_speed, unlawful)
     codes = next_contacts(contacts, touching, frame.valid, fault)
     if "ttc_s" in reads:
@@ -166,19 +167,12 @@ def _touch(
 
 
 def _requested(
-    bank: ScenarioBank,
-    context: AgentContext,
-    frame: Frame,
-    codes: Int[Array, " S"],
-    reads: frozenset[str],
+    bank: ScenarioBank, context: AgentContext, frame: Frame, codes: Int[Array, " S"], reads: frozenset[str],
     strand: Any,
-) -> dict[str, Array]:
+) -> dict[str, Array]:  # fmt: skip
     """Return the facts measured on request; those outside ``reads`` are zero."""
-    none, no = jnp.int16(-1), jnp.zeros((), bool)
-    zero = jnp.zeros(())
-    facts: dict[str, Array] = {
-        "gap_m": zero, "lag_m": zero, "strand": none, "lane_changed": no, "merged": no
-    }  # fmt: skip
+    facts: dict[str, Array] = dict.fromkeys(("gap_m", "lag_m"), jnp.zeros(()))
+    facts |= {"strand": jnp.int16(-1)} | dict.fromkeys(("lane_changed", "merged"), jnp.zeros((), bool))
     if "gap_m" in reads:
         facts["gap_m"] = nearest_gap(frame, context.slot, codes == Contact.IGNORED)
     if "lag_m" in reads:
@@ -197,7 +191,7 @@ def _requested(
 
 
 def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
-    """The facts that are requested; None in place of the others."""
+    """Return the facts with None in place of those that are not requested."""
     # The next passage is evaluated from the strand of this one.
     desired = reads | ({"strand"} if reads & _PASSAGES else frozenset())
 
@@ -207,21 +201,17 @@ def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
     return facts if desired >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(keep, facts)
 
 
-def _off_the_road(
+def off_the_road(
     bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: LaneHits
-) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:  # fmt: skip
-    """How far a box's worst corner is off the road (m), whether it left the map, or only the road."""
+) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
+    """Return how far the worst corner of a box is off the road (m), whether it left the map, or only the road."""
     beyond = offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
     left_map = left_the_map(bank, index, me[:2])
     return beyond, left_map, (beyond > OFFROAD_TOLERANCE_M) & ~left_map & is_mapped(bank, index)
 
 
-def _speed(frame: Frame) -> Float[Array, " S"]:
-    return norm(frame.velocity)
-
-
 def _rates(history: Float[Array, "16 4"]) -> tuple[Scalar, Scalar, Scalar]:
-    """Causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
+    """Return causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
     speed, heading = history[:, 3], history[:, 2]
     acceleration = (speed[-1] - speed[-6]) / (5 * DT_S)
     before = (speed[-6] - speed[-11]) / (5 * DT_S)

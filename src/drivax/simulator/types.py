@@ -14,7 +14,13 @@ from drivax.scenario.record import record
 
 #: Steps of recent motion in a context: the 15 accelerations of the comfort window need 16 speeds.
 HISTORY = 16
+#: x, y (m), heading (rad), speed (m/s, never negative).
+Motion = Float[Array, " 4"]
 MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
+#: Motions of the last 16 steps, the present one last.
+History = Float[Array, "16 4"]
+#: D numbers of an action space.
+Action = Float[Array, " D"]
 
 
 @record
@@ -231,19 +237,15 @@ class Task(Protocol):
         """Names of the facts to measure."""
         ...
 
-    def motion(
-        self, motion: Float[Array, " 4"], action: Float[Array, " D"], length: Any
-    ) -> Float[Array, " 4"]:
+    def motion(self, motion: Motion, action: Action, length: Any) -> Motion:
         """Return the next motion of the driven agent."""
         ...
 
-    def actuated(
-        self, motion: Float[Array, " 4"], action: Float[Array, " D"], last: Float[Array, " D"]
-    ) -> Float[Array, " D"]:
+    def actuated(self, motion: Motion, action: Action, last: Action) -> Action:
         """Return the executed action for a requested ``action``, given the ``last`` executed one."""
         ...
 
-    def first_action(self, history: Float[Array, "16 4"], length: Any) -> Float[Array, " D"]:
+    def first_action(self, history: History, length: Any) -> Action:
         """Return the previous action at the start of an episode; its size is that of every action."""
         ...
 

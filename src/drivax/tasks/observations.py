@@ -20,10 +20,17 @@ from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer, RouteC
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import DT_S, LightState
+from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.types import HISTORY, AgentContext
 from drivax.tasks.features import (
     COLUMNS,
+    PIECE_M,
+    POSITION_M,
+    SIZE_M,
+    SPEED_MPS,
     Features,
+    Frames,
+    View,
     columns_of,
     cut_rows,
     goal_ahead,
@@ -35,7 +42,6 @@ from drivax.tasks.features import (
 )
 from drivax.tasks.own import check_unique, name_of
 from drivax.tasks.perception import Perception, moved_lights, moved_road, perceived
-from drivax.tasks.view import PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Frames, View
 
 #: Block size of the running count.
 _BLOCK = 8
@@ -44,8 +50,6 @@ _PASSED_M = 5.0
 Observation = dict[str, Array]
 #: Names of the groups of this module.
 GROUPS = tuple(COLUMNS)
-
-
 #: Features ``[F]`` or rows of them ``[..., F]``, or a pair of rows and a mask over them.
 Feature = Callable[[ScenarioBank, AgentContext, Frames], Any]
 
@@ -163,18 +167,11 @@ PRESETS = MappingProxyType(
 def observe(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> Observation:
-    """Return the observation of a context.
+    """Return the observation of a context; ``frames(k)`` is the frame of all agents k steps ago.
 
-    Args:
-        config: Groups, sizes and features.
-        bank: The scenarios.
-        context: The context of the observing agent.
-        frames: Frame of all agents some steps ago.
-
-    Returns:
-        By default ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last
-        action; ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
-        ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's groups.
+    By default ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last
+    action; ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
+    ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's groups.
     """
     view, features = View.of(context), config.features
     if config.perception.of_agents:
@@ -200,7 +197,7 @@ def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> O
 def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     past = context.history[HISTORY - config.steps :]
     turned = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
-    size = bank.agent_box[context.index, context.slot, SizeColumn.FOOTPRINT] / SIZE_M
+    size = bank.agent_box[context.index, context.slot, : SizeColumn.KIND] / SIZE_M
     moving = {
         "position": lambda: view.point(past[:, :2]) / POSITION_M,
         "heading": lambda: turned[:, ::-1],
@@ -209,22 +206,18 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, v
     }
     static = {
         "length": lambda: size[:1],
-        "width": lambda: size[1:],
-        "height": lambda: bank.agent_box[context.index, context.slot, SizeColumn.HEIGHT][..., None] / SIZE_M,
+        "width": lambda: size[1:2],
+        "height": lambda: size[2:],
         "last_action": lambda: context.action,
     }
-    result = {}
-    for name, parts in (("ego", moving), ("ego_static", static)):
-        if chosen := getattr(config.features, name):
-            result[name] = joined(chosen, parts, ())
-    return result
+    groups = (("ego", config.features.ego, moving), ("ego_static", config.features.ego_static, static))
+    return {name: joined(chosen, parts, ()) for name, chosen, parts in groups if chosen}
 
 
 def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
     """Return the indices of the smallest entries, nearest first; padded with 0."""
-    count_there = min(count, distance.shape[0])
-    chosen = jax.lax.top_k(-distance, count_there)[1]
-    return jnp.concatenate([chosen, jnp.zeros(count - count_there, chosen.dtype)])
+    chosen = jax.lax.top_k(-distance, min(count, distance.shape[0]))[1]
+    return jnp.pad(chosen, (0, count - chosen.shape[0]))
 
 
 def _agents(
@@ -255,9 +248,9 @@ def _agents(
         }
         return joined(chosen_features, parts, (config.agents,)), frame.valid[chosen]
 
-    rows = [row(back) for back in range(config.steps - 1, -1, -1)]
-    moving = jnp.stack([features for features, _ in rows], axis=1)
-    mask = jnp.stack([valid for _, valid in rows], axis=1) & there[:, None]
+    past = [row(back) for back in range(config.steps - 1, -1, -1)]
+    moving, mask = (jnp.stack(rows, axis=1) for rows in zip(*past, strict=True))
+    mask &= there[:, None]
     size = now.box[chosen, 4:6] / SIZE_M
     parts = {
         "length": lambda: size[:, :1],
@@ -294,29 +287,19 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
     ahead, left = dx * view.cos + dy * view.sin, dy * view.cos - dx * view.sin
     inside = (ahead < config.road_ahead_m) & (ahead > -config.road_behind_m)
     inside &= (jnp.abs(left) < config.road_side_m) & (layer != RoadLayer.NONE)
-    layers = (
-        (config.lanes, RoadLayer.LANE),
-        (config.edges, RoadLayer.EDGE),
-        (config.crosswalks, RoadLayer.AREA),
-    )
-    for hidden in [kind for shown, kind in layers if not shown]:
-        inside &= layer != hidden
+    kinds = (RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA)
+    for shown, kind in zip((config.lanes, config.edges, config.crosswalks), kinds, strict=True):
+        inside &= shown or layer != kind
     # Compact without sorting: the running count is the target of each row inside.
     running = running_count(inside)
     place = jnp.where(inside, running - 1, config.road)
     take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(len(inside)), mode="drop")
     rows = bank.road[context.index, take]
-    parts = [view.point(rows[:, RoadColumn.XY]) / POSITION_M, view.vector(rows[:, RoadColumn.DIRECTION])]
-    types = (
-        rows[:, RoadColumn.LAYER, None] == jnp.asarray([RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA])
-    ).astype(jnp.float32)
+    types = (rows[:, RoadColumn.LAYER, None] == jnp.asarray(kinds)).astype(jnp.float32)
     limit = rows[:, RoadColumn.LIMIT, None]
-    parts += [
-        rows[:, RoadColumn.LENGTH, None] / PIECE_M,
-        types,
-        jnp.maximum(limit, 0.0) / SPEED_MPS,
-        (limit > 0).astype(jnp.float32),
-    ]
+    parts = [view.point(rows[:, RoadColumn.XY]) / POSITION_M, view.vector(rows[:, RoadColumn.DIRECTION])]
+    parts += [rows[:, RoadColumn.LENGTH, None] / PIECE_M, types]
+    parts += [jnp.maximum(limit, 0.0) / SPEED_MPS, (limit > 0).astype(jnp.float32)]
     if "curvature" in config.features.road:
         parts.append(shown_curvature(bank.road_curvature[context.index, take])[:, None])
     return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
@@ -368,8 +351,7 @@ def _lights(
 def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
     """Return one-hot unknown, green, yellow, red. Flashing lights count as unknown, not red."""
     green = (state == LightState.GO) | (state == LightState.ARROW_GO)
-    yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
-    red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
+    yellow, red = is_yellow(state), is_red(state)
     return jnp.stack([~(green | yellow | red), green, yellow, red], axis=-1).astype(jnp.float32)
 
 

@@ -96,12 +96,9 @@ def acceleration_to(speed: Scalar, desired: Scalar, config: TrackingConfig) -> S
 
 
 def steering_rate(
-    error: tuple[Array, Array, Array],
-    speeds: Float[Array, " N"],
-    curvatures: Float[Array, " N"],
-    wheelbase: Scalar,
-    config: TrackingConfig,
-) -> Scalar:
+    error: tuple[Array, Array, Array], speeds: Float[Array, " N"], curvatures: Float[Array, " N"],
+    wheelbase: Scalar, config: TrackingConfig,
+) -> Scalar:  # fmt: skip
     """Constant steering rate u that minimises ``x_N' Q x_N + r u^2``, rad/s.
 
     x is (lateral error e, heading error h, steering angle d), and per step

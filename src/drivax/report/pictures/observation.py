@@ -15,10 +15,9 @@ from drivax.report.pictures.palette import LIGHT
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.features import COLUMNS, feature_names
+from drivax.tasks.features import COLUMNS, PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, feature_names
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
-from drivax.tasks.view import PIECE_M, POSITION_M, SIZE_M, SPEED_MPS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

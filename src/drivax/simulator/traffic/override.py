@@ -1,4 +1,4 @@
-"""Agents that follow given motions (``override``): given trajectories, or given actions."""
+"""Traffic in which some agents follow given trajectories or actions (``override``)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_bank, with_data
-from drivax.simulator.traffic.log import LogTraffic, logged_history
+from drivax.simulator.traffic.log import LogTraffic, agent_rows, logged_history
 from drivax.simulator.types import AgentContext, Traffic
 
 #: Next motion for a motion, an action and a length in metres, such as ``Task.motion``.
@@ -51,46 +51,40 @@ class OverrideTraffic:
 
     @property
     def name(self) -> str:
-        """As printed in tables: ``override``, or ``override+idm``."""
+        """``override``, or ``override+idm``."""
         return "override" if self.base.name == "log" else f"override+{self.base.name}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """The bank with what ``base`` needs."""
+        """Return the bank with the data of ``base``."""
         return prepare_bank(self.base, bank)
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
-        """State of ``base``; the bank says the rest.
+        """Return the state of ``base``.
 
         Raises:
-            UsageError: If nothing is given in the bank.
+            UsageError: The bank has no motions.
         """
         data_of(bank, OverrideMotions, "use override.with_override")
         return self.base.start(bank, index, step)
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Any) -> Any:
-        """State of ``base`` one step later."""
+        """Return the state of ``base`` one step later."""
         return self.base.advance(bank, context, frame)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
-        """Rows of ``base``, with those of the overridden agents as given."""
+        """Return the rows of ``base`` with the overridden agents as given."""
         rows, given = self.base.agents(bank, context, back), data_of(bank, OverrideMotions)
         step = jnp.clip(context.step - back, 0, bank.steps - 1)
-        motion, valid = given.motion[context.index, step], given.valid[context.index, step]
-        cos, sin = jnp.cos(motion[:, 2]), jnp.sin(motion[:, 2])
-        parts = [motion[:, 0], motion[:, 1], given.z[context.index, step], cos, sin]
-        parts += [motion[:, 3] * cos, motion[:, 3] * sin, valid.astype(cos.dtype)]
-        slot = given.slot[context.index]
-        slot = jnp.where(slot >= 0, slot, rows.shape[0])
-        return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
+        at, slot = (context.index, step), given.slot[context.index]
+        overridden = agent_rows(given.motion[at], given.z[at], given.valid[at].astype(jnp.float32))
+        return rows.at[jnp.where(slot >= 0, slot, rows.shape[0])].set(overridden, mode="drop")
 
 
 def with_override(
-    bank: ScenarioBank,
-    slots: Int[Array, "N K"],
-    motion: Float[Array, "N T K 4"],
+    bank: ScenarioBank, slots: Int[Array, "N K"], motion: Float[Array, "N T K 4"],
     valid: Bool[Array, "N T K"] | None = None,
-) -> ScenarioBank:
-    """The bank with given trajectories; heights are those of the nearest lane, from the logged one on.
+) -> ScenarioBank:  # fmt: skip
+    """Return the bank with given trajectories; their heights follow the nearest lane, from the first logged one on.
 
     Differentiable with respect to ``motion``.
 
@@ -121,16 +115,13 @@ def with_override(
 
 
 def motions_of_actions(
-    bank: ScenarioBank,
-    slots: Int[Array, "N K"],
-    actions: Float[Array, "N steps K D"],
-    move: Move,
+    bank: ScenarioBank, slots: Int[Array, "N K"], actions: Float[Array, "N steps K D"], move: Move,
     begin: int = CURRENT_STEP,
-) -> Float[Array, "N T K 4"]:
-    """Trajectories of agents that carry out given actions from step ``begin`` on; as logged until then.
+) -> Float[Array, "N T K 4"]:  # fmt: skip
+    """Return the trajectories of agents that follow the log until step ``begin`` and then execute given actions.
 
-    Differentiable with respect to ``actions``. Agents that were not seen at step ``begin`` begin where they were seen
-    last, or first.
+    Differentiable with respect to ``actions``. An agent that the log lacks at ``begin`` starts where it was last seen,
+    or first.
 
     Args:
         bank: The scenarios.
