@@ -88,7 +88,7 @@ class Cloning:
         """Return the mean loss of expert actions where ``mask`` holds, and values to log."""
         error = policy.mode() - action
         squared = self.loss == "mse"
-        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.choice_of(action))
+        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.raw_action(action))
         share = 1.0 / jnp.maximum(mask.sum(dtype=jnp.float32), 1.0)
         mean = jnp.sum(loss * mask) * share
         logs = {

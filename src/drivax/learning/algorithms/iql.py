@@ -87,7 +87,7 @@ class Iql(Offline[IqlConfig]):
         policy = self.distribution(trained["policy"], observation)
         error = policy.mode() - expert
         squared = config.loss == "mse"
-        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.choice_of(expert))
+        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.raw_action(expert))
         imitation = jnp.mean(weights * loss)
         return value_loss + critic_loss + imitation, {
             "value": value_loss,
