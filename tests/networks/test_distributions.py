@@ -183,7 +183,9 @@ def test_policy_gradients_are_finite_at_saturation(kind):
         raw_action = one.raw_action(jnp.broadcast_to(bounds, (3, 3, 2)))
         far = raw_action + (9.0 if kind in ("gaussian", "mixture") else 0.0)
         mine = one.sample(key)
-        surrogate = one.log_prob(raw_action) + one.log_prob(far) + one.log_prob(mine) + one.entropy_estimate(key)
+        surrogate = (
+            one.log_prob(raw_action) + one.log_prob(far) + one.log_prob(mine) + one.entropy_estimate(key)
+        )
         return jnp.sum(surrogate) + jnp.sum(one.mean_action() + one.mode() + one.action(mine))
 
     value, gradient = quick(jax.value_and_grad(of), raw, jax.random.key(0))

@@ -1,9 +1,8 @@
 """Action distributions.
 
-A policy samples and stores *raw actions*, which map to actions in [-1, 1]. The raw action of a Gaussian, or of a mixture
-of them, is the unsquashed sample, so that a saturated action keeps a finite log-probability; the Beta's lies in (0, 1);
-the grid's is the index of a combination of levels. Log-densities are those of the action, except for the grid's
-log-probabilities, so that entropies can be compared.
+A policy samples and stores *raw actions*, which map to actions in [-1, 1]. The raw action of a Gaussian or of a mixture
+is the unsquashed sample, so that a saturated action keeps a finite log-probability; the Beta's lies in (0, 1); the
+grid's is the index of a combination of levels. Densities are those of the action, so that entropies can be compared.
 """
 
 from __future__ import annotations

@@ -18,8 +18,7 @@ from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBat
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.networks.distributions import Distribution
-from drivax.rl.offline import conservative_penalty, penalty_weight_loss, scaled_policy_loss
-from drivax.rl.online import td_target
+from drivax.rl.equations import conservative_penalty, penalty_weight_loss, scaled_policy_loss, td_target
 
 #: Largest logarithm of the Lagrange multiplier.
 _LARGEST_WEIGHT = math.log(1e6)

@@ -18,7 +18,7 @@ from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBat
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Value
-from drivax.rl.offline import advantage_weights, expectile_loss
+from drivax.rl.equations import advantage_weights, expectile_loss
 
 
 @dataclass(frozen=True)

@@ -32,13 +32,13 @@ from drivax.learning.program import divided
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Critic, NetworkConfig
 from drivax.networks.distributions import REPARAMETRISED, Actions
-from drivax.networks.normalised import (
+from drivax.networks.encoders import (
     NormalisedConfig,
     Statistics,
     feature_statistics,
     set_statistics,
 )
-from drivax.rl.online import polyak, td_target
+from drivax.rl.equations import polyak, td_target
 from drivax.scenario.record import record
 
 #: Held-out steps that the mean Q is taken over and steps that feature statistics are taken of; and at a time.

@@ -31,7 +31,7 @@ from drivax.learning.environment import (
 from drivax.learning.replay import Replay, ReplayBuffer, ReplayConfig, ReplayIndex, Transitions
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import REPARAMETRISED
-from drivax.rl.online import soft_value
+from drivax.rl.equations import soft_value
 from drivax.scenario.record import record
 
 

@@ -16,7 +16,7 @@ from drivax.learning.algorithms.off_policy import Trained
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
-from drivax.rl.offline import scaled_policy_loss, smoothed_action
+from drivax.rl.equations import scaled_policy_loss, smoothed_action
 
 
 @dataclass(frozen=True)
