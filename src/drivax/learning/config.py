@@ -25,8 +25,7 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.actions import DirectState
 from drivax.tasks.task import Task
-from drivax.tracking.run_folder import RunFolder
-from drivax.tracking.zoo import is_policy, policy_folder, zoo
+from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, zoo
 
 #: Built-in algorithms by ``kind``, or a configuration of your own.
 Algorithm = (

@@ -19,8 +19,7 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
-from drivax.tracking.run_folder import RunFolder, seed_folders, trained_on
-from drivax.tracking.zoo import policy_folder
+from drivax.tracking.run_folder import RunFolder, policy_folder, seed_folders, trained_on
 
 #: What an exported policy has instead of checkpoints.
 POLICY_FILE = "policy.npz"

@@ -175,13 +175,7 @@ def split_bootstrap(
 
 
 def paired_bootstrap(
-    a: Any,
-    b: Any,
-    clusters: Any = None,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    *,
-    seed: int,
+    a: Any, b: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES, *, seed: int
 ) -> Interval:
     """Percentile bootstrap interval of ``mean(a - b)`` over the pairs where both are defined.
 
@@ -191,12 +185,7 @@ def paired_bootstrap(
 
 
 def interquartile_bootstrap(
-    values: Any,
-    clusters: Any = None,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    *,
-    seed: int,
+    values: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES, *, seed: int
 ) -> Interval:
     """Percentile bootstrap interval of the interquartile mean over training seeds of their mean episode.
 

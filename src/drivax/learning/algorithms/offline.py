@@ -32,12 +32,7 @@ from drivax.learning.program import divided
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Critic, NetworkConfig
 from drivax.networks.distributions import REPARAMETRISED, Actions
-from drivax.networks.encoders import (
-    NormalisedConfig,
-    Statistics,
-    feature_statistics,
-    set_statistics,
-)
+from drivax.networks.encoders import NormalisedConfig, Statistics, feature_statistics, set_statistics
 from drivax.rl.equations import polyak, td_target
 from drivax.scenario.record import record
 
