@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from drivax.errors import DataError, UsageError
-from drivax.learning.algorithm import Agent, HeldOutMetrics, Learner, LearnerState, training_data
+from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.experience import WeightedSet
@@ -28,24 +28,29 @@ from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import RunFolder, run_and_step, seed_folders, trained_on
 
+#: Problem and option, where inputs of a resumed run differ.
+_RESUMED_WITH_OTHER = {
+    "validation": ("was validated on other scenarios", "--validation"),
+    "weights": ("was trained with other weights", "weights"),
+    "data": ("was trained on other scenarios", "--data"),
+}
+
 
 def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
     """Return the :class:`Agent` that ``drivax train`` trains, in parts for a training loop of your own.
 
     Args:
         config: Task, algorithm, traffic and starts.
-        bank: Scenarios to train on, prepared for reactive traffic (``simulator.traffic.bank_data.prepare_bank``); only
-            shapes are read.
+        bank: Scenarios to train on, prepared by ``simulator.traffic.bank_data.prepare_bank``; only shapes are read.
 
     Raises:
         UsageError: The algorithm does not interact with an environment (bc, cql, iql, td3_bc).
     """
-    learner = _learner(config, config.environment(find_traffic(config.traffic)), bank)
+    environment = config.environment(find_traffic(config.traffic))
+    learner = config.algorithm.build(environment, bank, config.iterations)
     if not isinstance(learner, Agent):
-        raise UsageError(
-            f"{type(config.algorithm).__name__} has no parts for a loop of your own",
-            cure="use ppo or sac, or drivax.train",
-        )
+        problem = f"{type(config.algorithm).__name__} has no parts for a loop of your own"
+        raise UsageError(problem, cure="use ppo or sac, or drivax.train")
     return learner
 
 
@@ -70,8 +75,8 @@ def train(
         validation: Scenarios that rank checkpoints.
         resume: Continue the run in ``out`` from its newest checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder.
-        seeds: Number of seeds to train in one program, from ``config.seed`` on; several have a run folder each inside
-            ``out``: ``seed-0``, ``seed-1``, ...
+        seeds: Number of seeds to train in one program, from ``config.seed`` on; several have run folders
+            ``out/seed-0``, ``out/seed-1``, ...
         log: Called with lines about memory, pretrained networks, and seeds that stop early.
 
     Raises:
@@ -87,10 +92,15 @@ def train(
         config, folders = _resumed_folders(data, validation, weights, out, seeds)
     else:
         RunFolder.check(out, overwrite, "training")
-        config = with_step(config)
-    _check(config, validation, seeds)
+        if config.begin_from is not None:
+            # With its step, so that resuming finds the same checkpoint.
+            config = replace(config, begin_from=str(Pretrained.of(config.begin_from)))
+    if config.patience and validation is None:
+        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+    if seeds < 1:
+        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
     environment, bank = _environment(config, data)
-    learner = _learner(config, environment, bank)
+    learner = config.algorithm.build(environment, bank, config.iterations)
     held_out = None if validation is None else Validation.of(validation)
     held_out_data = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
     numbers = tuple(config.seed + number for number in range(len(folders) or seeds))
@@ -110,11 +120,7 @@ def train(
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
-    """Return which logged steps ``[N, T]`` an offline training draws from, for weights to be normalised over.
-
-    Raises:
-        UsageError: The algorithm does not learn from logged steps.
-    """
+    """Return which logged steps ``[N, T]`` an offline training draws from; UsageError for other algorithms."""
     environment, bank = _environment(config, data)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
     return np.asarray(experience.usable)
@@ -143,18 +149,6 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
         if count > 0:
             row[name] = value / count
     return row
-
-
-def _check(config: TrainConfig, validation: ScenarioSet | None, seeds: int) -> None:
-    """Raise UsageError for impossible settings before any work is done."""
-    if config.patience and validation is None:
-        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
-    if seeds < 1:
-        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
-
-
-def _learner(config: TrainConfig, environment: Driving, bank: ScenarioBank) -> Learner:
-    return config.algorithm.build(environment, bank, config.iterations)
 
 
 def _environment(config: TrainConfig, data: ScenarioSet) -> tuple[Driving, ScenarioBank]:
@@ -188,20 +182,14 @@ def _create_folders(
 def _resumed_folders(
     data: ScenarioSet, validation: ScenarioSet | None, weights: np.ndarray | None, out: Path, seeds: int
 ) -> tuple[TrainConfig, list[RunFolder]]:
-    """Return the configuration of a run, and the folder of each of its seeds.
-
-    Raises:
-        UsageError: Training scenarios, validation scenarios, weights or the number of seeds differ.
-    """
-    folder, now = RunFolder.open(out), hashes(validation, weights)
-    if folder.info.get("validation") != now["validation"]:
-        raise UsageError(
-            "was validated on other scenarios", file=out, cure="resume with the same --validation"
-        )
-    if folder.info.get("weights") != now["weights"]:
-        raise UsageError("was trained with other weights", file=out, cure="resume with the same weights")
-    if [entry.get("hash") for entry in folder.info.get("data", [])] != [data.hash]:
-        raise UsageError("was trained on other scenarios", file=out, cure="resume with the same --data")
+    """Return the configuration of a run, and the folder of each of its seeds; UsageError if inputs differ."""
+    folder = RunFolder.open(out)
+    before = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
+    before |= {name: folder.info.get(name) for name in ("validation", "weights")}
+    for name, now in {**hashes(validation, weights), "data": [data.hash]}.items():
+        if before[name] != now:
+            problem, option = _RESUMED_WITH_OTHER[name]
+            raise UsageError(problem, file=out, cure=f"resume with the same {option}")
     folders = [RunFolder.open(path) for path in seed_folders(out)]
     if seeds not in (1, len(folders)):
         raise UsageError(f"holds {len(folders)} seeds, not {seeds}", file=out, cure="resume without --seeds")
@@ -234,24 +222,20 @@ def _learn(run: _Run) -> None:
             if all(log.stopped for log in run.logs):
                 break
             started = time.perf_counter()
-            state, raw = program.step(state)
-            values = jax.device_get(raw)
+            state, values = program.step(state)
+            values = jax.device_get(values)
             rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
             # Read once, so that every seed has a checkpoint of the same iteration.
             stops = stop.received and iteration < config.iterations
-            rows = [
-                mean_logs(program.seeds.member(values, number)) | {"steps_per_second": rate}
-                for number in range(len(run.logs))
-            ]
+            logged = (mean_logs(program.seeds.member(values, number)) for number in range(len(run.logs)))
+            rows = [row | {"steps_per_second": rate} for row in logged]
             _record(run, iteration, state, rows, stops)
             success = [row["rollout/success"] for row in rows if "rollout/success" in row]
             text = f"success {sum(success) / len(success):.2f}" if success else ""
             progress.update(run.steps(iteration), text)
             if stops:
-                raise Preempted(
-                    f"SIGTERM stopped the training after {run.steps(iteration):,} steps",
-                    cure="continue it with --resume",
-                )
+                problem = f"SIGTERM stopped the training after {run.steps(iteration):,} steps"
+                raise Preempted(problem, cure="continue it with --resume")
 
 
 def _start(run: _Run) -> tuple[int, Any]:
@@ -295,10 +279,8 @@ def _record(
         if last or due or stops or iteration % config.checkpoint_every == 0:
             log.save(steps, run.program.seeds.member(state, number), rank)
         if log.stopped and not last:
-            run.log(
-                f"seed {run.program.seeds.seeds[number]}: no better for {config.patience} validations, "
-                f"stopped at {steps:,} steps"
-            )
+            seed, patience = run.program.seeds.seeds[number], config.patience
+            run.log(f"seed {seed}: no better for {patience} validations, stopped at {steps:,} steps")
 
 
 def _validation(run: _Run, validation: Validation, state: LearnerState, number: int) -> dict[str, float]:
@@ -316,13 +298,7 @@ def _validation(run: _Run, validation: Validation, state: LearnerState, number: 
 
 @dataclass(frozen=True)
 class Pretrained:
-    """A checkpoint of another run.
-
-    Attributes:
-        run: Run folder.
-        step: Step of the checkpoint.
-        data: Data sets that it was trained on, as in its ``run.json``.
-    """
+    """A checkpoint of another run, and the data sets that it was trained on, as in its ``run.json``."""
 
     run: Path
     step: int
@@ -332,21 +308,16 @@ class Pretrained:
     def of(cls, name: str) -> Pretrained:
         """Find the checkpoint ``RUN@STEP``, or of ``RUN`` the best, or the newest without a validation.
 
-        Raises:
-            UsageError: The folder holds several seeds, or an exported policy.
-            DataError: It is no training run, or has no checkpoint.
+        Raises UsageError if the folder holds several seeds or an exported policy, DataError if it is no training run or
+        has no checkpoint.
         """
         run, step = run_and_step(name)
         folder, _ = open_policy(run)
         if (folder.path / POLICY_FILE).is_file():
-            raise UsageError(
-                "is an exported policy, which cannot be fine-tuned", file=run, cure="name the training run"
-            )
-        checkpoints = Checkpoints(folder.checkpoints)
+            problem = "is an exported policy, which cannot be fine-tuned"
+            raise UsageError(problem, file=run, cure="name the training run")
         if step is None:
-            step = checkpoints.best()
-        if step is None:
-            step = max(checkpoints.steps(), default=None)
+            step = Checkpoints(folder.checkpoints).best_or_newest()
         if step is None:
             raise DataError("has no checkpoint", file=run, cure="name a run that wrote one")
         return cls(Path(run), step, trained_on(folder.info))
@@ -361,10 +332,7 @@ class Pretrained:
     def networks(self, state: Any) -> dict[str, Any]:
         """Return the stored networks by the paths that they replace in a fresh state of one seed, or its shapes.
 
-        Networks that the checkpoint lacks are left out: a critic, where the other run only imitated.
-
-        Raises:
-            DataError: The first array that does not fit.
+        Networks that the checkpoint lacks are left out. Raises DataError for the first array that does not fit.
         """
         checkpoints = Checkpoints(self.run / "checkpoints")
         stored = [leaf["name"] for leaf in checkpoints.about(self.step)["leaves"]]
@@ -376,23 +344,8 @@ class Pretrained:
         return {path: restored[source] for path, source in sources.items()}
 
 
-def with_step(config: TrainConfig) -> TrainConfig:
-    """Return the configuration with the step of its pretrained run, so that resuming finds the same checkpoint.
-
-    Raises:
-        UsageError, DataError: As :meth:`Pretrained.of`.
-    """
-    if config.begin_from is None:
-        return config
-    return replace(config, begin_from=str(Pretrained.of(config.begin_from)))
-
-
 def pretrained_networks(name: str | None, program: Program, log: Callable[[str], None]) -> dict[str, Any]:
-    """Return the networks of the run ``RUN`` or ``RUN@STEP`` by their paths in the state, and log them; none for None.
-
-    Raises:
-        UsageError, DataError: As :meth:`Pretrained.of` and :meth:`Pretrained.networks`.
-    """
+    """Return the networks of the run ``RUN`` or ``RUN@STEP`` by their paths in the state, and log them."""
     if name is None:
         return {}
     run = Pretrained.of(name)

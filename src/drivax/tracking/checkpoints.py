@@ -54,6 +54,11 @@ class Checkpoints:
         known = [(tuple(np.atleast_1d(score)), step) for score, step in scores if score is not None]
         return max(known)[1] if known else None
 
+    def best_or_newest(self) -> int | None:
+        """Return the best step, or the newest without scores; None if there is no checkpoint."""
+        best = self.best()
+        return max(self.steps(), default=None) if best is None else best
+
     def about(self, step: int) -> dict[str, Any]:
         """Return step, score and leaves of a checkpoint; raises DataError if it is missing or damaged."""
         file = self._path(step) / ABOUT
