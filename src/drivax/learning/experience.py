@@ -10,6 +10,7 @@ others by a twentieth, 32 bits by a five-thousandth, and no step of weight zero 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax

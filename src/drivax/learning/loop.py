@@ -39,12 +39,8 @@ _RESUMED_WITH_OTHER = {
 def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
     """Return the :class:`Agent` that ``drivax train`` trains, in parts for a training loop of your own.
 
-    Args:
-        config: Task, algorithm, traffic and starts.
-        bank: Scenarios to train on, prepared by ``simulator.traffic.bank_data.prepare_bank``; only shapes are read.
-
-    Raises:
-        UsageError: The algorithm does not interact with an environment (bc, cql, iql, td3_bc).
+    Only shapes of the bank are read, which ``simulator.traffic.bank_data.prepare_bank`` prepares. Raises UsageError if
+    the algorithm does not interact with an environment (bc, cql, iql, td3_bc).
     """
     environment = config.environment(find_traffic(config.traffic))
     learner = config.algorithm.build(environment, bank, config.iterations)
@@ -86,10 +82,10 @@ def train(
         Preempted: SIGTERM stopped it, after a checkpoint.
     """
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
-    out = Path(out)
+    out, notes = Path(out), hashes(validation, weights)
     folders: list[RunFolder] = []
     if resume:
-        config, folders = _resumed_folders(data, validation, weights, out, seeds)
+        config, folders = _resumed_folders(data, notes, out, seeds)
     else:
         RunFolder.check(out, overwrite, "training")
         if config.begin_from is not None:
@@ -111,7 +107,7 @@ def train(
     log(memory.text())
     # Before any folder is made: they may not fit.
     networks = None if resume else pretrained_networks(config.begin_from, program, log)
-    folders = folders or _create_folders(config, data, validation, weights, out, numbers, overwrite)
+    folders = folders or _create_folders(config, data, notes, out, numbers, overwrite)
     with contextlib.ExitStack() as stack:
         rules = (config.checkpoint_rule, config.keep, config.patience)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
@@ -160,33 +156,29 @@ def _environment(config: TrainConfig, data: ScenarioSet) -> tuple[Driving, Scena
 def _create_folders(
     config: TrainConfig,
     data: ScenarioSet,
-    validation: ScenarioSet | None,
-    weights: np.ndarray | None,
+    notes: dict[str, Any],
     out: Path,
     seeds: tuple[int, ...],
     overwrite: bool,
 ) -> list[RunFolder]:
     """Create the run folder of each seed: ``out``, or for several ``out/seed-<seed>``."""
-    notes: dict[str, Any] = hashes(validation, weights)
     if config.begin_from is not None:
-        notes["networks_from"] = Pretrained.of(config.begin_from).notes()
+        notes = {**notes, "networks_from": Pretrained.of(config.begin_from).notes()}
     if len(seeds) == 1:
         return [RunFolder.create(out, config, [data], overwrite, kind="training", **notes)]
     RunFolder.create(out, config, [data], overwrite, kind="seeds", seeds=len(seeds), **notes)
-    return [
-        RunFolder.create(out / f"seed-{seed}", replace(config, seed=seed), [data], kind="training", **notes)
-        for seed in seeds
-    ]
+    configs = {out / f"seed-{seed}": replace(config, seed=seed) for seed in seeds}
+    return [RunFolder.create(path, own, [data], kind="training", **notes) for path, own in configs.items()]
 
 
 def _resumed_folders(
-    data: ScenarioSet, validation: ScenarioSet | None, weights: np.ndarray | None, out: Path, seeds: int
+    data: ScenarioSet, notes: Mapping[str, Any], out: Path, seeds: int
 ) -> tuple[TrainConfig, list[RunFolder]]:
     """Return the configuration of a run, and the folder of each of its seeds; UsageError if inputs differ."""
     folder = RunFolder.open(out)
     before = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
     before |= {name: folder.info.get(name) for name in ("validation", "weights")}
-    for name, now in {**hashes(validation, weights), "data": [data.hash]}.items():
+    for name, now in {**notes, "data": [data.hash]}.items():
         if before[name] != now:
             problem, option = _RESUMED_WITH_OTHER[name]
             raise UsageError(problem, file=out, cure=f"resume with the same {option}")
@@ -399,4 +391,4 @@ def _source(path: str, stored: Iterable[str]) -> str | None:
     for source in (name, f".learner{name}"):
         if any(is_part(leaf, [source]) for leaf in stored):
             return source
-    return name if name == _PARAMETERS else None
+    return name if name == ".parameters" else None

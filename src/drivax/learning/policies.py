@@ -34,9 +34,7 @@ def open_policy(run: str | Path) -> tuple[RunFolder, TrainConfig]:
 
     ``run`` is a run folder of ``drivax train``, a folder of :func:`export_policy`, or ``zoo:NAME``.
 
-    Raises:
-        UsageError: The folder holds several seeds, or the zoo has no such policy.
-        DataError: The folder is no training run.
+    Raises UsageError if the folder holds several seeds or the zoo has no such policy, DataError if it is no run.
     """
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":

@@ -50,13 +50,9 @@ class Validation:
 
 
 def validate(planner: Planner, validation: Validation, task: Task, traffic: Traffic) -> dict[str, float]:
-    """Evaluate a planner in closed loop on held-out scenarios.
+    """Evaluate a planner in closed loop on held-out scenarios; DrivaxError if actions are not finite.
 
-    Returns:
-        ``validation/<metric>``: means over the scenarios that define it.
-
-    Raises:
-        DrivaxError: Actions are not finite, because learning has diverged.
+    Returns ``validation/<metric>``: means over the scenarios that define it.
     """
     results = evaluate(planner, validation.bank, validation.names, task=task, traffic=traffic)
     if results.crashes:

@@ -279,16 +279,10 @@ def parameters_of(kind: DistributionName, actions: Actions) -> int:
 def first_parameters(
     kind: DistributionName, actions: Actions, scale: float
 ) -> Float[np.ndarray, " parameters"]:
-    """Return the parameters of a distribution centred at zero.
+    """Return the parameters of a distribution centred at zero; UsageError if a Beta would have no peak.
 
-    Args:
-        kind: Kind of distribution.
-        actions: Actions that it is over.
-        scale: Standard deviation of the unsquashed Gaussian, of the Beta's action, or of the Gaussian whose density
-            weights the grid's levels; in a mixture, of each part, with means between ``-scale`` and ``scale``.
-
-    Raises:
-        UsageError: The scale is too large for a Beta with a peak.
+    ``scale`` is the standard deviation of the unsquashed Gaussian, of the Beta's action, or of the Gaussian whose
+    density weights the grid's levels; in a mixture, of each part, with means between ``-scale`` and ``scale``.
     """
     if kind == "grid":
         return (-0.5 * (combinations(_levels(actions)) / scale) ** 2).sum(axis=-1)

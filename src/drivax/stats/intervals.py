@@ -101,14 +101,9 @@ def rate(values: Any, clusters: Any = None, confidence: float = 0.95) -> Interva
 
 
 def bootstrap_mean(
-    values: Any,
-    clusters: Any = None,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    *,
-    strata: Any = None,
-    seed: int,
-) -> Interval:
+    values: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES,
+    *, strata: Any = None, seed: int,
+) -> Interval:  # fmt: skip
     """Percentile bootstrap interval of a mean, resampling whole clusters, within strata where these are given.
 
     Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3; clusters: Davison and Hinkley,
@@ -133,15 +128,9 @@ def bootstrap_mean(
 
 
 def split_bootstrap(
-    values: Any,
-    first: Bool[np.ndarray, " n"],
-    clusters: Any = None,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    *,
-    strata: Any = None,
-    seed: int,
-) -> Interval:
+    values: Any, first: Bool[np.ndarray, " n"], clusters: Any = None, confidence: float = 0.95,
+    resamples: int = RESAMPLES, *, strata: Any = None, seed: int,
+) -> Interval:  # fmt: skip
     """Percentile bootstrap interval of the difference of the means of two arms that share no cluster, first - second.
 
     Each arm is resampled separately, as :func:`bootstrap_mean` does (Efron and Tibshirani 1993, section 8.3). ``first``

@@ -1,4 +1,7 @@
-"""Ranking quality of scores: AUC, precision at the base rate, and rank correlation."""
+"""Ranking quality of scores: AUC, precision at the base rate, and rank correlation.
+
+Functions of labels (true for positives) raise UsageError without positives or negatives.
+"""
 
 from __future__ import annotations
 
@@ -16,19 +19,14 @@ Labels = Bool[np.ndarray[Any, Any], " n"]
 
 
 def roc_auc(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Return the probability that a positive scores above a negative; a tie counts half (Hanley and McNeil, 1982).
-
-    Raises:
-        UsageError: There are no positives, or no negatives.
-    """
+    """Return the probability that a positive scores above a negative; a tie counts half (Hanley and McNeil, 1982)."""
     return _auc(*_masses(_ranks(scores, labels), labels, weights))
 
 
 def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> tuple[float, float]:
     """Return the interval of :func:`roc_auc` by DeLong, DeLong and Clarke-Pearson (Biometrics 44, 1988), within [0, 1].
 
-    Raises:
-        UsageError: There are fewer than two positives or negatives.
+    Raises UsageError for fewer than two positives or negatives.
     """
     positive, negative = scores[labels], scores[~labels]
     if min(len(positive), len(negative)) < 2:
@@ -46,9 +44,6 @@ def precision_at_base_rate(scores: Numbers, labels: Labels, weights: Numbers | N
     """Return the share of positives among as many of the highest scores; of equal ones at the edge a share is taken.
 
     1 for a perfect ranking, the base rate for a random one.
-
-    Raises:
-        UsageError: There are no positives, or no negatives.
     """
     return _precision(*_masses(_ranks(scores, labels), labels, weights))
 
@@ -61,9 +56,6 @@ def bootstrap_intervals(
 
     Whole clusters are drawn with replacement (Davison and Hinkley, Bootstrap Methods, 1997, 3.8): those with
     a positive and those without are drawn separately, so that the base rate stays.
-
-    Raises:
-        UsageError: There are no positives, or no negatives.
     """
     rank, rng = _ranks(scores, labels), np.random.default_rng(0)
     number, cluster = np.unique(clusters, return_inverse=True)

@@ -190,11 +190,7 @@ def seeds_interval(
 
 
 def crossed_difference(a: Values, b: Others, clusters: Any = None, weights: Weights | None = None) -> Crossed:
-    """Return the difference of the means of two policies.
-
-    Raises:
-        UsageError: There are fewer than two seeds of a policy, or clusters.
-    """
+    """Return the difference of the means of two policies; UsageError for fewer than two seeds of one, or clusters."""
     if a.shape[1] != b.shape[1]:
         raise UsageError("seeds have different scenarios", cure="give one value per seed and scenario")
     labels = dense(clusters, a.shape[1], "cluster")

@@ -133,21 +133,14 @@ def _mean_and_error(
 
 
 def split_permutation(
-    values: Any,
-    first: Bool[np.ndarray, " n"],
-    clusters: Any = None,
-    strata: Any = None,
-    resamples: int = RESAMPLES,
-    *,
-    seed: int,
-) -> Evidence:
+    values: Any, first: Bool[np.ndarray, " n"], clusters: Any = None, strata: Any = None,
+    resamples: int = RESAMPLES, *, seed: int,
+) -> Evidence:  # fmt: skip
     """Permutation test of the means of two arms: whole clusters are reassigned, keeping their number in each arm.
 
     Under the null hypothesis every assignment is as likely as the observed one, and the test is exact (Fisher 1935;
     Good 2005, section 3.3); strata keep their numbers in each arm. ``first`` marks the scenarios of the first arm.
-
-    Raises:
-        UsageError: A cluster is in both arms or in two strata.
+    Raises UsageError if a cluster is in both arms or in two strata.
     """
     check_draws(0.95, resamples)
     keep = ~np.isnan(numbers(values))
@@ -178,8 +171,7 @@ def _between(
     mine: Bool[np.ndarray, "draw cluster"], sums: Totals, counts: Totals
 ) -> Float64[np.ndarray, " draw"]:
     """Return the difference of the means of two arms."""
-    weight = mine.astype(np.float64)
-    total, number = weight @ sums, weight @ counts
+    total, number = (mine.astype(np.float64) @ values for values in (sums, counts))
     return total / number - (sums.sum() - total) / (counts.sum() - number)
 
 

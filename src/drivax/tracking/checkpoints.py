@@ -74,12 +74,9 @@ class Checkpoints:
             raise DataError(f"is damaged ({error})", file=file, cure="use another checkpoint") from error
 
     def save(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
-        """Store a state, drop checkpoints that need not stay, and return the folder.
+        """Store a pytree of JAX or numpy arrays (typed keys too) and numbers, drop others, and return the folder.
 
-        Args:
-            step: Training step; an existing checkpoint of it is replaced.
-            state: Pytree of JAX or numpy arrays (typed keys too) and Python numbers.
-            score: Higher is better; of several numbers the first that differs decides. NaN counts as none.
+        Higher scores are better; of several numbers the first that differs decides. NaN counts as none.
         """
         arrays, leaves = _describe(state)
         score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
@@ -99,15 +96,10 @@ class Checkpoints:
                 self._remove(later)
 
     def restore(self, template: State, step: int | None = None, part: str = "") -> State:
-        """Return the stored state, or a part of it.
+        """Return the stored state, or a part of it, as ``.parameters``, given such a pytree or its shapes.
 
-        Args:
-            template: A state of the same structure, or its shapes.
-            step: Step of the checkpoint; None: the newest.
-            part: Path of the part of the state (``.parameters``) that ``template`` stands for.
-
-        Raises:
-            DataError: The checkpoint is missing, damaged, or does not fit the template; names the first leaf.
+        ``step`` None is the newest checkpoint. Raises DataError with the first leaf if the checkpoint is missing,
+        damaged, or does not fit the template.
         """
         return self.restore_parts({part: template}, step)[part]
 
@@ -167,11 +159,7 @@ def pack(file: Path, tree: Any) -> None:
 
 
 def unpack(file: Path, template: State) -> State:
-    """Return what :func:`pack` wrote, given a pytree of the same structure, or its shapes.
-
-    Raises:
-        DataError: It is damaged, or does not fit the template; names the first leaf.
-    """
+    """Return what :func:`pack` wrote, given a pytree of the same structure, or its shapes; errors as in restoring."""
     try:
         with zipfile.ZipFile(file) as archive:
             # Read to the end, which is when a zip compares its checksum.

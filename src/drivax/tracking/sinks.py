@@ -8,23 +8,10 @@ import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Self
 
 from drivax.errors import DataError
 from drivax.files import sync_and_close, write_text
-
-
-@runtime_checkable
-class Sink(Protocol):
-    """A destination of logged numbers."""
-
-    def write(self, step: int, values: Mapping[str, Any]) -> None:
-        """Write the numbers of one step."""
-        ...
-
-    def close(self) -> None:
-        """Flush everything to disk."""
-        ...
 
 
 class JsonLines:
@@ -84,7 +71,7 @@ class MetricLog:
         self, folder: str | Path, resume_step: int | None = None, tensorboard: bool | None = None
     ) -> None:
         folder = Path(folder)
-        self.sinks: list[Sink] = [JsonLines(folder / "metrics.jsonl", resume_step)]
+        self.sinks: list[JsonLines | TensorBoard] = [JsonLines(folder / "metrics.jsonl", resume_step)]
         if tensorboard is None:
             tensorboard = importlib.util.find_spec("tensorboardX") is not None
         if tensorboard:

@@ -184,7 +184,7 @@ class OfflineConfig:
 
 @record
 class OfflineState:
-    """Everything that a run needs to continue: the policy's parameters, all else that is trained, by name, and so on."""
+    """Everything that a run needs to continue; ``rest`` is all that is trained in addition to the policy, by name."""
 
     networks: ClassVar[tuple[str, ...]] = ("parameters", "rest", "target")
 
