@@ -269,7 +269,7 @@ def _record(
             row |= _validation(run, run.validation, state, number)
         rank = log.write(steps, row)
         if last or due or stops or iteration % config.checkpoint_every == 0:
-            log.save(steps, run.program.seeds.member(state, number), rank)
+            log.checkpoints.save(steps, run.program.seeds.member(state, number), rank)
         if log.stopped and not last:
             seed, patience = run.program.seeds.seeds[number], config.patience
             run.log(f"seed {seed}: no better for {patience} validations, stopped at {steps:,} steps")

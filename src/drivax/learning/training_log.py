@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -112,9 +112,7 @@ class StopSignal:
             self._previous = signal.signal(signal.SIGTERM, self._receive)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._previous is not None:
             signal.signal(signal.SIGTERM, self._previous)
 
@@ -172,15 +170,9 @@ class TrainingLog:
             self._ranks.append(values)
         return values
 
-    def save(self, step: int, state: Any, rank: tuple[float, ...] | None) -> None:
-        """Store a checkpoint."""
-        self.checkpoints.save(step, state, rank)
-
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._log is not None:
             self._log.close()

@@ -204,7 +204,7 @@ def _to_record_of_kind(value: dict[str, Any], records: dict[str, Any]) -> Any:
 
 
 def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
-    options = {"_cattrs_forbid_extra_keys": True, "_cattrs_detailed_validation": True}
+    options: dict[str, Any] = {"_cattrs_forbid_extra_keys": True, "_cattrs_detailed_validation": True}
     build = make_dict_structure_fn(cls, converter, **options)
 
     def hook(value: Any, _: Any) -> Any:
@@ -233,10 +233,11 @@ def _on_defaults(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     result = dict(given)
     hints = typing.get_type_hints(cls)
     for field in dataclasses.fields(cls):
-        missing = field.default_factory is dataclasses.MISSING
-        default = field.default if missing else field.default_factory()
-        section = _value(given.get(field.name))
-        if _is_record(type(default)) and isinstance(section, Mapping):
+        default = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        section = _value(given.get(field.name)) if _is_record(type(default)) else None
+        if isinstance(section, Mapping):
             result[field.name] = _completed(_plain(default, hints[field.name]), default, section)
     return result
 

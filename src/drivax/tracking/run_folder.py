@@ -164,12 +164,10 @@ def seed_folders(path: str | Path) -> list[Path]:
 
 
 def _kind(path: Path) -> str | None:
-    """Kind of the run in a folder; None where it cannot be read."""
-    try:
-        info = json.loads((path / RUN_FILE).read_bytes())
-    except (OSError, ValueError):
-        return None
-    return info.get("kind") if isinstance(info, dict) else None
+    """Return the kind of the run in a folder; None if it cannot be read."""
+    with contextlib.suppress(DataError, OSError):
+        return RunFolder.open(path).kind
+    return None
 
 
 def run_and_step(name: str) -> tuple[str, int | None]:
