@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.learning.environment import Environments, Outcome, in_any
-from drivax.learning.experience import ExpertSteps, StepIndex
+from drivax.learning.experience import ExpertActions, ExpertSteps, StepIndex
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import expert_action, logged_motion
@@ -123,10 +123,8 @@ class Driving:
         outcome = Outcome(result.reward, result.terminated, result.truncated, self.cache(data, state), totals)
         return Environments(state, over, self.observe_all(data, state.context)), outcome
 
-    def demonstrations(
-        self, data: ScenarioBank, key: Array, count: int
-    ) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
-        """Return observations, expert actions, and whether those were clipped, at random steps of the log.
+    def demonstrations(self, data: ScenarioBank, key: Array, count: int) -> ExpertActions:
+        """Return the expert's actions at random steps of the log.
 
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
@@ -141,11 +139,8 @@ class Driving:
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
         """Observe logged steps as in :meth:`demonstrations`."""
-
-        def observe(scenario: Array, step: Array) -> dict[str, Array]:
-            return dict(self._logged.observe(data, self._logged_context(data, scenario, step)))
-
-        return jax.vmap(observe)(*index)
+        contexts = partial(self._logged_context, data)
+        return jax.vmap(lambda *index: dict(self._logged.observe(data, contexts(*index))))(*index)
 
     def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
         """Return the log as a rollout of the expert from the current step on, with the simulator's rewards and ends.
@@ -168,10 +163,8 @@ class Driving:
         """The simulator with all agents as logged and without metrics."""
         return Simulator(replace(self.task, metrics="none"))
 
-    def _logged_context(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]
-    ) -> AgentContext:
-        """The context of a logged step as if the expert had driven there."""
+    def _logged_context(self, bank: ScenarioBank, index: Array, step: Array) -> AgentContext:
+        """Return the context of a logged step as if the expert had driven there."""
         context, before = (self._logged.context(bank, index, t) for t in (step, jnp.maximum(step - 1, 0)))
         return replace(context, action=self._expert_action(bank, before)[0])
 

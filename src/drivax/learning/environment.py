@@ -123,8 +123,9 @@ class SampledAction(NamedTuple):
     extra: dict[str, Array]
 
 
-#: From observations and a key to the fields of :class:`SampledAction`.
-Actor = Callable[[Mapping[str, Array], Array], tuple[Array, Array, dict[str, Array]]]
+#: The fields of :class:`SampledAction`; an actor samples them, given observations and a key.
+Sampled = tuple[Array, Array, dict[str, Array]]
+Actor = Callable[[Mapping[str, Array], Array], Sampled]
 #: What a rollout keeps: observations, or states that can be observed again.
 Store = Literal["state", "observation"]
 
@@ -132,7 +133,7 @@ Store = Literal["state", "observation"]
 def transition(
     environment: Environment,
     now: Environments,
-    sampled: tuple[Array, Array, dict[str, Array]],
+    sampled: Sampled,
     outcome: Outcome,
     keep: Store = "observation",
 ) -> Rollout:

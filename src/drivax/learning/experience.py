@@ -27,6 +27,8 @@ from drivax.stats.intervals import effective_size
 
 #: Scenarios and steps.
 StepIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
+#: Observations, expert actions within the bounds, and whether those were clipped.
+ExpertActions = tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]
 
 _LAST = 2**32 - 1
 
@@ -121,9 +123,8 @@ class Recorded(Environment, Protocol):
 def recorded(environment: Environment) -> Recorded:
     """Return the environment; raises UsageError if it has no expert episodes."""
     if not isinstance(environment, Recorded):
-        raise UsageError(
-            f"{type(environment).__name__} has no logged episodes", cure="implement `expert_steps`"
-        )
+        problem = f"{type(environment).__name__} has no logged episodes"
+        raise UsageError(problem, cure="implement `expert_steps`")
     return environment
 
 
@@ -186,10 +187,8 @@ def _expert_steps(environment: Recorded, data: Any) -> ExpertSteps:
     return environment.expert_steps(data)
 
 
-def expert_actions(
-    environment: Recorded, experience: Experience, index: StepIndex
-) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
-    """Return observations of logged steps, the expert's actions, and whether those were clipped."""
+def expert_actions(environment: Recorded, experience: Experience, index: StepIndex) -> ExpertActions:
+    """Return the expert's actions at logged steps."""
     expert = experience.expert
     observation = environment.observe_recorded(experience.data, index)
     return observation, expert.action[index], expert.clipped[index]

@@ -99,9 +99,9 @@ def train(
     learner = config.algorithm.build(environment, bank, config.iterations)
     held_out = None if validation is None else Validation.of(validation)
     held_out_data = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
-    numbers = tuple(config.seed + number for number in range(len(folders) or seeds))
+    numbers = range(config.seed, config.seed + (len(folders) or seeds))
     experience = training_data(config.algorithm, environment, bank, weights)
-    program = Program(Seeds(learner, numbers), experience, config.devices)
+    program = Program(Seeds(learner, tuple(numbers)), experience, config.devices)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.check()
     log(memory.text())
@@ -122,7 +122,7 @@ def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
     return np.asarray(experience.usable)
 
 
-def hashes(validation: ScenarioSet | None, weights: np.ndarray | None) -> dict[str, str | None]:
+def hashes(validation: ScenarioSet | None, weights: np.ndarray | None) -> dict[str, Any]:
     """Return hashes of the validation set and of the weights, for ``run.json``."""
     digest = None if weights is None else hashlib.sha256(np.asarray(weights, "<f8").tobytes()).hexdigest()
     return {"validation": None if validation is None else validation.hash, "weights": digest}
@@ -154,12 +154,7 @@ def _environment(config: TrainConfig, data: ScenarioSet) -> tuple[Driving, Scena
 
 
 def _create_folders(
-    config: TrainConfig,
-    data: ScenarioSet,
-    notes: dict[str, Any],
-    out: Path,
-    seeds: tuple[int, ...],
-    overwrite: bool,
+    config: TrainConfig, data: ScenarioSet, notes: dict[str, Any], out: Path, seeds: range, overwrite: bool
 ) -> list[RunFolder]:
     """Create the run folder of each seed: ``out``, or for several ``out/seed-<seed>``."""
     if config.begin_from is not None:

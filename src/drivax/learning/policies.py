@@ -49,14 +49,11 @@ def load_policy(
     """Load a trained policy as a planner, and the task that it was trained for.
 
     Args:
-        run: As for :func:`open_policy`, with its errors.
+        run: As for :func:`open_policy`, with its errors; DataError if the parameters are missing or damaged.
         bank: Any bank; only shapes of its observations are read.
         step: Step of the checkpoint, shown in the planner's name; None: the best, or the newest without a validation.
+            UsageError for a step of an exported policy.
         samples: Whether to sample actions instead of taking the mode.
-
-    Raises:
-        UsageError: A step of an exported policy is requested.
-        DataError: The parameters are missing or damaged.
     """
     folder, config = open_policy(run)
     learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)

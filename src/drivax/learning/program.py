@@ -136,16 +136,10 @@ class Program:
 
 
 def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | None = None) -> list[Any]:
-    """Return the devices of a run.
+    """Return the requested number of devices; None: all of this machine that work can be divided among.
 
-    Args:
-        requested: Number of devices; None: all of this machine that can be divided among.
-        seeds: Number of seeds.
-        state: Their state, or its shapes.
-        batch: Batch size of an algorithm that learns from data alone.
-
-    Raises:
-        UsageError: There are fewer devices, or nothing can be divided among them.
+    That is seeds, the environments of their state (or its shapes), or the batch of an algorithm that learns from data
+    alone. Raises UsageError if there are fewer devices, or nothing can be divided among them.
     """
     available = jax.local_devices()
     if requested is not None and not 1 <= requested <= len(available):
@@ -230,14 +224,9 @@ class MemoryAccount:
 def account(
     data: Any, validation: Any, state: Any, compiled: jax.stages.Compiled, devices: Sequence[Any]
 ) -> MemoryAccount:
-    """Return the memory of a run.
+    """Return the memory of a run: training data on every device, validation data on the first, state, and iteration.
 
-    Args:
-        data: Training data, whole on every device.
-        validation: Validation data, on the first device.
-        state: State of the learners, or its shapes with their sharding.
-        compiled: The compiled iteration.
-        devices: The devices.
+    ``state`` may be the shapes of the learners' state with their sharding.
     """
     sizes = {"scenarios": _bytes(data), "validation": _bytes(validation)} | dict.fromkeys(
         (*_FIELDS, _REST), 0

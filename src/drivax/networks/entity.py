@@ -71,14 +71,15 @@ class EntityEncoder(nnx.Module):
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch; float32."""
-        rows: dict[str, list[tuple[Array, Array]]] = {part: [] for part in self.order}
-        for name, part in self.parts.items():
-            rows[part].append(self._entities(groups, name))
-        means = {part: masked_mean(*concatenate_groups(rows[part])) for part in self.order}
+        rows = {}
+        for part in self.order:
+            names = [name for name, own in self.parts.items() if own == part]
+            rows[part] = concatenate_groups([self._entities(groups, name) for name in names])
+        means = {part: masked_mean(*rows[part]) for part in self.order}
         if "others" in means:
             query = sum((means[part] for part in ("ego", "goal") if part in means), jnp.zeros(()))
             query = jnp.broadcast_to(query, means["others"].shape)[..., None, :]
-            means["others"] = self.norm(self.attention(query, *concatenate_groups(rows["others"]))[..., 0, :])
+            means["others"] = self.norm(self.attention(query, *rows["others"])[..., 0, :])
         return jnp.concatenate([means[part] for part in self.order], axis=-1)
 
     def _entities(self, groups: Groups, name: str) -> tuple[Array, Array]:

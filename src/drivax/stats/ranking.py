@@ -5,7 +5,6 @@ Functions of labels (true for positives) raise UsageError without positives or n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -112,11 +111,7 @@ def rank_correlation(first: Numbers, second: Numbers) -> float:
 
 
 def correlation_interval(
-    first: Numbers,
-    second: Numbers,
-    clusters: Sequence[Any] | np.ndarray[Any, Any],
-    resamples: int = 200,
-    confidence: float = 0.95,
+    first: Numbers, second: Numbers, clusters: Any, resamples: int = 200, confidence: float = 0.95
 ) -> tuple[float, float]:
     """Return the interval of :func:`rank_correlation`, by percentiles of a bootstrap of whole clusters.
 

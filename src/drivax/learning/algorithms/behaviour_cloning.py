@@ -14,9 +14,17 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
+from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.optimisers import check_falling, clipped_adam
 from drivax.learning.environment import Environment
-from drivax.learning.experience import Experience, ExperienceConfig, draw, expert_actions, recorded
+from drivax.learning.experience import (
+    Experience,
+    ExperienceConfig,
+    ExpertActions,
+    draw,
+    expert_actions,
+    recorded,
+)  # fmt: skip
 from drivax.learning.program import divided
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
@@ -33,10 +41,8 @@ Carry = tuple[Any, Any]
 class Demonstrated(Environment, Protocol):
     """An environment whose data hold actions of an expert."""
 
-    def demonstrations(
-        self, data: Any, key: Array, count: int
-    ) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
-        """Return observations of random steps, expert actions within bounds, and whether those were clipped."""
+    def demonstrations(self, data: Any, key: Array, count: int) -> ExpertActions:
+        """Return the expert's actions at random steps."""
         ...
 
 
@@ -103,11 +109,7 @@ class Cloning:
         return mean, logs
 
     def run_updates(
-        self,
-        carry: Carry,
-        optimiser: optax.GradientTransformation,
-        loss: Callable[[Any, Array], tuple[Array, dict[str, Array]]],
-        key: Array,
+        self, carry: Carry, optimiser: optax.GradientTransformation, loss: AuxiliaryLoss, key: Array
     ) -> tuple[Carry, dict[str, Array]]:
         """Take the updates of one iteration, and return the means of what the loss logs."""
 

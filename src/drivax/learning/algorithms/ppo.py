@@ -173,13 +173,9 @@ class Ppo:
     def update(
         self, data: Any, state: PpoState, rollout: Rollout, auxiliary_loss: AuxiliaryLoss | None = None
     ) -> tuple[PpoState, dict[str, Array]]:
-        """Take the updates of one iteration.
+        """Take the updates of one iteration on a rollout of ``unroll`` steps; ``data`` is unused.
 
-        Args:
-            data: The environment's data, unused.
-            state: The state that the rollout was sampled with, with the environments after it.
-            rollout: ``unroll`` steps.
-            auxiliary_loss: An additional loss of the parameters.
+        The state is the one that the rollout was sampled with, with the environments after it.
         """
         config = self.config
         _, update_key, key = jax.random.split(state.key, 3)

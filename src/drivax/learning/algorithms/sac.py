@@ -206,10 +206,7 @@ class Sac(OffPolicy[SacConfig]):
     ) -> tuple[SacState, dict[str, Array]]:
         """Take the updates of one iteration on batches from the buffer; none before ``warm_up`` steps.
 
-        Args:
-            data: The environment's data.
-            state: The state, with the rollout of this iteration in ``replay``.
-            auxiliary_loss: An additional loss of the policy.
+        The state has the rollout of this iteration in ``replay``.
         """
         config = self.config
         _, draw_key, update_key, key = jax.random.split(state.key, 4)
