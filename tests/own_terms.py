@@ -138,8 +138,8 @@ class _Action:
     def sample(self, key):
         return self.loc + 0.3 * jax.random.normal(key, self.loc.shape)
 
-    def action(self, choice):
-        return jnp.tanh(choice)
+    def action(self, raw_action):
+        return jnp.tanh(raw_action)
 
     def mode(self):
         return self.action(self.loc)
@@ -167,8 +167,8 @@ class Reinforce:
         policy = nnx.merge(self.graph, state.parameters)
 
         def actor(seen, key):
-            choice = policy(seen).sample(key)
-            return choice, jnp.tanh(choice), {}
+            raw_action = policy(seen).sample(key)
+            return raw_action, jnp.tanh(raw_action), {}
 
         begun, rollout, sums = collect(
             self.environment, data, state.environments, actor, collecting, self.config.unroll

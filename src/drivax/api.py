@@ -34,8 +34,7 @@ from drivax.simulator.types import Traffic
 from drivax.synthetic.generate import Generation
 from drivax.synthetic.generate import generate as generate_set
 from drivax.tasks.task import Task
-from drivax.tracking.run_folder import run_and_step
-from drivax.tracking.zoo import is_policy, zoo
+from drivax.tracking.run_folder import is_policy, run_and_step, zoo
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from drivax.planners.planner_traffic import TrafficPolicy
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
-from drivax.tracking.run_folder import RunFolder
-from drivax.tracking.zoo import is_policy, policy_folder, zoo
+from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, zoo
 from scenes import bank_of, car, straight_road
 from tiny_run import TINY, write_run
 

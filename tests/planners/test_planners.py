@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 from drivax.networks.actor_critic import NetworkConfig, Policy
-from drivax.networks.encoders import MlpConfig, group_spec
+from drivax.networks.encoders import MlpConfig
 from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.network_planner import NetworkPlanner
 from drivax.planners.planner import Planner
@@ -101,7 +101,8 @@ def test_the_expert_knows_the_log_and_stays_where_it_ends(simulator):
 @pytest.mark.slow
 def test_a_network_acts_by_the_mode_or_by_a_sample(simulator):
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
-    spec = group_spec(jax.eval_shape(lambda b: simulator.observe(b, simulator.context(b, 0, 10)), bank))
+    observation = jax.eval_shape(lambda b: simulator.observe(b, simulator.context(b, 0, 10)), bank)
+    spec = {name: value.shape for name, value in observation.items()}
     policy = Policy(NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,)), spec, nnx.Rngs(3))
     graph, weights = nnx.split(policy)
     mode, sample = (act(NetworkPlanner(weights, graph, samples=s), simulator, bank) for s in (False, True))

@@ -25,7 +25,7 @@ from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.store import ScenarioSet
 from drivax.tasks.task import Task
-from drivax.tracking.zoo import zoo
+from drivax.tracking.run_folder import zoo
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -115,7 +115,7 @@ def _console() -> Console:
 
 def _check_flags(args: Inspect) -> None:
     from drivax.errors import UsageError
-    from drivax.tracking.zoo import is_policy
+    from drivax.tracking.run_folder import is_policy
 
     if args.observations and (len(args.sets) > 1 or args.html is not None):
         raise UsageError(
