@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.evaluation.split import assign, strata_of
+from drivax.evaluation.pairing import assign, strata_of
 
 CLUSTERS = [f"r{number // 2}" for number in range(120)]
 #: A third of the recordings is hard; of the easy ones every fourth has one hard scenario of two.

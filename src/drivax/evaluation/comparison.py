@@ -16,11 +16,24 @@ from jaxtyping import Bool, Float64
 
 from drivax import settings
 from drivax.errors import UsageError
-from drivax.evaluation.decision import Decision, MetricComparison, Sensitivity, decide, with_winner
 from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interval_of
-from drivax.evaluation.pairing import Pairs, check_metric, check_pairs, undefined_metric
-from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.split import Split, assign, strata_of
+from drivax.evaluation.pairing import (
+    Pairs,
+    Split,
+    assign,
+    check_metric,
+    check_pairs,
+    strata_of,
+    undefined_metric,
+)
+from drivax.evaluation.plan import (
+    ComparisonPlan,
+    Decision,
+    MetricComparison,
+    Sensitivity,
+    decide,
+    with_winner,
+)
 from drivax.stats.clusters import defined, design_effect
 from drivax.stats.effects import (
     ROUNDING,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from html import escape
 
 from drivax.evaluation.comparison import Comparison
-from drivax.evaluation.decision import MetricComparison
+from drivax.evaluation.plan import MetricComparison
 from drivax.evaluation.tables import MetricLabel, metric_label
 from drivax.table import MISSING, Cell, Column, Table, bounds, interval_cell, number, suffix
 
