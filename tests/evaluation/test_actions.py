@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivax.evaluation.actions import action_jerk, until_crash
+from drivax.evaluation.runner import action_jerk, until_crash
 
 
 def test_action_jerk_is_the_deviation_of_differences():

@@ -10,7 +10,7 @@ from drivax.api import load
 from drivax.datasets.formats import detect, find_files
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import BATCH, audit
-from drivax.evaluation.rollout import drive, episode_keys, judging
+from drivax.evaluation.rollout import drive, episode_keys, evaluation_task
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
 from drivax.scenario.build.assemble import assemble
@@ -49,7 +49,7 @@ def test_every_finding_is_one_that_filters_know(found):
 
 def offroad_steps(planner, bank):
     index = jnp.arange(len(bank))
-    simulator = Simulator(judging(Task()))
+    simulator = Simulator(evaluation_task(Task()))
     return np.asarray(drive(simulator, planner, bank, index, episode_keys(bank, index, 0)).offroad_steps)
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.evaluation.rollout import drive, judging
+from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import RandomActions
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -65,7 +65,7 @@ def test_neither_batch_size_nor_neighbours_matter(world):
 
 @pytest.mark.slow
 def test_neither_batch_size_nor_neighbours_matter_to_any_metric(world):
-    check_batches(Simulator(judging(Task())), world)
+    check_batches(Simulator(evaluation_task(Task())), world)
 
 
 @pytest.mark.slow

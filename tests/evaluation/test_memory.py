@@ -10,8 +10,8 @@ from drivax.evaluation.memory import (
     _group_limits,
     free_memory,
     memory_of,
+    report_out_of_memory,
     scenarios_at_a_time,
-    telling_out_of_memory,
 )
 
 
@@ -61,9 +61,9 @@ def test_too_little_memory_is_one_line_with_the_cure():
         raise MemoryError
 
     for wasteful in (lambda: greedy(1.0).block_until_ready(), starve):
-        with pytest.raises(DrivaxError) as raised, telling_out_of_memory(1200):
+        with pytest.raises(DrivaxError) as raised, report_out_of_memory(1200):
             wasteful()
         line = str(raised.value)
         assert line.startswith("out of memory with 1,200 scenarios loaded; load fewer") and "--batch" in line
-    with pytest.raises(ValueError, match="else"), telling_out_of_memory(1):
+    with pytest.raises(ValueError, match="else"), report_out_of_memory(1):
         raise ValueError("something else")

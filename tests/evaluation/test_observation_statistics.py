@@ -18,7 +18,7 @@ from drivax.evaluation.observation_statistics import (
     look_at,
     observation_statistics,
 )
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.planners.planner import Memoryless
 from drivax.planners.simple import Expert
 from drivax.scenario.record import record, static
@@ -76,7 +76,7 @@ def column(found, group, name):
 
 @pytest.mark.slow
 def test_episodes_are_looked_at_until_and_after_the_collision(bank):
-    looks = look_at(Simulator(judging(TASK)), Shy(), bank, every=10)
+    looks = look_at(Simulator(evaluation_task(TASK)), Shy(), bank, every=10)
     assert looks.state.context.step.tolist() == [[*range(10, 81, 10)]] * 3
     # 30 m less a car's length at 9 m/s: they touch after 2.8 s, at step 38.
     assert looks.hit.tolist() == [[step > 38 for step in range(10, 81, 10)], [False] * 8, [False] * 8]

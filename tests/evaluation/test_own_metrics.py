@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 
 from drivax.errors import UsageError
-from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
-from drivax.evaluation.runner import evaluate
+from drivax.evaluation.runner import EvaluationConfig, evaluate, run_evaluation
 from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import make_planner
 from drivax.report.pages.report import explanations

@@ -10,7 +10,7 @@ from shapely import affinity
 
 import drivax
 from drivax.cli import main
-from drivax.evaluation.traffic_trajectories import packed, unpacked
+from drivax.evaluation.rollout import packed, unpacked
 from drivax.report.episodes import EvaluatedSet, ranked, rollouts_of
 from drivax.report.pictures.drawing import with_traffic_of
 from drivax.report.runs import read_runs

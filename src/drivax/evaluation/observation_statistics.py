@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.errors import UsageError
-from drivax.evaluation.rollout import advanced, episode_keys, judging
+from drivax.evaluation.rollout import advanced, check_actions, episode_keys, evaluation_task
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
@@ -137,12 +136,9 @@ def observation_statistics(
     Raises:
         UsageError: The planner acts in another action space than the task.
     """
-    if getattr(planner, "actions", task.actions) != task.actions:
-        raise UsageError(
-            f"planner {planner.name} acts in another action space than the task", cure="use the task's"
-        )
+    check_actions(planner, task)
     traffic = traffic or LogTraffic()
-    simulator, bank = Simulator(judging(task), traffic), prepare_bank(traffic, bank)
+    simulator, bank = Simulator(evaluation_task(task), traffic), prepare_bank(traffic, bank)
     looks = look_at(simulator, planner, bank, every, seed)
     seen = {name: np.asarray(leaf) for name, leaf in looks.observation.items()}
     hit, collides = np.asarray(looks.hit), np.asarray(looks.collides)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from drivax.errors import DataError
 from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
 from drivax.evaluation.pairing import comparable
-from drivax.evaluation.traffic_trajectories import unpacked
+from drivax.evaluation.rollout import unpacked
 from drivax.report.charts.motion import COMMANDED
 from drivax.report.pictures.drawing import Rollout
 from drivax.scenario.schema import Scenario

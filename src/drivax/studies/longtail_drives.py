@@ -19,7 +19,7 @@ from drivax.curation.methods import Request, curate
 from drivax.curation.weights import WeightConfig
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.episode_table import EpisodeTable
-from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
+from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.learning.config import TrainConfig
 from drivax.learning.policies import load_policy
 from drivax.planners.catalogue import make_planner

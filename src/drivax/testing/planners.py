@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.planners.catalogue import make_planner
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -57,7 +57,7 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
         "give it name, replays, init and act (planners.planner.Planner)",
     )
     what = f"planner {planner.name!r}"
-    simulator, bank = Simulator(judging(task or Task())), worlds.worlds()
+    simulator, bank = Simulator(evaluation_task(task or Task())), worlds.worlds()
     _check_forms(what, simulator, planner, bank)
     index, step = (part.ravel() for part in np.meshgrid(np.arange(len(bank)), _STARTS, indexing="ij"))
     program = Program(what, _driven(simulator, planner), (None, 0, 0))
