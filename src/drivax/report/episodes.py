@@ -15,7 +15,7 @@ from drivax.errors import DataError
 from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
 from drivax.evaluation.pairing import comparable
 from drivax.evaluation.rollout import unpacked
-from drivax.report.charts.motion import COMMANDED
+from drivax.report.charts import COMMANDED
 from drivax.report.pictures.drawing import Rollout
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet

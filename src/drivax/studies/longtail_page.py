@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from drivax.curation.scores import ScoreTable
 from drivax.files import write_text
-from drivax.report.charts.distributions import histogram
+from drivax.report.charts import histogram
 from drivax.report.pages.page import page
 from drivax.studies.longtail_drives import FIRST
 from drivax.studies.longtail_results import METRICS, RELATED, UNRELATED

@@ -7,10 +7,16 @@ from html import escape
 from pathlib import Path
 
 from drivax.files import check_output, write_text
-from drivax.report.charts.curves import series_legend
-from drivax.report.charts.distributions import histogram, short
-from drivax.report.inspection import QUANTITIES, Inspection, speeds
-from drivax.report.inspection_tables import Counts, content_table, of_all, true_findings
+from drivax.report.charts import histogram, series_legend, short
+from drivax.report.inspection import (
+    QUANTITIES,
+    Counts,
+    Inspection,
+    content_table,
+    of_all,
+    speeds,
+    true_findings,
+)
 from drivax.report.pages.page import page
 from drivax.report.pictures.palette import stroke
 from drivax.scenario.select.selection import FINDINGS

@@ -9,7 +9,7 @@ from importlib import metadata, resources
 from string import Template
 from typing import Any
 
-from drivax.report.charts.motion import COMMANDS, SIGNALS
+from drivax.report.charts import COMMANDS, SIGNALS
 from drivax.report.pictures.drawing import EVENT_WORDS, GOAL_M, LIGHTS, STOP_M, WIDTHS
 from drivax.report.pictures.palette import LEGEND, STROKES, THEMES
 from drivax.table import Cell, Column, Table

@@ -12,7 +12,7 @@ import numpy as np
 from drivax.curation.scores import ScoreTable
 from drivax.errors import UsageError, did_you_mean
 from drivax.files import check_output, write_text
-from drivax.report.charts.curves import chart, series_legend
+from drivax.report.charts import chart, series_legend
 from drivax.report.episodes import logged_motion
 from drivax.report.pages.page import asset, page, player_data, player_html, player_scripts
 from drivax.report.pictures.drawing import Rollout

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from drivax.report.charts.motion import COMMANDED, COMMANDS, SIGNALS, Signal, signals
+from drivax.report.charts import COMMANDED, COMMANDS, SIGNALS, Signal, signals
 from drivax.report.pictures.drawing import (
     EVENT_WORDS,
     LAYERS,
