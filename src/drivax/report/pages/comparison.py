@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from html import escape
 from importlib import metadata
 from pathlib import Path
@@ -12,7 +13,7 @@ from drivax.evaluation.comparison import Comparison
 from drivax.evaluation.plan import MetricComparison
 from drivax.evaluation.tables import MetricLabel, metric_label
 from drivax.files import check_output, write_text
-from drivax.report.pages.page import facts_html, page
+from drivax.report.pages.page import facts_html, page, section
 from drivax.table import MISSING, Cell, Column, Table, bounds, interval_cell, number, suffix
 
 #: Size of the picture of a difference, pixels.
@@ -22,10 +23,8 @@ _WIDTH, _HEIGHT = 180, 34
 def comparison_text(comparison: Comparison) -> str:
     """Return a comparison as text of at most 100 columns, the recommendation last."""
     tables = comparison_tables(comparison)
-    lines = [
-        f"{arm}  {name}  ({folder})"
-        for arm, name, folder in zip("AB", comparison.names, comparison.folders, strict=True)
-    ]
+    arms = zip("AB", comparison.names, comparison.folders, strict=True)
+    lines = [f"{arm}  {name}  ({folder})" for arm, name, folder in arms]
     lines += [conditions(comparison), "", tables[0].text(*tables[1:]), ""]
     lines += [f"recommendation: {title(comparison)}", *(f"  {reason}" for reason in reasons(comparison))]
     return "\n".join([*lines, *(f"  ({note})" for note in notes(comparison))])
@@ -53,22 +52,16 @@ def _row(metric: MetricComparison) -> tuple[Cell, ...]:
     label = _label(metric)
     effects = ", ".join(f"{name} {value:.3f}" for name, value in metric.effects.items() if value is not None)
     value = metric.effects.get("d_z", metric.effects.get("d"))
-    a, b, difference = (
-        interval_cell(interval, label.unit, metric.metric, signed)
-        for interval, signed in ((metric.a, False), (metric.b, False), (metric.difference, True))
-    )
+    intervals = ((metric.a, False), (metric.b, False), (metric.difference, True))
+    means = (interval_cell(interval, label.unit, metric.metric, signed) for interval, signed in intervals)
     return (
-        Cell(label.heading, title=label.title or metric.metric), _short(a), _short(b), _short(difference),
+        Cell(label.heading, title=label.title or metric.metric),
+        *(replace(cell, note="", style="", title="") for cell in means),  # n has a column of its own
         Cell("", html=_picture(metric, label)),
         Cell(MISSING if value is None else f"{value:+.2f}".replace("-", "−"), title=effects),
         Cell(_p_text(metric.p_adjusted), note=_test_name(metric)), Cell(f"{metric.difference.n:,}"),
         Cell(metric.winner or MISSING),
     )  # fmt: skip
-
-
-def _short(cell: Cell) -> Cell:
-    """Return mean and interval of a cell; n has a column of its own."""
-    return Cell(cell.text, cell.bounds, interval=cell.interval, metric=cell.metric)
 
 
 def _picture(metric: MetricComparison, label: MetricLabel) -> str:
@@ -139,18 +132,16 @@ def title(comparison: Comparison) -> str:
 
 def reasons(comparison: Comparison) -> list[str]:
     """Return the reasons of the recommendation in full sentences."""
-    primary, decision = comparison.primary, comparison.decision
+    decision, n = comparison.decision, f"{comparison.primary.difference.n:,}"
     sentences = [_test_sentence(comparison)]
     if decision.because == "minimum":
         minimum = f"{comparison.plan.minimum_scenarios:,}"
-        sentences.insert(
-            0, f"{primary.difference.n:,} scenarios count, and the plan asks for at least {minimum}."
-        )
+        sentences.insert(0, f"{n} scenarios count, and the plan asks for at least {minimum}.")
     if decision.because == "seeds":
         sentences.append("Seeds differ so much that more scenarios do not help: more seeds are needed.")
     if decision.because == "equal":
         same = "the same for A and B in each" if comparison.plan.split == "paired" else "the same in all"
-        sentences = [f"{_label(primary).text} is {same} of {primary.difference.n:,} scenarios."]
+        sentences = [f"{_label(comparison.primary).text} is {same} of {n} scenarios."]
     sentences += _power_sentences(comparison)
     if decision.caveats:
         names = ", ".join(metric_label(name).text for name in decision.caveats)
@@ -170,7 +161,7 @@ def _test_sentence(comparison: Comparison) -> str:
     more = "higher" if metric.difference.mean > 0 else "lower"
     if metric.winner is None:
         return f"{label.text} is {size} {more} with A ({test}): it may be chance."
-    alone = "" if comparison.decision.because != "minimum" else f" The test alone favours {metric.winner}."
+    alone = f" The test alone favours {metric.winner}." if comparison.decision.because == "minimum" else ""
     return f"{label.text} is {size} {more} with A ({test}).{alone}"
 
 
@@ -186,10 +177,8 @@ def _power_sentences(comparison: Comparison) -> list[str]:
         power = f"{100 * comparison.plan.power:.0f} %"
         sentences.append(f"A difference of {least} would be detected in {power} of such comparisons.")
     if needed is not None:
-        smallest = number(sensitivity.smallest, unit) + suffix(unit, signed=True)
-        sentences.append(
-            f"{needed:,} scenarios are needed; the smallest difference that matters is {smallest}."
-        )
+        least = number(sensitivity.smallest, unit) + suffix(unit, signed=True)
+        sentences.append(f"{needed:,} scenarios are needed; the smallest difference that matters is {least}.")
     return sentences
 
 
@@ -247,38 +236,37 @@ def _metrics(comparison: Comparison) -> str:
     items = "".join(f"<li>{escape(note)}</li>" for note in notes(comparison))
     a, b = comparison.names
     tables = "".join(f"{table.html()}<br>" for table in comparison_tables(comparison, (f"A: {a}", f"B: {b}")))
-    share = f"{100 * comparison.plan.confidence:.0f} %"
-    kind = "d_z, the mean of the differences over their standard deviation"
-    kind = kind if effect_name(comparison) == "d_z" else "d, with the pooled standard deviation"
-    level = f"{1 - comparison.plan.confidence:.2g}"
-    return (
-        f"<section><h2>Metrics</h2>{tables}{f'<ul>{items}</ul>' if items else ''}<p><small>Mean and {share} "
-        "interval; whole recordings are resampled. n: scenarios where the metric is defined. Effect size: Cohen's "
-        f"{kind}. A planner is called better where the two-sided p-value is below {level}; p-values of secondary "
-        "metrics are adjusted for their number by Holm's method.</small></p></section>"
+    share, level = (f"{100 * comparison.plan.confidence:.0f} %", f"{1 - comparison.plan.confidence:.2g}")
+    kind = "d, with the pooled standard deviation"
+    if effect_name(comparison) == "d_z":
+        kind = "d_z, the mean of the differences over their standard deviation"
+    note = (
+        f"Mean and {share} interval; whole recordings are resampled. n: scenarios where the metric is defined. Effect "
+        f"size: Cohen's {kind}. A planner is called better where the two-sided p-value is below {level}; p-values of "
+        "secondary metrics are adjusted for their number by Holm's method."
     )
+    return section("Metrics", tables, f"<ul>{items}</ul>" if items else "", note=note)
 
 
 def _plan(comparison: Comparison) -> str:
     plan = comparison.plan
-    return (
-        "<section><h2>The rule</h2><p>Nothing is decided with fewer than "
-        f"{plan.minimum_scenarios:,} scenarios. A p-value below {1 - plan.confidence:.2g} gives the better planner. "
-        "Otherwise there is no difference if the smallest difference that matters would have been detected with a "
-        f"power of {100 * plan.power:.0f} %, and if not, there are not enough scenarios.</p>"
-        f"<details><summary>the plan</summary><pre>{escape(settings.dump(plan))}</pre></details></section>"
+    return section(
+        "The rule",
+        f"<p>Nothing is decided with fewer than {plan.minimum_scenarios:,} scenarios. A p-value below "
+        f"{1 - plan.confidence:.2g} gives the better planner. Otherwise there is no difference if the smallest "
+        f"difference that matters would have been detected with a power of {100 * plan.power:.0f} %, and if not, "
+        "there are not enough scenarios.</p>"
+        f"<details><summary>the plan</summary><pre>{escape(settings.dump(plan))}</pre></details>",
     )
 
 
 def _origin(comparison: Comparison) -> str:
-    rows = [
-        (f"{arm}: {name}", [str(folder)])
-        for arm, name, folder in zip("AB", comparison.names, comparison.folders, strict=True)
-    ]
+    arms = zip("AB", comparison.names, comparison.folders, strict=True)
+    rows = [(f"{arm}: {name}", [str(folder)]) for arm, name, folder in arms]
     numbers = escape(json.dumps(comparison.as_dict(), indent=1, ensure_ascii=False))
-    return (
-        f"<section><h2>How this was made</h2>{facts_html(['', ''], rows)}"
-        f"<details><summary>all numbers</summary><pre>{numbers}</pre></details>"
-        f"<p><small>drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of both runs."
-        "</small></p></section>"
+    return section(
+        "How this was made",
+        facts_html(["", ""], rows),
+        f"<details><summary>all numbers</summary><pre>{numbers}</pre></details>",
+        note=f"drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of both runs.",
     )

@@ -17,7 +17,7 @@ from drivax.report.inspection import (
     speeds,
     true_findings,
 )
-from drivax.report.pages.page import page
+from drivax.report.pages.page import definitions, page, section
 from drivax.report.pictures.palette import stroke
 from drivax.scenario.select.selection import FINDINGS
 
@@ -45,9 +45,9 @@ def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bo
         UsageError: ``out`` exists.
     """
     check_output(out, overwrite)
-    names = ", ".join(inspection.name for inspection in inspections)
     sections = [_overview(inspections), _quantities(inspections), _shares(inspections), _meaning(inspections)]
-    title = f"Scenario sets: {names}" if len(inspections) > 1 else f"Scenario set: {names}"
+    names = ", ".join(inspection.name for inspection in inspections)
+    title = f"Scenario set{'s' if len(inspections) > 1 else ''}: {names}"
     write_text(out, page(title, f"<p class=lead>{_lead(inspections)}</p>", sections, _STYLE))
     return out
 
@@ -62,19 +62,23 @@ def _lead(inspections: Sequence[Inspection]) -> str:
 
 
 def _overview(inspections: Sequence[Inspection]) -> str:
-    return (
-        f"<section><h2>In numbers</h2>{content_table(inspections).html()}<p><small>Numbers of a scenario are means "
-        "over the scenarios that have them, counted in the source before cropping and capping. Windows of one "
-        "recording may overlap; the duration counts each in full.</small></p></section>"
+    note = (
+        "Numbers of a scenario are means over the scenarios that have them, counted in the source before cropping and "
+        "capping. Windows of one recording may overlap; the duration counts each in full."
     )
+    return section("In numbers", content_table(inspections).html(), note=note)
 
 
 def _quantities(inspections: Sequence[Inspection]) -> str:
     names = [inspection.name for inspection in inspections]
-    series = []
-    for quantity in QUANTITIES:
-        values = [inspection.values(quantity.read) for inspection in inspections]
-        series.append((quantity.label, quantity.unit or "per scenario", values))
+    series = [
+        (
+            each.label,
+            each.unit or "per scenario",
+            [inspection.values(each.read) for inspection in inspections],
+        )
+        for each in QUANTITIES
+    ]
     sampled = [speeds(inspection) for inspection in inspections]
     series.append(("speed of ego", "m/s", [sample.ego for sample in sampled]))
     series.append(("speed of other vehicles now", "m/s", [sample.vehicles for sample in sampled]))
@@ -88,9 +92,8 @@ def _quantities(inspections: Sequence[Inspection]) -> str:
         for sample, inspection in zip(sampled, inspections, strict=True)
         if sample.scenarios < len(inspection)
     ]
-    note = f"<p><small>Speeds: {escape('; '.join(counts))}, evenly spread.</small></p>" if counts else ""
-    drawn = f"<div class=charts>{charts}</div>"
-    return f"<section><h2>Histograms</h2>{_legend(inspections)}{drawn}{note}</section>"
+    note = f"Speeds: {escape('; '.join(counts))}, evenly spread." if counts else ""
+    return section("Histograms", _legend(inspections), f"<div class=charts>{charts}</div>", note=note)
 
 
 def _legend(inspections: Sequence[Inspection]) -> str:
@@ -101,15 +104,14 @@ def _shares(inspections: Sequence[Inspection]) -> str:
     """Return shares of scenarios by tag, flag and finding of the audit."""
     tagged = [inspection.tags() for inspection in inspections]
     sizes = [len(inspection) for inspection in inspections]
-    groups: dict[str, Counts] = {}
-    for name in dict.fromkeys(name for tags in tagged for name in tags):
-        counts = of_all([tags.get(name, {}) for tags in tagged], sizes)
-        if len(counts) <= _MOST_VALUES:
-            groups[name] = counts
+    groups = {
+        name: of_all([tags.get(name, {}) for tags in tagged], sizes)
+        for name in dict.fromkeys(name for tags in tagged for name in tags)
+    }
     flags = [inspection.words(lambda entry: entry["flags"]) for inspection in inspections]
-    bars = [_bars(name, counts) for name, counts in groups.items()]
+    bars = [_bars(name, counts) for name, counts in groups.items() if len(counts) <= _MOST_VALUES]
     bars += [_bars("flags", of_all(flags, sizes)), _bars("audit", true_findings(inspections))]
-    return f"<section><h2>Tags, flags, audit</h2>{_legend(inspections)}<div class=bars>{''.join(bars)}</div></section>"
+    return section("Tags, flags, audit", _legend(inspections), f"<div class=bars>{''.join(bars)}</div>")
 
 
 def _bars(title: str, counts: Counts) -> str:
@@ -127,9 +129,5 @@ def _bars(title: str, counts: Counts) -> str:
 
 def _meaning(inspections: Sequence[Inspection]) -> str:
     names = dict.fromkeys(name for inspection in inspections for name in inspection.findings())
-    items = "".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(FINDINGS[name].meaning)}</dd></div>"
-        for name in names
-        if name in FINDINGS
-    )
-    return f"<section><h2>What the audit checks</h2><dl class=metrics>{items}</dl></section>" if items else ""
+    items = [(name, FINDINGS[name].meaning) for name in names if name in FINDINGS]
+    return section("What the audit checks", definitions(items)) if items else ""

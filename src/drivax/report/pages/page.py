@@ -36,22 +36,18 @@ _CONTROLS = """<div class=controls>
 
 
 def page(
-    title: str,
-    lead: str,
-    sections: Iterable[str],
-    style: str = "",
-    data: Iterable[str] = (),
+    title: str, lead: str, sections: Iterable[str], style: str = "", data: Iterable[str] = (),
     scripts: Iterable[str] = (),
-) -> str:
+) -> str:  # fmt: skip
     """Return a whole page.
 
     Args:
         title: Its heading, as plain text.
         lead: HTML below the heading.
         sections: HTML of its parts; empty ones are left out.
-        style: CSS in addition to that of all pages.
+        style: Further CSS.
         data: Script elements that hold data.
-        scripts: Programs, in order.
+        scripts: JavaScript, in order.
     """
     return Template(asset("report.html.template")).substitute(
         title=escape(title),
@@ -62,6 +58,14 @@ def page(
         data="\n".join(data),
         script="\n".join(scripts),
     )
+
+
+def section(title: str, *parts: str, note: str = "", attributes: str = "") -> str:
+    """Return a section with the HTML of its parts and small print below; empty where all parts are."""
+    if not any(parts):
+        return ""
+    small = f"<p><small>{note}</small></p>" if note else ""
+    return f"<section{attributes}><h2>{title}</h2>{''.join(parts)}{small}</section>"
 
 
 def data_element(value: Any, **attributes: str) -> str:
@@ -75,6 +79,12 @@ def facts_html(headings: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]
     """Return a table of texts: a label and the facts about it in each row."""
     columns = tuple(Column(heading, label=not place) for place, heading in enumerate(headings))
     return Table("facts", columns, tuple((Cell(label), *map(Cell, facts)) for label, facts in rows)).html()
+
+
+def definitions(items: Iterable[tuple[str, str]]) -> str:
+    """Return a list of terms with their explanations."""
+    rows = (f"<div><dt>{escape(term)}</dt><dd>{escape(text)}</dd></div>" for term, text in items)
+    return f"<dl class=metrics>{''.join(rows)}</dl>"
 
 
 def asset(name: str) -> str:

@@ -34,11 +34,13 @@ from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, outcome, 
 from drivax.report.pages.page import (
     asset,
     data_element,
+    definitions,
     facts_html,
     page,
     player_data,
     player_html,
     player_scripts,
+    section,
 )
 from drivax.report.pictures.player_data import pack_episode
 from drivax.report.runs import Training, read_runs
@@ -74,10 +76,7 @@ def write_report(
     if episodes < 0:
         raise UsageError(f"cannot show {episodes} episodes", cure="give 0 or more")
     evaluations, trainings = read_runs(runs)
-    packed: Packed = ()
-    tags: Tags = {}
-    if evaluations and episodes:
-        packed, tags = _from_set(evaluations, data, episodes)
+    packed, tags = _from_set(evaluations, data, episodes) if evaluations and episodes else ((), {})
     write_text(out, _page(evaluations, trainings, packed, tags))
     return out
 
@@ -105,9 +104,10 @@ def _page(runs: Sequence[EpisodeTable], trainings: Sequence[Training], packed: P
         data.append(episode_data(runs, tags, played))
         scripts += [*(player_scripts() if packed else ()), asset("episode_table.js")]
     if trainings:
-        sections.append(f"<section><h2>Learning curves</h2>{curve_sections(trainings)}</section>")
+        sections.append(section("Learning curves", curve_sections(trainings)))
     if runs:
-        sections.append(_meaning(runs))
+        meanings = explanations(ordered(metric_names(runs)), runs)
+        sections.append(section("What the metrics mean", meanings))
     sections.append(_origin([*runs, *trainings]))
     title = f"{runs[-1].name}: evaluation report" if runs else "training report"
     return page(title, _lead(runs), sections, data=data, scripts=scripts)
@@ -134,19 +134,16 @@ def _results(runs: Sequence[EpisodeTable]) -> str:
     names = metric_names(runs)
     first = _first(runs, names)
     rest = [name for name in ordered(names) if name not in first]
-    more = (
-        f"<details><summary>{len(rest)} more metrics</summary>{planners_table(runs, rest).html()}</details>"
-        if rest
-        else ""
-    )
     table = planners_table(runs, first).html() if first else ""
-    return (
-        f"<section><h2>Results</h2>{_warning(runs)}{table}{more}<p><small>Mean, {CONFIDENCE:.0%} interval, and n, the "
-        "number of episodes where the metric is defined; undefined episodes are left out. The best mean is "
-        "underlined, whether or not it is clearly best. Click a mean for its episodes. Intervals: Wilson's for rates "
-        "(with the effective number of episodes where some share a recording), a bootstrap over recordings "
-        "otherwise.</small></p></section>"
+    more = f"<summary>{len(rest)} more metrics</summary>{planners_table(runs, rest).html()}"
+    note = (
+        f"Mean, {CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; undefined "
+        "episodes are left out. The best mean is underlined, whether or not it is clearly best. Click a mean for its "
+        "episodes. Intervals: Wilson's for rates (with the effective number of episodes where some share a "
+        "recording), a bootstrap over recordings otherwise."
     )
+    more = f"<details>{more}</details>" if rest else ""
+    return section("Results", _warning(runs), table, more, note=note)
 
 
 def _first(runs: Sequence[EpisodeTable], names: Sequence[str]) -> list[str]:
@@ -175,14 +172,14 @@ def _differences(runs: Sequence[EpisodeTable]) -> str:
     names = _first(runs, list(policy.metrics)) or ordered(list(policy.metrics))
     if not others or not names:
         return ""
-    table = differences_table(policy, others, names).html()
-    return (
-        f"<section><h2>{escape(policy.name)} against the others</h2>{table}<p><small>Mean of the differences, scenario "
-        f"by scenario, over those where both are defined (n pairs), with a {CONFIDENCE:.0%} bootstrap interval over "
-        "recordings. “Better” and “worse”: the interval excludes zero; it is not widened for the number of "
-        "comparisons. “All equal”: no pair differs from the next, so that a bootstrap has no width."
-        "</small></p></section>"
+    note = (
+        "Mean of the differences, scenario by scenario, over those where both are defined (n pairs), with a "
+        f"{CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval excludes zero; it "
+        "is not widened for the number of comparisons. “All equal”: no pair differs from the next, so that a "
+        "bootstrap has no width."
     )
+    table = differences_table(policy, others, names).html()
+    return section(f"{escape(policy.name)} against the others", table, note=note)
 
 
 def _transfer(runs: Sequence[EpisodeTable]) -> str:
@@ -191,13 +188,11 @@ def _transfer(runs: Sequence[EpisodeTable]) -> str:
         f"<h3>{escape(metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
         for table in transfer_tables(runs)
     )
-    return (
-        f"<section><h2>Transfer</h2>{tables}<p><small>Rows: planners and their training data (– where nothing was "
-        "trained, or the run does not say). Columns: evaluation data. Sets differ in difficulty: compare along a "
-        "column.</small></p></section>"
-        if tables
-        else ""
+    note = (
+        "Rows: planners and their training data (– where nothing was trained, or the run does not say). Columns: "
+        "evaluation data. Sets differ in difficulty: compare along a column."
     )
+    return section("Transfer", tables, note=note)
 
 
 def _collisions(runs: Sequence[EpisodeTable]) -> str:
@@ -205,19 +200,15 @@ def _collisions(runs: Sequence[EpisodeTable]) -> str:
     table = collisions_table(runs)
     if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
         return ""
-    meanings = "".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(meaning[:1].upper() + meaning[1:])}.</dd></div>"
-        for name, meaning in COLLISION_KINDS.values()
-    )
+    kinds = COLLISION_KINDS.values()
+    meanings = definitions((name, f"{meaning[:1].upper()}{meaning[1:]}.") for name, meaning in kinds)
     total = ", ".join(
         f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {len(run)}"
         for run in runs
         if "collision_type" in run.metrics
     )
-    return (
-        f"<section><h2>Kinds of collision</h2><p>Episodes with a collision: {total}.</p>{table.html()}"
-        f"<dl class=metrics>{meanings}</dl><p><small>{escape(table.caption)} (Wilson's).</small></p></section>"
-    )
+    parts = f"<p>Episodes with a collision: {total}.</p>", table.html(), meanings
+    return section("Kinds of collision", *parts, note=f"{escape(table.caption)} (Wilson's).")
 
 
 def _strata(runs: Sequence[EpisodeTable], tags: Tags) -> str:
@@ -227,31 +218,22 @@ def _strata(runs: Sequence[EpisodeTable], tags: Tags) -> str:
         f"{table.html()}</details>"
         for place, table in enumerate(strata_tables(runs, tags))
     )
-    return (
-        f"<section><h2>By kind of scenario</h2>{tables}<p><small>Tags describe the log. Small strata have wide "
-        "intervals; of many cells, some stand out by chance.</small></p></section>"
-        if tables
-        else ""
-    )
+    note = "Tags describe the log. Small strata have wide intervals; of many cells, some stand out by chance."
+    return section("By kind of scenario", tables, note=note)
 
 
 def _distributions(runs: Sequence[EpisodeTable]) -> str:
-    charts = distribution_charts(runs)
-    return (
-        f"<section><h2>Distributions</h2>{charts}<p><small>The height of a line at a value is the share of episodes at "
-        "or below it; undefined ones are left out.</small></p></section>"
-        if charts
-        else ""
-    )
+    note = "The height of a line at a value is the share of episodes at or below it; undefined ones are left out."
+    return section("Distributions", distribution_charts(runs), note=note)
 
 
 def _episodes(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     note = "▶ marks those that play below." if packed else "Rollouts and tags were left out of this page."
-    return (
-        f"<section id=episodes><h2>Episodes</h2><p>All episodes, worst first: the gravest kind of failure, then the "
-        f"lowest score. Click a number in the tables above for its episodes. {note}</p>{EPISODE_LIST}"
-        f"{_player(runs, packed)}</section>"
+    words = (
+        "<p>All episodes, worst first: the gravest kind of failure, then the lowest score. Click a number in the "
+        f"tables above for its episodes. {note}</p>"
     )
+    return section("Episodes", words, EPISODE_LIST, _player(runs, packed), attributes=" id=episodes")
 
 
 def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
@@ -278,19 +260,10 @@ def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     )
 
 
-def _meaning(runs: Sequence[EpisodeTable]) -> str:
-    return (
-        f"<section><h2>What the metrics mean</h2>{explanations(ordered(metric_names(runs)), runs)}</section>"
-    )
-
-
 def explanations(metrics: Sequence[str], runs: Sequence[EpisodeTable]) -> str:
     """Return a list that explains each known metric in one line."""
     labels = [label for metric in metrics if (label := metric_label(metric, runs)).explanation]
-    items = "".join(
-        f"<div><dt>{escape(label.heading)}</dt><dd>{escape(label.explanation)}</dd></div>" for label in labels
-    )
-    return f"<dl class=metrics>{items}</dl>"
+    return definitions((label.heading, label.explanation) for label in labels)
 
 
 def _origin(runs: Sequence[EpisodeTable | Training]) -> str:
@@ -309,11 +282,11 @@ def _origin(runs: Sequence[EpisodeTable | Training]) -> str:
         f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.info), indent=1, ensure_ascii=False))}</pre>"
         for run in runs
     )
-    return (
-        f"<section><h2>How this was made</h2>{facts_html(['run', 'command', 'data', 'versions'], rows)}"
-        f"<details><summary>all settings</summary>{settings}</details><p><small>drivax "
-        f"{escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of its run.</small></p>"
-        "</section>"
+    return section(
+        "How this was made",
+        facts_html(["run", "command", "data", "versions"], rows),
+        f"<details><summary>all settings</summary>{settings}</details>",
+        note=f"drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of its run.",
     )
 
 

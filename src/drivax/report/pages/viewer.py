@@ -46,12 +46,9 @@ def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ())
 
 
 def write_player(
-    scenarios: Sequence[Scenario],
-    out: Path,
-    overwrite: bool = False,
-    title: str = "scenarios",
+    scenarios: Sequence[Scenario], out: Path, overwrite: bool = False, title: str = "scenarios",
     details: Sequence[str] = (),
-) -> Path:
+) -> Path:  # fmt: skip
     """Write a page of logs to the HTML file ``out``.
 
     Args:
@@ -67,7 +64,14 @@ def write_player(
     check_output(out, overwrite)
     if not scenarios:
         raise UsageError("there is no scenario to show", cure="name at least one")
-    write_text(out, _page(scenarios, title, details or [""] * len(scenarios)))
+    packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
+    unclean = sum(bool(findings(scenario)) for scenario in scenarios)
+    audited = sum(bool(scenario.audit) for scenario in scenarios)
+    audit = f"the audit finds violations in {unclean} of {audited}" if audited else "not audited"
+    lead = f"<p class=lead><b>{len(scenarios)}</b> recorded scenarios; {audit}.</p>"
+    browser = _browser(scenarios, details or [""] * len(scenarios))
+    scripts = [*player_scripts(), asset("browser.js")]
+    write_text(out, page(title, lead, [browser], asset("browser.css"), player_data(packed), scripts))
     return out
 
 
@@ -93,21 +97,6 @@ def criticality_html(table: ScoreTable, row: int) -> str:
     return (
         f"<h3>Criticality</h3><p>{escape(words)}</p>"
         f"{chart('criticality over time', lines, share=True, across='s')}{series_legend(list(lines))}"
-    )
-
-
-def _page(scenarios: Sequence[Scenario], title: str, details: Sequence[str]) -> str:
-    packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
-    unclean = sum(bool(findings(scenario)) for scenario in scenarios)
-    audited = sum(bool(scenario.audit) for scenario in scenarios)
-    audit = f"the audit finds violations in {unclean} of {audited}" if audited else "not audited"
-    return page(
-        title,
-        f"<p class=lead><b>{len(scenarios)}</b> recorded scenarios; {audit}.</p>",
-        [_browser(scenarios, details)],
-        asset("browser.css"),
-        player_data(packed),
-        [*player_scripts(), asset("browser.js")],
     )
 
 
@@ -144,12 +133,9 @@ def _details(scenario: Scenario, details: str) -> str:
     """Return tags, flags, audit and overflow as lists, visible while the scenario is selected."""
     source = scenario.source
     counts = {
-        "steps": int(scenario.steps),
-        "tracks": source.tracks,
-        "tracks now": source.tracks_valid_now,
-        "map points": source.map_points,
-        "lights": source.lights,
-    }
+        "steps": int(scenario.steps), "tracks": source.tracks, "tracks now": source.tracks_valid_now,
+        "map points": source.map_points, "lights": source.lights,
+    }  # fmt: skip
     # The step of an event that never happened is stored as -1.
     audit = {
         name: "never" if name.endswith("_step") and value == -1 else value
@@ -166,11 +152,8 @@ def _details(scenario: Scenario, details: str) -> str:
 
 
 def _facts(values: Mapping[str, Any]) -> str:
-    rows = (
-        f"<dt>{escape(name.replace('_', ' '))}</dt><dd>{escape(_text(value))}</dd>"
-        for name, value in values.items()
-    )
-    return f"<dl>{''.join(rows)}</dl>"
+    words = ((escape(name.replace("_", " ")), escape(_text(value))) for name, value in values.items())
+    return f"<dl>{''.join(f'<dt>{name}</dt><dd>{text}</dd>' for name, text in words)}</dl>"
 
 
 def _text(value: Any) -> str:
