@@ -8,10 +8,9 @@ from scipy.signal import savgol_filter
 
 from drivax.cli import main
 from drivax.curation.ensemble import EnsembleConfig
-from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.kinematic import KinematicConfig, PublishedConfig
 from drivax.curation.logged import score_bank
 from drivax.curation.methods import Request, curate
-from drivax.curation.published import PublishedConfig
 from drivax.curation.scores import read_scores
 from drivax.curation.subset import top_rows
 from drivax.datasets.womd.scenario_reader import WomdScenario

@@ -127,7 +127,7 @@ def test_p_values_are_adjusted_within_their_group():
     for group in {one.claim.group for one in found}:
         ps = [one.found.p for one in found if one.claim.group == group]
         assert [one.adjusted for one in found if one.claim.group == group] == holm(ps)
-    claimed = [(c.one, c.other, c.metric, c.rows, c.change) for c in claims(list(ARMS))]
+    claimed = [(c.arm, c.reference, c.metric, c.rows, c.change) for c in claims(list(ARMS))]
     assert len(claimed) == len(set(claimed)) == 54
 
 
@@ -177,7 +177,7 @@ def test_controls_have_the_effective_sizes_of_their_arms(data):
         found[method] = ScoreTable(method, {}, "x", ids, np.ones(shape, bool), steps, steps.max(axis=1))
     usable = np.zeros(shape, bool)
     usable[:, 10:89] = rng.random((shape[0], 79)) < 0.95
-    pairs = {(c.one, c.other) for c in claims(list(ARMS)) if ARMS[c.other].permuted}
+    pairs = {(c.arm, c.reference) for c in claims(list(ARMS)) if ARMS[c.reference].permuted}
     curated = [name for name in ARMS if name.startswith(("heuristic", "ensemble", "action_rarity"))]
     assert {one for one, _ in pairs} == {*curated, "oracle"}
     for pair in pairs:

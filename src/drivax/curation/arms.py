@@ -10,9 +10,8 @@ from typing import Literal
 import numpy as np
 
 from drivax import settings
-from drivax.curation.controls import permute_scores
 from drivax.curation.scores import ScoreTable
-from drivax.curation.weights import Scale, WeightConfig, sampling_weights
+from drivax.curation.weights import Scale, WeightConfig, permute_scores, sampling_weights
 from drivax.errors import UsageError
 from drivax.learning.experience import WeightedSet
 from drivax.scenario.store import ScenarioSet
@@ -28,10 +27,10 @@ class Arm:
     """An arm of a study.
 
     Attributes:
-        preset: Its training configuration.
-        method: Name of the curation method that scores its steps.
+        preset: Training configuration.
+        method: Curation method that scores the steps.
         scale: Whether weights are of steps or of scenarios.
-        permuted: Whether the scores are permuted among scenarios: the matched random control of ``method``.
+        permuted: Whether scores are permuted among scenarios: the matched random control of ``method``.
         weights: How scores become weights; None: as the study or the command line says.
     """
 
@@ -48,17 +47,15 @@ class Claim:
 
     Attributes:
         words: The claim.
-        one: The arm that is claimed to be better.
-        other: The arm that it is compared with.
+        arm, reference: The arm that is claimed to be better, and the arm that it is compared with.
         group: Claims whose p-values are adjusted together.
-        metric: Metric of the comparison.
         rows: ``ordinary``, ``common`` or ``rare`` scenarios.
         change: Claimed relative change, at least; None: only its direction is claimed.
     """
 
     words: str
-    one: str
-    other: str
+    arm: str
+    reference: str
     group: ClaimGroup
     metric: str = "collision"
     rows: str = "ordinary"
@@ -79,22 +76,11 @@ ARMS: Mapping[str, Arm] = MappingProxyType(LONGTAIL.arms)
 
 
 def weighted(
-    arm: Arm,
-    data: ScenarioSet,
-    tables: Tables,
-    config: WeightConfig,
-    usable: np.ndarray | None = None,
-    seed: int = 0,
-) -> WeightedSet:
-    """Return a set with the sampling weights of an arm.
+    arm: Arm, data: ScenarioSet, tables: Tables, config: WeightConfig, usable: np.ndarray | None = None, seed: int = 0
+) -> WeightedSet:  # fmt: skip
+    """Return a set with the sampling weights of an arm; ``config`` is for arms without ``weights``.
 
-    Args:
-        arm: The arm.
-        data: The set.
-        tables: Score tables of the set.
-        config: How scores become weights, for arms without ``weights``.
-        usable: Steps that the training learns from (:func:`~drivax.curation.weights.sampling_weights`).
-        seed: Seed of the permutation.
+    ``usable`` are the steps that the training learns from; ``seed`` is that of the permutation.
 
     Raises:
         UsageError: The table is of another method, or no step has a weight or a label.

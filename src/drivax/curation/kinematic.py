@@ -29,9 +29,15 @@ from jaxtyping import Array, Bool, Float
 from drivax.curation.logged import LOG_ROUTE, Logged
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
-from drivax.geometry.vectors import wrap
+from drivax.geometry.vectors import norm, wrap
 from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, savgol_matrix
-from drivax.scenario.bank.queries import LEVEL_M, lane_distance, offroad_distance, project_on_route
+from drivax.scenario.bank.queries import (
+    LEVEL_M,
+    lane_distance,
+    offroad_distance,
+    project_on_route,
+    vertex_distances,
+)
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import STOPPED_MPS, TTC_HORIZON_S, time_to_collision
@@ -110,13 +116,7 @@ def required_braking(
     up to about 75 m ahead. Oncoming agents count as standing, so that ego need not brake while it stands or gives way.
     0 where no agent is on the path, or the nearest one is not approached.
 
-    Args:
-        bank: The scenarios.
-        index: Scenario of the bank.
-        frame: All agents at the step; ego is slot 0.
-        counts: Agents that are considered.
-        along_m: Arc length of ego along the logged route.
-        speed_mps: Speed of ego.
+    Only agents that ``counts`` marks are considered; ``along_m`` is ego's arc length along the logged route.
     """
     me, xy = frame.box[0], frame.box[:, :2]
 
@@ -211,3 +211,65 @@ def _deviation(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Floa
         return jnp.where(jnp.isfinite(distance), jnp.minimum(distance / config.lane_m, 1.0), 0.0)
 
     return jax.vmap(at_step)(log.motion[:, :2], log.ground_m)
+
+
+@dataclass(frozen=True)
+class PublishedConfig:
+    """Scales of the components: the value at which each is 1.
+
+    Attributes:
+        jerk_mps3, yaw_rps2: Jerk, and yaw acceleration (rad/s2).
+        interaction_m2ps: Product of distance and closing speed.
+        edge_m: Distance of ego's centre to the nearest point of a road edge at which off_road is 0.
+        lane_m: Distance to the nearest point of a lane centre.
+        crowd: Number of agents, ego included.
+        spacing_m: Distance between the points of the map.
+    """
+
+    jerk_mps3: float = 2.5
+    yaw_rps2: float = 1.5
+    interaction_m2ps: float = 1000.0
+    edge_m: float = 0.75
+    lane_m: float = 1.25
+    crowd: int = 50
+    spacing_m: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_positive(dict(vars(self)))
+
+    def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Float[Array, " T"]]:
+        """Return the components of every step of a log."""
+        xy = log.motion[:, :2]
+        edge_m, lane_m = jax.vmap(lambda point: vertex_distances(bank, log.index, point, self.spacing_m))(xy)
+        return {
+            "volatility": _published_volatility(self, log),
+            "interaction": _interaction(self, log),
+            "off_road": jnp.maximum(1.0 - edge_m / self.edge_m, 0.0),
+            "lane_deviation": jnp.minimum(lane_m / self.lane_m, 1.0),
+            "density": crowding(log, self.crowd),
+        }
+
+
+def _published_volatility(config: PublishedConfig, log: Logged) -> Float[Array, " T"]:
+    """Return jerk and yaw acceleration from two backward differences, 0 at the start."""
+    heading = log.motion[:, 2]
+    acceleration = _backward(norm(log.velocity)) / DT_S
+    yaw_rate = wrap(_backward(heading)) / DT_S
+    jerk, yaw = _backward(acceleration) / DT_S, _backward(yaw_rate) / DT_S
+    return jnp.minimum(jnp.maximum(jnp.abs(jerk) / config.jerk_mps3, jnp.abs(yaw) / config.yaw_rps2), 1.0)
+
+
+def _backward(values: Float[Array, " T"]) -> Float[Array, " T"]:
+    return jnp.concatenate([jnp.zeros(1), values[1:] - values[:-1]])
+
+
+def _interaction(config: PublishedConfig, log: Logged) -> Float[Array, " T"]:
+    """Return the largest product of distance and closing speed, ``max(0, -dp . dv)``, over all agents."""
+
+    def largest(frame: Frame, velocity: Array) -> Array:
+        offset, relative = frame.box[:, :2] - frame.box[0, :2], frame.velocity - velocity
+        closing = -jnp.sum(offset * relative, axis=-1)
+        counts = frame.valid & (jnp.arange(len(closing)) > 0)
+        return jnp.max(jnp.where(counts, jnp.clip(closing / config.interaction_m2ps, 0.0, 1.0), 0.0))
+
+    return jax.vmap(largest)(log.frame, log.velocity)

@@ -122,15 +122,7 @@ def score_bank(score: Any, bank: ScenarioBank) -> dict[str, Array]:
 
 
 def score_steps(data: ScenarioSet, score: Any, progress: Progress | None = None) -> dict[str, Numbers]:
-    """Apply a score function to every log of a set, in batches.
-
-    Args:
-        data: The scenarios.
-        score: A hashable ``(bank, log) -> {name: [T, ...]}``.
-        progress: Called after every batch.
-
-    Returns:
-        By name ``[N, T, ...]``.
+    """Apply a hashable ``(bank, log) -> {name: [T, ...]}`` to every log of a set, in batches: ``{name: [N, T, ...]}``.
 
     Raises:
         DataError: A scenario has no future.

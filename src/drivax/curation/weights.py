@@ -1,8 +1,8 @@
-"""Turn scores into sampling weights, and describe the draws that weights lead to."""
+"""Turn scores into sampling weights, describe the draws that weights lead to, and permute scores as a control."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -151,4 +151,27 @@ def draw_statistics(weights: Float[Array, "N T"], drawable: Bool[Array, "N T"]) 
         tilt=float(np.quantile(values, 0.99) / values.mean()),
         largest=float(ordered[0] / values.mean()),
         concentration=float(ordered[: max(round(len(values) * 0.05), 1)].sum() / values.sum()),
+    )
+
+
+def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | None = None) -> ScoreTable:
+    """Return the matched random control of a table: every scenario gets the scores of another one, cyclically shifted.
+
+    The distribution of the scores is kept over all steps, within a scenario, and among scenarios; exactly where all
+    scenarios have the same number of usable steps (longer sequences are cut, shorter ones repeated). Permuting single
+    steps would spread large scores evenly over all scenarios, and the control would see more scenarios. ``usable``
+    steps are those of :func:`sampling_weights`.
+    """
+    rng = np.random.default_rng(seed)
+    drawable = table.drawable if usable is None else usable
+    steps, scenarios = table.steps.copy(), table.scenarios.copy()
+    indices = np.flatnonzero(drawable.any(axis=1))
+    for index, other in zip(indices, rng.permutation(indices), strict=True):
+        scores = table.steps[other, drawable[other]]
+        scores = np.roll(scores, rng.integers(len(scores)))
+        steps[index, drawable[index]] = np.resize(scores, int(drawable[index].sum()))
+        scenarios[index] = table.scenarios[other]
+    config = {"like": table.method, "like_config": dict(table.config), "seed": seed}
+    return replace(
+        table, method="random_matched", config=config, steps=steps, scenarios=scenarios, components={}
     )

@@ -52,13 +52,10 @@ _ARROWS = {"high": " ↑", "low": " ↓", "-": ""}
 
 @dataclass(frozen=True)
 class MetricLabel:
-    """How a metric is shown.
+    """How a metric is shown: label with unit, better direction (``-`` for none), unit, and explanation.
 
-    Attributes:
-        text: Its label, with the unit where it has one.
-        better: Whether ``high`` or ``low`` is better; ``-`` for neither.
-        unit: ``rate`` for a share of episodes, ``share`` for another number without a unit, else the unit.
-        explanation: One sentence; empty for unknown metrics.
+    The unit is ``rate`` for a share of episodes, ``share`` for another number without a unit; the explanation of an
+    unknown metric is empty.
     """
 
     text: str
@@ -80,11 +77,11 @@ class MetricLabel:
 
 def metric_label(name: str, runs: Sequence[EpisodeTable] = ()) -> MetricLabel:
     """Return how to show a metric; ``runs`` describe the user's own metrics."""
-    known = METRICS.get(name) or ADDED.get(name)
-    metric = known or next((run.own_metrics[name] for run in runs if name in run.own_metrics), None)
-    text = (metric.label if metric else None) or name.replace("_", " ")
+    own = (run.own_metrics[name] for run in runs if name in run.own_metrics)
+    metric = METRICS.get(name) or ADDED.get(name) or next(own, None)
     if metric is None:
-        return MetricLabel(text, "-", "", "")
+        return MetricLabel(name.replace("_", " "), "-", "", "")
+    text = metric.label or name.replace("_", " ")
     plain = metric.unit == "-"
     if not plain:
         text = f"{text} [{metric.unit.replace('s2', 's²').replace('s3', 's³')}]"
@@ -109,12 +106,9 @@ def ordered(names: Sequence[str]) -> list[str]:
 
 
 def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interval:
-    """Return the mean of a metric over episodes, with the interval that ``summary.json`` gives.
+    """Return the mean of a metric over episodes (``rows``), with the interval that ``summary.json`` gives.
 
-    Args:
-        run: The evaluation; one without the metric gives an empty interval.
-        metric: Name of the metric.
-        rows: Which episodes, as an index of an array; all by default.
+    It is empty where the evaluation lacks the metric.
     """
     if metric not in run.metrics:
         return NOTHING
@@ -139,24 +133,14 @@ def paired_differences(results: EpisodeTable, other: EpisodeTable, metric: str) 
     return paired_difference(results, other, metric)
 
 
-@dataclass(frozen=True)
-class Difference:
-    """A metric of one planner minus another's, over their common scenarios.
+def difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> tuple[Interval, str]:
+    """Return the paired difference ``run - other`` of a metric with its verdict.
 
-    Attributes:
-        interval: Mean difference with its interval and the number of pairs.
-        verdict: ``better``, ``worse``, ``unclear`` (the interval holds 0), ``same`` (no pair differs) or ``none`` (no
-            direction, no interval).
+    The verdict is ``better``, ``worse``, ``unclear`` (the interval holds 0), ``same`` (no pair differs) or ``none``
+    (no direction, no interval).
     """
-
-    interval: Interval
-    verdict: str
-
-
-def difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> Difference:
-    """Return the paired difference ``run - other`` of a metric with its verdict."""
     interval = paired_difference(run, other, metric)
-    return Difference(interval, _verdict(interval, metric_label(metric, [run]).better))
+    return interval, _verdict(interval, metric_label(metric, [run]).better)
 
 
 def _verdict(interval: Interval, better: str) -> str:
@@ -172,14 +156,14 @@ def _verdict(interval: Interval, better: str) -> str:
 
 def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
     """Return a table with planners in rows and metrics in columns, the best mean of each column marked."""
-    columns = [[summarise(run, name) for run in runs] for name in metrics]
-    best = [_best(column, metric_label(name, runs)) for name, column in zip(metrics, columns, strict=True)]
+    means = [[summarise(run, name) for run in runs] for name in metrics]
+    best = [_best(column, metric_label(name, runs)) for name, column in zip(metrics, means, strict=True)]
     rows = []
     for place, run in enumerate(runs):
         label = Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic")
         cells = [
             _cell(runs, name, column[place], {"run": run.name, "metric": name}, top)
-            for name, column, top in zip(metrics, columns, best, strict=True)
+            for name, column, top in zip(metrics, means, best, strict=True)
         ]
         rows.append((label, *cells))
     heads = (Column("planner", label=True), *_metric_columns(metrics, runs))
@@ -195,12 +179,8 @@ def _best(intervals: Sequence[Interval], label: MetricLabel) -> float | None:
 
 
 def _cell(
-    runs: Sequence[EpisodeTable],
-    metric: str,
-    interval: Interval,
-    link: Mapping[str, Any],
-    best: float | None = None,
-) -> Cell:
+    runs: Sequence[EpisodeTable], metric: str, interval: Interval, link: Mapping[str, Any], best: float | None = None
+) -> Cell:  # fmt: skip
     if interval.mean is None:
         return interval_cell(interval, "", metric)
     style = "best" if best is not None and interval.mean == best else ""
@@ -252,14 +232,11 @@ def differences_table(policy: EpisodeTable, others: Sequence[EpisodeTable], metr
 def _difference_cell(policy: EpisodeTable, other: EpisodeTable, metric: str) -> Cell:
     if unmatched := mismatch(policy, other):
         return Cell(f"no pairs: {unmatched[0]}", style="undefined")
-    compared = difference(policy, other, metric)
-    if compared.interval.mean is None:
-        title = "no scenario where both are defined"
-        return interval_cell(compared.interval, "", metric, signed=True, title=title)
-    return interval_cell(
-        compared.interval, metric_label(metric, [policy]).unit, metric, signed=True, style=compared.verdict,
-        mark=_MARKS[compared.verdict], link={"run": policy.name, "metric": metric},
-    )  # fmt: skip
+    interval, verdict = difference(policy, other, metric)
+    if interval.mean is None:
+        return interval_cell(interval, "", metric, signed=True, title="no scenario where both are defined")
+    more = {"style": verdict, "mark": _MARKS[verdict], "link": {"run": policy.name, "metric": metric}}
+    return interval_cell(interval, metric_label(metric, [policy]).unit, metric, signed=True, **more)
 
 
 def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
@@ -289,14 +266,7 @@ def strata_table(
     tag: str,
     metrics: Sequence[str],
 ) -> Table:
-    """Return a table with a row per value of a tag and run, metrics in columns.
-
-    Args:
-        runs: Evaluations.
-        tags: The tags of their scenarios; a scenario without the tag counts as ``unknown``.
-        tag: The tag.
-        metrics: Columns.
-    """
+    """Return a table with a row per value of a tag and run, metrics in columns; without the tag it is ``unknown``."""
     values = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
     order = {value: place for place, value in enumerate(TAGS.get(tag, ()))}
     every = {value for of_run in values.values() for value in of_run}
@@ -318,14 +288,12 @@ def strata_table(
 
 def set_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     """Return unique short names of all data sets that runs were evaluated or trained on, by their key."""
-    entries = {set_key(entry): entry for run in runs for entry in (run.data, *_trained_on(run))}
+    entries = {
+        set_key(entry): entry for run in runs for entry in (run.data, *(run.info.get("trained_on") or ()))
+    }
     named = {key: _set_name(entry) for key, entry in entries.items()}
     names = list(named.values())
     return {key: name if names.count(name) == 1 else f"{name} {key[:6]}" for key, name in named.items()}
-
-
-def _trained_on(run: EpisodeTable) -> Sequence[Mapping[str, Any]]:
-    return run.info.get("trained_on") or ()
 
 
 def set_key(entry: Mapping[str, Any]) -> str:
@@ -350,9 +318,8 @@ def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     for key, name in own.items():
         paths = [Path(other).parts for other in own if other != key and own[other] == name]
         parts = Path(key).parts
-        take = next(
-            (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in paths)), len(parts)
-        )
+        unique = (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in paths))
+        take = next(unique, len(parts))
         named[key] = "/".join(parts[-take:]) if paths else name
     return named
 
@@ -367,23 +334,18 @@ def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
     evaluated = [names[set_key(run.data)] for run in runs]
     cells: dict[tuple[str, ...], dict[str, Cell]] = {}
     for run, where in zip(runs, evaluated, strict=True):
-        trained = ", ".join(names[set_key(entry)] for entry in _trained_on(run)) or "–"
+        trained = ", ".join(names[set_key(entry)] for entry in run.info.get("trained_on") or ()) or "–"
         labels = (planners[_planner_key(run)], trained, run.traffic)
         if where in cells.get(labels, {}):
             labels = (run.name, *labels[1:])
         link = {"run": run.name, "metric": metric}
         cells.setdefault(labels, {})[where] = _cell(runs, metric, summarise(run, metric), link)
-    columns = tuple(dict.fromkeys(evaluated))
+    sets = tuple(dict.fromkeys(evaluated))
     rows = tuple(
-        (*map(Cell, labels), *(row.get(name, Cell(style="undefined")) for name in columns))
+        (*map(Cell, labels), *(row.get(name, Cell(style="undefined")) for name in sets))
         for labels, row in cells.items()
     )
     heads = [Column(key, label=True) for key in ("planner", "trained on", "traffic")]
+    columns = (*heads, *(Column(name, name) for name in sets))
     caption = f"By training and evaluation data: mean and {CONFIDENCE:.0%} interval"
-    return Table(
-        f"transfer-{metric}",
-        (*heads, *(Column(name, name) for name in columns)),
-        rows,
-        caption,
-        "evaluated on",
-    )
+    return Table(f"transfer-{metric}", columns, rows, caption, "evaluated on")

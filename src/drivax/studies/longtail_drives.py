@@ -13,9 +13,8 @@ from jaxtyping import Bool, Float
 
 from drivax import settings
 from drivax.curation.arms import ARMS
-from drivax.curation.controls import event_kinds
 from drivax.curation.ensemble import EnsembleConfig
-from drivax.curation.methods import Request, curate
+from drivax.curation.methods import Request, curate, event_kinds
 from drivax.curation.weights import WeightConfig
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.episode_table import EpisodeTable

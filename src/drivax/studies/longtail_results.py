@@ -122,7 +122,7 @@ class Condition:
 
 def claims(arms: Sequence[str]) -> list[Claim]:
     """Return the claims of the long-tail study about these arms."""
-    return [claim for claim in LONGTAIL.claims if claim.one in arms and claim.other in arms]
+    return [claim for claim in LONGTAIL.claims if claim.arm in arms and claim.reference in arms]
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def judge(
     tested = []
     for claim in claims(arms):
         weights = counts(claim.rows, rare, share)
-        one, other = (episodes[name][claim.metric] for name in (claim.one, claim.other))
+        one, other = (episodes[name][claim.metric] for name in (claim.arm, claim.reference))
         difference = ratio = None
         if _several(np.concatenate([one, other]), labels, weights):
             difference = crossed_difference(one, other, labels, weights)
