@@ -229,14 +229,14 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
             _check_source(header["version"], header["set_hash"], file, data)
             arrays = {name: stored[name] for name in stored.files if name not in ("header", "scenario_id")}
             _check_shapes(ids, arrays, file, data)
-            scores = [arrays.pop(name) for name in ("valid", "step_score", "scenario_score")]
+            valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
             components = {
                 name.removeprefix(_COMPONENT): values
                 for name, values in arrays.items()
                 if name.startswith(_COMPONENT)
             }
-            about = (header[name] for name in ("method", "config", "set_hash"))
-            table = ScoreTable(*about, ids, *scores, components)
+            method, config, set_hash = (header[name] for name in ("method", "config", "set_hash"))
+            table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components)
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         problem = f"not a score table, or damaged ({type(error).__name__})"
         raise DataError(problem, file=file, cure=_AGAIN) from error

@@ -37,7 +37,7 @@ class Pairs:
         return cls(keys, tuple(cluster[key] for key in keys))
 
     def values(self, table: EpisodeTable, metric: str) -> Float64[np.ndarray[Any, Any], " scenario"]:
-        """A metric of one evaluation per scenario; repeated episodes are averaged."""
+        """Return a metric of one evaluation per scenario; repeated episodes are averaged."""
         means = table.by_scenario(metric)
         return np.array([means[key] for key in self.keys], np.float64)
 
@@ -67,11 +67,7 @@ def comparable(a: EpisodeTable, b: EpisodeTable) -> bool:
 
 
 def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
-    """Refuse evaluations whose episodes cannot be paired.
-
-    Args:
-        a: The evaluations of A, one per training seed.
-        b: Those of B.
+    """Refuse evaluations of A and B, one per training seed, whose episodes cannot be paired.
 
     Raises:
         UsageError: A run is named twice, a side holds several planners, or sets, traffic or starts differ.
@@ -103,9 +99,8 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
     for table in tables:
         if metric not in table.metrics:
             known = [name for name in table.metrics if all(name in other.metrics for other in tables)]
-            raise UsageError(
-                f"{table.folder or table.name} has no metric {metric!r}", cure=did_you_mean(metric, known)
-            )
+            problem = f"{table.folder or table.name} has no metric {metric!r}"
+            raise UsageError(problem, cure=did_you_mean(metric, known))
     if metric in NOT_SUMMARISED:
         raise UsageError(f"{metric} is a code or count without a mean", cure="choose another metric")
     if metric.endswith("_partial"):
@@ -126,9 +121,8 @@ def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
             f"every {metric} is partial: one of its inputs is undefined in these scenarios",
             cure="choose another primary metric, as success or accuracy",
         )
-    return UsageError(
-        f"{metric} is defined for A and B in no common scenario", cure="choose another primary metric"
-    )
+    problem = f"{metric} is defined for A and B in no common scenario"
+    return UsageError(problem, cure="choose another primary metric")
 
 
 @dataclass(frozen=True)
@@ -150,11 +144,7 @@ class Split:
 
 
 def strata_of(entries: Sequence[Mapping[str, Any]], tags: Sequence[str]) -> list[str]:
-    """Return the stratum of each scenario: the values of its tags.
-
-    Args:
-        entries: Manifest entry of each scenario.
-        tags: Names of tags, as ``difficulty``.
+    """Return the stratum of each scenario (manifest entry): the values of its tags.
 
     Raises:
         UsageError: No scenario has one of the tags.
@@ -167,16 +157,10 @@ def strata_of(entries: Sequence[Mapping[str, Any]], tags: Sequence[str]) -> list
 
 
 def assign(clusters: Sequence[str], strata: Sequence[str] | None, ratio: float, seed: int) -> Split:
-    """Assign whole clusters to two arms at random, in each stratum a share of ``ratio`` to the first.
+    """Assign whole clusters to two arms at random, in each stratum (None: in all) a share of ``ratio`` to the first.
 
     A cluster belongs to the most frequent stratum of its scenarios (the first by name among equals). Strata of fewer
     than ten clusters are merged. Rounding in one stratum is made up for in the next.
-
-    Args:
-        clusters: Cluster of each scenario.
-        strata: Stratum of each scenario; None: a random split.
-        ratio: Share of the clusters that the first arm gets.
-        seed: Seed of the random numbers.
 
     Raises:
         UsageError: An arm is empty.
@@ -194,10 +178,8 @@ def assign(clusters: Sequence[str], strata: Sequence[str] | None, ratio: float, 
         first[inside[:count_here]] = True
         assigned += count_here
     if not first.any() or first.all():
-        raise UsageError(
-            f"{count} recordings at a ratio of {ratio} leave an arm empty",
-            cure="use split: paired, or evaluate more scenarios",
-        )
+        problem = f"{count} recordings at a ratio of {ratio} leave an arm empty"
+        raise UsageError(problem, cure="use split: paired, or evaluate more scenarios")
     return Split(first[labels], of[labels])
 
 

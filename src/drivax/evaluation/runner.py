@@ -364,18 +364,18 @@ class _Evaluation:
             for name, metric in self.metrics.items()
             if name not in METRICS
         }
-        crashes = (
-            (names[row], step, errors.get((int(identity[row]), step), "action is not finite"))
-            for row, step in enumerate(crashed.tolist())
-            if step >= 0
-        )
+        crashes: list[Crash] = []
+        for row in np.flatnonzero(crashed >= 0):
+            step = int(crashed[row])
+            error = errors.get((int(identity[row]), step), "action is not finite")
+            crashes.append(Crash(names[row]["dataset"], names[row]["scenario_id"], step, error))
         return EpisodeTable(
             folder=None,
             name=planner,
             info={"planner": planner, "traffic": traffic} | ({"own_metrics": own} if own else {}),
             keys={name: columns[name] for name in KEYS},
             metrics=fail_crashed(metrics, crashed >= 0),
-            crashes=tuple(Crash(row["dataset"], row["scenario_id"], *crash) for row, *crash in crashes),
+            crashes=tuple(crashes),
             in_memory=Trajectories(
                 ego=np.asarray(episodes.motion),
                 action=actions,

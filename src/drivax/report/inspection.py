@@ -201,8 +201,8 @@ def speeds(inspection: Inspection) -> Speeds:
         ego.append(speed[valid[:, 0], 0])
         others = valid[now, 1:] & (scenario.agent_kind[1:] == 1)
         vehicles.append(speed[now, 1:][others])
-    joined = (np.concatenate(values, dtype=np.float64) for values in (ego, vehicles))
-    return Speeds(*joined, len(ego))
+    ego_mps, vehicles_mps = (np.concatenate(values, dtype=np.float64) for values in (ego, vehicles))
+    return Speeds(ego_mps, vehicles_mps, len(ego))
 
 
 #: Maximum numbers of listed scenarios, named values of a tag, sets per table, and causes of unreadable records.

@@ -115,10 +115,8 @@ def _poses(scale: Scale, boxes: Boxes) -> Array:
 
 def _boxes(scale: Scale, boxes: Boxes, poses: Array) -> dict[str, Any]:
     return {
-        "kind": list(boxes.colour),
-        "size": _encoded(scale.lengths(boxes.size)),
-        "pose": _encoded(poses),
-    }
+        "kind": list(boxes.colour), "size": _encoded(scale.lengths(boxes.size)), "pose": _encoded(poses)
+    }  # fmt: skip
 
 
 def _parked(scale: Scale, parked: Boxes) -> dict[str, Any]:

@@ -5,6 +5,7 @@ matplotlib's rasteriser draws frames directly: a figure with artists takes ten t
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -43,15 +44,9 @@ _ACROSS = 3
 
 
 def write_videos(
-    runs: Sequence[Path],
-    out: Path,
-    which: str,
-    side_by_side: bool = False,
-    data: Path | None = None,
-    theme: str = "light",
-    overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Path]:
+    runs: Sequence[Path], out: Path, which: str, side_by_side: bool = False, data: Path | None = None,
+    theme: str = "light", overwrite: bool = False, progress: Callable[[int, int], None] | None = None,
+) -> list[Path]:  # fmt: skip
     """Write episodes of evaluation runs as mp4 files, in real time; returns the files, worst episode first.
 
     Args:
@@ -93,9 +88,8 @@ def _selected(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
     if which.startswith("worst:"):
         count = which.removeprefix("worst:")
         if not count.isdecimal() or int(count) < 1:
-            raise UsageError(
-                f"{which!r} is not a selection", cure="write worst:N with N at least 1, as worst:20"
-            )
+            cure = "write worst:N with N at least 1, as worst:20"
+            raise UsageError(f"{which!r} is not a selection", cure=cure)
         return groups[: int(count)]
     if requested := [group for group in groups if group.scenario_id == which]:
         return requested
@@ -107,11 +101,10 @@ def _selected(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
 def _files(out: Path, groups: Sequence[EpisodeGroup], ranked: bool) -> list[Path]:
     """Return the names of the files: the scenario's id, after its rank in a ranking."""
     names = [re.sub(r"[^\w.+-]", "_", group.scenario_id) for group in groups]
-    digits = len(str(len(names)))
-    return [
-        out / (f"{place:0{digits}d}-{name}.mp4" if ranked else f"{name}.mp4")
-        for place, name in enumerate(names, start=1)
-    ]
+    if ranked:
+        digits = len(str(len(names)))
+        names = [f"{rank:0{digits}d}-{name}" for rank, name in enumerate(names, start=1)]
+    return [out / f"{name}.mp4" for name in names]
 
 
 def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light") -> Iterator[Picture]:
@@ -123,15 +116,12 @@ def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light"
         recorded if rollout.others is None else Scenery(canvas, with_traffic_of(rollout, scenario), rollouts)
         for rollout in rollouts
     ]
-    across = (
-        len(rollouts) if len(rollouts) <= _ACROSS else -(-len(rollouts) // (-(-len(rollouts) // _ACROSS)))
-    )
-    legend = legend_strip(across * side, theme)
+    rows = math.ceil(len(rollouts) / _ACROSS)
+    across = math.ceil(len(rollouts) / rows)
+    legend, dt_s = legend_strip(across * side, theme), float(scenario.dt_s)
     for step in range(min(rollout.start for rollout in rollouts), int(scenario.steps)):
-        panes = [
-            draw_frame(scenery, rollout, step, float(scenario.dt_s))
-            for scenery, rollout in zip(sceneries, rollouts, strict=True)
-        ]
+        drawn = zip(sceneries, rollouts, strict=True)
+        panes = [draw_frame(scenery, rollout, step, dt_s) for scenery, rollout in drawn]
         for pane in panes if across > 1 else ():
             pane[:, -1, :3] = rgb(THEMES[theme]["lane"])
         yield np.concatenate((_tiled(panes, across), legend))
@@ -146,12 +136,7 @@ def _tiled(panes: Sequence[Picture], across: int) -> Picture:
 
 
 def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
-    """Write pictures as H.264, which every browser plays; the file appears when it is complete.
-
-    Args:
-        file: The mp4 file.
-        pictures: At least one, all of one even width and height.
-        dt_s: Seconds between pictures.
+    """Write at least one picture, all of one even size, as H.264, which every browser plays, every ``dt_s`` seconds.
 
     Raises:
         UsageError: PyAV is not installed.
@@ -160,16 +145,12 @@ def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
         import av
     except ImportError as error:
         raise missing_package(error) or error from error
-    faststart = {"movflags": "+faststart"}
-    with (
-        atomic_write(file) as target,
-        av.open(target.name, "w", format="mp4", options=faststart) as container,
-    ):
+    options = {"movflags": "+faststart"}
+    with atomic_write(file) as target, av.open(target.name, "w", format="mp4", options=options) as container:
         stream: Any = None
         for picture in pictures:
             if stream is None:
-                rate = Fraction(1 / dt_s).limit_denominator(20)
-                options = {"preset": "veryfast", "crf": "23"}
+                rate, options = Fraction(1 / dt_s).limit_denominator(20), {"preset": "veryfast", "crf": "23"}
                 stream = container.add_stream("libx264", rate=rate, options=options)
                 stream.height, stream.width = picture.shape[:2]
                 stream.pix_fmt = "yuv420p"
@@ -226,13 +207,8 @@ class Canvas:
         self.draw(self.path(shape.lines), shape.line, shape.width, shape.fill, shape.dash)
 
     def draw(
-        self,
-        path: Any,
-        line: str | None,
-        width: float = 1.0,
-        fill: str | None = None,
-        dash: Sequence[float] = (),
-    ) -> None:
+        self, path: Any, line: str | None, width: float = 1.0, fill: str | None = None, dash: Sequence[float] = ()
+    ) -> None:  # fmt: skip
         """Draw a path, metres, with an outline of ``width`` pixels; None draws nothing."""
         if path is None:
             return
@@ -276,13 +252,7 @@ class Canvas:
 
 
 class Scenery:
-    """A scenario on a canvas, its map prepared once.
-
-    Args:
-        canvas: Where it is drawn.
-        scenario: The scenario.
-        rollouts: All rollouts to be drawn; the map far from all of them is left out.
-    """
+    """A scenario on a canvas, its map prepared once and cut to the surroundings of the rollouts."""
 
     def __init__(self, canvas: Canvas, scenario: Scenario, rollouts: Sequence[Rollout]) -> None:
         self.canvas, self.scenario = canvas, scenario
@@ -313,9 +283,9 @@ def draw_frame(scenery: Scenery, rollout: Rollout, step: int, dt_s: float) -> Pi
     speed = "gone" if absent else f"{rollout.ego[step, 3]:.1f} m/s"
     canvas.text(canvas.width - 10, 20, f"{speed}   {step * dt_s:.1f} s", 12, right=True)
     past = [name for name, at in rollout.events.items() if 0 <= at <= step and name in EVENT_WORDS]
-    for row, name in enumerate(past):
+    for line, name in enumerate(past):
         words = f"✕ {EVENT_WORDS[name]} at {rollout.events[name] * dt_s:.1f} s"
-        canvas.text(10, _BAR + 18 + 16 * row, words, 12, "mark")
+        canvas.text(10, _BAR + 18 + 16 * line, words, 12, "mark")
     _scale_bar(canvas, scale)
     return canvas.pixels()
 
