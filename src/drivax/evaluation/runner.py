@@ -103,25 +103,13 @@ class EvaluationConfig:
 
 
 def run_evaluation(
-    config: EvaluationConfig,
-    planner: Planner,
-    data: ScenarioSet,
-    out: str | Path,
-    *,
-    traffic: Traffic | None = None,
-    sizes: Sizes | None = None,
-    overwrite: bool = False,
-) -> EpisodeTable:
-    """Evaluate a planner on a scenario set, and write the run folder.
+    config: EvaluationConfig, planner: Planner, data: ScenarioSet, out: str | Path, *, traffic: Traffic | None = None,
+    sizes: Sizes | None = None, overwrite: bool = False,
+) -> EpisodeTable:  # fmt: skip
+    """Evaluate a planner on the scenarios of a set that ``config`` selects, and write the run folder.
 
-    Args:
-        config: Task, scenarios, starts, seed, and the names of planner and traffic.
-        planner: The planner.
-        data: Scenario set, from which ``config`` selects.
-        out: Run folder; it appears once all episodes are done.
-        traffic: Traffic model; by default the built-in one named ``config.traffic``.
-        sizes: Sizes that the whole set uses, if they are known already.
-        overwrite: Replace an existing run folder.
+    The folder appears once all episodes are done. The traffic model is by default the built-in one named
+    ``config.traffic``; ``sizes`` are those that the whole set uses, if they are known already.
     """
     scenarios = [data[row] for row in select_scenarios(data, config.filter, config.scenarios, config.limit)]
     RunFolder.check(Path(out), overwrite, "evaluation")
@@ -166,12 +154,7 @@ def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
 
 
 def format_metrics(summary: Mapping[str, Any], names: tuple[str, ...]) -> str:
-    """Format metrics of one planner as a table: mean, 95 % interval and n.
-
-    Args:
-        summary: Summary of an evaluation.
-        names: Metric sets, metrics and user-defined metrics (``metrics.selection``).
-    """
+    """Format metrics of one planner as a table: mean, 95 % interval and n; names are those of ``metrics.selection``."""
     rows = []
     for name in select_metrics(names).names:
         if (metric := summary["metrics"].get(name)) is not None:
@@ -214,25 +197,18 @@ class Options(TypedDict, total=False):
 
 
 def evaluate(
-    planner: Planner,
-    scenarios: ScenarioBank | Sequence[Scenario],
-    names: Names | None = None,
-    *,
-    task: Task | None = None,
-    traffic: Traffic | None = None,
-    start: Start | None = None,
-    **options: Unpack[Options],
-) -> EpisodeTable:
+    planner: Planner, scenarios: ScenarioBank | Sequence[Scenario], names: Names | None = None, *,
+    task: Task | None = None, traffic: Traffic | None = None, start: Start | None = None, **options: Unpack[Options],
+) -> EpisodeTable:  # fmt: skip
     """Run a planner on every scenario to the end of its log, and measure each episode.
 
     Args:
         planner: The planner.
         scenarios: A bank, or stored scenarios of one capacity.
-        names: ``dataset``, ``scenario_id`` and ``segment`` of every scenario of a bank; stored scenarios know theirs.
-        task: Action space and observation of the planner; the default task if None. All metrics are measured, and no
-            episode ends early.
-        traffic: Traffic model, log replay if None; what it needs is precomputed here.
-        start: How episodes start, as logged if None. Random starts are the same for every planner.
+        names: ``dataset``, ``scenario_id`` and ``segment`` of every scenario of a bank.
+        task: Action space and observation of the planner. All metrics are measured, and no episode ends early.
+        traffic: Traffic model, log replay by default; what it needs is precomputed here.
+        start: How episodes start, as logged by default. Random starts are the same for every planner.
         options: See :class:`Options`.
 
     Raises:
@@ -271,19 +247,20 @@ def evaluate(
 def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
     """Check the names of a bank, and that episodes can start there."""
     if len(names) != len(bank):
-        raise UsageError(
-            f"{len(names)} scenario names for a bank of {len(bank)}", cure="name every scenario of the bank"
-        )
-    _check_future(names, np.asarray(bank.flags) & Flag.NO_FUTURE != 0)
-    _check_present(names, np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0, start_step)
+        problem = f"{len(names)} scenario names for a bank of {len(bank)}"
+        raise UsageError(problem, cure="name every scenario of the bank")
+    present = np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0
+    _check_starts(names, np.asarray(bank.flags) & Flag.NO_FUTURE != 0, present, start_step)
     return names
 
 
 def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
     """Return the names of stored scenarios, and check that episodes can start there."""
     names = scenario_names(scenarios)
-    _check_future(names, [Flag.NO_FUTURE in scenario.has for scenario in scenarios])
-    _check_present(names, [scenario.agent_valid[start_step, 0] for scenario in scenarios], start_step)
+    no_future = [Flag.NO_FUTURE in scenario.has for scenario in scenarios]
+    _check_starts(
+        names, no_future, [scenario.agent_valid[start_step, 0] for scenario in scenarios], start_step
+    )
     return names
 
 
@@ -325,10 +302,8 @@ class _Evaluation:
             raise UsageError(f"start step {start_step} leaves no action", cure=f"use 0 to {steps - 2}")
         check_actions(planner, task)
         if planner.replays and simulator.start != LogStart():
-            raise UsageError(
-                f"planner {planner.name} replays the log and cannot start elsewhere",
-                cure="use expert_actions",
-            )
+            problem = f"planner {planner.name} replays the log and cannot start elsewhere"
+            raise UsageError(problem, cure="use expert_actions")
         task = evaluation_task(task)
         metrics = metric_specs(task.metrics)
         if taken := sorted({*KEYS, *ADDED} & metrics.keys()):
@@ -389,12 +364,9 @@ class _Evaluation:
 def until_crash(
     actions: Float[np.ndarray, "episode step D"], crashed: Int[np.ndarray, " episode"], start: int
 ) -> Float[np.ndarray, "episode step D"]:
-    """Return actions with NaN from the step on at which the planner crashed.
+    """Return actions with NaN from the step on at which the planner crashed (-1: never).
 
-    Args:
-        actions: Actions at every step from ``start`` on.
-        crashed: Step of the log at which each episode's planner crashed, -1 for none.
-        start: Step of the log of the first action.
+    ``start`` is the step of the log of the first action.
     """
     step = start + np.arange(actions.shape[1])
     own = (crashed[:, None] < 0) | (step < crashed[:, None])
@@ -422,33 +394,23 @@ def _batch(bank: ScenarioBank, rows: Int[Array, " W"], seed: int) -> tuple[Scena
     return batch, episode_keys(batch, jnp.arange(len(rows)), seed)
 
 
-def _check_future(names: Names, no_future: Sequence[bool] | Any) -> None:
-    short = [row["scenario_id"] for row, missing in zip(names, no_future, strict=True) if missing]
-    if short:
-        raise DataError(
-            f"no logged future (a short log or a test split) in {len(short)} of {len(names)} scenarios",
-            record=short[0],
-            cure="leave them out with --filter flag!=NO_FUTURE",
-        )
-
-
-def _check_present(names: Names, present: Sequence[bool] | Any, start_step: int) -> None:
-    absent = [row["scenario_id"] for row, valid in zip(names, present, strict=True) if not valid]
-    if absent:
+def _check_starts(names: Names, no_future: Any, present: Any, start_step: int) -> None:
+    """Refuse scenarios without a logged future, and those without ego at the start."""
+    ids = [row["scenario_id"] for row in names]
+    if short := [name for name, missing in zip(ids, no_future, strict=True) if missing]:
+        problem = f"no logged future (a short log or a test split) in {len(short)} of {len(names)} scenarios"
+        raise DataError(problem, record=short[0], cure="leave them out with --filter flag!=NO_FUTURE")
+    if absent := [name for name, valid in zip(ids, present, strict=True) if not valid]:
+        problem = f"ego is not in the log at step {start_step} in {len(absent)} of {len(names)} scenarios"
         leave_out = f", or leave them out: --filter 'scenario_id!={'|'.join(absent)}'"
-        raise UsageError(
-            f"ego is not in the log at step {start_step} in {len(absent)} of {len(names)} scenarios",
-            record=absent[0],
-            cure="start at another step" + (leave_out if len(absent) <= _NAMED else ""),
-        )
+        cure = "start at another step" + (leave_out if len(absent) <= _NAMED else "")
+        raise UsageError(problem, record=absent[0], cure=cure)
 
 
 def _check_finite(episodes: Episodes, names: Names) -> None:
     """Refuse motion that is not finite although all actions were: a defect of action space or traffic."""
     broken = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
     if broken.size:
-        raise DrivaxError(
-            f"ego's motion is not finite in {broken.size} scenarios",
-            record=names[int(broken[0])]["scenario_id"],
-            cure="check the action space and the traffic",
-        )
+        problem, record = f"ego's motion is not finite in {broken.size} scenarios", names[int(broken[0])]
+        cure = "check the action space and the traffic"
+        raise DrivaxError(problem, record=record["scenario_id"], cure=cure)

@@ -41,25 +41,19 @@ def curve_sections(runs: Sequence[Training]) -> str:
     drawable = [name for name in names if any(len(run.curves.get(name, ())) > 1 for run in runs)]
     if not drawable:
         return "<p>No quantity was logged more than once.</p>"
-    first = [name for group in _FIRST for name in drawable if name.split("/")[0] == group]
-    first = first or drawable[:6]
+    first = [name for group in _FIRST for name in drawable if name.split("/")[0] == group] or drawable[:6]
     rest = [name for name in drawable if name not in first]
-    more = (
-        f"<details><summary>{len(rest)} more curves</summary>{_charts(rest, runs)}</details>" if rest else ""
-    )
-    return series_legend([run.name for run in runs]) + _charts(first, runs) + more
+    more = f"<details><summary>{len(rest)} more curves</summary>{_charts(rest, runs)}</details>"
+    return series_legend([run.name for run in runs]) + _charts(first, runs) + (more if rest else "")
 
 
 def chart(
     title: str, lines: Mapping[str, tuple[Stroke, Points]], share: bool = False, across: str = ""
 ) -> str:
-    """Return one chart as HTML.
+    """Return one chart as HTML, with a title above and words (``across``) below.
 
-    Args:
-        title: Words above it.
-        lines: Name of a run -> its stroke and points (horizontal, vertical), sorted by the former.
-        share: Whether to draw the vertical axis from 0 to 1 where all values fit.
-        across: Words below it.
+    ``lines`` has the stroke and the points (horizontal, vertical) of each run; with ``share``, the vertical axis is
+    from 0 to 1 where all values fit.
     """
     drawn = {name: (style, _thinned(points)) for name, (style, points) in lines.items() if len(points)}
     values = np.concatenate([points for _, points in drawn.values()])
@@ -70,10 +64,10 @@ def chart(
     axes = Axes(x_ticks[0], last, y_ticks[0], y_ticks[-1], left=52)
     shapes = [axes.horizontal(value, compact(value)) for value in y_ticks]
     shapes += [axes.mark(value) for value in x_ticks if value <= axes.x1 + 1e-9]
-    for name, (style, points) in drawn.items():
-        shapes.append(
-            f'<polyline {style.svg} points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
-        )
+    shapes += [
+        f'<polyline {style.svg} points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
+        for name, (style, points) in drawn.items()
+    ]
     return axes.figure(title, shapes, across)
 
 
@@ -86,13 +80,9 @@ def _thinned(points: Points) -> Float[np.ndarray[Any, Any], "bin 2"]:
 
 
 def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
-    drawn = []
+    drawn, styled = [], list(enumerate(runs))
     for name in names:
-        lines = {
-            run.name: (stroke(place), run.curves[name])
-            for place, run in enumerate(runs)
-            if name in run.curves
-        }
+        lines = {run.name: (stroke(at), run.curves[name]) for at, run in styled if name in run.curves}
         share = name.split("/")[-1] in (*SHARES, "progress_ratio")
         drawn.append(chart(name, lines, share, across="environment steps"))
     return f"<div class=charts>{''.join(drawn)}</div>"
@@ -161,10 +151,8 @@ def compact(value: float) -> str:
 
 def series_legend(names: Sequence[str]) -> str:
     """Return the legend of charts: names in the order of their strokes."""
-    items = "".join(
-        f'<li><i style="background:{stroke(place).key}"></i>{escape(name)}</li>'
-        for place, name in enumerate(names)
-    )
+    styled = [(stroke(place).key, escape(name)) for place, name in enumerate(names)]
+    items = "".join(f'<li><i style="background:{style}"></i>{name}</li>' for style, name in styled)
     return f"<ul class=series>{items}</ul>"
 
 
@@ -194,11 +182,9 @@ def distribution_charts(runs: Sequence[EpisodeTable]) -> str:
 
 
 def distribution(values: Any) -> Float[np.ndarray[Any, Any], "point 2"]:
-    """Return the corners of the empirical distribution function: value, share of the values up to it.
+    """Return the corners of the empirical distribution function: value, share of the defined values up to it.
 
-    Args:
-        values: One per episode; NaN where undefined. More than 75 values are thinned evenly, so that no corner moves by
-            more than 1 / 75.
+    More than 75 values are thinned evenly, so that no corner moves by more than 1 / 75.
     """
     known = np.sort(np.asarray(values, np.float64))
     known = known[~np.isnan(known)]
@@ -212,13 +198,7 @@ def distribution(values: Any) -> Float[np.ndarray[Any, Any], "point 2"]:
 
 
 def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenario") -> str:
-    """Return one histogram as HTML: the share of the values of each series in common bins.
-
-    Args:
-        title: Words above it.
-        series: Values by name, in the order of ``palette.STROKES``.
-        unit: Unit of the values, written below the axis.
-    """
+    """Return one histogram as HTML: the share of each series in common bins; the unit is written below."""
     values = np.concatenate(list(series.values()))
     edges = bins(values)
     shares = {name: _shares(numbers, edges) for name, numbers in series.items()}
@@ -227,18 +207,12 @@ def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenari
     axes = Axes(low, high, 0.0, levels[-1], left=44)
     shapes = [axes.horizontal(value, f"{compact(100 * value)} %") for value in levels]
     whole = bool((values == np.round(values)).all())
-    shapes += [
-        axes.mark(value)
-        for value in ticks(low, high, 5)
-        if low <= value <= high and (not whole or value == round(value))
-    ]
-    for place, share in enumerate(shares.values()):
-        draw = _bars if len(shares) == 1 else _steps
-        shapes.append(draw(axes, edges, share, stroke(place)))
-    facts = "".join(
-        f"<small>{escape(f'{name}: ' if len(series) > 1 else '')}{_facts(numbers)}</small>"
-        for name, numbers in series.items()
-    )
+    marks = [value for value in ticks(low, high, 5) if low <= value <= high]
+    shapes += [axes.mark(value) for value in marks if not whole or value == round(value)]
+    draw = _bars if len(shares) == 1 else _steps
+    shapes += [draw(axes, edges, share, stroke(place)) for place, share in enumerate(shares.values())]
+    names = {name: escape(f"{name}: ") if len(series) > 1 else "" for name in series}
+    facts = "".join(f"<small>{names[name]}{_facts(numbers)}</small>" for name, numbers in series.items())
     return axes.figure(title, shapes, unit, facts)
 
 
@@ -300,14 +274,7 @@ _CURVED_MPS = 0.5
 
 @dataclass(frozen=True)
 class Signal:
-    """One plot.
-
-    Attributes:
-        name, title: Its name, and the words above the plot.
-        unit: Unit of its values.
-        step: Resolution of the packed values.
-        limits: Comfort limits, low and high; empty without.
-    """
+    """One plot: title, unit, resolution of the packed values (``step``), and comfort limits, low and high, if any."""
 
     name: str
     title: str
@@ -335,13 +302,10 @@ COMMANDED = len(COMMANDS)
 def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
     """Return the signals of a path by name, differentiated and filtered like the comfort metrics.
 
-    Savitzky-Golay windows of nuPlan: accelerations 8/2, jerk and yaw rate 15/2 (``metrics.comfort``). Curvature is yaw
-    rate over speed. The 7 steps at either end have values of the first or last window's polynomial. Values are NaN
-    outside of the last unbroken stretch of the path, at its first step, and, except for speed, throughout if it has
-    fewer than 16 steps.
-
-    Args:
-        ego: Position [m], heading [rad], speed [m/s] at every step; NaN where the agent is absent.
+    The path has position [m], heading [rad] and speed [m/s]; NaN where the agent is absent. Savitzky-Golay windows of
+    nuPlan: accelerations 8/2, jerk and yaw rate 15/2 (``metrics.comfort``). Curvature is yaw rate over speed. The 7
+    steps at either end have values of the first or last window's polynomial. Values are NaN outside of the last
+    unbroken stretch of the path, at its first step, and, except for speed, throughout if it has fewer than 16 steps.
     """
     present = np.asarray(np.isfinite(ego).all(axis=1))
     values = {signal.name: np.full(len(ego), np.nan) for signal in SIGNALS}

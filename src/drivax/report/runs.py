@@ -36,8 +36,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
         raise UsageError("name every run once, and at least one", cure="drivax report RUN [RUN ...]")
     evaluations, trainings = [], []
     # A training and the evaluation of its policy may share a name: no table holds both.
-    names: set[str] = set()
-    charts: set[str] = set()
+    names, charts = set[str](), set[str]()
     for folder in folders:
         run = RunFolder.open(folder)
         if run.kind == "training":

@@ -12,22 +12,9 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
+from drivax.evaluation import tables
 from drivax.evaluation.episode_table import RATES, EpisodeTable, ScenarioKey
 from drivax.evaluation.pairing import comparable, mismatch
-from drivax.evaluation.tables import (
-    CODES,
-    COLLISION_KINDS,
-    CONFIDENCE,
-    UNKNOWN,
-    collisions_table,
-    differences_table,
-    headline,
-    metric_label,
-    metric_names,
-    ordered,
-    planners_table,
-    summarise,
-)
 from drivax.files import check_output, write_text
 from drivax.report.charts import curve_sections, distribution_charts
 from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, outcome, rollouts_of, worst_first
@@ -106,7 +93,7 @@ def _page(runs: Sequence[EpisodeTable], trainings: Sequence[Training], packed: P
     if trainings:
         sections.append(section("Learning curves", curve_sections(trainings)))
     if runs:
-        meanings = explanations(ordered(metric_names(runs)), runs)
+        meanings = explanations(tables.ordered(tables.metric_names(runs)), runs)
         sections.append(section("What the metrics mean", meanings))
     sections.append(_origin([*runs, *trainings]))
     title = f"{runs[-1].name}: evaluation report" if runs else "training report"
@@ -120,7 +107,7 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
     path = Path(str(policy.data.get("path", "its scenario set")))
     name, where = escape(policy.name), escape(str(policy.data.get("name") or path.name))
     for metric, words in (("success", "succeeds in"), ("accuracy", "drives without failure in")):
-        interval = summarise(policy, metric)
+        interval = tables.summarise(policy, metric)
         if interval.mean is not None:
             share = number(interval.mean, "rate") + suffix("rate")
             return (
@@ -131,15 +118,15 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
 
 
 def _results(runs: Sequence[EpisodeTable]) -> str:
-    names = metric_names(runs)
+    names = tables.metric_names(runs)
     first = _first(runs, names)
-    rest = [name for name in ordered(names) if name not in first]
-    table = planners_table(runs, first).html() if first else ""
-    more = f"<summary>{len(rest)} more metrics</summary>{planners_table(runs, rest).html()}"
+    rest = [name for name in tables.ordered(names) if name not in first]
+    table = tables.planners_table(runs, first).html() if first else ""
+    more = f"<summary>{len(rest)} more metrics</summary>{tables.planners_table(runs, rest).html()}"
     note = (
-        f"Mean, {CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; undefined "
-        "episodes are left out. The best mean is underlined, whether or not it is clearly best. Click a mean for its "
-        "episodes. Intervals: Wilson's for rates (with the effective number of episodes where some share a "
+        f"Mean, {tables.CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; "
+        "undefined episodes are left out. The best mean is underlined, whether or not it is clearly best. Click a "
+        "mean for its episodes. Intervals: Wilson's for rates (with the effective number of episodes where some share a "
         "recording), a bootstrap over recordings otherwise."
     )
     more = f"<details>{more}</details>" if rest else ""
@@ -149,7 +136,7 @@ def _results(runs: Sequence[EpisodeTable]) -> str:
 def _first(runs: Sequence[EpisodeTable], names: Sequence[str]) -> list[str]:
     """Return the metrics of the first table: the headline, after crashes where there were any."""
     crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
-    return [*(["crashed"] if crashed and "crashed" in names else []), *headline(names)]
+    return [*(["crashed"] if crashed and "crashed" in names else []), *tables.headline(names)]
 
 
 def _warning(runs: Sequence[EpisodeTable]) -> str:
@@ -169,38 +156,38 @@ def _warning(runs: Sequence[EpisodeTable]) -> str:
 
 def _differences(runs: Sequence[EpisodeTable]) -> str:
     policy, others = runs[-1], runs[:-1]
-    names = _first(runs, list(policy.metrics)) or ordered(list(policy.metrics))
+    names = _first(runs, list(policy.metrics)) or tables.ordered(list(policy.metrics))
     if not others or not names:
         return ""
     note = (
         "Mean of the differences, scenario by scenario, over those where both are defined (n pairs), with a "
-        f"{CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval excludes zero; it "
-        "is not widened for the number of comparisons. “All equal”: no pair differs from the next, so that a "
+        f"{tables.CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval excludes "
+        "zero; it is not widened for the number of comparisons. “All equal”: no pair differs from the next, so that a "
         "bootstrap has no width."
     )
-    table = differences_table(policy, others, names).html()
+    table = tables.differences_table(policy, others, names).html()
     return section(f"{escape(policy.name)} against the others", table, note=note)
 
 
 def _transfer(runs: Sequence[EpisodeTable]) -> str:
     """Return the results by training and evaluation data; empty where all runs share one set."""
-    tables = "".join(
-        f"<h3>{escape(metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
+    parts = "".join(
+        f"<h3>{escape(tables.metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
         for table in transfer_tables(runs)
     )
     note = (
         "Rows: planners and their training data (– where nothing was trained, or the run does not say). Columns: "
         "evaluation data. Sets differ in difficulty: compare along a column."
     )
-    return section("Transfer", tables, note=note)
+    return section("Transfer", parts, note=note)
 
 
 def _collisions(runs: Sequence[EpisodeTable]) -> str:
     """Return the kinds of the first collision with their meanings; empty without collisions of a known kind."""
-    table = collisions_table(runs)
+    table = tables.collisions_table(runs)
     if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
         return ""
-    kinds = COLLISION_KINDS.values()
+    kinds = tables.COLLISION_KINDS.values()
     meanings = definitions((name, f"{meaning[:1].upper()}{meaning[1:]}.") for name, meaning in kinds)
     total = ", ".join(
         f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {len(run)}"
@@ -213,13 +200,13 @@ def _collisions(runs: Sequence[EpisodeTable]) -> str:
 
 def _strata(runs: Sequence[EpisodeTable], tags: Tags) -> str:
     """Return the results by kind of scenario; empty without tags."""
-    tables = "".join(
+    parts = "".join(
         f"<details{'' if place else ' open'}><summary>{escape(table.name.replace('-', ' '))}</summary>"
         f"{table.html()}</details>"
         for place, table in enumerate(strata_tables(runs, tags))
     )
     note = "Tags describe the log. Small strata have wide intervals; of many cells, some stand out by chance."
-    return section("By kind of scenario", tables, note=note)
+    return section("By kind of scenario", parts, note=note)
 
 
 def _distributions(runs: Sequence[EpisodeTable]) -> str:
@@ -262,7 +249,7 @@ def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
 
 def explanations(metrics: Sequence[str], runs: Sequence[EpisodeTable]) -> str:
     """Return a list that explains each known metric in one line."""
-    labels = [label for metric in metrics if (label := metric_label(metric, runs)).explanation]
+    labels = [label for metric in metrics if (label := tables.metric_label(metric, runs)).explanation]
     return definitions((label.heading, label.explanation) for label in labels)
 
 
@@ -326,8 +313,8 @@ def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[Scena
         tags: The tags of scenarios.
         played: The scenarios in the player, and their place there.
     """
-    names = ordered(metric_names(runs))
-    names += [name for name in metric_names(runs) if name in CODES]
+    names = tables.ordered(tables.metric_names(runs))
+    names += [name for name in tables.metric_names(runs) if name in tables.CODES]
     keys = list(dict.fromkeys(key for run in runs for key in run.scenarios))
     place = {key: number for number, key in enumerate(keys)}
     return data_element(
@@ -344,7 +331,7 @@ def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[Scena
 
 
 def _metric(name: str, runs: Sequence[EpisodeTable]) -> dict[str, Any]:
-    label = metric_label(name, runs)
+    label = tables.metric_label(name, runs)
     bad = {"high": 0, "low": 1, "-": None}[label.better] if name in RATES else None
     return {"name": name, "label": label.text, "better": label.better, "unit": label.unit, "bad": bad}
 
@@ -387,7 +374,7 @@ def _rounded(value: float) -> float:
 def _tags(tagged: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     columns = []
     for name in dict.fromkeys(name for tags in tagged for name in tags):
-        values = [tags.get(name, UNKNOWN) for tags in tagged]
+        values = [tags.get(name, tables.UNKNOWN) for tags in tagged]
         distinct = sorted(set(values))
         if 1 < len(distinct) <= MOST_VALUES:
             number = {value: place for place, value in enumerate(distinct)}
