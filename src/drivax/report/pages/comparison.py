@@ -13,7 +13,7 @@ from drivax.evaluation.comparison import Comparison
 from drivax.evaluation.plan import MetricComparison
 from drivax.evaluation.tables import MetricLabel, metric_label
 from drivax.files import check_output, write_text
-from drivax.report.pages.page import facts_html, page, section
+from drivax.report.pages.page import asset, facts_html, page, section
 from drivax.table import MISSING, Cell, Column, Table, bounds, interval_cell, number, suffix
 
 #: Size of the picture of a difference, pixels.
@@ -200,15 +200,6 @@ def notes(comparison: Comparison) -> list[str]:
     return lines
 
 
-_STYLE = """
-td svg { display: block; width: 180px; height: 34px; margin-left: auto; }
-td svg line { stroke: var(--soft); stroke-width: 1; }
-td svg .span { stroke: var(--ink); stroke-width: 2; }
-td svg circle { fill: var(--ink); }
-td svg text { font-size: 10px; fill: var(--soft); }
-"""
-
-
 def write_comparison(comparison: Comparison, out: Path, overwrite: bool = False) -> Path:
     """Write the page of a comparison to the HTML file ``out``.
 
@@ -219,7 +210,7 @@ def write_comparison(comparison: Comparison, out: Path, overwrite: bool = False)
     names = f"{comparison.names[0]} against {comparison.names[1]}"
     label = f"{comparison.plan.name}: " if comparison.plan.name else ""
     sections = [_metrics(comparison), _plan(comparison), _origin(comparison)]
-    write_text(out, page(f"{label}{names}", _lead(comparison), sections, _STYLE))
+    write_text(out, page(f"{label}{names}", _lead(comparison), sections, asset("comparison.css")))
     return out
 
 

@@ -17,25 +17,12 @@ from drivax.report.inspection import (
     speeds,
     true_findings,
 )
-from drivax.report.pages.page import definitions, page, section
+from drivax.report.pages.page import asset, definitions, page, section
 from drivax.report.pictures.palette import stroke
 from drivax.scenario.select.selection import FINDINGS
 
 #: Tags with more values than this (ids, dates) are left out of the page.
 _MOST_VALUES = 16
-_STYLE = """
-.chart rect { stroke: none; }
-.bars { display: grid; gap: 14px 28px; grid-template-columns: repeat(auto-fill, minmax(min(100%, 360px), 1fr)); }
-.bars h3 { margin-top: 10px; }
-.bars table td, .bars table th { border: 0; padding: 1px 6px; font-size: 13px; font-weight: 400; }
-.bars tr > :first-child { background: none; position: static; min-width: 0; width: 40%; max-width: none; }
-.bars td:last-child { text-align: right; width: 96px; white-space: nowrap; }
-.bars i { display: block; box-sizing: content-box; height: 10px; border: solid transparent; border-width: 4.75px 0;
-  background-clip: padding-box; }
-table.sets { width: auto; }
-table.sets td { min-width: 120px; }
-.chart figcaption small { display: block; font-weight: 400; }
-"""
 
 
 def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bool = False) -> Path:
@@ -48,7 +35,7 @@ def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bo
     sections = [_overview(inspections), _quantities(inspections), _shares(inspections), _meaning(inspections)]
     names = ", ".join(inspection.name for inspection in inspections)
     title = f"Scenario set{'s' if len(inspections) > 1 else ''}: {names}"
-    write_text(out, page(title, f"<p class=lead>{_lead(inspections)}</p>", sections, _STYLE))
+    write_text(out, page(title, f"<p class=lead>{_lead(inspections)}</p>", sections, asset("inspection.css")))
     return out
 
 

@@ -18,21 +18,6 @@ KEYS = (
     ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
     ("+ −", "zoom"), ("f", "follow or whole episode"), ("n p", "next and previous episode"),
 )  # fmt: skip
-_CONTROLS = """<div class=controls>
-<button type=button data-control=back aria-label="one step back" title="one step back (←)">◂</button>
-<button type=button data-control=play aria-label="play" title="play or pause (space)">▶</button>
-<button type=button data-control=forward aria-label="one step on" title="one step on (→)">▸</button>
-<div class=track><div class=ticks data-control=ticks></div>
-<input type=range min=0 max=90 value=0 step=1 data-control=scrub aria-label="time"></div>
-<span class=clock data-control=clock></span>
-<select data-control=speed aria-label="speed" title="speed ([ and ])">
-<option value=0.25>¼×</option><option value=0.5>½×</option><option value=1 selected>1×</option>
-<option value=2>2×</option><option value=4>4×</option></select>
-<button type=button data-control=follow aria-pressed=true title="follow the ego (f)">follow</button>
-<button type=button data-control=fit aria-pressed=false title="show the whole episode (f)">whole</button>
-<button type=button data-control=wider aria-label="zoom out" title="zoom out (−)">−</button>
-<button type=button data-control=closer aria-label="zoom in" title="zoom in (+)">+</button>
-</div>"""
 
 
 def page(
@@ -102,9 +87,10 @@ def _colours() -> str:
 def player_html() -> str:
     """Return stage, controls, legend, keys and plots."""
     legend = "".join(_legend_item(name, words) for name, words in LEGEND)
+    controls = asset("controls.html").rstrip()
     keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
     return (
-        f"<div id=stage></div>{_CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
+        f"<div id=stage></div>{controls}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
         "<noscript><p>The player needs JavaScript, which this page carries with it.</p></noscript>"
         "<h3>Motion and commands</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the "
         "filters of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are "

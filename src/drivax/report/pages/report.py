@@ -40,12 +40,8 @@ Packed = Sequence[tuple[EpisodeGroup, Mapping[str, Any]]]
 
 
 def write_report(
-    runs: Sequence[Path],
-    out: Path,
-    data: Path | None = None,
-    episodes: int = EPISODES,
-    overwrite: bool = False,
-) -> Path:
+    runs: Sequence[Path], out: Path, data: Path | None = None, episodes: int = EPISODES, overwrite: bool = False
+) -> Path:  # fmt: skip
     """Write a report of evaluation and training runs to the HTML file ``out``; the last evaluation is the policy.
 
     Args:
@@ -126,8 +122,8 @@ def _results(runs: Sequence[EpisodeTable]) -> str:
     note = (
         f"Mean, {tables.CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; "
         "undefined episodes are left out. The best mean is underlined, whether or not it is clearly best. Click a "
-        "mean for its episodes. Intervals: Wilson's for rates (with the effective number of episodes where some share a "
-        "recording), a bootstrap over recordings otherwise."
+        "mean for its episodes. Intervals: Wilson's for rates (with the effective number of episodes where some share "
+        "a recording), a bootstrap over recordings otherwise."
     )
     more = f"<details>{more}</details>" if rest else ""
     return section("Results", _warning(runs), table, more, note=note)
@@ -220,7 +216,13 @@ def _episodes(runs: Sequence[EpisodeTable], packed: Packed) -> str:
         "<p>All episodes, worst first: the gravest kind of failure, then the lowest score. Click a number in the "
         f"tables above for its episodes. {note}</p>"
     )
-    return section("Episodes", words, EPISODE_LIST, _player(runs, packed), attributes=" id=episodes")
+    return section(
+        "Episodes",
+        words,
+        asset("episode_list.html").rstrip(),
+        _player(runs, packed),
+        attributes=" id=episodes",
+    )
 
 
 def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
@@ -234,12 +236,8 @@ def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     )
     policy = escape(runs[-1].name)
     shown = [run for run in runs if comparable(run, runs[-1])]
-    caution = (
-        f"<p><b>Other agents are drawn as they moved around {policy};</b> around the others they reacted "
-        "differently.</p>"
-        if len(shown) > 1 and runs[-1].traffic != "log"
-        else ""
-    )
+    words = f"Other agents are drawn as they moved around {policy};</b> around the others they reacted differently."
+    caution = f"<p><b>{words}</p>" if len(shown) > 1 and runs[-1].traffic != "log" else ""
     return (
         f"<h3>Rollouts</h3><p>Selected by rule: failures of {policy} first, each kind in turn, then successes. All "
         f"planners start from the same state at the same time.</p>{caution}"
@@ -283,21 +281,6 @@ MOST_VALUES = 24
 _SHOWN = (
     "vmax_score", "at_fault_collision", "collision", "offroad", "red_light", "progress_ratio", "min_ttc", "comfortable",
 )  # fmt: skip
-
-EPISODE_LIST = """<form class=filters id=filters onsubmit="return false">
-<label>planner <select name=run></select></label>
-<label>outcome <select name=outcome></select></label>
-<label>failed <select name=failed></select></label>
-<label>metric <select name=metric></select></label>
-<label class=bound><select name=sign aria-label="at least, at most or equal"><option value=ge>≥</option>
-<option value=le>≤</option><option value=eq>=</option></select>
-<input name=bound type=number step=any size=7 aria-label="bound of the metric" placeholder="number"></label>
-<span id=tags></span>
-<label>scenario <input name=words type=search placeholder="part of its id"></label>
-<button type=button name=all>all</button></form>
-<p id=count role=status></p>
-<div class="scroll list" tabindex=0 role=region aria-label="list of episodes"><table class=episodes><thead><tr id=heads>
-</tr></thead><tbody id=rows></tbody></table></div><button type=button id=more hidden>more</button>"""
 
 
 def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[ScenarioKey, int]) -> str:
@@ -344,17 +327,14 @@ def _run(
     distinct = list(dict.fromkeys(outcomes))
     keys = run.scenarios
     scenarios, crashes = [keys[row] for row in rows], run.crash_by_scenario
+    failed = ((str(row), key) for row, key in enumerate(scenarios))
     return {
         "name": run.name,
         "playable": comparable(run, runs[-1]),
         "scenario": [place[key] for key in scenarios],
         "outcomes": distinct,
         "outcome": [distinct.index(words) for words in outcomes],
-        "errors": {
-            str(row): (crashes[key].step, crashes[key].error)
-            for row, key in enumerate(scenarios)
-            if key in crashes
-        },
+        "errors": {row: (crashes[key].step, crashes[key].error) for row, key in failed if key in crashes},
         "values": [_column(run.metrics.get(name), rows) for name in names],
     }
 
