@@ -87,10 +87,8 @@ def weighted(
     """
     table = tables(arm.method)
     if table.method != arm.method:
-        raise UsageError(
-            f"scores of {table.method!r} for an arm that is curated by {arm.method!r}",
-            cure=f"drivax curate {arm.method} --data {data.path} --out SCORES",
-        )
+        problem = f"scores of {table.method!r} for an arm that is curated by {arm.method!r}"
+        raise UsageError(problem, cure=f"drivax curate {arm.method} --data {data.path} --out SCORES")
     if arm.method == "oracle" and not table.steps.any():
         raise UsageError("no scenario has a labelled event", file=data.path, cure="use an arm without labels")
     if arm.permuted:

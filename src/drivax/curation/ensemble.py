@@ -45,6 +45,8 @@ _SAMPLES = 16
 #: No past steps and no last action, which a policy could copy instead of observing the scene.
 _OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
 
+_NETWORK = NetworkConfig(encoder=EntityConfig(), activation="relu")
+
 Numbers = np.ndarray[Any, Any]
 
 
@@ -67,11 +69,7 @@ class EnsembleConfig:
     """
 
     folds: int = 5
-    cloning: BcConfig = field(
-        default_factory=lambda: BcConfig(
-            batch=128, network=NetworkConfig(encoder=EntityConfig(), activation="relu")
-        )
-    )
+    cloning: BcConfig = field(default_factory=lambda: BcConfig(batch=128, network=_NETWORK))
     learn_from: int | None = None
     total_steps: int = 384_000
     weighted: Literal["plain", "rarity"] = "plain"

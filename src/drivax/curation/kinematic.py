@@ -31,13 +31,7 @@ from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, wrap
 from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, savgol_matrix
-from drivax.scenario.bank.queries import (
-    LEVEL_M,
-    lane_distance,
-    offroad_distance,
-    project_on_route,
-    vertex_distances,
-)
+from drivax.scenario.bank import queries
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import STOPPED_MPS, TTC_HORIZON_S, time_to_collision
@@ -122,7 +116,7 @@ def required_braking(
 
     def window(offset_m: float) -> Any:
         near = along_m + offset_m
-        return jax.vmap(lambda point: project_on_route(bank, index, point, near, route=LOG_ROUTE))(xy)
+        return jax.vmap(lambda point: queries.project_on_route(bank, index, point, near, route=LOG_ROUTE))(xy)
 
     # Beyond a window the projection is its end point, so take the nearer of the two.
     first, second = map(window, _WINDOWS_M)
@@ -131,7 +125,7 @@ def required_braking(
     cos = jnp.sum(frame.box[:, 2:4] * hits.heading, axis=-1)
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
     length, width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
-    counts = counts & (jnp.abs(frame.z - frame.z[0]) <= LEVEL_M)
+    counts = counts & (jnp.abs(frame.z - frame.z[0]) <= queries.LEVEL_M)
     on_path = hits.distance_m < jnp.abs(sin) * length + jnp.abs(cos) * width + me[5] / 2
     gap = hits.along_m - along_m - (jnp.abs(cos) * length + sin * width) - me[4] / 2
     gap = jnp.where(counts & on_path & (hits.along_m > along_m), gap, jnp.inf)
@@ -198,7 +192,7 @@ def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> 
     def at_step(box: Array, ground: Array) -> Array:
         # A logged car without an edge nearby is on the road: on a driveway, or beyond the map.
         road = jnp.ones(4, bool)
-        beyond = offroad_distance(bank, log.index, box[:2], corners(box), road, ground)
+        beyond = queries.offroad_distance(bank, log.index, box[:2], corners(box), road, ground)
         return jnp.max(jnp.clip(1.0 + beyond / config.edge_m, 0.0, 1.0))
 
     return jax.vmap(at_step)(log.frame.box[:, 0], log.ground_m)
@@ -206,7 +200,7 @@ def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> 
 
 def _deviation(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
     def at_step(xy: Array, ground: Array) -> Array:
-        distance = lane_distance(bank, log.index, xy, ground)
+        distance = queries.lane_distance(bank, log.index, xy, ground)
         # Beyond the cut-off there is no lane: a car park, a driveway, the end of the map.
         return jnp.where(jnp.isfinite(distance), jnp.minimum(distance / config.lane_m, 1.0), 0.0)
 
@@ -240,7 +234,9 @@ class PublishedConfig:
     def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Float[Array, " T"]]:
         """Return the components of every step of a log."""
         xy = log.motion[:, :2]
-        edge_m, lane_m = jax.vmap(lambda point: vertex_distances(bank, log.index, point, self.spacing_m))(xy)
+        edge_m, lane_m = jax.vmap(
+            lambda point: queries.vertex_distances(bank, log.index, point, self.spacing_m)
+        )(xy)
         return {
             "volatility": _published_volatility(self, log),
             "interaction": _interaction(self, log),

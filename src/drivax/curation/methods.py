@@ -90,10 +90,8 @@ def curate(name: str, request: Request) -> ScoreTable:
     if name not in METHODS:
         raise UsageError(f"there is no method {name!r}", cure=did_you_mean(name, sorted(METHODS)))
     if (request.like is not None) != (name == "random_matched"):
-        raise UsageError(
-            "random_matched needs --like, a table of the same set, and no other method takes it",
-            cure="drivax curate random_matched --like SCORES ...",
-        )
+        problem = "random_matched needs --like, a table of the same set, and no other method takes it"
+        raise UsageError(problem, cure="drivax curate random_matched --like SCORES ...")
     default = METHODS[name].config
     config = default if request.config is None else request.config
     if type(config) is not type(default):

@@ -135,14 +135,11 @@ class ScoreTable:
     """Scores of every scenario and step of a set, in the set's order.
 
     Attributes:
-        method: Name of the method.
-        config: Its configuration; ``combination`` holds the arguments of :meth:`combined`.
-        set_hash: ``ScenarioSet.hash`` of the data.
-        scenario_ids: Id of each scenario.
+        method, config: Its name and configuration; ``combination`` holds the arguments of :meth:`combined`.
+        set_hash, scenario_ids: ``ScenarioSet.hash`` of the data, and the id of each scenario.
         valid: Whether ego is observed; other steps score 0.
-        steps: Score of every step, in [0, 1].
-        scenarios: Score of every scenario, in [0, 1].
-        components: Components of the scores by name, of every step, in [0, 1].
+        steps, scenarios: Scores, in [0, 1].
+        components: Components of the steps' scores by name, in [0, 1].
     """
 
     method: str
@@ -193,12 +190,9 @@ def write_scores(table: ScoreTable, out: Path, overwrite: bool = False) -> None:
     check_output(out, overwrite)
     _check_range(table, None, "report this as a defect of drivax")
     header = {
-        "version": SCORES_VERSION,
-        "method": table.method,
-        "config": dict(table.config),
-        "set_hash": table.set_hash,
+        "version": SCORES_VERSION, "method": table.method, "config": dict(table.config), "set_hash": table.set_hash,
         "drivax_version": metadata.version("drivax"),
-    }
+    }  # fmt: skip
     with atomic_write(out) as file:
         np.savez_compressed(
             file,
@@ -249,11 +243,9 @@ def _check_source(version: object, set_hash: object, file: Path, data: ScenarioS
         raise DataError(f"version {version}, this drivax reads {SCORES_VERSION}", file=file, cure=_AGAIN)
     if set_hash != data.hash:
         own = data.path / OWN_SCORES
-        raise DataError(
-            f"scores are of other data (hash {str(set_hash)[:12]}, {data.path} has {data.hash[:12]})",
-            file=file,
-            cure=f"use {own}" if own.is_file() and own != file else _AGAIN,
-        )
+        problem = f"scores are of other data (hash {str(set_hash)[:12]}, {data.path} has {data.hash[:12]})"
+        cure = f"use {own}" if own.is_file() and own != file else _AGAIN
+        raise DataError(problem, file=file, cure=cure)
 
 
 def _check_shapes(ids: tuple[str, ...], arrays: Mapping[str, Any], file: Path, data: ScenarioSet) -> None:

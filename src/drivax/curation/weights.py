@@ -63,11 +63,8 @@ def sampling_weights(
 ) -> Float[Array, "N T"]:
     """Return the weight of every step: mean 1 over the steps that can be drawn, 0 elsewhere.
 
-    Args:
-        table: The scores.
-        config: How scores become weights.
-        scale: ``step``: weights of steps; ``scenario``: every step has the weight of its scenario.
-        usable: Steps that can be drawn (:func:`drivax.learning.loop.usable_steps`); None: ``ScoreTable.drawable``.
+    At the scale ``scenario``, every step has the weight of its scenario. The steps that can be drawn are ``usable``
+    (:func:`drivax.learning.loop.usable_steps`), by default ``ScoreTable.drawable``.
 
     Raises:
         UsageError: No step can be drawn, or all weights are 0.

@@ -40,11 +40,9 @@ Values = Float64[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class SeedSpread:
-    """How the seeds of a policy differ in the primary metric.
+    """Means of a policy's seeds in the primary metric (None: undefined throughout), and their interquartile mean.
 
-    Attributes:
-        means: Mean of each seed; None where it is undefined throughout.
-        interquartile: Interquartile mean over seeds, with an interval that resamples seeds and recordings.
+    The interval of the interquartile mean resamples seeds and recordings.
     """
 
     means: tuple[float | None, ...]
@@ -56,16 +54,12 @@ class Comparison:
     """The result of a comparison.
 
     Attributes:
-        plan: The plan.
         names, folders: Names and run folders of A and B.
         traffic: Traffic model of both.
         scenarios, recordings: Numbers of A and of B; the same ones where they are paired.
         strata: Number of strata of the split; 1 without.
-        primary: The metric that decides.
-        secondary: The others.
         sensitivity: Of the primary metric; None where it does not vary.
         seeds: Spread over seeds of A and B; None for a single one.
-        decision: The decision.
     """
 
     plan: ComparisonPlan
@@ -143,13 +137,9 @@ def compare(
     b: Sequence[EpisodeTable],
     entries: Sequence[Mapping[str, Any]] = (),
 ) -> Comparison:
-    """Compare two planners by a plan.
+    """Compare two planners by a plan, each with an evaluation per seed.
 
-    Args:
-        plan: What to compare and how to decide.
-        a: The evaluations of A's seeds; a single one for a planner without.
-        b: B's.
-        entries: Manifest entries of the scenarios, for a stratified split.
+    Manifest ``entries`` of the scenarios are for a stratified split.
 
     Raises:
         UsageError: The evaluations cannot be compared, or lack a metric of the plan.
@@ -202,10 +192,8 @@ def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, An
         known = {(entry["dataset"], entry["scenario_id"]): entry for entry in entries}
         missing = next((key for key in pairs.keys if key not in known), None)
         if missing is not None:
-            raise UsageError(
-                f"nothing tells the stratum of {missing[1]}",
-                cure="pass the set that was evaluated with --data",
-            )
+            cure = "pass the set that was evaluated with --data"
+            raise UsageError(f"nothing tells the stratum of {missing[1]}", cure=cure)
         strata = pairing.strata_of([known[key] for key in pairs.keys], plan.strata)
     return pairing.assign(pairs.clusters, strata, plan.ratio, plan.seed)
 

@@ -83,9 +83,8 @@ class EpisodeTable:
     """Episodes of one planner on one scenario set.
 
     Attributes:
-        folder: Run folder; None for episodes in memory only.
+        folder, info: Run folder (None for episodes in memory), and content of ``run.json``.
         name: Planner name in tables.
-        info: Content of ``run.json``.
         keys: Columns :data:`KEYS` as text.
         metrics: Values by metric name, NaN where undefined.
         crashes: Episodes whose planner crashed.

@@ -79,11 +79,10 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
         # Seeds are numbered at the end of the name, before the checkpoint; two checkpoints are two planners.
         planners = {re.sub(r"^(.*?)[0-9]*(@[0-9]+)?$", r"\1\2", table.name): table.name for table in side}
         if len(planners) > 1:
-            raise UsageError(
-                f"holds evaluations of several planners ({', '.join(sorted(planners.values()))})",
-                file=None if side[0].folder is None else side[0].folder.parent,
-                cure=f"name one of them, as {side[0].folder}",
-            )
+            problem = f"holds evaluations of several planners ({', '.join(sorted(planners.values()))})"
+            folder = side[0].folder
+            file = None if folder is None else folder.parent
+            raise UsageError(problem, file=file, cure=f"name one of them, as {folder}")
     for table in tables[1:]:
         if problem := mismatch(tables[0], table):
             names = [run.folder or run.name for run in (tables[0], table)]

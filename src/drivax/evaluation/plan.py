@@ -98,11 +98,9 @@ class MetricComparison:
     """One metric of both planners.
 
     Attributes:
-        metric: Its name.
         unit: ``-`` for shares, empty where unknown.
         better: ``high`` or ``low``; ``-`` where neither is.
-        a, b: Means over the scenarios that count.
-        difference: ``A - B``.
+        a, b, difference: Means over the scenarios that count, and ``A - B``.
         effects: Cohen's d: ``d_z`` and ``d_av`` of pairs, ``d`` of a split.
         evidence: The test.
         p_adjusted: By Holm's method over the secondary metrics; the primary metric's own.

@@ -81,16 +81,9 @@ def drive(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, index: Int[Array, " B"], keys: Array,
     start_step: int = CURRENT_STEP, slot: Any = 0,
 ) -> Episodes:  # fmt: skip
-    """Run one planner on scenarios ``index``; one compilation per planner kind, batch size and start step.
+    """Run one planner on rows ``index`` of a bank; one compilation per planner kind, batch size and start step.
 
-    Args:
-        simulator: With a task whose episodes do not end early (:func:`evaluation_task`).
-        planner: The planner.
-        bank: The scenarios.
-        index: Rows of the bank.
-        keys: A random key for each.
-        start_step: Step of the log at which to begin.
-        slot: Which agent is driven.
+    The task's episodes must not end early (:func:`evaluation_task`); ``slot`` is the driven agent.
     """
     episode = partial(_episode, simulator, planner, bank, start_step, slot)
     return jax.vmap(episode)(index, keys)

@@ -334,11 +334,8 @@ class _Evaluation:
         }
         columns = {key: tuple(row[key] for row in names) for key in ("dataset", "scenario_id", "segment")}
         columns |= {"planner": (planner,) * n, "seed": (str(self.seed),) * n, "traffic": (traffic,) * n}
-        own = {
-            name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
-            for name, metric in self.metrics.items()
-            if name not in METRICS
-        }
+        theirs = {name: metric for name, metric in self.metrics.items() if name not in METRICS}
+        own = {name: {"unit": m.unit, "better": m.better, "text": m.definition} for name, m in theirs.items()}
         crashes: list[Crash] = []
         for row in np.flatnonzero(crashed >= 0):
             step = int(crashed[row])

@@ -123,11 +123,7 @@ def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> In
 
 
 def paired_differences(results: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
-    """Return :func:`paired_difference` of two evaluations in memory.
-
-    Raises:
-        UsageError: If their scenarios differ.
-    """
+    """Return :func:`paired_difference` of two evaluations of one set; others raise :class:`UsageError`."""
     if set(results.scenarios) != set(other.scenarios):
         raise UsageError("the scenarios of the evaluations differ", cure="evaluate both on one set")
     return paired_difference(results, other, metric)
@@ -203,15 +199,13 @@ def _run_columns(runs: Sequence[EpisodeTable]) -> list[Column]:
 
 def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
     """Return a table with metrics in rows and runs in columns."""
-    rows = tuple(
-        (
-            _metric_cell(name, runs),
-            *(_cell(runs, name, summarise(run, name), {"run": run.name, "metric": name}) for run in runs),
-        )
-        for name in metrics
-    )
+    rows = []
+    for name in metrics:
+        links = [(run, {"run": run.name, "metric": name}) for run in runs]
+        cells = (_cell(runs, name, summarise(run, name), link) for run, link in links)
+        rows.append((_metric_cell(name, runs), *cells))
     columns = (Column("metric", "metric", label=True), *_run_columns(runs))
-    return Table("results", columns, rows, f"Mean and {CONFIDENCE:.0%} interval", "planner")
+    return Table("results", columns, tuple(rows), f"Mean and {CONFIDENCE:.0%} interval", "planner")
 
 
 #: Words of a verdict; the sign repeats in shape what the colour says.
@@ -276,10 +270,8 @@ def strata_table(
             inside = np.flatnonzero(np.array(values[run.name]) == value)
             if inside.size:
                 link = {"run": run.name, "tags": {tag: value}}
-                cells = (
-                    _cell(runs, name, summarise(run, name, inside), link | {"metric": name})
-                    for name in metrics
-                )
+                means = ((name, summarise(run, name, inside)) for name in metrics)
+                cells = (_cell(runs, name, mean, link | {"metric": name}) for name, mean in means)
                 rows.append((Cell(value), Cell(run.name), *cells))
     caption = f"By {tag}: mean and {CONFIDENCE:.0%} interval"
     labels = (Column(tag, label=True), Column("planner", label=True))

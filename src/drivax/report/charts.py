@@ -14,14 +14,8 @@ from jaxtyping import Float
 from drivax.evaluation.episode_table import SHARES, EpisodeTable
 from drivax.evaluation.tables import metric_label
 from drivax.geometry.vectors import wrap
-from drivax.metrics.comfort import (
-    JERK_MPS3,
-    LATERAL_MPS2,
-    LONGITUDINAL_MPS2,
-    WINDOW,
-    YAW_RATE_RPS,
-    savgol_matrix,
-)
+from drivax.metrics import comfort
+from drivax.metrics.comfort import WINDOW, savgol_matrix
 from drivax.report.pictures.palette import Stroke, stroke
 from drivax.report.runs import Training
 from drivax.scenario.schema import DT_S
@@ -285,11 +279,11 @@ class Signal:
 
 SIGNALS = (
     Signal("speed", "speed", "m/s", 0.01),
-    Signal("acceleration", "acceleration along the road", "m/s²", 0.01, LONGITUDINAL_MPS2),
-    Signal("jerk", "jerk along the road", "m/s³", 0.01, (-JERK_MPS3, JERK_MPS3)),
+    Signal("acceleration", "acceleration along the road", "m/s²", 0.01, comfort.LONGITUDINAL_MPS2),
+    Signal("jerk", "jerk along the road", "m/s³", 0.01, (-comfort.JERK_MPS3, comfort.JERK_MPS3)),
     Signal("curvature", "curvature", "1/m", 0.0001),
-    Signal("yaw_rate", "yaw rate", "rad/s", 0.001, (-YAW_RATE_RPS, YAW_RATE_RPS)),
-    Signal("lateral", "lateral acceleration", "m/s²", 0.01, (-LATERAL_MPS2, LATERAL_MPS2)),
+    Signal("yaw_rate", "yaw rate", "rad/s", 0.001, (-comfort.YAW_RATE_RPS, comfort.YAW_RATE_RPS)),
+    Signal("lateral", "lateral acceleration", "m/s²", 0.01, (-comfort.LATERAL_MPS2, comfort.LATERAL_MPS2)),
 )
 #: Commands: the first two numbers of an action.
 COMMANDS = (

@@ -68,9 +68,7 @@ class Inspection:
         if not rows:
             text = " and ".join(condition.text for condition in selection.filters)
             lacking = ", ".join(f"{count:,} lack what {name!r} asks for" for name, count in unknown.items())
-            problem = f"none of {len(scenarios):,} scenarios has {text}" + (
-                f" ({lacking})" if lacking else ""
-            )
+            problem = f"none of {len(scenarios):,} scenarios has {text}{f' ({lacking})' if lacking else ''}"
             cure = "drivax inspect without --filter shows what there is"
             raise DataError(problem, file=path, cure=cure)
         return cls(path.resolve().name, scenarios, rows, unknown, check)
@@ -217,10 +215,8 @@ def overview(inspection: Inspection) -> Table:
     manifest, capacity = scenarios.manifest, scenarios.capacity
     segments = f"recorded segments: {inspection.recordings:,}, shards: {len(manifest['shards']):,}"
     rows = [("set", str(scenarios.path)), ("scenarios", f"{_selected(inspection)} ({segments})")]
-    rows += [
-        ("", f"{lacking:,} lack what {name!r} asks for and are left out")
-        for name, lacking in inspection.unknown.items()
-    ]
+    unknown = inspection.unknown.items()
+    rows += [("", f"{lacking:,} lack what {name!r} asks for and are left out") for name, lacking in unknown]
     size = f"{inspection.megabytes:,.1f} MB, {manifest['record_bytes'] / 1e3:,.0f} kB per scenario"
     sizes = (
         f"{capacity.name}: {capacity.agents} moving and {capacity.parked} parked agents, {capacity.segments:,} map "
@@ -284,11 +280,9 @@ def listing(inspection: Inspection) -> Table:
     """Return the first scenarios with the counts of their source."""
     names = ("steps", "tracks", "now", "lanes", "lines", "edges", "others", "points", "lights", "segments")
     columns = (Column("scenario", label=True, most=24), *map(Column, names))
-    rows = tuple(
-        (Cell(entry["scenario_id"]), *(Cell(f"{count:,}") for count in _counts(entry)))
-        for entry in inspection.entries[:LISTED]
-    )
-    return Table("scenarios", columns, rows)
+    listed = inspection.entries[:LISTED]
+    rows = ((entry["scenario_id"], *(f"{count:,}" for count in _counts(entry))) for entry in listed)
+    return Table("scenarios", columns, tuple(tuple(map(Cell, row)) for row in rows))
 
 
 def _counts(entry: Entry) -> tuple[int, ...]:

@@ -32,12 +32,8 @@ def write_tables(
     ``results`` and, of several runs, ``differences``; ``collisions`` where kinds of collision are known; ``by-TAG`` for
     the tags of the scenarios; ``transfer-METRIC`` where runs were evaluated on several data sets.
 
-    Args:
-        runs: Run folders; the last evaluation is the policy.
-        out: The folder.
-        data: The scenario set of the evaluation, where it has moved.
-        overwrite: Replace existing files.
-        metrics: Further metrics (columns of ``episodes.csv``, or a set) for ``results``, ``differences``, ``by-TAG``.
+    The last evaluation is the policy. ``data`` is its scenario set, where it has moved; ``metrics`` are further columns
+    of ``episodes.csv``, or a set of metrics, for ``results``, ``differences`` and ``by-TAG``.
 
     Raises:
         DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.

@@ -58,14 +58,10 @@ def _overview(inspections: Sequence[Inspection]) -> str:
 
 def _quantities(inspections: Sequence[Inspection]) -> str:
     names = [inspection.name for inspection in inspections]
-    series = [
-        (
-            each.label,
-            each.unit or "per scenario",
-            [inspection.values(each.read) for inspection in inspections],
-        )
-        for each in QUANTITIES
-    ]
+    series = []
+    for quantity in QUANTITIES:
+        values = [inspection.values(quantity.read) for inspection in inspections]
+        series.append((quantity.label, quantity.unit or "per scenario", values))
     sampled = [speeds(inspection) for inspection in inspections]
     series.append(("speed of ego", "m/s", [sample.ego for sample in sampled]))
     series.append(("speed of other vehicles now", "m/s", [sample.vehicles for sample in sampled]))

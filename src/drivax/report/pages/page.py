@@ -24,15 +24,9 @@ def page(
     title: str, lead: str, sections: Iterable[str], style: str = "", data: Iterable[str] = (),
     scripts: Iterable[str] = (),
 ) -> str:  # fmt: skip
-    """Return a whole page.
+    """Return a whole page from a title (plain text), HTML below it and of its sections (empty ones are left out).
 
-    Args:
-        title: Its heading, as plain text.
-        lead: HTML below the heading.
-        sections: HTML of its parts; empty ones are left out.
-        style: Further CSS.
-        data: Script elements that hold data.
-        scripts: JavaScript, in order.
+    ``style`` is further CSS, ``data`` are script elements that hold data, ``scripts`` are programs in order.
     """
     return Template(asset("report.html.template")).substitute(
         title=escape(title),

@@ -46,7 +46,7 @@ def write_report(
 
     Args:
         runs: Run folders of ``drivax evaluate`` and ``drivax train``, in the order of the tables.
-        out: The file; it appears when it is complete.
+        out: The file.
         data: The scenario set of the evaluation, where it has moved.
         episodes: Number of playable episodes; 0 leaves out rollouts and tags and needs no scenario set.
         overwrite: Replace an existing file.
@@ -185,11 +185,8 @@ def _collisions(runs: Sequence[EpisodeTable]) -> str:
         return ""
     kinds = tables.COLLISION_KINDS.values()
     meanings = definitions((name, f"{meaning[:1].upper()}{meaning[1:]}.") for name, meaning in kinds)
-    total = ", ".join(
-        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {len(run)}"
-        for run in runs
-        if "collision_type" in run.metrics
-    )
+    counted = [(run, run.metrics["collision_type"] > 0) for run in runs if "collision_type" in run.metrics]
+    total = ", ".join(f"{escape(run.name)} {int(hit.sum())} of {len(run)}" for run, hit in counted)
     parts = f"<p>Episodes with a collision: {total}.</p>", table.html(), meanings
     return section("Kinds of collision", *parts, note=f"{escape(table.caption)} (Wilson's).")
 
@@ -216,13 +213,8 @@ def _episodes(runs: Sequence[EpisodeTable], packed: Packed) -> str:
         "<p>All episodes, worst first: the gravest kind of failure, then the lowest score. Click a number in the "
         f"tables above for its episodes. {note}</p>"
     )
-    return section(
-        "Episodes",
-        words,
-        asset("episode_list.html").rstrip(),
-        _player(runs, packed),
-        attributes=" id=episodes",
-    )
+    listed = asset("episode_list.html").rstrip()
+    return section("Episodes", words, listed, _player(runs, packed), attributes=" id=episodes")
 
 
 def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
@@ -284,17 +276,12 @@ _SHOWN = (
 
 
 def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[ScenarioKey, int]) -> str:
-    """Return the data of the list as a script element.
+    """Return the data of the list as a script element; the policy is the last run, ``played`` has places in the player.
 
     ``metrics`` says how each is shown and which value of a rate is a failure; ``runs[].values`` holds one column per
     metric with four significant digits, null where undefined, rows worst first; ``runs[].errors`` by row the step and
     the error of a crash; ``tags`` holds for each tag its values and for each scenario the index of its value, which is
     ``unknown`` where it has none.
-
-    Args:
-        runs: Evaluations, the policy last.
-        tags: The tags of scenarios.
-        played: The scenarios in the player, and their place there.
     """
     names = tables.ordered(tables.metric_names(runs))
     names += [name for name in tables.metric_names(runs) if name in tables.CODES]

@@ -49,14 +49,7 @@ def write_player(
     scenarios: Sequence[Scenario], out: Path, overwrite: bool = False, title: str = "scenarios",
     details: Sequence[str] = (),
 ) -> Path:  # fmt: skip
-    """Write a page of logs to the HTML file ``out``.
-
-    Args:
-        scenarios: The scenarios; some tens of kB of page each.
-        out: The file; it appears when it is complete.
-        overwrite: Replace an existing file.
-        title: Heading of the page, as the name of the set.
-        details: HTML above the facts of each scenario.
+    """Write a page of logs (some tens of kB each) to the HTML file ``out``; ``details`` is HTML above each one's facts.
 
     Raises:
         UsageError: ``out`` exists or is a folder, or there is no scenario.

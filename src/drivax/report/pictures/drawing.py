@@ -126,12 +126,10 @@ class Drawing:
     """A scenario as it is drawn, local frame, metres.
 
     Attributes:
-        layers: Polylines of the map by layer.
-        stops: Positions of stop signs.
-        route, goal: Points of the route to the goal; the goal, if it is near.
+        layers, stops: Polylines of the map by layer, and positions of stop signs.
+        route, goal: Points of the route, and the goal, if it is near.
         light_line, light_state: Stop line of each light, and its code (:data:`LIGHTS`) at every step, -1 unobserved.
-        agents, parked: All agents but ego.
-        log: The logged ego.
+        agents, parked, log: All agents but ego, and the logged ego.
     """
 
     layers: Mapping[str, Lines]

@@ -41,12 +41,7 @@ _SCALE = {
 
 @dataclass(frozen=True)
 class ObservationGroups:
-    """An observation by group and feature: lengths in m, velocities in m/s, other values unchanged.
-
-    Attributes:
-        values: Group -> feature -> ``[..., columns]``, as configured.
-        masks: Group -> which rows are valid.
-    """
+    """An observation by group and feature ``[..., columns]`` in m and m/s, and the valid rows of each group."""
 
     values: Mapping[str, Mapping[str, Values]]
     masks: Mapping[str, Values]
@@ -148,13 +143,9 @@ def _draw_reach(axes: Axes, config: ObservationConfig) -> None:
     from matplotlib.patches import Rectangle
 
     side, behind, ahead = config.road_side_m, config.road_behind_m, config.road_ahead_m
-    style: dict[str, Any] = {
-        "facecolor": "white",
-        "edgecolor": LIGHT["lane"],
-        "linestyle": (0, (6, 4)),
-        "linewidth": 0.9,
-    }
-    axes.add_patch(Rectangle((-side, -behind), 2 * side, ahead + behind, zorder=0, **style))
+    box = Rectangle((-side, -behind), 2 * side, ahead + behind, facecolor="white", edgecolor=LIGHT["lane"])
+    box.set(linestyle=(0, (6, 4)), linewidth=0.9, zorder=0)
+    axes.add_patch(box)
 
 
 def _draw_road(axes: Axes, groups: ObservationGroups) -> None:

@@ -99,11 +99,8 @@ def draw_on(
 def _draw(axes: Axes, colours: Colours, shape: Shape) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
-    lines, width, line = (
-        list(shape.lines),
-        _POINTS * shape.width,
-        colours[shape.line] if shape.line else "none",
-    )
+    lines, width = list(shape.lines), _POINTS * shape.width
+    line = colours[shape.line] if shape.line else "none"
     artist: Any = LineCollection(lines, colors=line, linewidths=width, capstyle="round")
     if shape.fill:
         artist = PolyCollection(lines, facecolor=colours[shape.fill], edgecolor=line, linewidth=width)

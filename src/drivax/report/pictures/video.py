@@ -51,7 +51,7 @@ def write_videos(
 
     Args:
         runs: Run folders; the last evaluation is the policy, whose episodes are ranked and, alone, drawn.
-        out: Folder for the files; each appears when it is complete.
+        out: Folder for the files.
         which: ``worst:N``, ``all``, or the id of a scenario.
         side_by_side: Draw every run with an episode of the scenario in one picture.
         data: The scenario set of the evaluation, where it has moved.
