@@ -59,12 +59,12 @@ def check_batches(simulator, bank):
 
 
 @pytest.mark.slow
-def test_neither_batch_size_nor_neighbours_matter(world):
+def test_episodes_do_not_depend_on_batch_size_or_neighbours(world):
     check_batches(Simulator(Task(metrics=METRICS, to_the_end=True)), world)
 
 
 @pytest.mark.slow
-def test_neither_batch_size_nor_neighbours_matter_to_any_metric(world):
+def test_metrics_do_not_depend_on_batch_size_or_neighbours(world):
     check_batches(Simulator(evaluation_task(Task())), world)
 
 

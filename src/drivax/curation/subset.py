@@ -25,10 +25,9 @@ def check_top(
     """
     total, recordings = len(data), len(set(recordings_of(data.entries)))
     if not all_windows and recordings < total and not 1 <= count <= recordings:
-        raise UsageError(
-            f"the {count} most critical of {recordings} recordings, one scenario of each",
-            cure=f"ask for 1 to {recordings}, or pass --all-windows to choose among all {total} scenarios",
-        )
+        cure = f"ask for 1 to {recordings}, or pass --all-windows to choose among all {total} scenarios"
+        problem = f"the {count} most critical of {recordings} recordings, one scenario of each"
+        raise UsageError(problem, cure=cure)
     if not 1 <= count <= total:
         raise UsageError(f"the {count} most critical of {total} scenarios", cure=f"ask for 1 to {total}")
     refuse_part(data, out)
@@ -55,15 +54,12 @@ def subset_of_table(table: ScoreTable, indices: Sequence[int], subset: ScenarioS
     chosen = list(indices)
     source = subset.manifest["source"]["part_of"]
     source = {name: value for name, value in source.items() if name not in ("method", "config")}
+    ids = tuple(table.scenario_ids[index] for index in chosen)
+    scores = {name: getattr(table, name)[chosen] for name in ("valid", "steps", "scenarios")}
+    components = {name: component[chosen] for name, component in table.components.items()}
+    config = {**table.config, "part_of": source}
     return replace(
-        table,
-        config={**table.config, "part_of": source},
-        set_hash=subset.hash,
-        scenario_ids=tuple(table.scenario_ids[index] for index in chosen),
-        valid=table.valid[chosen],
-        steps=table.steps[chosen],
-        scenarios=table.scenarios[chosen],
-        components={name: component[chosen] for name, component in table.components.items()},
+        table, config=config, set_hash=subset.hash, scenario_ids=ids, components=components, **scores
     )
 
 

@@ -125,8 +125,7 @@ class DrawStatistics:
         effective: Effective sample size over the number of drawable steps, ``(sum w)^2 / (n sum w^2)`` (Kish, 1965):
             1 for uniform weights, 1 / n if one step has all weight.
         effective_scenarios: The same for the scenarios' sums of weights.
-        tilt: 99th percentile of the weights over their mean.
-        largest: Largest weight over the mean.
+        tilt, largest: 99th percentile of the weights, and the largest, over their mean.
         concentration: Share of the draws from the 5 % of steps with the largest weights; 0.05 for uniform weights.
     """
 

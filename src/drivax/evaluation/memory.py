@@ -48,12 +48,9 @@ def free_memory(device: Any) -> int | None:
 
 
 def scenarios_at_a_time(scenario_bytes: int, lanes: int, free: int | None) -> int:
-    """Return the number of scenarios that fit in half of the free memory, at least those of one program call.
+    """Return the number of scenarios that fit in half of the free memory, at least those of one program call (lanes).
 
-    Args:
-        scenario_bytes: Size of a scenario; it exists twice while a bank is made.
-        lanes: Scenarios per program call.
-        free: Free bytes; None where unknown.
+    A scenario exists twice while a bank is made. Free bytes are None where unknown.
     """
     if free is None:
         return MOST
@@ -69,18 +66,14 @@ def report_out_of_memory(count: int) -> Iterator[None]:
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        raise DrivaxError(
-            f"out of memory with {count:,} scenarios loaded",
-            cure="load fewer at a time (--batch), evaluate fewer (--limit), or free memory",
-        ) from error
+        cure = "load fewer at a time (--batch), evaluate fewer (--limit), or free memory"
+        raise DrivaxError(f"out of memory with {count:,} scenarios loaded", cure=cure) from error
 
 
 def _group_limits(groups: Path = _GROUPS, ours: Path = _OUR_GROUPS) -> list[tuple[int, int]]:
     """Return limit and use (bytes, without the page cache) of every control group of this process that has a limit.
 
-    Args:
-        groups: Folder of the control groups.
-        ours: File that names those of this process: ``hierarchy:controllers:path`` (cgroups(7)).
+    The file ``ours`` names them as ``hierarchy:controllers:path`` (cgroups(7)), ``groups`` is their folder.
     """
     limits = []
     rows = ours.read_text(encoding="utf-8").splitlines() if ours.is_file() else []

@@ -115,9 +115,8 @@ def _episode(
     others_first = others(state)
     metrics, to_the_end = episode_metrics(bank, final), episode_metrics(bank, last)
     # What a scenario defines does not depend on how soon its planner crashed.
-    failed = {
-        name: replace(metrics[name], defined=to_the_end[name].defined) for name in FAILED if name in metrics
-    }
+    names = [name for name in FAILED if name in metrics]
+    failed = {name: replace(metrics[name], defined=to_the_end[name].defined) for name in names}
     return Episodes(
         metrics=metrics | failed,
         events=event_steps(final.episode),

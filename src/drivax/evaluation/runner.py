@@ -178,15 +178,11 @@ def format_crashes(table: EpisodeTable) -> str:
 
 
 class Options(TypedDict, total=False):
-    """Keyword options of :func:`evaluate`.
+    """Keyword options of :func:`evaluate`: start step (default: current step), seed (default: 0), and more.
 
-    Attributes:
-        start_step: Step of the log at which episodes start, by default the current step.
-        seed: Seed of all random numbers, by default 0.
-        batch: Stored scenarios loaded at a time, by default as many as memory allows; no result depends on it.
-        sizes: Sizes of the banks, by default what the scenarios use. Subsets of a set that are given the sizes of the
-            whole share its compiled program.
-        progress: Called with (done, total) after every batch.
+    ``batch`` is the number of stored scenarios loaded at a time, by default what fits in memory; no result depends on
+    it. ``sizes`` of the banks are by default what the scenarios use; subsets with the sizes of the whole set share its
+    compiled program. ``progress`` is called with (done, total) after every batch.
     """
 
     start_step: int

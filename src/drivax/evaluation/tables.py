@@ -193,10 +193,6 @@ def _metric_cell(metric: str, runs: Sequence[EpisodeTable]) -> Cell:
     return Cell(label.heading, metric=metric, title=label.title or metric)
 
 
-def _run_columns(runs: Sequence[EpisodeTable]) -> list[Column]:
-    return [Column(run.name, run.name) for run in runs]
-
-
 def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
     """Return a table with metrics in rows and runs in columns."""
     rows = []
@@ -204,7 +200,7 @@ def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table
         links = [(run, {"run": run.name, "metric": name}) for run in runs]
         cells = (_cell(runs, name, summarise(run, name), link) for run, link in links)
         rows.append((_metric_cell(name, runs), *cells))
-    columns = (Column("metric", "metric", label=True), *_run_columns(runs))
+    columns = (Column("metric", "metric", label=True), *(Column(run.name, run.name) for run in runs))
     return Table("results", columns, tuple(rows), f"Mean and {CONFIDENCE:.0%} interval", "planner")
 
 
@@ -219,7 +215,7 @@ def differences_table(policy: EpisodeTable, others: Sequence[EpisodeTable], metr
         for name in metrics
     )
     caption = f"{policy.name} minus the others, paired by scenario, with {CONFIDENCE:.0%} interval"
-    columns = (Column("metric", "metric", label=True), *_run_columns(others))
+    columns = (Column("metric", "metric", label=True), *(Column(run.name, run.name) for run in others))
     return Table("differences", columns, rows, caption, "against")
 
 
@@ -250,7 +246,7 @@ def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
             cells.append(_cell(runs, "collision", share, {"run": run.name, "kind": int(code)}))
         rows.append((Cell(name), *cells))
     caption = f"First collisions by kind: share of {of} with {CONFIDENCE:.0%} interval"
-    columns = (Column("first collision", label=True), *_run_columns(runs))
+    columns = (Column("first collision", label=True), *(Column(run.name, run.name) for run in runs))
     return Table("collisions", columns, tuple(rows), caption, "planner")
 
 

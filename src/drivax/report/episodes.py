@@ -121,10 +121,7 @@ def ranked(runs: Sequence[EpisodeTable]) -> list[EpisodeGroup]:
 
 def _first_rows(run: EpisodeTable) -> dict[ScenarioKey, int]:
     """Return the first episode of each scenario."""
-    rows: dict[ScenarioKey, int] = {}
-    for row, key in enumerate(run.scenarios):
-        rows.setdefault(key, row)
-    return rows
+    return {key: row for row, key in reversed([*enumerate(run.scenarios)])}
 
 
 def _value(run: EpisodeTable, metric: str, row: int) -> float:

@@ -81,10 +81,10 @@ def criticality_html(table: ScoreTable, row: int) -> str:
     valid = table.valid[row]
     time = np.flatnonzero(valid) * DT_S
     series = {"score": table.steps[row], **{name: part[row] for name, part in table.components.items()}}
-    lines = {
-        name.replace("_", " "): (stroke(place), np.column_stack([time, values[valid]]))
-        for place, (name, values) in enumerate(series.items())
+    points = {
+        name.replace("_", " "): np.column_stack([time, values[valid]]) for name, values in series.items()
     }
+    lines = {name: (stroke(place), line) for place, (name, line) in enumerate(points.items())}
     rank = int(np.flatnonzero(table.order == row)[0]) + 1
     words = f"score {table.scenarios[row]:.3f}, rank {rank:,} of {len(table.scenarios):,} by {table.method}"
     return (

@@ -67,9 +67,8 @@ def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) ->
     Arrays are little-endian int16 in base64, in C order. ``map`` holds per layer the number of points of each line
     and the points of all lines; ``agents.pose`` is ``[agent, step, 3]``; ``parked.seen`` the first and last step at
     which a parked agent was seen; ``lights.state`` ``[step, light]`` indexes ``LIGHTS`` and is -1 where unobserved;
-    ``rollouts[].pose`` is ``[step, 3]``, ``speed`` is in cm/s, and ``signals`` are ``motion.SIGNALS`` and
-    ``motion.COMMANDS`` in order, in units of their steps, ABSENT where missing. Other agents move as in the last of the
-    rollouts.
+    ``rollouts[].pose`` is ``[step, 3]``, ``speed`` is in cm/s, and ``signals`` are ``charts.SIGNALS`` and
+    ``charts.COMMANDS`` in order, in units of their steps, ABSENT where missing. Other agents move as in the last one.
     """
     scenario = with_traffic_of(rollouts[-1], scenario)
     box = surroundings(scenario, rollouts)
