@@ -131,8 +131,7 @@ def map_batches(
     data: ScenarioSet, function: Callable[[ScenarioBank], dict[str, Any]], progress: Progress | None = None
 ) -> dict[str, Numbers]:
     """Apply a function to banks of one shape that hold ``BATCH`` scenarios each: by name ``[N, ...]``."""
-    sizes = Sizes.used(data)
-    batches: list[dict[str, Any]] = []
+    sizes, batches = Sizes.used(data), list[dict[str, Any]]()
     for first in range(0, len(data), BATCH):
         scenarios = data[first : first + BATCH]
         count = len(scenarios)

@@ -224,11 +224,8 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
             arrays = {name: stored[name] for name in stored.files if name not in ("header", "scenario_id")}
             _check_shapes(ids, arrays, file, data)
             valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
-            components = {
-                name.removeprefix(_COMPONENT): values
-                for name, values in arrays.items()
-                if name.startswith(_COMPONENT)
-            }
+            named = [name for name in arrays if name.startswith(_COMPONENT)]
+            components = {name.removeprefix(_COMPONENT): arrays[name] for name in named}
             method, config, set_hash = (header[name] for name in ("method", "config", "set_hash"))
             table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components)
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:

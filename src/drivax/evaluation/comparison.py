@@ -19,14 +19,7 @@ from drivax.errors import UsageError
 from drivax.evaluation import pairing
 from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interval_of
 from drivax.evaluation.pairing import Pairs, Split
-from drivax.evaluation.plan import (
-    ComparisonPlan,
-    Decision,
-    MetricComparison,
-    Sensitivity,
-    decide,
-    with_winner,
-)
+from drivax.evaluation.plan import ComparisonPlan, Decision, MetricComparison, Sensitivity, decide
 from drivax.stats import effects, significance
 from drivax.stats.clusters import defined, design_effect
 from drivax.stats.intervals import Interval, interquartile_bootstrap, paired_bootstrap, split_bootstrap
@@ -160,8 +153,8 @@ def compare(
     if min(first.a.n, first.b.n) == 0:
         raise pairing.undefined_metric(plan.primary, (*a, *b))
     adjusted = significance.holm([metric.evidence.p for metric in others])
-    secondary = tuple(with_winner(plan, metric, p) for metric, p in zip(others, adjusted, strict=True))
-    primary = with_winner(plan, first, first.evidence.p)
+    secondary = tuple(metric.with_winner(plan, p) for metric, p in zip(others, adjusted, strict=True))
+    primary = first.with_winner(plan, first.evidence.p)
     sensitivity = _sensitivity(plan, sides, split)
     return Comparison(
         plan=plan,

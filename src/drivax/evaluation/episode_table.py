@@ -47,6 +47,8 @@ _RERUN = "run drivax evaluate again"
 Array = np.ndarray[Any, Any]
 #: ``(dataset, scenario_id)``.
 ScenarioKey = tuple[str, str]
+#: Tags of scenarios by name.
+Tags = Mapping[ScenarioKey, Mapping[str, str]]
 
 
 @dataclass(frozen=True)
@@ -217,13 +219,15 @@ class EpisodeTable:
 
     def write(self, folder: Path) -> None:
         """Write ``episodes.csv``, ``summary.json``, ``trajectories.npz`` and, after crashes, ``crashes.json``."""
+        records: dict[str, Any] = {"summary.json": self.summary()}
         if self.crashes:
-            _write_json(folder / "crashes.json", [asdict(crash) for crash in self.crashes])
+            records["crashes.json"] = [asdict(crash) for crash in self.crashes]
+        for name, record in records.items():
+            (folder / name).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, [*KEYS, *self.metrics], lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows())
-        _write_json(folder / "summary.json", self.summary())
         driven = self.trajectories
         arrays = {f"{name}_step": driven.events[name].astype(np.int16) for name in EVENTS}
         arrays |= {} if driven.others is None else {"others": driven.others}
@@ -262,8 +266,7 @@ class EpisodeTable:
 def fail_crashed(metrics: Mapping[str, Array], crashed: Any) -> dict[str, Array]:
     """Set the metrics :data:`FAILED` of crashed episodes to 0 where defined, and add the column ``crashed``.
 
-    So crashing never improves a score. All other metrics are those measured until the crash. User-defined metrics come
-    last.
+    So crashing never improves a score. All other metrics are as measured until the crash; user-defined ones come last.
     """
     values = {
         name: np.where(crashed & ~np.isnan(column), 0.0, column) if name in FAILED else column
@@ -284,10 +287,6 @@ def _cell(value: Any) -> str:
     if not np.isfinite(value):
         return ""
     return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
-
-
-def _write_json(path: Path, value: Any) -> None:
-    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:

@@ -103,10 +103,8 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
     if metric in NOT_SUMMARISED:
         raise UsageError(f"{metric} is a code or count without a mean", cure="choose another metric")
     if metric.endswith("_partial"):
-        raise UsageError(
-            f"{metric} combines different inputs in different scenarios, so its mean has no meaning",
-            cure=f"choose {metric.removesuffix('_partial')}, or one of its inputs",
-        )
+        problem = f"{metric} combines different inputs in different scenarios, so its mean has no meaning"
+        raise UsageError(problem, cure=f"choose {metric.removesuffix('_partial')}, or one of its inputs")
     info = tables[0].metric(metric)
     if primary and (info is None or info.better == "-"):
         raise UsageError(f"{metric} is neither better high nor low", cure="choose another primary metric")
@@ -116,10 +114,8 @@ def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
     """Return the error for a primary metric without a single pair of values."""
     partial = [table.metrics.get(f"{metric}_partial", np.full(1, np.nan)) for table in tables]
     if any(not np.isnan(values).all() for values in partial):
-        return UsageError(
-            f"every {metric} is partial: one of its inputs is undefined in these scenarios",
-            cure="choose another primary metric, as success or accuracy",
-        )
+        problem = f"every {metric} is partial: one of its inputs is undefined in these scenarios"
+        return UsageError(problem, cure="choose another primary metric, as success or accuracy")
     problem = f"{metric} is defined for A and B in no common scenario"
     return UsageError(problem, cure="choose another primary metric")
 

@@ -123,6 +123,13 @@ class MetricComparison:
     undefined_a: int
     undefined_b: int
 
+    def with_winner(self, plan: ComparisonPlan, p: float | None) -> MetricComparison:
+        """Return the comparison with its adjusted p-value, and the winner where that is small enough."""
+        mean, winner = self.difference.mean, None
+        if self.better != "-" and mean and p is not None and p < 1 - plan.confidence:
+            winner = "A" if (mean > 0) == (self.better == "high") else "B"
+        return replace(self, p_adjusted=p, winner=winner)
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -139,14 +146,6 @@ class Decision:
     because: Literal["test", "power", "minimum", "equal", "seeds"]
     needed: int | None
     caveats: tuple[str, ...]
-
-
-def with_winner(plan: ComparisonPlan, comparison: MetricComparison, p: float | None) -> MetricComparison:
-    """Return a comparison with its adjusted p-value, and the winner where that is small enough."""
-    mean, winner = comparison.difference.mean, None
-    if comparison.better != "-" and mean and p is not None and p < 1 - plan.confidence:
-        winner = "A" if (mean > 0) == (comparison.better == "high") else "B"
-    return replace(comparison, p_adjusted=p, winner=winner)
 
 
 def decide(

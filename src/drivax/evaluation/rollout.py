@@ -71,9 +71,8 @@ def evaluation_task(task: Task) -> Task:
 def check_actions(planner: Planner, task: Task) -> None:
     """Refuse a planner that acts in another action space than the task."""
     if getattr(planner, "actions", task.actions) != task.actions:
-        raise UsageError(
-            f"planner {planner.name} acts in another action space than the task", cure="use the task's"
-        )
+        problem = f"planner {planner.name} acts in another action space than the task"
+        raise UsageError(problem, cure="use the task's")
 
 
 @partial(jax.jit, static_argnames=("simulator", "start_step"))

@@ -11,14 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.episode_table import (
-    ADDED,
-    NOT_SUMMARISED,
-    RATES,
-    EpisodeTable,
-    ScenarioKey,
-    interval_of,
-)
+from drivax.evaluation.episode_table import ADDED, NOT_SUMMARISED, RATES, EpisodeTable, Tags, interval_of
 from drivax.evaluation.pairing import Pairs, mismatch
 from drivax.metrics.catalogue import METRICS
 from drivax.metrics.catalogue import headline as headline_metrics
@@ -250,12 +243,7 @@ def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
     return Table("collisions", columns, tuple(rows), caption, "planner")
 
 
-def strata_table(
-    runs: Sequence[EpisodeTable],
-    tags: Mapping[ScenarioKey, Mapping[str, str]],
-    tag: str,
-    metrics: Sequence[str],
-) -> Table:
+def strata_table(runs: Sequence[EpisodeTable], tags: Tags, tag: str, metrics: Sequence[str]) -> Table:
     """Return a table with a row per value of a tag and run, metrics in columns; without the tag it is ``unknown``."""
     values = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
     order = {value: place for place, value in enumerate(TAGS.get(tag, ()))}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError
-from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable
 from drivax.evaluation.rollout import unpacked
 from drivax.report.charts import COMMANDED
@@ -148,7 +148,7 @@ class EvaluatedSet:
             raise DataError("is not in the scenario set", file=self.scenarios.path, record=key[1], cure=cure)
         return self.scenarios[self._rows[key]]
 
-    def tags(self) -> dict[ScenarioKey, Mapping[str, str]]:
+    def tags(self) -> Tags:
         """Return the tags of every scenario."""
         return {key: self.scenarios.entries[row]["tags"] for key, row in self._rows.items()}
 

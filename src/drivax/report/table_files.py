@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation import tables
-from drivax.evaluation.episode_table import ADDED, EpisodeTable, ScenarioKey
+from drivax.evaluation.episode_table import ADDED, EpisodeTable, Tags
 from drivax.evaluation.pairing import comparable
 from drivax.files import check_output, write_text
 from drivax.metrics.catalogue import METRICS, SETS
@@ -21,7 +21,6 @@ KEY_METRICS = (
 )  # fmt: skip
 #: Metrics of a transfer matrix.
 TRANSFERRED = ("success", "vmax_score")
-Tags = Mapping[ScenarioKey, Mapping[str, str]]
 
 
 def write_tables(
@@ -41,9 +40,8 @@ def write_tables(
     """
     texts = {}
     for table in _tables(read_evaluations(runs), data, metrics):
-        texts[f"{table.name}.csv"] = table.csv()
-        texts[f"{table.name}.md"] = table.markdown()
-        texts[f"{table.name}.tex"] = table.latex()
+        kinds = {"csv": table.csv(), "md": table.markdown(), "tex": table.latex()}
+        texts |= {f"{table.name}.{kind}": text for kind, text in kinds.items()}
     for name in texts:
         check_output(out / name, overwrite)
     for name, text in texts.items():

@@ -80,7 +80,10 @@ def _colours() -> str:
 
 def player_html() -> str:
     """Return stage, controls, legend, keys and plots."""
-    legend = "".join(_legend_item(name, words) for name, words in LEGEND)
+    legend = ""
+    for name, words in LEGEND:
+        fill = "" if name in ("log", "route", "mark", "goal") else f' style="background:var(--{name})"'
+        legend += f'<li><i class="k-{name}"{fill}>{"✕" if name == "mark" else ""}</i>{escape(words)}</li>'
     controls = asset("controls.html").rstrip()
     keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
     return (
@@ -114,9 +117,3 @@ def player_data(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
 def player_scripts() -> list[str]:
     """Return the programs of plots and player; the plots listen to the player, so they come first."""
     return [asset("plots.js"), asset("player.js")]
-
-
-def _legend_item(name: str, words: str) -> str:
-    sign = "✕" if name == "mark" else ""
-    fill = "" if name in ("log", "route", "mark", "goal") else f' style="background:var(--{name})"'
-    return f'<li><i class="k-{name}"{fill}>{sign}</i>{escape(words)}</li>'

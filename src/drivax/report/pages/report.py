@@ -13,7 +13,7 @@ import numpy as np
 
 from drivax.errors import UsageError
 from drivax.evaluation import tables
-from drivax.evaluation.episode_table import RATES, EpisodeTable, ScenarioKey
+from drivax.evaluation.episode_table import RATES, EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable, mismatch
 from drivax.files import check_output, write_text
 from drivax.report.charts import curve_sections, distribution_charts
@@ -31,7 +31,7 @@ from drivax.report.pages.page import (
 )
 from drivax.report.pictures.player_data import pack_episode
 from drivax.report.runs import Training, read_runs
-from drivax.report.table_files import Tags, strata_tables, transfer_tables
+from drivax.report.table_files import strata_tables, transfer_tables
 from drivax.table import bounds, number, suffix
 
 EPISODES = 12
