@@ -16,7 +16,7 @@ import drivax
 from drivax.adapters import gym
 from drivax.adapters.gym import TASKS, DrivingEnv, VectorDrivingEnv
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.build.assemble import assemble
@@ -141,7 +141,7 @@ def test_step_equals_the_simulator(env, data):
 @pytest.mark.slow
 def test_the_log_ends_truncated_with_the_metrics_of_an_evaluation(data):
     """Zero actions are the planner constant_velocity."""
-    env = DrivingEnv(data, judging(SMALL))
+    env = DrivingEnv(data, evaluation_task(SMALL))
     results = drivax.evaluate(ConstantVelocity(), data, task=SMALL)
     for row in range(len(data)):
         steps = drive(env, row)

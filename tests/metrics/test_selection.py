@@ -11,7 +11,7 @@ import pytest
 
 from drivax import settings
 from drivax.errors import UsageError
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.learning.config import TrainConfig
 from drivax.metrics import steps
 from drivax.metrics.catalogue import METRICS, SETS
@@ -230,7 +230,7 @@ def test_a_selection_changes_no_value_in_simulation():
 
 def test_evaluation_uses_the_full_set_whatever_the_task_learned_with():
     for metrics in ("none", ("training", "min_ttc")):
-        assert select_metrics(judging(Task(metrics=metrics)).metrics).names == tuple(METRICS)
+        assert select_metrics(evaluation_task(Task(metrics=metrics)).metrics).names == tuple(METRICS)
 
 
 def test_no_metric_is_defined_before_the_first_step(traced):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from drivax.evaluation.rollout import drive, judging
+from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
@@ -147,7 +147,7 @@ def test_one_configuration_is_compiled_once(traffic):
     def driven(scenarios, rows, trim=True):
         bank = prepare_bank(model, ScenarioBank.from_scenarios(scenarios, trim=trim))
         keys = jax.random.split(jax.random.key(0), 2)
-        drive(Simulator(judging(Task()), model), ConstantVelocity(), bank, jnp.asarray(rows), keys)
+        drive(Simulator(evaluation_task(Task()), model), ConstantVelocity(), bank, jnp.asarray(rows), keys)
         return drive._cache_size()
 
     data = [assemble(generate_recording(7, i)) for i in range(3)]

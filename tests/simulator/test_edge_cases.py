@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.evaluation.rollout import drive, judging
+from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import ConstantVelocity, Expert
 from drivax.scenario.schema import LightState
@@ -16,7 +16,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, bank_of, car, straight_road, tracks
 
-SIMULATOR = Simulator(judging(Task(observation=GLIMPSE)))
+SIMULATOR = Simulator(evaluation_task(Task(observation=GLIMPSE)))
 #: For what only lights decide.
 LIGHTS = Simulator(Task(observation=GLIMPSE, metrics=("red_light",), to_the_end=True))
 

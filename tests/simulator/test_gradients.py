@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
@@ -158,7 +158,7 @@ def test_reactive_traffic_differentiates_with_respect_to_ego():
 @pytest.mark.parametrize("speed", [0.0, 8.0])
 def test_rewards_facts_and_observations_have_finite_gradients(speed):
     """Not only the trajectory: what a policy sees and is paid for, from a standstill on and through a collision."""
-    simulator = Simulator(judging(Task()))
+    simulator = Simulator(evaluation_task(Task()))
     bank = bank_of(straight_road([car(0, 0, 0, speed), car(25, 0.4, 0, 3), car(20, 3.7, 0, 3)], light=RED))
 
     @jax.jit

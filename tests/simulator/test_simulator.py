@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.evaluation.rollout import drive, judging
+from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
@@ -18,7 +18,7 @@ from scenes import GLIMPSE, RED, bank_of, car, moved, straight_road
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Simulator(judging(Task(observation=GLIMPSE)))
+    return Simulator(evaluation_task(Task(observation=GLIMPSE)))
 
 
 def measuring(*metrics):

@@ -13,7 +13,7 @@ from drivax import settings
 from drivax.api import find_planner, load
 from drivax.cli import record_of
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation.run_evaluation import (
+from drivax.evaluation.runner import (
     EvaluationConfig,
     format_crashes,
     format_metrics,

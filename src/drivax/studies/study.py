@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from drivax.curation.controls import event_kinds
 from drivax.curation.logged import score_steps
-from drivax.curation.methods import Request, check_current, curate
+from drivax.curation.methods import Request, check_current, curate, event_kinds
 from drivax.curation.rarity import ExpertActions
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.subset import top_rows

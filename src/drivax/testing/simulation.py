@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.planners.catalogue import make_planner
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.columns import AgentColumn
@@ -68,7 +68,7 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
     cure = "give it name, replays, init and act (planners.planner.Planner)"
     expect(valid, f"{planner!r} is not a planner", cure)
     what = f"planner {planner.name!r}"
-    simulator, bank = Simulator(judging(task or Task())), worlds.worlds()
+    simulator, bank = Simulator(evaluation_task(task or Task())), worlds.worlds()
     _check_layout(what, simulator, planner, bank)
     index, step = (axis.ravel() for axis in np.meshgrid(np.arange(len(bank)), _STARTS, indexing="ij"))
     actions_of = _driven(simulator, planner)
