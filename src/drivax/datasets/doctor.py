@@ -240,7 +240,7 @@ def free_bytes(path: Path) -> int:
 
 
 def gigabytes(size: float) -> str:
-    """A size for people: ``540 kB``, ``6.6 GB``, ``412 GB``."""
+    """A readable size: ``540 kB``, ``6.6 GB``, ``412 GB``."""
     for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
         if size >= scale:
             return f"{size / scale:.1f} {unit}" if size < 10 * scale else f"{size / scale:,.0f} {unit}"
@@ -248,7 +248,7 @@ def gigabytes(size: float) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number with its noun, in the plural where it must be."""
+    """A number with its noun in the singular or plural."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 

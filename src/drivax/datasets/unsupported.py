@@ -1,4 +1,4 @@
-"""Data that drivax does not read, and what to use instead: the wrong flavours of public data sets, archives, sets.
+"""Data that drivax does not read, and what to use instead: other forms of public data sets, archives, scenario sets.
 
 Detection reads the beginning of a file, its first record, or file names.
 """
@@ -131,7 +131,7 @@ _Folders = tuple[tuple[Callable[[Path, set[str]], bool], str, str], ...]
 
 
 def explain_folder(folder: Path) -> DataError | None:
-    """The error for a folder without any file to convert that is something known all the same; None otherwise."""
+    """The error for a known kind of folder without any file to convert; None for others."""
     return _first_match(folder, (*_OWN_FOLDERS, *_FOLDERS))
 
 

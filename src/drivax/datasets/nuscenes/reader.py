@@ -28,7 +28,7 @@ _TABLES = (
     "category", "ego_pose", "instance", "log", "sample", "sample_annotation", "sample_data", "scene",
 )  # fmt: skip
 _OTHERS = ("attribute", "calibrated_sensor", "map", "sensor", "visibility", "lidarseg", "panoptic")
-#: Keyframes are 0.5 s apart; nothing is made up over a missing one.
+#: Keyframes are 0.5 s apart; the gap of a missing one is not interpolated.
 LONGEST_GAP_S = 0.75
 #: Scenes last 20 s; a longer one is damage.
 _LONGEST_S = 120.0
@@ -56,7 +56,7 @@ _CLOCK = "LIDAR_TOP"
 
 @dataclass(frozen=True)
 class NuScenes:
-    """Reads the tables of one version (``v1.0-mini``, ``v1.0-trainval``); each scene is a recording."""
+    """Reader of the tables of one version (``v1.0-mini``, ``v1.0-trainval``); each scene is a recording."""
 
     name: str = "nuscenes"
     patterns: tuple[str, ...] = ("v1.0-*/scene.json",)
