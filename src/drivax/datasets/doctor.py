@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from drivax.datasets import unsupported
-from drivax.datasets.formats import AUTO, Input, Survey, detect, reader_named, survey
+from drivax.datasets.formats import AUTO, Survey, reader_named, survey
 from drivax.datasets.reader import BadRecord, Description, Reader
-from drivax.errors import DataError, DrivaxError, UsageError
+from drivax.errors import DataError, UsageError
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
 
@@ -111,7 +111,8 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
-    problems = [_unknown(entry) for entry in data.inputs if entry.format is None][:_NAMED]
+    unknown = [entry.path for entry in data.inputs if entry.format is None][:_NAMED]
+    problems = [BadRecord.of(unsupported.explain(file), file) for file in unknown]
     for name in sorted(data.formats):
         files = [entry.path for entry in data.inputs if entry.format == name]
         step = -(-len(files) // _SAMPLE)
@@ -147,15 +148,6 @@ def _notes(many: Sequence[Description]) -> Iterator[str]:
         yield note if times == len(many) else f"{note} (in {times} of {len(many)} files)"
     if len(counts) > _NOTES:
         yield f"{len(counts) - _NOTES} more notes on single files; name one of them to see its own"
-
-
-def _unknown(entry: Input) -> BadRecord:
-    """What is wrong with a file that has the name of a format and holds something else."""
-    try:
-        detect(entry.path)
-    except DrivaxError as error:
-        return BadRecord.of(error, entry.path)
-    return BadRecord(entry.path, None, "changed while it was looked at", "run drivax doctor again")
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:
@@ -248,7 +240,7 @@ def free_bytes(path: Path) -> int:
 
 
 def gigabytes(size: float) -> str:
-    """A size for people: ``540 kB``, ``6.6 GB``, ``412 GB``."""
+    """A readable size: ``540 kB``, ``6.6 GB``, ``412 GB``."""
     for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
         if size >= scale:
             return f"{size / scale:.1f} {unit}" if size < 10 * scale else f"{size / scale:,.0f} {unit}"
@@ -256,7 +248,7 @@ def gigabytes(size: float) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number with its noun, in the plural where it must be."""
+    """A number with its noun in the singular or plural."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 

@@ -1,4 +1,4 @@
-"""Data that drivax does not read, and what to use instead: the wrong flavours of public data sets, archives, sets.
+"""Data that drivax does not read, and what to use instead: other forms of public data sets, archives, scenario sets.
 
 Detection reads the beginning of a file, its first record, or file names.
 """
@@ -6,6 +6,7 @@ Detection reads the beginning of a file, its first record, or file names.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,58 +15,47 @@ from drivax.datasets.womd.tfrecord import read_records
 from drivax.errors import DataError, UsageError
 from drivax.scenario.store import MANIFEST
 
-#: (where in a file, bytes, what it is, cure)
-_MAGIC = (
-    (0, b"\x1f\x8b", "the file is gzip-compressed", "decompress it first (gunzip, or tar xzf for a .tgz)"),
-    (0, b"PK\x03\x04", "a zip archive", "unpack it first (unzip)"),
-    (0, b"BZh", "the file is bzip2-compressed", "decompress it first (bunzip2)"),
-    (0, b"\xfd7zXZ", "the file is xz-compressed", "decompress it first (unxz)"),
-    (0, b"\x28\xb5\x2f\xfd", "the file is zstd-compressed", "decompress it first (unzstd)"),
-    (257, b"ustar", "a tar archive", "unpack it first (tar xf)"),
-    (0, b"\x89HDF", "an HDF5 file", "give the files of the data set as they are downloaded"),
-    (
-        0,
-        b"\x93NUMPY",
+#: What a file is by its first bytes (of a tar archive those from ``_TAR_BYTE`` on), and what to do.
+_TAR, _TAR_BYTE = b"ustar", 257
+_MAGIC = {
+    b"\x1f\x8b": ("the file is gzip-compressed", "decompress it first (gunzip, or tar xzf for a .tgz)"),
+    b"PK\x03\x04": ("a zip archive", "unpack it first (unzip)"),
+    b"BZh": ("the file is bzip2-compressed", "decompress it first (bunzip2)"),
+    b"\xfd7zXZ": ("the file is xz-compressed", "decompress it first (unxz)"),
+    b"\x28\xb5\x2f\xfd": ("the file is zstd-compressed", "decompress it first (unzstd)"),
+    _TAR: ("a tar archive", "unpack it first (tar xf)"),
+    b"\x89HDF": ("an HDF5 file", "give the files of the data set as they are downloaded"),
+    b"\x93NUMPY": (
         "a numpy array, not a file of a public data set",
         "a shard of a scenario set? name its folder",
     ),
-    (
-        0,
-        b"PAR1",
+    b"PAR1": (
         "a parquet file without the columns of Argoverse 2 motion forecasting (WOMD perception v2 has such files)",
         "use scenario_*.parquet of Argoverse 2, or the motion data set of Waymo (TFRecord)",
     ),
-    (
-        0,
-        b"ARROW1",
+    b"ARROW1": (
         "a feather file that is no table of annotations of Argoverse 2",
         "give the folder of the log (annotations.feather next to city_SE3_egovehicle.feather and map/)",
     ),
-    (
-        0,
-        b"SQLite format 3",
+    b"SQLite format 3": (
         "a SQLite file without nuPlan's tables (a map, perhaps)",
         "give the logs of nuPlan (splits/*/*.db), with maps/ next to them",
     ),
-)
+}
 _HEAD = 1 << 16
 _MOTION = "download the motion data set (scenario/*.tfrecord-*)"
-
-
-#: (words of which the beginning of a JSON file has one, what it is, cure); the first that fits.
-_JSON = (
-    (
-        (b'"objects"', b'"roads"'),
+#: What a JSON file is by words at its beginning, and what to do.
+_JSON = {
+    rb'"(objects|roads)"': (
         "looks like a GPUDrive scene but has no metadata, so the ego is unknown",
         "convert the scenes again with a GPUDrive that writes metadata",
     ),
-    (
-        (b'"lane_segments"', b'"drivable_areas"'),
+    rb'"(lane_segments|drivable_areas)"': (
         "a map of Argoverse 2 without its recording",
         "give the folder that holds the scenario_*.parquet or annotations.feather as well",
     ),
-    ((b"",), "JSON of no data set that drivax knows", "give the files of the data set as downloaded"),
-)
+    rb"": ("JSON of no data set that drivax knows", "give the files of the data set as downloaded"),
+}
 _INDICES = ("dataset_summary.pkl", "dataset_mapping.pkl")
 
 
@@ -78,8 +68,8 @@ def explain(path: Path) -> DataError:
         return DataError(error.strerror or "cannot be opened", file=path, cure="check the path")
     if not head:
         return DataError("the file is empty", file=path, cure="copy or download the file again")
-    for place, magic, problem, cure in _MAGIC:
-        if head[place : place + len(magic)] == magic:
+    for magic, (problem, cure) in _MAGIC.items():
+        if head[_TAR_BYTE if magic == _TAR else 0 :].startswith(magic):
             return DataError(problem, file=path, cure=cure)
     if head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
         problem, cure = "a pickle that is no ScenarioNet scenario", "give the sd_*.pkl files"
@@ -88,8 +78,7 @@ def explain(path: Path) -> DataError:
             cure = "give the folder that holds its sd_*.pkl files"
         return DataError(problem, file=path, cure=cure)
     if head.lstrip()[:1] in (b"{", b"["):
-        known = (entry for entry in _JSON if any(word in head for word in entry[0]))
-        _, problem, cure = next(known)
+        problem, cure = next(known for words, known in _JSON.items() if re.search(words, head))
         return DataError(problem, file=path, cure=cure)
     return _tfrecord(path)
 
@@ -142,7 +131,7 @@ _Folders = tuple[tuple[Callable[[Path, set[str]], bool], str, str], ...]
 
 
 def explain_folder(folder: Path) -> DataError | None:
-    """The error for a folder without any file to convert that is something known all the same; None otherwise."""
+    """The error for a known kind of folder without any file to convert; None for others."""
     return _first_match(folder, (*_OWN_FOLDERS, *_FOLDERS))
 
 

@@ -52,7 +52,7 @@ _SKIP = "skip this scenario, or download it again"
 
 @dataclass(frozen=True)
 class ArgoverseMotion:
-    """Reads motion forecasting scenarios: 110 steps at 10 Hz (50 in the test split), lane graph, no box sizes."""
+    """Reader of motion forecasting scenarios: 110 steps at 10 Hz (50 in the test split), lane graph, no box sizes."""
 
     name: str = "av2-motion"
     patterns: tuple[str, ...] = ("scenario_*.parquet",)
@@ -63,7 +63,7 @@ class ArgoverseMotion:
         return path.match(self.patterns[0]) and tables.has_magic(path, tables.PARQUET_MAGIC)
 
     def describe(self, path: Path) -> Description:
-        """Tracks, steps, city and split of one scenario."""
+        """Tracks, steps and city of one scenario."""
         table = read_table(path, _COLUMNS)
         steps = 1 + int(table.numbers["timestep"].max())
         map_path = _map_path(path)

@@ -53,7 +53,7 @@ _SKIP = "skip this log, or download it again"
 
 @dataclass(frozen=True)
 class ArgoverseSensor:
-    """Reads sensor logs: about 156 frames at 10 Hz with measured boxes, heights, and the local map."""
+    """Reader of sensor logs: about 156 frames at 10 Hz with measured boxes, heights, and the local map."""
 
     name: str = "av2-sensor"
     patterns: tuple[str, ...] = ("annotations.feather", "annotations_with_ego.feather")

@@ -103,7 +103,7 @@ class _Layers:
         self._content = content
         self._nodes = {node["token"]: (float(node["x"]), float(node["y"])) for node in content["node"]}
         if not np.isfinite(np.array(list(self._nodes.values()))).all():
-            raise ValueError("a node is nowhere")
+            raise ValueError("a node is not finite")
         self._lines = {line["token"]: line["node_tokens"] for line in content["line"]}
         self._polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
         self._lost: dict[str, int] = {}

@@ -28,7 +28,7 @@ _TABLES = (
     "category", "ego_pose", "instance", "log", "sample", "sample_annotation", "sample_data", "scene",
 )  # fmt: skip
 _OTHERS = ("attribute", "calibrated_sensor", "map", "sensor", "visibility", "lidarseg", "panoptic")
-#: Keyframes are 0.5 s apart; nothing is made up over a missing one.
+#: Keyframes are 0.5 s apart; the gap of a missing one is not interpolated.
 LONGEST_GAP_S = 0.75
 #: Scenes last 20 s; a longer one is damage.
 _LONGEST_S = 120.0
@@ -56,18 +56,14 @@ _CLOCK = "LIDAR_TOP"
 
 @dataclass(frozen=True)
 class NuScenes:
-    """Reads the tables of one version (``v1.0-mini``, ``v1.0-trainval``); each scene is a recording."""
+    """Reader of the tables of one version (``v1.0-mini``, ``v1.0-trainval``); each scene is a recording."""
 
     name: str = "nuscenes"
     patterns: tuple[str, ...] = ("v1.0-*/scene.json",)
     companions: tuple[str, ...] = (
         *(f"v1.0-*/{table}.json" for table in (*_TABLES[:-1], *_OTHERS)),
-        "maps/*.png",
-        "maps/*.json",
-        "expansion/*.json",
-        "maps/*/*.json",
-        "maps/*/*.png",
-    )
+        "maps/*.png", "maps/*.json", "expansion/*.json", "maps/*/*.json", "maps/*/*.png",
+    )  # fmt: skip
 
     def recognise(self, path: Path) -> bool:
         """Whether it is ``scene.json`` with the other tables next to it."""
@@ -107,7 +103,7 @@ class NuScenes:
         for row, about in enumerate(tables.scenes):
             try:
                 scene = tables.scene(row)
-                yield recording(scene, _maps(path) / f"{Path(scene.location).name}.json", path.parent.name)
+                yield recording(scene, _maps(path) / f"{Path(scene.location).name}.json")
             except DataError as error:
                 yield BadRecord.of(error, path, about["name"])
 
@@ -120,7 +116,7 @@ def _maps(path: Path) -> Path:
     return next((folder for folder in folders if any(folder.glob("*.json"))), expansion)
 
 
-def recording(scene: Scene, map_file: Path, version: str) -> Recording:
+def recording(scene: Scene, map_file: Path) -> Recording:
     """The recording of one scene: at 10 Hz, in the city's frame."""
     begin = scene.keyframes_s[0]
     duration = float(scene.keyframes_s[-1] - begin)
@@ -151,10 +147,10 @@ def _tracks(scene: Scene, times: Float64[Array, " time"]) -> Tracks:
     """The ego (row 0) and every instance at some times."""
     poses = scene.poses[:, 1:].copy()
     poses[:, :2] = box_centre(poses[:, :2], poses[:, 2], CENTRE_AHEAD_M)
-    check_finite(poses, *scene.observations.values())
+    check_finite(poses, *scene.observations)
     moved = [interpolate(scene.poses[:, 0], poses, times)]
-    moved += [interpolate(table[:, 0], table[:, 1:4], times) for table in scene.observations.values()]
-    sizes = [EGO_SIZE_M, *(np.median(table[:, 4:7], axis=0) for table in scene.observations.values())]
+    moved += [interpolate(table[:, 0], table[:, 1:4], times) for table in scene.observations]
+    sizes = [EGO_SIZE_M, *(np.median(table[:, 4:7], axis=0) for table in scene.observations)]
     state = np.stack([states for states, _ in moved])
     valid = np.stack([seen for _, seen in moved])
     return Tracks(
@@ -164,7 +160,7 @@ def _tracks(scene: Scene, times: Float64[Array, " time"]) -> Tracks:
         velocity=state[..., 3:5],
         size=np.where(valid[..., None], np.array(sizes)[:, None], 0.0),
         valid=valid,
-        kind=np.array([AgentKind.VEHICLE, *scene.kinds.values()], np.int8),
+        kind=np.array([AgentKind.VEHICLE, *scene.kinds], np.int8),
         track_id=np.arange(len(moved), dtype=np.int64),
     )
 
@@ -207,15 +203,12 @@ def interpolate(
 
 @dataclass
 class Scene:
-    """One scene of the tables.
+    """One scene of the tables, cut from a log (``logfile``) in a city (``location``).
 
     Attributes:
-        name: As people call it (``scene-0061``).
-        location: Name of the city map.
-        logfile: The log that the scene was cut from.
         keyframes_s: Times of the keyframes, seconds since the epoch, increasing.
         poses: Ego poses: time [s], x, y, heading; of the centre of the rear axle.
-        observations: Per instance its annotations in time: time [s], x, y, heading [rad], length, width, height [m].
+        observations: Annotations of every instance: time [s], x, y, heading [rad], length, width, height [m].
         kinds: Class of every instance.
     """
 
@@ -224,8 +217,8 @@ class Scene:
     logfile: str
     keyframes_s: Float64[Array, " keyframe"]
     poses: Float64[Array, "pose 4"]
-    observations: dict[int, Float64[Array, "row 7"]]
-    kinds: dict[int, AgentKind]
+    observations: list[Float64[Array, "_ 7"]]
+    kinds: list[AgentKind]
 
 
 @dataclass
@@ -234,9 +227,8 @@ class Tables:
 
     Attributes:
         scenes: Rows of ``scene.json``.
-        logs: ``log.json`` by token: (location, logfile).
-        sample_scene: Row of the scene of every sample.
-        sample_time: Time of every sample, seconds.
+        logs: Location and logfile of each log by token.
+        sample_scene: Row of the scene of every sample; ``sample_time`` is its time in seconds.
         poses: Scene row, time [s], x, y, heading of every lidar frame's pose.
         annotations: Sample row, instance row, x, y, heading, length, width, height.
         kinds: Class of every instance.
@@ -293,19 +285,17 @@ class Tables:
             problem = f"{len(samples)} keyframes, {len(poses)} ego poses, log {location or 'unknown'}"
             raise DataError(f"the scene cannot be used: {problem}", record=about["name"], cure=_AGAIN)
         annotations = self.annotations[np.isin(self.annotations[:, 0], samples)]
-        observations: dict[int, Array] = {}
-        for instance in np.unique(annotations[:, 1]).astype(np.int64).tolist():
-            of = annotations[annotations[:, 1] == instance]
-            times = self.sample_time[of[:, 0].astype(np.int64)]
-            observations[instance] = _in_time(np.column_stack((times, of[:, 2:])))
+        times = self.sample_time[annotations[:, 0].astype(np.int64)]
+        table = np.column_stack((times, annotations[:, 2:]))
+        instances = np.unique(annotations[:, 1]).astype(np.int64).tolist()
         return Scene(
             name=about["name"],
             location=location,
             logfile=logfile,
             keyframes_s=np.unique(self.sample_time[samples]),
             poses=_in_time(poses),
-            observations=observations,
-            kinds={instance: self.kinds[instance] for instance in observations},
+            observations=[_in_time(table[annotations[:, 1] == instance]) for instance in instances],
+            kinds=[self.kinds[instance] for instance in instances],
         )
 
 

@@ -31,7 +31,7 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class WomdExample(womd.TfRecordReader):
-    """Reads tf.Examples: tracks, map points grouped into features, lights re-keyed by lane."""
+    """Reader of tf.Examples: tracks, map points grouped into features, lights re-keyed by lane."""
 
     name: str = womd.EXAMPLE_FORMAT
     companions: tuple[str, ...] = ("export.json",)

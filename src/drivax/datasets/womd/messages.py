@@ -237,15 +237,12 @@ class Features:
             raise DataError(f"feature {name} holds floats, not integers", cure=SKIP)
         return values
 
-    def rows(self, name: str, used: _Array) -> _Array:
-        """A feature with one value per track, for the rows used; zeros if the file lacks it."""
-        if not self.has(name):
-            return np.zeros(used.size, np.int64)
-        return self.numbers(name, (self.numbers("state/id").size,))[used]
-
     def marked(self, name: str, used: _Array) -> tuple[int, ...]:
-        """Rows among those used whose value is 1."""
-        return tuple(np.flatnonzero(self.rows(name, used) == 1).tolist())
+        """Rows among those used whose value is 1; none if the file lacks the feature."""
+        if not self.has(name):
+            return ()
+        values = self.numbers(name, (self.numbers("state/id").size,))[used]
+        return tuple(np.flatnonzero(values == 1).tolist())
 
     def scenario_id(self, payload: bytes) -> str:
         """The scenario's id, or the first 16 digits of the payload's SHA-256 if the file has none."""

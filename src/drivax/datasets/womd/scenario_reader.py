@@ -28,7 +28,7 @@ _Points = Float64[np.ndarray, "point 3"]
 
 @dataclass(frozen=True)
 class WomdScenario(womd.TfRecordReader):
-    """Reads Scenario protos: dense tracks, map with lane graph and speed limits, lights by lane."""
+    """Reader of Scenario protos: dense tracks, map with lane graph and speed limits, lights by lane."""
 
     name: str = womd.SCENARIO_FORMAT
 
