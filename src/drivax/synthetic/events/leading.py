@@ -204,10 +204,9 @@ class CutIn(EventScript):
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
         """See :class:`EventScript`: for a late merge the ends of lanes, on the adjacent lanes."""
-        lanes = network.lanes
         if not self.late_merge:
             return open_road(network, has_neighbour=True)
-        places = []
+        lanes, places = network.lanes, []
         for lane in lanes:
             for neighbour in (lane.left, lane.right) if lane.ends or lane.exit_only else ():
                 if neighbour >= 0 and not (lanes[neighbour].ends or lanes[neighbour].exit_only):

@@ -34,14 +34,7 @@ class CurvedRoad(StreetFamily):
 
     tightest_m: tuple[float, float] = (30.0, 140.0)
     widest_turn: float = math.radians(150.0)
-    layouts: Layouts = (
-        (1, 1, 0.28),
-        (2, 0, 0.16),
-        (2, 1, 0.12),
-        (2, 2, 0.24),
-        (3, 0, 0.1),
-        (3, 1, 0.1),
-    )
+    layouts: Layouts = ((1, 1, 0.28), (2, 0, 0.16), (2, 1, 0.12), (2, 2, 0.24), (3, 0, 0.1), (3, 1, 0.1))
     median_share: float = 0.3
     name: str = "curved_road"
 
