@@ -188,8 +188,7 @@ class CutIn(EventScript):
     Attributes:
         late_merge: Only where the actor's lane ends or leads off the road, shortly before its end.
         speed_share, slower_share: Speed of the actor before and afterwards as a share of ego's, low and high.
-        braking_mps2: Deceleration of the actor, low and high.
-        lasts_s: Duration of the lane change, low and high.
+        braking_mps2, lasts_s: Deceleration of the actor and duration of the lane change, low and high.
         before_end_m: Largest distance from the end of a late merge to the end of the lane.
         end_after_s: Time of ego's arrival at the end of the lane, low and high.
     """

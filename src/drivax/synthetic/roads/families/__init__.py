@@ -33,9 +33,11 @@ class RoadFamily(Protocol):
     @property
     def name(self) -> str:
         """Short name, part of scenario ids."""
+        ...
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draw an example."""
+        ...
 
 
 #: All families; add a new family here.

@@ -221,8 +221,7 @@ class Highway(StreetFamily):
 
     Attributes:
         shares: Shares of highways with an on-ramp, with an off-ramp and with both.
-        two_way_share: Share of highways of two or three lanes with the other direction beyond a median.
-        median_m: Width of that median, low and high.
+        two_way_share: Share of highways of two or three lanes with the other direction beyond a median (``median_m``).
         ramp_m: Length of an on-ramp and of an off-ramp.
         ramp_radius_m, ramp_turn: Radius and angle (rad) of a ramp's bend, low and high.
         ramp_limit: Limit on ramps as a share of the highway's, low and high.
