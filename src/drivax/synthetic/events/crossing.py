@@ -76,10 +76,7 @@ def _chain(
     """Draw successive lanes before (-1) or after (1) a lane up to a total length."""
     result: list[int] = []
     total, at = 0.0, first
-    while total < length_m:
-        links = lanes[at].successors if direction > 0 else lanes[at].predecessors
-        if not links:
-            break
+    while total < length_m and (links := lanes[at].successors if direction > 0 else lanes[at].predecessors):
         at = int(rng.choice(links))
         result.append(at)
         total += lanes[at].length_m
@@ -194,6 +191,8 @@ class CrossTraffic(EventScript):
         network = view.roles.network
         if network.signals is None:
             return self.turning
-        colour, _ = network.signals.colours(view.times_s, len(network.lanes))
+        # On the clock of the lights the recording begins at 0.
+        times = (np.arange(view.steps) - view.first_step) * DT_S
+        colour, _ = network.signals.colours(times, len(network.lanes))
         red = colour[entry - 12 : entry + 1, lane] == Colour.RED
         return not red.any() if self.turning else bool(red.all())

@@ -112,11 +112,6 @@ class EgoView:
         return min(self.first_step + STEPS, self.steps) - 1
 
     @property
-    def times_s(self) -> Float64[np.ndarray, " time"]:
-        """Times on the clock of the lights: the recording begins at 0."""
-        return (np.arange(self.steps) - self.first_step) * DT_S
-
-    @property
     def ego_size_m(self) -> Float64[np.ndarray, " 3"]:
         """Ego's length, width, height."""
         return self.motion.size_m[0]

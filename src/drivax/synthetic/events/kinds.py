@@ -57,10 +57,9 @@ class StagedEvent:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An event as a script proposes it, before the checks.
+    """An event of about this severity as a script proposes it, before the checks.
 
     Attributes:
-        severity_mps2: Intended severity.
         adversary: Undisturbed motion of the actor at all steps.
         vehicle: Row of the actor if it is a vehicle of the traffic; else it is the first of the extras.
         others: Rows of further actors.

@@ -188,8 +188,7 @@ class CutIn(EventScript):
     Attributes:
         late_merge: Only where the actor's lane ends or leads off the road, shortly before its end.
         speed_share, slower_share: Speed of the actor before and afterwards as a share of ego's, low and high.
-        braking_mps2: Deceleration of the actor, low and high.
-        lasts_s: Duration of the lane change, low and high.
+        braking_mps2, lasts_s: Deceleration of the actor and duration of the lane change, low and high.
         before_end_m: Largest distance from the end of a late merge to the end of the lane.
         end_after_s: Time of ego's arrival at the end of the lane, low and high.
     """
@@ -204,10 +203,9 @@ class CutIn(EventScript):
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
         """See :class:`EventScript`: for a late merge the ends of lanes, on the adjacent lanes."""
-        lanes = network.lanes
         if not self.late_merge:
             return open_road(network, has_neighbour=True)
-        places = []
+        lanes, places = network.lanes, []
         for lane in lanes:
             for neighbour in (lane.left, lane.right) if lane.ends or lane.exit_only else ():
                 if neighbour >= 0 and not (lanes[neighbour].ends or lanes[neighbour].exit_only):

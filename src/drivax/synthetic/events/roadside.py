@@ -33,8 +33,8 @@ class _StreetScript(EventScript):
 
 def _is_open_street(view: EgoView, station: float) -> bool:
     """Whether a station is on an ordinary street, away from junctions and crosswalks."""
-    lane = view.lane_at(station)
-    return view.plain_road(station) and view.roles.network.lanes[lane].limit_mps <= _STREET_MPS
+    lanes = view.roles.network.lanes
+    return view.plain_road(station) and lanes[view.lane_at(station)].limit_mps <= _STREET_MPS
 
 
 def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: float) -> tuple[float, float]:

@@ -87,10 +87,9 @@ class Start:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Place where pedestrians cross.
+    """Place where pedestrians cross, from kerb to kerb along an axis.
 
     Attributes:
-        axis: Two points, one on each kerb.
         lanes: Crossed lanes, each with the distance along it of the axis, m.
         marked: Whether there is a crosswalk, where drivers yield to pedestrians.
     """
@@ -116,9 +115,7 @@ class RoadNetwork:
     """A road map in its own frame (metres).
 
     Attributes:
-        family: Name of the family that built it.
         edges: Closed rings without the repeated point: the outer boundary counter-clockwise, islands clockwise.
-        starts: Possible starts of ego.
         walks: Sidewalks outside the edges.
         busy: Lanes with denser traffic.
     """

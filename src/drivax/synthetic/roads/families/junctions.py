@@ -78,11 +78,7 @@ class LeftTurns:
 
 
 def set_lights(
-    rng: np.random.Generator,
-    draft: Draft,
-    site: Site,
-    lefts: Sequence[LeftTurns],
-    green_s: tuple[float, float],
+    rng: np.random.Generator, draft: Draft, site: Site, lefts: list[LeftTurns], green_s: tuple[float, float]
 ) -> SignalPlan:
     """Set the lights of a four-way junction: one or two phases for approaches 0 and 2, then for 1 and 3.
 
@@ -414,7 +410,7 @@ class Corridor:
             set_priorities(draft, site, plot.main, Control.STOP)
             return None
         protected = plot.left_only and bool(rng.random() < self.protected_share)
-        lefts = (LeftTurns(protected, permissive=True), LeftTurns(protected=False, permissive=True))
+        lefts = [LeftTurns(protected, permissive=True), LeftTurns(protected=False, permissive=True)]
         return set_lights(rng, draft, site, lefts, self.green_s)
 
     def _signals(

@@ -57,8 +57,7 @@ class _Plan:
     Attributes:
         radius_m: Radii of the circle's lane centres, inner first.
         join: Angle from an arm to the entry and the exit of each circle, rad.
-        gap_m: Gap between the directions at the yield lines.
-        yield_m: Distance of the yield lines from the centre.
+        gap_m, yield_m: Gap between the directions at the yield lines, and distance of these from the centre.
         circle_m, width_m: Width of lanes in the circle and on the arms.
     """
 

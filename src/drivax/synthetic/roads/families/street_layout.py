@@ -51,7 +51,7 @@ def strips(ahead: int, back: int, sections: int) -> tuple[Strip, ...]:
 
 @dataclass(frozen=True)
 class Street:
-    """A cross-section along a reference line, and the draft to which it is added.
+    """A street along a reference line, and the draft to which it is added.
 
     Attributes:
         middle: The reference line: between the directions, or anywhere in a one-way road.

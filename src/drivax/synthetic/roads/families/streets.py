@@ -34,14 +34,7 @@ class CurvedRoad(StreetFamily):
 
     tightest_m: tuple[float, float] = (30.0, 140.0)
     widest_turn: float = math.radians(150.0)
-    layouts: Layouts = (
-        (1, 1, 0.28),
-        (2, 0, 0.16),
-        (2, 1, 0.12),
-        (2, 2, 0.24),
-        (3, 0, 0.1),
-        (3, 1, 0.1),
-    )
+    layouts: Layouts = ((1, 1, 0.28), (2, 0, 0.16), (2, 1, 0.12), (2, 2, 0.24), (3, 0, 0.1), (3, 1, 0.1))
     median_share: float = 0.3
     name: str = "curved_road"
 
@@ -228,8 +221,7 @@ class Highway(StreetFamily):
 
     Attributes:
         shares: Shares of highways with an on-ramp, with an off-ramp and with both.
-        two_way_share: Share of highways of two or three lanes with the other direction beyond a median.
-        median_m: Width of that median, low and high.
+        two_way_share: Share of highways of two or three lanes with the other direction beyond a median (``median_m``).
         ramp_m: Length of an on-ramp and of an off-ramp.
         ramp_radius_m, ramp_turn: Radius and angle (rad) of a ramp's bend, low and high.
         ramp_limit: Limit on ramps as a share of the highway's, low and high.
