@@ -67,16 +67,9 @@ class Simulator:
         """Return the context at a step: logged, or drawn by ``start``."""
         index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
         history, route_m = LogStart().begin(bank, index, step, slot)
-        context = AgentContext(
-            index=index,
-            step=step,
-            slot=slot,
-            history=history,
-            action=self.task.first_action(history, bank.length_m(index, slot)),
-            route_m=route_m,
-            z=bank.agents[index, step, slot, AgentColumn.Z],
-            traffic=self.traffic.start(bank, index, step),
-        )
+        action = self.task.first_action(history, bank.length_m(index, slot))
+        z, traffic = bank.agents[index, step, slot, AgentColumn.Z], self.traffic.start(bank, index, step)
+        context = AgentContext(index, step, slot, history, action, route_m, z, traffic)
         if isinstance(self.start, LogStart):
             return context
         agents = self.traffic.agents(bank, context, 0)
@@ -93,9 +86,8 @@ class Simulator:
 
     def frame(self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int) -> Frame:
         """Return all agents ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses."""
-        return frame_of(
-            bank, context.index, context.step, self.traffic.agents(bank, context, back), driven, back
-        )
+        agents = self.traffic.agents(bank, context, back)
+        return frame_of(bank, context.index, context.step, agents, driven, back)
 
     def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
         """Return all agents now, around one driven agent."""
@@ -135,9 +127,8 @@ class Simulator:
         seen = self.frame(bank, first, states.context, 0)
         traffic = self.traffic.advance(bank, first, seen)
         moved = jax.vmap(lambda s, a: self._move_agent(bank, s.context, a, None, traffic))(states, actions)
-        after, done = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))(
-            states, moved, actions
-        )
+        settle = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))
+        after, done = settle(states, moved, actions)
         counts = is_driven(bank, states) & (True if over is None else ~over)
         choose = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
         after = replace(after, episode=choose(counts, after.episode, states.episode))
@@ -161,10 +152,7 @@ class Simulator:
     ) -> Mapping[str, Any]:
         """Return the task's observation of a context, live or from a replay buffer."""
         driven = alone(context) if driven is None else driven
-
-        def frames(back: int) -> Frame:
-            return self.frame(bank, context, driven, back)
-
+        frames = partial(self.frame, bank, context, driven)
         return self.task.observe(bank, context, frames, frames(0))
 
     def step_or_reset(
@@ -217,13 +205,8 @@ class Simulator:
         if motion is None:
             action = self.task.actuated(context.history[-1], action, context.action)
             motion = self.task.motion(context.history[-1], action, bank.length_m(context.index, context.slot))
-        return replace(
-            context,
-            step=context.step + 1,
-            history=jnp.concatenate([context.history[1:], motion[None]]),
-            action=action,
-            traffic=traffic,
-        )
+        history = jnp.concatenate([context.history[1:], motion[None]])
+        return replace(context, step=context.step + 1, history=history, action=action, traffic=traffic)
 
     def _settle(
         self, bank: ScenarioBank, before: SimState, moved: AgentContext, driven: AgentContext, seen: Frame,
