@@ -14,7 +14,7 @@ from drivax.learning.environment import collect
 from drivax.metrics.catalogue import Metric
 from drivax.metrics.steps import StepValue
 from drivax.networks.encoders import group_names
-from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.functions import NetworkPlanner
 from drivax.planners.planner import Memoryless
 from drivax.scenario.record import record
 from drivax.tasks.observations import View

@@ -11,7 +11,7 @@ from flax import nnx
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.encoders import MlpConfig, group_spec
 from drivax.planners.catalogue import PLANNERS, make_planner
-from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.functions import NetworkPlanner
 from drivax.planners.planner import Planner
 from drivax.planners.simple import IdmPlanner, RandomActions, expert_action, logged_motion
 from drivax.simulator.idm import IdmParameters, idm_acceleration

@@ -20,15 +20,20 @@ from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
 from drivax.simulator.types import (
+    Action,
     AgentContext,
     EpisodeStart,
     Frame,
+    Motion,
     SimState,
     Situation,
     Task,
     Traffic,
     Transition,
 )
+
+#: The next state, and the step to it.
+Step = tuple[SimState, Transition]
 
 
 @dataclass(frozen=True)
@@ -93,15 +98,11 @@ class Simulator:
         """Return all agents now, around one driven agent."""
         return self.frame(bank, context, alone(context), 0)
 
-    def step(
-        self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"]
-    ) -> tuple[SimState, Transition]:
+    def step(self, bank: ScenarioBank, state: SimState, action: Action) -> Step:
         """Drive one step of 0.1 s with an action of the task's action space."""
         return self._drive(bank, state, action, None)
 
-    def replay(
-        self, bank: ScenarioBank, state: SimState, motion: Float[Array, " 4"], action: Float[Array, " D"]
-    ) -> tuple[SimState, Transition]:
+    def replay(self, bank: ScenarioBank, state: SimState, motion: Motion, action: Action) -> Step:
         """Move the agent to ``motion`` without dynamics (exact expert); ``action`` is only recorded."""
         return self._drive(bank, state, action, motion)
 
@@ -117,7 +118,7 @@ class Simulator:
 
     def step_together(
         self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None
-    ) -> tuple[SimState, Transition]:
+    ) -> Step:
         """Drive K agents of one scenario; they see each other, and traffic sees them.
 
         Slots beyond the moving agents are padding: never rewarded or terminated, with undefined facts. ``over`` is the
@@ -156,9 +157,9 @@ class Simulator:
         return self.task.observe(bank, context, frames, frames(0))
 
     def step_or_reset(
-        self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"], over: Bool[Array, ""],
+        self, bank: ScenarioBank, state: SimState, action: Action, over: Bool[Array, ""],
         fresh: EpisodeStart, seen: Frame | None = None,
-    ) -> tuple[SimState, Transition]:  # fmt: skip
+    ) -> Step:  # fmt: skip
         """Step, or start a new episode where the current one is ``over``.
 
         For collectors: the end of an episode costs one call that only resets, with a meaningless transition to mask. In
@@ -184,9 +185,7 @@ class Simulator:
         flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
         return after, replace(transition, after=after, **flags)
 
-    def _drive(
-        self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None
-    ) -> tuple[SimState, Transition]:
+    def _drive(self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None) -> Step:
         seen = self.now(bank, state.context)
         moved = self._move(bank, state.context, seen, action, motion)
         return self._settle(bank, state, moved, alone(moved), seen, action)
@@ -211,7 +210,7 @@ class Simulator:
     def _settle(
         self, bank: ScenarioBank, before: SimState, moved: AgentContext, driven: AgentContext, seen: Frame,
         action: Array,
-    ) -> tuple[SimState, Transition]:  # fmt: skip
+    ) -> Step:  # fmt: skip
         """Measure an agent after all agents have moved, and build the transition."""
         now = self.frame(bank, moved, driven, 0)
         situation, contacts, lights = measure(

@@ -25,7 +25,7 @@ from drivax.simulator.types import HISTORY, AgentContext
 from drivax.tasks import features
 from drivax.tasks.features import COLUMNS, PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Features, Frames, View
 from drivax.tasks.own import check_unique, name_of
-from drivax.tasks.perception import Perception, moved_lights, moved_road, perceived
+from drivax.tasks.perception import MOVED_LIGHTS, MOVED_ROAD, Perception, perceived, position_errors
 
 #: Block size of the running count.
 _BLOCK = 8
@@ -124,6 +124,11 @@ class ObservationConfig:
         return PRESETS[name]
 
 
+_PUBLISHED = Features(
+    ego_static=("length", "width", "height"),
+    agents=("position", "heading", "velocity", "length", "width", "height", "type"),
+    route=("position", "heading", "recommended_speed"),
+)
 #: ``published`` is the observation of the published description with road pieces of at most 10 m: 2,000 rows are 400
 #: pieces cut into five each, in a box of 100 m instead of a circle.
 PRESETS = MappingProxyType(
@@ -138,11 +143,7 @@ PRESETS = MappingProxyType(
             road_behind_m=100.0,
             road_side_m=100.0,
             road_cut=5,
-            features=Features(
-                ego_static=("length", "width", "height"),
-                agents=("position", "heading", "velocity", "length", "width", "height", "type"),
-                route=("position", "heading", "recommended_speed"),
-            ),
+            features=_PUBLISHED,
         ),
     }
 )
@@ -260,10 +261,10 @@ def _shown_road(
     if config.road_cut > 1:
         rows, mask = features.cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
     if noisy:
-        rows = rows.at[:, :2].add(moved_road(config.perception, bank, context, config.road) / POSITION_M)
-    columns = features.columns_of("road", selected) + (
-        [rows.shape[-1] - 1] if "curvature" in selected else []
-    )
+        errors = position_errors(config.perception, bank, context, MOVED_ROAD, config.road)
+        rows = rows.at[:, :2].add(errors / POSITION_M)
+    columns = features.columns_of("road", selected)
+    columns += [rows.shape[-1] - 1] if "curvature" in selected else []
     return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
 
@@ -323,7 +324,8 @@ def _lights(
     def position() -> Float[Array, "K 2"]:
         middle = view.point(line[LightRow.XY, chosen].T)
         if perception.noise_m > 0:
-            middle = middle + moved_lights(perception, bank, context, state.shape[0])[chosen]
+            errors = position_errors(perception, bank, context, MOVED_LIGHTS, state.shape[0])
+            middle = middle + errors[chosen]
         return middle / POSITION_M
 
     parts = {

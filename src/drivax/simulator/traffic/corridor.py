@@ -148,8 +148,7 @@ def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any
 def _bulge(part: Any, way: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
     """Return the offset of the path to the left of a straight piece, relative to its length: cubic with both tangents.
 
-    ``part`` is the relative position on the piece and ``way`` its direction (cosine, sine); ``tangents`` are those of
-    the path at start and end.
+    ``part`` is the relative position on the piece, ``way`` its direction; ``tangents`` are those at start and end.
     """
     (ux, uy), slopes = way, []
     for cos, sin in (tangents[:2], tangents[2:]):
