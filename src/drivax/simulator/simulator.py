@@ -168,7 +168,8 @@ class Simulator:
         there. ``seen`` is ``now(bank, state.context)``, if already computed.
         """
         seen = self.now(bank, state.context) if seen is None else seen
-        moved = self._move(bank, state.context, seen, action, None)
+        traffic = self.traffic.advance(bank, state.context, seen)
+        moved = self._move_agent(bank, state.context, action, None, traffic)
         context = jax.tree.map(partial(jnp.where, over), fresh.context, moved)
         before = replace(
             state,
@@ -187,15 +188,9 @@ class Simulator:
 
     def _drive(self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None) -> Step:
         seen = self.now(bank, state.context)
-        moved = self._move(bank, state.context, seen, action, motion)
+        traffic = self.traffic.advance(bank, state.context, seen)
+        moved = self._move_agent(bank, state.context, action, motion, traffic)
         return self._settle(bank, state, moved, alone(moved), seen, action)
-
-    def _move(
-        self, bank: ScenarioBank, context: AgentContext, seen: Frame, action: Array, motion: Array | None
-    ) -> AgentContext:
-        """Move all agents one step without measuring."""
-        traffic = self.traffic.advance(bank, context, seen)
-        return self._move_agent(bank, context, action, motion, traffic)
 
     def _move_agent(
         self, bank: ScenarioBank, context: AgentContext, action: Array, motion: Array | None, traffic: Any

@@ -219,16 +219,12 @@ def _agents(
     def row(back: int) -> tuple[Float[Array, "K F"], Bool[Array, " K"]]:
         frame = now if back == 0 else frames(back)
         box, x = frame.box[chosen], context.history[HISTORY - 1 - back]
-
-        def relative() -> Float[Array, "K 2"]:
-            own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
-            return view.vector(frame.velocity[chosen] - own) / SPEED_MPS
-
+        own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
         parts = {
             "position": lambda: view.point(box[:, :2]) / POSITION_M,
             "heading": lambda: view.vector(box[:, 2:4])[:, ::-1],
             "velocity": lambda: view.vector(frame.velocity[chosen]) / SPEED_MPS,
-            "relative_velocity": relative,
+            "relative_velocity": lambda: view.vector(frame.velocity[chosen] - own) / SPEED_MPS,
             "time": lambda: jnp.full((config.agents, 1), -DT_S * back),
         }
         return features.joined(chosen_features, parts, (config.agents,)), frame.valid[chosen]
