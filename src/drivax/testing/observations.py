@@ -64,7 +64,7 @@ def check_feature(feature: Feature | str) -> None:
     expect(
         largest <= LARGEST,
         f"{what} reaches {largest:g}",
-        "scale it to about [-1, 1] (units: tasks.view)",
+        "scale it to about [-1, 1] (units: tasks.features)",
     )
     check_numbers(what, program(worlds.without_others(bank), contexts))
     variants = (
