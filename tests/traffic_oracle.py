@@ -61,7 +61,7 @@ class Path:
         return tuple(np.interp(s, self.arc, column) for column in columns)
 
     def project(self, xy, first, reach):
-        """Arc length, distance and direction of the nearest point in a range of arcs, and direction of 4 m around it."""
+        """Arc length, distance and direction of the nearest point in a range of arcs; direction of 4 m around it."""
         keep = (self.arc[1:] > first - self.spacing) & (self.arc[:-1] < reach)
         a, b = self.points[:-1, :2][keep], self.points[1:, :2][keep]
         u = b - a
