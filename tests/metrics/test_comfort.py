@@ -17,7 +17,7 @@ from drivax.metrics.comfort import (
 
 
 @pytest.mark.parametrize(("window", "order", "derivative"), [(8, 2, 0), (15, 2, 1), (15, 3, 2)])
-def test_tail_operator_is_scipys_filter(window, order, derivative):
+def test_tail_matrix_equals_scipys_filter(window, order, derivative):
     signal = np.random.default_rng(0).normal(size=60)
     whole = savgol_filter(signal, window, order, deriv=derivative)
     for end in (40, 50):
@@ -36,7 +36,7 @@ def histories(speed, heading):
     return np.stack([motion[t - 15 : t + 1] for t in range(15, len(speed))])
 
 
-def test_judgement_equals_limits_on_scipys_signals():
+def test_comfort_equals_limits_on_scipys_signals():
     rng = np.random.default_rng(3)
     t = np.arange(120) * 0.1
     speed = 8 + 2.0 * np.sin(0.9 * t) + 0.4 * np.sin(5.1 * t)
@@ -65,7 +65,7 @@ def test_judgement_equals_limits_on_scipys_signals():
     np.testing.assert_allclose(whole.jerk_mps3, magnitude[7:], rtol=1e-3, atol=5e-3)
 
 
-def test_lateral_acceleration_can_fail():
+def test_lateral_acceleration_alone_fails_comfort():
     # 10 m/s at 0.5 rad/s is 5 m/s2: over the limit of 4.89.
     heading = np.arange(16) * 0.05
     judged = check_comfort(jnp.asarray(histories(np.full(16, 10.0), heading)[0]))
@@ -73,7 +73,7 @@ def test_lateral_acceleration_can_fail():
     np.testing.assert_allclose(judged.lateral_mps2, 5.0, rtol=1e-3)
 
 
-def test_a_heading_that_wraps_is_no_discomfort():
+def test_wrapping_heading_is_comfortable():
     heading = (np.linspace(np.pi - 0.1, np.pi + 0.1, 16) + np.pi) % (2 * np.pi) - np.pi
     judged = check_comfort(jnp.asarray(histories(np.full(16, 5.0), heading)[0]))
     assert bool(judged.comfortable.all())

@@ -73,7 +73,7 @@ def size(tree):
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-def test_sets_are_of_the_catalogue():
+def test_sets_contain_catalogue_metrics():
     assert SETS["none"] == () and SETS["full"] == tuple(METRICS)
     assert set(SETS["training"]) < set(METRICS)
     for name, metric in METRICS.items():
@@ -81,7 +81,7 @@ def test_sets_are_of_the_catalogue():
     assert {value.name for value in select_metrics("full").step_values()} == set(STEP_VALUES)
 
 
-def test_a_list_names_sets_and_metrics_and_brings_what_they_need():
+def test_list_of_sets_and_metrics_adds_their_inputs():
     wanted = select_metrics(("training", "comfortable", "min_ttc", "min_ttc"))
     assert wanted.names == (*SETS["training"], "comfortable", "min_ttc")
     assert "comfort" in dict(wanted.metrics) and "comfort" not in wanted.names
@@ -178,7 +178,7 @@ def zeros(shapes):
 
 
 @pytest.mark.slow
-def test_operators_and_that_a_selection_changes_no_value(traced):
+def test_operators_and_selection_do_not_change_values(traced):
     found, empty = random_situations(), zeros(traced["none"].state)
     full, events = episode("full", found, empty)
     facts = jax.tree.map(np.asarray, found.facts)

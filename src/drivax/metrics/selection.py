@@ -44,11 +44,9 @@ class MetricSelection:
 
 @cache
 def select_metrics(names: MetricNames) -> MetricSelection:
-    """Return the metrics that a configuration names.
+    """Return the metrics that a configuration names: a set, or a tuple of sets, metrics and dotted names.
 
-    Args:
-        names: ``none``, ``training`` or ``full``; or a tuple of such sets, names of metrics, and dotted names
-            (``package.module:name``) of the user's own metrics, which take their last word as name.
+    The last word of a dotted name (``package.module:name``) is the name of the user's metric.
 
     Raises:
         UsageError: There is no such set or metric, or two metrics have the same name.

@@ -2,9 +2,9 @@ from .catalogue import PLANNERS as PLANNERS
 from .catalogue import as_planner as as_planner
 from .catalogue import make_planner as make_planner
 from .functions import FunctionPlanner as FunctionPlanner
+from .functions import NetworkPlanner as NetworkPlanner
 from .functions import jax_planner as jax_planner
 from .functions import python_planner as python_planner
-from .network_planner import NetworkPlanner as NetworkPlanner
 from .pdm import EmergencyBrake as EmergencyBrake
 from .pdm import PdmConfig as PdmConfig
 from .pdm import PdmPlanner as PdmPlanner

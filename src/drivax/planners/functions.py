@@ -1,4 +1,4 @@
-"""Planners defined by one user function, in JAX or in plain Python.
+"""Planners defined by one user function, in JAX or in plain Python, or by a trained policy.
 
 A function maps the situation and observation of one scenario to an action of the task's action space. A planner with
 memory or random numbers is a class (``planners.planner.Planner``).
@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 from jaxtyping import Array
 
 from drivax.planners.planner import Memoryless
@@ -76,6 +77,27 @@ def python_planner(function: Drive) -> FunctionPlanner:
     (``evaluation.runner``). It must not call JAX, which waits for it.
     """
     return FunctionPlanner(function, in_python=True)
+
+
+@record
+class NetworkPlanner(Memoryless):
+    """A policy network that acts by its mode, or by a sample.
+
+    Attributes:
+        parameters: Weights of the network.
+        graph: Structure of the network.
+        samples: Whether to act by a sample.
+    """
+
+    parameters: Any
+    graph: Any = static()
+    name: str = static(default="policy")
+    samples: bool = static(default=False)
+
+    def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
+        """Return the policy's action for the observation."""
+        distribution = nnx.merge(self.graph, self.parameters)(observation)
+        return distribution.action(distribution.sample(key)) if self.samples else distribution.mode()
 
 
 @contextmanager

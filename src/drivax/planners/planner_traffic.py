@@ -41,17 +41,11 @@ class TrafficPolicy(TrafficData):
 
 @record
 class PlannerTrafficState:
-    """State of the K agents that the planner drives.
+    """State of the K agents that the planner drives."""
 
-    Attributes:
-        begin: First step of the episode; until then all agents moved as logged.
-        contexts: One context per agent; slots beyond the moving agents are empty.
-        base: State of the traffic around them.
-    """
-
-    begin: Int[Array, "*batch"]
-    contexts: AgentContext
-    base: Any
+    begin: Int[Array, "*batch"]  # First step of the episode; until then all agents moved as logged
+    contexts: AgentContext  # One context per agent; slots beyond the moving agents are empty
+    base: Any  # State of the traffic around them
 
 
 @dataclass(frozen=True)

@@ -31,18 +31,12 @@ STOP_SHORT_M = 1.0
 
 @record
 class Ahead:
-    """Inputs of a car-following driver.
+    """Inputs of a car-following driver."""
 
-    Attributes:
-        gap: Gap to the nearest obstacle, bumper to bumper, or a little less than to a light that requires a stop, m;
-            10 km if there is neither.
-        leader: Speed of the obstacle along the route, m/s; 0 for a light.
-        desired: Speed limit (13.4 where unknown), or what the curves ahead allow; 0 at the end of the route, m/s.
-    """
-
+    # To the nearest obstacle, bumper to bumper, or a little less than to a light that requires a stop, m; else 10 km
     gap: Scalar
-    leader: Scalar
-    desired: Scalar
+    leader: Scalar  # Speed of the obstacle along the route, m/s; 0 for a light
+    desired: Scalar  # Limit (13.4 if unknown), or what curves ahead allow; 0 at the route's end, m/s
 
     def acceleration(self, speed: Scalar, parameters: IdmParameters) -> Scalar:
         """Return the IDM acceleration at a speed, m/s2."""
@@ -72,11 +66,9 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
     stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
     gap = jnp.minimum(gaps[nearest], stop)
-    return Ahead(
-        gap=jnp.where(jnp.isfinite(gap), gap, FREE_M),
-        leader=jnp.where(stop < gaps[nearest], 0.0, speed[nearest]),
-        desired=jnp.where(there[1], desired_speed(path, there, offsets), 0.0),
-    )
+    leader = jnp.where(stop < gaps[nearest], 0.0, speed[nearest])
+    desired = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
+    return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
 
 
 def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:

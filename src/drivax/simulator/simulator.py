@@ -20,15 +20,20 @@ from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
 from drivax.simulator.types import (
+    Action,
     AgentContext,
     EpisodeStart,
     Frame,
+    Motion,
     SimState,
     Situation,
     Task,
     Traffic,
     Transition,
 )
+
+#: The next state, and the step to it.
+Step = tuple[SimState, Transition]
 
 
 @dataclass(frozen=True)
@@ -67,16 +72,9 @@ class Simulator:
         """Return the context at a step: logged, or drawn by ``start``."""
         index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
         history, route_m = LogStart().begin(bank, index, step, slot)
-        context = AgentContext(
-            index=index,
-            step=step,
-            slot=slot,
-            history=history,
-            action=self.task.first_action(history, bank.length_m(index, slot)),
-            route_m=route_m,
-            z=bank.agents[index, step, slot, AgentColumn.Z],
-            traffic=self.traffic.start(bank, index, step),
-        )
+        action = self.task.first_action(history, bank.length_m(index, slot))
+        z, traffic = bank.agents[index, step, slot, AgentColumn.Z], self.traffic.start(bank, index, step)
+        context = AgentContext(index, step, slot, history, action, route_m, z, traffic)
         if isinstance(self.start, LogStart):
             return context
         agents = self.traffic.agents(bank, context, 0)
@@ -93,23 +91,18 @@ class Simulator:
 
     def frame(self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int) -> Frame:
         """Return all agents ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses."""
-        return frame_of(
-            bank, context.index, context.step, self.traffic.agents(bank, context, back), driven, back
-        )
+        agents = self.traffic.agents(bank, context, back)
+        return frame_of(bank, context.index, context.step, agents, driven, back)
 
     def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
         """Return all agents now, around one driven agent."""
         return self.frame(bank, context, alone(context), 0)
 
-    def step(
-        self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"]
-    ) -> tuple[SimState, Transition]:
+    def step(self, bank: ScenarioBank, state: SimState, action: Action) -> Step:
         """Drive one step of 0.1 s with an action of the task's action space."""
         return self._drive(bank, state, action, None)
 
-    def replay(
-        self, bank: ScenarioBank, state: SimState, motion: Float[Array, " 4"], action: Float[Array, " D"]
-    ) -> tuple[SimState, Transition]:
+    def replay(self, bank: ScenarioBank, state: SimState, motion: Motion, action: Action) -> Step:
         """Move the agent to ``motion`` without dynamics (exact expert); ``action`` is only recorded."""
         return self._drive(bank, state, action, motion)
 
@@ -125,7 +118,7 @@ class Simulator:
 
     def step_together(
         self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None
-    ) -> tuple[SimState, Transition]:
+    ) -> Step:
         """Drive K agents of one scenario; they see each other, and traffic sees them.
 
         Slots beyond the moving agents are padding: never rewarded or terminated, with undefined facts. ``over`` is the
@@ -135,9 +128,8 @@ class Simulator:
         seen = self.frame(bank, first, states.context, 0)
         traffic = self.traffic.advance(bank, first, seen)
         moved = jax.vmap(lambda s, a: self._move_agent(bank, s.context, a, None, traffic))(states, actions)
-        after, done = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))(
-            states, moved, actions
-        )
+        settle = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))
+        after, done = settle(states, moved, actions)
         counts = is_driven(bank, states) & (True if over is None else ~over)
         choose = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
         after = replace(after, episode=choose(counts, after.episode, states.episode))
@@ -161,16 +153,13 @@ class Simulator:
     ) -> Mapping[str, Any]:
         """Return the task's observation of a context, live or from a replay buffer."""
         driven = alone(context) if driven is None else driven
-
-        def frames(back: int) -> Frame:
-            return self.frame(bank, context, driven, back)
-
+        frames = partial(self.frame, bank, context, driven)
         return self.task.observe(bank, context, frames, frames(0))
 
     def step_or_reset(
-        self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"], over: Bool[Array, ""],
+        self, bank: ScenarioBank, state: SimState, action: Action, over: Bool[Array, ""],
         fresh: EpisodeStart, seen: Frame | None = None,
-    ) -> tuple[SimState, Transition]:  # fmt: skip
+    ) -> Step:  # fmt: skip
         """Step, or start a new episode where the current one is ``over``.
 
         For collectors: the end of an episode costs one call that only resets, with a meaningless transition to mask. In
@@ -179,7 +168,8 @@ class Simulator:
         there. ``seen`` is ``now(bank, state.context)``, if already computed.
         """
         seen = self.now(bank, state.context) if seen is None else seen
-        moved = self._move(bank, state.context, seen, action, None)
+        traffic = self.traffic.advance(bank, state.context, seen)
+        moved = self._move_agent(bank, state.context, action, None, traffic)
         context = jax.tree.map(partial(jnp.where, over), fresh.context, moved)
         before = replace(
             state,
@@ -196,19 +186,11 @@ class Simulator:
         flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
         return after, replace(transition, after=after, **flags)
 
-    def _drive(
-        self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None
-    ) -> tuple[SimState, Transition]:
+    def _drive(self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None) -> Step:
         seen = self.now(bank, state.context)
-        moved = self._move(bank, state.context, seen, action, motion)
+        traffic = self.traffic.advance(bank, state.context, seen)
+        moved = self._move_agent(bank, state.context, action, motion, traffic)
         return self._settle(bank, state, moved, alone(moved), seen, action)
-
-    def _move(
-        self, bank: ScenarioBank, context: AgentContext, seen: Frame, action: Array, motion: Array | None
-    ) -> AgentContext:
-        """Move all agents one step without measuring."""
-        traffic = self.traffic.advance(bank, context, seen)
-        return self._move_agent(bank, context, action, motion, traffic)
 
     def _move_agent(
         self, bank: ScenarioBank, context: AgentContext, action: Array, motion: Array | None, traffic: Any
@@ -217,18 +199,13 @@ class Simulator:
         if motion is None:
             action = self.task.actuated(context.history[-1], action, context.action)
             motion = self.task.motion(context.history[-1], action, bank.length_m(context.index, context.slot))
-        return replace(
-            context,
-            step=context.step + 1,
-            history=jnp.concatenate([context.history[1:], motion[None]]),
-            action=action,
-            traffic=traffic,
-        )
+        history = jnp.concatenate([context.history[1:], motion[None]])
+        return replace(context, step=context.step + 1, history=history, action=action, traffic=traffic)
 
     def _settle(
         self, bank: ScenarioBank, before: SimState, moved: AgentContext, driven: AgentContext, seen: Frame,
         action: Array,
-    ) -> tuple[SimState, Transition]:  # fmt: skip
+    ) -> Step:  # fmt: skip
         """Measure an agent after all agents have moved, and build the transition."""
         now = self.frame(bank, moved, driven, 0)
         situation, contacts, lights = measure(

@@ -11,29 +11,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, wrap
+from drivax.scenario.bank import queries
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.passages import lane_passage
-from drivax.scenario.bank.queries import (
-    OFFROAD_TOLERANCE_M,
-    LaneHits,
-    around_lanes,
-    is_mapped,
-    left_the_map,
-    offroad_distance,
-    project_on_route,
-)
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.scenario.schema import DT_S, Flag
-from drivax.simulator.contact import (
-    STOPPED_MPS,
-    Contact,
-    classify_contacts,
-    first_contacts,
-    nearest_gap,
-    next_contacts,
-    overlaps,
-    time_to_collision,
-)
+from drivax.simulator import contact
+from drivax.simulator.contact import STOPPED_MPS, Contact
 from drivax.simulator.lights import check_lights
 from drivax.simulator.types import (
     FACTS,
@@ -127,9 +111,11 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     """Return all agents, the lanes around the driven agent, and its position on its route."""
     me = frame.box[context.slot]
     ground = _ground(bank, context, frame)
-    lanes = around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground)
+    lanes = queries.around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground)
     ahead_m = 1.5 * _moved(context) + 2.0
-    return Surroundings(frame, lanes, project_on_route(bank, context.index, me[:2], context.route_m, ahead_m))
+    return Surroundings(
+        frame, lanes, queries.project_on_route(bank, context.index, me[:2], context.route_m, ahead_m)
+    )
 
 
 def _ground(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
@@ -153,16 +139,18 @@ def _touch(
     fault, kind, ttc = jnp.zeros(contacts.shape, bool), jnp.zeros((), jnp.int8), jnp.zeros(())
     if not reads & _CONTACTS:
         return contacts, fault.any(), kind, ttc
-    touching = overlaps(frame, context.slot)
+    touching = contact.overlaps(frame, context.slot)
     if reads & _FAULTS:
-        fresh = first_contacts(contacts, touching)
+        fresh = contact.first_contacts(contacts, touching)
         speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
         others_speed = jnp.where(previous.valid, norm(previous.velocity), 0.0)
         others_speed = jnp.maximum(norm(frame.velocity), others_speed)
-        fault, kind = classify_contacts(frame, context.slot, fresh, speed, others_speed, unlawful)
-    codes = next_contacts(contacts, touching, frame.valid, fault)
+        fault, kind = contact.classify_contacts(frame, context.slot, fresh, speed, others_speed, unlawful)
+    codes = contact.next_contacts(contacts, touching, frame.valid, fault)
     if "ttc_s" in reads:
-        ttc = time_to_collision(frame, context.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT))
+        ttc = contact.time_to_collision(
+            frame, context.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT)
+        )
     return codes, fault.any(), kind, ttc
 
 
@@ -174,7 +162,7 @@ def _requested(
     facts: dict[str, Array] = dict.fromkeys(("gap_m", "lag_m"), jnp.zeros(()))
     facts |= {"strand": jnp.int16(-1)} | dict.fromkeys(("lane_changed", "merged"), jnp.zeros((), bool))
     if "gap_m" in reads:
-        facts["gap_m"] = nearest_gap(frame, context.slot, codes == Contact.IGNORED)
+        facts["gap_m"] = contact.nearest_gap(frame, context.slot, codes == Contact.IGNORED)
     if "lag_m" in reads:
         me, logged = frame.box[context.slot], bank.agents[context.index, context.step, context.slot]
         facts["lag_m"] = jnp.sum((logged[AgentColumn.XY] - me[:2]) * me[2:4])
@@ -202,12 +190,16 @@ def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
 
 
 def off_the_road(
-    bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: LaneHits
+    bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: queries.LaneHits
 ) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
     """Return how far the worst corner of a box is off the road (m), whether it left the map, or only the road."""
-    beyond = offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
-    left_map = left_the_map(bank, index, me[:2])
-    return beyond, left_map, (beyond > OFFROAD_TOLERANCE_M) & ~left_map & is_mapped(bank, index)
+    beyond = queries.offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
+    left_map = queries.left_the_map(bank, index, me[:2])
+    return (
+        beyond,
+        left_map,
+        (beyond > queries.OFFROAD_TOLERANCE_M) & ~left_map & queries.is_mapped(bank, index),
+    )
 
 
 def _rates(history: Float[Array, "16 4"]) -> tuple[Scalar, Scalar, Scalar]:

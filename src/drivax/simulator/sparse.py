@@ -16,12 +16,8 @@ AT_ONCE = 8
 def map_where(requested: Bool[Array, " B"], function: Callable[..., Any], *arguments: Any) -> Any:
     """``jax.vmap(function)`` where ``requested``, zeros elsewhere; cost grows with the number requested.
 
-    A loop computes 8 elements at a time; it has no reverse-mode derivative.
-
-    Args:
-        requested: Elements of the batch to compute.
-        function: Maps one element of each argument to a pytree of arrays.
-        arguments: Pytrees of arrays ``[B, ...]``.
+    ``function`` maps one element of each argument (pytrees of arrays ``[B, ...]``) to a pytree of arrays. A loop
+    computes 8 elements at a time; it has no reverse-mode derivative.
     """
     count, batched = requested.shape[0], jax.vmap(function)
     chunk = min(AT_ONCE, count)
@@ -29,9 +25,6 @@ def map_where(requested: Bool[Array, " B"], function: Callable[..., Any], *argum
     zeros = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), element)
     # The first requested element ranks highest; top_k of floats is the cheapest way to find a few of them.
     rank = jnp.arange(count, 0, -1).astype(jnp.float32)
-
-    def pending(carry: tuple[Array, Any]) -> Array:
-        return carry[0].any()
 
     def compute(carry: tuple[Array, Any]) -> tuple[Array, Any]:
         left, results = carry
@@ -41,4 +34,4 @@ def map_where(requested: Bool[Array, " B"], function: Callable[..., Any], *argum
         results = jax.tree.map(lambda total, value: total.at[index].set(value, mode="drop"), results, values)
         return left.at[index].set(False, mode="drop"), results
 
-    return jax.lax.while_loop(pending, compute, (requested, zeros))[1]
+    return jax.lax.while_loop(lambda carry: carry[0].any(), compute, (requested, zeros))[1]

@@ -47,7 +47,6 @@ class Start(Protocol):
 
         ``agents`` are the rows of all moving agents at ``step``, from the traffic model.
         """
-        ...
 
 
 @dataclass(frozen=True)
@@ -139,9 +138,8 @@ class NoisyStart:
 
 
 def _acceptable(
-    bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Float[Array, "A 8"],
-    history: History,
-) -> Bool[Array, ""]:  # fmt: skip
+    bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Rows, history: History
+) -> Bool[Array, ""]:
     """Whether an agent with this history touches none of the others and is on the road at ``step``."""
     zero, z = jnp.zeros(()), bank.agents[index, step, slot, AgentColumn.Z]
     context = AgentContext(index, step, slot, history, jnp.zeros(2), zero, z, ())

@@ -22,26 +22,10 @@ from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import DT_S, LightState
 from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.types import HISTORY, AgentContext
-from drivax.tasks.features import (
-    COLUMNS,
-    PIECE_M,
-    POSITION_M,
-    SIZE_M,
-    SPEED_MPS,
-    Features,
-    Frames,
-    View,
-    columns_of,
-    cut_rows,
-    goal_ahead,
-    has_route,
-    joined,
-    recommended_speed,
-    route_curvature,
-    shown_curvature,
-)
+from drivax.tasks import features
+from drivax.tasks.features import COLUMNS, PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Features, Frames, View
 from drivax.tasks.own import check_unique, name_of
-from drivax.tasks.perception import Perception, moved_lights, moved_road, perceived
+from drivax.tasks.perception import MOVED_LIGHTS, MOVED_ROAD, Perception, perceived, position_errors
 
 #: Block size of the running count.
 _BLOCK = 8
@@ -140,6 +124,11 @@ class ObservationConfig:
         return PRESETS[name]
 
 
+_PUBLISHED = Features(
+    ego_static=("length", "width", "height"),
+    agents=("position", "heading", "velocity", "length", "width", "height", "type"),
+    route=("position", "heading", "recommended_speed"),
+)
 #: ``published`` is the observation of the published description with road pieces of at most 10 m: 2,000 rows are 400
 #: pieces cut into five each, in a box of 100 m instead of a circle.
 PRESETS = MappingProxyType(
@@ -154,11 +143,7 @@ PRESETS = MappingProxyType(
             road_behind_m=100.0,
             road_side_m=100.0,
             road_cut=5,
-            features=Features(
-                ego_static=("length", "width", "height"),
-                agents=("position", "heading", "velocity", "length", "width", "height", "type"),
-                route=("position", "heading", "recommended_speed"),
-            ),
+            features=_PUBLISHED,
         ),
     }
 )
@@ -173,17 +158,17 @@ def observe(
     action; ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
     ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's groups.
     """
-    view, features = View.of(context), config.features
+    view, chosen = View.of(context), config.features
     if config.perception.of_agents:
         frames = perceived(config.perception, bank, context, frames)
     result = _ego(config, bank, context, view)
-    if features.agents:
+    if chosen.agents:
         result |= _agents(config, bank, context, view, frames)
-    if config.road and features.road:
+    if config.road and chosen.road:
         result |= _shown_road(config, bank, context, view)
-    if features.lights:
+    if chosen.lights:
         result |= _lights(config, bank, context, view, frames(0).lights)
-    if features.route:
+    if chosen.route:
         result |= _route(config, bank, context, view)
     for group in config.own:
         result |= group.observe(bank, context, frames)
@@ -211,7 +196,7 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, v
         "last_action": lambda: context.action,
     }
     groups = (("ego", config.features.ego, moving), ("ego_static", config.features.ego_static, static))
-    return {name: joined(chosen, parts, ()) for name, chosen, parts in groups if chosen}
+    return {name: features.joined(chosen, parts, ()) for name, chosen, parts in groups if chosen}
 
 
 def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
@@ -234,19 +219,15 @@ def _agents(
     def row(back: int) -> tuple[Float[Array, "K F"], Bool[Array, " K"]]:
         frame = now if back == 0 else frames(back)
         box, x = frame.box[chosen], context.history[HISTORY - 1 - back]
-
-        def relative() -> Float[Array, "K 2"]:
-            own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
-            return view.vector(frame.velocity[chosen] - own) / SPEED_MPS
-
+        own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
         parts = {
             "position": lambda: view.point(box[:, :2]) / POSITION_M,
             "heading": lambda: view.vector(box[:, 2:4])[:, ::-1],
             "velocity": lambda: view.vector(frame.velocity[chosen]) / SPEED_MPS,
-            "relative_velocity": relative,
+            "relative_velocity": lambda: view.vector(frame.velocity[chosen] - own) / SPEED_MPS,
             "time": lambda: jnp.full((config.agents, 1), -DT_S * back),
         }
-        return joined(chosen_features, parts, (config.agents,)), frame.valid[chosen]
+        return features.joined(chosen_features, parts, (config.agents,)), frame.valid[chosen]
 
     past = [row(back) for back in range(config.steps - 1, -1, -1)]
     moving, mask = (jnp.stack(rows, axis=1) for rows in zip(*past, strict=True))
@@ -258,7 +239,7 @@ def _agents(
         "height": lambda: bank.agent_box[context.index, chosen, SizeColumn.HEIGHT][..., None] / SIZE_M,
         "type": lambda: (now.kind[chosen, None] == jnp.arange(1, 5)).astype(jnp.float32),
     }
-    static = joined(chosen_features, parts, (config.agents,))
+    static = features.joined(chosen_features, parts, (config.agents,))
     static = jnp.broadcast_to(static[:, None], (*moving.shape[:2], static.shape[-1]))
     return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
@@ -274,10 +255,12 @@ def _shown_road(
         return group
     rows, mask = group["road"], group["road_mask"]
     if config.road_cut > 1:
-        rows, mask = cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
+        rows, mask = features.cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
     if noisy:
-        rows = rows.at[:, :2].add(moved_road(config.perception, bank, context, config.road) / POSITION_M)
-    columns = columns_of("road", selected) + ([rows.shape[-1] - 1] if "curvature" in selected else [])
+        errors = position_errors(config.perception, bank, context, MOVED_ROAD, config.road)
+        rows = rows.at[:, :2].add(errors / POSITION_M)
+    columns = features.columns_of("road", selected)
+    columns += [rows.shape[-1] - 1] if "curvature" in selected else []
     return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
 
@@ -301,7 +284,7 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
     parts += [rows[:, RoadColumn.LENGTH, None] / PIECE_M, types]
     parts += [jnp.maximum(limit, 0.0) / SPEED_MPS, (limit > 0).astype(jnp.float32)]
     if "curvature" in config.features.road:
-        parts.append(shown_curvature(bank.road_curvature[context.index, take])[:, None])
+        parts.append(features.shown_curvature(bank.road_curvature[context.index, take])[:, None])
     return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
 
 
@@ -337,7 +320,8 @@ def _lights(
     def position() -> Float[Array, "K 2"]:
         middle = view.point(line[LightRow.XY, chosen].T)
         if perception.noise_m > 0:
-            middle = middle + moved_lights(perception, bank, context, state.shape[0])[chosen]
+            errors = position_errors(perception, bank, context, MOVED_LIGHTS, state.shape[0])
+            middle = middle + errors[chosen]
         return middle / POSITION_M
 
     parts = {
@@ -345,7 +329,7 @@ def _lights(
         "state": lambda: _colour(state[chosen]),
         "on_route": lambda: on_route[chosen, None].astype(jnp.float32),
     }
-    return _masked("lights", joined(config.features.lights, parts, ()), there)
+    return _masked("lights", features.joined(config.features.lights, parts, ()), there)
 
 
 def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
@@ -358,19 +342,19 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
 def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, there = route_ahead(bank, context.index, context.route_m, offsets)
-    there &= has_route(bank, context)
+    there &= features.has_route(bank, context)
     limit = rows[:, RouteColumn.LIMIT, None]
 
     def curvature() -> Float[Array, "K 1"]:
-        return route_curvature(bank, context.index, context.route_m + offsets)[:, None]
+        return features.route_curvature(bank, context.index, context.route_m + offsets)[:, None]
 
     goal = bank.goal[context.index]
     parts = {
         "position": lambda: view.point(rows[:, RouteColumn.XY]) / POSITION_M,
         "heading": lambda: view.vector(rows[:, RouteColumn.HEADING])[:, ::-1],
         "limit": lambda: jnp.where(limit > 0, limit / SPEED_MPS, 0.0),
-        "curvature": lambda: shown_curvature(curvature()),
-        "recommended_speed": lambda: recommended_speed(curvature()) / SPEED_MPS,
-        "goal": lambda: jnp.broadcast_to(goal_ahead(view.point(goal)), (config.route, 2)),
+        "curvature": lambda: features.shown_curvature(curvature()),
+        "recommended_speed": lambda: features.recommended_speed(curvature()) / SPEED_MPS,
+        "goal": lambda: jnp.broadcast_to(features.goal_ahead(view.point(goal)), (config.route, 2)),
     }
-    return _masked("route", joined(config.features.route, parts, ()), there)
+    return _masked("route", features.joined(config.features.route, parts, ()), there)

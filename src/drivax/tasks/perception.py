@@ -28,7 +28,7 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 #: Numbers folded into the key of a step, by what is drawn.
-_DROPPED, _MOVED, _DROPPED_LIGHTS, _MOVED_LIGHTS, _MOVED_ROAD = range(5)
+_DROPPED, _MOVED, _DROPPED_LIGHTS, MOVED_LIGHTS, MOVED_ROAD = range(5)
 
 
 @dataclass(frozen=True)
@@ -131,18 +131,11 @@ def lights_seen(
     return _reported(config, key, distance_m)
 
 
-def moved_lights(
-    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
+def position_errors(
+    config: Perception, bank: ScenarioBank, context: AgentContext, drawn: int, count: int
 ) -> Float[Array, "count 2"]:
-    """Return position errors of lights in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_LIGHTS), count)
-
-
-def moved_road(
-    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
-) -> Float[Array, "count 2"]:
-    """Return position errors of road pieces in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_ROAD), count)
+    """Return position errors of ``MOVED_LIGHTS`` or ``MOVED_ROAD`` in the ego frame, m."""
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), drawn), count)
 
 
 def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: int = 0) -> Array:

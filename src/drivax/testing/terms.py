@@ -105,7 +105,9 @@ def check_feature(feature: Feature | str) -> None:
     results = program.check_pure(bank, contexts)
     check_numbers(what, results)
     largest = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(results))
-    expect(largest <= LARGEST, f"{what} reaches {largest:g}", "scale it to about [-1, 1] (units: tasks.view)")
+    expect(
+        largest <= LARGEST, f"{what} reaches {largest:g}", "scale it to about [-1, 1] (units: tasks.features)"
+    )
     check_numbers(what, program(worlds.without_others(bank), contexts))
     check_variants(what, results, worlds.BANK_VARIANTS, lambda change: program(change(bank), contexts))
     present = np.asarray(contexts.step) == _NOW

@@ -28,7 +28,7 @@ from drivax.learning.experience import (
 from drivax.learning.program import divided
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
-from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.functions import NetworkPlanner
 from drivax.scenario.record import record
 
 #: From parameters and a batch of observations to action distributions.

@@ -15,7 +15,7 @@ from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
 from drivax.networks.distributions import Actions, Distribution
-from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.functions import NetworkPlanner
 from drivax.rl.equations import polyak, soft_policy_loss, td_target, temperature_loss
 
 

@@ -26,7 +26,7 @@ from drivax.learning.environment import (
 from drivax.learning.program import divided
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig
 from drivax.networks.distributions import Actions, Distribution
-from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.functions import NetworkPlanner
 from drivax.rl.equations import clipped_surrogate_loss, generalised_advantages
 from drivax.scenario.record import record
 

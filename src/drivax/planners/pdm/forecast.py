@@ -22,19 +22,12 @@ _FURTHER = 0.02
 
 @record
 class Forecast:
-    """Agents that keep their velocity and heading.
+    """Agents that keep their velocity and heading."""
 
-    Attributes:
-        box: Their boxes now.
-        velocity: m/s.
-        kind: ``scenario.schema.AgentKind``.
-        valid: Mask of present agents.
-    """
-
-    box: Float[Array, "K 6"]
-    velocity: Float[Array, "K 2"]
-    kind: Int[Array, " K"]
-    valid: Bool[Array, " K"]
+    box: Float[Array, "K 6"]  # Their boxes now
+    velocity: Float[Array, "K 2"]  # m/s
+    kind: Int[Array, " K"]  # ``scenario.schema.AgentKind``
+    valid: Bool[Array, " K"]  # Mask of present agents
 
     @classmethod
     def of(

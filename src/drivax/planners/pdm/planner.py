@@ -16,16 +16,11 @@ from jaxtyping import Array, Bool, Float
 from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH
 from drivax.geometry.vectors import wrap
+from drivax.planners.pdm import scoring
 from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unroll_idm
-from drivax.planners.pdm.scoring import (
-    ProposalMetrics,
-    ScoringConfig,
-    evaluate_proposal,
-    ground_along,
-    scores,
-)
+from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig
 from drivax.planners.pdm.tracking import Car, TrackingConfig, track
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
@@ -87,32 +82,20 @@ class PdmConfig:
 
 @record
 class Memory:
-    """Carry of PDM.
+    """Carry of PDM."""
 
-    Attributes:
-        touched: Agents that have overlapped ego since the episode started; ignored.
-        acceleration: Last requested acceleration, m/s2.
-        steering: Steering angle, rad.
-    """
-
-    touched: Bool[Array, " S"]
-    acceleration: Float[Array, ""]
-    steering: Float[Array, ""]
+    touched: Bool[Array, " S"]  # Agents that have overlapped ego since the episode started; ignored
+    acceleration: Float[Array, ""]  # Last requested acceleration, m/s2
+    steering: Float[Array, ""]  # Steering angle, rad
 
 
 @record
 class ScoredProposals:
-    """Simulated and scored proposals of a step: speeds of one line after each other, lines in order.
+    """Simulated and scored proposals of a step: speeds of one line after each other, lines in order."""
 
-    Attributes:
-        cars: Simulated motion, step by step.
-        metrics: Metrics of each proposal.
-        score: In [0, 1].
-    """
-
-    cars: Car
-    metrics: ProposalMetrics
-    score: Float[Array, " N"]
+    cars: Car  # Simulated motion, step by step
+    metrics: ProposalMetrics  # Metrics of each proposal
+    score: Float[Array, " N"]  # In [0, 1]
 
 
 @record
@@ -186,14 +169,14 @@ class PdmPlanner:
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
         every = config.scoring.ground_every
-        ground = ground_along(bank, context.index, cars.motion, size, z, on_route, every)
+        ground = scoring.ground_along(bank, context.index, cars.motion, size, z, on_route, every)
         ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
         yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
 
-        metrics = jax.vmap(evaluate_proposal, in_axes=(0, 0, None, None, None, 0, 0, None))(
+        metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, 0, None, None, None, 0, 0, None))(
             cars.motion, cars.acceleration, yaw_rate, size, others, ground, ends, config.scoring
         )
-        return ScoredProposals(cars, metrics, scores(metrics, config.scoring))
+        return ScoredProposals(cars, metrics, scoring.scores(metrics, config.scoring))
 
     def _wheelbase(self, length_m: Float[Array, ""]) -> Float[Array, ""]:
         return self.config.tracking.wheelbase * jnp.maximum(length_m, 1.0)

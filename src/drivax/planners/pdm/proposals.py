@@ -35,20 +35,14 @@ LINE_X, LINE_Y, LINE_COS, LINE_SIN, LINE_BEND, LINE_PLACE, LINE_Z = range(7)
 
 @record
 class Lines:
-    """P lines along the route, each at points 1 m apart along itself, from abreast of ego on.
+    """P lines along the route, each at points 1 m apart along itself, from abreast of ego on."""
 
-    Attributes:
-        points: x, y, cosine and sine of the heading, curvature (1/m), place along the route from ego on (m), and height
-            above where ego is (m).
-        route: Rows of ``bank.routes`` every 2 m ahead; straight on beyond the end.
-        left_m: How much of the route is left.
-        limit: Speed limit of ego's lane, m/s; not positive where unknown.
-    """
-
+    # x, y, cosine and sine of the heading, curvature (1/m), place along the route from ego on (m), and height above
+    # where ego is (m)
     points: Float[Array, "P M 7"]
-    route: Float[Array, "R 7"]
-    left_m: Scalar
-    limit: Scalar
+    route: Float[Array, "R 7"]  # Rows of ``bank.routes`` every 2 m ahead; straight on beyond the end
+    left_m: Scalar  # How much of the route is left
+    limit: Scalar  # Speed limit of ego's lane, m/s; not positive where unknown
 
     @classmethod
     def along_route(
@@ -128,15 +122,10 @@ def _line(
 
 @record
 class Proposals:
-    """Proposals along P lines with F target speeds, at T steps from now on.
+    """Proposals along P lines with F target speeds, at T steps from now on."""
 
-    Attributes:
-        way: Arc length along the line, m.
-        speed: m/s.
-    """
-
-    way: Float[Array, "P F T"]
-    speed: Float[Array, "P F T"]
+    way: Float[Array, "P F T"]  # Arc length along the line, m
+    speed: Float[Array, "P F T"]  # m/s
 
     def reference(self, lines: Lines) -> Reference:
         """Return the flattened proposals: target speeds of one line after each other."""

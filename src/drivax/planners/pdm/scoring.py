@@ -54,37 +54,27 @@ class ScoringConfig:
 
 @record
 class Ground:
-    """Position relative to lanes and road at each step of a motion.
+    """Position relative to lanes and road at each step of a motion."""
 
-    Attributes:
-        several: In more than one lane.
-        off: Some corner is off the road.
-        astray: The centre is outside the lanes in the route's direction (nuPlan's oncoming traffic).
-    """
-
-    several: Bool[Array, "*T"]
-    off: Bool[Array, "*T"]
+    several: Bool[Array, "*T"]  # In more than one lane
+    off: Bool[Array, "*T"]  # Some corner is off the road
+    # The centre is outside the lanes in the route's direction (nuPlan's oncoming traffic)
     astray: Bool[Array, "*T"]
 
 
 @record
 class ProposalMetrics:
-    """Metrics of a proposal.
+    """Metrics of a proposal."""
 
-    Attributes:
-        collision, road, direction: Gates: 1 passed, 0 failed.
-        progress_m: Along the route.
-        ttc, comfort: 1 within limits, 0 not.
-        fault_s: Time of the first at-fault collision, infinite for none.
-    """
-
+    # Gates: 1 passed, 0 failed
     collision: Float[Array, "*batch"]
     road: Float[Array, "*batch"]
     direction: Float[Array, "*batch"]
-    progress_m: Float[Array, "*batch"]
+    progress_m: Float[Array, "*batch"]  # Along the route
+    # 1 within limits, 0 not
     ttc: Float[Array, "*batch"]
     comfort: Float[Array, "*batch"]
-    fault_s: Float[Array, "*batch"]
+    fault_s: Float[Array, "*batch"]  # Time of the first at-fault collision, infinite for none
 
 
 def ground_at(

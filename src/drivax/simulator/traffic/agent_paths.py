@@ -54,33 +54,23 @@ Numbers = np.ndarray[Any, Any]
 
 @record
 class AgentPaths(TrafficData):
-    """Paths of the R agents of a scenario that may react; rows without an agent have slot -1.
+    """Paths of the R agents of a scenario that may react; rows without an agent have slot -1."""
 
-    Attributes:
-        slot: Agent slot of each path.
-        points: x, y, cos, sin, evenly spaced.
-        profile: Height of the box centre, and speed limit from peak and curves (m/s), at the same points.
-        spacing: Arc length between two points, m.
-        log_arc: Arc length of the logged agent at each step, m; never decreases, holds while unobserved.
-        log_speed: Logged speed at each step, not negative, m/s.
-        appears: First step at or after each step at which the log has the agent; T for none.
-        stop_arc: Arc lengths of the stop lines that the path crosses, m; very large for none.
-        stop_light: Slot of the light of each of them.
-        overlaps: Up to two slots whose boxes the agent overlaps in the log, -1 for none.
-        kinds: Agent classes with paths.
-    """
-
-    slot: Int[Array, "N R"]
-    points: Float[Array, "N R M 4"]
+    slot: Int[Array, "N R"]  # Agent slot of each path
+    points: Float[Array, "N R M 4"]  # x, y, cos, sin, evenly spaced
+    # Height of the box centre, and speed limit from peak and curves (m/s), at the same points
     profile: Float[Array, "N R M 2"]
-    spacing: Float[Array, "N R"]
+    spacing: Float[Array, "N R"]  # Arc length between two points, m
+    # Arc length of the logged agent at each step, m; never decreases, holds while unobserved
     log_arc: Float[Array, "N T R"]
-    log_speed: Float[Array, "N T R"]
+    log_speed: Float[Array, "N T R"]  # Logged speed at each step, not negative, m/s
+    # First step at or after each step at which the log has the agent; T for none
     appears: Int[Array, "N T R"]
+    # Arc lengths of the stop lines that the path crosses, m; very large for none
     stop_arc: Float[Array, "N R 4"]
-    stop_light: Int[Array, "N R 4"]
-    overlaps: Int[Array, "N T R 2"]
-    kinds: tuple[int, ...] = static()
+    stop_light: Int[Array, "N R 4"]  # Slot of the light of each of them
+    overlaps: Int[Array, "N T R 2"]  # Up to two slots whose boxes the agent overlaps in the log, -1 for none
+    kinds: tuple[int, ...] = static()  # Agent classes with paths
 
 
 @dataclass(frozen=True)

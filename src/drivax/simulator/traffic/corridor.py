@@ -44,40 +44,25 @@ _SLOT_BITS, _PIECE_BITS = 10, 4
 
 @record
 class Movers:
-    """R vehicles on their paths.
+    """R vehicles on their paths."""
 
-    Attributes:
-        box: x, y, cos, sin, length, width.
-        z: Height of the box centre, m.
-        arc: Arc length along the path, m.
-        speed: m/s.
-        slot: Slot of the frame.
-        ignored: Slots of ignored agents, -1 for none.
-    """
-
-    box: Float[Array, "R 6"]
-    z: Float[Array, " R"]
-    arc: Float[Array, " R"]
-    speed: Float[Array, " R"]
-    slot: Int[Array, " R"]
-    ignored: Int[Array, "R 2"]
+    box: Float[Array, "R 6"]  # x, y, cos, sin, length, width
+    z: Float[Array, " R"]  # Height of the box centre, m
+    arc: Float[Array, " R"]  # Arc length along the path, m
+    speed: Float[Array, " R"]  # m/s
+    slot: Int[Array, " R"]  # Slot of the frame
+    ignored: Int[Array, "R 2"]  # Slots of ignored agents, -1 for none
 
 
 @record
 class Leaders:
-    """What is ahead of R vehicles.
+    """What is ahead of R vehicles."""
 
-    Attributes:
-        gap: Free path to the nearest agent in the corridor, bumper to bumper, m; 10 km if free.
-        speed: Speed of that agent along the path, m/s.
-        things: Slots of the closest agents around the corridor.
-        real: Mask of valid ``things``.
-    """
-
+    # Free path to the nearest agent in the corridor, bumper to bumper, m; 10 km if free
     gap: Float[Array, " R"]
-    speed: Float[Array, " R"]
-    things: Int[Array, "R C"]
-    real: Bool[Array, "R C"]
+    speed: Float[Array, " R"]  # Speed of that agent along the path, m/s
+    things: Int[Array, "R C"]  # Slots of the closest agents around the corridor
+    real: Bool[Array, "R C"]  # Mask of valid ``things``
 
 
 def path_poses(
@@ -163,8 +148,7 @@ def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any
 def _bulge(part: Any, way: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
     """Return the offset of the path to the left of a straight piece, relative to its length: cubic with both tangents.
 
-    ``part`` is the relative position on the piece and ``way`` its direction (cosine, sine); ``tangents`` are those of
-    the path at start and end.
+    ``part`` is the relative position on the piece, ``way`` its direction; ``tangents`` are those at start and end.
     """
     (ux, uy), slopes = way, []
     for cos, sin in (tangents[:2], tangents[2:]):

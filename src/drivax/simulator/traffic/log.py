@@ -77,17 +77,15 @@ def frame_of(
     z = agents[:, AgentColumn.Z].at[driven.slot].set(driven.z, mode="drop")
     rows = agent_rows(motion, jnp.zeros_like(present), present)
     agents = agents.at[driven.slot].set(rows, mode="drop")
-    box = bank.agent_box[index]
-    at = jnp.clip(step - back, 0, bank.steps - 1)
+    box, at = bank.agent_box[index], jnp.clip(step - back, 0, bank.steps - 1)
     bit = bank.parked_when[index, at // WORD] >> (at % WORD).astype(jnp.uint32)
     there = (bit & 1 > 0) & (step >= back)
     parked, more = bank.parked[index], len(box) - len(agents)
     z = jnp.where(there, parked[:, AgentColumn.Z], jnp.pad(z, (0, more)))
     agents = jnp.where(there[:, None], parked, jnp.pad(agents, ((0, more), (0, 0))))
+    parts = [agents[:, AgentColumn.XY], agents[:, AgentColumn.HEADING], box[:, SizeColumn.FOOTPRINT]]
     return Frame(
-        box=jnp.concatenate(
-            [agents[:, AgentColumn.XY], agents[:, AgentColumn.HEADING], box[:, SizeColumn.FOOTPRINT]], axis=-1
-        ),
+        box=jnp.concatenate(parts, axis=-1),
         velocity=agents[:, AgentColumn.VELOCITY],
         z=z,
         valid=agents[:, AgentColumn.VALID] > 0,

@@ -25,19 +25,12 @@ Move = Callable[[Float[Array, " 4"], Float[Array, " D"], Any], Float[Array, " 4"
 
 @record
 class OverrideMotions(TrafficData):
-    """Motions of K agents of every scenario.
+    """Motions of K agents of every scenario."""
 
-    Attributes:
-        slot: Their slots, -1 for none.
-        motion: x, y, heading, speed.
-        z: Height of the box centre, m.
-        valid: Whether they are there.
-    """
-
-    slot: Int[Array, "N K"]
-    motion: Float[Array, "N T K 4"]
-    z: Float[Array, "N T K"]
-    valid: Bool[Array, "N T K"]
+    slot: Int[Array, "N K"]  # Their slots, -1 for none
+    motion: Float[Array, "N T K 4"]  # x, y, heading, speed
+    z: Float[Array, "N T K"]  # Height of the box centre, m
+    valid: Bool[Array, "N T K"]  # Whether they are there
 
 
 @dataclass(frozen=True)
@@ -86,13 +79,8 @@ def with_override(
 ) -> ScenarioBank:  # fmt: skip
     """Return the bank with given trajectories; their heights follow the nearest lane, from the first logged one on.
 
-    Differentiable with respect to ``motion``.
-
-    Args:
-        bank: The scenarios.
-        slots: Moving agents of each scenario, -1 for none.
-        motion: x, y (m), heading (rad), speed (m/s) at every step of the log.
-        valid: Whether they are there; always by default.
+    Differentiable with respect to ``motion``: x, y (m), heading (rad), speed (m/s) at every step of the log, with the
+    mask ``valid`` (by default all). ``slots`` are moving agents of each scenario, -1 for none.
     """
     valid = jnp.ones(motion.shape[:3], bool) if valid is None else valid
     slots = jnp.asarray(slots, jnp.int32)
@@ -121,14 +109,9 @@ def motions_of_actions(
     """Return the trajectories of agents that follow the log until step ``begin`` and then execute given actions.
 
     Differentiable with respect to ``actions``. An agent that the log lacks at ``begin`` starts where it was last seen,
-    or first.
-
-    Args:
-        bank: The scenarios.
-        slots: Moving agents of each scenario, -1 for none.
-        actions: One per step from ``begin`` on; after the last one it is repeated.
-        move: The dynamics under the action space, such as ``Task().motion``.
-        begin: Step of the log at which they take over, at most 15 steps of whose past are kept.
+    or first. ``slots`` are moving agents of each scenario, -1 for none. There is one action per step; the last one is
+    repeated. ``move`` is the dynamics of the action space, such as ``Task().motion``. At most 15 steps before ``begin``
+    are as logged.
     """
     steps = bank.steps - 1 - begin
     desired = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)

@@ -34,24 +34,15 @@ _STANDS_MPS = 0.5
 
 @record
 class Reactive:
-    """State of the R vehicles of a scenario that may react; the last of the 10 rows is now.
+    """State of the R vehicles of a scenario that may react; the last of the 10 rows is now."""
 
-    Attributes:
-        begin: First step of the episode; until then all agents moved as logged.
-        phase: Replays (0), waits to appear (1), drives (2), has left (3).
-        entry: Step at which the vehicle appears in the log.
-        arc: Arc length along the path, m.
-        speed: m/s.
-        there: Whether the vehicle is on the road.
-        ignored: Slots of agents overlapped on appearing, until they separate; -1 for none.
-    """
-
-    begin: Int[Array, "*batch"]
-    phase: Int[Array, "*batch R"]
-    entry: Int[Array, "*batch R"]
-    arc: Float[Array, "*batch 10 R"]
-    speed: Float[Array, "*batch 10 R"]
-    there: Bool[Array, "*batch 10 R"]
+    begin: Int[Array, "*batch"]  # First step of the episode; until then all agents moved as logged
+    phase: Int[Array, "*batch R"]  # Replays (0), waits to appear (1), drives (2), has left (3)
+    entry: Int[Array, "*batch R"]  # Step at which the vehicle appears in the log
+    arc: Float[Array, "*batch 10 R"]  # Arc length along the path, m
+    speed: Float[Array, "*batch 10 R"]  # m/s
+    there: Bool[Array, "*batch 10 R"]  # Whether the vehicle is on the road
+    # Slots of agents overlapped on appearing, until they separate; -1 for none
     ignored: Int[Array, "*batch R 2"]
 
 
