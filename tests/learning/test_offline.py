@@ -354,7 +354,7 @@ def test_weights_select_training_steps(bandit):
         assert logs["sampler/critic_effective"] == pytest.approx(len(chosen) if weighted == "all" else 500)
 
 
-def test_what_cannot_be_learned_is_refused():
+def test_impossible_settings_are_refused():
     grid = replace(NETWORK, distribution="grid")
     for config in (CqlConfig, Td3BcConfig, partial(IqlConfig, loss="mse")):
         with pytest.raises(UsageError, match="a gradient through its actions"):

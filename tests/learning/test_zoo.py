@@ -172,7 +172,7 @@ def test_shipped_policies_drive_and_have_provenance(name, bank):
 
 
 @pytest.mark.slow
-def test_the_aggressive_driver_drives_and_drives_others(data, tmp_path):
+def test_aggressive_policy_drives_as_planner_and_as_traffic(data, tmp_path):
     loaded = drivax.load(data.path)
     alone = drivax.evaluate("zoo:aggressive", loaded)
     pushed = drivax.evaluate("zoo:aggressive", loaded, traffic="zoo:aggressive+idm")
