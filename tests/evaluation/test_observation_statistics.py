@@ -13,7 +13,7 @@ from scipy import stats
 from drivax.errors import UsageError
 from drivax.evaluation.observation_statistics import (
     collision_correlation,
-    described,
+    column_statistics,
     importances,
     look_at,
     observation_statistics,
@@ -149,7 +149,9 @@ def test_statistics_of_hand_made_observations():
     hit, collides = np.array([[False] * 3, [False, False, True]]), np.array([False, True])
     static = np.linspace(0, 1, 6).reshape(2, 3, 1)
     seen = {"mine": rows, "mine_mask": mask, "ego_static": static}
-    one, two, static = described(Features(ego_static=("width",)), seen, hit, collides, {("mine", 0): 0.5})
+    one, two, static = column_statistics(
+        Features(ego_static=("width",)), seen, hit, collides, {("mine", 0): 0.5}
+    )
     assert (one.group, one.name, static.name) == ("mine", "0", "width")
     kept = [0.0, 2.0, 6.0, 8.0, 10.0]
     assert (one.count, one.broken, one.mean, one.low, one.high) == (5, 0, np.mean(kept), 0.0, 10.0)
@@ -160,7 +162,9 @@ def test_statistics_of_hand_made_observations():
     # Of two episodes nothing can be said; of four, r is that of their means before the collision: 1, 7, 1, 7.
     assert np.isnan(one.collision)
     twice = {name: np.concatenate([values, values]) for name, values in seen.items()}
-    again = described(Features(ego_static=("width",)), twice, np.tile(hit, (2, 1)), np.tile(collides, 2), {})
+    again = column_statistics(
+        Features(ego_static=("width",)), twice, np.tile(hit, (2, 1)), np.tile(collides, 2), {}
+    )
     assert again[0].collision == pytest.approx(1.0)
 
 

@@ -10,7 +10,7 @@ from shapely import affinity
 
 import drivax
 from drivax.cli import main
-from drivax.evaluation.rollout import packed, unpacked
+from drivax.evaluation.rollout import pack_poses, unpack_poses
 from drivax.report.episodes import EvaluatedSet, ranked, rollouts_of
 from drivax.report.pictures.drawing import with_traffic_of
 from drivax.report.runs import read_runs
@@ -27,9 +27,9 @@ def test_poses_round_trip_within_a_centimetre_and_absent_agents_stay_absent():
     )
     rows = np.concatenate([rows, there[..., None]], -1)
     rows[0, 0, :2], rows[0, 0, 7], there[0, 0] = (700.0, 0.0), 1.0, False
-    kept = np.asarray(packed(jnp.asarray(rows, jnp.float32)))
+    kept = np.asarray(pack_poses(jnp.asarray(rows, jnp.float32)))
     assert kept.dtype == np.int16 and kept.shape == (5, 7, 3)
-    found = unpacked(kept)
+    found = unpack_poses(kept)
     np.testing.assert_array_equal(np.isfinite(found).all(-1), there)
     np.testing.assert_allclose(found[there][:, :2], xy[there], atol=0.0101)
     turned = found[there][:, 2] - heading[there]
@@ -86,5 +86,5 @@ def test_log_traffic_stores_no_trajectories(tmp_path):
     scenarios = ScenarioSet.open(tmp_path / "set")
     for rows, scenario in zip(found, scenarios, strict=True):
         # No agent has moved yet when the episode begins.
-        pose, there = unpacked(rows[0]), scenario.agent_valid[10, : rows.shape[1]]
+        pose, there = unpack_poses(rows[0]), scenario.agent_valid[10, : rows.shape[1]]
         np.testing.assert_allclose(pose[there][:, :2], scenario.agent_xy[10, : len(there)][there], atol=0.02)

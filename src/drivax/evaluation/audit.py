@@ -50,10 +50,8 @@ def audit(scenarios: Sequence[Scenario]) -> list[Finding]:
     usable = [scenario for scenario in scenarios if Flag.NO_FUTURE not in scenario.has]
     batches = (usable[first : first + BATCH] for first in range(0, len(usable), BATCH))
     replayed = iter([row for batch in batches for row in _replayed(batch)])
-    return [
-        (next(replayed) if Flag.NO_FUTURE not in scenario.has else {}) | _known(scenario)
-        for scenario in scenarios
-    ]
+    futures = ((scenario, Flag.NO_FUTURE not in scenario.has) for scenario in scenarios)
+    return [(next(replayed) if future else {}) | _known(scenario) for scenario, future in futures]
 
 
 def _known(scenario: Scenario) -> Finding:

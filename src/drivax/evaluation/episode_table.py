@@ -70,7 +70,7 @@ class Trajectories:
         action: Executed action at every step from ``start`` on, NaN after a crash; no columns where unknown.
         start: Step of the log at which the planner took over.
         events: Step of the first event by name (:data:`EVENTS`), -1 for none.
-        others: Packed poses of the other agents (``evaluation.rollout.packed``); None where they replayed the log.
+        others: Packed poses of the other agents (``evaluation.rollout.pack_poses``); None where they replayed the log.
     """
 
     ego: Float32[Array, "episode step 4"]

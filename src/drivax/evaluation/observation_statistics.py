@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.evaluation.rollout import advanced, check_actions, episode_keys, evaluation_task
+from drivax.evaluation.rollout import advance, check_actions, episode_keys, evaluation_task
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
@@ -143,13 +143,13 @@ def observation_statistics(
         *rest, shown = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], known)
         act = partial(_actions, simulator, planner, bank, *rest)
         columns, groups = importances(act, jax.device_get(shown), seed)
-    features = described(task.observation.features, seen, hit, collides, columns)
+    features = column_statistics(task.observation.features, seen, hit, collides, columns)
     return ObservationStatistics(
         planner.name, len(collides), int(collides.sum()), hit.size, permuted, features, groups
     )
 
 
-def described(
+def column_statistics(
     features: Features, observation: Mapping[str, Values], hit: Values, collides: Values,
     importance: Mapping[tuple[str, int], float],
 ) -> tuple[FeatureStatistics, ...]:  # fmt: skip
@@ -201,7 +201,7 @@ def _episode(
 
     def step(now: Any, key: Array) -> tuple[Any, None]:
         state, carry, hit = now
-        state, carry, _ = advanced(simulator, planner, bank, state, carry, key)
+        state, carry, _ = advance(simulator, planner, bank, state, carry, key)
         return (state, carry, hit | state.facts.collision), None
 
     def look(now: Any, keys: Array) -> tuple[Any, Any]:

@@ -43,7 +43,7 @@ class Episodes:
         events: Step of the first collision, off-road step and red light, -1 for none.
         motion: x, y, heading, speed of the driven agent from the start step to the end.
         actions: Executed actions, after bounds and actuators.
-        others: Packed poses of the other agents at each step (:func:`packed`); None in log traffic.
+        others: Packed poses of the other agents at each step (:func:`pack_poses`); None in log traffic.
         offroad_steps: Number of steps off the road.
         crashed: First step whose action was not finite, -1 for none; nothing is measured from there on.
     """
@@ -97,11 +97,11 @@ def _episode(
 
     def others(state: SimState) -> Int16[Array, "A 3"] | None:
         traffic = simulator.traffic
-        return None if traffic.name == LogTraffic.name else packed(traffic.agents(bank, state.context, 0))
+        return None if traffic.name == LogTraffic.name else pack_poses(traffic.agents(bank, state.context, 0))
 
     def step(now: Any, key: Array) -> Any:
         state, kept, carry, sound = now
-        state, carry, finite = advanced(simulator, planner, bank, state, carry, key)
+        state, carry, finite = advance(simulator, planner, bank, state, carry, key)
         sound &= finite
         kept = state if planner.replays else jax.tree.map(partial(jnp.where, sound), state, kept)
         context = kept.context
@@ -127,7 +127,7 @@ def _episode(
     )
 
 
-def advanced(
+def advance(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any, key: Array
 ) -> tuple[SimState, Any, Bool[Array, ""]]:
     """Return state and carry one step later, and whether the action was finite; replaying planners follow the log.
@@ -147,7 +147,7 @@ def advanced(
     return simulator.step(bank, state, jnp.where(sound, action, nothing))[0], carry, sound
 
 
-def packed(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
+def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
     """Pack positions and headings of bank rows; agents further than 650 m from the origin count as absent."""
     xy = agents[..., AgentColumn.XY]
     heading = jnp.arctan2(agents[..., AgentColumn.SIN], agents[..., AgentColumn.COS])
@@ -156,7 +156,7 @@ def packed(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
     return jnp.where(present[..., None], jnp.round(poses), _ABSENT).astype(jnp.int16)
 
 
-def unpacked(rows: Int16[np.ndarray, "*batch A 3"]) -> Float32[np.ndarray, "*batch A 3"]:
+def unpack_poses(rows: Int16[np.ndarray, "*batch A 3"]) -> Float32[np.ndarray, "*batch A 3"]:
     """Return positions (m) and headings (rad), NaN where absent."""
     poses = rows * np.array([_METRES, _METRES, _RADIANS], np.float32)
     return np.where(rows == _ABSENT, np.nan, poses).astype(np.float32)

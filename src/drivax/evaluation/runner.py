@@ -333,7 +333,7 @@ class _Evaluation:
         theirs = {name: metric for name, metric in self.metrics.items() if name not in METRICS}
         own = {name: {"unit": m.unit, "better": m.better, "text": m.definition} for name, m in theirs.items()}
         crashes: list[Crash] = []
-        for row in np.flatnonzero(crashed >= 0):
+        for row in np.flatnonzero(crashed >= 0).tolist():
             step = int(crashed[row])
             error = errors.get((int(identity[row]), step), "action is not finite")
             crashes.append(Crash(names[row]["dataset"], names[row]["scenario_id"], step, error))

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from drivax.errors import DataError
 from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable
-from drivax.evaluation.rollout import unpacked
+from drivax.evaluation.rollout import unpack_poses
 from drivax.report.charts import COMMANDED
 from drivax.report.pictures.drawing import Rollout
 from drivax.scenario.schema import Scenario
@@ -175,7 +175,7 @@ def _rollout(run: EpisodeTable, row: int, scenario: Scenario) -> Rollout:
     others = None
     if stored.others is not None:
         others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
-        others[start : start + len(motion)] = unpacked(stored.others[row, : steps - start])
+        others[start : start + len(motion)] = unpack_poses(stored.others[row, : steps - start])
     return Rollout(run.name, ego, start, events, outcome(run, row), action, others)
 
 
