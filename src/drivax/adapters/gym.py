@@ -54,14 +54,17 @@ class Scenarios(Protocol):
     @property
     def bank(self) -> ScenarioBank:
         """The scenarios, stacked."""
+        ...
 
     @property
     def names(self) -> Sequence[Mapping[str, str]]:
         """``scenario_id`` (and more) of each row of the bank."""
+        ...
 
     @property
     def scenarios(self) -> Sequence[Scenario]:
         """The stored scenarios."""
+        ...
 
 
 def _open(data: Scenarios | str | Path | int) -> tuple[ScenarioBank, list[str], Sequence[Scenario]]:
