@@ -17,7 +17,7 @@ from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.starts import LogStart, NoisyStart
-from drivax.simulator.traffic.catalogue import make_traffic
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
 from drivax.table import Cell, Column, Table
 from drivax.tasks.task import Task

@@ -14,8 +14,8 @@ from drivax.learning.config import TrainConfig, split_traffic
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import PlannerTraffic, with_driver
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
