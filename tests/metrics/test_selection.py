@@ -18,7 +18,7 @@ from drivax.metrics.catalogue import METRICS, SETS
 from drivax.metrics.episode import episode_add, episode_metrics, episode_start, event_steps
 from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.metrics.steps import STEP_VALUES
-from drivax.simulator import situation
+from drivax.simulator import contact, situation
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import FACTS
 from drivax.tasks.task import Task
@@ -57,7 +57,7 @@ def traced():
             patch.setattr(module, name, heard)
 
         for name in COSTLY:
-            listen(steps if name == "check_comfort" else situation, name)
+            listen({"check_comfort": steps, "check_lights": situation}.get(name, contact), name)
         for wanted in ("none", "training", "full", ("at_fault_collision",)):
             called.clear()
             simulator = Simulator(Task(metrics=wanted))

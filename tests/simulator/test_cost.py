@@ -10,11 +10,11 @@ from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
-from drivax.simulator import situation
+from drivax.simulator import contact, situation
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import prepare_bank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.override import OverrideTraffic, with_override
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.studies.bench import BenchConfig, _parts, _rounds
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.rewards import RewardConfig
@@ -79,17 +79,17 @@ def test_operation_count_detects_pairwise_agent_work(bank):
 def test_optional_facts_cost_nothing_unless_requested(bank, monkeypatch):
     asked = set()
 
-    def noted(name):
-        real = getattr(situation, name)
+    def noted(module, name):
+        real = getattr(module, name)
 
         def call(*arguments):
             asked.add(name)
             return real(*arguments)
 
-        monkeypatch.setattr(situation, name, call)
+        monkeypatch.setattr(module, name, call)
 
-    noted("lane_passage")
-    noted("nearest_gap")
+    noted(situation, "lane_passage")
+    noted(contact, "nearest_gap")
     less = operations(bank, Simulator(Task(observation=GLIMPSE, rewards=RewardConfig(preset="published"))))
     assert asked == set()
     rewards = RewardConfig(preset="published", lane_change=0.2, close=-0.1)

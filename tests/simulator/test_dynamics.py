@@ -118,7 +118,7 @@ def test_displacement_is_in_the_agent_frame_and_inverts_displace():
 
 
 @pytest.mark.parametrize("name", ["physical", "published", "discrete", "delta_local", "limited"])
-def test_zero_action_keeps_the_motion_and_bounds_clip(name):
+def test_zero_action_adds_nothing_and_bounds_clip(name):
     space, motion = SPACES[name], jnp.array([1.0, 2.0, 0.5, 4.0])
     after = np.asarray(space.move(motion, jnp.zeros(space.size), LENGTH_M))
     if name == "delta_local":

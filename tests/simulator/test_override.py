@@ -13,10 +13,9 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.contact import CollisionType
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import prepare_bank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import LogTraffic, alone
 from drivax.simulator.traffic.override import OverrideTraffic, motions_of_actions, with_override
-from drivax.simulator.traffic.reactive import IdmTraffic
+from drivax.simulator.traffic.reactive import IdmTraffic, make_traffic
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, bank_of, car, straight_road
 

@@ -26,8 +26,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.simulator import Simulator
-from drivax.simulator.sparse import map_where
+from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.types import AgentContext, SimState, Traffic
 from drivax.synthetic.world import generate_recording
@@ -54,14 +53,17 @@ class Scenarios(Protocol):
     @property
     def bank(self) -> ScenarioBank:
         """The scenarios, stacked."""
+        ...
 
     @property
     def names(self) -> Sequence[Mapping[str, str]]:
         """``scenario_id`` (and more) of each row of the bank."""
+        ...
 
     @property
     def scenarios(self) -> Sequence[Scenario]:
         """The stored scenarios."""
+        ...
 
 
 def _open(data: Scenarios | str | Path | int) -> tuple[ScenarioBank, list[str], Sequence[Scenario]]:

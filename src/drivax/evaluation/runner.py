@@ -37,8 +37,8 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart, Start
 from drivax.simulator.traffic.bank_data import prepare_bank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
 from drivax.table import Cell, Column, Table
 from drivax.tasks.task import Task

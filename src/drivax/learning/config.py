@@ -20,8 +20,8 @@ from drivax.plugins import is_dotted
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
-from drivax.simulator.traffic.catalogue import TRAFFIC, make_traffic
 from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.traffic.reactive import TRAFFIC, make_traffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.actions import DirectState
 from drivax.tasks.task import Task

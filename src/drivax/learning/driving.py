@@ -19,8 +19,7 @@ from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, STEPS
-from drivax.simulator.simulator import Simulator
-from drivax.simulator.sparse import map_where
+from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.starts import LogStart
 from drivax.simulator.types import AgentContext, EpisodeStart, Frame, SimState
 from drivax.tasks.actions import Discrete

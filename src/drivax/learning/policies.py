@@ -14,8 +14,8 @@ from drivax.learning.config import TrainConfig, split_traffic
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import PlannerTraffic, with_driver
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
@@ -145,7 +145,7 @@ def policy_traffic(
 def find_traffic(name: str) -> Traffic:
     """Return the traffic of a name in a command line or a configuration.
 
-    It is one of ``simulator.traffic.catalogue.TRAFFIC``; ``package.module:name``; or the folder of a trained policy or
+    It is one of ``simulator.traffic.reactive.TRAFFIC``; ``package.module:name``; or the folder of a trained policy or
     ``zoo:NAME``, which drives the vehicles nearest to ego while all others follow the log, or the traffic named after a
     plus sign: ``zoo:NAME+idm``. Raises UsageError if there is none, DataError if a folder is no training run.
     """

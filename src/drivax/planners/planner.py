@@ -23,19 +23,23 @@ class Planner(Protocol):
     @property
     def name(self) -> str:
         """Name in tables."""
+        ...
 
     @property
     def replays(self) -> bool:
         """Whether the logged motion is replayed exactly instead of driving the action through the dynamics."""
+        ...
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
         """Return the carry at the start of an episode."""
+        ...
 
     def act(
         self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
     ) -> tuple[Action, Any]:  # fmt: skip
         """Return an action of the task's action space, which the simulator clips, and the carry of the next step."""
+        ...
 
 
 class Memoryless:

@@ -47,6 +47,7 @@ class Start(Protocol):
 
         ``agents`` are the rows of all moving agents at ``step``, from the traffic model.
         """
+        ...
 
 
 @dataclass(frozen=True)

@@ -209,15 +209,19 @@ class Traffic(Protocol):
     @property
     def name(self) -> str:
         """Name in tables."""
+        ...
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
         """Return the traffic state at a step of the log."""
+        ...
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Any:
         """Return the traffic state one step later, given the present frame."""
+        ...
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Return the rows of ``bank.agents`` for the moving slots ``back`` steps ago."""
+        ...
 
 
 @runtime_checkable
@@ -227,33 +231,42 @@ class Task(Protocol):
     @property
     def reads(self) -> frozenset[str]:
         """Names of the facts to measure."""
+        ...
 
     def motion(self, motion: Motion, action: Action, length: Any) -> Motion:
         """Return the next motion of the driven agent."""
+        ...
 
     def actuated(self, motion: Motion, action: Action, last: Action) -> Action:
         """Return the executed action for a requested ``action``, given the ``last`` executed one."""
+        ...
 
     def first_action(self, history: History, length: Any) -> Action:
         """Return the previous action at the start of an episode; its size is that of every action."""
+        ...
 
     def observe(
         self, bank: ScenarioBank, context: AgentContext, agents: Any, frame: Frame
     ) -> Mapping[str, Any]:
         """Return the observation of a context."""
+        ...
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
         """Return the weighted reward terms by name."""
+        ...
 
     def ended(
         self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Return whether the episode is terminated, and whether it is truncated."""
+        ...
 
     def episode_start(self) -> Any:
         """Return empty metric accumulators."""
+        ...
 
     def episode_add(
         self, episode: Any, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
     ) -> Any:
         """Return the accumulators after a step to ``situation``, in an episode that started at step ``start``."""
+        ...

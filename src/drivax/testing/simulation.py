@@ -19,8 +19,8 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import prepare_bank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import alone, logged_history
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import AgentContext, SimState, Traffic
 from drivax.tasks.observations import View
 from drivax.tasks.task import Task

@@ -1,14 +1,17 @@
-"""Reactive traffic (``idm``): vehicles follow their own logged paths by the Intelligent Driver Model."""
+"""Reactive traffic (``idm``): vehicles follow their logged paths by the Intelligent Driver Model; traffic by name."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
+from drivax.plugins import find_named, is_dotted
 from drivax.scenario.bank.columns import SizeColumn
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -20,7 +23,8 @@ from drivax.simulator.traffic import agent_paths
 from drivax.simulator.traffic.agent_paths import PROFILE_SPEED, PROFILE_Z, AgentPaths
 from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.corridor import FREE_M, Leaders, Movers, columns, leaders, path_poses
-from drivax.simulator.types import AgentContext, Frame
+from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.types import AgentContext, Frame, Traffic
 
 #: Steps of recent motion kept for observations; older frames repeat the oldest.
 PAST = 10
@@ -102,14 +106,17 @@ class IdmTraffic:
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Reactive:
         """Advance all vehicles by one step of 0.1 s from the present frame."""
         paths, now = data_of(bank, AgentPaths), context.traffic
-        slot = paths.slot[context.index].astype(jnp.int32)
+        slot, drives, waits = (
+            paths.slot[context.index].astype(jnp.int32),
+            now.phase == DRIVES,
+            now.phase == WAITS,
+        )
         movers, most = _movers(bank, context, slot)
-        movers, ignored = _without_parted(movers, frame, now.phase == WAITS)
+        movers, ignored = _without_parted(movers, frame, waits)
         ahead = leaders(paths, context.index, movers, frame)
         driver = self._parameters(bank, context.index, slot)
         acceleration = _acceleration(bank, context, movers, most, ahead, driver)
         arc, speed = _driven(movers.arc, movers.speed, acceleration)
-        drives, waits = now.phase == DRIVES, now.phase == WAITS
         enters = waits & _may_enter(context, movers, ahead, frame)
         arrived = arc >= paths.spacing[context.index] * (agent_paths.PATH_POINTS - 1)
         phase = jnp.where(enters, DRIVES, jnp.where(drives & arrived, LEFT, now.phase))
@@ -236,3 +243,24 @@ def _entry_speed(movers: Movers, ahead: Leaders, driver: IdmParameters) -> Float
     room = jnp.maximum(ahead.gap - driver.min_gap_m, 0.0)
     square = jnp.maximum(ahead.speed, 0.0) ** 2 + 2.0 * driver.comfortable_braking_mps2 * room
     return jnp.minimum(movers.speed, jnp.sqrt(jnp.maximum(square, 1e-6)))
+
+
+#: Traffic models by name.
+TRAFFIC: dict[str, Callable[[], Traffic]] = {"log": LogTraffic, "idm": IdmTraffic}
+
+
+def make_traffic(name: str) -> Traffic:
+    """Return the traffic model of a name in :data:`TRAFFIC`, or of ``package.module:name`` (a class or function).
+
+    Raises:
+        UsageError: Unknown name, or it makes no traffic model.
+    """
+    if name in TRAFFIC:
+        return TRAFFIC[name]()
+    if not is_dotted(name):
+        cure = f"use {', '.join(TRAFFIC)}, or package.module:name"
+        raise UsageError(f"there is no traffic {name!r}", cure=cure)
+    traffic = find_named(name)()
+    if not isinstance(traffic, Traffic):
+        raise UsageError(f"{name!r} makes no traffic", cure="see drivax.simulator.types.Traffic")
+    return traffic
