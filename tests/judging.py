@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.metrics.episode import episode_metrics, event_steps
 from drivax.metrics.steps import step_metrics
 from drivax.simulator.simulator import Simulator
@@ -23,7 +23,7 @@ START = 10
 
 @cache
 def _program():
-    simulator = Simulator(judging(Task()))
+    simulator = Simulator(evaluation_task(Task()))
 
     def one(bank, row, motion):
         def step(state, here):

@@ -1,6 +1,6 @@
-"""Hand-made scenes with the value that each metric has by hand. Ego starts at the origin and drives 80 steps.
+"""Hand-made scenes with the expected value of each metric. Ego starts at the origin and drives 80 steps.
 
-Unless a scene says otherwise ego is 4.8 m x 2 m, drives 10 m/s along y = 0 (as does its log, 80 m), and lanes are 3.7 m
+Unless a scene differs, ego is 4.8 m x 2 m, drives 10 m/s along y = 0 (as does its log, 80 m), and lanes are 3.7 m
 wide with a limit of 13.4 m/s.
 """
 
@@ -18,7 +18,7 @@ from scenes import GREEN, LANE_M, RED, car, line, straight_road
 
 @dataclass(frozen=True)
 class Scene:
-    """A recording, how ego drives in it (None: as logged), and what comes out."""
+    """A recording, ego's motion in it (None: as logged), and the expected metrics."""
 
     recording: Any
     drive: Any = None
@@ -31,9 +31,9 @@ def driven(speed, heading=0.0, **options):
     middle = (psi[1:] + psi[:-1]) / 2
     step = (v[1:] + v[:-1])[:, None] / 2 * 0.1 * np.stack([np.cos(middle), np.sin(middle)], -1)
     xy = np.concatenate([np.zeros((1, 2)), step.cumsum(axis=0)])
-    made = car(**options)
+    agent = car(**options)
     along = np.stack([np.cos(psi), np.sin(psi)], -1)
-    return made | {
+    return agent | {
         "xy": xy - xy[10],
         "heading": (psi + np.pi) % (2 * np.pi) - np.pi,
         "velocity": v[:, None] * along,
@@ -67,8 +67,8 @@ def faster_road(cars, limit):
     return straight_road(cars, limit=limit)
 
 
-def beside(offset, steps=None):
-    """The log, moved ``offset`` metres to the left for the first so many steps (None: all)."""
+def shifted_left(offset, steps=None):
+    """The log, shifted by ``offset`` metres to the left for the first ``steps`` steps (None: all)."""
 
     def drive(log):
         here = np.arange(STEPS) - 10
@@ -117,14 +117,14 @@ NO_ROUTE = {
 
 
 def closing(gap, closing_speed, length=None):
-    """Least and mean time to collision of 80 steps when a gap closes steadily.
+    """Minimum and mean time to collision over 80 steps in which a gap closes steadily.
 
-    Ego drives through what is ``length`` metres long; once that is behind ego's rear axle it counts no more.
+    Ego drives through an agent of ``length`` metres, which no longer counts behind ego's rear axle.
     """
-    made = closing_speed * 0.1 * np.arange(1, 81)
-    ttc = np.clip((gap - made) / closing_speed, 0.0, 5.0)
+    closed = closing_speed * 0.1 * np.arange(1, 81)
+    ttc = np.clip((gap - closed) / closing_speed, 0.0, 5.0)
     if length is not None:
-        ttc = np.where(made > gap + 2.4 + length + 4.8 * 1.461 / 5.176, 5.0, ttc)
+        ttc = np.where(closed > gap + 2.4 + length + 4.8 * 1.461 / 5.176, 5.0, ttc)
     return {"min_ttc": ttc.min(), "average_ttc": ttc.mean(), "ttc_ok": float(ttc.min() >= 0.95)}
 
 
@@ -205,7 +205,7 @@ def _collisions():
     )  # fmt: skip
 
 
-def _threats():
+def _traffic():
     yield "oncoming in its own lane", Scene(two_way_road([EGO, car(100, LANE_M, np.pi, 10.0)]), None, PERFECT)
     yield "following without closing in", Scene(straight_road([EGO, car(20, speed=10.0)]), None, PERFECT)
     yield (
@@ -232,7 +232,7 @@ def _roads():
                 "collision": 0, "route_deviation_max": 80 * np.sin(0.05), "off_route": 1, "fde": 0, "distance": 80},
     )  # fmt: skip
     yield "0.25 m over the edge", Scene(
-        straight_road([EGO]), beside(-1.1),
+        straight_road([EGO]), shifted_left(-1.1),
         PERFECT | {"lane_straddle": 8.0, "lane_keeping": 0, "vmax_score": 16 / 19, "route_deviation_mean": 1.1,
                    "route_deviation_max": 1.1, "ade": 1.1, "fde": 1.1, "goal_distance": 1.1,
                    "distance": 79 + np.hypot(1, 1.1), "offroad": 0},
@@ -241,7 +241,7 @@ def _roads():
         "0.35 m over the edge",
         Scene(
             straight_road([EGO]),
-            beside(-1.2),
+            shifted_left(-1.2),
             LOST | {"offroad": 1, "offroad_step": 11, "lane_straddle": 8.0},
         ),
     )
@@ -252,23 +252,23 @@ def _roads():
     )  # fmt: skip
     yield "past the end by a step", Scene(straight_road([EGO], end=80.5), None, {"offroad": 1, "left_map": 0})
     yield "in the other lane of the corridor", Scene(
-        straight_road([EGO]), beside(LANE_M),
+        straight_road([EGO]), shifted_left(LANE_M),
         PERFECT | {"route_deviation_mean": LANE_M, "route_deviation_max": LANE_M, "ade": LANE_M, "fde": LANE_M,
                    "goal_distance": LANE_M, "distance": 79 + np.hypot(1, LANE_M)},
     )  # fmt: skip
     yield "between two lanes of one direction", Scene(
-        straight_road([EGO]), beside(LANE_M / 2),
+        straight_road([EGO]), shifted_left(LANE_M / 2),
         PERFECT | {"route_deviation_mean": LANE_M / 2, "route_deviation_max": LANE_M / 2, "ade": LANE_M / 2,
                    "fde": LANE_M / 2, "goal_distance": LANE_M / 2, "distance": 79 + np.hypot(1, LANE_M / 2)},
     )  # fmt: skip
-    yield "half the way aside", Scene(
-        straight_road([EGO]), beside(0.8, 40),
+    yield "aside for half the log", Scene(
+        straight_road([EGO]), shifted_left(0.8, 40),
         PERFECT | {"route_deviation_mean": 0.4, "route_deviation_max": 0.8, "ade": 0.4, "fde": 0,
                    "distance": 78 + 2 * np.hypot(1, 0.8)},
     )  # fmt: skip
     for steps, keeping in ((30, 1), (31, 1), (32, 1), (34, 1), (35, 0.5), (57, 0.5), (58, 0)):
         yield f"straddling for {steps} steps", Scene(
-            two_way_road([EGO]), beside(1.2, steps),
+            two_way_road([EGO]), shifted_left(1.2, steps),
             SAFE | {"lane_straddle": steps / 10, "lane_keeping": keeping, "wrong_way": 0, "direction": 1,
                     "vmax_score": (16 + 3 * keeping) / 19, "nuplan_score": 1, "off_route": 0},
         )  # fmt: skip
@@ -278,11 +278,11 @@ def _roads():
         first = np.hypot(speed / 10, LANE_M)
         total, worst = first + 7.9 * speed, first + 0.9 * speed
         yield f"against traffic at {speed} m/s", Scene(
-            two_way_road([car(speed=speed)]), beside(LANE_M),
+            two_way_road([car(speed=speed)]), shifted_left(LANE_M),
             SAFE | against | {"wrong_way": total, "wrong_way_worst": worst, "direction": grade, "nuplan_score": grade},
         )  # fmt: skip
     yield "against traffic for three steps", Scene(
-        two_way_road([car(speed=1.0)]), lambda log: beside(LANE_M, 23)(beside(-LANE_M, 20)(log)),
+        two_way_road([car(speed=1.0)]), lambda log: shifted_left(LANE_M, 23)(shifted_left(-LANE_M, 20)(log)),
         SAFE | {"wrong_way": 0.2 + np.hypot(0.1, LANE_M), "wrong_way_worst": 0.2 + np.hypot(0.1, LANE_M)},
     )  # fmt: skip
 
@@ -389,7 +389,7 @@ def _comforts():
             {"max_lateral_acceleration": speed * rate, "max_jerk": 0, "comfort": comfort, "comfortable": comfort,
              "collision": 0, "min_ttc": 5},
         )  # fmt: skip
-    # 64 m of a ring of 20 m radius: 3.2 rad, so the way ends 40 m from where it began.
+    # 64 m of a ring of 20 m radius: 3.2 rad, so the path ends 40 m from its start.
     yield "round a bend", Scene(
         ring_road([driven(8.0, 0.4 * T)], 20.0), None,
         {"progress": 64, "progress_ratio": 1, "distance": 64, "off_route": 0, "offroad": 0,
@@ -422,7 +422,7 @@ def _journeys():
     # Times to collision and comfort see the speeds, which are the log's.
     for share, far in ((0.5, 0), (0.21, 0), (0.19, 0), (0.94, 0), (0.97, 1)):
         moving = float(share >= 0.2)
-        yield f"{share:.0%} of the way", Scene(
+        yield f"{share:.0%} of the log", Scene(
             straight_road([EGO]), slower(share),
             SAFE | FREE
             | {"progress": 80 * share, "progress_ratio": share, "making_progress": moving, "reached_goal": far,
@@ -463,9 +463,9 @@ def _journeys():
 
 def scenes():
     """All scenes by name."""
-    found = {}
-    for group in (_journeys, _collisions, _threats, _roads, _lights, _speeds, _comforts):
+    by_name = {}
+    for group in (_journeys, _collisions, _traffic, _roads, _lights, _speeds, _comforts):
         for name, scene in group():
-            assert name not in found, name
-            found[name] = scene
-    return found
+            assert name not in by_name, name
+            by_name[name] = scene
+    return by_name

@@ -1,4 +1,4 @@
-"""Planners that tests drive with: functions such as a user writes, and one that can be told to break."""
+"""Planners for tests: functions as a user writes them, and a class that fails on request."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drivax.scenario.record import record, static
 
 @python_planner
 def slow_python(situation, observation):
-    """Slows down to 5 m/s and aims at a point of the route; breaks where nobody else is there."""
+    """Slow down to 5 m/s and aim at a point of the route; raise an error where no other agent is there."""
     if situation.context.step == 15 and situation.surroundings.frame.valid.sum() == 1:
         raise LookupError("nobody\nto follow")
     ahead, left = 50.0 * observation["route"][1, :2]
@@ -25,7 +25,7 @@ def slow_python(situation, observation):
 
 @jax_planner
 def slow_jax(situation, observation):
-    """The same in JAX; it cannot raise, so it gives no number."""
+    """The same in JAX, which cannot raise: the action is infinite instead."""
     alone = (situation.context.step == 15) & (situation.surroundings.frame.valid.sum() == 1)
     ahead, left = 50.0 * observation["route"][1, 0], 50.0 * observation["route"][1, 1]
     turn = 2.0 * left / (ahead**2 + left**2 + 1e-6)
@@ -35,25 +35,25 @@ def slow_jax(situation, observation):
 
 @python_planner
 def no_haste(situation, observation):
-    """Keeps its speed, and raises where it begins faster than 12 m/s."""
+    """Keep the speed; raise an error where the episode starts faster than 12 m/s."""
     if situation.context.step == 10 and situation.facts.speed_mps > 12.0:
         raise ValueError("too fast")
     return 0.0, 0.0
 
 
 def plain(situation, observation):
-    """A function that nobody made a planner of."""
+    """A plain function without a planner decorator."""
     return [0.0, 0.0]
 
 
 @record
 class Fragile(Memoryless):
-    """Draws its actions, the same all times or anew; from a step on it gives no numbers in one scenario.
+    """Random actions that are NaN in one scenario from a step on.
 
     Attributes:
-        share: How much of an action is drawn.
-        breaks: Identity of that scenario.
-        step: That step.
+        share: Factor of the random numbers.
+        breaks: Identity of the scenario.
+        step: The step.
     """
 
     share: Any
@@ -69,5 +69,5 @@ class Fragile(Memoryless):
 
 
 def fragile(share=1.0, breaks=0, step=91):
-    """A :class:`Fragile`; the same program whatever its numbers."""
+    """A :class:`Fragile` whose numbers are leaves: they share one program."""
     return Fragile(jnp.float32(share), jnp.uint32(breaks), jnp.int32(step))

@@ -1,4 +1,4 @@
-"""Terms such as a user writes, reached by dotted name; every one keeps to the rules."""
+"""Valid extensions as a user writes them, referenced by dotted name."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from drivax.learning.environment import collect
 from drivax.metrics.catalogue import Metric
 from drivax.metrics.steps import StepValue
 from drivax.networks.encoders import group_names
-from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.functions import NetworkPlanner
 from drivax.planners.planner import Memoryless
 from drivax.scenario.record import record
 from drivax.tasks.observations import View
 
 
 def hurry(before, now, around):
-    """How much slower than 10 m/s, as a share."""
+    """Shortfall of the speed from 10 m/s, as a share."""
     return jnp.clip(1.0 - now.speed_mps / 10.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Crowded:
-    """The number of others within some distance, as a share of ten."""
+    """Number of other agents within a distance, over ten."""
 
     within_m: float = 20.0
 
@@ -39,12 +39,12 @@ class Crowded:
 
 
 def goal(bank, context, frames):
-    """The goal in the ego frame, in units of 50 m, at most 5 of them."""
+    """The goal in the ego frame, in units of 50 m, clipped to 5."""
     return jnp.clip(View.of(context).point(bank.goal[context.index])[None] / 50.0, -5.0, 5.0)
 
 
 def walkers(bank, context, frames):
-    """The three nearest pedestrians: place and velocity."""
+    """Position and velocity of the three nearest pedestrians."""
     now, view = frames(0), View.of(context)
     place = view.point(now.box[:, :2])
     there = now.valid & (now.kind == 2) & (jnp.linalg.norm(place, axis=-1) < 60.0)
@@ -103,7 +103,7 @@ class _Mean(nnx.Module):
 
 @dataclass(frozen=True)
 class MeanConfig:
-    """Every row through one layer per group, then the mean."""
+    """One layer per group, applied to every row, then the mean."""
 
     width: int = 8
 
@@ -113,7 +113,7 @@ class MeanConfig:
 
 @record
 class ReinforceState:
-    """What REINFORCE needs to continue."""
+    """Training state of REINFORCE."""
 
     parameters: Any
     optimiser: Any
@@ -138,15 +138,15 @@ class _Action:
     def sample(self, key):
         return self.loc + 0.3 * jax.random.normal(key, self.loc.shape)
 
-    def action(self, choice):
-        return jnp.tanh(choice)
+    def action(self, raw_action):
+        return jnp.tanh(raw_action)
 
     def mode(self):
         return self.action(self.loc)
 
 
 class Reinforce:
-    """REINFORCE with the reward to go of the next steps."""
+    """REINFORCE with the reward-to-go of the next steps."""
 
     def __init__(self, config, environment, data):
         self.config, self.environment = config, environment
@@ -155,11 +155,11 @@ class Reinforce:
         self.optimiser = optax.adam(config.learning_rate)
 
     def init(self, data, key):
-        key, network, environments = jax.random.split(key, 3)
+        key, network, starting = jax.random.split(key, 3)
         parameters = nnx.state(_Gauss(self.spec, nnx.Rngs(network)), nnx.Param)
-        begun = self.environment.start(data, environments, self.config.environments)
+        environments = self.environment.start(data, starting, self.config.environments)
         return ReinforceState(
-            parameters, self.optimiser.init(parameters), begun, key, jnp.zeros((), jnp.int32)
+            parameters, self.optimiser.init(parameters), environments, key, jnp.zeros((), jnp.int32)
         )
 
     def iterate(self, data, state):
@@ -167,10 +167,10 @@ class Reinforce:
         policy = nnx.merge(self.graph, state.parameters)
 
         def actor(seen, key):
-            choice = policy(seen).sample(key)
-            return choice, jnp.tanh(choice), {}
+            raw_action = policy(seen).sample(key)
+            return raw_action, jnp.tanh(raw_action), {}
 
-        begun, rollout, sums = collect(
+        environments, rollout, sums = collect(
             self.environment, data, state.environments, actor, collecting, self.config.unroll
         )
         gains = jnp.cumsum(rollout.reward[::-1], axis=0)[::-1]
@@ -185,7 +185,7 @@ class Reinforce:
         change, optimiser = self.optimiser.update(gradient, state.optimiser, state.parameters)
         parameters = optax.apply_updates(state.parameters, change)
         logs = {f"rollout/{name}": total for name, total in sums.items()} | {"loss/policy": value}
-        return ReinforceState(parameters, optimiser, begun, key, state.iteration + 1), logs
+        return ReinforceState(parameters, optimiser, environments, key, state.iteration + 1), logs
 
     def planner(self, parameters, name, samples):
         return NetworkPlanner(parameters, self.graph, name, samples)
@@ -209,7 +209,7 @@ class ReinforceConfig:
 
 @dataclass(frozen=True)
 class Drift:
-    """Traffic: everyone goes on as at the start, straight, at constant velocity."""
+    """Traffic in which all agents keep the velocity that they have at the start."""
 
     name: str = "drift"
 
@@ -227,7 +227,7 @@ class Drift:
 
 @dataclass(frozen=True)
 class FullBrake(Memoryless):
-    """A planner that brakes."""
+    """Brake fully."""
 
     name: str = "full_brake"
     replays: bool = False

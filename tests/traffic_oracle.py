@@ -1,4 +1,4 @@
-"""Reactive traffic by another program: float64, one vehicle at a time, the whole path searched, no candidates."""
+"""An independent model of reactive traffic: float64, one vehicle at a time, a search of the whole path."""
 
 from dataclasses import replace
 
@@ -18,12 +18,12 @@ from drivax.tasks.task import Task
 TRAFFIC = IdmTraffic()
 SIMULATOR = Simulator(Task(), TRAFFIC)
 STEPS = 80
-#: Two things whose gaps differ by less are equally near, m: a path of stored points has no better direction.
+#: Agents whose gaps differ by less are equally near, m: a path of stored points has no better direction.
 EQUALLY_NEAR_M = 0.3
 
 
 def _rolled(bank, index):
-    """Ego replays; before every step the frame that everybody looked at, and the state of traffic."""
+    """Replay ego; return the frame and the traffic state before every step."""
 
     def one(context, _):
         frame = SIMULATOR.frame(bank, context, alone(context), 0)
@@ -41,13 +41,13 @@ rolled = jax.jit(jax.vmap(_rolled, (None, 0)))
 
 
 def runs_of(bank):
-    """Frames and traffic of every scenario, ego replaying."""
+    """Frames and traffic states of every scenario in which ego replays its log."""
     whole = jax.tree.map(np.asarray, rolled(bank, jnp.arange(len(bank))))
     return [jax.tree.map(lambda leaf, i=i: leaf[i], whole) for i in range(len(bank))]
 
 
 class Path:
-    """A vehicle's path as a polyline, every point of it."""
+    """The path of a vehicle as a polyline of all its points."""
 
     def __init__(self, paths, index, row):
         self.points = np.asarray(paths.points[index, row], np.float64)
@@ -61,7 +61,7 @@ class Path:
         return tuple(np.interp(s, self.arc, column) for column in columns)
 
     def project(self, xy, first, reach):
-        """Arc, distance and direction of the nearest point between two arc lengths, and that of the 4 m around it."""
+        """Arc length, distance and direction of the nearest point in a range of arcs; direction of 4 m around it."""
         keep = (self.arc[1:] > first - self.spacing) & (self.arc[:-1] < reach)
         a, b = self.points[:-1, :2][keep], self.points[1:, :2][keep]
         u = b - a
@@ -75,21 +75,21 @@ class Path:
 
 
 def extents(box, way):
-    """Half of what a box measures along and across a direction."""
+    """Half the extent of a box along and across a direction."""
     turn_cos, turn_sin = abs(box[2:4] @ way), abs(box[3] * way[0] - box[2] * way[1])
     return turn_cos * box[4] / 2 + turn_sin * box[5] / 2, turn_sin * box[4] / 2 + turn_cos * box[5] / 2
 
 
 def law(speed, desired, gap, leader):
-    """The IDM, written out once more."""
-    wish = 2.0 + max(0.0, 1.5 * speed + speed * (speed - leader) / (2 * np.sqrt(1.5 * 3.0)))
-    return max(1.5 * (1 - (speed / max(desired, 0.1)) ** 4 - (wish / max(gap, 0.1)) ** 2), -6.0)
+    """Return the IDM acceleration, independent of the code under test."""
+    desired_gap = 2.0 + max(0.0, 1.5 * speed + speed * (speed - leader) / (2 * np.sqrt(1.5 * 3.0)))
+    return max(1.5 * (1 - (speed / max(desired, 0.1)) ** 4 - (desired_gap / max(gap, 0.1)) ** 2), -6.0)
 
 
-def wanted(bank, index, row, arc, speed, ignored, frame, step):
-    """Accelerations of one vehicle, and how near the nearest thing is to the border of its corridor.
+def expected_accelerations(bank, index, row, arc, speed, ignored, frame, step):
+    """Return an acceleration for each agent that may count as the nearest, and the smallest distance to a border.
 
-    One acceleration for each thing that may count as the nearest.
+    The border is that of the vehicle's corridor.
     """
     path, slot = Path(data_of(bank, AgentPaths), index, row), int(data_of(bank, AgentPaths).slot[index, row])
     x, y, z, most = path.at(arc)
@@ -103,7 +103,7 @@ def wanted(bank, index, row, arc, speed, ignored, frame, step):
             continue
         s, away, way, around = path.project(box[other, :2], arc, arc + look)
         (half_length, half_width), (long, wide) = extents(box[other], way), extents(box[other], around)
-        # A logged path jitters, and with it what a long thing measures along and across it.
+        # A logged path jitters, and with it the extent of a long box along and across it.
         beyond = [away - (width / 2 + 0.1 + half) for half in (half_width, wide)]
         border = min(abs(beyond[0]), abs(beyond[1])) if beyond[0] * beyond[1] > 0 else 0.0
         ahead = s - arc
@@ -139,16 +139,18 @@ def wanted(bank, index, row, arc, speed, ignored, frame, step):
 
 
 def compare(bank, index, frames, traffic, every=7):
-    """How far each vehicle's speed is from the oracle's after a step (m/s), and its acceleration there (m/s2)."""
-    found = []
+    """Return each vehicle's speed error after a step (m/s), and the expected acceleration (m/s2)."""
+    errors = []
     for t in range(0, STEPS - 1, every):
         frame = jax.tree.map(lambda leaf, t=t: leaf[t], frames)
         for row in np.flatnonzero((traffic.phase[t] == DRIVES) & (traffic.phase[t + 1] == DRIVES)):
             arc, speed = float(traffic.arc[t, -1, row]), float(traffic.speed[t, -1, row])
             ignored = set(traffic.ignored[t + 1, row].tolist())
-            accelerations, close = wanted(bank, index, row, arc, speed, ignored, frame, 10 + t)
+            accelerations, close = expected_accelerations(
+                bank, index, row, arc, speed, ignored, frame, 10 + t
+            )
             if close < 0.1:
-                continue  # on the border of the corridor, either answer is right
+                continue  # on the border of the corridor both answers are right
             reached = traffic.speed[t + 1, -1, row]
             acceleration = min(
                 accelerations, key=lambda a, v=speed, u=reached: abs(max(v + a * 0.1, 0.0) - u)
@@ -156,19 +158,19 @@ def compare(bank, index, frames, traffic, every=7):
             after = max(speed + acceleration * 0.1, 0.0)
             moved = (speed + after) * 0.05 if after > 0 else speed**2 / max(-2 * acceleration, 1e-9)
             assert traffic.arc[t + 1, -1, row] - arc == pytest.approx(moved, abs=1e-3)
-            found.append((abs(after - reached), acceleration))
-    return np.array(found).reshape(-1, 2)
+            errors.append((abs(after - reached), acceleration))
+    return np.array(errors).reshape(-1, 2)
 
 
 def meetings(bank, index, frames, traffic):
-    """Pairs of slots, one of them reacting, whose boxes come to overlap after the first step; and those that react."""
+    """Slot pairs with a reacting agent that begin to overlap after the first step; and the reacting slots."""
     slots = np.asarray(data_of(bank, AgentPaths).slot[index])
     reacting = [int(s) for s in slots[(traffic.phase != 0).any(0) & (slots > 0)]]
-    found = set()
+    pairs = set()
     for slot in reacting:
         hits = overlap(frames.box[:, slot, None], frames.box) & frames.valid & frames.valid[:, slot, None]
         hits &= np.abs(frames.z - frames.z[:, slot, None]) <= 3
         hits[:, slot] = False
         begins = hits.any(0) & ~hits[0]
-        found |= {(min(slot, int(o)), max(slot, int(o))) for o in np.flatnonzero(begins)}
-    return found, reacting
+        pairs |= {(min(slot, int(o)), max(slot, int(o))) for o in np.flatnonzero(begins)}
+    return pairs, reacting

@@ -28,12 +28,18 @@ from typing import Any
 import numpy as np
 
 from drivax import settings
-from drivax.curation.controls import event_kinds, event_steps, permute_scores
 from drivax.curation.ensemble import Ensemble, EnsembleConfig, train_ensemble
-from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.kinematic import KinematicConfig, PublishedConfig
 from drivax.curation.logged import BATCH, score_steps
-from drivax.curation.methods import Request, curate, ensemble_table, make_table
-from drivax.curation.published import PublishedConfig
+from drivax.curation.methods import (
+    Request,
+    curate,
+    ensemble_table,
+    event_kinds,
+    event_steps,
+    make_table,
+    permute_scores,
+)
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import WeightConfig, draw_statistics, sampling_weights

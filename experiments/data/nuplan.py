@@ -43,7 +43,10 @@ def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
     time_s = DT_S * (np.arange(len(rows)) - 10)
     agents = scene["agents"]
     way = [agent["v"] * np.array([np.cos(agent["h"]), np.sin(agent["h"])]) for agent in agents]
-    xy = [np.array([agent["x"], agent["y"]]) + time_s[:, None] * step for agent, step in zip(agents, way, strict=True)]
+    xy = [
+        np.array([agent["x"], agent["y"]]) + time_s[:, None] * step
+        for agent, step in zip(agents, way, strict=True)
+    ]
     heading = np.stack([rows[:, 2], *(np.full(len(rows), agent["h"]) for agent in agents)])
     velocity = rows[:, 6:7] * np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], axis=-1)
     ends = [[_BEGIN_M, 0.0], [_END_M, 0.0]]
@@ -100,7 +103,11 @@ def shown(result: Mapping[str, Mapping[str, Mapping[str, int]]]) -> str:
     heads = ["metric", "ours", *(f"{group}, {state}" for group in groups for state in result)]
     rows = [
         [name, metric]
-        + [f"{result[state][group][name]} of {result[state][group]['scenes']}" for group in groups for state in result]
+        + [
+            f"{result[state][group][name]} of {result[state][group]['scenes']}"
+            for group in groups
+            for state in result
+        ]
         for name, metric in METRICS.items()
     ]
     return "\n".join(table(heads, rows))
@@ -108,7 +115,9 @@ def shown(result: Mapping[str, Mapping[str, Mapping[str, int]]]) -> str:
 
 def main() -> None:
     """Measure, store, and fill the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path)
     parser.add_argument("--state", default="now", help="name of the state of the code, stored beside others")
     parser.add_argument("--write", action="store_true")

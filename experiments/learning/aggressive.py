@@ -32,7 +32,7 @@ import numpy as np
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import EpisodeTable, interval_of
-from drivax.evaluation.rollout import drive, judging
+from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.evaluation.runner import evaluate
 from drivax.evaluation.tables import paired_differences
 from drivax.learning.policies import export_policy, find_traffic, load_policy, policy_traffic
@@ -101,7 +101,7 @@ def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path)
         slots = np.asarray(start(with_driver(bank, planner), jnp.arange(len(bank))).contexts.slot)
         row, place = np.nonzero(slots < bank.agents.shape[2])
         values = _driven(
-            Simulator(judging(replace(task, metrics=OWN))), planner, bank, row, slots[row, place]
+            Simulator(evaluation_task(replace(task, metrics=OWN))), planner, bank, row, slots[row, place]
         )
         segments = np.array([names[number]["segment"] for number in row])
         table[name] = {

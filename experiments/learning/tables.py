@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from drivax.report.charts.curves import compact
+from drivax.report.charts import compact
 from drivax.report.pictures.palette import LIGHT, SERIES
 from experiments.repository import DOCS
 

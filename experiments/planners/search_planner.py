@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, corners, overlap
-from drivax.planners.idm import pursuit
+from drivax.planners.simple import pursuit
 from drivax.scenario.bank.columns import AgentColumn, RouteColumn
 from drivax.scenario.bank.queries import (
     LEVEL_M,

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from drivax.datasets.conversion import Conversion, convert, convert_file
-from drivax.datasets.womd.messages import scenario_class
+from drivax.datasets.womd.messages import message_class
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.datasets.womd.tfrecord import read_records, write_record
 from drivax.evaluation.audit import audit
@@ -43,7 +43,7 @@ BATCH = 64
 def repeated(source: Path, target: Path, copies: int) -> Path:
     """The first record of a TFRecord file of protos, repeated, each with an id of its own."""
     _, payload = next(read_records(source))
-    message = scenario_class().FromString(payload)
+    message = message_class("Scenario").FromString(payload)
     with target.open("wb") as file:
         for number in range(copies):
             message.scenario_id = f"{number:016x}"

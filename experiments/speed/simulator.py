@@ -24,12 +24,10 @@ import jax.numpy as jnp
 
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.simulator import Simulator
-from drivax.simulator.sparse import map_where
+from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.traffic.bank_data import prepare_bank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.override import OverrideTraffic, with_override
-from drivax.simulator.traffic.reactive import IdmTraffic
+from drivax.simulator.traffic.reactive import IdmTraffic, make_traffic
 from drivax.studies.bench import (
     BenchConfig,
     bench,

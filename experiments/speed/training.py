@@ -65,8 +65,12 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
 
         def actor(seen: Mapping[str, Array], key: Array) -> tuple[Array, Array, dict[str, Array]]:
             policy, value = network.both(seen)
-            choice = policy.sample(key)
-            return choice, policy.action(choice), {"log_prob": policy.log_prob(choice), "value": value}
+            raw_action = policy.sample(key)
+            return (
+                raw_action,
+                policy.action(raw_action),
+                {"log_prob": policy.log_prob(raw_action), "value": value},
+            )
 
         return collected(bank, state, actor)
 

@@ -19,7 +19,7 @@ from drivax.evaluation.comparison import Comparison
 from drivax.evaluation.comparison import compare as compare_evaluations
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.run_evaluation import with_metrics
+from drivax.evaluation.runner import with_metrics
 from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
 from drivax.planners.planner import Planner
@@ -34,8 +34,7 @@ from drivax.simulator.types import Traffic
 from drivax.synthetic.generate import Generation
 from drivax.synthetic.generate import generate as generate_set
 from drivax.tasks.task import Task
-from drivax.tracking.run_folder import run_and_step
-from drivax.tracking.zoo import is_policy, zoo
+from drivax.tracking.run_folder import is_policy, run_and_step, zoo
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,12 @@ class Column:
     """A column.
 
     Attributes:
-        heading: Its heading, with unit and direction.
-        key: Its name in CSV files; the heading where it is empty.
-        label: Whether its cells say what a row is about: row headings, never wrapped.
+        heading: Heading, with unit and direction.
+        key: Name in CSV files; the heading where it is empty.
+        label: Whether its cells are row headings, which are never wrapped.
         left: Whether text is aligned left; labels always are.
-        title: An explanation, shown in HTML where the pointer rests.
-        most: Characters in a terminal at most.
+        title: Tooltip in HTML.
+        most: Maximum width in a terminal, characters.
         picture: Whether its cells are pictures, which only HTML shows.
     """
 
@@ -51,15 +51,12 @@ class Cell:
     """A cell.
 
     Attributes:
-        text: What it shows.
-        bounds: Its interval in words, on a line of its own.
-        note: Small print, left out in a terminal.
-        interval: The number behind the text, for CSV files.
-        metric: The metric of the interval.
+        text, bounds, note: Text, its interval in words, and small print (not in a terminal).
+        interval, metric: The number behind the text with its metric, for CSV files.
         mark: A verdict next to the text, in HTML.
-        style: Its class in HTML; ``group`` makes a bold row in a terminal.
-        title: An explanation, shown in HTML where the pointer rests.
-        link: What the page's list of episodes is filtered by when the number is clicked.
+        style: CSS class; ``group`` makes a bold row in a terminal.
+        title: Tooltip in HTML.
+        link: Filter of the page's list of episodes when the number is clicked.
         html: A picture.
     """
 
@@ -80,10 +77,9 @@ class Table:
     """Cells under headings, with a renderer for every output.
 
     Attributes:
-        name: Name of its file, and its class in HTML.
-        columns: The columns.
+        name: Name of its file, and CSS class.
         rows: One cell per column in each row.
-        caption: One line about its numbers.
+        caption: One line about the numbers.
         across: What the columns of numbers stand for in a CSV file: ``metric``, ``planner``, ...
     """
 
@@ -103,11 +99,10 @@ class Table:
             box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0), show_header=headed
         )
         for column in (self.columns[at] for at in shown):
-            align = "left" if column.label or column.left else "right"
-            style = "bold" if column.label and not headed else ""
             grid.add_column(
-                column.heading, justify=align, no_wrap=column.label, max_width=column.most,
-                overflow="ellipsis" if column.label else "fold", style=style,
+                column.heading, justify="left" if column.label or column.left else "right", no_wrap=column.label,
+                max_width=column.most, overflow="ellipsis" if column.label else "fold",
+                style="bold" if column.label and not headed else "",
             )  # fmt: skip
         for table in (self, *below):
             if table is not self:
@@ -140,16 +135,9 @@ class Table:
         align = "".join("l" if column.label else "r" for column in self.columns)
         heads = " & ".join(escape_latex(column.heading) for column in self.columns)
         rows = (" & ".join(_latex_cell(_words(cell)) for cell in row) for row in self.rows)
-        lines = [
-            f"% {re.sub(r'[^ -~]', '-', self.caption)}",
-            rf"\begin{{tabular}}{{{align}}}",
-            r"\hline",
-            rf"{heads} \\",
-            r"\hline",
-            *(rf"{row} \\" for row in rows),
-            r"\hline",
-            r"\end{tabular}",
-        ]
+        caption = f"% {re.sub(r'[^ -~]', '-', self.caption)}"
+        above = [caption, rf"\begin{{tabular}}{{{align}}}", r"\hline", rf"{heads} \\", r"\hline"]
+        lines = [*above, *(rf"{row} \\" for row in rows), r"\hline", r"\end{tabular}"]
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
@@ -163,11 +151,10 @@ class Table:
         for row in self.rows:
             for column, cell in zip(self.columns, row, strict=True):
                 if (interval := cell.interval) is not None:
-                    numbers = (
-                        "" if x is None else repr(x) for x in (interval.mean, interval.low, interval.high)
-                    )
                     place = [*(row[at].text for at in labels), *([column.key] if across else [])]
-                    lines.writerow([*place, cell.metric, *numbers, interval.n])
+                    numbers = (interval.mean, interval.low, interval.high)
+                    digits = ("" if value is None else repr(value) for value in numbers)
+                    lines.writerow([*place, cell.metric, *digits, interval.n])
         return stream.getvalue()
 
     def html(self) -> str:
@@ -177,10 +164,7 @@ class Table:
             for column in self.columns
         )
         head = f"<thead><tr>{heads}</tr></thead>" if any(column.heading for column in self.columns) else ""
-        rows = "".join(
-            f"<tr>{''.join(map(_html_cell, self.columns, row))}</tr>"
-            for row in self.rows
-        )  # fmt: skip
+        rows = "".join(f"<tr>{''.join(map(_html_cell, self.columns, row))}</tr>" for row in self.rows)
         return (
             f'<div class=scroll tabindex=0 role=region aria-label="{escape(self.name)}"><table class="'
             f'{escape(self.name)}">{head}<tbody>{rows}</tbody></table></div>'
@@ -188,30 +172,18 @@ class Table:
 
 
 def interval_cell(interval: Interval, unit: str, metric: str = "", signed: bool = False, **more: Any) -> Cell:
-    """Return the cell of an estimate: mean, interval and n.
-
-    Args:
-        interval: The estimate.
-        unit: Unit of the metric, as :func:`number` takes it.
-        metric: Name of the metric.
-        signed: Whether it is a difference.
-        more: Other fields of the cell.
-    """
+    """Return the cell of an estimate: mean, interval and n; ``signed`` for a difference, ``more`` for other fields."""
     if interval.mean is None:
         more = {"style": "undefined", "title": "undefined in every episode"} | more
         return Cell(note="n 0", interval=interval, metric=metric, **more)
     mean = number(interval.mean, unit, signed) + suffix(unit, signed)
-    words = bounds(interval, unit, signed)
-    return Cell(mean, words, f"n {interval.n}", interval, metric, **more)
+    return Cell(mean, bounds(interval, unit, signed), f"n {interval.n}", interval, metric, **more)
 
 
 def number(value: float | None, unit: str, signed: bool = False) -> str:
-    """Return a number as tables print it.
+    """Return a number as tables print it; ``signed`` writes a plus sign, too.
 
-    Args:
-        value: The number; None is missing.
-        unit: ``rate`` (percent, one digit), ``share`` (three digits), or a physical unit (three figures).
-        signed: Whether to write a plus sign.
+    The unit is ``rate`` (percent, one digit), ``share`` (three digits), or a physical unit (three figures).
     """
     if value is None:
         return MISSING
@@ -234,14 +206,11 @@ def suffix(unit: str, signed: bool = False) -> str:
 
 
 def bounds(interval: Interval, unit: str, signed: bool = False) -> str:
-    """Return an interval in words: ``low–high``, or ``low to high`` where signs would be confused with the dash.
-
-    A bootstrap of equal values has no width; the words say so instead of claiming certainty.
-    """
+    """Return an interval in words: ``low–high``, or ``low to high`` where signs would be confused with the dash."""
     if interval.low is None or interval.high is None:
         return "no interval" if interval.n else ""
     if interval.low == interval.high:
-        return "all equal"
+        return "all equal"  # a bootstrap of equal values has no width, which is not certainty
     low, high = number(interval.low, unit, signed), number(interval.high, unit, signed)
     between = " to " if signed or "−" in low + high else "–"
     return f"{low}{between}{high}"
@@ -251,7 +220,7 @@ def _words(cell: Cell) -> list[str]:
     """Return the texts of a cell on paper, the interval in brackets."""
     if cell.interval is None:
         return [cell.text]
-    return [cell.text, *([f"({cell.bounds})"] if cell.interval.mean is not None else []), cell.note]
+    return [cell.text, *([] if cell.interval.mean is None else [f"({cell.bounds})"]), cell.note]
 
 
 def _attribute(name: str, value: str) -> str:
@@ -300,10 +269,9 @@ _LATEX: Mapping[str, str] = MappingProxyType(
 
 def escape_latex(text: str) -> str:
     """Return plain text as LaTeX; a character that its fonts lack is named by its number."""
-    return "".join(_LATEX.get(letter) or _latex_letter(letter) for letter in text)
-
-
-def _latex_letter(letter: str) -> str:
     # The letters of Latin-1 are in every font of LaTeX; control characters, emoji and other scripts are not.
-    known = " " <= letter <= "~" or ("À" <= letter <= "ÿ" and letter not in "×÷")
-    return letter if known else rf"\texttt{{U+{ord(letter):04X}}}"
+    known = re.compile("[ -~À-ÖØ-öø-ÿ]")
+    return "".join(
+        _LATEX.get(letter) or (letter if known.match(letter) else rf"\texttt{{U+{ord(letter):04X}}}")
+        for letter in text
+    )

@@ -16,7 +16,7 @@ import drivax
 from drivax.adapters import gym
 from drivax.adapters.gym import TASKS, DrivingEnv, VectorDrivingEnv
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.build.assemble import assemble
@@ -139,9 +139,9 @@ def test_step_equals_the_simulator(env, data):
 
 
 @pytest.mark.slow
-def test_the_log_ends_truncated_with_the_metrics_of_an_evaluation(data):
+def test_end_of_log_truncates_with_the_metrics_of_an_evaluation(data):
     """Zero actions are the planner constant_velocity."""
-    env = DrivingEnv(data, judging(SMALL))
+    env = DrivingEnv(data, evaluation_task(SMALL))
     results = drivax.evaluate(ConstantVelocity(), data, task=SMALL)
     for row in range(len(data)):
         steps = drive(env, row)
@@ -175,7 +175,7 @@ def test_seeds_choose_scenarios_and_results_are_copies(env):
     np.testing.assert_array_equal(seen["ego"], kept)
 
 
-def test_a_set_on_disk(tmp_path, data):
+def test_scenario_set_folder_is_loaded(tmp_path, data):
     with ScenarioWriter(tmp_path / "set", data.scenarios[0].capacity) as writer:
         for scenario in data.scenarios:
             writer.add(scenario)
@@ -310,7 +310,7 @@ def test_render_draws_ego_at_its_simulated_pose(data):
 
 
 @pytest.mark.parametrize(("traffic", "name"), [("idm", "idm"), ("own_terms:Drift", "drift")])
-def test_environments_take_the_traffic_that_evaluation_takes(data, traffic, name):
+def test_environments_accept_the_traffic_of_evaluation(data, traffic, name):
     env = gym.make(SMALL, data, traffic=traffic)
     assert isinstance(env, DrivingEnv) and env._worlds.simulator.traffic.name == name
     env.reset(options={"scenario": 1})

@@ -62,7 +62,7 @@ def test_every_format_is_described_and_convertible(name, tmp_path, capsys):
 
 
 def test_a_folder_of_everything(tmp_path, capsys):
-    """Several formats side by side: each is reported by itself, companions are not counted as ignored files."""
+    """Several formats side by side: each is described by itself, companions are no ignored files."""
     for name in FORMATS:
         sample(name, tmp_path / "data" / name)
     (tmp_path / "data" / "notes.md").write_text("mine")
@@ -214,16 +214,16 @@ def test_many_files_are_sampled(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("numbers", "expected"),
+    ("numbers", "sentence"),
     [
         ([0, 1, 2, 3, 4], "all 5 shards"),
         ([0, 2], "2 of 5 shards, missing 00001, 00003 to 00004"),
         ([4], "1 of 5 shards, missing 00000 to 00003"),
     ],
 )
-def test_gaps_in_shard_numbers_are_named(numbers, expected):
+def test_gaps_in_shard_numbers_are_named(numbers, sentence):
     paths = [Path("w") / f"training.tfrecord-{number:05d}-of-00005" for number in numbers]
-    assert gaps([*paths, Path("w/other.tfrecord")]) == [f"training.tfrecord: {expected}"]
+    assert gaps([*paths, Path("w/other.tfrecord")]) == [f"training.tfrecord: {sentence}"]
 
 
 def test_many_gaps_are_counted_only():

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from drivax.cli import main
-from drivax.report.inspection import Inspection
-from drivax.report.inspection_tables import finding_text
+from drivax.report.inspection import Inspection, finding_text
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES
 from drivax.scenario.store import ScenarioWriter

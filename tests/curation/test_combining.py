@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivax.curation.combining import Combination, aggregate
+from drivax.curation.scores import Combination, aggregate
 from drivax.errors import UsageError
 
 RNG = np.random.default_rng(3)

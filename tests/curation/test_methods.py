@@ -9,11 +9,9 @@ import pytest
 from drivax.cli import main
 from drivax.cli.curate import Curate
 from drivax.cli.train import Train
-from drivax.curation.combining import Combination
-from drivax.curation.controls import event_kinds, event_steps
 from drivax.curation.kinematic import KinematicConfig
-from drivax.curation.methods import METHODS, Request, check_current, curate
-from drivax.curation.scores import read_scores, write_scores
+from drivax.curation.methods import METHODS, Request, check_current, curate, event_kinds, event_steps
+from drivax.curation.scores import Combination, read_scores, write_scores
 from drivax.curation.subset import top_rows, write_top
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from drivax.curation.kinematic import PublishedConfig
 from drivax.curation.logged import score_bank
 from drivax.curation.methods import PUBLISHED
-from drivax.curation.published import PublishedConfig
 from drivax.errors import UsageError
 from scenes import bank_of, car, straight_road
 

@@ -8,9 +8,8 @@ import pytest
 
 from drivax.cli import main
 from drivax.curation import scores
-from drivax.curation.combining import Combination
 from drivax.curation.methods import Request, curate
-from drivax.curation.scores import ScoreTable, read_scores, write_scores
+from drivax.curation.scores import Combination, ScoreTable, read_scores, write_scores
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Capacity

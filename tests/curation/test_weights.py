@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from drivax.curation.controls import permute_scores
 from drivax.curation.scores import ScoreTable
-from drivax.curation.weights import PUBLISHED, WeightConfig, draw_statistics, sampling_weights
+from drivax.curation.weights import PUBLISHED, WeightConfig, draw_statistics, permute_scores, sampling_weights
 from drivax.errors import UsageError
 from drivax.stats.intervals import effective_size
 

@@ -54,7 +54,7 @@ def test_lanes(read, centrelines):
     assert back.points[0, 0] > back.points[-1, 0]
 
 
-def test_the_middle_of_curved_boundaries_of_unequal_point_counts(read):
+def test_centre_is_the_middle_of_curved_boundaries_of_unequal_point_counts(read):
     """Quarter circles of 20 and 24 m radius, with 5 and 60 points: the centre has a radius of 22 m."""
     content = av2_motion.local_map(centrelines=False)
     segment = content["lane_segments"][str(IDS["slow1"])]
@@ -109,7 +109,7 @@ def test_check_list_22_ids_of_nine_digits_survive(read):
     assert 205_119_121 in lanes(read(content)) and int(np.float32(205_119_121)) != 205_119_121
 
 
-def test_painted_lines_come_once_and_unpainted_ones_not(read):
+def test_painted_lines_are_read_once_and_unpainted_ones_left_out(read):
     """Both lanes next to a line name it; the oncoming ones from the other end and with other points between."""
     found = read(av2_motion.local_map())
     counts = Counter(f.kind for f in found.features if 5 <= f.kind <= 13)
@@ -142,7 +142,7 @@ def test_painted_lines_come_once_and_unpainted_ones_not(read):
         ("UNKNOWN", RoadKind.LINE_UNKNOWN),
     ],
 )
-def test_marks(read, mark, kind):
+def test_marks_become_kinds_of_lines(read, mark, kind):
     content = av2_motion.local_map()
     content["lane_segments"][str(IDS["bike1"])]["right_lane_mark_type"] = mark
     outermost = [
@@ -218,7 +218,7 @@ def test_damage_is_refused_in_one_line(read, tmp_path, problem):
     assert caught.value.cure
 
 
-def test_other_json_and_missing_files(read, tmp_path):
+def test_other_json_and_missing_files_are_refused(read, tmp_path):
     for content in ([], 3, {}, {"lane_segments": [], "drivable_areas": {}, "pedestrian_crossings": {}}):
         with pytest.raises(DataError, match="is no Argoverse 2 map"):
             read(content)

@@ -157,7 +157,7 @@ def test_ids_that_are_no_numbers_become_row_numbers(rewritten):
         assert recording.tracks.track_id.tolist() == [0, 1, 2, 3, 4] and recording.ego == 4
 
 
-def test_rows_that_come_twice_are_counted(rewritten):
+def test_repeated_rows_are_counted(rewritten):
     recording = decode(rewritten(lambda table: {n: [*v, v[-1]] for n, v in table.items()}))
     assert recording.lost == {"repeated_rows": 1} and recording.tracks.valid[4].all()
 
@@ -211,7 +211,7 @@ def test_a_missing_map_is_named(sample, tmp_path):
     assert READER.describe(sample).missing == ()
 
 
-def test_cut_and_empty_files(sample, tmp_path):
+def test_truncated_and_empty_files_are_refused(sample, tmp_path):
     data = sample.read_bytes()
     for number, content in enumerate(
         (b"", b"PAR1", data[:-20], data[: len(data) // 2], data[:4] + data[100:])

@@ -107,7 +107,7 @@ def test_the_ego_is_moved_from_its_rear_axle_to_its_middle(rewritten, own_boxes)
     assert tracks.valid[0].all()
 
 
-def test_rotations_against_scipy():
+def test_rotations_equal_those_of_scipy():
     rng = np.random.default_rng(2)
     quaternion = rng.normal(size=(50, 4))
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
@@ -138,7 +138,7 @@ def test_frames_without_a_pose_are_left_out_and_counted(rewritten):
     assert recording.lost == {"frames_without_pose": 2} and len(recording.timestamps_s) == FRAMES - 2
 
 
-def test_poses_out_of_order_and_twice(rewritten, recording):
+def test_poses_may_be_unordered_and_repeated(rewritten, recording):
     def shuffled(poses):
         order = np.random.default_rng(1).permutation(len(poses["timestamp_ns"]))
         order = np.concatenate((order, order[:9]))
@@ -219,7 +219,7 @@ def test_maps_of_unknown_cities_give_no_place(tmp_path):
     assert "unknown city" in READER.describe(path).flavour
 
 
-def test_cut_and_empty_files(sample, tmp_path):
+def test_truncated_and_empty_files_are_refused(sample, tmp_path):
     path = av2_sensor.write(tmp_path)
     data = sample.read_bytes()
     for content in (

@@ -31,6 +31,6 @@ def test_unknown_places_keep_their_own_word_only():
     assert len(place_tags("x" * 5000)["location"]) == 64
 
 
-def test_no_name_means_two_cities():
+def test_names_of_cities_are_unique():
     names = [name for city, others in PLACES.items() for name in (city, *others)]
     assert len(set(names)) == len(names) and all(name == name.lower() for name in names)

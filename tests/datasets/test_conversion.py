@@ -20,7 +20,7 @@ import pytest
 
 from drivax.cli import main
 from drivax.datasets.conversion import Conversion, convert, convert_file
-from drivax.datasets.estimate import estimate
+from drivax.datasets.doctor import estimate
 from drivax.datasets.formats import survey
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DataError, UsageError
@@ -373,7 +373,7 @@ def test_plan_is_announced_before_the_work(thirty, tmp_path):
 
 
 def test_many_files_are_sampled_and_scaled_by_size(wire, tmp_path, monkeypatch):
-    monkeypatch.setattr("drivax.datasets.estimate._SAMPLE", 4)
+    monkeypatch.setattr("drivax.datasets.doctor._COUNTED", 4)
     record = wire.frame(wire.scenario(steps=11))
     (tmp_path / "src").mkdir()
     for number in range(12):

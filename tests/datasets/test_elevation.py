@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.datasets import elevation as ground
-from drivax.datasets.elevation import flatten, lift
+from drivax.datasets import parsing
+from drivax.datasets.parsing import flatten, lift
 from drivax.scenario.recording import MapFeature, Tracks
 from drivax.scenario.schema import AgentKind, RoadKind
 
@@ -47,7 +47,7 @@ def test_the_nearest_line_decides():
     np.testing.assert_allclose(lifted.z[0, :2], [5.8, 21.8], atol=0.05)
 
 
-def test_against_brute_force():
+def test_heights_equal_brute_force():
     rng = np.random.default_rng(3)
     features = [
         MapFeature(i, RoadKind.LINE_UNKNOWN, np.cumsum(rng.uniform(-9, 9, (5, 3)) * [1, 1, 0.1], axis=0))
@@ -66,23 +66,23 @@ def test_against_brute_force():
         assert np.abs(near - found).min() < 0.05
 
 
-def test_sizes_that_are_unknown_take_half_the_height_of_their_class():
+def test_unknown_sizes_take_half_the_height_of_their_class():
     lifted = lift(tracks([[5, 0], [0, 0]], height=0.0, kind=AgentKind.PEDESTRIAN), [ramp()])
     assert lifted.z[0, 0] == pytest.approx(20.5 + 0.9, abs=0.05)
 
 
-def test_no_map_puts_agents_on_zero():
+def test_without_a_map_agents_stand_at_zero():
     np.testing.assert_array_equal(lift(tracks([[5, 0], [0, 0]]), []).z, [[0.8, 0.0]])
 
 
-def test_a_map_of_absurd_length_does_not_cost_memory(monkeypatch):
-    monkeypatch.setattr(ground, "MOST_SAMPLES", 50)
+def test_a_map_of_absurd_length_costs_no_memory(monkeypatch):
+    monkeypatch.setattr(parsing, "MOST_SAMPLES", 50)
     far = MapFeature(1, RoadKind.LANE_SURFACE, np.array([[0.0, 0, 0], [1e7, 0, 10]]))
-    assert len(ground._samples([far])) <= 52
+    assert len(parsing._samples([far])) <= 52
     assert lift(tracks([[1e7, 0], [0, 0]]), [far]).z[0, 0] == pytest.approx(10.8)
 
 
-def test_flatten():
+def test_flatten_puts_agents_and_map_on_one_plane():
     original = tracks([[5, 0], [9, 0], [0, 0]])
     flat, features = flatten(original, [ramp()])
     np.testing.assert_array_equal(flat.z, [[0.8, 0.8, 0.0]])

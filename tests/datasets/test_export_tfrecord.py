@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datasets.samples import womd_example, womd_scenario
-from drivax.datasets.womd.messages import example_class
+from drivax.datasets.womd.messages import message_class
 from drivax.datasets.womd.tfrecord import example, read_records, shard_name, varints, write_record
 
 
@@ -51,7 +51,7 @@ def test_protobuf_reads_it():
         "s": b"\x00\xff",
         "n": np.zeros(0),
     }
-    read = example_class().FromString(example(values))
+    read = message_class("Example").FromString(example(values))
     table = {entry.key: entry.value for entry in read.features.feature}
     np.testing.assert_array_equal(table["f"].float_list.value, values["f"].ravel().astype(np.float32))
     np.testing.assert_array_equal(table["i"].int64_list.value, values["i"])

@@ -16,7 +16,7 @@ from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError
 
 
-def test_content_decides_not_the_name(wire, write_records):
+def test_content_decides_the_format_not_the_name(wire, write_records):
     assert detect(write_records("example.tfrecord", wire.scenario())).name == "womd-scenario"
     assert detect(write_records("scenario.bin", wire.example())).name == "womd-example"
 
@@ -130,7 +130,7 @@ def test_first_record_may_be_damaged(wire, tmp_path):
         (None, "No such file"),
     ],
 )
-def test_unrecognised_files_say_why(content, problem, tmp_path):
+def test_errors_for_unrecognised_files_say_why(content, problem, tmp_path):
     path = tmp_path / "shard.tfrecord"
     if content is not None:
         path.write_bytes(content)
@@ -139,13 +139,13 @@ def test_unrecognised_files_say_why(content, problem, tmp_path):
     assert caught.value.file == path and caught.value.cure
 
 
-def test_other_tfrecords_say_what_drivax_reads(wire, write_records):
+def test_errors_for_other_tfrecords_say_what_drivax_reads(wire, write_records):
     images = wire.blob(1, wire.entry("image/encoded", wire.blob(1, wire.blob(1, b"jpeg"))))
     with pytest.raises(DataError, match=r"without the features of motion data.*motion data set"):
         detect(write_records("images.tfrecord", images))
 
 
-def test_unknown_format_suggests():
+def test_unknown_format_suggests_a_known_one():
     with pytest.raises(UsageError, match="did you mean 'womd-scenario'"):
         reader_named("womd_scenario")
     with pytest.raises(UsageError, match=r"use one of auto, av2-motion, .*womd-scenario"):

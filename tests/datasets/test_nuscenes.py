@@ -12,8 +12,15 @@ from scipy.integrate import solve_ivp
 from datasets.samples import nuscenes as sample
 from drivax.datasets.nuscenes import map as nuscenes_map
 from drivax.datasets.nuscenes.map import Box
-from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M, EGO_SIZE_M, NuScenes, interpolate
-from drivax.datasets.nuscenes.tables import kind_of, rows, yaw
+from drivax.datasets.nuscenes.reader import (
+    CENTRE_AHEAD_M,
+    EGO_SIZE_M,
+    NuScenes,
+    interpolate,
+    kind_of,
+    rows,
+    yaw,
+)
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
@@ -33,7 +40,7 @@ def scene(tmp_path):
     return found
 
 
-def test_is_a_reader(tmp_path):
+def test_nuscenes_is_a_reader(tmp_path):
     reader = NuScenes()
     assert isinstance(reader, Reader)
     path = sample.write(tmp_path)
@@ -56,7 +63,7 @@ def test_missing_files_are_reported(tmp_path):
 
 
 @pytest.mark.parametrize("folder", ["maps", "expansion"])
-def test_maps_lie_where_people_unpack_them(tmp_path, folder):
+def test_maps_are_read_from_where_they_are_unpacked(tmp_path, folder):
     """The archive of the map expansion holds a folder ``expansion``; its older versions held none."""
     path = sample.write(tmp_path)
     file = tmp_path / "maps" / "expansion" / f"{sample.CITY}.json"
@@ -80,7 +87,7 @@ def test_the_test_split_has_no_annotations_and_is_refused(tmp_path):
     assert bad.file.name == "sample_annotation.json" and "the test split has none" in str(bad.error())
 
 
-def test_item_16_two_hertz_to_ten(scene):
+def test_item_16_keyframes_of_two_hertz_become_ten_hertz(scene):
     assert len(scene.timestamps_s) == 196
     np.testing.assert_allclose(np.diff(scene.timestamps_s), 0.1, atol=1e-9)
     car, t = scene.tracks.xy[1], scene.timestamps_s
@@ -95,7 +102,7 @@ def test_item_16_heading_is_unwrapped_before_it_is_interpolated(scene):
     assert np.abs(heading).max() <= math.pi
 
 
-def test_item_16_nothing_is_made_up_over_gaps(scene):
+def test_item_16_gaps_are_not_interpolated(scene):
     seen = scene.tracks.valid[2]
     # Keyframes 9 and 12 are 1.5 s apart: steps 45 and 60 are observed, nothing in between.
     assert seen[:46].all()
@@ -178,7 +185,7 @@ def test_scene_becomes_windows_with_routes(scene):
 
 
 @pytest.mark.parametrize(("shape", "radius"), [("LSR", 20.0), ("RLR", 15.0), ("SSS", 1e6), ("RSL", 999.9)])
-def test_arc_lines_against_an_integrated_unicycle(shape, radius):
+def test_arc_lines_follow_an_integrated_unicycle(shape, radius):
     lengths = [10.0, 25.0, 17.3]
     path = [sample.arc((5.0, -3.0, 0.7), lengths, shape, radius)]
     line = nuscenes_map.arc_line(path)
@@ -202,7 +209,7 @@ def test_arc_lines_against_an_integrated_unicycle(shape, radius):
     "broken",
     [{"radius": 0.0}, {"segment_length": [1e9, 0, 0]}, {"start_pose": [math.nan, 0, 0]}, {"shape": "LS"}],
 )
-def test_arc_lines_refuse_nonsense(broken):
+def test_invalid_arc_lines_are_refused(broken):
     with pytest.raises(ValueError, match=r"arc line|argument"):
         nuscenes_map.arc_line([sample.arc((0, 0, 0), [1.0, 2.0, 3.0], "LSR") | broken])
 
@@ -224,7 +231,7 @@ def test_interpolation_of_one_observation_holds_at_its_step_alone():
     np.testing.assert_allclose(state[5], [3.0, 4.0, 0.1, 0.0, 0.0])
 
 
-def test_yaw_of_quaternions_against_rotation_matrices():
+def test_yaw_of_quaternions_equals_rotation_matrices():
     from scipy.spatial.transform import Rotation
 
     for rotation in Rotation.random(50, rng=np.random.default_rng(0)):
@@ -233,7 +240,7 @@ def test_yaw_of_quaternions_against_rotation_matrices():
         assert yaw(w, x, y, z) == pytest.approx(math.atan2(ahead[1], ahead[0]), abs=1e-9)
 
 
-def test_markings():
+def test_names_of_dividers_become_kinds_of_lines():
     assert nuscenes_map.marking("NIL") is None
     assert nuscenes_map.marking("DOUBLE_SOLID_WHITE") is RoadKind.LINE_SOLID_DOUBLE_WHITE
     assert nuscenes_map.marking("SINGLE_ZIGZAG_WHITE") is RoadKind.LINE_SOLID_SINGLE_WHITE
@@ -257,7 +264,7 @@ def test_large_tables_are_read_in_pieces(tmp_path):
         ("[1]", "is no object"),
     ],
 )
-def test_damaged_tables(tmp_path, content, problem):
+def test_damaged_tables_are_refused(tmp_path, content, problem):
     path = tmp_path / "table.json"
     path.write_text(content)
     with pytest.raises(DataError, match=problem):

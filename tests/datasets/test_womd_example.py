@@ -21,7 +21,7 @@ def recording(wire) -> Recording:
     return decode(wire.example())
 
 
-def test_19_rows(recording):
+def test_19_rows_are_numbered_without_padding(recording):
     """Check-list 19: the ego is not row 0; rows to predict and of interest are numbered without padding."""
     assert recording.scenario_id == recording.segment == "fedcba9876543210"
     assert recording.tracks.track_id.tolist() == [17, 33, 2406, 900]  # padding is dropped
@@ -103,7 +103,7 @@ def test_paths_are_counted_not_used(recording):
     assert recording.lost == {"paths": 2} and recording.route_lanes == ()
 
 
-def test_limits_of_points_are_read_where_a_writer_adds_them(wire):
+def test_limits_of_points_are_read_if_a_writer_adds_them(wire):
     count = len(wire.example_points())
     table = {"roadgraph_samples/speed_limit": wire.floats([25.0] * count + [-1.0] * 7)}
     limits = {f.feature_id: f.limit_mps for f in decode(wire.example(**table)).features}
@@ -125,7 +125,7 @@ def test_10_lights_are_rekeyed_by_lane(recording):
 
 
 @pytest.mark.parametrize("how", ["absent", "invalid"])
-def test_20_test_split(wire, how):
+def test_20_test_split_has_no_future(wire, how):
     """Check-list 20."""
     cells = wire.ROWS * 80
     future = [name for name in example_names(wire) if name.startswith("state/future/")]
@@ -156,7 +156,7 @@ def test_missing_id_is_replaced_by_a_stable_one(wire):
     assert len(one.scenario_id) == 16 and set(one.scenario_id) <= set("0123456789abcdef")
 
 
-def test_no_map_no_lights(wire):
+def test_map_and_lights_may_be_missing(wire):
     gone = [f"traffic_light_state/{span}/id" for span in wire.SPANS] + ["roadgraph_samples/id"]
     recording = decode(wire.example(**dict.fromkeys(gone)))
     assert recording.features == () and recording.lights == () and recording.flags == Flag.NONE

@@ -57,7 +57,7 @@ def test_values_and_columns(wire):
     np.testing.assert_array_equal(read_table([*points, flat], POINTS), [[1, 2, 3], [5, 6, 7], [8, 9, 0]])
 
 
-def test_no_messages():
+def test_no_messages_give_an_empty_table():
     assert read_table([], POINTS).shape == (0, 3) and read_table([], STATES).shape == (0, 10)
 
 

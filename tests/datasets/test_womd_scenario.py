@@ -156,7 +156,7 @@ def test_twenty_second_file_becomes_windows(wire, write_records):
     assert WomdScenario().count(path) == len(parts)
 
 
-def test_no_lights_no_map(wire):
+def test_lights_and_map_may_be_missing(wire):
     recording = decode(wire.scenario(lights=b"", map=b""))
     assert recording.features == () and recording.lights == () and recording.lost == {}
     assert not assemble(recording).has & (Flag.LIGHTS | Flag.LANE_GRAPH)
@@ -364,7 +364,7 @@ def test_other_flavour_names_the_cure(wire, write_records):
 
 
 def test_missing_protobuf_names_the_extra(wire, hide_packages):
-    messages._class.cache_clear()
+    messages.message_class.cache_clear()
     messages._pool.cache_clear()
     hide_packages("google.protobuf")
     with pytest.raises(UsageError, match=r"pip install 'drivax\[womd\]'"):

@@ -35,7 +35,7 @@ def one_error(records):
     return errors[0]
 
 
-def test_known_crc_values(wire):
+def test_masked_crc_of_known_values(wire):
     # RFC 3720 B.4: CRC-32C of 32 zero bytes and of "123456789".
     assert wire.crc32c(bytes(32)) == 0x8A9136AA
     assert wire.crc32c(b"123456789") == 0xE3069283
@@ -95,7 +95,7 @@ def test_compressed_file_names_the_cure(good, read, compress, word):
     assert number == 0 and "compressed" in str(error) and word in str(error.cure)
 
 
-def test_other_file(read):
+def test_other_files_are_refused(read):
     assert "not a TFRecord file" in str(one_error(read(b"<html>not found</html>" * 9)[0])[1])
 
 
@@ -136,7 +136,7 @@ def test_framing_is_detected_by_the_first_header(good, tmp_path):
     assert not looks_framed(tmp_path / "none") and not looks_framed(tmp_path)
 
 
-def test_missing_file(tmp_path):
+def test_missing_file_is_reported(tmp_path):
     with pytest.raises(DataError, match="No such file"):
         next(read_records(tmp_path / "none"))
 

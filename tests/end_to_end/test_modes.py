@@ -15,7 +15,7 @@ from drivax import settings
 from drivax.api import find_planner, load
 from drivax.cli import main
 from drivax.errors import UsageError
-from drivax.evaluation.run_evaluation import EvaluationConfig
+from drivax.evaluation.runner import EvaluationConfig
 from drivax.learning.config import TrainConfig
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.starts import NoisyStart

@@ -1,4 +1,4 @@
-"""How unsteadily a planner acts, against the textbook formula and by hand."""
+"""Action jerk against the standard library and hand-computed values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivax.evaluation.actions import action_jerk, until_crash
+from drivax.evaluation.runner import action_jerk, until_crash
 
 
 def test_action_jerk_is_the_deviation_of_differences():
@@ -21,7 +21,7 @@ def test_action_jerk_is_the_deviation_of_differences():
     assert large[0] == pytest.approx((2 / 3) ** 0.5, abs=0.01), "what the docstring says of chance"
 
 
-def test_a_ramp_is_steady_and_switching_is_not():
+def test_action_jerk_of_ramp_is_zero_and_of_switching_is_not():
     ramp, switch = np.linspace(-1, 1, 81), np.tile([1.0, -1.0], 41)[:81]
     found = action_jerk(np.stack([np.stack([ramp, ramp], -1), np.stack([switch, 0 * switch], -1)]))
     assert found[0] == pytest.approx(0.0, abs=1e-12)
@@ -29,7 +29,7 @@ def test_a_ramp_is_steady_and_switching_is_not():
     assert found[1] == pytest.approx(2**0.5)
 
 
-def test_what_follows_a_crash_is_not_the_planners():
+def test_actions_after_a_crash_are_nan():
     actions = np.tile(np.array([0.0, 1.0, -1.0, 0.5])[None, :, None], (3, 1, 2))
     cut = until_crash(actions, np.array([-1, 12, 10]), 10)
     assert np.isfinite(cut[0]).all() and np.isnan(cut[1, 2:]).all() and np.isfinite(cut[1, :2]).all()

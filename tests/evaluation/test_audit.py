@@ -1,4 +1,4 @@
-"""The audit against hand-worked scenes, and against the evaluation of the exact expert."""
+"""The audit against hand-made scenarios, and against the evaluation of the exact expert."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from drivax.api import load
 from drivax.datasets.formats import detect, find_files
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import BATCH, audit
-from drivax.evaluation.rollout import drive, episode_keys, judging
+from drivax.evaluation.rollout import drive, episode_keys, evaluation_task
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
 from drivax.scenario.build.assemble import assemble
@@ -37,7 +37,7 @@ def found(world):
     return audit(world.scenarios)
 
 
-def test_every_finding_is_one_that_filters_know(found):
+def test_filters_know_every_finding(found):
     kinds = {"truth": bool, "number": int | float, "word": str}
     for finding in found:
         assert set(finding) == set(FINDINGS)
@@ -49,12 +49,12 @@ def test_every_finding_is_one_that_filters_know(found):
 
 def offroad_steps(planner, bank):
     index = jnp.arange(len(bank))
-    simulator = Simulator(judging(Task()))
+    simulator = Simulator(evaluation_task(Task()))
     return np.asarray(drive(simulator, planner, bank, index, episode_keys(bank, index, 0)).offroad_steps)
 
 
 @pytest.mark.slow
-def test_it_agrees_with_the_evaluation_of_the_expert(world, found):
+def test_audit_agrees_with_the_evaluation_of_the_expert(world, found):
     results = evaluate(Expert(), world.bank, world.names)
     offroad = offroad_steps(Expert(), world.bank)
     for row, finding in enumerate(found):
@@ -70,26 +70,26 @@ def test_it_agrees_with_the_evaluation_of_the_expert(world, found):
 
 
 @pytest.mark.slow
-def test_companions_and_batches_change_nothing(world, found):
+def test_batch_size_and_other_scenarios_change_no_finding(world, found):
     scenarios = list(world.scenarios)
     assert audit(scenarios * 12) == found * 12 and len(found) * 12 > BATCH
     assert audit(scenarios[::-1]) == found[::-1]
     assert audit([]) == []
 
 
-def test_a_collision_is_dated():
+def test_collision_has_its_first_step():
     # Bumper to bumper 30 - 4.8 = 25.2 m at 8 m/s: 3.15 s after the current step, so seen at the 32nd step after it.
     (finding,) = audited(straight_road([car(0, 0, 0, 8), car(30, 0, 0, 0)]))
     assert (finding["log_collides"], finding["first_collision_step"]) == (True, CURRENT_STEP + 32)
     assert finding["clean"] is False and finding["log_offroad_fraction"] == 0.0
 
 
-def test_who_overlaps_at_first_is_ignored_and_counted():
+def test_agents_that_overlap_at_the_start_are_ignored_and_counted():
     (finding,) = audited(straight_road([car(0, 0, 0, 5), car(1, 0.5, 0, 5)]))
     assert finding["ignored_overlaps"] == 1 and finding["clean"] is True
 
 
-def test_leaving_and_entering_the_road_are_dated():
+def test_leaving_and_entering_the_road_have_their_first_steps():
     # The edge is at y = -1.85, tolerance 0.3 m. A car of 4.8 x 2.0 m that points along the road and slides across it
     # has its corners at y -+ 1.0: off the road while y < -1.15.
     def slides(y, speed):
@@ -117,7 +117,7 @@ def test_distance_and_distance_to_the_route():
     assert finding["route_reaches_goal"] is True
 
 
-def test_a_route_that_ends_elsewhere_does_not_reach_the_goal():
+def test_route_that_ends_elsewhere_does_not_reach_the_goal():
     # The route is given along lanes 1 and 3; the log drives away from them at 45 degrees for 8 s.
     recording = straight_road([car(0, 0, np.pi / 4, 6)])
     (finding,) = audited(recording)
@@ -125,7 +125,7 @@ def test_a_route_that_ends_elsewhere_does_not_reach_the_goal():
     assert finding["route_deviation_max_m"] == pytest.approx(8 * 6 * np.sin(np.pi / 4), abs=0.2)
 
 
-def test_what_the_log_does_not_know_is_not_judged():
+def test_steps_without_a_logged_ego_are_not_evaluated():
     # Ego is lost after step 30; another car later drives through the place where it was seen last.
     seen = straight_road([car(0, 0, 0, 8), car(-60, 0, 0, 20)])
     gone = straight_road([car(0, 0, 0, 8, steps=range(31)), car(-60, 0, 0, 20, steps=range(91))])
@@ -162,7 +162,7 @@ def test_sources_of_sizes_velocities_and_time():
     assert [other[name] for name in names] == [True, "differentiated", True]
 
 
-def test_without_a_map_nothing_is_said_about_it():
+def test_findings_about_the_map_are_none_without_a_map():
     recording = straight_road([car(0, 0, 0, 8)])
     (finding,) = audited(replace(recording, features=(), route_lanes=(), flags=Flag.NONE))
     unknown = {name for name, value in finding.items() if value is None and not name.startswith("first_coll")}
@@ -173,7 +173,7 @@ def test_without_a_map_nothing_is_said_about_it():
     assert finding["log_collides"] is False and finding["distance_m"] == pytest.approx(64.0, abs=0.05)
 
 
-def test_a_test_split_gets_what_needs_no_replay():
+def test_scenarios_without_future_get_findings_that_need_no_replay():
     recording = straight_road([car(0, 0, 0, 8)], light=GREEN)
     tracks = recording.tracks
     part = {
@@ -189,7 +189,7 @@ def test_a_test_split_gets_what_needs_no_replay():
     assert set(other) == set(FINDINGS)
 
 
-def test_a_level_above_is_no_collision():
+def test_agents_on_another_level_do_not_collide():
     # The overpass: another car crosses ego's way 6 m higher.
     recording = straight_road([car(0, 0, 0, 8), car(32, -32, np.pi / 2, 8)])
     z = np.zeros((2, 91))
@@ -200,7 +200,7 @@ def test_a_level_above_is_no_collision():
 
 
 @pytest.mark.slow
-def test_the_ego_of_every_real_file_is_clean(real_data):
+def test_logged_ego_of_every_real_file_is_clean(real_data):
     """No collision, at most 1 % of the steps off the road, no false finding through z on the overpass."""
     scenarios = []
     for file in find_files(real_data)[0]:
@@ -216,7 +216,7 @@ def test_the_ego_of_every_real_file_is_clean(real_data):
 
 
 @pytest.mark.slow
-def test_clipped_shares_count_what_the_log_asks_for():
+def test_clipped_shares_count_logged_actions_beyond_the_bounds():
     # Braking at 5 m/s2 from step 20 to 29 is within `physical` and beyond `published`; at 9 m/s2 beyond both.
     def braking(deceleration):
         speed = 16.0 - deceleration * 0.1 * np.clip(np.arange(91) - 20, 0, 10)

@@ -46,7 +46,7 @@ def table(name, shift=0.0, seed=1, rows=range(N), per_recording=1, about=None, *
     return EpisodeTable(Path("runs") / name, name, known, keys, values | metrics)
 
 
-def test_paired_by_hand():
+def test_paired_comparison_equals_hand_computed_values():
     a, b = table("one", 0.1, seed=2), table("two")
     found = compare(PLAN, [a], [b])
     one = found.primary
@@ -62,7 +62,7 @@ def test_paired_by_hand():
     assert [r.p_adjusted for r in rates] == holm([r.evidence.p for r in rates])
 
 
-def test_turned_round():
+def test_exchanging_planners_negates_the_difference():
     a, b = table("one", 0.1, seed=2), table("two")
     forth, back = compare(PLAN, [a], [b]), compare(PLAN, [b], [a])
     assert back.decision.recommendation == "B"
@@ -70,13 +70,13 @@ def test_turned_round():
     assert back.primary.evidence.p == pytest.approx(forth.primary.evidence.p, abs=0.01)
 
 
-def test_less_is_better_where_the_metric_says_so():
+def test_lower_is_better_for_metrics_to_minimise():
     worse = table("one", collision=np.ones(N))
     plan = dataclasses.replace(PLAN, primary="collision", secondary=("vmax_score",))
     assert compare(plan, [worse], [table("two", seed=2)]).decision.recommendation == "B"
 
 
-def test_recordings_are_kept_together():
+def test_recordings_are_resampled_as_a_whole():
     a, b = table("one", per_recording=3, seed=2), table("two", per_recording=3)
     found = compare(PLAN, [a], [b])
     assert found.recordings == (20, 20) and found.secondary[0].evidence.name == "permutation"
@@ -92,7 +92,7 @@ def test_order_does_not_matter_and_only_common_scenarios_count():
     assert found.scenarios == (40, 40) and found.primary.difference.mean == pytest.approx(expected)
 
 
-def test_undefined_values_leave_in_pairs():
+def test_undefined_values_are_left_out_in_pairs():
     a, b = table("one", seed=2), table("two")
     a.metrics["vmax_score"][:5], b.metrics["vmax_score"][3:10] = np.nan, np.nan
     one = compare(PLAN, [a], [b]).primary
@@ -109,7 +109,7 @@ def test_too_few_scenarios_decide_nothing():
     assert found.decision.needed >= 61
 
 
-def test_power_tells_no_difference_from_not_knowing():
+def test_power_separates_no_difference_from_too_few_scenarios():
     a, b = table("one", seed=2), table("two")
     deviation = (a.metrics["vmax_score"] - b.metrics["vmax_score"]).std(ddof=1)
     for smallest, recommendation in ((0.05, "no difference"), (0.01, "not enough scenarios")):
@@ -125,7 +125,7 @@ def test_power_tells_no_difference_from_not_knowing():
     assert compare(PLAN, [a], [b]).sensitivity.needed == scenarios_needed(0.1) == 787
 
 
-def test_recordings_of_several_scenarios_take_more_of_them():
+def test_clustered_scenarios_need_more_of_them():
     a, b = table("one", per_recording=4, seed=2), table("two", per_recording=4)
     a.metrics["vmax_score"][:] += np.repeat(np.random.default_rng(5).normal(0, 0.2, N // 4), 4)
     seen = compare(PLAN, [a], [b]).sensitivity
@@ -138,7 +138,7 @@ def test_equal_planners_give_no_difference():
     assert found.primary.evidence.p == 1.0 and found.sensitivity is None
 
 
-def test_a_better_score_with_more_collisions_is_said():
+def test_worse_secondary_metrics_are_caveats():
     found = compare(PLAN, [table("one", 0.3, collision=np.ones(N))], [table("two", seed=2)])
     assert found.decision.recommendation == "A" and found.decision.caveats == ("collision",)
 
@@ -173,7 +173,7 @@ def seeds_of(*shifts, folder="runs/bc", first=3, **more):
     return [dataclasses.replace(one, folder=Path(folder) / one.name) for one in tables]
 
 
-def test_seeds_and_scenarios_both_vary():
+def test_interval_covers_seeds_and_scenarios():
     seeds, others = seeds_of(0.0, 0.03, 0.06), [table("two")]
     found = compare(PLAN, seeds, others)
     assert found.names[0] == "bc" and found.folders[0] == Path("runs/bc")
@@ -200,7 +200,7 @@ def test_seeds_and_scenarios_both_vary():
     assert found.seeds[1] is None and found.secondary[0].a.n == N, "shares of several seeds are no 0 or 1"
 
 
-def test_seeds_that_differ_decide_nothing_however_many_scenarios():
+def test_seeds_that_differ_decide_nothing_with_any_number_of_scenarios():
     """Either seed alone would be sure; and no number of scenarios would do."""
     others, plan = [table("two")], dataclasses.replace(PLAN, smallest_difference=0.05)
     seeds = seeds_of(-0.2, 0.3)
@@ -233,19 +233,19 @@ def test_seeds_that_differ_equally_everywhere_need_more_seeds():
     assert (same.decision.recommendation, same.decision.because) == ("no difference", "equal")
 
 
-def test_seeds_on_one_recording_tell_nothing():
+def test_seeds_on_one_recording_decide_nothing():
     found = compare(PLAN, seeds_of(0.0, 0.1, per_recording=N), [table("two", per_recording=N)])
     assert found.primary.evidence.p is None and found.primary.winner is None and found.sensitivity is None
     assert found.primary.difference.low is None and found.primary.difference.mean is not None
 
 
-def test_a_split_takes_no_seeds():
+def test_split_with_several_seeds_is_refused():
     plan = dataclasses.replace(PLAN, split="random")
     with pytest.raises(UsageError, match="one evaluation"):
         compare(plan, seeds_of(0.0, 0.1), [table("two")])
 
 
-def test_everything_is_plain_json():
+def test_comparison_is_plain_json():
     found = compare(PLAN, [table("one", 0.1)], [table("two", seed=2)])
     stored = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert stored["decision"]["recommendation"] == "A" and stored["primary"]["difference"]["n"] == N
@@ -264,7 +264,7 @@ def test_everything_is_plain_json():
         ({"name": "one"}, "the same run"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(change, words):
+def test_incomparable_evaluations_are_refused(change, words):
     with pytest.raises(UsageError) as caught:
         compare(PLAN, [table("one")], [table(**{"name": "two"} | change)])
     assert words in str(caught.value) and caught.value.cure and "\n" not in str(caught.value)
@@ -281,14 +281,14 @@ def test_what_cannot_be_compared_is_refused(change, words):
         ({"split": "random", "ratio": 0.999}, "leave an arm empty"),
     ],
 )
-def test_plans_that_cannot_be_carried_out_are_refused(change, words):
+def test_plans_that_do_not_fit_the_runs_are_refused(change, words):
     more = {"vmax_score_partial": np.ones(N), "ade": np.ones(N)}
     with pytest.raises(UsageError) as caught:
         compare(dataclasses.replace(PLAN, **change), [table("one", **more)], [table("two", **more)])
     assert words in str(caught.value) and caught.value.cure and "\n" not in str(caught.value)
 
 
-def test_seeds_of_several_planners_are_no_seeds():
+def test_folders_of_several_planners_are_refused():
     with pytest.raises(UsageError, match=r"several planners \(idm, one\)"):
         compare(PLAN, [table("one"), table("idm", seed=2)], [table("two", seed=3)])
     seeds = [table("seed-0@4"), table("seed-1@4", seed=2)]
@@ -327,7 +327,7 @@ def written(folder, lines, about='{"kind": "evaluation", "planner": "p"}'):
     return folder
 
 
-def test_runs_are_read_back_and_damage_is_named(tmp_path):
+def test_runs_round_trip_and_damaged_files_are_named(tmp_path):
     run = written(tmp_path / "run", ["p,d,s1,,0,log,1", "p,d,s1,,1,log,0", "p,d,s2,r,0,log,"])
     found = EpisodeTable.read(run)
     assert found.by_scenario("success")["d", "s1"] == 0.5 and np.isnan(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.evaluation.rollout import drive, judging
+from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import RandomActions
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -59,13 +59,13 @@ def check_batches(simulator, bank):
 
 
 @pytest.mark.slow
-def test_neither_batch_size_nor_neighbours_matter(world):
+def test_episodes_do_not_depend_on_batch_size_or_neighbours(world):
     check_batches(Simulator(Task(metrics=METRICS, to_the_end=True)), world)
 
 
 @pytest.mark.slow
-def test_neither_batch_size_nor_neighbours_matter_to_any_metric(world):
-    check_batches(Simulator(judging(Task())), world)
+def test_metrics_do_not_depend_on_batch_size_or_neighbours(world):
+    check_batches(Simulator(evaluation_task(Task())), world)
 
 
 @pytest.mark.slow

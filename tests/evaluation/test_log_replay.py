@@ -50,7 +50,7 @@ def real_windows(folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(4))
-def test_a_thousand_generated_logs_replay_exactly_and_can_be_driven(part):
+def test_thousand_generated_logs_replay_exactly_and_can_be_driven(part):
     scenarios = generated(1000 + part, 250)
     check_exact(scenarios)
     assert (driven_by(DRIVEN, scenarios)["fde"] <= 0.2).mean() >= 0.95

@@ -1,4 +1,4 @@
-"""How many scenarios are loaded at a time, and what is said when memory was too little."""
+"""Evaluation batch size from free memory, and the error when memory runs out."""
 
 import jax
 import jax.numpy as jnp
@@ -10,24 +10,24 @@ from drivax.evaluation.memory import (
     _group_limits,
     free_memory,
     memory_of,
+    report_out_of_memory,
     scenarios_at_a_time,
-    telling_out_of_memory,
 )
 
 
-def test_half_of_what_is_free_holds_two_copies_and_the_program():
+def test_half_of_free_memory_holds_two_copies_and_the_program():
     # 1 GB for us: 16 x 8 MB for the program leave 872 MB, for 436 scenarios of 1 MB that are there twice.
     assert scenarios_at_a_time(1_000_000, 16, 2_000_000_000) == 436
     assert scenarios_at_a_time(1_000_000, 16, 100_000_000) == 16, "never fewer than are driven side by side"
     assert scenarios_at_a_time(1_000, 16, 10**12) == scenarios_at_a_time(1_000, 16, None) == MOST
 
 
-def test_this_machine_has_some_left():
+def test_this_machine_has_free_memory():
     device = jax.devices()[0]
     assert 10**7 < free_memory(device) <= memory_of(device)
 
 
-def test_every_group_that_we_are_in_counts(tmp_path):
+def test_every_control_group_of_the_process_counts(tmp_path):
     groups, ours = tmp_path / "cgroup", tmp_path / "self"
     job = groups / "batch" / "job-7"
     job.mkdir(parents=True)
@@ -50,7 +50,7 @@ def test_every_group_that_we_are_in_counts(tmp_path):
     assert _group_limits(groups, tmp_path / "none") == []
 
 
-def test_too_little_memory_is_one_line_with_the_cure():
+def test_out_of_memory_is_one_line_with_the_cure():
     """A program that asks for 4 TB; and what numpy says."""
 
     @jax.jit
@@ -61,9 +61,9 @@ def test_too_little_memory_is_one_line_with_the_cure():
         raise MemoryError
 
     for wasteful in (lambda: greedy(1.0).block_until_ready(), starve):
-        with pytest.raises(DrivaxError) as raised, telling_out_of_memory(1200):
+        with pytest.raises(DrivaxError) as raised, report_out_of_memory(1200):
             wasteful()
         line = str(raised.value)
         assert line.startswith("out of memory with 1,200 scenarios loaded; load fewer") and "--batch" in line
-    with pytest.raises(ValueError, match="else"), telling_out_of_memory(1):
+    with pytest.raises(ValueError, match="else"), report_out_of_memory(1):
         raise ValueError("something else")

@@ -13,12 +13,12 @@ from scipy import stats
 from drivax.errors import UsageError
 from drivax.evaluation.observation_statistics import (
     collision_correlation,
-    described,
+    column_statistics,
     importances,
     look_at,
     observation_statistics,
 )
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.planners.planner import Memoryless
 from drivax.planners.simple import Expert
 from drivax.scenario.record import record, static
@@ -75,8 +75,8 @@ def column(found, group, name):
 
 
 @pytest.mark.slow
-def test_episodes_are_looked_at_until_and_after_the_collision(bank):
-    looks = look_at(Simulator(judging(TASK)), Shy(), bank, every=10)
+def test_states_are_sampled_before_and_after_the_collision(bank):
+    looks = look_at(Simulator(evaluation_task(TASK)), Shy(), bank, every=10)
     assert looks.state.context.step.tolist() == [[*range(10, 81, 10)]] * 3
     # 30 m less a car's length at 9 m/s: they touch after 2.8 s, at step 38.
     assert looks.hit.tolist() == [[step > 38 for step in range(10, 81, 10)], [False] * 8, [False] * 8]
@@ -84,7 +84,7 @@ def test_episodes_are_looked_at_until_and_after_the_collision(bank):
 
 
 @pytest.mark.slow
-def test_a_column_is_described_by_its_valid_rows(shy):
+def test_statistics_of_a_column_are_of_its_valid_rows(shy):
     assert (shy.planner, shy.episodes, shy.collisions, shy.states, shy.permuted) == (
         "shy",
         3,
@@ -102,7 +102,7 @@ def test_a_column_is_described_by_its_valid_rows(shy):
 
 
 @pytest.mark.slow
-def test_what_is_not_finite_is_found(shy):
+def test_entries_that_are_not_finite_are_counted(shy):
     one = column(shy, "faulty", "0")
     assert (one.broken, shy.broken, one.count) == (2, 2, 22)
     steps = np.array([*range(10, 81, 10)] * 3)[[k for k in range(24) if k not in (1, 4)]] / 100
@@ -116,7 +116,7 @@ def test_what_is_not_finite_is_found(shy):
 
 
 @pytest.mark.slow
-def test_only_what_the_planner_looks_at_matters(shy):
+def test_only_features_that_the_planner_uses_are_important(shy):
     found = {(one.group, one.name): one.importance for one in shy.features}
     assert found.pop(("agents", "position x")) > 0.5 and shy.groups["agents"] > 0.5
     assert set(found.values()) == {0.0}
@@ -124,7 +124,7 @@ def test_only_what_the_planner_looks_at_matters(shy):
 
 
 @pytest.mark.slow
-def test_others_move_as_the_traffic_says():
+def test_other_agents_move_by_the_traffic_model():
     """A car comes up behind ego at 12 m/s: the log drives through it, by IDM it brakes."""
     bank = bank_of(straight_road([car(0, 0, 0, 2), car(-40, 0, 0, 12)]))
     log, idm = (
@@ -136,12 +136,12 @@ def test_others_move_as_the_traffic_says():
     assert log.low == pytest.approx(12 / 15, abs=1e-3) and idm.low < 4 / 15
 
 
-def test_a_planner_of_another_action_space_is_refused(bank):
+def test_planner_of_another_action_space_is_refused(bank):
     with pytest.raises(UsageError, match="another action space"):
         observation_statistics(Expert(), bank, replace(TASK, actions=Published()), permute=False)
 
 
-def test_columns_of_observations_made_by_hand():
+def test_statistics_of_hand_made_observations():
     """Two episodes of three looks at one row that is there or not; the second one hits an agent at its last look."""
     rows = np.arange(12.0).reshape(2, 3, 1, 2)
     mask = np.array([[[True], [True], [False]], [[True], [True], [True]]])
@@ -149,7 +149,9 @@ def test_columns_of_observations_made_by_hand():
     hit, collides = np.array([[False] * 3, [False, False, True]]), np.array([False, True])
     static = np.linspace(0, 1, 6).reshape(2, 3, 1)
     seen = {"mine": rows, "mine_mask": mask, "ego_static": static}
-    one, two, static = described(Features(ego_static=("width",)), seen, hit, collides, {("mine", 0): 0.5})
+    one, two, static = column_statistics(
+        Features(ego_static=("width",)), seen, hit, collides, {("mine", 0): 0.5}
+    )
     assert (one.group, one.name, static.name) == ("mine", "0", "width")
     kept = [0.0, 2.0, 6.0, 8.0, 10.0]
     assert (one.count, one.broken, one.mean, one.low, one.high) == (5, 0, np.mean(kept), 0.0, 10.0)
@@ -160,11 +162,13 @@ def test_columns_of_observations_made_by_hand():
     # Of two episodes nothing can be said; of four, r is that of their means before the collision: 1, 7, 1, 7.
     assert np.isnan(one.collision)
     twice = {name: np.concatenate([values, values]) for name, values in seen.items()}
-    again = described(Features(ego_static=("width",)), twice, np.tile(hit, (2, 1)), np.tile(collides, 2), {})
+    again = column_statistics(
+        Features(ego_static=("width",)), twice, np.tile(hit, (2, 1)), np.tile(collides, 2), {}
+    )
     assert again[0].collision == pytest.approx(1.0)
 
 
-def test_correlation_is_scipys_point_biserial():
+def test_correlation_equals_scipy_pointbiserialr():
     rng = np.random.default_rng(5)
     collides = rng.random(40) < 0.4
     values = rng.normal(size=(40, 6, 3)) + 0.8 * collides[:, None, None]
@@ -201,7 +205,7 @@ def test_importance_of_a_linear_policy_is_known():
     assert all(np.isnan(value) for value in still.values())
 
 
-def test_permuting_keeps_masks_and_moves_only_valid_entries():
+def test_permutation_keeps_masks_and_moves_only_valid_entries():
     rng = np.random.default_rng(2)
     mask = rng.random((50, 4)) < 0.5
     mask[:, 0] = True

@@ -1,4 +1,4 @@
-"""A metric of the user's own in results, run folder, table and report."""
+"""User-defined metrics in results, run folder, table and report."""
 
 import csv
 import json
@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 
 from drivax.errors import UsageError
-from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
-from drivax.evaluation.runner import evaluate
+from drivax.evaluation.runner import EvaluationConfig, evaluate, run_evaluation
 from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import make_planner
 from drivax.report.pages.report import explanations
@@ -20,7 +19,7 @@ from scenes import SMALL, bank_of, car, straight_road
 
 
 @pytest.mark.slow
-def test_an_own_metric_is_a_column_with_unit_and_direction(tmp_path):
+def test_own_metric_is_a_column_with_unit_and_direction(tmp_path):
     """Row 0: a car stands 30 m ahead of a standing ego. Row 1: no other agent, so it is undefined."""
     worlds = straight_road([car(), car(x=30.0)]), replace(straight_road([car()]), scenario_id="alone")
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
@@ -42,13 +41,13 @@ def test_an_own_metric_is_a_column_with_unit_and_direction(tmp_path):
     assert "Smallest distance between centres." in explanations(["nearest_other"], runs)
 
 
-def test_own_metrics_spoil_no_column():
+def test_own_metrics_change_no_other_column():
     bank, names = bank_of(straight_road([car()])), [{"dataset": "", "scenario_id": "a", "segment": "a"}]
     with pytest.raises(UsageError, match="another column 'crashed'; give your metric another name"):
         evaluate(make_planner("random"), bank, names, task=Task(metrics=("own_terms:crashed",)))
 
 
-def test_what_is_no_metric_is_refused():
+def test_invalid_metrics_are_refused():
     for name, words in (
         ("own_terms:hurry", "'own_terms:hurry' is not a metric"),
         ("own_terms:nearest", "did you mean 'nearest_other'"),

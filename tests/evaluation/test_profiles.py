@@ -9,7 +9,7 @@ import shapely
 
 from drivax.cli import main
 from drivax.evaluation.profiles import TERMS, ProfileRow, _objects, devkit_rows, format_rows, write_rows
-from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
+from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter

@@ -1,4 +1,4 @@
-"""Evaluation: an episode follows from its scenario alone, a planner that crashes has failed, the audit finds faults."""
+"""Evaluation: episodes depend on their scenario alone, crashes fail episodes, and the audit finds violations."""
 
 import csv
 import json
@@ -12,8 +12,7 @@ from drivax.api import load
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.episode_table import ADDED, FAILED, KEYS, Crash, EpisodeTable, fail_crashed
-from drivax.evaluation.run_evaluation import format_crashes
-from drivax.evaluation.runner import evaluate
+from drivax.evaluation.runner import evaluate, format_crashes
 from drivax.evaluation.tables import paired_difference, paired_differences, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
@@ -69,7 +68,7 @@ def by_scenario(results):
 
 
 @pytest.mark.slow
-def test_neither_batches_nor_order_nor_company_change_an_episode(scenarios, whole, driven):
+def test_episodes_do_not_depend_on_batches_order_or_other_scenarios(scenarios, whole, driven):
     expected = by_scenario(whole)
     assert len(expected) == COUNT
     for batch in (1, 7, 64):
@@ -92,7 +91,7 @@ def test_neither_batches_nor_order_nor_company_change_an_episode(scenarios, whol
     "planner",
     ["expert", "constant_velocity", "idm", "random", "pdm", "search_planner:SearchPlanner", "zoo:aggressive"],
 )
-def test_nor_do_they_with_our_planners_in_a_set(scenarios, planner, tmp_path):
+def test_built_in_planners_do_not_depend_on_batches_order_or_other_scenarios(scenarios, planner, tmp_path):
     with ScenarioWriter(tmp_path / "set", scenarios[0].capacity) as writer:
         for scenario in scenarios:
             writer.add(scenario)
@@ -103,7 +102,7 @@ def test_nor_do_they_with_our_planners_in_a_set(scenarios, planner, tmp_path):
         assert found == {name: expected[name] for name in found} and len(found) in (COUNT, len(ids))
 
 
-def test_actions_are_what_moved_the_car(whole):
+def test_stored_actions_reproduce_the_motion(whole):
     """The first number is a share of 6 m/s2, for a tenth of a second."""
     assert whole.trajectories.action.shape == (COUNT, 80, 2) and np.abs(whole.trajectories.action).max() <= 1
     before, after = whole.trajectories.ego[:, :-1, 3], whole.trajectories.ego[:, 1:, 3]
@@ -128,7 +127,7 @@ def crashed(scenarios, data, driven):
     return driven(scenarios, fragile(breaks=data.bank.identity[3], step=40))
 
 
-def test_a_crash_is_a_failed_episode_and_no_other_changes(scenarios, whole, crashed):
+def test_crash_fails_its_episode_and_changes_no_other(scenarios, whole, crashed):
     assert crashed.crashes == (Crash("drivax", scenarios[3].id, 40, "action is not finite"),)
     before, after = by_scenario(whole), by_scenario(crashed)
     assert {name for name in before if before[name] != after[name]} == {scenarios[3].id}
@@ -157,7 +156,7 @@ def test_a_crash_is_a_failed_episode_and_no_other_changes(scenarios, whole, cras
     assert crashed.summary()["metrics"]["crashed"]["mean"] == pytest.approx(1 / COUNT)
 
 
-def test_a_crash_is_named(scenarios, crashed, whole, tmp_path):
+def test_crash_has_scenario_step_and_error(scenarios, crashed, whole, tmp_path):
     crashed.write(tmp_path)
     found = json.loads((tmp_path / "crashes.json").read_text())
     assert found == [
@@ -184,7 +183,7 @@ def test_a_crash_is_named(scenarios, crashed, whole, tmp_path):
         paired_differences(crashed, replace(whole, keys=elsewhere), "success")
 
 
-def test_a_summary_has_the_intervals_of_the_tables(whole, tmp_path):
+def test_summary_has_the_intervals_of_the_tables(whole, tmp_path):
     """Segments of two data sets may share a name, and where none is known scenarios are their own clusters."""
     names = {
         "dataset": tuple(f"set-{row % 2}" for row in range(COUNT)),
@@ -203,7 +202,7 @@ def test_a_summary_has_the_intervals_of_the_tables(whole, tmp_path):
         assert summary[name] == pytest.approx(told, rel=1e-4), name
 
 
-def test_crashes_by_hand():
+def test_fail_crashed_equals_hand_computed_values():
     nan = np.nan
     found = fail_crashed(
         {
@@ -222,7 +221,7 @@ def test_crashes_by_hand():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
-def test_a_planner_of_another_action_space_is_refused(data):
+def test_planner_of_another_action_space_is_refused(data):
     with pytest.raises(UsageError, match="another action space"):
         evaluate(Expert(), data.bank, data.names, task=Task(actions=PUBLISHED))
 
@@ -232,7 +231,7 @@ def test_plain_function_is_refused_as_planner(data):
         drivax.evaluate(plain, data)
 
 
-def test_the_audit_finds_what_the_log_does_wrong():
+def test_audit_finds_violations_of_the_log():
     clean = straight_road([car(0, 0, 0, 8), car(30, 0, 0, 8)])
     crash = straight_road([car(0, 0, 0, 8), car(30, 0, 0, 0)])
     leaves = straight_road([car(0, 0, np.deg2rad(-3), 10)])
@@ -247,7 +246,7 @@ def test_the_audit_finds_what_the_log_does_wrong():
     assert [row["ignored_overlaps"] for row in found] == [0, 0, 0, 0, 1]
 
 
-def test_a_start_step_without_an_action_is_refused():
+def test_start_step_without_an_action_is_refused():
     bank = bank_of(straight_road([car(0, 0, 0, 8)]))
     names = [{"dataset": "test", "scenario_id": "a", "segment": "a"}]
     with pytest.raises(UsageError, match="leaves no action"):

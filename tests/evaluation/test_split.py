@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.evaluation.split import assign, strata_of
+from drivax.evaluation.pairing import assign, strata_of
 
 CLUSTERS = [f"r{number // 2}" for number in range(120)]
 #: A third of the recordings is hard; of the easy ones every fourth has one hard scenario of two.
@@ -24,7 +24,7 @@ def test_split_assigns_whole_recordings_in_the_ratio():
     assert (found.first != assign(CLUSTERS, None, 0.25, seed=2).first).any()
 
 
-def test_strata_are_halved():
+def test_strata_are_split_in_halves():
     found = assign(CLUSTERS, HARD, 0.5, seed=0)
     assert found.strata_count == 2
     for stratum in range(2):
@@ -35,26 +35,26 @@ def test_strata_are_halved():
     assert sizes == {0: 80, 1: 40}
 
 
-def test_rounding_is_made_up_for():
+def test_rounding_in_a_stratum_is_made_up_for_in_the_next():
     """Ten strata of eleven recordings each: halves of the whole, though no stratum can be halved."""
     clusters = [str(number) for number in range(110)]
     found = assign(clusters, [f"{number % 10}" for number in range(110)], 0.5, seed=0)
     assert found.first.sum() == 55 and found.strata_count == 10
 
 
-def test_small_strata_are_taken_together():
+def test_small_strata_are_merged():
     clusters = [str(number) for number in range(40)]
     strata = ["common"] * 28 + ["rare"] * 7 + ["rarer"] * 5
     found = assign(clusters, strata, 0.5, seed=0)
     assert found.strata_count == 2 and Counter(found.strata.tolist()) == {0: 28, 1: 12}
 
 
-def test_an_empty_arm_is_refused():
+def test_empty_arm_is_refused():
     with pytest.raises(UsageError, match="leave an arm empty"):
         assign(["a", "a"], None, 0.5, seed=0)
 
 
-def test_strata_are_the_words_of_tags():
+def test_strata_are_the_values_of_tags():
     entries = [{"tags": {"difficulty": "hard", "type": "straight"}}, {"tags": {"type": "merge"}}]
     assert strata_of(entries, ["difficulty", "type"]) == ["hard straight", "unknown merge"]
     with pytest.raises(UsageError, match=r"no scenario has a tag 'dificulty'.*difficulty"):

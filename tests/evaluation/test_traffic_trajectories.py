@@ -1,4 +1,4 @@
-"""Where reactive traffic went: kept as it was, and drawn as it was."""
+"""Trajectories of reactive traffic are stored and drawn as they were simulated."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shapely import affinity
 
 import drivax
 from drivax.cli import main
-from drivax.evaluation.traffic_trajectories import packed, unpacked
+from drivax.evaluation.rollout import pack_poses, unpack_poses
 from drivax.report.episodes import EvaluatedSet, ranked, rollouts_of
 from drivax.report.pictures.drawing import with_traffic_of
 from drivax.report.runs import read_runs
@@ -18,7 +18,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate
 
 
-def test_places_come_back_within_a_centimetre_and_who_is_gone_stays_gone():
+def test_poses_round_trip_within_a_centimetre_and_absent_agents_stay_absent():
     rng = np.random.default_rng(0)
     xy, heading = rng.uniform(-640, 640, (5, 7, 2)), rng.uniform(-np.pi, np.pi, (5, 7))
     there = rng.random((5, 7)) < 0.7
@@ -27,9 +27,9 @@ def test_places_come_back_within_a_centimetre_and_who_is_gone_stays_gone():
     )
     rows = np.concatenate([rows, there[..., None]], -1)
     rows[0, 0, :2], rows[0, 0, 7], there[0, 0] = (700.0, 0.0), 1.0, False
-    kept = np.asarray(packed(jnp.asarray(rows, jnp.float32)))
+    kept = np.asarray(pack_poses(jnp.asarray(rows, jnp.float32)))
     assert kept.dtype == np.int16 and kept.shape == (5, 7, 3)
-    found = unpacked(kept)
+    found = unpack_poses(kept)
     np.testing.assert_array_equal(np.isfinite(found).all(-1), there)
     np.testing.assert_allclose(found[there][:, :2], xy[there], atol=0.0101)
     turned = found[there][:, 2] - heading[there]
@@ -59,7 +59,7 @@ def nearest_m(scenario, drive, step):
 
 
 @pytest.mark.slow
-def test_a_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
+def test_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
     generate(tmp_path / "set", 24, 3, Generation(workers=0))
     call = ["evaluate", "--planner", "constant_velocity", "--data", str(tmp_path / "set"), "--traffic", "idm"]
     assert main([*call, "--out", str(tmp_path / "run")]) == 0
@@ -68,7 +68,7 @@ def test_a_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
     for choice in ranked(evaluations):
         scenario = driven.scenario((choice.dataset, choice.scenario_id))
         (drive,) = rollouts_of(evaluations, choice, scenario)
-        seen = with_traffic_of(scenario, drive)
+        seen = with_traffic_of(drive, scenario)
         at = drive.events["collision"]
         np.testing.assert_array_equal(seen.agent_xy[:10], scenario.agent_xy[:10])
         if at >= 0:
@@ -79,12 +79,12 @@ def test_a_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
 
 
 @pytest.mark.slow
-def test_where_the_log_is_replayed_nothing_is_kept(tmp_path):
+def test_log_traffic_stores_no_trajectories(tmp_path):
     generate(tmp_path / "set", 2, 3, Generation(workers=0))
     assert drivax.evaluate("constant_velocity", tmp_path / "set").trajectories.others is None
     found = drivax.evaluate("constant_velocity", tmp_path / "set", traffic="idm").trajectories.others
     scenarios = ScenarioSet.open(tmp_path / "set")
     for rows, scenario in zip(found, scenarios, strict=True):
-        # Nobody has moved yet when the episode begins.
-        pose, there = unpacked(rows[0]), scenario.agent_valid[10, : rows.shape[1]]
+        # No agent has moved yet when the episode begins.
+        pose, there = unpack_poses(rows[0]), scenario.agent_valid[10, : rows.shape[1]]
         np.testing.assert_allclose(pose[there][:, :2], scenario.agent_xy[10, : len(there)][there], atol=0.02)

@@ -51,8 +51,8 @@ def experience(bank, driving):
     environments = jax.jit(driving.start, static_argnums=2)(bank, jax.random.key(0), 6)
 
     def actor(observation, key):
-        choice = 0.5 * jax.random.normal(key, (6, 2))
-        return choice, jnp.tanh(choice), {"seen": observation["route"]}
+        raw_action = 0.5 * jax.random.normal(key, (6, 2))
+        return raw_action, jnp.tanh(raw_action), {"seen": observation["route"]}
 
     run = jax.jit(lambda b, e, k: collect(driving, b, e, actor, k, 120, "state"))
     return jax.device_get(run(bank, environments, jax.random.key(1)))

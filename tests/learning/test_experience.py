@@ -137,7 +137,7 @@ def test_usable_steps_are_the_drawn_steps(data):
         usable_steps(replace(config, algorithm=PpoConfig()), data)
 
 
-def test_what_cannot_be_learned_from_is_refused(bank):
+def test_unusable_experience_is_refused(bank):
     shape = (3, 91)
     for weights, words in (
         (np.ones((3, 90)), r"weights of shape \(3, 90\) for 3 scenarios of 91 steps"),

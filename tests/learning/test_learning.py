@@ -60,14 +60,14 @@ def test_preempted_run_resumes_bit_for_bit(data, kind, tmp_path, monkeypatch):
     whole = train(config, data, tmp_path / "whole")
     write = MetricLog.write
 
-    def write_and_be_told(log, step, values, prefix=""):
-        write(log, step, values, prefix)
+    def write_and_interrupt(log, step, values):
+        write(log, step, values)
         if step == 2 * each:
             os.kill(os.getpid(), signal.SIGTERM)
 
     former = signal.getsignal(signal.SIGTERM)
     with monkeypatch.context() as patch:
-        patch.setattr(MetricLog, "write", write_and_be_told)
+        patch.setattr(MetricLog, "write", write_and_interrupt)
         with pytest.raises(
             Preempted, match=f"after {3 * each:,} steps; continue it with --resume"
         ) as stopped:

@@ -54,7 +54,7 @@ def test_account_covers_all_bytes():
     assert memory_of(jax.devices()[0], 4) == found.limit // 4
 
 
-def test_what_does_not_fit_is_refused_with_the_cure():
+def test_training_that_does_not_fit_is_refused_with_a_cure():
     parts = {"scenarios": 3_000_000_000, "replay": 5_000_000_000, "program": 2}
     fits = MemoryAccount(parts, 9_000_000_000, "cuda:0")
     fits.check()

@@ -94,20 +94,20 @@ def test_cql_against_numpy(part, improved):
         rows = {"uniform": [], "now": [], "then": []}
         for number in range(ACTIONS):
             for name, policy, own in (("now", now, now_key), ("then", following, then_key)):
-                choice = policy.sample(jax.random.split(own, ACTIONS)[number])
-                q = learner.q_values(trained["critic"], part.observation, jnp.tanh(choice))
-                rows[name].append((q, policy.log_prob(choice)))
+                raw_action = policy.sample(jax.random.split(own, ACTIONS)[number])
+                q = learner.q_values(trained["critic"], part.observation, jnp.tanh(raw_action))
+                rows[name].append((q, policy.log_prob(raw_action)))
             rows["uniform"].append(
                 (learner.q_values(trained["critic"], part.observation, uniform[number]), None)
             )
-        choice = there.sample(policy_key)
+        raw_action = there.sample(policy_key)
         return {
             "target": learner.q_values(target["critic"], part.next_observation, then),
             "q": learner.q_values(trained["critic"], part.observation, part.action),
             **{f"q_{name}": jnp.stack([q for q, _ in found]) for name, found in rows.items()},
             **{f"p_{name}": jnp.stack([p for _, p in rows[name]]) for name in ("now", "then")},
-            "judged": learner.q_values(trained["critic"], improved[0], jnp.tanh(choice)),
-            "log_prob": there.log_prob(choice),
+            "judged": learner.q_values(trained["critic"], improved[0], jnp.tanh(raw_action)),
+            "log_prob": there.log_prob(raw_action),
             "mode": there.mode(),
         }
 
@@ -354,7 +354,7 @@ def test_weights_select_training_steps(bandit):
         assert logs["sampler/critic_effective"] == pytest.approx(len(chosen) if weighted == "all" else 500)
 
 
-def test_what_cannot_be_learned_is_refused():
+def test_impossible_settings_are_refused():
     grid = replace(NETWORK, distribution="grid")
     for config in (CqlConfig, Td3BcConfig, partial(IqlConfig, loss="mse")):
         with pytest.raises(UsageError, match="a gradient through its actions"):

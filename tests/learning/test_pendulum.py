@@ -86,7 +86,7 @@ def expert():
     return found, Demonstrations(moments.stored, moments.action), logs
 
 
-def test_the_pendulum_is_gymnasiums():
+def test_pendulum_equals_gymnasiums():
     theirs = gymnasium.make("Pendulum-v1")
     theirs.reset(seed=3)
     angle, rate = theirs.unwrapped.state
@@ -133,7 +133,7 @@ def test_cloned_policy_swings_up_like_its_expert(expert):
 
 
 @pytest.mark.slow
-def test_the_full_lengths_reach_their_targets():
+def test_full_length_trainings_reach_their_targets():
     for config, steps, target in ((SAC, 30_000, -200), (PPO, 300_000, -300)):
         learner, states, _ = trained(config, (), steps)
         found, _ = driven(learner.distribution, states.parameters)

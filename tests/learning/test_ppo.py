@@ -43,7 +43,7 @@ def test_a_truncated_step_bootstraps_its_own_final_state():
         np.testing.assert_array_equal(batch["alive"], [1, 1, 0, 1])
 
 
-def test_the_loss_against_numpy():
+def test_loss_against_numpy():
     """Of what the networks say; rows between episodes (``alive`` 0) do not count, advantages are normalised."""
     config = PpoConfig(network=NETWORK, clip=0.1, value_coefficient=0.7, entropy_coefficient=0.03)
     learner = config.build(Pendulum(), (), 1)
@@ -118,7 +118,7 @@ def test_networks_are_clipped_by_their_own_norms():
     np.testing.assert_array_equal(nothing["policy"], [0.0, 0.0])
 
 
-def test_the_rate_falls_to_a_tenth():
+def test_learning_rate_falls_to_a_tenth():
     """The first step of Adam is the rate itself, whatever the gradient; and so are all, if it stays the same."""
     optimiser = clipped_adam(0.5, 1.0, updates=10, eps=0.0)
     weights, state = {"w": jnp.zeros(1)}, optimiser.init({"w": jnp.zeros(1)})

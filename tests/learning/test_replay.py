@@ -119,7 +119,7 @@ def test_steps_are_sampled_uniformly():
     assert stats.chisquare(np.concatenate([counts, 2 * counts])).pvalue < 1e-9
 
 
-def test_what_does_not_fit_is_refused():
+def test_rollouts_that_do_not_fit_are_refused():
     with pytest.raises(UsageError, match=r"capacity to 6 or more"):
         ReplayConfig(capacity=5).rows(3)
     buffer, kept, _ = fill(ReplayConfig(12), 4, 4)

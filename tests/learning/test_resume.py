@@ -13,8 +13,7 @@ from drivax.learning.algorithms.behaviour_cloning import BcConfig, Cloning
 from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig, WarmStart
-from drivax.learning.loop import mean_logs
-from drivax.learning.pretrained import Pretrained, with_networks
+from drivax.learning.loop import Pretrained, mean_logs, with_networks
 from drivax.learning.replay import ReplayConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig

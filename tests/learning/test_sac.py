@@ -96,7 +96,7 @@ def test_every_loss_reaches_its_own_parameters_only(sac):
     assert float(slopes["total"].log_temperature) == pytest.approx(slope, rel=1e-3, abs=1e-5)
 
 
-def test_what_cannot_be_learned_from_is_refused():
+def test_impossible_settings_are_refused():
     with pytest.raises(UsageError, match="no step with a successor"):
         SacConfig(network=NETWORK, environments=4, unroll=1, warm_up=4)
     with pytest.raises(UsageError, match=r"raise replay\.capacity"):

@@ -29,8 +29,7 @@ from drivax.planners.planner_traffic import TrafficPolicy
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
-from drivax.tracking.run_folder import RunFolder
-from drivax.tracking.zoo import is_policy, policy_folder, zoo
+from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, zoo
 from scenes import bank_of, car, straight_road
 from tiny_run import TINY, write_run
 
@@ -173,7 +172,7 @@ def test_shipped_policies_drive_and_have_provenance(name, bank):
 
 
 @pytest.mark.slow
-def test_the_aggressive_driver_drives_and_drives_others(data, tmp_path):
+def test_aggressive_policy_drives_as_planner_and_as_traffic(data, tmp_path):
     loaded = drivax.load(data.path)
     alone = drivax.evaluate("zoo:aggressive", loaded)
     pushed = drivax.evaluate("zoo:aggressive", loaded, traffic="zoo:aggressive+idm")

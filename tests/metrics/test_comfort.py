@@ -18,7 +18,7 @@ from drivax.metrics.comfort import (
 
 
 @pytest.mark.parametrize(("window", "order", "derivative"), [SMOOTH, YAW_RATE, YAW_ACCELERATION])
-def test_tail_operator_is_scipys_filter(window, order, derivative):
+def test_tail_matrix_equals_scipys_filter(window, order, derivative):
     signal = np.random.default_rng(0).normal(size=60)
     whole = savgol_filter(signal, window, order, deriv=derivative)
     for end in (40, 50):
@@ -38,7 +38,7 @@ def histories(speed, heading):
     return np.stack([motion[t - 22 : t + 1] for t in range(22, len(speed))])
 
 
-def test_judgement_equals_limits_on_scipys_signals():
+def test_comfort_equals_limits_on_scipys_signals():
     rng = np.random.default_rng(3)
     t = np.arange(120) * 0.1
     speed = 8 + 2.0 * np.sin(0.9 * t) + 0.4 * np.sin(5.1 * t)
@@ -47,16 +47,16 @@ def test_judgement_equals_limits_on_scipys_signals():
     a = np.diff(speed) / 0.1
     lateral = (speed[1:] + speed[:-1]) / 2 * np.diff(heading) / 0.1
 
-    # A sample before the first, so that the windows of the steps that are evaluated are not at SciPy's edge.
     def smoothed(signal):
+        # A sample before the first keeps the windows of the steps that are evaluated away from SciPy's edge.
         return savgol_filter(np.concatenate([[0.0], signal]), 8, 2)[1:]
 
     smooth = smoothed(a)
     fine = (smooth >= -4.05) & (smooth <= 2.40)
     fine &= np.abs(smoothed(lateral)) <= 4.89
     fine &= np.abs(savgol_filter(smooth, 15, 2, deriv=1, delta=0.1)) <= 4.13
-    magnitude = savgol_filter(smoothed(np.hypot(a, lateral)), 15, 2, deriv=1, delta=0.1)
-    fine &= np.abs(magnitude) <= 8.37
+    magnitude = np.abs(savgol_filter(smoothed(np.hypot(a, lateral)), 15, 2, deriv=1, delta=0.1))
+    fine &= magnitude <= 8.37
     # The filters of the running version see accelerations from step 1 on, and headings from the same step.
     turn = heading[1:]
     fine &= np.abs(savgol_filter(turn, 5, 2, deriv=1, delta=0.1)) <= 0.95
@@ -69,10 +69,10 @@ def test_judgement_equals_limits_on_scipys_signals():
     motion = jnp.asarray(np.stack([0 * speed, 0 * speed, heading, speed], -1), jnp.float32)
     whole = jax.jit(check_trip_comfort)(motion)
     np.testing.assert_array_equal(whole.comfortable, expected)
-    np.testing.assert_allclose(whole.jerk_mps3, np.abs(magnitude[10:]), rtol=1e-3, atol=5e-3)
+    np.testing.assert_allclose(whole.jerk_mps3, magnitude[10:], rtol=1e-3, atol=5e-3)
 
 
-def test_lateral_acceleration_can_fail():
+def test_lateral_acceleration_alone_fails_comfort():
     # 10 m/s at 0.5 rad/s is 5 m/s2: over the limit of 4.89.
     heading = np.arange(23) * 0.05
     judged = check_comfort(jnp.asarray(histories(np.full(23, 10.0), heading)[0]))
@@ -80,7 +80,7 @@ def test_lateral_acceleration_can_fail():
     np.testing.assert_allclose(judged.lateral_mps2, 5.0, rtol=1e-3)
 
 
-def test_a_heading_that_wraps_is_no_discomfort():
+def test_wrapping_heading_is_comfortable():
     heading = (np.linspace(np.pi - 0.1, np.pi + 0.1, 23) + np.pi) % (2 * np.pi) - np.pi
     judged = check_comfort(jnp.asarray(histories(np.full(23, 5.0), heading)[0]))
     assert bool(judged.comfortable.all())

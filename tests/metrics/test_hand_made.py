@@ -40,7 +40,7 @@ def test_values_by_hand(judged, name):
     assert differences(SCENES[name], judged[name]) == []
 
 
-def test_every_metric_is_worked_out_at_least_five_times():
+def test_every_metric_has_at_least_five_expected_values():
     counts = Counter(name for scene in SCENES.values() for name in scene.expected)
     few = {name: counts[name] for name in METRICS if counts[name] < 5}
     assert few == {}
@@ -84,7 +84,7 @@ def reversed_and_joined(scene):
 
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("change", [shifted_and_turned, reversed_and_joined])
-def test_what_must_change_nothing(judged, change, every):
+def test_irrelevant_changes_keep_every_metric(judged, change, every):
     some = dict(list(SCENES.items())[::every])
     pairs = [change(scene) for scene in some.values()]
     again = judge([recording for recording, _ in pairs], [drive for _, drive in pairs])
@@ -98,7 +98,7 @@ def test_what_must_change_nothing(judged, change, every):
                 assert one == pytest.approx(other, rel=3e-3, abs=2e-2), (name, metric)
 
 
-def test_steps_add_up_to_the_episode(judged):
+def test_step_values_accumulate_to_episode_metrics(judged):
     """Step values are the numbers that episodes are made of."""
     for name, found in judged.items():
         series = found["series"]

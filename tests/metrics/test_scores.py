@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivax.metrics.scores import Value, nuplan_score, vmax_score
+from drivax.metrics.catalogue import nuplan_score, vmax_score
+from drivax.metrics.steps import Value
 
 PERFECT = {
     "ttc_ok": 1.0, "progress_ratio": 1.0, "speed_compliance": 1.0, "comfortable": 1.0, "lane_keeping": 1.0,

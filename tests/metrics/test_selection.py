@@ -11,14 +11,14 @@ import pytest
 
 from drivax import settings
 from drivax.errors import UsageError
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.learning.config import TrainConfig
 from drivax.metrics import steps
 from drivax.metrics.catalogue import METRICS, SETS
 from drivax.metrics.episode import episode_add, episode_metrics, episode_start, event_steps
 from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.metrics.steps import STEP_VALUES
-from drivax.simulator import situation
+from drivax.simulator import contact, situation
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import FACTS
 from drivax.tasks.task import Task
@@ -57,7 +57,7 @@ def traced():
             patch.setattr(module, name, heard)
 
         for name in COSTLY:
-            listen(steps if name == "check_comfort" else situation, name)
+            listen({"check_comfort": steps, "check_lights": situation}.get(name, contact), name)
         for wanted in ("none", "training", "full", ("at_fault_collision",)):
             called.clear()
             simulator = Simulator(Task(metrics=wanted))
@@ -73,7 +73,7 @@ def size(tree):
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-def test_sets_are_of_the_catalogue():
+def test_sets_contain_catalogue_metrics():
     assert SETS["none"] == () and SETS["full"] == tuple(METRICS)
     assert set(SETS["training"]) < set(METRICS)
     for name, metric in METRICS.items():
@@ -81,7 +81,7 @@ def test_sets_are_of_the_catalogue():
     assert {value.name for value in select_metrics("full").step_values()} == set(STEP_VALUES)
 
 
-def test_a_list_names_sets_and_metrics_and_brings_what_they_need():
+def test_list_of_sets_and_metrics_adds_their_inputs():
     wanted = select_metrics(("training", "comfortable", "min_ttc", "min_ttc"))
     assert wanted.names == (*SETS["training"], "comfortable", "min_ttc")
     assert "comfort" in dict(wanted.metrics) and "comfort" not in wanted.names
@@ -178,7 +178,7 @@ def zeros(shapes):
 
 
 @pytest.mark.slow
-def test_operators_and_that_a_selection_changes_no_value(traced):
+def test_operators_and_selection_do_not_change_values(traced):
     found, empty = random_situations(), zeros(traced["none"].state)
     full, events = episode("full", found, empty)
     facts = jax.tree.map(np.asarray, found.facts)
@@ -230,7 +230,7 @@ def test_a_selection_changes_no_value_in_simulation():
 
 def test_evaluation_uses_the_full_set_whatever_the_task_learned_with():
     for metrics in ("none", ("training", "min_ttc")):
-        assert select_metrics(judging(Task(metrics=metrics)).metrics).names == tuple(METRICS)
+        assert select_metrics(evaluation_task(Task(metrics=metrics)).metrics).names == tuple(METRICS)
 
 
 def test_no_metric_is_defined_before_the_first_step(traced):

@@ -48,9 +48,9 @@ def gaussian_density(action, loc, scale):
 def test_gaussian_log_prob_and_its_jacobian():
     action = np.array([0.7, -0.99])
     wanted = np.log(gaussian_density(action, np.asarray(GAUSSIAN.loc), np.asarray(GAUSSIAN.scale))).sum()
-    choice = GAUSSIAN.choice_of(jnp.asarray(action))
-    assert float(GAUSSIAN.log_prob(choice)) == pytest.approx(wanted, rel=1e-4)
-    np.testing.assert_allclose(GAUSSIAN.action(choice), action, atol=1e-5)
+    raw_action = GAUSSIAN.raw_action(jnp.asarray(action))
+    assert float(GAUSSIAN.log_prob(raw_action)) == pytest.approx(wanted, rel=1e-4)
+    np.testing.assert_allclose(GAUSSIAN.action(raw_action), action, atol=1e-5)
 
 
 def test_gaussian_density_integrates_to_one():
@@ -71,18 +71,18 @@ def test_gaussian_mean_action_equals_quadrature():
 
 
 def test_gaussian_samples_have_its_moments():
-    choice = draws(GAUSSIAN)
-    np.testing.assert_allclose(choice.mean(0), GAUSSIAN.loc, atol=0.03)
-    np.testing.assert_allclose(choice.std(0), GAUSSIAN.scale, atol=0.03)
-    np.testing.assert_allclose(GAUSSIAN.mode(), np.median(np.tanh(choice), axis=0), atol=0.03)
+    raw_action = draws(GAUSSIAN)
+    np.testing.assert_allclose(raw_action.mean(0), GAUSSIAN.loc, atol=0.03)
+    np.testing.assert_allclose(raw_action.std(0), GAUSSIAN.scale, atol=0.03)
+    np.testing.assert_allclose(GAUSSIAN.mode(), np.median(np.tanh(raw_action), axis=0), atol=0.03)
 
 
 def test_beta_against_scipy():
     x = np.array([0.2, 0.93])
     reference = stats.beta(np.asarray(BETA.alpha, float), np.asarray(BETA.beta, float), loc=-1, scale=2)
-    choice = BETA.choice_of(jnp.asarray(2 * x - 1))
-    np.testing.assert_allclose(choice, x, rtol=1e-6)
-    assert float(BETA.log_prob(choice)) == pytest.approx(reference.logpdf(2 * x - 1).sum(), rel=1e-5)
+    raw_action = BETA.raw_action(jnp.asarray(2 * x - 1))
+    np.testing.assert_allclose(raw_action, x, rtol=1e-6)
+    assert float(BETA.log_prob(raw_action)) == pytest.approx(reference.logpdf(2 * x - 1).sum(), rel=1e-5)
     np.testing.assert_allclose(BETA.mean_action(), reference.mean(), rtol=1e-5)
     assert float(BETA.entropy_estimate(jax.random.key(0))) == pytest.approx(
         reference.entropy().sum(), rel=1e-4
@@ -102,11 +102,11 @@ def test_a_uniform_beta_has_its_mode_in_the_middle():
 def test_grid_against_scipy():
     wanted = special.log_softmax(np.asarray(GRID.logits, float))
     table = np.array([(a, b) for a in LEVELS[0] for b in LEVELS[1]])
-    choice = jnp.arange(15.0)[:, None]
+    raw_action = jnp.arange(15.0)[:, None]
     batch = Grid(jnp.broadcast_to(GRID.logits, (15, 15)), LEVELS)
-    np.testing.assert_allclose(batch.log_prob(choice), wanted, rtol=1e-5)
-    np.testing.assert_array_equal(batch.action(choice), table.astype(np.float32))
-    np.testing.assert_array_equal(batch.choice_of(jnp.asarray(table, jnp.float32) + 0.1), choice)
+    np.testing.assert_allclose(batch.log_prob(raw_action), wanted, rtol=1e-5)
+    np.testing.assert_array_equal(batch.action(raw_action), table.astype(np.float32))
+    np.testing.assert_array_equal(batch.raw_action(jnp.asarray(table, jnp.float32) + 0.1), raw_action)
     np.testing.assert_array_equal(GRID.mode(), table[np.argmax(wanted)].astype(np.float32))
     np.testing.assert_allclose(GRID.mean_action(), np.exp(wanted) @ table, atol=1e-6)
     entropy = float(GRID.entropy_estimate(jax.random.key(0)))
@@ -122,9 +122,9 @@ def test_mixture_against_scipy():
         gaussian_density(action, np.asarray(loc, float), np.asarray(scale, float)).prod(axis=-1)
         for loc, scale in zip(MIXTURE.parts.loc, MIXTURE.parts.scale, strict=True)
     ]
-    choice = MIXTURE.choice_of(jnp.asarray(action))
+    raw_action = MIXTURE.raw_action(jnp.asarray(action))
     np.testing.assert_allclose(
-        jax.vmap(MIXTURE.log_prob)(choice), np.log(shares @ np.array(parts)), rtol=1e-4
+        jax.vmap(MIXTURE.log_prob)(raw_action), np.log(shares @ np.array(parts)), rtol=1e-4
     )
     np.testing.assert_allclose(MIXTURE.mode(), np.tanh([0.3, -1.0]), rtol=1e-5)
 
@@ -133,15 +133,15 @@ def test_mixture_against_scipy():
 def test_samples_agree_with_mean_mode_and_entropy(kind):
     one = ALL[kind]
     assert isinstance(one, Distribution)
-    choice = draws(one)
-    keys = jax.random.split(jax.random.key(1), len(choice))
+    raw_action = draws(one)
+    keys = jax.random.split(jax.random.key(1), len(raw_action))
 
-    def run(one, choice, keys):
+    def run(one, raw_action, keys):
         estimates = jax.vmap(one.entropy_estimate)(keys)
-        return one.action(choice), one.mean_action(), jax.vmap(one.log_prob)(choice), estimates
+        return one.action(raw_action), one.mean_action(), jax.vmap(one.log_prob)(raw_action), estimates
 
-    action, mean, log_probs, estimates = quick(run, one, choice, keys)
-    assert choice.dtype == np.float32 and np.abs(action).max() <= 1.0
+    action, mean, log_probs, estimates = quick(run, one, raw_action, keys)
+    assert raw_action.dtype == np.float32 and np.abs(action).max() <= 1.0
     np.testing.assert_allclose(action.mean(0), mean, atol=0.02)
     assert estimates.mean() == pytest.approx(-log_probs.mean(), abs=0.04)
 
@@ -180,10 +180,12 @@ def test_policy_gradients_are_finite_at_saturation(kind):
 
     def of(raw, key):
         one = distribution(kind, raw[:, None].repeat(3, 1), actions)
-        choice = one.choice_of(jnp.broadcast_to(bounds, (3, 3, 2)))
-        far = choice + (9.0 if kind in ("gaussian", "mixture") else 0.0)
+        raw_action = one.raw_action(jnp.broadcast_to(bounds, (3, 3, 2)))
+        far = raw_action + (9.0 if kind in ("gaussian", "mixture") else 0.0)
         mine = one.sample(key)
-        surrogate = one.log_prob(choice) + one.log_prob(far) + one.log_prob(mine) + one.entropy_estimate(key)
+        surrogate = (
+            one.log_prob(raw_action) + one.log_prob(far) + one.log_prob(mine) + one.entropy_estimate(key)
+        )
         return jnp.sum(surrogate) + jnp.sum(one.mean_action() + one.mode() + one.action(mine))
 
     value, gradient = quick(jax.value_and_grad(of), raw, jax.random.key(0))

@@ -10,13 +10,17 @@ from drivax import settings
 from drivax.errors import UsageError
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig, Policy, TwinCritic
 from drivax.networks.distributions import Actions
-from drivax.networks.encoders import MlpConfig, group_spec
+from drivax.networks.encoders import MlpConfig
 from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 from quick import drawn, quick
 
 SMALL = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,))
 LEVELS = ((-1.0, 0.0, 1.0), (-1.0, -0.5, 0.0, 0.5, 1.0))
+
+
+def shapes(observation):
+    return {name: value.shape for name, value in observation.items()}
 
 
 def observation(rng):
@@ -44,7 +48,7 @@ def test_masked_rows_have_no_effect_and_batches_agree(rows):
     rng = np.random.default_rng(0)
     one, other = observation(rng), observation(rng)
     config = NetworkConfig(encoder=MlpConfig(rows=rows, hidden=(16, 16)), head=(8,))
-    graph, parameters = drawn(lambda: ActorCritic(config, group_spec(one), nnx.Rngs(0)))
+    graph, parameters = drawn(lambda: ActorCritic(config, shapes(one), nnx.Rngs(0)))
     noisy = dict(one, agents=jnp.where(one["agents_mask"][..., None], one["agents"], 99.0))
     nobody = dict(one, agents_mask=jnp.zeros_like(one["agents_mask"]))
 
@@ -63,7 +67,7 @@ def test_pooled_rows_have_no_order():
     one = observation(np.random.default_rng(2))
     order = jnp.array([2, 0, 3, 1])
     mixed = dict(one, agents=one["agents"][order], agents_mask=one["agents_mask"][order])
-    spec = group_spec(one)
+    spec = shapes(one)
     graph, parameters = drawn(lambda: MlpConfig(rows=(8,), hidden=(16,)).build(spec, nnx.Rngs(0)))
     found = quick(lambda p, groups: nnx.merge(graph, p)(groups), parameters, stacked(one, mixed))
     np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
@@ -75,7 +79,7 @@ def test_heads_of_all_distributions_start_at_zero(kind):
     config = NetworkConfig(encoder=MlpConfig(hidden=(8,)), distribution=kind)
 
     def run(groups, key):
-        found = Policy(config, group_spec(one), nnx.Rngs(key), Actions(2, LEVELS))(groups)
+        found = Policy(config, shapes(one), nnx.Rngs(key), Actions(2, LEVELS))(groups)
         many = jax.vmap(found.sample)(jax.random.split(key, 2000))
         return found.mean_action(), found.action(many), found.log_prob(many[0])
 
@@ -91,7 +95,7 @@ def test_heads_of_all_distributions_start_at_zero(kind):
 def test_shared_encoder_runs_once_for_policy_and_value(shared):
     one = observation(np.random.default_rng(3))
     config = NetworkConfig(SMALL.encoder, (4,), shared_encoder=shared)
-    graph, parameters = drawn(lambda: ActorCritic(config, group_spec(one), nnx.Rngs(0)))
+    graph, parameters = drawn(lambda: ActorCritic(config, shapes(one), nnx.Rngs(0)))
     # 16 + 8 + 12 numbers in: 24 of agents, their 8 masks, 12 of ego; heads 8 -> 4 -> 4 and 8 -> 4 -> 1.
     encoder, heads = (24 + 8 + 12) * 8 + 8, (8 * 4 + 4 + 4 * 4 + 4) + (8 * 4 + 4 + 4 + 1)
     assert size(parameters) == encoder * (1 if shared else 2) + heads
@@ -114,7 +118,7 @@ def test_shared_encoder_runs_once_for_policy_and_value(shared):
 def test_twin_critics_share_nothing_and_can_be_negative():
     rng = np.random.default_rng(4)
     one = observation(rng)
-    graph, parameters = drawn(lambda: TwinCritic(SMALL, group_spec(one), nnx.Rngs(0), Actions(2)))
+    graph, parameters = drawn(lambda: TwinCritic(SMALL, shapes(one), nnx.Rngs(0), Actions(2)))
     assert size(parameters) == 2 * ((24 + 8 + 12) * 8 + 8 + (8 + 2) * 4 + 4 + 4 + 1)
     batch = stacked(*(observation(rng) for _ in range(64)))
     actions = jnp.asarray(rng.uniform(-1, 1, (64, 2)), jnp.float32)

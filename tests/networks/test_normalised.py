@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from drivax.networks.encoders import MlpConfig
-from drivax.networks.normalised import NormalisedConfig, feature_statistics, set_statistics
+from drivax.networks.encoders import MlpConfig, NormalisedConfig, feature_statistics, set_statistics
 
 SPEC = {"ego": (3,), "agents": (4, 2), "agents_mask": (4,)}
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.networks.pooling import dense, largest, only_winners
+from drivax.networks.encoders import dense, largest, only_winners
 
 
 def plain(activation, layers, rows, there):

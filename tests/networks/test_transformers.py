@@ -10,10 +10,9 @@ from flax import nnx
 
 import encoder_oracle as oracle
 from drivax.errors import UsageError
-from drivax.networks.attention import Attention
+from drivax.networks.attention import Attention, forms
 from drivax.networks.encoders import MlpConfig
 from drivax.networks.entity import EntityConfig
-from drivax.networks.tokens import forms
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 from quick import drawn, quick
 

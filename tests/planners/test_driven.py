@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 from drivax.errors import UsageError
-from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.functions import NetworkPlanner
 from drivax.planners.planner_traffic import PlannerTraffic, TrafficPolicy, with_driver
 from drivax.planners.simple import Expert
 from drivax.scenario.schema import AgentKind

@@ -69,7 +69,7 @@ def test_python_and_jax_planners_agree_batched_or_alone(bank, moments):
 
 
 @pytest.mark.slow
-def test_python_and_jax_make_the_same_episodes(bank):
+def test_python_and_jax_planners_have_the_same_episodes(bank):
     """Inside the compiled loop over all steps; both crash at step 15 of the scenario with ego only."""
     rows = jnp.arange(2)
     keys = episode_keys(bank, rows, 0)

@@ -100,7 +100,7 @@ def test_lines_keep_their_offset_from_the_route_and_even_spacing():
     np.testing.assert_allclose(steps, steps[:1].repeat(len(steps), 0), atol=1e-3)
 
 
-def test_without_a_route_the_lines_lead_straight_ahead():
+def test_lines_lead_straight_ahead_without_a_route():
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
     bank = replace(bank, route_points=jnp.zeros_like(bank.route_points))
     me = jnp.asarray([5.0, 3.0, 0.6, 0.8, 4.8, 2.0])
@@ -180,7 +180,7 @@ def test_idm_is_unrolled_as_in_double_precision(stop):
 # Decisions -------------------------------------------------------------------------------------------------------
 
 
-def test_on_a_free_road_the_fastest_proposal_in_the_middle_wins():
+def test_fastest_centred_proposal_wins_on_a_free_road():
     action, after, scored = decide(straight_road([car(0, 0, 0, 9)]))
     assert scored.cars.motion.shape == (15, 41, 4)
     assert int(np.argmax(scored.score)) == 4 and scored.score[4] == pytest.approx(1.0)

@@ -85,7 +85,7 @@ def test_ego_hit_from_behind_or_standing_is_not_at_fault(evaluate):
     assert evaluate(straight(1.0), side, several=True).collision == 0.0
 
 
-def test_a_collision_is_foreseen_for_nine_tenths_of_a_second(evaluate):
+def test_time_to_collision_looks_0_9_s_ahead(evaluate):
     """5 m/s for 4 s is 20 m; bumpers are 2.4 m from centres; in 0.9 s ego would come 4.5 m further."""
     for gap, kept in ((20 + 4.4, 0.0), (20 + 4.6, 1.0)):
         found = evaluate(straight(5.0), others((gap + 4.8, 0, 0, 0, AgentKind.VEHICLE)))
@@ -121,7 +121,7 @@ def comfortable_by_scipy(motion, acceleration):
     return fine & (np.abs(smooth(yaw, 5, 3, 2)).max() <= 1.93)
 
 
-def test_comfort_is_that_of_scipy():
+def test_comfort_equals_scipy():
     rng = np.random.default_rng(2)
     drives, wanted = [], []
     for _ in range(60):
@@ -210,7 +210,7 @@ def test_forecast_keeps_agents_that_come_near():
     assert sorted(box[1, :, 1].tolist()) == pytest.approx([-10.0, 2.0])
 
 
-def test_times_to_overlap_are_those_of_steps():
+def test_times_to_overlap_equal_small_steps():
     """Against moving both boxes on in steps of a hundredth of a second."""
     rng = np.random.default_rng(1)
     rows = [

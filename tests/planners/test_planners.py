@@ -9,12 +9,11 @@ import pytest
 from flax import nnx
 
 from drivax.networks.actor_critic import NetworkConfig, Policy
-from drivax.networks.encoders import MlpConfig, group_spec
+from drivax.networks.encoders import MlpConfig
 from drivax.planners.catalogue import PLANNERS, make_planner
-from drivax.planners.idm import IdmPlanner
-from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.functions import NetworkPlanner
 from drivax.planners.planner import Planner
-from drivax.planners.simple import RandomActions, expert_action, logged_motion
+from drivax.planners.simple import IdmPlanner, RandomActions, expert_action, logged_motion
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import PHYSICAL
@@ -47,7 +46,7 @@ def act(planner, simulator, bank):
 
 
 @pytest.mark.parametrize("name", sorted(PLANNERS))
-def test_every_planner_answers_with_an_action(name, simulator):
+def test_every_planner_returns_a_finite_action(name, simulator):
     planner = make_planner(name)
     assert isinstance(planner, Planner) and planner.name == name
     bank = bank_of(straight_road([car(0, 0, 0, 9), car(30, 0, 0, 5)], light=RED))
@@ -57,14 +56,14 @@ def test_every_planner_answers_with_an_action(name, simulator):
     assert jax.tree.structure(planner) == jax.tree.structure(make_planner(name))
 
 
-def test_idm_on_a_free_road_accelerates_by_its_law(simulator):
+def test_idm_accelerates_by_its_law_on_a_free_road(simulator):
     # Desired speed is the limit of 13.4 m/s; a free road leaves a (1 - (v / v0)^4).
     action = act(IdmPlanner(), simulator, bank_of(straight_road([car(0, 0, 0, 9)])))
     assert action[0] * 6.0 == pytest.approx(1.5 * (1 - (9 / 13.4) ** 4), rel=1e-3)
     assert action[1] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_idm_brakes_for_the_nearest_thing_in_its_corridor(simulator):
+def test_idm_brakes_for_the_nearest_agent_in_its_corridor(simulator):
     # Gap of 20 - 4.8 = 15.2 m to a car at 5 m/s.
     leader = act(IdmPlanner(), simulator, bank_of(straight_road([car(0, 0, 0, 9), car(20, 0, 0, 5)])))
     speed = np.array(9.0)
@@ -88,7 +87,7 @@ def test_idm_law_by_hand():
     assert float(idm_acceleration(np.array(20.0), np.array(10.0), np.array(0.2), np.array(0.0), p)) == -6.0
 
 
-def test_the_expert_knows_the_log_and_stays_where_it_ends(simulator):
+def test_expert_follows_the_log_and_stays_where_it_ends(simulator):
     bank = bank_of(straight_road([car(0, 0, 0, 9), car(20, 3.7, 0, 6, steps=range(60))]))
     ego = simulator.context(bank, 0, 88)
     np.testing.assert_allclose(logged_motion(bank, ego, 1), [71.1, 0, 0, 9], atol=1e-3)
@@ -102,7 +101,8 @@ def test_the_expert_knows_the_log_and_stays_where_it_ends(simulator):
 @pytest.mark.slow
 def test_a_network_acts_by_the_mode_or_by_a_sample(simulator):
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
-    spec = group_spec(jax.eval_shape(lambda b: simulator.observe(b, simulator.context(b, 0, 10)), bank))
+    observation = jax.eval_shape(lambda b: simulator.observe(b, simulator.context(b, 0, 10)), bank)
+    spec = {name: value.shape for name, value in observation.items()}
     policy = Policy(NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,)), spec, nnx.Rngs(3))
     graph, weights = nnx.split(policy)
     mode, sample = (act(NetworkPlanner(weights, graph, samples=s), simulator, bank) for s in (False, True))

@@ -38,7 +38,7 @@ def at_the_horizon(x, rate, speeds, curvatures):
     return x
 
 
-def test_the_acceleration_is_the_cheapest():
+def test_acceleration_minimises_its_cost():
     for speed, wanted in ((5.0, 8.0), (12.0, 3.0), (4.0, 4.0)):
         cost = lambda a, v=speed, w=wanted: 10.0 * (v + a - w) ** 2 + a * a  # noqa: E731  10 steps of 0.1 s
         assert float(acceleration_to(jnp.asarray(speed), jnp.asarray(wanted), CONFIG)) == pytest.approx(
@@ -46,7 +46,7 @@ def test_the_acceleration_is_the_cheapest():
         )
 
 
-def test_the_steering_rate_is_the_cheapest():
+def test_steering_rate_minimises_its_cost():
     rng = np.random.default_rng(0)
     for _ in range(5):
         x = rng.normal(size=3) * [1.0, 0.3, 0.1]
@@ -63,7 +63,7 @@ def test_the_steering_rate_is_the_cheapest():
         assert float(found) == pytest.approx(minimize_scalar(cost).x, rel=1e-3, abs=1e-4)
 
 
-def test_held_for_one_step_the_gains_are_those_of_the_riccati_recursion():
+def test_gains_equal_the_riccati_recursion_for_one_step():
     """With the cost to go P of SciPy's algebraic equation as Q, one step of the recursion has the stationary gain."""
     q, r = 7.0, 2.0
     p = solve_discrete_are(np.eye(1), np.array([[DT]]), np.array([[q]]), np.array([[r]]))[0, 0]
@@ -164,7 +164,7 @@ def test_tracker_reaches_the_line_keeps_the_circle_and_stops(drives):
     assert cars.motion[2, -1, 3] < 0.25
 
 
-def test_the_first_step_is_what_the_simulator_does(drives):
+def test_first_tracked_step_equals_the_simulator(drives):
     cars, _, _ = drives
     bend = np.tan(cars.steering[:, 1]) / WHEELBASE
     for now, then, acceleration, k in zip(

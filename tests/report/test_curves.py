@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivax.report.charts.curves import chart, compact, curve_sections, ticks
+from drivax.report.charts import chart, compact, curve_sections, ticks
 from drivax.report.pictures.palette import Stroke
 from drivax.report.runs import read_runs
 

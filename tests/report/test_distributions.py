@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivax.report.charts.distributions import distribution, distribution_charts
+from drivax.report.charts import distribution, distribution_charts
 from drivax.report.runs import read_runs
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivax.errors import UsageError
-from drivax.report.charts.distributions import BINS, bins, histogram
+from drivax.report.charts import BINS, bins, histogram
 from drivax.report.inspection import Inspection
 from drivax.report.pages.inspection import write_histograms
 from drivax.scenario.select.selection import Selection

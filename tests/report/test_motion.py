@@ -5,7 +5,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from drivax.metrics.comfort import check_trip_comfort
-from drivax.report.charts.motion import COMMANDS, SIGNALS, signals
+from drivax.report.charts import COMMANDS, SIGNALS, signals
 from drivax.report.pictures.drawing import Rollout
 from drivax.report.pictures.player_data import pack_episode
 

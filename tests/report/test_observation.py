@@ -12,7 +12,7 @@ from rich.console import Console
 
 from drivax.errors import UsageError
 from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
-from drivax.report.inspection_tables import observation_overview, observation_table
+from drivax.report.inspection import observation_overview, observation_table
 from drivax.tasks.features import Features
 from drivax.tasks.observations import ObservationConfig
 

@@ -30,7 +30,7 @@ def drive(scenario, sideways=3.0, **events):
 
 
 def scene(theme="light"):
-    from drivax.report.pictures.frames import Canvas, Scenery
+    from drivax.report.pictures.video import Canvas, Scenery
 
     scenario = make_scenario(0)
     return scenario, Scenery(Canvas(720, 720, theme), scenario, [drive(scenario)])
@@ -38,7 +38,7 @@ def scene(theme="light"):
 
 @pytest.mark.parametrize("theme", THEMES)
 def test_frame_shows_only_present_things(theme):
-    from drivax.report.pictures.frames import draw_frame
+    from drivax.report.pictures.video import draw_frame
 
     scenario, scenery = scene(theme)
     early = draw_frame(scenery, drive(scenario), 19, 0.1)
@@ -53,7 +53,7 @@ def test_frame_shows_only_present_things(theme):
 
 def test_camera_follows_ego():
     """Metres and pixels: the picture is 690 / 70 pixels per metre, ego is in the middle below the bar."""
-    from drivax.report.pictures.frames import draw_frame
+    from drivax.report.pictures.video import draw_frame
 
     scenario, scenery = scene()
     image = draw_frame(scenery, drive(scenario, 20.0), 60, 0.1)
@@ -65,7 +65,7 @@ def test_camera_follows_ego():
 
 
 def test_failures_are_marked_from_their_step_on():
-    from drivax.report.pictures.frames import draw_frame
+    from drivax.report.pictures.video import draw_frame
 
     scenario, scenery = scene()
     failed = drive(scenario, collision=40, offroad=-1)
@@ -80,7 +80,7 @@ def test_failures_are_marked_from_their_step_on():
 
 
 def test_legend_has_every_colour():
-    from drivax.report.pictures.frames import legend_strip
+    from drivax.report.pictures.video import legend_strip
 
     for theme in THEMES:
         strip = legend_strip(720, theme)

@@ -10,8 +10,7 @@ import pytest
 
 from browser import acted, browse, needs_browser
 from drivax.cli import main
-from drivax.curation.combining import Combination
-from drivax.curation.scores import ScoreTable, write_scores
+from drivax.curation.scores import Combination, ScoreTable, write_scores
 from drivax.errors import UsageError
 from drivax.report.pages.viewer import findings, select, write_player
 from drivax.scenario.build.assemble import assemble

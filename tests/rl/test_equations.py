@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.rl.online import clipped_surrogate_loss, generalised_advantages
+from drivax.rl.equations import clipped_surrogate_loss, generalised_advantages
 
 
 def by_loop(reward, value, after, terminated, truncated, gamma, lambda_):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from drivax.rl.offline import (
+from drivax.rl.equations import (
     advantage_weights,
     conservative_penalty,
     expectile_loss,
@@ -14,8 +14,8 @@ from drivax.rl.offline import (
     penalty_weight_loss,
     scaled_policy_loss,
     smoothed_action,
+    td_target,
 )
-from drivax.rl.online import td_target
 
 STATES, ACTIONS, GAMMA = 6, 4, 0.9
 

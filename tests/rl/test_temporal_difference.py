@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.rl.online import polyak, soft_policy_loss, soft_value, td_target, temperature_loss
+from drivax.rl.equations import polyak, soft_policy_loss, soft_value, td_target, temperature_loss
 
 
 def slope(of, at, step=1e-3):

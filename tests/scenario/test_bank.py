@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, DrivaxError
-from drivax.evaluation.rollout import drive, judging
-from drivax.planners.idm import IdmPlanner
+from drivax.evaluation.rollout import drive, evaluation_task
+from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Flag, Scenario
@@ -71,7 +71,11 @@ def test_trimming_changes_nothing_that_is_measured(both):
 
 @pytest.mark.slow
 def test_trimming_changes_no_result(both):
-    simulator, rows, keys = Simulator(judging(Task())), np.arange(3), jax.random.split(jax.random.key(0), 3)
+    simulator, rows, keys = (
+        Simulator(evaluation_task(Task())),
+        np.arange(3),
+        jax.random.split(jax.random.key(0), 3),
+    )
     one, other = (drive(simulator, IdmPlanner(), bank, rows, keys) for bank in both)
     np.testing.assert_allclose(one.motion, other.motion, atol=1e-4)
     for name in one.metrics:

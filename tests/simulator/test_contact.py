@@ -128,7 +128,7 @@ def test_head_on_pair():
     assert float(time_to_collision(world, jnp.array(0), jnp.zeros(2, bool))) == pytest.approx(1.535, abs=1e-4)
 
 
-def test_a_crosser_far_to_the_side_counts_and_a_follower_does_not():
+def test_crossing_agent_counts_for_ttc_and_follower_does_not():
     # A car from 60 deg to the left that meets ego after two seconds.
     crossing = frame([box(0, 0), box(10, 17.3, -np.pi / 2)], [[5, 0], [0, -8.65]])
     assert float(time_to_collision(crossing, jnp.array(0), jnp.zeros(2, bool))) < 2.0
@@ -161,7 +161,7 @@ def test_ignored_agents_do_not_count_for_ttc():
         (box(-0.5, 1.9), 5.0, 0.04, False, True, CollisionType.SIDE_SWIPE),  # along a car that stands
     ],
 )
-def test_fault_by_the_order_of_nuplan(other, ego_speed, other_speed, unlawful, fault, kind):
+def test_fault_follows_the_order_of_nuplan(other, ego_speed, other_speed, unlawful, fault, kind):
     world = frame([box(0, 0), other], [[ego_speed, 0], [other_speed, 0]])
     speeds = jnp.array([ego_speed, other_speed])
     found, found_kind = classify_contacts(
@@ -231,7 +231,7 @@ def test_gaps_agree_with_polygons():
     np.testing.assert_allclose(slopes, [0.0, 0.0, 1.0, -1.0], atol=1e-6)
 
 
-def test_the_nearest_gap_is_that_to_the_nearest_who_counts():
+def test_nearest_gap_skips_agents_left_out():
     rows = [box(0, 0), box(8.8, 0), box(0, 3.5), box(-5.8, 0), box(0, -60)]
     now = frame(rows, [[0, 0]] * 5)
     none, nearest = jnp.zeros(5, bool), jax.jit(nearest_gap)

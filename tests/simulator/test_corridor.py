@@ -82,7 +82,7 @@ def test_gap_counts_agents_reaching_into_the_corridor_behind_a_turn(left, size):
     np.testing.assert_allclose(found, at - arcs - 2.4 - size[0] / 2, atol=0.15)
 
 
-def test_bystanders_do_not_hide_obstacles():
+def test_agents_next_to_the_corridor_do_not_hide_obstacles():
     car = thing(BEFORE + 16.0, 0.0, CAR)
     # Nine of them, on the inside of the turn and along the way to it, each nearer than the car.
     people = [thing(arc, 3.0, PERSON) for arc in np.linspace(5.0, 33.0, 9)]

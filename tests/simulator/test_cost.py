@@ -6,15 +6,15 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from drivax.evaluation.rollout import drive, judging
+from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
-from drivax.simulator import situation
+from drivax.simulator import contact, situation
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import prepare_bank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.override import OverrideTraffic, with_override
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.studies.bench import BenchConfig, _parts, _repeated
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.rewards import RewardConfig
@@ -79,17 +79,17 @@ def test_operation_count_detects_pairwise_agent_work(bank):
 def test_optional_facts_cost_nothing_unless_requested(bank, monkeypatch):
     asked = set()
 
-    def noted(name):
-        real = getattr(situation, name)
+    def noted(module, name):
+        real = getattr(module, name)
 
         def call(*arguments):
             asked.add(name)
             return real(*arguments)
 
-        monkeypatch.setattr(situation, name, call)
+        monkeypatch.setattr(module, name, call)
 
-    noted("lane_passage")
-    noted("nearest_gap")
+    noted(situation, "lane_passage")
+    noted(contact, "nearest_gap")
     less = operations(bank, Simulator(Task(observation=GLIMPSE, rewards=RewardConfig(preset="published"))))
     assert asked == set()
     rewards = RewardConfig(preset="published", lane_change=0.2, close=-0.1)
@@ -147,7 +147,7 @@ def test_one_configuration_is_compiled_once(traffic):
     def driven(scenarios, rows, trim=True):
         bank = prepare_bank(model, ScenarioBank.from_scenarios(scenarios, trim=trim))
         keys = jax.random.split(jax.random.key(0), 2)
-        drive(Simulator(judging(Task()), model), ConstantVelocity(), bank, jnp.asarray(rows), keys)
+        drive(Simulator(evaluation_task(Task()), model), ConstantVelocity(), bank, jnp.asarray(rows), keys)
         return drive._cache_size()
 
     data = [assemble(generate_recording(7, i)) for i in range(3)]
@@ -161,7 +161,7 @@ def test_one_configuration_is_compiled_once(traffic):
 def test_components_are_timed_on_unmodified_states(part):
     # Empty accumulators are infinite or undefined; what is timed in the next round must not be.
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
-    simulator = Simulator(Task(observation=GLIMPSE))
+    simulator, config = Simulator(Task(observation=GLIMPSE)), BenchConfig(batch=2, steps=3)
     states = jax.jit(jax.vmap(simulator.reset, (None, 0)))(bank, jnp.zeros(2, jnp.int32))
-    shift = _repeated(BenchConfig(batch=2, steps=3), _parts(simulator)[part])(bank, states, None)
+    shift = _repeated(config, _parts(simulator)[part])(bank, states, None)
     assert (jnp.abs(shift) < 1e-9).all()

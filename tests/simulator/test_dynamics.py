@@ -54,7 +54,7 @@ def path_of(motion, acceleration, curvature, steps):
     return np.asarray(drive(PHYSICAL, jnp.asarray(motion, jnp.float32), action, steps)[0])
 
 
-def test_full_braking_from_ten_stops_at_8_33_m_and_stays():
+def test_full_braking_from_10_mps_stops_after_8_33_m():
     path = path_of([0.0, 0.0, 0.0, 10.0], -6.0, 0.0, 60)
     assert path[-1, 0] == pytest.approx(100 / 12, abs=1e-3)
     assert path[-1, 3] == 0.0
@@ -97,7 +97,7 @@ def test_a_standing_car_steers_straight():
     assert float(acceleration) == 0.0
 
 
-def test_commands_can_be_read_off_motions():
+def test_command_between_inverts_the_bicycle():
     motion = jnp.array([5.0, -3.0, 3.1, 9.0])  # turns over the wrap of the heading
     read = command_between(motion, bicycle(motion, jnp.float32(-1.5), jnp.float32(0.08)))
     np.testing.assert_allclose(read, [-1.5, 0.08], atol=1e-4)
@@ -105,7 +105,7 @@ def test_commands_can_be_read_off_motions():
     assert float(command_between(slow, bicycle(slow, jnp.float32(0.0), jnp.float32(0.3)))[1]) == 0.0
 
 
-def test_a_displacement_is_in_the_own_frame_and_inverts():
+def test_displacement_is_in_the_agent_frame_and_inverts_displace():
     # Heading north: 3 m ahead is +y, 0.4 m left is -x.
     motion = jnp.array([10.0, 20.0, np.pi / 2, 7.0])
     moved = displace(motion, jnp.array([3.0, 0.4]), jnp.float32(2.0))
@@ -118,7 +118,7 @@ def test_a_displacement_is_in_the_own_frame_and_inverts():
 
 
 @pytest.mark.parametrize("name", ["physical", "published", "discrete", "delta_local", "limited"])
-def test_zero_is_zero_and_bounds_are_bounds(name):
+def test_zero_action_adds_nothing_and_bounds_clip(name):
     space, motion = SPACES[name], jnp.array([1.0, 2.0, 0.5, 4.0])
     after = np.asarray(space.move(motion, jnp.zeros(space.size), LENGTH_M))
     if name == "delta_local":
@@ -133,7 +133,7 @@ def test_zero_is_zero_and_bounds_are_bounds(name):
 
 
 @pytest.mark.parametrize("name", SPACES)
-def test_planners_can_ask_every_space_for_a_command(name):
+def test_every_space_maps_controls_to_actions(name):
     """The car gets about where the bicycle would, and to the same speed."""
     space, motion = SPACES[name], jnp.array([1.0, 2.0, 0.5, 9.0])
     action = space.action(motion, jnp.float32(1.0), jnp.float32(0.03), LENGTH_M)
@@ -145,7 +145,7 @@ def test_planners_can_ask_every_space_for_a_command(name):
 
 
 @pytest.mark.parametrize("name", ["physical", "published", "delta_local", "direct_state", "limited"])
-def test_the_expert_of_a_space_follows_a_log(name):
+def test_expert_actions_of_each_space_follow_a_log(name):
     space, rng = SPACES[name], np.random.default_rng(1)
     log = [jnp.array([0.0, 0.0, 3.0, 8.0])]
     command, step = (0.0, 0.0), jax.jit(bicycle)
@@ -186,12 +186,12 @@ def test_levels_are_denser_near_zero_and_contain_it():
 
 
 @pytest.mark.parametrize("options", [{"accelerations": 6}, {"curvatures": 1}, {"density": 0.5}])
-def test_levels_that_cannot_be_meant_are_refused(options):
+def test_invalid_levels_are_refused(options):
     with pytest.raises(UsageError):
         Discrete(**options)
 
 
-def test_actuators_are_as_slow_as_they_are_set():
+def test_actuator_rates_limit_changes():
     space = Physical(jerk_mps3=10.0, steering_rate=0.2)
     motion, full = jnp.array([0.0, 0.0, 0.0, 5.0]), jnp.array([-1.0, 1.0])
     carried = np.asarray(drive(space, motion, full, 20)[1])
@@ -207,13 +207,13 @@ def test_actuators_are_as_slow_as_they_are_set():
     np.testing.assert_allclose(begun[:, 1] * 0.3, [0.28, 0.26, 0.24], rtol=1e-4)
 
 
-def test_steering_rate_of_published_is_one_of_the_angle():
+def test_published_steering_rate_limits_the_angle():
     space, motion = Published(steering_rate=0.5), jnp.array([0.0, 0.0, 0.0, 3.0])
     carried = np.asarray(drive(space, motion, jnp.array([0.0, 1.0]), 8)[1])
     np.testing.assert_allclose(carried[:, 1] * 0.3, np.minimum(0.05 * np.arange(1, 9), 0.3), rtol=1e-5)
 
 
-def test_limited_actuators_begin_as_the_log_had_them():
+def test_limited_actuators_start_from_the_logged_command():
     space = Physical(jerk_mps3=10.0)
     before = jnp.array([0.0, 0.0, 0.0, 8.0])
     now = bicycle(before, jnp.float32(-3.0), jnp.float32(0.06))

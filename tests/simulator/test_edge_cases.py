@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.evaluation.rollout import drive, judging
+from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import ConstantVelocity, Expert
 from drivax.scenario.schema import LightState
@@ -16,7 +16,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, bank_of, car, straight_road, tracks
 
-SIMULATOR = Simulator(judging(Task(observation=GLIMPSE)))
+SIMULATOR = Simulator(evaluation_task(Task(observation=GLIMPSE)))
 #: For what only lights decide.
 LIGHTS = Simulator(Task(observation=GLIMPSE, metrics=("red_light",), to_the_end=True))
 
@@ -65,7 +65,7 @@ def test_without_a_map_nothing_is_off_the_road():
 
 
 @pytest.mark.slow
-def test_another_slot_has_no_route_and_is_paid_for_none():
+def test_other_slots_have_no_route_and_no_route_reward():
     bank = bank_of(straight_road([car(0, 0, 0, 8), car(20, 3.7, 0, 9)]))
     found = metrics(Expert(), bank, slot=1)
     for name in ("progress", "progress_ratio", "success", "off_route", "vmax_score", "goal_distance"):
@@ -135,7 +135,7 @@ def test_a_right_turn_on_red_without_a_stop_is_not():
 
 
 @pytest.mark.slow
-def test_a_line_that_was_crossed_before_the_episode_is_not_charged_to_it():
+def test_stop_line_crossed_before_the_episode_does_not_count():
     # Slot 1, which has no route, crosses the red line between steps 9 and 10.
     bank = bank_of(straight_road([car(-60, 0, 0, 10), car(37.9, 0, 0, 10)], light=LightState.STOP))
     simulator = Simulator(Task(observation=GLIMPSE, metrics=("red_light",), ends=()))

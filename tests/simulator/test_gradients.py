@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
@@ -49,7 +49,7 @@ def driving(space, seed):
 
 
 @pytest.mark.parametrize("name", SPACES)
-def test_rollouts_differentiate_as_finite_differences(name):
+def test_rollout_gradients_equal_finite_differences(name):
     space = SPACES[name]
     with jax.enable_x64(True):
         start, weights = jnp.array([3.0, -2.0, 3.0, 6.0]), np.random.default_rng(9).normal(size=(STEPS, 4))
@@ -72,7 +72,7 @@ def test_rollouts_differentiate_as_finite_differences(name):
 
 @pytest.mark.parametrize("name", SPACES)
 @pytest.mark.parametrize("speed", [0.0, 5.0])
-def test_gradients_are_finite_at_every_corner(name, speed):
+def test_gradients_are_finite_at_every_limit(name, speed):
     """At a standstill, at the bounds, at full braking and beyond, where masks and clips meet."""
     space = SPACES[name]
     slope = jax.jit(jax.grad(lambda start, actions: rollout(space, start, actions).sum(), argnums=(0, 1)))
@@ -102,7 +102,7 @@ def together():
 
 
 @pytest.mark.slow
-def test_the_simulator_differentiates_as_finite_differences(together):
+def test_simulator_gradients_equal_finite_differences(together):
     """Through the whole step, with everything that it measures: own actions count, the other's do not (log)."""
     bank, positions = together
     with jax.enable_x64(True):
@@ -158,7 +158,7 @@ def test_reactive_traffic_differentiates_with_respect_to_ego():
 @pytest.mark.parametrize("speed", [0.0, 8.0])
 def test_rewards_facts_and_observations_have_finite_gradients(speed):
     """Not only the trajectory: what a policy sees and is paid for, from a standstill on and through a collision."""
-    simulator = Simulator(judging(Task()))
+    simulator = Simulator(evaluation_task(Task()))
     bank = bank_of(straight_road([car(0, 0, 0, speed), car(25, 0.4, 0, 3), car(20, 3.7, 0, 3)], light=RED))
 
     @jax.jit

@@ -56,7 +56,7 @@ def judged(recording):
     return {name: float(v.value[0]) for name, v in result.metrics.items()}
 
 
-def test_a_car_under_a_bridge_knows_nothing_of_it():
+def test_agent_under_a_bridge_ignores_the_bridge():
     found = judged(crossing(8.0, [(car(0, 0, 0, 10), 0.0), (car(DECK_X, 0, np.pi / 2, 0), 8.0)]))
     assert found["distance"] == pytest.approx(80.0, abs=0.1)
     for name in ("collision", "offroad", "lane_straddle", "speeding_max", "wrong_way", "off_route"):
@@ -69,7 +69,7 @@ def test_on_one_level_the_same_crossing_is_a_collision_off_the_road():
     assert found["collision"] == 1.0 and found["offroad"] == 1.0 and found["min_ttc"] == 0.0
 
 
-def test_a_car_on_the_bridge_knows_nothing_of_the_road_below():
+def test_agent_on_a_bridge_ignores_the_road_below():
     found = judged(crossing(8.0, [(car(DECK_X, -40, np.pi / 2, 10), 8.0), (car(DECK_X, 0, 0, 0), 0.0)]))
     assert found["collision"] == 0.0 and found["offroad"] == 0.0 and found["min_ttc"] == 5.0
     assert found["speeding_max"] == pytest.approx(5.0, abs=1e-3), "10 m/s where the deck allows 5"

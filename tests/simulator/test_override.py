@@ -13,10 +13,9 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.contact import CollisionType
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import prepare_bank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import LogTraffic, alone
 from drivax.simulator.traffic.override import OverrideTraffic, motions_of_actions, with_override
-from drivax.simulator.traffic.reactive import IdmTraffic
+from drivax.simulator.traffic.reactive import IdmTraffic, make_traffic
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, bank_of, car, straight_road
 
@@ -90,7 +89,7 @@ def test_reactive_vehicles_stop_behind_an_overridden_agent(bank):
 
 
 @pytest.mark.slow
-def test_ego_collides_with_a_car_overridden_to_stand():
+def test_ego_collides_with_an_agent_overridden_to_stand_still():
     """At 10 m/s the 5.2 m to its rear end take 0.52 s: the sixth step overlaps, is at fault, and ends the episode."""
     bank = bank_of(straight_road([car(0, 0, 0, 10), car(10, 3.7, 0, 5)]))
     task = Task(observation=GLIMPSE, metrics=("collision", "at_fault_collision", "collision_type"))
@@ -138,7 +137,7 @@ def test_bank_without_overrides_is_refused(bank):
     assert (OverrideTraffic().name, OverrideTraffic(IdmTraffic()).name) == ("override", "override+idm")
 
 
-def test_traffic_is_found_by_name(bank):
+def test_traffic_models_are_found_by_name(bank):
     assert isinstance(make_traffic("log"), LogTraffic) and isinstance(make_traffic("idm"), IdmTraffic)
     assert isinstance(make_traffic("drivax.simulator.traffic.reactive:IdmTraffic"), IdmTraffic)
     assert prepare_bank(LogTraffic(), bank) is bank

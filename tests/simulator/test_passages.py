@@ -16,8 +16,7 @@ from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAPACITIES, STEPS, RoadKind
 from drivax.simulator.simulator import Simulator
-from drivax.synthetic.roads.families.highway import Highway
-from drivax.synthetic.roads.families.streets import LaneDrop
+from drivax.synthetic.roads.families import Highway, LaneDrop
 from drivax.synthetic.roads.network import map_features
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
@@ -240,14 +239,14 @@ def test_every_scene_has_its_lane_changes_and_merges(driven):
 
 
 @pytest.mark.slow
-def test_they_are_rewarded_once(driven):
+def test_lane_changes_and_merges_are_rewarded_once(driven):
     _, _, (facts, terms) = driven
     np.testing.assert_allclose(terms["lane_change"], 0.2 * facts.lane_changed)
     np.testing.assert_allclose(terms["merge"], 0.2 * facts.merged)
 
 
 @pytest.mark.slow
-def test_logged_steps_score_as_simulated_ones(driven):
+def test_logged_steps_have_the_rewards_of_simulated_steps(driven):
     made, bank, (_, terms) = driven
     for name in ("there and back", "a lane drop", "a ramp", "a fork"):
         row = list(made).index(name)

@@ -126,7 +126,7 @@ def test_absent_agents_and_other_levels_have_no_potential_and_no_gradient():
         assert (np.asarray(slope) == 0.0).all() == empty
 
 
-def test_gradient_of_collision_is_the_finite_difference():
+def test_collision_gradient_equals_the_finite_difference():
     with jax.enable_x64(True):
         other = jnp.asarray(boxes(np.random.default_rng(4), 40, spread=4.0))
 
@@ -154,7 +154,7 @@ def test_offroad_is_positive_off_the_road_and_zero_beyond_the_margin(road):
     assert value[0] == pytest.approx(2 * (1 - 0.25 / MARGIN_M) ** 2, abs=1e-3)
 
 
-def test_gradient_of_offroad_is_the_finite_difference(road):
+def test_offroad_gradient_equals_the_finite_difference(road):
     rng, step = np.random.default_rng(3), 2e-3
     poses = np.stack([rng.uniform(-60, 60, 400), rng.uniform(-1.6, 5.3, 400), rng.uniform(-1, 1, 400)], -1)
     _, gradients, _ = map(np.asarray, offroad(road, jnp.asarray(poses, jnp.float32)))
@@ -176,6 +176,6 @@ def test_without_a_map_nothing_is_off_the_road():
     assert not np.asarray(value).any() and not np.asarray(slope).any()
 
 
-def test_a_margin_beyond_what_queries_see_is_refused(road):
+def test_margin_beyond_the_reach_of_queries_is_refused(road):
     with pytest.raises(UsageError, match=r"margin_m is 3\.5"):
         offroad_potential(road, jnp.int32(0), jnp.zeros(6), jnp.zeros(()), margin_m=3.5)

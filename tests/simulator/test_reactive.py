@@ -133,7 +133,7 @@ def test_vehicle_with_its_front_over_the_stop_line_waits():
     assert np.ptp(run.x[:, 1]) < 0.1
 
 
-def test_a_leader_that_brakes_is_not_hit():
+def test_braking_leader_is_not_hit():
     # A pedestrian's track replays whatever it does: here it is a wall that brakes from 12 m/s with 5 m/s2.
     t = np.arange(91) * 0.1
     wall = profile(30, 0, np.clip(12 - 5 * (t - 2), 0, 12), kind=AgentKind.PEDESTRIAN, length=4.8, width=2.0)
@@ -144,7 +144,7 @@ def test_a_leader_that_brakes_is_not_hit():
 
 
 @pytest.mark.parametrize("speed", [4.0, 8.0, 11.0])
-def test_the_gap_in_equilibrium_is_that_of_the_closed_form(speed):
+def test_equilibrium_gap_equals_the_closed_form(speed):
     # The follower's peak is 13 m/s; the leader, a replay, keeps its speed: (s0 + v T) / sqrt(1 - (v / v0)^4).
     fast = np.where(np.arange(91) < 2, 13.0, speed)
     wanted = (2.0 + 1.5 * speed) / np.sqrt(1 - (speed / 13.0) ** 4)
@@ -155,7 +155,7 @@ def test_the_gap_in_equilibrium_is_that_of_the_closed_form(speed):
     assert run.speed[80, 2] == pytest.approx(speed, abs=0.05)
 
 
-def test_ego_that_cuts_in_is_given_way():
+def test_vehicles_yield_to_ego_that_cuts_in():
     cars = [car(12, 3.7, 0, 6), car(0, 0, 0, 10)]
     t = np.arange(1, 81) * 0.1
     change = np.clip(t / 2.0, 0, 1)
@@ -183,7 +183,7 @@ def test_an_occupied_entry_place_delays_entry():
     assert late.x[42, 1] == pytest.approx(at, abs=1e-3)
 
 
-def test_a_car_enters_no_faster_than_it_can_stop_behind_its_leader():
+def test_vehicle_enters_no_faster_than_it_can_stop_behind_its_leader():
     cars = [car(-60, 0, 0, 0), profile(20, 0, 12.0, steps=range(30, 91))]
     at = float(cars[1]["xy"][30, 0])
     ego = np.tile(np.array([at + 4.8 + 8.0, 0.0, 0.0, 0.0]), (80, 1))
@@ -303,7 +303,7 @@ def test_history_of_a_vehicle_is_its_simulated_motion():
         np.testing.assert_array_equal(rows(bank, traffic, 30)[place], rows(bank, traffic, 30 - back)[0])
 
 
-def test_paths_go_through_the_log_and_on_along_the_lane():
+def test_paths_follow_the_log_and_continue_along_the_lane():
     bank = TRAFFIC.prepare(bank_of(straight_road([EGO, car(0, 0.8, 0, 10)])))
     paths, row = data_of(bank, AgentPaths), list(np.asarray(data_of(bank, AgentPaths).slot[0])).index(1)
     points, spacing = np.array(paths.points[0, row]), float(paths.spacing[0, row])
@@ -334,7 +334,7 @@ def test_all_agents_follow_idm_in_random_traffic(seed):
     assert away.max() < 1e-3
 
 
-def test_a_bank_without_paths_is_refused_and_one_with_paths_is_kept():
+def test_bank_without_paths_is_refused_and_bank_with_paths_is_kept():
     bank = bank_of(straight_road([EGO, car(0, 0, 0, 8)]))
     with pytest.raises(UsageError, match="no AgentPaths"):
         SIMULATOR.context(bank, 0, 10)

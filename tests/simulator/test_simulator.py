@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.evaluation.rollout import drive, judging
-from drivax.planners.idm import IdmPlanner
-from drivax.planners.simple import ConstantVelocity, Expert
+from drivax.evaluation.rollout import drive, evaluation_task
+from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.simulator.simulator import Simulator
@@ -19,7 +18,7 @@ from scenes import GLIMPSE, RED, bank_of, car, moved, straight_road
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Simulator(judging(Task(observation=GLIMPSE)))
+    return Simulator(evaluation_task(Task(observation=GLIMPSE)))
 
 
 def measuring(*metrics):
@@ -51,7 +50,7 @@ def metric(result, name):
     return np.where(value.defined, value.value, np.nan)
 
 
-def test_the_exact_expert_is_clean_and_never_diverges(simulator, world):
+def test_replayed_expert_has_no_violations_and_no_divergence(simulator, world):
     keys = jax.random.split(jax.random.key(0), len(world))
     result = drive(simulator, Expert(), world, jnp.arange(len(world)), keys)
     for name, expected in (("accuracy", 1.0), ("success", 1.0), ("collision", 0.0), ("offroad", 0.0)):
@@ -61,7 +60,7 @@ def test_the_exact_expert_is_clean_and_never_diverges(simulator, world):
 
 
 @pytest.mark.slow
-def test_the_driven_expert_follows_the_log(world):
+def test_driven_expert_follows_the_log(world):
     assert metric(episodes(measuring("fde"), Expert(replays=False), world), "fde").max() < 0.2
 
 
@@ -83,7 +82,7 @@ def test_collision_with_a_stopped_car(simulator):
     assert metric(result, "min_ttc")[0] == 0.0 and metric(result, "accuracy")[0] == 0.0
 
 
-def test_an_agent_that_overlaps_at_the_start_is_ignored_until_it_parts(simulator):
+def test_agent_overlapping_at_the_start_is_ignored_until_it_separates(simulator):
     bank = bank_of(straight_road([car(0, 0, 0, 5), car(1, 0.5, 0, 5)]))
     result = episodes(simulator, ConstantVelocity(), bank)
     assert metric(result, "collision")[0] == 0.0 and metric(result, "min_ttc")[0] == 5.0
@@ -94,7 +93,7 @@ def test_an_agent_that_appears_on_top_of_ego_is_ignored(simulator):
     assert metric(episodes(simulator, ConstantVelocity(), bank), "collision")[0] == 0.0
 
 
-def test_leaving_the_road(simulator):
+def test_leaving_the_road_is_offroad(simulator):
     # The log drives straight; a heading of 3 deg leads off the right edge, 1.85 m away.
     bank = bank_of(straight_road([car(0, 0, np.deg2rad(-3), 10)]))
     result = episodes(simulator, ConstantVelocity(), bank)
@@ -143,7 +142,7 @@ def test_metrics_without_lights_are_undefined(simulator):
 
 
 @pytest.mark.slow
-def test_shift_and_rotation_change_nothing(simulator):
+def test_results_are_invariant_to_translation_and_rotation(simulator):
     cars = [car(0, 0, 0, 9), car(25, 0.4, 0, 6), car(-12, 3.7, 0, 11), car(40, 3.5, np.pi, 3)]
     here = straight_road(cars, light=RED)
     one, other = (
@@ -218,7 +217,7 @@ def test_other_vehicles_as_ego_replay_cleanly(simulator):
 
 
 @pytest.mark.slow
-def test_vmap_is_a_loop(single, world):
+def test_vmap_equals_a_loop(single, world):
     simulator, reset, step = single
     action = jnp.array([0.3, -0.1])
     rows = jnp.array([0, 2, 5])

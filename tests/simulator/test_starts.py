@@ -125,7 +125,7 @@ def test_noisy_start_does_not_collide_with_overridden_agents():
     assert near.any(), "some draws would have touched"
 
 
-def test_fewer_steps_where_the_log_does_not_reach_back(open_road):
+def test_perturbs_fewer_steps_where_the_log_starts_later(open_road):
     first = Simulator(Task()).context(open_road, 0, 0)
     for step, driven in ((0, 0), (3, 3)):
         history = np.asarray(noisy(open_road, step, keys(64)).history)
@@ -156,7 +156,7 @@ def test_invalid_settings_are_refused(options):
         NoisyStart(**options)
 
 
-def test_an_episode_begins_at_any_step_as_logged():
+def test_episode_starts_at_any_step_as_logged():
     bank = bank_of(straight_road([car(0, 0, 0, 6), car(30, 3.7, 0, 4)]))
     simulator = Simulator(Task(metrics=("ade", "progress"), ends=()))
     states = jax.jit(jax.vmap(lambda step: simulator.reset(bank, 0, step)))(jnp.arange(90))

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.simulator.simulator import Simulator
-from drivax.simulator.together import is_driven, slots_of
+from drivax.simulator.simulator import Simulator, is_driven, slots_of
 from drivax.simulator.traffic.agent_paths import AgentPaths
 from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import IdmTraffic
@@ -118,7 +117,7 @@ def test_reactive_traffic_sees_every_driven_agent(bank, braking):
 
 
 @pytest.mark.slow
-def test_a_stack_of_one_is_a_single_agent(bank):
+def test_stack_of_one_equals_a_single_agent(bank):
     actions = jax.random.uniform(jax.random.key(0), (30, 3, 2), minval=-0.5, maxval=0.3)
     slots = jnp.asarray([0, 16, 16])
     (states, done), seen = together(MEASURED, bank, slots, actions)

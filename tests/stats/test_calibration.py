@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.evaluation.split import assign
+from drivax.evaluation.pairing import assign
 from drivax.stats.seeds import certain, crossed_difference
 from drivax.stats.significance import (
     holm,

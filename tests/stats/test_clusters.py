@@ -7,7 +7,7 @@ from drivax.errors import UsageError
 from drivax.stats.clusters import defined, dense, design_effect, stratum_of_clusters
 
 
-def test_undefined_values_leave_and_their_clusters_close_up():
+def test_undefined_values_are_dropped_and_clusters_renumbered():
     x, labels = defined([1.0, None, 3.0, float("nan"), 5.0], ["b", "a", "b", "c", "d"])
     np.testing.assert_array_equal(x, [1, 3, 5])
     np.testing.assert_array_equal(labels, [0, 0, 1])

@@ -69,7 +69,7 @@ def test_power_at_its_ends():
         lambda: scenarios_needed(0.1, 1.0),
     ],
 )
-def test_the_impossible_is_refused_in_one_line(call):
+def test_impossible_arguments_are_refused_in_one_line(call):
     with pytest.raises(UsageError) as caught:
         call()
     assert "\n" not in str(caught.value) and caught.value.cure

@@ -44,7 +44,7 @@ def test_effective_sizes():
     assert effective_size(np.zeros((2, 2))) == 0.0
 
 
-def test_nothing_defined_is_nothing():
+def test_undefined_values_have_no_interval():
     nothing = Interval(None, None, None, 0)
     assert wilson(0, 0) == nothing
     assert rate([None, float("nan")]) == nothing
@@ -188,13 +188,13 @@ def test_coverage_of_clustered_data():
         lambda: paired_bootstrap([1.0], [1.0, 2.0], seed=0),
     ],
 )
-def test_the_impossible_is_refused_in_one_line(call):
+def test_impossible_arguments_are_refused_in_one_line(call):
     with pytest.raises(UsageError) as caught:
         call()
     assert "\n" not in str(caught.value) and caught.value.cure
 
 
-def test_an_interquartile_bootstrap_of_agents_that_agree_is_that_of_their_episodes():
+def test_interquartile_bootstrap_of_equal_seeds_is_that_of_their_episodes():
     row = np.random.default_rng(0).normal(size=60)
     one, alone = interquartile_bootstrap([row, row, row], seed=0), bootstrap_mean(row, seed=0)
     assert one.mean == pytest.approx(alone.mean)
@@ -275,7 +275,7 @@ def test_interquartile_mean_by_hand():
     assert interquartile_mean([7.0]) == pytest.approx(7.0) and interquartile_mean([None]) is None
 
 
-def test_an_interquartile_bootstrap_is_the_exact_distribution():
+def test_interquartile_bootstrap_is_the_exact_distribution():
     values = np.array([[0.0, 2.0], [1.0, 5.0], [8.0, 9.0]])
     found = interquartile_bootstrap(values, confidence=0.8, resamples=20_000, seed=0)
     assert found.mean == pytest.approx(interquartile_mean(values.mean(axis=1))) and found.n == 6

@@ -106,7 +106,7 @@ def test_bootstrap_intervals_hold_the_measures_and_agree_with_delong():
     np.testing.assert_allclose(auc, auc_interval(SCORES, LABELS), atol=0.02)
 
 
-def test_the_interval_of_a_rank_correlation():
+def test_interval_of_rank_correlation():
     """Of normal variables Fisher's: tanh(atanh(r) +- 1.96 / sqrt(n - 3)), nearly; repeating each value adds nothing."""
     rng = np.random.default_rng(3)
     one, noise = rng.normal(size=(2, 400))

@@ -22,7 +22,7 @@ def drawn(rng, seeds, scenarios, *, agent=0.0, scenario=0.0, both=0.0, shift=0.0
     return kinds[0] + shift, kinds[1]
 
 
-def test_by_hand():
+def test_crossed_difference_by_hand():
     a, b = np.array([[1.0, 0.0], [1.0, 1.0]]), np.array([[0.0, 0.0], [0.0, 1.0]])
     found = crossed_difference(a, b)
     assert found.difference == 0.5
@@ -36,7 +36,7 @@ def test_by_hand():
     assert found.freedom == pytest.approx(0.25**2 / sum(part**2 for part in parts))
 
 
-def test_of_seeds_alone_it_is_welch():
+def test_variance_of_seeds_alone_gives_welchs_test():
     rng = np.random.default_rng(0)
     means = rng.normal(size=(2, 5)) * np.array([[1.0], [3.0]])
     a, b = (np.repeat(row[:, None], 30, axis=1) for row in means)
@@ -45,14 +45,14 @@ def test_of_seeds_alone_it_is_welch():
     assert found.interval() == pytest.approx(tuple(wanted.confidence_interval()))
 
 
-def test_of_scenarios_alone_it_is_a_paired_t_test():
+def test_variance_of_scenarios_alone_gives_a_paired_t_test():
     rng = np.random.default_rng(1)
     one, other = rng.normal(size=(2, 40))
     a, b = np.tile(one, (3, 1)), np.tile(other, (4, 1))
     assert crossed_difference(a, b).p == pytest.approx(stats.ttest_rel(one, other).pvalue)
 
 
-def test_the_mean_of_one_kind():
+def test_mean_of_one_policy():
     rng = np.random.default_rng(8)
     alone = rng.random((1, 40))
     wanted = stats.ttest_1samp(alone[0], 0.0).confidence_interval()
@@ -74,7 +74,7 @@ def test_clusters_count_once():
 @pytest.mark.parametrize(
     "effects", [{"agent": 1.0}, {"agent": 0.3, "both": 1.0}, {"scenario": 3.0, "both": 1.0}]
 )
-def test_it_is_not_fooled_by_chance(effects):
+def test_false_positives_keep_their_level(effects):
     """Of comparisons without a difference at most 5 % are called one; by scenarios alone far more would be."""
     rng = np.random.default_rng(3)
     found = [crossed_difference(*drawn(rng, 5, 50, **effects)).p < 0.05 for _ in range(400)]
@@ -91,7 +91,7 @@ def test_it_is_not_fooled_by_chance(effects):
         {"agent": 0.1, "apart": 0.5, "both": 1.0},
     ],
 )
-def test_the_error_is_that_of_the_difference(effects):
+def test_standard_error_is_the_deviation_of_the_difference(effects):
     """The scatter of the difference itself, over many studies; neither seeds nor scenarios count twice."""
     rng = np.random.default_rng(9)
     apart = effects.pop("apart", 0.0)
@@ -115,7 +115,7 @@ def test_weights_count_scenarios_several_times():
         assert getattr(weighed, name) == pytest.approx(getattr(twice, name)), name
 
 
-def test_it_finds_what_it_says_it_can():
+def test_detectable_difference_is_detected_with_its_power():
     rng = np.random.default_rng(4)
     effects = {"agent": 0.3, "both": 1.0}
     typical = np.mean([crossed_difference(*drawn(rng, 5, 200, **effects)).detectable() for _ in range(100)])
@@ -123,7 +123,7 @@ def test_it_finds_what_it_says_it_can():
     assert 0.72 < np.mean(found) < 0.93
 
 
-def test_as_many_as_are_said_to_be_needed_find_it():
+def test_needed_seeds_and_clusters_reach_the_power():
     """Seeds, or scenarios: drawn again in that number they find a difference of this size in about 80 %."""
     rng = np.random.default_rng(5)
     effects = {"agent": 0.02, "both": 1.0}
@@ -146,7 +146,7 @@ def test_as_many_as_are_said_to_be_needed_find_it():
         assert 0.68 < np.mean(found) < 0.92
 
 
-def test_how_many_would_be_needed():
+def test_needed_numbers_at_their_ends():
     rng = np.random.default_rng(5)
     no_noise = crossed_difference(*drawn(rng, 4, 400, agent=5.0, shift=0.01))
     assert no_noise.clusters_needed() is None  # no number of scenarios makes up for seeds
@@ -178,7 +178,7 @@ def test_log_ratio_covers():
     assert held / 200 > 0.9
 
 
-def test_of_the_same_agents_pairs_count():
+def test_differences_of_the_same_seeds_are_paired():
     """Agents vary far more than what is done to each of them."""
     rng = np.random.default_rng(11)
     before, _ = drawn(rng, 5, 50, agent=2.0)
@@ -201,7 +201,7 @@ def test_undefined_scenarios_are_left_out_and_too_little_is_refused():
         crossed_difference(a, b[:, :2])
 
 
-def test_intervals_of_agents():
+def test_seeds_interval():
     rng = np.random.default_rng(0)
     values, clusters = (rng.random((3, 60)) < 0.3).astype(np.float64), np.arange(60) // 2
     values[0, 5] = np.nan
@@ -224,7 +224,7 @@ def test_intervals_of_agents():
     assert seeds_interval(np.full((2, 3), np.nan)).mean is None
 
 
-def test_power_is_that_of_what_is_detectable():
+def test_power_of_the_detectable_difference():
     rng = np.random.default_rng(1)
     found = crossed_difference(rng.normal(size=(3, 80)) + rng.normal(size=(3, 1)), rng.normal(size=(3, 80)))
     assert found.power(found.detectable(0.8)) == pytest.approx(0.8)
@@ -242,7 +242,7 @@ def test_more_clusters_may_help_although_many_more_would_not():
     assert replace(one, difference=1.0).clusters_needed() is None
 
 
-def test_the_same_numbers_are_no_difference():
+def test_equal_values_have_no_difference():
     """Three times a number, by three, may be another float."""
     rng = np.random.default_rng(0)
     for _ in range(50):

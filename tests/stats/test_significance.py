@@ -110,7 +110,7 @@ def test_bootstrap_test_is_the_exact_distribution_of_a_small_sample():
     assert found.p == pytest.approx(np.mean(beyond), abs=0.005)
 
 
-def test_bootstrap_test_of_what_does_not_vary():
+def test_bootstrap_test_of_constant_differences():
     assert paired_bootstrap_test([1.0, 1.0], [1.0, 1.0], seed=0).p == 1.0
     assert paired_bootstrap_test([2.0, 2.0], [1.0, 1.0], seed=0).p < 0.001
     assert paired_bootstrap_test([2.0, 2.0], [1.0, 0.0], ["a", "a"], seed=0).p is None
@@ -155,7 +155,7 @@ def test_holm_by_hand():
         lambda: split_permutation([1.0, 2.0], np.array([True, False]), ["a", "a"], seed=0),
     ],
 )
-def test_the_impossible_is_refused_in_one_line(call):
+def test_impossible_arguments_are_refused_in_one_line(call):
     with pytest.raises(UsageError) as caught:
         call()
     assert "\n" not in str(caught.value) and caught.value.cure

@@ -1,4 +1,4 @@
-"""Scenes made by hand in which events find an occasion; shared by tests."""
+"""Hand-made scenarios in which events can be staged; shared by tests."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ import math
 import numpy as np
 
 from drivax.scenario.schema import AgentKind, RoadKind
-from drivax.synthetic.events import (
-    EventKind,
-)
+from drivax.synthetic.events import EventKind
 from drivax.synthetic.roads.curves import Pose, straight, turn
-from drivax.synthetic.roads.draft import Draft
-from drivax.synthetic.roads.network import Control, Line, RoadNetwork
+from drivax.synthetic.roads.network import Control, Draft, Line, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import Sway, lane_path
@@ -24,16 +21,15 @@ CURRENT = FIRST + 10
 
 
 def drivers(count):
-    """Equal drivers."""
+    """Identical drivers."""
     values = {f.name: np.full(count, 1.5) for f in dataclasses.fields(Drivers)}
     values["size_m"] = np.tile([4.8, 2.0, 1.6], (count, 1))
-    if "kind" in values:
-        values["kind"] = np.full(count, AgentKind.VEHICLE, np.int8)
+    values["kind"] = np.full(count, AgentKind.VEHICLE, np.int8)
     return Drivers(**values)
 
 
 def scene(network, routes, at, speed, parked=()):
-    """All users drive along a sequence of lanes at constant speed; the first is ego."""
+    """Roles and motion of vehicles that follow their routes at constant speed; the first is ego."""
     paths = [lane_path(network, route, Sway()) for route in routes]
     times = np.arange(STEPS) * 0.1
     distance = np.array(at, float)[:, None] + np.array(speed, float)[:, None] * times
@@ -63,7 +59,7 @@ def scene(network, routes, at, speed, parked=()):
 
 
 def road(lanes=2, ends=False, limit=14.0):
-    """One direction along +x, 600 m, lane 0 at y = 0, others to its left; lane 1 may end at 250 m."""
+    """One-way road along +x, 600 m long: lane 0 at y = 0, others to its left; lane 1 may end at 250 m."""
     draft = Draft()
     for k in range(lanes):
         length = 250.0 if ends and k == 1 else 600.0
@@ -79,11 +75,11 @@ def road(lanes=2, ends=False, limit=14.0):
 
 
 def junction(turning):
-    """Ego goes east through a junction at 160 to 190 m; a vehicle crosses from the south or turns left."""
+    """Junction at 160 to 190 m on ego's way east; the conflicting lane comes from the south or turns left."""
     draft = Draft()
     control = Control.NONE if turning else Control.SIGNAL
     arm = draft.lane(straight(Pose(0.0, 0.0, 0.0), 160.0), 3.5, 14.0)
-    way = draft.lane(straight(Pose(160.0, 0.0, 0.0), 30.0), 3.5, 14.0, connector=True, control=control)
+    through = draft.lane(straight(Pose(160.0, 0.0, 0.0), 30.0), 3.5, 14.0, connector=True, control=control)
     out = draft.lane(straight(Pose(190.0, 0.0, 0.0), 300.0), 3.5, 14.0)
     if turning:
         begin = Pose(190.0, 3.5, math.pi)
@@ -95,24 +91,24 @@ def junction(turning):
         bend = straight(begin, 30.0)
     cross = draft.lane(bend, 3.5, 14.0, connector=True, control=Control.YIELD if turning else control)
     far = draft.lane(straight(bend.end, 150.0), 3.5, 14.0)
-    for a, b in ((arm, way), (way, out), (other, cross), (cross, far)):
+    for a, b in ((arm, through), (through, out), (other, cross), (cross, far)):
         draft.link(a, b)
     lanes = list(draft.lanes)
     if turning:
-        lanes[cross] = dataclasses.replace(lanes[cross], yields_to=(way,))
-    groups = (LightGroup((way,), False), LightGroup((cross,), False))
+        lanes[cross] = dataclasses.replace(lanes[cross], yields_to=(through,))
+    groups = (LightGroup((through,), False), LightGroup((cross,), False))
     signals = None if turning else SignalPlan(groups, ((0,), (1,)), (60.0, 10.0), offset_s=-20.0)
-    return RoadNetwork("test", tuple(lanes), (), signals=signals), (arm, way, out)
+    return RoadNetwork("test", tuple(lanes), (), signals=signals), (arm, through, out)
 
 
 def parked_row():
-    """Cars next to the road every 9 m, 2.6 m to the right of ego's way."""
+    """Parked cars every 9 m, 2.7 m to the right of ego's path."""
     poses = [Pose(60.0 + 9.0 * k, -2.7, 0.0) for k in range(30)]
     return [Scripted.standing(AgentKind.VEHICLE, (4.4, 1.8, 1.5), pose, STEPS) for pose in poses]
 
 
-def occasion(kind, rng):
-    """A scenario with an occasion for a kind of event."""
+def suitable(kind, rng):
+    """Roles and motion of a scenario in which a kind of event can be staged."""
     v = float(rng.uniform(9.0, 13.0))
     if kind in (EventKind.LEAD_BRAKES, EventKind.TAILGATER):
         gap = 4.8 + float(rng.uniform(1.0, 1.6)) * v

@@ -17,8 +17,7 @@ from drivax.synthetic.events.destinations import (
     route_past,
 )
 from drivax.synthetic.roads.curves import Pose, straight
-from drivax.synthetic.roads.draft import Draft
-from drivax.synthetic.roads.network import Control, RoadNetwork, Start
+from drivax.synthetic.roads.network import Control, Draft, RoadNetwork, Start
 from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
 from drivax.synthetic.traffic.population import Placement
 

@@ -9,24 +9,17 @@ import pytest
 from drivax.geometry.boxes import overlap
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.idm import IdmParameters, idm_acceleration
-from drivax.synthetic.events import (
-    SCRIPTS,
-    SEVERITY_MPS2,
-    EgoView,
-    EventKind,
-    draw_severity,
-    stage,
-)
+from drivax.synthetic.events import SCRIPTS, SEVERITY_MPS2, EgoView, EventKind, draw_severity, stage
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.population import Density, draw_drivers
 from drivax.synthetic.traffic.roles import Override, Roles, Scripted, Staging, Tailgate
 from drivax.synthetic.traffic.simulation import Traffic
 
-from .event_scenes import FIRST, STEPS, junction, occasion, road, scene
+from .event_scenes import FIRST, STEPS, junction, road, scene, suitable
 
 
 def predicted(motion, staged):
-    """Motion of the actor: as scripted, or braking along its path from the given step on."""
+    """Motion of the actor: as scripted, or braking along its path from the override's first step on."""
     if staged.staging.extras:
         return staged.staging.extras[0]
     (override,) = staged.staging.overrides
@@ -41,9 +34,9 @@ def predicted(motion, staged):
 
 
 def march(motion, actor, begin, deceleration, start, speed):
-    """Marches ego (on a straight way along +x) in steps of 10 ms; whether its box and the actor's ever overlap.
+    """Move ego along +x in steps of 10 ms and return whether its box ever overlaps the actor's.
 
-    Returns also the least time, on a grid of 50 ms, after which both would overlap at constant velocities.
+    Also return the least time, on a grid of 50 ms, after which both would overlap at constant velocities.
     """
     fine = np.arange(0.0, (FIRST + 90 - begin) * 0.1, 0.01)
     index = begin + fine / 0.1
@@ -66,20 +59,20 @@ def march(motion, actor, begin, deceleration, start, speed):
     ego_speed = np.maximum(speed - deceleration * fine, 0.0)
     for ahead in np.arange(0.0, 1.001, 0.05):
         ego = box(np.column_stack([x + ego_speed * ahead, np.full(n, y)]), np.zeros(n), [length, width])
-        met = bool(np.any(overlap(ego, box(xy + velocity * ahead, heading, actor.size_m[:2])) & valid))
-        hit = met if ahead == 0.0 else hit
-        ttc = min(ttc, float(ahead)) if met else ttc
+        touches = bool(np.any(overlap(ego, box(xy + velocity * ahead, heading, actor.size_m[:2])) & valid))
+        hit = touches if ahead == 0.0 else hit
+        ttc = min(ttc, float(ahead)) if touches else ttc
     return hit, ttc
 
 
-def followed(actor, start, speed, until):
-    """Where ego is, and its speed, when it has kept its distance from a car ahead since that is there."""
-    law, wanted = IdmParameters(2.0, 1.5, 1.5, 1.5), speed
+def follow(actor, start, speed, until):
+    """Position and speed of an ego that has followed the actor since it appeared."""
+    law, target = IdmParameters(2.0, 1.5, 1.5, 1.5), speed
     begin = int(np.argmax(actor.valid))
     x, v = start - speed * 0.1 * (until - begin), speed
     for t in range(begin, until):
         gap = actor.xy[t, 0] - actor.size_m[0] / 2 - x - 2.4
-        a = idm_acceleration(np.array(v), np.array(wanted), np.array(gap), np.array(actor.speed[t]), law)
+        a = idm_acceleration(np.array(v), np.array(target), np.array(gap), np.array(actor.speed[t]), law)
         after = v + max(float(a), -6.0) * 0.1
         x, v = x + (v + after) * 0.05, after
     return x, v
@@ -90,7 +83,7 @@ def test_required_braking_avoids_the_actor_and_constant_speed_does_not(kind):
     staged_count, close, severities = 0, 0, []
     for seed in range(14):
         rng = np.random.default_rng([int(kind), seed])
-        roles, motion = occasion(kind, rng)
+        roles, motion = suitable(kind, rng)
         staged = stage(kind, EgoView(roles, motion, FIRST), draw_severity(rng), rng)
         if staged is None:
             continue
@@ -103,10 +96,10 @@ def test_required_braking_avoids_the_actor_and_constant_speed_does_not(kind):
         begin, v = staged.first_step, float(motion.speed[0, 0])
         start = float(motion.xy[0, begin, 0])
         if kind == EventKind.STALLED_VEHICLE:
-            start, v = followed(actor, start, v, begin)
+            start, v = follow(actor, start, v, begin)
         hit, ttc = march(motion, actor, begin, 0.0, start, v)
         close += hit or ttc < 1.0
-        # It begins to brake 0.4 s later. Steps of 0.1 s leave some doubt about when an actor has passed.
+        # Ego brakes from 0.4 s later on. The margins allow for steps of 0.1 s in when an actor has passed.
         brakes, at = begin + 4, start + 0.4 * v
         assert not march(motion, actor, brakes, 1.1 * staged.severity_mps2 + 0.3, at, v)[0]
         assert march(motion, actor, brakes, 0.85 * staged.severity_mps2 - 0.1, at, v)[0]
@@ -116,10 +109,10 @@ def test_required_braking_avoids_the_actor_and_constant_speed_does_not(kind):
 
 
 @pytest.mark.parametrize("kind", sorted(SCRIPTS))
-def test_actors_are_plausible(kind):
+def test_actors_move_plausibly_and_appear_out_of_view(kind):
     for seed in range(8):
         rng = np.random.default_rng([int(kind), seed])
-        roles, motion = occasion(kind, rng)
+        roles, motion = suitable(kind, rng)
         staged = stage(kind, EgoView(roles, motion, FIRST), draw_severity(rng), rng)
         if staged is None:
             continue
@@ -127,22 +120,22 @@ def test_actors_are_plausible(kind):
             assert -8.0 <= override.acceleration_mps2 < -3.6
             assert (override.first_step, override.last_step) == (staged.first_step, staged.last_step)
         for extra in staged.staging.extras:
-            there = np.flatnonzero(extra.valid)
-            assert np.all(np.diff(there) == 1) and extra.xy.shape == (STEPS, 2)
-            xy = extra.xy[there]
+            present = np.flatnonzero(extra.valid)
+            assert np.all(np.diff(present) == 1) and extra.xy.shape == (STEPS, 2)
+            xy = extra.xy[present]
             speed = np.hypot(*np.diff(xy, axis=0).T) / 0.1
             acceleration = np.diff(xy, n=2, axis=0) / 0.01
             assert np.hypot(*acceleration.T).max() <= 8.5
-            assert np.abs(extra.speed[there][:-1]) == pytest.approx(
+            assert np.abs(extra.speed[present][:-1]) == pytest.approx(
                 speed, abs=0.5 * np.hypot(*acceleration.T).max() * 0.1 + 0.3
             )
             if extra.kind == AgentKind.PEDESTRIAN:
                 assert speed.max() <= 3.05
             if extra.kind == AgentKind.CYCLIST:
                 assert speed.min() >= 3.0 and speed.max() <= 7.5
-            if there[0] > FIRST:
-                assert np.hypot(*(extra.xy[there[0]] - motion.xy[0, there[0]])) >= 40.0
-            assert there[0] <= staged.first_step
+            if present[0] > FIRST:
+                assert np.hypot(*(extra.xy[present[0]] - motion.xy[0, present[0]])) >= 40.0
+            assert present[0] <= staged.first_step
         rows = len(motion.kind)
         assert all(0 < actor < rows + len(staged.staging.extras) for actor in staged.actors)
         if kind == EventKind.TAILGATER:
@@ -158,7 +151,7 @@ def test_actors_are_plausible(kind):
     ],
 )  # fmt: skip
 def test_unsuitable_scenarios_have_no_event(kind):
-    # One lane, nobody else, no junction, no parked cars.
+    # One lane, no other agents, no junction, no parked cars.
     roles, motion = scene(road(lanes=1), [(0,)], [60.0], [11.0])
     assert stage(kind, EgoView(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
 
@@ -172,7 +165,7 @@ def test_standing_ego_has_no_event(kind):
 def test_red_light_runner_enters_at_red():
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        roles, motion = occasion(EventKind.RED_LIGHT_RUNNER, rng)
+        roles, motion = suitable(EventKind.RED_LIGHT_RUNNER, rng)
         staged = stage(EventKind.RED_LIGHT_RUNNER, EgoView(roles, motion, FIRST), 2.5, rng)
         if staged is not None:
             (extra,) = staged.staging.extras
@@ -195,8 +188,8 @@ def test_queue_before_the_red_light_runner_is_removed():
     assert staged is not None and staged.staging.removed == (1, 2)
     table = draw_drivers(3, Density(), np.random.default_rng(0))
     roles = dataclasses.replace(roles, drivers=table)
-    went = Traffic(roles, np.arange(30) * 0.1 - 6.0).run(Staging(removed=(1, 2)))
-    assert went.valid[0].all() and not went.valid[1:].any()
+    simulated = Traffic(roles, np.arange(30) * 0.1 - 6.0).run(Staging(removed=(1, 2)))
+    assert simulated.valid[0].all() and not simulated.valid[1:].any()
 
 
 def test_event_kinds_keep_their_stored_numbers():

@@ -30,13 +30,13 @@ def built(family, seed):
 
 @cache
 def ground(family, seed):
-    """What can be driven on: inside the outer boundary, outside of the islands."""
+    """Drivable area: inside the outer boundary, outside of the islands."""
     outer, *islands = built(family, seed).edges
     return shapely.Polygon(outer.xy, [island.xy for island in islands])
 
 
 def drivable(point, network) -> bool:
-    """Inside the outer boundary (once around, counter-clockwise) and outside of all islands."""
+    """Whether a point is inside the outer boundary (winding number 1) and outside of all islands."""
     return sum(winding_number(point, edge.xy) for edge in network.edges) == 1
 
 
@@ -127,7 +127,7 @@ def test_starts_have_road_ahead(family, seed):
             # A change to the neighbour of a lane that ends adds no distance.
             room += network.lanes[ahead[0]].length_m if at.successors else 0.0
             at = network.lanes[ahead[0]]
-        # Nine seconds at the limit, and the 50 m of route beyond the goal.
+        # Nine seconds at the limit, and the 50 m of route beyond the destination.
         assert room > 9.0 * lane.limit_mps + 50.0
         if not lane.predecessors:
             assert start.low_m > 100.0
@@ -207,7 +207,7 @@ def test_bays_are_inside_the_road_next_to_their_lane(family, seed):
         to = np.array([bay.pose.x, bay.pose.y]) - xy
         assert abs(to @ [math.cos(heading), math.sin(heading)]) < 0.1
         assert math.cos(heading - bay.pose.heading) > 0.999
-    # No two bays share ground: each box meets only itself.
+    # Bays do not overlap: each box intersects only itself.
     assert all(sum(shapely.intersects(box, boxes)) == 1 for box in boxes)
 
 
@@ -238,7 +238,7 @@ def test_random_routes_end_at_lane_ends_and_repeat_no_lane(family, seed):
             assert len(set(lanes)) == len(lanes)
             assert not network.lanes[lanes[-1]].successors
             used |= set(pairwise(lanes))
-    # Where lanes fork every way is taken sometimes.
+    # At forks nearly every branch is taken sometimes.
     forks = {
         (i, k) for i, lane in enumerate(network.lanes) if len(lane.successors) > 1 for k in lane.successors
     }
@@ -259,18 +259,18 @@ def test_families_draw_varied_roads():
 
 
 def test_lane_drops_lose_lanes_on_both_sides_and_gain_lanes():
-    found = set()
+    changes = set()
     for seed in range(30):
         network = built(NAMED["lane_drop"], seed)
         ending = [lane for lane in network.lanes if lane.ends]
         forks = [lane for lane in network.lanes if len(lane.successors) == 2]
-        found.add("gain" if forks else "left" if ending[0].left < 0 else "right")
+        changes.add("gain" if forks else "left" if ending[0].left < 0 else "right")
         assert len(ending) + len(forks) == 1
-    assert found == {"gain", "left", "right"}
+    assert changes == {"gain", "left", "right"}
 
 
-def test_highways_have_ramps():
-    found = set()
+def test_highways_have_an_on_ramp_an_off_ramp_or_both():
+    layouts = set()
     for seed in range(20):
         network = built(NAMED["highway"], seed)
         assert all(lane.kind == RoadKind.LANE_FREEWAY for lane in network.lanes)
@@ -284,29 +284,29 @@ def test_highways_have_ramps():
         assert sorted(leave + enter) == ramps
         assert all(network.lanes[k].exit_only for i in leave for k in network.lanes[i].predecessors)
         assert {s.lane for s in network.starts} & set(ramps) == set(enter)
-        found.add((ends, len(enter), len(leave)))
+        layouts.add((ends, len(enter), len(leave)))
     # A lane that ends behind an on-ramp, an off-ramp, or a lane from one to the other.
-    assert found == {(True, 1, 0), (False, 0, 1), (False, 1, 1)}
+    assert layouts == {(True, 1, 0), (False, 0, 1), (False, 1, 1)}
 
 
 def test_roundabout_entries_yield_to_circulating_traffic():
-    lanes_per_arm = set()
+    layouts = set()
     for seed in range(12):
         network = built(NAMED["roundabout"], seed)
         outer = [lane for lane in network.lanes if not lane.predecessors]
         arms = sum(lane.left < 0 for lane in outer)
-        lanes_per_arm.add((arms, len(outer) // arms))
+        layouts.add((arms, len(outer) // arms))
         entries = [i for lane in outer for i in lane.successors]
         assert all(network.lanes[i].control == Control.YIELD and network.lanes[i].yields_to for i in entries)
-        # Whoever could meet: exactly one of both yields.
+        # Of two connectors in conflict exactly one yields.
         for a, b in zip(*np.nonzero(np.triu(network.conflicts)), strict=True):
             assert (b in network.lanes[a].yields_to) != (a in network.lanes[b].yields_to)
-        # It goes round counter-clockwise.
+        # Traffic circulates counter-clockwise.
         for lane in network.lanes:
             if len(lane.successors) == 2:
                 x, y = lane.curve.xy[0]
                 assert x * math.sin(lane.curve.heading[0]) - y * math.cos(lane.curve.heading[0]) > 0
-    assert {arms for arms, _ in lanes_per_arm} == {3, 4} and {count for _, count in lanes_per_arm} == {1, 2}
+    assert {arms for arms, _ in layouts} == {3, 4} and {count for _, count in layouts} == {1, 2}
 
 
 def test_streets_have_the_features_of_their_family():

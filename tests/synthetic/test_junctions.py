@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import Capacity, RoadKind
-from drivax.synthetic.roads.families.corridor import Corridor
 from drivax.synthetic.roads.families.junction_layout import CrossSection, Geometry
 from drivax.synthetic.roads.families.junctions import (
     AllWayStop,
+    Corridor,
     SignalisedJunction,
     TJunction,
     UnprotectedLeft,
@@ -52,8 +52,8 @@ def closest(a, b) -> float:
     return float(np.sqrt(np.min(np.sum((a[:, None] - b[None]) ** 2, axis=-1))))
 
 
-def go(network):
-    """Which lane has green or yellow at which time, over a few cycles; none without lights."""
+def open_lights(network):
+    """Whether each lane has green or yellow at each time of a few cycles; False without lights."""
     if network.signals is None:
         return np.zeros((1, len(network.lanes)), bool)
     times = np.arange(0.0, 3 * network.signals.cycle_s, 0.25)
@@ -65,7 +65,7 @@ def go(network):
 def test_each_conflict_has_exactly_one_right_of_way(family, style, seed):
     network = built(family, style, seed)
     lanes = network.lanes
-    moving = go(network)
+    moving = open_lights(network)
     conflicts = 0
     for a, b in itertools.combinations(connectors(network), 2):
         if lanes[a].predecessors == lanes[b].predecessors:
@@ -93,27 +93,29 @@ def test_approaches_connect_to_all_other_arms(family, style, seed):
         if lane.connector:
             assert len(lane.predecessors) == 1 and len(lane.successors) == 1
         else:
-            # Who arrives finds a way on, unless the map ends there.
+            # An arriving vehicle can drive on, unless the map ends there.
             assert lane.successors or lane.predecessors
             assert all(lanes[i].connector for i in (*lane.successors, *lane.predecessors))
 
     def road(lane):
-        """All neighbours of a lane."""
-        row = {lane}
+        """A lane and all its neighbours."""
+        parallel = {lane}
         for side in ("left", "right"):
             at = getattr(lanes[lane], side)
             while at >= 0:
-                row.add(at)
+                parallel.add(at)
                 at = getattr(lanes[at], side)
-        return frozenset(row)
+        return frozenset(parallel)
 
     roads = {road(i) for i, lane in enumerate(lanes) if not lane.connector and lane.successors}
-    for one in roads:
-        ways = [i for lane in one for i in lanes[lane].successors]
-        # Three ways at a crossing, two at a T-junction: each ends on a road of its own, and turns as it should.
-        arms = {road(lanes[i].successors[0]) for i in ways}
+    for approach in roads:
+        leaving = [i for lane in approach for i in lanes[lane].successors]
+        # Three turns at a crossing, two at a T-junction: each leads to a road of its own.
+        arms = {road(lanes[i].successors[0]) for i in leaving}
         assert len(arms) in (2, 3)
-        turns = {0 if abs(turned(lanes[i])) < math.pi / 4 else int(np.sign(turned(lanes[i]))) for i in ways}
+        turns = {
+            0 if abs(turned(lanes[i])) < math.pi / 4 else int(np.sign(turned(lanes[i]))) for i in leaving
+        }
         assert len(turns) == len(arms)
 
 
@@ -129,15 +131,15 @@ def test_crossings_span_the_road_and_list_crossed_lanes(family, style, seed):
         listed = dict(crossing.lanes)
         assert len(listed) == len(crossing.lanes)
         for index, lane in enumerate(network.lanes):
-            met = _crossed_at(crossing.axis, lane.curve)
+            along_m = _intersection(crossing.axis, lane.curve)
             if index in listed:
-                assert met == pytest.approx(listed[index], abs=0.05)
+                assert along_m == pytest.approx(listed[index], abs=0.05)
             else:
-                assert met is None
+                assert along_m is None
 
 
-def _crossed_at(axis, curve):
-    """Where along a curve it crosses the axis: the sign of the side on which its points lie changes there."""
+def _intersection(axis, curve):
+    """Distance along a curve at which it crosses the axis, where the side of its points changes; None: nowhere."""
     along = axis[1] - axis[0]
     along, length = along / np.hypot(*along), np.hypot(*along)
     offset = curve.xy - axis[0]
@@ -193,7 +195,7 @@ def test_left_turns_at_lights_are_protected_permissive_or_split(style):
     kinds = set()
     for seed in range(20):
         network = built(JUNCTIONS[0], style, seed)
-        lanes, moving = network.lanes, go(network)
+        lanes, moving = network.lanes, open_lights(network)
         for i in connectors(network):
             if turned(lanes[i]) < math.pi / 4:
                 assert not lanes[i].yields_to
@@ -207,7 +209,7 @@ def test_left_turns_at_lights_are_protected_permissive_or_split(style):
             together = [j for j in oncoming if (moving[:, i] & moving[:, j]).any()]
             arrow = next(g.arrow for g in network.signals.groups if i in g.lanes)
             kinds.add((arrow, bool(together)))
-            # Who goes with oncoming traffic gives way to it; an arrow promises that nobody comes.
+            # A permissive left turn gives way to oncoming traffic; an arrow means that there is none.
             assert set(lanes[i].yields_to) >= {
                 j for j in together if closest(lanes[i].curve.xy[::2], lanes[j].curve.xy[::2]) < CLEARANCE_M
             }
@@ -243,7 +245,7 @@ def test_t_junction_stem_and_left_turns_yield(seed):
 
 
 def _neighbours(lanes, lane):
-    """The connectors that begin at the neighbours of this lane."""
+    """Connectors that begin at the neighbours of a lane."""
     return [i for side in (lanes[lane].left, lanes[lane].right) if side >= 0 for i in lanes[side].successors]
 
 
@@ -252,12 +254,12 @@ def test_unprotected_left_starts_mostly_in_left_turn_lanes(style):
     for seed in range(8):
         network = built(JUNCTIONS[3], style, seed)
         lanes = network.lanes
-        giving = [
+        yields = [
             all(turned(lanes[i]) > 1.0 and lanes[i].yields_to for i in lanes[start.lane].successors)
             for start in network.starts
         ]
-        assert np.mean(giving) >= 0.6
-        # Traffic is dense on the lanes to whose users it gives way.
+        assert np.mean(yields) >= 0.6
+        # Traffic is dense on the lanes to which it gives way.
         first = {
             j for start in network.starts for i in lanes[start.lane].successors for j in lanes[i].yields_to
         }
@@ -300,7 +302,7 @@ def test_corridors_pass_two_junctions(style):
     assert {crossings for _, crossings in kinds} >= {7, 8}
 
 
-def test_mouths_by_hand():
+def test_mouths_follow_from_corner_radius_and_angle():
     geometry = Geometry(skew=0.0, offset_m=0.0, corner_m=(8.0, 8.0))
     rng = np.random.default_rng(0)
     wide, narrow = CrossSection(2, 1, 3.5, 1.0, 13.4), CrossSection(1, 1, 3.0, 0.5, 13.4)
@@ -335,8 +337,8 @@ def test_coordinated_lights_turn_green_when_the_platoon_arrives():
         shared = next(
             lane for lane in network.lanes if not lane.connector and lane.predecessors and lane.successors
         )
-        ways = [network.lanes[i] for i in (*shared.predecessors, *shared.successors)]
-        far = shared.length_m + max(way.length_m for way in ways)
+        connectors_m = [network.lanes[i].length_m for i in (*shared.predecessors, *shared.successors)]
+        far = shared.length_m + max(connectors_m)
         travel = plan.lags_s[1] * 0.85 * shared.limit_mps
         if cycles[0] == pytest.approx(cycles[1]):
             assert shared.length_m < travel < far + 15.0

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from drivax.synthetic.roads.curves import Pose, straight
-from drivax.synthetic.roads.draft import Draft
-from drivax.synthetic.roads.network import Bay, RoadNetwork
+from drivax.synthetic.roads.network import Bay, Draft, RoadNetwork
 from drivax.synthetic.traffic.population import parked_cars
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.synthetic.roads.curves import Pose, straight
-from drivax.synthetic.roads.draft import Draft
-from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
+from drivax.synthetic.roads.network import Control, Crossing, Draft, RoadNetwork
 from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
 from drivax.synthetic.traffic.obstacles import Boxes
 from drivax.synthetic.traffic.pedestrians import Walkers, place_walkers

@@ -24,7 +24,7 @@ PLAN = SignalPlan(
 )
 
 
-def test_signal_cycle_by_hand():
+def test_colours_follow_the_phases_of_the_cycle():
     assert PLAN.cycle_s == 22.0
     assert PLAN.starts_s == (0.0, 9.5)
     times = np.array([1.9, 2.0, 6.9, 7.0, 9.9, 10.0, 11.4, 11.5, 19.4, 19.5, 22.4, 22.5, 23.9, 24.0])
@@ -49,7 +49,7 @@ def test_light_states_of_arrows_and_round_lights():
     assert light_states(colours, False).tolist() == [-1, LightState.GO, LightState.CAUTION, LightState.STOP]
 
 
-def test_phase_of_a_lane():
+def test_phase_of_a_lane_serves_it_or_raises():
     assert [PLAN.phase_of(lane) for lane in range(3)] == [0, 1, 1]
     with pytest.raises(KeyError):
         PLAN.phase_of(3)
@@ -73,8 +73,8 @@ def test_combined_plans_keep_their_own_cycles():
     assert np.array_equal(colour[:, :4], alone[:, :4])
     # The second one's cycle is 4 + 6 + 2 x 4.5 = 19 s, its green begins at 2 + 1 s.
     for k, shown in ((3.05, Colour.GREEN), (6.85, Colour.GREEN), (7.05, Colour.YELLOW), (10.05, Colour.RED)):
-        row = int(np.searchsorted(times, k))
-        assert colour[row, 4] == colour[row + 190, 4] == colour[row + 380, 5] == shown
+        at = int(np.searchsorted(times, k))
+        assert colour[at, 4] == colour[at + 190, 4] == colour[at + 380, 5] == shown
     assert left[72, 4] == pytest.approx(2.8, abs=1e-4)
 
 
@@ -89,7 +89,7 @@ def test_all_lights_are_red_between_phases():
     plan = network.signals
     times = np.arange(0.0, plan.cycle_s, 0.05)
     colour, _ = plan.colours(times, len(network.lanes))
-    ways = [i for i, lane in enumerate(network.lanes) if lane.connector]
-    all_red = np.all(colour[:, ways] == Colour.RED, axis=1)
+    connectors = [i for i, lane in enumerate(network.lanes) if lane.connector]
+    all_red = np.all(colour[:, connectors] == Colour.RED, axis=1)
     assert 1.0 <= plan.all_red_s <= 2.0
     assert all_red.sum() * 0.05 == pytest.approx(plan.all_red_s * len(plan.phases), abs=0.4)

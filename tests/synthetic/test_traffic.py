@@ -7,9 +7,8 @@ import pytest
 
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.roads.curves import Pose, straight
-from drivax.synthetic.roads.draft import Draft
 from drivax.synthetic.roads.families import FAMILIES, CurvedRoad
-from drivax.synthetic.roads.network import Crossing, RoadNetwork
+from drivax.synthetic.roads.network import Crossing, Draft, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Sway, lane_path, random_lanes

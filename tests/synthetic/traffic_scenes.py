@@ -9,8 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from drivax.synthetic.roads.curves import Pose, straight
-from drivax.synthetic.roads.draft import Draft
-from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.roads.network import Draft, RoadNetwork
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.population import Density, draw_drivers
 from drivax.synthetic.traffic.roles import Roles

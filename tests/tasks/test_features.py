@@ -186,7 +186,7 @@ def test_examples(seen):
     np.testing.assert_allclose(own["stop_line"][:2], [[37.6 / 50, 1, 1], [1, 0, 0]], atol=0.02)
 
 
-def test_car_following_sees_what_the_idm_reacts_to(seen):
+def test_car_following_has_the_inputs_of_idm(seen):
     """The car that stands across the route leads, 16.6 m ahead, at no speed along it; nothing leads on the arc."""
     wanted_gap = 2 + 1.5 * 9 + 9 * 9 / (2 * np.sqrt(1.5 * 3))
     braking = 1.5 * (1 - (9 / 13.4) ** 4 - (wanted_gap / 16.6) ** 2)

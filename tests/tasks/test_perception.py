@@ -1,4 +1,4 @@
-"""Perception: lines of sight against shapely, and noise, range and drop-out as a tracker would have them."""
+"""Perception: lines of sight against shapely; noise, range and drop-out as of a tracker."""
 
 from dataclasses import replace
 
@@ -27,14 +27,14 @@ def shown(x, y, heading, length, width):
 
 
 def some_boxes(rng):
-    """A crowd about the origin: vehicles, and some as slim as people."""
+    """Boxes around the origin: vehicles and pedestrians."""
     size = rng.choice([(4.8, 2.0), (12.0, 2.6), (0.6, 0.6)], BOXES)
     place, heading = rng.uniform(-25, 25, (BOXES, 2)), rng.uniform(-np.pi, np.pi, BOXES)
     return np.stack([shown(*p, h, *s) for p, h, s in zip(place, heading, size, strict=True)])
 
 
 def in_view_by_shapely(eye, boxes, blocks, more):
-    """The rule told by another library; boxes that block are larger by ``more`` on each side."""
+    """Visibility by shapely, with blocking boxes enlarged by ``more`` on each side."""
     from shapely import affinity, geometry
 
     def polygon(row, more):
@@ -71,17 +71,17 @@ def test_visibility_agrees_with_shapely():
 
 
 def test_lines_of_sight_by_hand():
-    eye, everyone = jnp.zeros(2), jnp.ones(3, bool)
+    eye, blocks = jnp.zeros(2), jnp.ones(3, bool)
     bus = shown(10, 0, 0, 10.0, 3.0)
     behind = jnp.stack([bus, shown(25, 0, 0, 4.0, 2.0), shown(25, 3.0, 0, 4.0, 2.0)])
     # The shadow of the bus's near side (x = 5, |y| < 1.5) ends at |y| = 0.3 x: beyond the corners of the second car
     # (y up to 4 at x = 27, where it reaches 8.1), so both are hidden; one as far off as y = 7 shows a corner.
-    assert in_view(eye, behind, everyone).tolist() == [True, False, False]
+    assert in_view(eye, behind, blocks).tolist() == [True, False, False]
     behind = behind.at[2, 1].set(7.0)
-    assert in_view(eye, behind, everyone).tolist() == [True, False, True]
-    assert in_view(eye, behind, everyone.at[0].set(False)).tolist() == [True, True, True]
-    # A bus in which the eye itself is hides nobody.
-    assert in_view(jnp.array([8.0, 0.0]), behind, everyone).tolist() == [True, True, True]
+    assert in_view(eye, behind, blocks).tolist() == [True, False, True]
+    assert in_view(eye, behind, blocks.at[0].set(False)).tolist() == [True, True, True]
+    # A bus around the eye hides no agent.
+    assert in_view(jnp.array([8.0, 0.0]), behind, blocks).tolist() == [True, True, True]
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +95,10 @@ def bank():
 
 FIRST = 15
 ALL = Perception(dropout_m=40.0, noise_m=0.1, range_m=50.0, occlusion=True)
-FAULTS = {
+ERRORS = {
     "none": Perception(),
     "occlusion": Perception(occlusion=True),
-    # A seed with which nobody changes places among the nearest, who are compared row by row.
+    # With this seed the order of the nearest agents stays; they are compared row by row.
     "noise": Perception(noise_m=0.1, seed=1),
     "all": ALL,
 }
@@ -106,9 +106,9 @@ FAULTS = {
 
 @pytest.fixture(scope="module")
 def seen(bank):
-    """What is seen at every step from 15 on with each kind of fault, by one program; and the scenes."""
+    """Observations at every step from 15 on with each kind of error, by one program; and the contexts."""
     simulators = {
-        name: Simulator(Task(observation=replace(SMALL, perception=one))) for name, one in FAULTS.items()
+        name: Simulator(Task(observation=replace(SMALL, perception=one))) for name, one in ERRORS.items()
     }
 
     def look(bank, step):
@@ -119,7 +119,7 @@ def seen(bank):
 
 
 def lengths(seen, step=0):
-    """Who is there at a step, by the lengths of their boxes, m."""
+    """Lengths of the observed boxes at a step, m."""
     rows, mask = seen["agents"][step, :, -1], seen["agents_mask"][step, :, -1]
     return sorted(np.round(rows[mask, 2].astype(np.float64) * 5, 1).tolist())
 
@@ -129,21 +129,21 @@ def test_agents_behind_a_bus_are_occluded(seen):
     # The car at 32 m is hidden by the bus ahead of ego; the one at 60 m, far to the left, is seen past it.
     assert lengths(seen["occlusion"]) == [0.6, 4.2, 4.4, 4.6, 12.0]
     for name in ("occlusion", "all"):
-        # Who is not seen now has no past, and leaves no gap among the nearest.
+        # An agent that is not seen now has no past, and leaves no gap among the nearest.
         mask = seen[name]["agents_mask"]
         assert not (mask.any(axis=2) & ~mask[..., -1]).any()
         assert (np.sort(mask[..., -1], axis=1)[:, ::-1] == mask[..., -1]).all()
-    # Of the agents in view, all but that at 61 m are in range of 50 m, and chance lets each be seen at some steps.
-    everyone = {length for step in range(76) for length in lengths(seen["all"], step)}
-    assert everyone == {0.6, 4.2, 4.4, 12.0}
+    # Of the agents in view, all but that at 61 m are within 50 m, and each is seen at some steps.
+    observed = {length for step in range(76) for length in lengths(seen["all"], step)}
+    assert observed == {0.6, 4.2, 4.4, 12.0}
 
 
 def errors(seen, group="agents"):
-    """Errors of places, m."""
+    """Position errors, m."""
     return (seen["noise"][group][..., :2] - seen["none"][group][..., :2]) * 50
 
 
-def test_noise_has_its_deviation_and_is_independent(seen):
+def test_noise_has_its_standard_deviation_and_is_independent(seen):
     truth, noisy = seen["none"], seen["noise"]
     error = errors(seen)[:, :6, -1]
     count = error.size
@@ -162,7 +162,7 @@ def test_noise_has_its_deviation_and_is_independent(seen):
 
 
 def test_past_steps_keep_their_perception(seen):
-    """Ego drives straight on at 4 m/s, so what it saw a step ago lies 0.4 m further behind now."""
+    """Ego drives straight on at 4 m/s: what it saw a step ago is 0.4 m further behind now."""
     for name in ("noise", "all"):
         rows, mask = seen[name]["agents"], seen[name]["agents_mask"]
         compared = 0
@@ -170,34 +170,34 @@ def test_past_steps_keep_their_perception(seen):
             for row in np.flatnonzero(mask[step, :, -1]):
                 same = np.abs(rows[step - 1, :, -1, 2] - rows[step, row, -1, 2]) < 1e-6
                 before = np.flatnonzero(same & mask[step - 1, :, -1])
-                # It was seen then if and only if it is remembered now.
+                # Its past step is shown if and only if it was seen then.
                 assert len(before) == mask[step, row, -2]
                 if len(before):
-                    wanted = rows[step - 1, before[0], -1, :2] - np.array([0.4 / 50, 0.0])
-                    np.testing.assert_allclose(rows[step, row, -2, :2], wanted, atol=1e-5)
+                    expected = rows[step - 1, before[0], -1, :2] - np.array([0.4 / 50, 0.0])
+                    np.testing.assert_allclose(rows[step, row, -2, :2], expected, atol=1e-5)
                     compared += 1
         assert compared > 60
 
 
 def test_range_and_dropout_by_distance(bank, seen):
-    """The share of steps at which something is seen is exp(-distance / 40 m); nothing is seen beyond the range."""
+    """Lights are seen at a share exp(-distance / 40 m) of the steps, and never beyond the range."""
     context = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), seen["context"])
     distance = jnp.array([1.0, 15.0, 40.0, 90.0])
 
-    def look(faults):
-        return jax.vmap(lambda step: lights_seen(faults, bank, replace(context, step=step), distance))(
+    def look(perception):
+        return jax.vmap(lambda step: lights_seen(perception, bank, replace(context, step=step), distance))(
             jnp.arange(4000)
         )
 
     one, other, near = (
-        np.asarray(look(Perception(**faults)))
-        for faults in ({"dropout_m": 40.0}, {"dropout_m": 40.0, "seed": 1}, {"range_m": 40.0})
+        np.asarray(look(Perception(**options)))
+        for options in ({"dropout_m": 40.0}, {"dropout_m": 40.0, "seed": 1}, {"range_m": 40.0})
     )
-    wanted = np.exp(-np.asarray(distance) / 40.0)
-    np.testing.assert_array_less(np.abs(one.mean(axis=0) - wanted), 4 * np.sqrt(wanted * (1 - wanted) / 4000))
+    share = np.exp(-np.asarray(distance) / 40.0)
+    np.testing.assert_array_less(np.abs(one.mean(axis=0) - share), 4 * np.sqrt(share * (1 - share) / 4000))
     assert abs(np.corrcoef(one[:, 2], other[:, 2])[0, 1]) < 4 / np.sqrt(4000)
     assert near.all(axis=0).tolist() == [True, True, True, False] and not near[:, 3].any()
-    # Agents go by the same rule, each for itself at every step.
+    # Agents follow the same rule, independently at every step.
     free = np.linalg.norm(seen["occlusion"]["agents"][:, :5, -1, :2] * 50, axis=-1)
     expected = np.where(free <= 50.0, np.exp(-free / 40.0), 0.0)
     found = seen["all"]["agents_mask"][..., -1].sum(axis=1)
@@ -206,7 +206,7 @@ def test_range_and_dropout_by_distance(bank, seen):
 
 
 def test_unseen_lights_are_hidden_from_custom_groups():
-    """A red light 40 m ahead, and nobody else; out of range neither example that reads lights knows of it."""
+    """A red light 40 m ahead on an empty road: both examples that read lights miss it out of range."""
     bank = bank_of(straight_road([car(0, 0, 0, 4)], light=RED))
     own = (OwnGroup(stop_line), OwnGroup(car_following))
     near, far = (
@@ -226,18 +226,18 @@ def test_unseen_lights_are_hidden_from_custom_groups():
 
 @pytest.mark.slow
 def test_replayed_perception_equals_live_perception(bank, seen):
-    """A stored context, observed alone and in another program, as it was seen in the batch."""
+    """A stored context, observed alone in another program, has the observation of the batch."""
     simulator = Simulator(Task(observation=replace(SMALL, perception=ALL)))
     context = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), seen["context"])
     for name, value in jax.jit(simulator.observe)(bank, context).items():
         np.testing.assert_allclose(value, seen["all"][name][25], atol=1e-6, err_msg=name)
 
 
-def test_disabled_features_cost_nothing(bank):
-    """The program of an observation without faults draws nothing, whatever the seed."""
+def test_perception_without_errors_draws_no_random_numbers(bank):
+    """The compiled program contains none, whatever the seed."""
 
-    def program(faults):
-        config = replace(SMALL, perception=faults)
+    def program(perception):
+        config = replace(SMALL, perception=perception)
         simulator = Simulator(Task(observation=config))
 
         def look(bank):
@@ -250,8 +250,8 @@ def test_disabled_features_cost_nothing(bank):
 
     plain = program(Perception())
     assert "random" not in plain and program(Perception(seed=9)) == plain
-    for faults in (Perception(noise_m=0.1), Perception(dropout_m=200.0)):
-        assert "random" in program(faults)
+    for perception in (Perception(noise_m=0.1), Perception(dropout_m=200.0)):
+        assert "random" in program(perception)
 
 
 def _alone(context):

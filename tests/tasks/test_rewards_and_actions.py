@@ -52,7 +52,7 @@ def test_behaviour_by_hand(measured):
     assert terms["speeding"] == pytest.approx(-0.1)
 
 
-def test_presets_include_those_before_them():
+def test_presets_include_the_previous_preset():
     names = ["safety", "navigation", "behaviour"]
     for less, more in pairwise(names):
         assert PRESETS[less].items() <= PRESETS[more].items()
@@ -93,7 +93,7 @@ def test_termination_and_truncation_are_separate(measured):
     ("x", "y", "heading", "lag"),
     [(-3.0, 0.0, 0.0, 3.0), (2.0, 0.5, 0.0, -2.0), (-3.0, 1.0, np.pi / 3, 0.634)],
 )
-def test_lag_is_how_far_the_log_is_ahead(x, y, heading, lag):
+def test_lag_is_the_distance_behind_the_log(x, y, heading, lag):
     """At a pose displaced from the logged one: x ahead of it, y to its left, turned by an angle.
 
     The log is then at (-x, -y), of which the part along the heading is -x cos - y sin: 3/2 - 0.866 in the last case.

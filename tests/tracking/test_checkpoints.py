@@ -61,7 +61,7 @@ def bits(state: State) -> list[Any]:
     return leaves
 
 
-def test_bit_for_bit(tmp_path: Path):
+def test_states_are_restored_bit_for_bit(tmp_path: Path):
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     state = make_state(1)
     path = checkpoints.save(100, state)
@@ -74,7 +74,7 @@ def test_bit_for_bit(tmp_path: Path):
     assert [item.name for item in (tmp_path / "checkpoints").iterdir()] == [path.name]
 
 
-def test_parts_by_their_paths(tmp_path: Path):
+def test_parts_are_restored_by_their_paths(tmp_path: Path):
     checkpoints = Checkpoints(tmp_path)
     state = {"critic": jnp.arange(3.0), "critics": jnp.zeros(2), "policy": {"w": jnp.ones(2)}}
     checkpoints.save(5, state)
@@ -89,7 +89,7 @@ def test_parts_by_their_paths(tmp_path: Path):
         checkpoints.restore_parts({"['policy']": {"v": jnp.zeros(2)}}, cure="begin elsewhere")
 
 
-def test_shapes_are_template_enough(tmp_path: Path):
+def test_shapes_suffice_as_template(tmp_path: Path):
     """As a fresh process does: nothing is computed to make the template."""
     checkpoints = Checkpoints(tmp_path)
 
@@ -161,14 +161,14 @@ def test_left_overs_of_a_killed_process_are_no_checkpoints(tmp_path: Path):
         ({"w": jax.random.split(jax.random.key(0), 3)}, r"not key<fry>\[3\]"),
     ],
 )
-def test_a_template_that_does_not_fit(tmp_path: Path, template: dict[str, Any], message: str):
+def test_template_that_does_not_fit_is_refused(tmp_path: Path, template: dict[str, Any], message: str):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(1, {"w": jnp.ones(3)})
     with pytest.raises(DataError, match=message):
         checkpoints.restore(template)
 
 
-def test_unknown_step(tmp_path: Path):
+def test_unknown_step_is_refused(tmp_path: Path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(1, {"a": 1})
     with pytest.raises(DataError, match="no checkpoint of step 7; there are: 1"):

@@ -91,7 +91,7 @@ def test_a_configuration_that_cannot_be_written_leaves_nothing(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_run(tmp_path: Path):
+def test_folders_without_a_run_are_refused(tmp_path: Path):
     with pytest.raises(DataError, match=r"not a run folder: no run\.json; give a folder"):
         RunFolder.open(tmp_path)
     run = RunFolder.create(tmp_path / "run", Config())
@@ -129,7 +129,7 @@ def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             made.unlink(missing_ok=True)
 
 
-def test_where_a_planner_was_trained(tmp_path):
+def test_training_sets_of_a_planner(tmp_path):
     data = [{"path": "sets/a", "hash": "abc", "scenarios": 3}]
     for name, kind in (("policy", "training"), ("judged", "evaluation")):
         RunFolder.create(tmp_path / name, Config(), kind=kind).note(data=data)

@@ -15,11 +15,11 @@ from drivax.tracking.sinks import MetricLog, read_rows
 def test_rows_are_on_disk_at_once(tmp_path: Path):
     log = MetricLog(tmp_path, tensorboard=False)
     log.write(0, {"loss": np.float32(0.5), "count": 3})
-    log.write(10, {"score": float("nan"), "big": float("inf")}, prefix="valid")
+    log.write(10, {"score": float("nan"), "big": float("inf")})
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert rows == [
         {"step": 0, "loss": 0.5, "count": 3.0},
-        {"step": 10, "valid/score": None, "valid/big": None},
+        {"step": 10, "score": None, "big": None},
     ]
     log.close()
     assert list(read_rows(tmp_path / "metrics.jsonl")) == rows
@@ -73,7 +73,7 @@ def test_tensorboard_events(tmp_path: Path):
     from tensorboardX.proto.event_pb2 import Event
 
     with MetricLog(tmp_path) as log:
-        log.write(7, {"loss": 0.25}, prefix="train")
+        log.write(7, {"train/loss": 0.25})
     (file,) = (tmp_path / "tensorboard").iterdir()
     data, found = file.read_bytes(), []
     while data:  # a TFRecord: length, its CRC, the payload, its CRC

@@ -35,13 +35,13 @@ def group_is_gone(leader, seconds):
     return False
 
 
-def test_a_pool_works():
+def test_pool_runs_tasks():
     with worker_pool(1) as pool:
         assert list(pool.map(abs, [-1, 2])) == [1, 2]
 
 
 @pytest.mark.parametrize("end", ["time.sleep(60)", "pool.submit(time.sleep, 60); time.sleep(60)"])
-def test_a_killed_parent_takes_its_workers_along(tmp_path, end):
+def test_workers_end_with_a_killed_parent(tmp_path, end):
     (tmp_path / "program.py").write_text(PROGRAM.format(end=end))
     command = [sys.executable, str(tmp_path / "program.py")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
@@ -58,5 +58,5 @@ def on_which_cores(number):
     return number, len(os.sched_getaffinity(0))
 
 
-def test_every_task_has_one_core():
+def test_each_task_has_one_core():
     assert sorted(one_core_each(on_which_cores, [3, 1, 2], cores=2)) == [(n, (n, 1)) for n in (1, 2, 3)]

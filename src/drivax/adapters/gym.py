@@ -1,8 +1,8 @@
 """Gymnasium environments over scenarios: numpy in, numpy out.
 
-For libraries that expect the Gymnasium interface, and for trying things out. ``VectorDrivingEnv`` steps a batch in one
-compiled call; an own loop under ``vmap`` and ``scan`` (``docs/start/own_loop.md``) is faster still: nothing leaves the
-device between steps. Importing this module registers ``drivax/<task>-v0`` for every name in :data:`TASKS`.
+For libraries that expect the Gymnasium interface. ``VectorDrivingEnv`` steps a batch in one compiled call; a loop of
+your own under ``vmap`` and ``scan`` (``docs/start/own_loop.md``) is faster: nothing leaves the device. Importing
+this module registers ``drivax/<task>-v0`` for every name in :data:`TASKS`.
 """
 
 from __future__ import annotations
@@ -21,14 +21,12 @@ from jaxtyping import Array, Bool, Float
 from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
 from drivax.learning.policies import find_traffic
 from drivax.metrics.episode import episode_metrics
-from drivax.metrics.scores import Value
 from drivax.report.pictures.still import draw_pixels
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.simulator import Simulator
-from drivax.simulator.sparse import map_where
+from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.types import AgentContext, SimState, Traffic
 from drivax.synthetic.world import generate_recording
@@ -50,7 +48,7 @@ LIMIT = 100.0
 
 @runtime_checkable
 class Scenarios(Protocol):
-    """Scenarios on the device and as they are stored; what ``drivax.load`` returns."""
+    """Scenarios on the device and as stored, such as those that ``drivax.load`` returns."""
 
     @property
     def bank(self) -> ScenarioBank:
@@ -109,7 +107,7 @@ def _step_all(
     simulator: Simulator, bank: ScenarioBank, states: SimState, actions: Float[Any, "B D"],
     begins: Bool[Any, " B"], rows: Any,
 ) -> tuple[SimState, dict[str, Array], tuple[Array, Array, Array]]:  # fmt: skip
-    """Step a batch; where an episode ``begins``, the scenario of ``rows`` starts instead with reward 0."""
+    """Step a batch; where an episode ``begins``, start the scenario of ``rows`` instead, with reward 0."""
     begins = jnp.asarray(begins)
     fresh = map_where(begins, partial(simulator.new_episode, bank), jnp.asarray(rows))
     step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0))
@@ -119,16 +117,8 @@ def _step_all(
     return states, seen, (reward, transition.terminated, transition.truncated)
 
 
-@jax.jit
-def _metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
-    """Return the episode metrics."""
-    return episode_metrics(bank, state)
-
-
-@jax.jit
-def _metrics_all(bank: ScenarioBank, states: SimState) -> dict[str, Value]:
-    """Batched."""
-    return jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
+_metrics = jax.jit(episode_metrics)
+_metrics_all = jax.jit(jax.vmap(episode_metrics, in_axes=(None, 0)))
 
 
 def _observe(simulator: Simulator, bank: ScenarioBank, state: SimState) -> dict[str, Array]:
@@ -152,7 +142,7 @@ Observation = dict[str, Any]
 
 
 class _Worlds:
-    """What both environments share: scenarios on the CPU, a simulator, the spaces of one agent."""
+    """Scenarios on the CPU, a simulator, and the spaces of one agent, for both environments."""
 
     def __init__(self, data: Scenarios | str | Path | int, task: Task | None, traffic: str | Traffic) -> None:
         bank, self.ids, self.scenarios = _open(data)
@@ -171,9 +161,8 @@ class _Worlds:
         except TypeError:
             row = -1
         if not 0 <= row < len(self.ids):
-            raise UsageError(
-                f"there is no scenario {scenario!r}", cure=f"use a row from 0 to {len(self.ids) - 1}"
-            )
+            cure = f"use a row from 0 to {len(self.ids) - 1}"
+            raise UsageError(f"there is no scenario {scenario!r}", cure=cure)
         return row
 
     def commands(self, actions: Any, lead: tuple[int, ...]) -> Float[Any, "*lead D"]:
@@ -181,11 +170,10 @@ class _Worlds:
         space = self.task.actions
         if isinstance(space, Discrete):
             chosen = np.asarray(actions)
-            good = chosen.dtype.kind in "iu" and chosen.shape == lead
-            if not good or ((chosen < 0) | (chosen >= space.choices)).any():
-                raise UsageError(
-                    f"{actions!r} is no action", cure=f"give choices from 0 to {space.choices - 1}"
-                )
+            valid = chosen.dtype.kind in "iu" and chosen.shape == lead
+            if not valid or ((chosen < 0) | (chosen >= space.choices)).any():
+                cure = f"give choices from 0 to {space.choices - 1}"
+                raise UsageError(f"{actions!r} is no action", cure=cure)
             accelerations, curvatures = (np.asarray(level) for level in space.levels())
             row, column = np.divmod(chosen, space.curvatures)
             return np.stack([accelerations[row], curvatures[column]], axis=-1).astype(np.float32)
@@ -198,16 +186,16 @@ class _Worlds:
 
 
 class DrivingEnv(gymnasium.Env[Observation, Any]):
-    """Drives ego from the current step of a scenario to the end of its log, one episode at a time.
+    """Drive ego from the current step of a scenario to the end of its log, one episode at a time.
 
     Observations are the task's groups: ``Box`` for features, ``MultiBinary`` for masks (1 where a row is valid).
     Actions are the task's, in [-1, 1], or ``Discrete`` choices. A failure that ends the episode is ``terminated``, the
-    end of log or map is ``truncated``. ``info`` holds ``scenario_id`` and, after the last step, ``metrics``: every
-    episode metric that is defined. Everything runs on the CPU, whatever else the machine has.
+    end of log or map is ``truncated``. ``info`` holds ``scenario_id`` and, after the last step, ``metrics``: all
+    defined episode metrics. Everything runs on the CPU.
 
     Args:
-        data: What ``drivax.load`` returned, the folder of a scenario set, or how many scenarios of the built-in world.
-        task: Action space, observation, reward and what ends an episode; the default one otherwise.
+        data: What ``drivax.load`` returned, the folder of a scenario set, or a number of generated scenarios.
+        task: Action space, observation, reward and termination; by default ``Task()``.
         render_mode: ``rgb_array`` draws the scenario from above (needs the extra ``show``).
         traffic: How the other agents move: ``log``, ``idm``, the folder of a trained policy, ``zoo:NAME``,
             ``package.module:name``, or a traffic model.
@@ -216,12 +204,9 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own spelling)
 
     def __init__(
-        self,
-        data: Scenarios | str | Path | int = BUILT_IN,
-        task: Task | None = None,
-        render_mode: str | None = None,
-        traffic: str | Traffic = "log",
-    ) -> None:
+        self, data: Scenarios | str | Path | int = BUILT_IN, task: Task | None = None,
+        render_mode: str | None = None, traffic: str | Traffic = "log",
+    ) -> None:  # fmt: skip
         self._worlds = _Worlds(data, task, traffic)
         self._state: SimState | None = None
         self._row, self._path = 0, np.zeros((0, 4), np.float32)
@@ -236,7 +221,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
 
         Args:
             seed: Seed of the random choice of scenarios.
-            options: ``{"scenario": i}`` chooses row i; otherwise a row is drawn, each as likely as any other.
+            options: ``{"scenario": i}`` chooses row i; by default rows are drawn uniformly.
 
         Raises:
             UsageError: There is no such option or no such row.
@@ -246,8 +231,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         worlds = self._worlds
         self._row = int(self.np_random.integers(len(worlds.ids))) if chosen is None else worlds.row(chosen)
         state, observation = _reset(worlds.simulator, worlds.bank, self._row)
-        self._state = state
-        self._path = _path_of(state.context)
+        self._state, self._path = state, _path_of(state.context)
         return _plain(observation), {"scenario_id": worlds.ids[self._row]}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -283,19 +267,11 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
 
 
 class VectorDrivingEnv(VectorEnv):
-    """Many :class:`DrivingEnv` in one compiled call.
+    """Step ``num_envs`` :class:`DrivingEnv` in one compiled call; the other arguments are the same.
 
-    Autoreset is Gymnasium's ``NEXT_STEP``: the step after an episode's last one ignores that environment's action,
-    starts its next episode with reward 0; the last observation of an episode is that of its last step.
-    ``info`` holds ``scenario_id`` of every environment and, for those whose episode ended, ``metrics`` as arrays with
-    ``_metrics`` masks, as Gymnasium's own vector environments do.
-
-    Args:
-        num_envs: Number of environments.
-        data: As in :class:`DrivingEnv`.
-        task: As in :class:`DrivingEnv`.
-        render_mode: As in :class:`DrivingEnv`; ``render`` returns one picture per environment.
-        traffic: As in :class:`DrivingEnv`.
+    Autoreset is Gymnasium's ``NEXT_STEP``: the step after the last one of an episode ignores that environment's action
+    and starts its next episode with reward 0. ``info`` holds ``scenario_id`` of every environment and, for those whose
+    episode ended, ``metrics`` as arrays with ``_metrics`` masks. ``render`` returns one picture per environment.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -303,13 +279,9 @@ class VectorDrivingEnv(VectorEnv):
     }  # fmt: skip
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        data: Scenarios | str | Path | int = BUILT_IN,
-        task: Task | None = None,
-        render_mode: str | None = None,
-        traffic: str | Traffic = "log",
-    ) -> None:
+        self, num_envs: int = 1, data: Scenarios | str | Path | int = BUILT_IN, task: Task | None = None,
+        render_mode: str | None = None, traffic: str | Traffic = "log",
+    ) -> None:  # fmt: skip
         self._worlds = _Worlds(data, task, traffic)
         self.num_envs = num_envs
         self.render_mode = _known(render_mode)
@@ -328,7 +300,7 @@ class VectorDrivingEnv(VectorEnv):
         """Start an episode in every environment.
 
         Args:
-            seed: Seed of the random choice of scenarios; one number for all environments.
+            seed: Seed of the random choice of scenarios in all environments.
             options: ``{"scenarios": [i, ...]}`` chooses a row per environment.
 
         Raises:
@@ -336,14 +308,11 @@ class VectorDrivingEnv(VectorEnv):
         """
         super().reset(seed=seed)
         chosen = _option(options, "scenarios")
-        self._rows = (
-            self._drawn() if chosen is None else np.array([self._worlds.row(i) for i in chosen], np.int32)
-        )
+        rows = self._drawn() if chosen is None else [self._worlds.row(scenario) for scenario in chosen]
+        self._rows = np.array(rows, np.int32)
         if self._rows.shape != (self.num_envs,):
-            raise UsageError(
-                f"{len(self._rows)} scenarios for {self.num_envs} environments",
-                cure="give one per environment",
-            )
+            problem = f"{len(self._rows)} scenarios for {self.num_envs} environments"
+            raise UsageError(problem, cure="give one per environment")
         self._over[:] = False
         self._state, observation = _reset_all(self._worlds.simulator, self._worlds.bank, self._rows)
         self._follow(self._over | True)
@@ -361,9 +330,8 @@ class VectorDrivingEnv(VectorEnv):
         worlds, begins = self._worlds, self._over
         commands = worlds.commands(actions, (self.num_envs,))
         self._rows = np.where(begins, self._drawn(), self._rows)
-        self._state, observation, ending = _step_all(
-            worlds.simulator, worlds.bank, self._state, commands, begins, self._rows
-        )
+        arguments = (worlds.bank, self._state, commands, begins, self._rows)
+        self._state, observation, ending = _step_all(worlds.simulator, *arguments)
         reward, terminated, truncated = (np.array(leaf) for leaf in jax.device_get(ending))
         self._over = terminated | truncated
         self._follow(begins)
@@ -381,10 +349,8 @@ class VectorDrivingEnv(VectorEnv):
             return None
         if not self._paths:
             raise gymnasium.error.ResetNeeded("there is nothing to draw yet; call reset() first")
-        scenarios = self._worlds.scenarios
-        return tuple(
-            draw_pixels(scenarios[int(row)], path) for row, path in zip(self._rows, self._paths, strict=True)
-        )
+        scenarios = [self._worlds.scenarios[int(row)] for row in self._rows]
+        return tuple(map(draw_pixels, scenarios, self._paths))
 
     def _drawn(self) -> Any:
         return self.np_random.integers(len(self._worlds.ids), size=self.num_envs, dtype=np.int32)
@@ -397,14 +363,11 @@ class VectorDrivingEnv(VectorEnv):
         """Record the driven paths if they are rendered."""
         if self.render_mode is None or self._state is None:
             return
-        contexts = [
-            jax.tree.map(lambda leaf, n=n: leaf[n], self._state.context) for n in range(self.num_envs)
-        ]
         old = self._paths or [None] * self.num_envs
-        self._paths = [
-            _path_of(context, None if new else path)
-            for context, path, new in zip(contexts, old, begins, strict=True)
-        ]
+        before = [None if new else path for path, new in zip(old, begins, strict=True)]
+        context = self._state.context
+        contexts = [jax.tree.map(operator.itemgetter(number), context) for number in range(self.num_envs)]
+        self._paths = list(map(_path_of, contexts, before))
 
 
 def make(
@@ -436,9 +399,7 @@ def _option(options: Mapping[str, Any] | None, name: str) -> Any:
 
 def _action_space(task: Task) -> gymnasium.spaces.Space[Any]:
     if isinstance(task.actions, DirectState):
-        raise UsageError(
-            "direct_state has no bounds that a space could have", cure="use another action space"
-        )
+        raise UsageError("direct_state is unbounded and has no space", cure="use another action space")
     if isinstance(task.actions, Discrete):
         return gymnasium.spaces.Discrete(task.actions.choices)
     return gymnasium.spaces.Box(-1.0, 1.0, (task.actions.size,), np.float32)
@@ -466,9 +427,7 @@ for _name, _task in TASKS.items():
 def _path_of(context: AgentContext, before: Any = None) -> Any:
     """Return ego's motion from the first step of the log to the present one ``[step + 1, 4]``; NaN where unknown.
 
-    Args:
-        context: The present context.
-        before: The path one step ago; None where an episode starts.
+    ``before`` is the path one step ago, None where an episode starts.
     """
     history, step = np.asarray(context.history), int(context.step)
     if before is not None:

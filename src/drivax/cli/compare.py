@@ -49,8 +49,7 @@ def run(args: Compare, overrides: Sequence[str] = ()) -> int:
     from drivax.evaluation.episode_table import EpisodeTable
     from drivax.evaluation.plan import ComparisonPlan
     from drivax.files import check_output, write_text
-    from drivax.report.comparison import comparison_text
-    from drivax.report.pages.comparison import write_comparison
+    from drivax.report.pages.comparison import comparison_text, write_comparison
 
     if len(args.runs) not in (0, 2):
         raise UsageError(f"{len(args.runs)} runs are named", cure="write drivax compare A B")

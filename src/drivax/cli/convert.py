@@ -12,7 +12,7 @@ import tyro
 
 from drivax.cli import record_of
 from drivax.datasets.conversion import Conversion, Converted, Plan, convert
-from drivax.datasets.estimate import counted
+from drivax.datasets.doctor import counted
 from drivax.datasets.formats import READERS
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit

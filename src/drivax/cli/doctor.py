@@ -19,8 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from drivax.datasets.doctor import Diagnosis, Part, diagnose
-from drivax.datasets.estimate import counted, free_bytes, gigabytes
+from drivax.datasets.doctor import Diagnosis, Part, counted, diagnose, free_bytes, gigabytes
 
 _COLUMNS = 100
 #: Modules of every extra, and what it is for.

@@ -13,7 +13,7 @@ from drivax import settings
 from drivax.api import find_planner, load
 from drivax.cli import judge, record_of
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation.run_evaluation import (
+from drivax.evaluation.runner import (
     EvaluationConfig,
     format_crashes,
     format_metrics,
@@ -25,7 +25,7 @@ from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.store import ScenarioSet
 from drivax.tasks.task import Task
-from drivax.tracking.zoo import zoo
+from drivax.tracking.run_folder import zoo
 
 #: Profile among the metrics: computed from the finished episodes.
 _DEVKIT = "devkit"

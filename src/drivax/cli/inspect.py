@@ -87,7 +87,7 @@ def run(args: Inspect) -> int:
 
 def _print(opened: list[Inspection]) -> None:
     """Print one set in full, or several side by side."""
-    from drivax.report import inspection_tables as tables
+    from drivax.report import inspection as tables
 
     console = _console()
     if len(opened) > 1:
@@ -115,7 +115,7 @@ def _console() -> Console:
 
 def _check_flags(args: Inspect) -> None:
     from drivax.errors import UsageError
-    from drivax.tracking.zoo import is_policy
+    from drivax.tracking.run_folder import is_policy
 
     if args.observations and (len(args.sets) > 1 or args.html is not None):
         raise UsageError(
@@ -162,7 +162,7 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
 
 
 def _print_observations(statistics: ObservationStatistics) -> None:
-    from drivax.report import inspection_tables as tables
+    from drivax.report import inspection as tables
 
     console = _console()
     console.print(tables.observation_overview(statistics))

@@ -1,15 +1,15 @@
-from .combining import Combination as Combination
-from .controls import permute_scores as permute_scores
 from .ensemble import EnsembleConfig as EnsembleConfig
 from .ensemble import train_ensemble as train_ensemble
 from .kinematic import KinematicConfig as KinematicConfig
 from .methods import METHODS as METHODS
 from .methods import Request as Request
 from .methods import curate as curate
+from .scores import Combination as Combination
 from .scores import ScoreTable as ScoreTable
 from .scores import read_scores as read_scores
 from .scores import write_scores as write_scores
 from .subset import write_top as write_top
 from .weights import WeightConfig as WeightConfig
 from .weights import draw_statistics as draw_statistics
+from .weights import permute_scores as permute_scores
 from .weights import sampling_weights as sampling_weights

@@ -8,7 +8,7 @@ arXiv 1612.01474.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -45,6 +45,8 @@ _SAMPLES = 16
 #: No past steps and no last action, which a policy could copy instead of observing the scene.
 _OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
 
+_NETWORK = NetworkConfig(encoder=EntityConfig(), activation="relu")
+
 Numbers = np.ndarray[Any, Any]
 
 
@@ -67,11 +69,7 @@ class EnsembleConfig:
     """
 
     folds: int = 5
-    cloning: BcConfig = field(
-        default_factory=lambda: BcConfig(
-            batch=128, network=NetworkConfig(encoder=EntityConfig(), activation="relu")
-        )
-    )
+    cloning: BcConfig = field(default_factory=lambda: BcConfig(batch=128, network=_NETWORK))
     learn_from: int | None = None
     total_steps: int = 384_000
     weighted: Literal["plain", "rarity"] = "plain"
@@ -92,13 +90,10 @@ class EnsembleConfig:
 
 @dataclass(frozen=True)
 class Predictions:
-    """Predictions of the members at every step of a set.
+    """Modes of the members (``action``) and the expert's actions at every step of a set, in units of the action space.
 
-    Attributes:
-        action: Mode of each member, in units of the action space.
-        expert: Action of the expert.
-        known: Whether the expert's action is known and within the bounds.
-        information: Mutual information of action and member, nats, for members trained by likelihood.
+    ``known``: the expert's action is known and within the bounds. ``information``: mutual information of action and
+    member in nats, for members trained by likelihood.
     """
 
     action: Float[Numbers, "N T K D"]
@@ -116,10 +111,7 @@ class Predictions:
     ) -> Float[Numbers, "N T"]:
         """Return the squared error over the expert's variance, summed over the action's dimensions.
 
-        Args:
-            deviation: Standard deviation of the expert's actions.
-            fold: Member that has not seen the scenario and is evaluated on it; -1, or None for all: no member has seen
-                it, and their mean is evaluated.
+        It is that of the member ``fold``, which has not seen the scenario; of the members' mean where none has (-1).
         """
         members = np.full(len(self.action), -1) if fold is None else fold
         errors = []
@@ -136,15 +128,10 @@ class Predictions:
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """A trained ensemble.
+    """A trained ensemble: the learner of one member, and the parameters of all along a leading axis.
 
-    Attributes:
-        config: Its configuration.
-        learner: The learner of one member.
-        parameters: Parameters of all members, along a leading axis.
-        set_hash: ``ScenarioSet.hash`` of the training set.
-        fold: Fold of every scenario of that set; -1 for scenarios that no member has seen.
-        deviation: Standard deviation of the expert's actions there, in units of the action space.
+    Of the training set it has ``ScenarioSet.hash``, the fold of every scenario (-1 where no member has seen it), and
+    the standard deviation of the expert's actions, in units of the action space.
     """
 
     config: EnsembleConfig
@@ -181,11 +168,7 @@ def mutual_information(members: Distribution, key: Array) -> Float[Array, "*batc
     """Return the mutual information of action and member, nats: 0 for equal distributions, at most ``ln K``.
 
     The mean of ``ln p_k(a) - ln (1/K sum_j p_j(a))`` over members k and actions drawn from them (Jensen-Shannon
-    divergence; Lin 1991), estimated from 16 samples of each.
-
-    Args:
-        members: Distributions along a leading axis of K.
-        key: Random key.
+    divergence; Lin 1991), estimated from 16 samples of each. The members lie along the leading axis.
     """
     count = jax.tree.leaves(members)[0].shape[0]
     density = jax.vmap(lambda member, action: member.log_prob(action), (0, None))
@@ -208,10 +191,8 @@ def assign_folds(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers,
     """
     names, number = np.unique(clusters, return_inverse=True)
     if len(names) < folds:
-        raise UsageError(
-            f"{len(names)} recordings for {folds} folds",
-            cure=f"use {folds} recordings or more, or fewer folds",
-        )
+        cure = f"use {folds} recordings or more, or fewer folds"
+        raise UsageError(f"{len(names)} recordings for {folds} folds", cure=cure)
     return np.random.default_rng(seed).permutation(len(names))[number] % folds
 
 
@@ -226,15 +207,8 @@ def sample_recordings(clusters: Sequence[str], count: int | None, seed: int) -> 
     return np.flatnonzero((np.cumsum(sizes) - sizes < count)[rank[number]])
 
 
-def train_ensemble(
-    config: EnsembleConfig, data: ScenarioSet, log: Callable[[int, int], None] | None = None
-) -> Ensemble:
-    """Train an ensemble.
-
-    Args:
-        config: Its configuration.
-        data: The scenarios; those to learn from are held on the device.
-        log: Called with (iterations done, iterations).
+def train_ensemble(config: EnsembleConfig, data: ScenarioSet, log: Progress | None = None) -> Ensemble:
+    """Train an ensemble; ``log`` is called with (iterations done, iterations).
 
     Raises:
         UsageError: There are fewer recordings than folds, or the scenarios do not fit on the device.
@@ -261,13 +235,11 @@ def _check_memory(config: EnsembleConfig, data: ScenarioSet, count: int, free: i
     # A bank exists twice while it is made.
     if 2 * size * count > free:
         fits = free // (4 * size)
-        raise UsageError(
-            f"{count:,} scenarios take some {2e-9 * size * count:,.0f} GB, and {free / 1e9:,.0f} GB are free",
-            file=data.path,
-            cure=f"pass --learn_from {fits} to train on fewer scenarios; all are scored"
-            if fits >= config.folds
-            else "free memory",
+        problem = (
+            f"{count:,} scenarios take about {2e-9 * size * count:,.0f} GB, and {free / 1e9:,.0f} GB are free"
         )
+        fewer = f"pass --learn_from {fits} to train on fewer scenarios; all are scored"
+        raise UsageError(problem, file=data.path, cure=fewer if fits >= config.folds else "free memory")
 
 
 def experience_of(
@@ -284,23 +256,13 @@ def experience_of(
 
 
 def fit(
-    config: EnsembleConfig,
-    learner: Bc,
-    experience: Experience,
-    fold: Int[Numbers, " N"],
-    log: Callable[[int, int], None] | None = None,
-    together: bool | None = None,
-) -> Any:
+    config: EnsembleConfig, learner: Bc, experience: Experience, fold: Int[Numbers, " N"],
+    log: Progress | None = None, together: bool | None = None,
+) -> Any:  # fmt: skip
     """Return the trained parameters of all members, along a leading axis.
 
-    Args:
-        config: Configuration of the ensemble.
-        learner: The learner of one member.
-        experience: What members learn from.
-        fold: Fold of every scenario.
-        log: Called with (iterations done, iterations).
-        together: Update all members in one stacked computation instead of one after the other; same results. None:
-            stacked except on CPUs, where products of stacked small matrices take three times as long.
+    With ``together``, all members are updated in one stacked computation instead of one after the other; same results.
+    None: except on CPUs, where products of stacked small matrices take three times as long.
     """
     environment, cloning = recorded(learner.environment), config.cloning
     if together is None:

@@ -29,9 +29,9 @@ from jaxtyping import Array, Bool, Float
 from drivax.curation.logged import LOG_ROUTE, Logged
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
-from drivax.geometry.vectors import wrap
+from drivax.geometry.vectors import norm, wrap
 from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, savgol_matrix
-from drivax.scenario.bank.queries import LEVEL_M, lane_distance, offroad_distance, project_on_route
+from drivax.scenario.bank import queries
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import STOPPED_MPS, TTC_HORIZON_S, time_to_collision
@@ -110,19 +110,13 @@ def required_braking(
     up to about 75 m ahead. Oncoming agents count as standing, so that ego need not brake while it stands or gives way.
     0 where no agent is on the path, or the nearest one is not approached.
 
-    Args:
-        bank: The scenarios.
-        index: Scenario of the bank.
-        frame: All agents at the step; ego is slot 0.
-        counts: Agents that are considered.
-        along_m: Arc length of ego along the logged route.
-        speed_mps: Speed of ego.
+    Only agents that ``counts`` marks are considered; ``along_m`` is ego's arc length along the logged route.
     """
     me, xy = frame.box[0], frame.box[:, :2]
 
     def window(offset_m: float) -> Any:
         near = along_m + offset_m
-        return jax.vmap(lambda point: project_on_route(bank, index, point, near, route=LOG_ROUTE))(xy)
+        return jax.vmap(lambda point: queries.project_on_route(bank, index, point, near, route=LOG_ROUTE))(xy)
 
     # Beyond a window the projection is its end point, so take the nearer of the two.
     first, second = map(window, _WINDOWS_M)
@@ -131,7 +125,7 @@ def required_braking(
     cos = jnp.sum(frame.box[:, 2:4] * hits.heading, axis=-1)
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
     length, width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
-    counts = counts & (jnp.abs(frame.z - frame.z[0]) <= LEVEL_M)
+    counts = counts & (jnp.abs(frame.z - frame.z[0]) <= queries.LEVEL_M)
     on_path = hits.distance_m < jnp.abs(sin) * length + jnp.abs(cos) * width + me[5] / 2
     gap = hits.along_m - along_m - (jnp.abs(cos) * length + sin * width) - me[4] / 2
     gap = jnp.where(counts & on_path & (hits.along_m > along_m), gap, jnp.inf)
@@ -198,7 +192,7 @@ def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> 
     def at_step(box: Array, ground: Array) -> Array:
         # A logged car without an edge nearby is on the road: on a driveway, or beyond the map.
         road = jnp.ones(4, bool)
-        beyond = offroad_distance(bank, log.index, box[:2], corners(box), road, ground)
+        beyond = queries.offroad_distance(bank, log.index, box[:2], corners(box), road, ground)
         return jnp.max(jnp.clip(1.0 + beyond / config.edge_m, 0.0, 1.0))
 
     return jax.vmap(at_step)(log.frame.box[:, 0], log.ground_m)
@@ -206,8 +200,76 @@ def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> 
 
 def _deviation(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
     def at_step(xy: Array, ground: Array) -> Array:
-        distance = lane_distance(bank, log.index, xy, ground)
+        distance = queries.lane_distance(bank, log.index, xy, ground)
         # Beyond the cut-off there is no lane: a car park, a driveway, the end of the map.
         return jnp.where(jnp.isfinite(distance), jnp.minimum(distance / config.lane_m, 1.0), 0.0)
 
     return jax.vmap(at_step)(log.motion[:, :2], log.ground_m)
+
+
+@dataclass(frozen=True)
+class PublishedConfig:
+    """The published kinematic heuristic, for comparison, with the values at which its five components are 1.
+
+    Backward differences at 10 Hz, the product of distance and closing speed, and distances to the points of the map, of
+    which only lanes for cars count. Noise of 1 cm/s scores like violent driving, and distant traffic like a conflict
+    (``tests/curation/test_published.py``), which :class:`KinematicConfig` avoids.
+
+    Attributes:
+        jerk_mps3, yaw_rps2: Jerk, and yaw acceleration (rad/s2).
+        interaction_m2ps: Product of distance and closing speed.
+        edge_m: Distance of ego's centre to the nearest point of a road edge at which off_road is 0.
+        lane_m: Distance to the nearest point of a lane centre.
+        crowd: Number of agents, ego included.
+        spacing_m: Distance of the map's points, sampled from our segments; 0.5 m as in Waymo's maps.
+    """
+
+    jerk_mps3: float = 2.5
+    yaw_rps2: float = 1.5
+    interaction_m2ps: float = 1000.0
+    edge_m: float = 0.75
+    lane_m: float = 1.25
+    crowd: int = 50
+    spacing_m: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_positive(dict(vars(self)))
+
+    def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Float[Array, " T"]]:
+        """Return the components of every step of a log."""
+        xy = log.motion[:, :2]
+        edge_m, lane_m = jax.vmap(
+            lambda point: queries.vertex_distances(bank, log.index, point, self.spacing_m)
+        )(xy)
+        return {
+            "volatility": _published_volatility(self, log),
+            "interaction": _interaction(self, log),
+            "off_road": jnp.maximum(1.0 - edge_m / self.edge_m, 0.0),
+            "lane_deviation": jnp.minimum(lane_m / self.lane_m, 1.0),
+            "density": crowding(log, self.crowd),
+        }
+
+
+def _published_volatility(config: PublishedConfig, log: Logged) -> Float[Array, " T"]:
+    """Return jerk and yaw acceleration from two backward differences, 0 at the start."""
+    heading = log.motion[:, 2]
+    acceleration = _backward(norm(log.velocity)) / DT_S
+    yaw_rate = wrap(_backward(heading)) / DT_S
+    jerk, yaw = _backward(acceleration) / DT_S, _backward(yaw_rate) / DT_S
+    return jnp.minimum(jnp.maximum(jnp.abs(jerk) / config.jerk_mps3, jnp.abs(yaw) / config.yaw_rps2), 1.0)
+
+
+def _backward(values: Float[Array, " T"]) -> Float[Array, " T"]:
+    return jnp.concatenate([jnp.zeros(1), values[1:] - values[:-1]])
+
+
+def _interaction(config: PublishedConfig, log: Logged) -> Float[Array, " T"]:
+    """Return the largest product of distance and closing speed, ``max(0, -dp . dv)``, over all agents."""
+
+    def largest(frame: Frame, velocity: Array) -> Array:
+        offset, relative = frame.box[:, :2] - frame.box[0, :2], frame.velocity - velocity
+        closing = -jnp.sum(offset * relative, axis=-1)
+        counts = frame.valid & (jnp.arange(len(closing)) > 0)
+        return jnp.max(jnp.where(counts, jnp.clip(closing / config.interaction_m2ps, 0.0, 1.0), 0.0))
+
+    return jax.vmap(largest)(log.frame, log.velocity)

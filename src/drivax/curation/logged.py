@@ -36,14 +36,11 @@ class Logged:
     """One log; where ego is not observed, its last motion is repeated.
 
     Attributes:
-        context: Context of ego at every step, as in simulation.
-        motion: x, y (m), heading (rad), speed (m/s) of ego.
-        velocity: As logged, m/s.
+        context, frame: Context of ego, and all agents, at every step.
+        motion, velocity: x, y (m), heading (rad), speed (m/s) of ego; its velocity as logged (m/s).
         valid: Whether ego is observed.
-        frame: All agents at every step.
         ignored: Agents that overlapped ego when they appeared, until they part: metrics ignore them, too.
-        along_m: Arc length of ego along the logged route.
-        ground_m: Height of the ground under ego.
+        along_m, ground_m: Arc length of ego along the logged route, and height of the ground under it.
     """
 
     context: AgentContext
@@ -69,11 +66,11 @@ def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
     contexts = jax.vmap(lambda step: _context(bank, index, step))(last_valid)
     motion = jax.vmap(lambda context: logged_motion(bank, context, 0))(contexts)
     contexts = jax.vmap(lambda step, now: _context(bank, index, step, now))(steps, motion)
-    frame = jax.vmap(
-        lambda context: frame_of(
-            bank, index, context.step, bank.agents[index, context.step], alone(context), 0
-        )
-    )(contexts)
+
+    def frame_at(context: AgentContext) -> Frame:
+        return frame_of(bank, index, context.step, bank.agents[index, context.step], alone(context), 0)
+
+    frame = jax.vmap(frame_at)(contexts)
     touching = jax.vmap(lambda now: overlaps(now, jnp.int32(0)))(frame)
     return Logged(
         context=contexts,
@@ -122,15 +119,7 @@ def score_bank(score: Any, bank: ScenarioBank) -> dict[str, Array]:
 
 
 def score_steps(data: ScenarioSet, score: Any, progress: Progress | None = None) -> dict[str, Numbers]:
-    """Apply a score function to every log of a set, in batches.
-
-    Args:
-        data: The scenarios.
-        score: A hashable ``(bank, log) -> {name: [T, ...]}``.
-        progress: Called after every batch.
-
-    Returns:
-        By name ``[N, T, ...]``.
+    """Apply a hashable ``(bank, log) -> {name: [T, ...]}`` to every log of a set, in batches: ``{name: [N, T, ...]}``.
 
     Raises:
         DataError: A scenario has no future.
@@ -142,8 +131,7 @@ def map_batches(
     data: ScenarioSet, function: Callable[[ScenarioBank], dict[str, Any]], progress: Progress | None = None
 ) -> dict[str, Numbers]:
     """Apply a function to banks of one shape that hold ``BATCH`` scenarios each: by name ``[N, ...]``."""
-    sizes = Sizes.used(data)
-    batches: list[dict[str, Any]] = []
+    sizes, batches = Sizes.used(data), list[dict[str, Any]]()
     for first in range(0, len(data), BATCH):
         scenarios = data[first : first + BATCH]
         count = len(scenarios)

@@ -6,26 +6,27 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from drivax import settings
-from drivax.curation.combining import Combination
-from drivax.curation.controls import event_steps, permute_scores
 from drivax.curation.ensemble import Ensemble, EnsembleConfig, train_ensemble
-from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.kinematic import KinematicConfig, PublishedConfig
 from drivax.curation.logged import Progress, score_steps, valid_steps
-from drivax.curation.published import PublishedConfig
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity, rarity_steps
-from drivax.curation.scores import ScoreTable, read_scores
+from drivax.curation.scores import Combination, ScoreTable, read_scores
+from drivax.curation.weights import permute_scores
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.networks.distributions import Actions
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import plain
 from drivax.stats.ranking import rank_correlation
+from drivax.synthetic.events import EventKind
 
 #: Weights of the kinematic heuristic, chosen on the validation set of the built-in world's benchmark
 #: (docs/results/curation.md). A scenario scores as its most critical second.
@@ -50,8 +51,7 @@ class Request:
 
     Attributes:
         data: The set.
-        like: Table to match (``random_matched`` only).
-        seed: Seed of the permutation (``random_matched`` only; an ensemble has its own).
+        like, seed: Table to match, and seed of the permutation (``random_matched`` only; an ensemble has its own seed).
         config: Settings of the method, of the type of its ``Method.config``; None: the defaults.
         progress: Called with (scenarios done, scenarios).
         training: Called with (iterations done, iterations) while an ensemble is trained.
@@ -67,14 +67,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Method:
-    """A registered method.
+    """A registered method, with its default settings (``config``; None: it has none).
 
-    Attributes:
-        name: Its name, on the command line too.
-        score: From a request, with settings, to the table.
-        config: Default settings; None: it has none.
-        combination: How its components become scores, from its settings.
-        unweighted: Components without a weight, from its settings.
+    From the settings, ``combination`` tells how components become scores, and ``unweighted`` names components without a
+    weight.
     """
 
     name: str
@@ -94,17 +90,13 @@ def curate(name: str, request: Request) -> ScoreTable:
     if name not in METHODS:
         raise UsageError(f"there is no method {name!r}", cure=did_you_mean(name, sorted(METHODS)))
     if (request.like is not None) != (name == "random_matched"):
-        raise UsageError(
-            "random_matched needs --like, a table of the same set, and no other method takes it",
-            cure="drivax curate random_matched --like SCORES ...",
-        )
+        problem = "random_matched needs --like, a table of the same set, and no other method takes it"
+        raise UsageError(problem, cure="drivax curate random_matched --like SCORES ...")
     default = METHODS[name].config
-    if request.config is not None and type(request.config) is not type(default):
-        raise UsageError(
-            f"{name} has no settings of type {type(request.config).__name__}",
-            cure="leave them out" if default is None else f"use {type(default).__name__}",
-        )
     config = default if request.config is None else request.config
+    if type(config) is not type(default):
+        cure = "leave them out" if default is None else f"use {type(default).__name__}"
+        raise UsageError(f"{name} has no settings of type {type(config).__name__}", cure=cure)
     table = METHODS[name].score(replace(request, config=config))
     if request.progress is not None:
         request.progress(len(request.data), len(request.data))
@@ -114,10 +106,7 @@ def curate(name: str, request: Request) -> ScoreTable:
 def check_current(table: ScoreTable, config: Any = None, file: Path | None = None) -> None:
     """Refuse a table that differs in settings from what its method would write.
 
-    Args:
-        table: The table.
-        config: Settings of the method; None: the defaults.
-        file: Source of the table.
+    ``config`` are the settings of the method (None: the defaults), ``file`` is the source of the table.
 
     Raises:
         DataError: It has other settings or another combination.
@@ -135,11 +124,8 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
     stored, current = (json.loads(json.dumps(values)) for values in (stored, current))
     for name, value in current.items():
         if stored.get(name) != value:
-            raise DataError(
-                f"scores of {table.method!r} with {name} {stored.get(name)}, which is {value} here",
-                file=file,
-                cure="score again with `drivax curate`",
-            )
+            problem = f"scores of {table.method!r} with {name} {stored.get(name)}, which is {value} here"
+            raise DataError(problem, file=file, cure="score again with `drivax curate`")
 
 
 def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> None:
@@ -149,20 +135,13 @@ def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> Non
 
 
 def make_table(
-    name: str,
-    config: Any,
-    data: ScenarioSet,
-    components: Mapping[str, np.ndarray[Any, Any]],
+    name: str, config: Any, data: ScenarioSet, components: Mapping[str, np.ndarray[Any, Any]],
     details: Mapping[str, Any] = MappingProxyType({}),
-) -> ScoreTable:
-    """Return the score table of a set.
+) -> ScoreTable:  # fmt: skip
+    """Return the score table of a set from the components of every step, in [0, 1].
 
-    Args:
-        name: Name of the method.
-        config: Its settings; None: it has none.
-        data: The set.
-        components: By name, of every step, in [0, 1].
-        details: Further entries of the table's configuration, as plain values.
+    ``config`` are the settings of the method ``name``; ``details`` are further plain values for the table's
+    configuration.
     """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
     valid = valid_steps(data)
@@ -187,8 +166,8 @@ def ensemble_table(
         ensemble: The ensemble.
         data: The set.
         progress: Called with (scenarios done, scenarios).
-        scale: Disagreement that scores 0.5; None: the 99th percentile of the set, separately for scenarios of the
-            training and for the rest.
+        scale: Disagreement that scores 0.5; None: the 99th percentile of the set, separately for the scenarios that
+            the ensemble was trained on and for the rest.
     """
     predictions = ensemble.predictions(data, progress)
     valid, own = valid_steps(data), data.hash == ensemble.set_hash
@@ -203,10 +182,8 @@ def ensemble_table(
         half = np.zeros((len(data), 1))
         for group, value in zip(groups, scales, strict=True):
             half[group] = np.maximum(value, np.finfo(np.float64).tiny)
-        components = {
-            _action(index): values / (values + half)
-            for index, values in enumerate(np.moveaxis(dimensions, -1, 0))
-        }
+        actions = enumerate(np.moveaxis(dimensions, -1, 0))
+        components = {f"action_{index}": values / (values + half) for index, values in actions}
         components["disagreement"] = total / (total + half)
     else:
         components = {"information": predictions.information / math.log(ensemble.config.folds)}
@@ -218,38 +195,26 @@ def ensemble_table(
     return replace(table, config={**table.config, **correlation})
 
 
-def _action(index: int) -> str:
-    return f"action_{index}"
-
-
-def _by_likelihood(config: EnsembleConfig) -> bool:
-    return config.cloning.loss == "likelihood"
-
-
 def _ensemble_combination(config: EnsembleConfig) -> Combination:
     """Score a scenario as its most uncertain second."""
-    return Combination({"information" if _by_likelihood(config) else "disagreement": 1.0}, "top10")
+    by_likelihood = config.cloning.loss == "likelihood"
+    return Combination({"information" if by_likelihood else "disagreement": 1.0}, "top10")
 
 
 def _action_components(config: EnsembleConfig) -> tuple[str, ...]:
-    return () if _by_likelihood(config) else tuple(map(_action, range(Actions().size)))
+    by_likelihood = config.cloning.loss == "likelihood"
+    return () if by_likelihood else tuple(f"action_{index}" for index in range(Actions().size))
 
 
-def _heuristic(name: str) -> Callable[[Request], ScoreTable]:
-    def score(request: Request) -> ScoreTable:
-        components = score_steps(request.data, request.config, request.progress)
-        return make_table(name, request.config, request.data, components)
-
-    return score
+def _heuristic(name: str, request: Request) -> ScoreTable:
+    components = score_steps(request.data, request.config, request.progress)
+    return make_table(name, request.config, request.data, components)
 
 
-def _rarity(name: str) -> Callable[[Request], ScoreTable]:
-    def score(request: Request) -> ScoreTable:
-        expert = score_steps(request.data, ExpertActions(), request.progress)
-        components = {"rarity": rarity_steps(request.config, expert["action"], expert["known"])}
-        return make_table(name, request.config, request.data, components)
-
-    return score
+def _rarity(name: str, request: Request) -> ScoreTable:
+    expert = score_steps(request.data, ExpertActions(), request.progress)
+    components = {"rarity": rarity_steps(request.config, expert["action"], expert["known"])}
+    return make_table(name, request.config, request.data, components)
 
 
 def _ensemble(request: Request) -> ScoreTable:
@@ -266,35 +231,46 @@ def _oracle(request: Request) -> ScoreTable:
     return make_table("oracle", None, request.data, {"all": event_steps(request.data).astype(np.float64)})
 
 
+def event_steps(data: ScenarioSet) -> Bool[np.ndarray, "N T"]:
+    """Return the steps within a labelled event of the built-in world.
+
+    Raises:
+        DataError: The set is not of the built-in world.
+    """
+    dataset = {str(entry["dataset"]) for entry in data.entries}
+    if dataset != {"drivax"}:
+        problem = f"only the built-in world has event labels, this set is of {', '.join(sorted(dataset))}"
+        cure = "use another method, or a set that `drivax generate` made"
+        raise DataError(problem, file=data.path, cure=cure)
+    step = np.arange(data.capacity.steps)
+    events = []
+    for scenario in data:
+        kind, first, last = (scenario.record[f"event_{name}"][:, None] for name in ("kind", "start", "end"))
+        events.append(((kind > EventKind.NONE) & (step >= first) & (step <= last)).any(axis=0))
+    return np.stack(events)
+
+
+def event_kinds(data: ScenarioSet) -> Int[np.ndarray, " N"]:
+    """Return the :class:`~drivax.synthetic.events.EventKind` of every scenario's first event, 0 where it has none."""
+    return np.array([max(int(scenario.record["event_kind"][0]), 0) for scenario in data])
+
+
 def _random_matched(request: Request) -> ScoreTable:
     assert request.like is not None
     return permute_scores(read_scores(request.like, request.data), request.seed)
 
 
-#: All methods by name.
-METHODS: Mapping[str, Method] = MappingProxyType(
-    {
-        method.name: method
-        for method in (
-            Method(
-                "kinematic",
-                _heuristic("kinematic"),
-                KinematicConfig(),
-                lambda _: KINEMATIC,
-                lambda _: ("density",),
-            ),
-            Method("published", _heuristic("published"), PublishedConfig(), lambda _: PUBLISHED),
-            Method("ensemble", _ensemble, EnsembleConfig(), _ensemble_combination, _action_components),
-            Method("action_rarity", _rarity("action_rarity"), KernelRarity(), lambda _: RARITY),
-            Method(
-                "action_rarity_published",
-                _rarity("action_rarity_published"),
-                PublishedRarity(),
-                lambda _: RARITY,
-            ),
-            Method("uniform", _uniform),
-            Method("random_matched", _random_matched),
-            Method("oracle", _oracle),
-        )
-    }
+_KINEMATIC, _PUBLISHED = partial(_heuristic, "kinematic"), partial(_heuristic, "published")
+_RARITY, _RARITY_PUBLISHED = partial(_rarity, "action_rarity"), partial(_rarity, "action_rarity_published")
+_METHODS = (
+    Method("kinematic", _KINEMATIC, KinematicConfig(), lambda _: KINEMATIC, lambda _: ("density",)),
+    Method("published", _PUBLISHED, PublishedConfig(), lambda _: PUBLISHED),
+    Method("ensemble", _ensemble, EnsembleConfig(), _ensemble_combination, _action_components),
+    Method("action_rarity", _RARITY, KernelRarity(), lambda _: RARITY),
+    Method("action_rarity_published", _RARITY_PUBLISHED, PublishedRarity(), lambda _: RARITY),
+    Method("uniform", _uniform),
+    Method("random_matched", _random_matched),
+    Method("oracle", _oracle),
 )
+#: All methods by name.
+METHODS: Mapping[str, Method] = MappingProxyType({method.name: method for method in _METHODS})

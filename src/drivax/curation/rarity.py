@@ -32,7 +32,7 @@ _SPACE = Physical()
 
 @dataclass(frozen=True)
 class ExpertActions:
-    """The action that follows the log from every step, in units of the default action space."""
+    """Score function that returns the action that follows the log from every step, in the default action space."""
 
     def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Array]:
         """Return ``action [T, 2]``, clipped, and ``known [T]``: ego is observed at the step and at the next two.
@@ -124,10 +124,8 @@ class PublishedRarity:
     def _cell(self, actions: Others) -> Int[np.ndarray[Any, Any], " m"]:
         scale = np.where(actions[:, 0] < 0, _SPACE.braking_mps2, _SPACE.acceleration_mps2)
         values = (actions[:, 0] * scale, actions[:, 1] * _SPACE.steering)
-        first, second = (
-            np.searchsorted(edges, value, side="right") - 1
-            for edges, value in zip(self.edges, values, strict=True)
-        )
+        binned = zip(self.edges, values, strict=True)
+        first, second = (np.searchsorted(edges, value, side="right") - 1 for edges, value in binned)
         return first * 89 + second
 
 

@@ -1,11 +1,12 @@
-"""Score tables: criticality scores of a scenario set, in a file that names their data and method."""
+"""Score tables: criticality of steps and scenarios from components, in a file that names their data and method."""
 
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
@@ -15,10 +16,112 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from drivax.curation.combining import Combination, aggregate
-from drivax.errors import DataError
+from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.files import atomic_write, check_output
 from drivax.scenario.store import ScenarioSet
+
+Steps = Float[np.ndarray[Any, Any], "N T"]
+Valid = Bool[np.ndarray[Any, Any], "N T"]
+Scenarios = Float[np.ndarray[Any, Any], " N"]
+
+_NUMBERED = re.compile(r"(p|top)(\d+)")
+
+
+@dataclass(frozen=True)
+class Combination:
+    """How components become scores.
+
+    Attributes:
+        weights: Non-negative weight of each component; only their ratios matter.
+        scenario: Aggregator of steps: ``max``, ``mean``, ``std``, ``p0`` to ``p100`` (percentile) or ``topN`` (mean of
+            the N largest). A string aggregates the combined score; a mapping names an aggregator for each component,
+            and the results are weighted.
+    """
+
+    weights: Mapping[str, float]
+    scenario: str | Mapping[str, str] = "max"
+
+    def __post_init__(self) -> None:
+        for name, weight in self.weights.items():
+            if not 0.0 <= weight < float("inf"):
+                raise UsageError(f"the weight of {name!r} is {weight}", cure="use 0 or more")
+        if not any(self.weights.values()):
+            raise UsageError("no component has a weight", cure="give one a weight above 0")
+        aggregators = {"": self.scenario} if isinstance(self.scenario, str) else self.scenario
+        for name in aggregators.values():
+            check_aggregator(name)
+        if not isinstance(self.scenario, str):
+            missing = sorted(set(self.weights) - set(self.scenario))
+            if missing:
+                problem = f"there is no aggregator for {missing[0]!r}"
+                raise UsageError(problem, cure="name one for each component")
+
+    def check_components(self, available: Collection[str]) -> None:
+        """Refuse weights and aggregators of components that are not available."""
+        for name in (*self.weights, *(() if isinstance(self.scenario, str) else self.scenario)):
+            if name not in available:
+                cure = did_you_mean(name, sorted(available))
+                raise UsageError(f"there is no component {name!r}", cure=cure)
+
+    def combine(self, components: Mapping[str, Steps], valid: Valid) -> tuple[Steps, Scenarios]:
+        """Return the scores of steps and of scenarios, in [0, 1].
+
+        Invalid steps score 0 and do not count for their scenario.
+
+        Raises:
+            UsageError: A component that has a weight is missing.
+        """
+        self.check_components(components)
+        shares = {name: weight / sum(self.weights.values()) for name, weight in self.weights.items()}
+        steps = sum(share * components[name] for name, share in shares.items())
+        # A mean of ones may exceed 1 by rounding.
+        steps = np.where(valid, np.minimum(steps, 1.0), 0.0)
+        if isinstance(self.scenario, str):
+            return steps, aggregate(steps, valid, self.scenario)
+        each = {name: aggregate(components[name], valid, self.scenario[name]) for name in shares}
+        scenarios = sum((share * each[name] for name, share in shares.items()), np.zeros(len(steps)))
+        return steps, np.minimum(scenarios, 1.0)
+
+
+def check_aggregator(name: str) -> None:
+    """Refuse an unknown aggregator."""
+    match = _NUMBERED.fullmatch(name)
+    if match is None:
+        known = name in ("max", "mean", "std")
+    else:
+        known = int(match[2]) <= 100 if match[1] == "p" else int(match[2]) >= 1
+    if not known:
+        cure = "use max, mean, std, p0 to p100, or top1, top2, ..."
+        raise UsageError(f"unknown aggregator {name!r}", cure=cure)
+
+
+def aggregate(steps: Steps, valid: Valid, name: str) -> Scenarios:
+    """Aggregate the valid steps of every scenario; 0 where there are none.
+
+    Percentiles interpolate linearly (NumPy's default); ``std`` is the population's.
+    """
+    check_aggregator(name)
+    count = valid.sum(axis=1)
+    divisor = np.maximum(count, 1)
+    masked = np.where(valid, steps, 0.0)
+    mean = masked.sum(axis=1) / divisor
+    if name == "mean":
+        return mean
+    if name == "std":
+        return np.sqrt(np.where(valid, (steps - mean[:, None]) ** 2, 0.0).sum(axis=1) / divisor)
+    ordered = np.sort(np.where(valid, steps, np.inf), axis=1)
+    ordered = np.where(np.isinf(ordered), 0.0, ordered)
+    match = _NUMBERED.fullmatch(name)
+    if match is not None and match[1] == "top":
+        rank = np.arange(steps.shape[1])
+        largest = (rank < count[:, None]) & (rank >= count[:, None] - int(match[2]))
+        return np.where(largest, ordered, 0.0).sum(axis=1) / np.maximum(largest.sum(axis=1), 1)
+    position = (divisor - 1) * (1.0 if match is None else int(match[2]) / 100.0)
+    low = np.floor(position).astype(int)
+    high, scenario = np.minimum(low + 1, divisor - 1), np.arange(len(steps))
+    fraction = position - low
+    return ordered[scenario, low] * (1.0 - fraction) + ordered[scenario, high] * fraction
+
 
 SCORES_VERSION = 3
 #: File name of the scores of an exported subset, in its folder.
@@ -32,14 +135,11 @@ class ScoreTable:
     """Scores of every scenario and step of a set, in the set's order.
 
     Attributes:
-        method: Name of the method.
-        config: Its configuration; ``combination`` holds the arguments of :meth:`combined`.
-        set_hash: ``ScenarioSet.hash`` of the data.
-        scenario_ids: Id of each scenario.
+        method, config: Its name and configuration; ``combination`` holds the arguments of :meth:`combined`.
+        set_hash, scenario_ids: ``ScenarioSet.hash`` of the data, and the id of each scenario.
         valid: Whether ego is observed; other steps score 0.
-        steps: Score of every step, in [0, 1].
-        scenarios: Score of every scenario, in [0, 1].
-        components: Components of the scores by name, of every step, in [0, 1].
+        steps, scenarios: Scores, in [0, 1].
+        components: Components of the steps' scores by name, in [0, 1].
     """
 
     method: str
@@ -90,12 +190,9 @@ def write_scores(table: ScoreTable, out: Path, overwrite: bool = False) -> None:
     check_output(out, overwrite)
     _check_range(table, None, "report this as a defect of drivax")
     header = {
-        "version": SCORES_VERSION,
-        "method": table.method,
-        "config": dict(table.config),
-        "set_hash": table.set_hash,
+        "version": SCORES_VERSION, "method": table.method, "config": dict(table.config), "set_hash": table.set_hash,
         "drivax_version": metadata.version("drivax"),
-    }
+    }  # fmt: skip
     with atomic_write(out) as file:
         np.savez_compressed(
             file,
@@ -116,11 +213,8 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
         DataError: The table is missing, damaged, of another version, or of other data than ``data``.
     """
     if not file.is_file():
-        raise DataError(
-            "score table not found",
-            file=file,
-            cure="write it with `drivax curate METHOD --data SET --out FILE`",
-        )
+        cure = "write it with `drivax curate METHOD --data SET --out FILE`"
+        raise DataError("score table not found", file=file, cure=cure)
     try:
         # np.load does not close a damaged file that it opened itself.
         with file.open("rb") as raw, np.load(raw, allow_pickle=False) as stored:
@@ -129,24 +223,14 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
             _check_source(header["version"], header["set_hash"], file, data)
             arrays = {name: stored[name] for name in stored.files if name not in ("header", "scenario_id")}
             _check_shapes(ids, arrays, file, data)
-            table = ScoreTable(
-                method=header["method"],
-                config=header["config"],
-                set_hash=header["set_hash"],
-                scenario_ids=ids,
-                valid=arrays["valid"],
-                steps=arrays["step_score"],
-                scenarios=arrays["scenario_score"],
-                components={
-                    name.removeprefix(_COMPONENT): values
-                    for name, values in arrays.items()
-                    if name.startswith(_COMPONENT)
-                },
-            )
+            valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
+            named = [name for name in arrays if name.startswith(_COMPONENT)]
+            components = {name.removeprefix(_COMPONENT): arrays[name] for name in named}
+            method, config, set_hash = (header[name] for name in ("method", "config", "set_hash"))
+            table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components)
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(
-            f"not a score table, or damaged ({type(error).__name__})", file=file, cure=_AGAIN
-        ) from error
+        problem = f"not a score table, or damaged ({type(error).__name__})"
+        raise DataError(problem, file=file, cure=_AGAIN) from error
     _check_range(table, file, _AGAIN)
     return table
 
@@ -156,20 +240,16 @@ def _check_source(version: object, set_hash: object, file: Path, data: ScenarioS
         raise DataError(f"version {version}, this drivax reads {SCORES_VERSION}", file=file, cure=_AGAIN)
     if set_hash != data.hash:
         own = data.path / OWN_SCORES
-        raise DataError(
-            f"scores are of other data (hash {str(set_hash)[:12]}, {data.path} has {data.hash[:12]})",
-            file=file,
-            cure=f"use {own}" if own.is_file() and own != file else _AGAIN,
-        )
+        problem = f"scores are of other data (hash {str(set_hash)[:12]}, {data.path} has {data.hash[:12]})"
+        cure = f"use {own}" if own.is_file() and own != file else _AGAIN
+        raise DataError(problem, file=file, cure=cure)
 
 
 def _check_shapes(ids: tuple[str, ...], arrays: Mapping[str, Any], file: Path, data: ScenarioSet) -> None:
     expected = tuple(entry["scenario_id"] for entry in data.entries)
     shape = (len(expected), data.capacity.steps)
-    fits = all(
-        values.shape == (shape[:1] if name == "scenario_score" else shape) for name, values in arrays.items()
-    )
-    if ids != expected or not fits:
+    shapes = {name: shape[:1] if name == "scenario_score" else shape for name in arrays}
+    if ids != expected or any(values.shape != shapes[name] for name, values in arrays.items()):
         raise DataError("does not score every scenario and step of its set", file=file, cure=_AGAIN)
 
 

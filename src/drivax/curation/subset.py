@@ -25,10 +25,9 @@ def check_top(
     """
     total, recordings = len(data), len(set(recordings_of(data.entries)))
     if not all_windows and recordings < total and not 1 <= count <= recordings:
-        raise UsageError(
-            f"the {count} most critical of {recordings} recordings, one scenario of each",
-            cure=f"ask for 1 to {recordings}, or pass --all-windows to choose among all {total} scenarios",
-        )
+        cure = f"ask for 1 to {recordings}, or pass --all-windows to choose among all {total} scenarios"
+        problem = f"the {count} most critical of {recordings} recordings, one scenario of each"
+        raise UsageError(problem, cure=cure)
     if not 1 <= count <= total:
         raise UsageError(f"the {count} most critical of {total} scenarios", cure=f"ask for 1 to {total}")
     refuse_part(data, out)
@@ -38,10 +37,7 @@ def check_top(
 def top_rows(table: ScoreTable, count: int, recordings: Sequence[str] | None = None) -> list[int]:
     """Return the indices of the ``count`` most critical scenarios, in the order of ``ScoreTable.order``.
 
-    Args:
-        table: The scores.
-        count: Maximum number.
-        recordings: Recording of every scenario; only the most critical scenario of each is taken. None: all are.
+    With the recording of every scenario, only the most critical scenario of each recording is taken.
     """
     indices = table.order
     if recordings is not None:
@@ -51,47 +47,30 @@ def top_rows(table: ScoreTable, count: int, recordings: Sequence[str] | None = N
 
 
 def subset_of_table(table: ScoreTable, indices: Sequence[int], subset: ScenarioSet) -> ScoreTable:
-    """Return the scores of a subset; their configuration names the whole set as ``part_of``.
+    """Return the scores of a subset that ``write_part`` wrote; their configuration names the whole set as ``part_of``.
 
-    Args:
-        table: Scores of the whole set.
-        indices: Scenarios of the whole set, in the order of the subset.
-        subset: The subset, as :func:`~drivax.datasets.export.writer.write_part` writes it.
+    ``indices`` are the scenarios of the whole set in the order of the subset.
     """
     chosen = list(indices)
     source = subset.manifest["source"]["part_of"]
     source = {name: value for name, value in source.items() if name not in ("method", "config")}
+    ids = tuple(table.scenario_ids[index] for index in chosen)
+    scores = {name: getattr(table, name)[chosen] for name in ("valid", "steps", "scenarios")}
+    components = {name: component[chosen] for name, component in table.components.items()}
+    config = {**table.config, "part_of": source}
     return replace(
-        table,
-        config={**table.config, "part_of": source},
-        set_hash=subset.hash,
-        scenario_ids=tuple(table.scenario_ids[index] for index in chosen),
-        valid=table.valid[chosen],
-        steps=table.steps[chosen],
-        scenarios=table.scenarios[chosen],
-        components={name: component[chosen] for name, component in table.components.items()},
+        table, config=config, set_hash=subset.hash, scenario_ids=ids, components=components, **scores
     )
 
 
 def write_top(
-    table: ScoreTable,
-    data: ScenarioSet,
-    count: int,
-    out: Path,
-    overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-    all_windows: bool = False,
-) -> Exported:
-    """Write the most critical scenarios as a scenario set, the most critical first, with their scores in its folder.
+    table: ScoreTable, data: ScenarioSet, count: int, out: Path, overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None, all_windows: bool = False,
+) -> Exported:  # fmt: skip
+    """Write the ``count`` most critical scenarios as a scenario set, the most critical first, with their scores.
 
-    Args:
-        table: Scores of ``data``.
-        data: The set.
-        count: How many.
-        out: Folder to create.
-        overwrite: Replace an existing scenario set.
-        progress: Called with (scenarios done, scenarios).
-        all_windows: Choose among all scenarios, not only the most critical one of each recording.
+    Without ``all_windows``, only the most critical scenario of each recording is chosen. ``progress`` is called with
+    (scenarios done, scenarios).
 
     Raises:
         UsageError: There are fewer, or ``out`` exists.

@@ -1,8 +1,8 @@
-"""Turn scores into sampling weights, and describe the draws that weights lead to."""
+"""Turn scores into sampling weights, describe the draws that weights lead to, and permute scores as a control."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -63,11 +63,8 @@ def sampling_weights(
 ) -> Float[Array, "N T"]:
     """Return the weight of every step: mean 1 over the steps that can be drawn, 0 elsewhere.
 
-    Args:
-        table: The scores.
-        config: How scores become weights.
-        scale: ``step``: weights of steps; ``scenario``: every step has the weight of its scenario.
-        usable: Steps that can be drawn (:func:`drivax.learning.loop.usable_steps`); None: ``ScoreTable.drawable``.
+    At the scale ``scenario``, every step has the weight of its scenario. The steps that can be drawn are ``usable``
+    (:func:`drivax.learning.loop.usable_steps`), by default ``ScoreTable.drawable``.
 
     Raises:
         UsageError: No step can be drawn, or all weights are 0.
@@ -128,8 +125,7 @@ class DrawStatistics:
         effective: Effective sample size over the number of drawable steps, ``(sum w)^2 / (n sum w^2)`` (Kish, 1965):
             1 for uniform weights, 1 / n if one step has all weight.
         effective_scenarios: The same for the scenarios' sums of weights.
-        tilt: 99th percentile of the weights over their mean.
-        largest: Largest weight over the mean.
+        tilt, largest: 99th percentile of the weights, and the largest, over their mean.
         concentration: Share of the draws from the 5 % of steps with the largest weights; 0.05 for uniform weights.
     """
 
@@ -151,4 +147,27 @@ def draw_statistics(weights: Float[Array, "N T"], drawable: Bool[Array, "N T"]) 
         tilt=float(np.quantile(values, 0.99) / values.mean()),
         largest=float(ordered[0] / values.mean()),
         concentration=float(ordered[: max(round(len(values) * 0.05), 1)].sum() / values.sum()),
+    )
+
+
+def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | None = None) -> ScoreTable:
+    """Return the matched random control of a table: every scenario gets the scores of another one, cyclically shifted.
+
+    The distribution of the scores is kept over all steps, within a scenario, and among scenarios; exactly where all
+    scenarios have the same number of usable steps (longer sequences are cut, shorter ones repeated). Permuting single
+    steps would spread large scores evenly over all scenarios, and the control would see more scenarios. ``usable``
+    steps are those of :func:`sampling_weights`.
+    """
+    rng = np.random.default_rng(seed)
+    drawable = table.drawable if usable is None else usable
+    steps, scenarios = table.steps.copy(), table.scenarios.copy()
+    indices = np.flatnonzero(drawable.any(axis=1))
+    for index, other in zip(indices, rng.permutation(indices), strict=True):
+        scores = table.steps[other, drawable[other]]
+        scores = np.roll(scores, rng.integers(len(scores)))
+        steps[index, drawable[index]] = np.resize(scores, int(drawable[index].sum()))
+        scenarios[index] = table.scenarios[other]
+    config = {"like": table.method, "like_config": dict(table.config), "seed": seed}
+    return replace(
+        table, method="random_matched", config=config, steps=steps, scenarios=scenarios, components={}
     )

@@ -18,7 +18,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from drivax.datasets.estimate import Estimate, estimate
+from drivax.datasets.doctor import Estimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, reader_named, survey
 from drivax.datasets.reader import BadRecord
 from drivax.datasets.spool import converted_ahead

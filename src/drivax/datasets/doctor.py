@@ -1,23 +1,27 @@
-"""What a file or folder is, what is missing, and what it would become; without converting anything."""
+"""What a file or folder is, what is missing, and how large a scenario set it would become, without converting it."""
 
 from __future__ import annotations
 
 import re
+import shutil
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from drivax.datasets import unsupported
-from drivax.datasets.estimate import estimate, free_bytes, input_bytes
-from drivax.datasets.formats import AUTO, Input, Survey, detect, reader_named, survey
-from drivax.datasets.reader import BadRecord, Description
-from drivax.errors import DataError, DrivaxError
+from drivax.datasets.formats import AUTO, Survey, reader_named, survey
+from drivax.datasets.reader import BadRecord, Description, Reader
+from drivax.errors import DataError, UsageError
 from drivax.scenario.recording import STRIDE
-from drivax.scenario.schema import CAPACITIES
+from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
 
 #: Files of a format that are inspected; they stand for the others.
 _SAMPLE = 24
+#: Files of a format whose scenarios are counted; where there are more, the sample is scaled by file size.
+_COUNTED = 48
 #: Damaged or unknown files that are named.
 _NAMED = 10
 #: Notes given on files of one kind.
@@ -28,14 +32,10 @@ _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 
 @dataclass(frozen=True)
 class Part:
-    """Files of one format, data set and version.
+    """Files of one format, data set and version: ``looked`` of them were described, ``whole`` if those are all.
 
-    Attributes:
-        format: As in ``--format``.
-        description: What they are; ``recordings`` is the sum over the files that were looked into, None where some
-            file does not tell; ``notes`` and ``missing`` are those of all of them.
-        looked: How many were looked into.
-        whole: Whether those are all that there are.
+    ``recordings`` of the description is the sum over these files, None if some file does not tell; ``notes`` and
+    ``missing`` are those of all of them.
     """
 
     format: str
@@ -51,13 +51,11 @@ class Diagnosis:
     Attributes:
         path: The file or folder.
         parts: What can be read in it.
-        files: Number of files by format.
-        input_bytes: Their size, without what is read along with them.
-        companions, ignored: How many other files are read along, and how many belong to no format.
-        scenarios: About how many scenarios it will become.
-        set_bytes: About how large they will be.
+        files: Number of files by format; ``input_bytes`` is their size.
+        companions: Number of files that are read along with them; ``ignored`` ones belong to no format.
+        scenarios: About how many scenarios it will become, of ``set_bytes`` altogether.
         free_bytes: What the disk of ``path`` has left.
-        shards: What is incomplete in numbered shards, one sentence each.
+        shards: One sentence per family of numbered shards.
         problems: What is wrong, and what to do about it; most important first.
         convertible: Whether ``drivax convert`` would make something of it.
     """
@@ -77,11 +75,7 @@ class Diagnosis:
 
 
 def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
-    """Finds out what a file or folder is. Nothing that is wrong with the data is an exception.
-
-    Args:
-        path: A file or a folder.
-        format: A format, or ``auto``.
+    """Find out what a file or folder is; what is wrong with the data is no exception but among the problems.
 
     Raises:
         UsageError: There is no such format, or a package that it needs is missing.
@@ -103,12 +97,12 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
         path=path,
         parts=parts,
         files=data.formats,
-        input_bytes=input_bytes(data.inputs),
+        input_bytes=_size([entry.path for entry in data.inputs]),
         companions=data.companions,
         ignored=data.ignored,
         scenarios=expected.scenarios,
         set_bytes=expected.size_bytes,
-        free_bytes=free_bytes(path),
+        free_bytes=expected.free_bytes,
         shards=tuple(gaps([entry.path for entry in data.inputs])),
         problems=tuple(problems),
         convertible=any(not part.description.missing for part in parts),
@@ -117,7 +111,8 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
-    problems = [_unknown(entry) for entry in data.inputs if entry.format is None][:_NAMED]
+    unknown = [entry.path for entry in data.inputs if entry.format is None][:_NAMED]
+    problems = [BadRecord.of(unsupported.explain(file), file) for file in unknown]
     for name in sorted(data.formats):
         files = [entry.path for entry in data.inputs if entry.format == name]
         step = -(-len(files) // _SAMPLE)
@@ -128,23 +123,22 @@ def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
                 problems.append(BadRecord.of(error, file))
                 continue
             groups[name, description.dataset, description.version, step == 1].append(description)
-    parts = tuple(
-        Part(format, Description(dataset, _flavours(many), version, *_together(many)), len(many), whole)
-        for (format, dataset, version, whole), many in groups.items()
-    )
-    return parts, problems
+    parts = (Part(name, _together(many), len(many), whole) for (name, *_, whole), many in groups.items())
+    return tuple(parts), problems
 
 
-def _flavours(many: Sequence[Description]) -> str:
+def _together(many: Sequence[Description]) -> Description:
+    """One description for files of one data set and version."""
     flavours = sorted({description.flavour for description in many})
     more = f" and {len(flavours) - _FLAVOURS} more" if len(flavours) > _FLAVOURS else ""
-    return "; ".join(flavours[:_FLAVOURS]) + more
-
-
-def _together(many: Sequence[Description]) -> tuple[int | None, tuple[str, ...], tuple[str, ...]]:
     counts = [description.recordings for description in many if description.recordings is not None]
-    missing = dict.fromkeys(name for description in many for name in description.missing)
-    return sum(counts) if len(counts) == len(many) else None, tuple(_notes(many)), tuple(missing)
+    return replace(
+        many[0],
+        flavour="; ".join(flavours[:_FLAVOURS]) + more,
+        recordings=sum(counts) if len(counts) == len(many) else None,
+        notes=tuple(_notes(many)),
+        missing=tuple(dict.fromkeys(name for description in many for name in description.missing)),
+    )
 
 
 def _notes(many: Sequence[Description]) -> Iterator[str]:
@@ -156,21 +150,11 @@ def _notes(many: Sequence[Description]) -> Iterator[str]:
         yield f"{len(counts) - _NOTES} more notes on single files; name one of them to see its own"
 
 
-def _unknown(entry: Input) -> BadRecord:
-    """What is wrong with a file that is called as those of a format are, and holds something else."""
-    try:
-        detect(entry.path)
-    except DrivaxError as error:
-        return BadRecord.of(error, entry.path)
-    return BadRecord(entry.path, None, "changed while it was looked at", "run drivax doctor again")
-
-
 def gaps(paths: Sequence[Path]) -> list[str]:
-    """Which shards of numbered families (``NAME-00003-of-00150``) are not there, one sentence per family."""
+    """Missing shards of numbered families (``NAME-00003-of-00150``), one sentence per family."""
     families: defaultdict[tuple[Path, str, int], set[int]] = defaultdict(set)
     for path in paths:
-        match = _SHARD.fullmatch(path.name)
-        if match:
+        if match := _SHARD.fullmatch(path.name):
             families[path.parent, match["prefix"], int(match["total"])].add(int(match["number"]))
     sentences = []
     for (_, prefix, total), numbers in sorted(families.items()):
@@ -178,18 +162,95 @@ def gaps(paths: Sequence[Path]) -> list[str]:
         if not missing:
             sentences.append(f"{prefix}: all {total:,} shards")
             continue
-        runs = _runs(missing)
-        named = f", missing {', '.join(runs)}" if len(runs) <= 8 else ""
+        runs = np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1)
+        names = (f"{run[0]:05d}" if len(run) == 1 else f"{run[0]:05d} to {run[-1]:05d}" for run in runs)
+        named = f", missing {', '.join(names)}" if len(runs) <= 8 else ""
         sentences.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{named}")
     return sentences
 
 
-def _runs(numbers: Sequence[int]) -> list[str]:
-    """Ascending numbers as runs: ``00003``, ``00007 to 00010``."""
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    return [f"{first:05d}" if first == last else f"{first:05d} to {last:05d}" for first, last in runs]
+@dataclass(frozen=True)
+class Estimate:
+    """What a conversion will need and what the disk has left; ``sampled`` if only some of the files were counted."""
+
+    scenarios: int
+    size_bytes: int
+    free_bytes: int
+    sampled: bool = False
+
+    def __str__(self) -> str:
+        size, free = gigabytes(self.size_bytes), gigabytes(self.free_bytes)
+        return f"about {counted(self.scenarios, 'scenario')}, {size}; {free} free"
+
+    def check(self, out: Path, written: int = 0) -> None:
+        """Refuse a set that will not fit; ``written`` of its scenarios are on the disk already."""
+        needed = self.size_bytes * max(self.scenarios - written, 0) // max(self.scenarios, 1)
+        if needed > self.free_bytes:
+            raise DataError(
+                f"the disk has {gigabytes(self.free_bytes)} left, the set needs about {gigabytes(needed)}",
+                file=out,
+                cure="make room, choose another disk, or use --limit",
+            )
+
+
+def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: int | None) -> Estimate:
+    """Estimate a conversion by counting scenarios, in a sample of the files where there are many.
+
+    Args:
+        data: What is converted.
+        out: Where the set will lie; the folder need not exist.
+        capacity: Padded sizes.
+        stride: Steps between the starts of two windows.
+        limit: The most scenarios, None for all.
+    """
+    total, sampled = 0.0, False
+    for name in data.formats:
+        paths = [entry.path for entry in data.inputs if entry.format == name]
+        step = -(-len(paths) // _COUNTED)
+        sample = paths[::step]
+        sampled |= step > 1
+        scale = _size(paths) / max(_size(sample), 1) if step > 1 else 1.0
+        total += scale * sum(count(reader_named(name), path, stride) for path in sample)
+    scenarios = round(total) if limit is None else min(round(total), limit)
+    return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out), sampled)
+
+
+def count(reader: Reader, path: Path, stride: int = STRIDE) -> int:
+    """About how many scenarios a file becomes; 0 if it cannot be read."""
+    try:
+        scenarios = reader.count(path)
+        if stride == STRIDE or scenarios == 0:
+            return scenarios
+        recordings = reader.describe(path).recordings
+    except (DataError, UsageError):
+        return 0
+    if not recordings or recordings >= scenarios:
+        return scenarios
+    # Readers count windows of the usual stride, which tell about how long the recordings are.
+    steps = STEPS + STRIDE * (scenarios / recordings - 1)
+    return round(recordings * ((steps - STEPS) // stride + 1))
+
+
+def free_bytes(path: Path) -> int:
+    """Free bytes of the disk on which a path lies, or would."""
+    path = path.absolute()
+    while not path.exists():
+        path = path.parent
+    return shutil.disk_usage(path).free
+
+
+def gigabytes(size: float) -> str:
+    """A readable size: ``540 kB``, ``6.6 GB``, ``412 GB``."""
+    for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if size >= scale:
+            return f"{size / scale:.1f} {unit}" if size < 10 * scale else f"{size / scale:,.0f} {unit}"
+    return f"{size / 1e3:.0f} kB" if size >= 1e3 else f"{size:.0f} bytes"
+
+
+def counted(number: int, noun: str) -> str:
+    """A number with its noun in the singular or plural."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+
+
+def _size(paths: Sequence[Path]) -> int:
+    return sum(path.stat().st_size for path in paths)

@@ -1,10 +1,11 @@
-"""Parsing that readers share: imports of extras, checks, time bases, lights by lane, city names, JSON files."""
+"""What readers share: imports of extras, checks, time bases, lights by lane, city names, JSON files, heights."""
 
 from __future__ import annotations
 
 import importlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,16 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from drivax.errors import DataError, missing_package
+from drivax.geometry.polylines import Polylines, cut_counts
 from drivax.scenario.arrays import differentiate as differentiate
-from drivax.scenario.recording import STRIDE, Light, MapFeature
-from drivax.scenario.schema import POLYGON_KINDS, STEPS, LightState, RoadKind
+from drivax.scenario.build.tracks import DEFAULT_SIZES
+from drivax.scenario.recording import STRIDE, Light, MapFeature, Tracks
+from drivax.scenario.schema import POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
 
-#: Cities (the tag ``place``) and how data sets call them or their parts: nuScenes and nuPlan by the names of their
-#: maps, Argoverse 2 by name or by the code in the names of its sensor maps.
+Array = np.ndarray[Any, Any]
+
+#: Cities (the tag ``place``) and the names of them or their parts in data sets: of the maps of nuScenes and nuPlan,
+#: of Argoverse 2 and the codes of its sensor maps.
 PLACES: Mapping[str, tuple[str, ...]] = {
     "austin": ("atx",),
     "boston": ("boston-seaport", "us-ma-boston"),
@@ -34,14 +39,7 @@ _LONGEST = 64
 
 
 def place_tags(location: str | None) -> dict[str, str]:
-    """The tags ``place`` (the city) and ``location`` (the source's own word, which may name a part of the city).
-
-    Args:
-        location: What the source calls the place; None or empty where it does not tell, which gives no tag.
-
-    Returns:
-        ``location`` alone where the city is not known: ``place`` never holds the private word of one data set.
-    """
+    """The tags ``place`` (the city, if it is a known one) and ``location`` (the source's own word); none without it."""
     if not location:
         return {}
     city = _CITY_OF.get(location.lower().replace("_", "-"))
@@ -63,28 +61,23 @@ def import_extra(package: str) -> Any:
 
 
 class Lights:
-    """Collects light states by lane: slots and list positions move between steps, lanes do not.
-
-    Args:
-        steps: Number of steps; a lane that is not observed at a step has state -1 there.
-    """
+    """Collects light states by lane over some steps; slots and list positions move between steps, lanes do not."""
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
-        # Lists of plain numbers: a scenario has a thousand observations, and arrays are slow one by one.
+        # Lists: a scenario has a thousand observations, and arrays are slow one by one.
         self._lights: dict[int, tuple[tuple[float, ...], list[int]]] = {}
 
     def observe(self, step: int, lane: int, state: int, stop_point: Sequence[float]) -> None:
-        """Note one observation. Of several for one lane and step the first that is not UNKNOWN counts."""
-        light = self._lights.get(lane)
-        if light is None:
-            light = self._lights[lane] = tuple(stop_point), [_UNOBSERVED] * self._steps
-        states = light[1]
+        """Note one observation; of several for one lane and step the first that is not UNKNOWN counts."""
+        if lane not in self._lights:
+            self._lights[lane] = tuple(stop_point), [_UNOBSERVED] * self._steps
+        states = self._lights[lane][1]
         if states[step] <= _UNKNOWN:
             states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
     def collected(self) -> tuple[Light, ...]:
-        """The lights in order of first observation."""
+        """The lights in order of first observation, with state -1 where they are not observed."""
         return tuple(
             Light(lane, np.array(point, np.float64), np.array(states, np.int8))
             for lane, (point, states) in self._lights.items()
@@ -92,7 +85,7 @@ class Lights:
 
 
 def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
-    """Row numbers as ints."""
+    """Row numbers as ints, each checked to be less than ``count``."""
     for row in rows:
         if not 0 <= row < count:
             raise DataError(f"{what} names track {row}, there are {count}", cure="skip this record")
@@ -100,13 +93,13 @@ def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
 
 
 def check_finite(*measured: np.ndarray[Any, Any]) -> None:
-    """Refuse NaN and infinities among what is marked valid."""
+    """Refuse NaN and infinities in valid states."""
     if not all(np.isfinite(values).all() for values in measured):
         raise DataError("valid states hold numbers that are not finite", cure="skip this record")
 
 
 def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " time"]:
-    """Timestamps with unknown ones (NaN) filled at 10 Hz from the nearest known one before, or after."""
+    """Timestamps with unknown ones (NaN) filled at 10 Hz from the nearest known one before, else after."""
     known = np.flatnonzero(np.isfinite(timestamps))
     steps = np.arange(len(timestamps))
     if known.size == 0:
@@ -118,12 +111,12 @@ def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " t
 def box_centre(
     rear_axle: Float[np.ndarray, "step 2"], heading: Float[np.ndarray, " step"], ahead_m: float
 ) -> Float[np.ndarray, "step 2"]:
-    """Positions of the middle of a car ``ahead_m`` ahead of its rear axle, where poses of recording cars are."""
+    """Positions of the box centre, ``ahead_m`` ahead of the rear axle, of which poses of recording cars are."""
     return rear_axle + ahead_m * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
 
 
 def spacing_m(features: Sequence[MapFeature]) -> float | None:
-    """Median distance of neighbouring points of lines (polygons are left out), metres; None without any."""
+    """Median distance of neighbouring points of lines without polygons, metres; None without any."""
     gaps = [
         np.hypot(*np.diff(feature.points[:, :2], axis=0).T)
         for feature in features
@@ -143,21 +136,69 @@ def load_json(path: Path) -> Any:
 
 
 def windows_of(steps: int) -> int:
-    """Number of scenarios that a recording of ``steps`` steps becomes (``scenario.recording.windows``)."""
+    """Number of windows that a recording of ``steps`` steps becomes."""
     return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
 
 
 def nonzero(**counts: int) -> dict[str, int]:
-    """Counts by name for ``Recording.lost``; only what is not zero."""
+    """Counts that are not zero, for ``Recording.lost``."""
     return {name: int(count) for name, count in counts.items() if count}
 
 
 def one_point_features(features: Sequence[MapFeature]) -> int:
-    """How many lines and polygons have one point only: without direction or extent they are nowhere on the map."""
+    """How many lines and polygons have one point only, so neither direction nor extent."""
     return sum(len(f.points) < 2 and f.kind != RoadKind.STOP_SIGN for f in features)
 
 
 def check_within(most: float, *measured: np.ndarray[Any, Any]) -> None:
-    """Refuse numbers that nothing on a road has: NaN, infinities, and what is further from 0 than ``most``."""
+    """Refuse NaN, infinities, and what is further from 0 than ``most``."""
     if not all((np.abs(values) <= most).all() for values in measured):  # NaN compares false
         raise DataError(f"holds numbers that are not finite or beyond {most:g}", cure="skip this record")
+
+
+#: Map lines are sampled at least this densely before the nearest point is looked up, unless that took too many.
+SPACING_M = 1.0
+MOST_SAMPLES = 1_000_000
+
+
+def lift(tracks: Tracks, features: Sequence[MapFeature]) -> Tracks:
+    """Set agents of a source without heights on its 3-D map: at the nearest map line, plus half their height.
+
+    Where roads cross above each other the nearest line in the plane decides, which may be of the other level. Without
+    a map the ground is at 0.
+    """
+    z = np.where(tracks.valid, _half_heights(tracks), 0.0)
+    ground = _samples(features)
+    if len(ground):
+        from scipy.spatial import KDTree
+
+        _, nearest = KDTree(ground[:, :2]).query(tracks.xy[tracks.valid])
+        z[tracks.valid] += ground[nearest, 2]
+    return replace(tracks, z=z)
+
+
+def flatten(tracks: Tracks, features: Sequence[MapFeature]) -> tuple[Tracks, tuple[MapFeature, ...]]:
+    """Set agents of a source with a 2-D map on the plane z = 0, box centres at half their height, and the map too."""
+    flat = tuple(replace(f, points=np.pad(f.points[:, :2], ((0, 0), (0, 1)))) for f in features)
+    return replace(tracks, z=np.where(tracks.valid, _half_heights(tracks), 0.0)), flat
+
+
+def _half_heights(tracks: Tracks) -> Float[Array, "track time"]:
+    """Half the height of every track and step; of its class if it was not measured."""
+    default = np.array([DEFAULT_SIZES[AgentKind(kind)][2] for kind in tracks.kind]).reshape(-1, 1)
+    return np.where(tracks.size[..., 2] > 0.0, tracks.size[..., 2], default) / 2
+
+
+def _samples(features: Sequence[MapFeature]) -> Float[Array, "sample 3"]:
+    """Points of all map lines, about ``SPACING_M`` apart along them; closing edges of polygons are left out."""
+    lines = Polylines.of([np.asarray(f.points, np.float64) for f in features if len(f.points)])
+    if len(lines.points) == 0:
+        return np.zeros((0, 3))
+    inner = np.append(lines.row[1:] == lines.row[:-1], False)
+    a, b = lines.points[inner], lines.points[np.flatnonzero(inner) + 1]
+    length = np.hypot(*(b - a)[:, :2].T)
+    pieces = cut_counts(length, max(SPACING_M, float(length.sum()) / MOST_SAMPLES))
+    owner = np.repeat(np.arange(len(a)), pieces)
+    part = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    between = a[owner] + (part / pieces[owner])[:, None] * (b - a)[owner]
+    return np.concatenate((between, lines.points[~inner]))

@@ -13,13 +13,9 @@ from drivax.scenario.recording import Recording
 
 @dataclass(frozen=True)
 class BadRecord:
-    """A record that could not be read or converted: plain data, so that worker processes can send it.
+    """A record that could not be read or converted, as plain data that worker processes can send.
 
-    Attributes:
-        file: The file that holds it.
-        record: Its number in the file (from 0) or its scenario id; None where the whole file is at fault.
-        problem: What is wrong.
-        cure: What to do about it.
+    ``record`` is its number in the file (from 0) or its scenario id, None for the whole file; ``cure`` is what to do.
     """
 
     file: Path
@@ -29,10 +25,9 @@ class BadRecord:
 
     @classmethod
     def of(cls, error: DrivaxError, file: Path, record: int | str | None = None) -> BadRecord:
-        """The bad record that an error describes; ``file`` and ``record`` where the error does not say."""
-        return cls(
-            error.file or file, record if error.record is None else error.record, error.problem, error.cure
-        )
+        """The bad record that an error describes; ``file`` and ``record`` unless the error names them."""
+        record = record if error.record is None else error.record
+        return cls(error.file or file, record, error.problem, error.cure)
 
     def error(self) -> DataError:
         """The error to raise for it."""
@@ -44,12 +39,10 @@ class Description:
     """What ``drivax doctor`` tells about one file of a format.
 
     Attributes:
-        dataset: Full name of the public data set, for people.
-        flavour: Which of its forms this is.
-        version: Its version, as far as the file tells.
-        recordings: How many recordings the file holds; None where only reading all of it would tell.
+        dataset: Full name of the public data set; ``flavour`` is its form, ``version`` as far as the file tells.
+        recordings: Number of recordings; None if only reading the whole file would tell.
         notes: What the file holds or lacks that its user should know, one short sentence each.
-        missing: Files that must lie next to it before it can be converted, and are not there.
+        missing: Files that it needs next to it and that are not there.
     """
 
     dataset: str
@@ -62,11 +55,11 @@ class Description:
 
 @runtime_checkable
 class Reader(Protocol):
-    """One public format. A new format is one module with such a class, listed in ``formats.READERS``.
+    """One public format: a module with such a class, listed in ``formats.READERS``.
 
-    Readers hold no state and no open files: worker processes receive them by name. The unit that is read at once is
-    one file, the one that names the recording or recordings (a shard, a pickle, a parquet or a database); what
-    belongs to it (a map, poses) is found next to it. Packages of extras are imported when they are needed.
+    Readers hold no state and no open files: worker processes receive them by name. They read one file at a time, the
+    one that names the recording or recordings (a shard, a pickle, a parquet, a database), and find what belongs to it
+    (a map, poses) next to it. Packages of extras are imported when they are needed.
     """
 
     @property
@@ -76,30 +69,26 @@ class Reader(Protocol):
 
     @property
     def patterns(self) -> tuple[str, ...]:
-        """File-name patterns of the format; a matching file in a folder is reported when it cannot be read."""
+        """File-name patterns of the format; a matching file that cannot be read is reported."""
         ...
 
     @property
     def companions(self) -> tuple[str, ...]:
-        """File-name patterns of what is read along with those files (maps, poses) and is no recording itself."""
+        """File-name patterns of what is read along with those files (maps, poses)."""
         ...
 
     def recognise(self, path: Path) -> bool:
-        """Whether the content of a file is of this format; looks at the beginning only, never raises."""
+        """Whether a file is of this format, by its beginning; never raises."""
         ...
 
     def describe(self, path: Path) -> Description:
-        """What the file is, without decoding all of it.
-
-        Raises:
-            DataError: It is damaged.
-        """
+        """What the file is, without decoding all of it; raises a DataError if it is damaged."""
         ...
 
     def count(self, path: Path) -> int:
-        """About how many scenarios the file will become, quickly; 0 where it cannot be read."""
+        """About how many scenarios the file becomes, quickly; 0 if it cannot be read."""
         ...
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recordings of one file in file order, and in their place the records that cannot be read."""
+        """The recordings of a file in file order, and a bad record in place of each that cannot be read."""
         ...

@@ -1,7 +1,7 @@
 """Reader of ScenarioMax's tf.Examples in TFRecord files, which V-Max reads.
 
-They have WOMD's layout (``womd.tf_example``) with differences: ego is row 0, ids are renumbered from 0, padding looks
-like tracks, times, speeds and courses are missing, map points have limits in mph, lights keep their slot and are
+They have WOMD's layout (``womd.example_reader``) with differences: ego is row 0, ids are renumbered from 0, padding
+looks like tracks, times, speeds and courses are missing, map points have limits in mph, lights keep their slot and are
 UNKNOWN where nothing was known, ten paths of ego are included, and the original data set is not named.
 """
 
@@ -14,8 +14,8 @@ import numpy as np
 
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
+from drivax.datasets.womd import example_reader as tf_example
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd import tf_example
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import Flag, LightState

@@ -1,7 +1,4 @@
-"""Files converted ahead in worker processes: records wait on the disk, not in memory, until it is their turn.
-
-Workers stream assembled records to a file each; what comes back through the process boundary is small.
-"""
+"""Convert files ahead in worker processes: assembled records wait on the disk, not in memory, for their turn."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +16,11 @@ import numpy as np
 
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DataError
-from drivax.scenario.schema import Capacity, Scenario, SourceCounts, record_dtype
+from drivax.scenario.schema import Capacity, Scenario, record_dtype
 from drivax.tracking.workers import await_interrupt, worker_pool
 
-
-@dataclass(frozen=True)
-class _Kept:
-    """A scenario whose record is in the spool file."""
-
-    source: SourceCounts
-    overflow: dict[str, int]
-    tags: dict[str, str]
+#: In place of a record that is in the spool file.
+_SPOOLED = np.zeros(())
 
 
 def converted_ahead(
@@ -39,29 +30,26 @@ def converted_ahead(
     workers: int,
     folder: Path,
 ) -> Generator[Iterator[Scenario | BadRecord], None, None]:
-    """The results of tasks in the order of the tasks, made in worker processes.
+    """Yield the scenarios and bad records of each task in order; read them before asking for the next task's.
 
     Args:
-        tasks: Arguments that can be sent to other processes.
-        convert: What a worker does with those of one task, a function of a module.
+        tasks: Arguments of ``convert``, which can be sent to other processes.
+        convert: What a worker does, a function of a module.
         capacity: Padded sizes of the scenarios.
         workers: Number of processes.
-        folder: An existing folder for what waits: about ``workers + 2`` tasks' worth.
-
-    Yields:
-        The scenarios and bad records of one task; read them before asking for the next.
+        folder: An existing folder for the records of about ``workers + 2`` tasks.
     """
     spool = folder / f"spool-{os.getpid()}"
     spool.mkdir()
     pool = worker_pool(min(workers, len(tasks)))
-    waiting: deque[tuple[Path, Future[list[_Kept | BadRecord]]]] = deque()
-    todo = iter(enumerate(tasks))
+    waiting: deque[tuple[Path, Future[list[Scenario | BadRecord]]]] = deque()
+    todo = enumerate(tasks)
     try:
         while True:
             # Two tasks ahead keep all workers busy and bound the space on the disk.
-            while len(waiting) < workers + 2 and (following := next(todo, None)) is not None:
-                path = spool / f"{following[0]}.records"
-                waiting.append((path, pool.submit(_spool, following[1], convert, capacity, path)))
+            while len(waiting) < workers + 2 and (numbered := next(todo, None)) is not None:
+                path = spool / f"{numbered[0]}.records"
+                waiting.append((path, pool.submit(_spool, numbered[1], convert, path)))
             if not waiting:
                 return
             path, future = waiting.popleft()
@@ -73,29 +61,24 @@ def converted_ahead(
 
 
 def _spool(
-    task: tuple[Any, ...],
-    convert: Callable[..., Iterator[Scenario | BadRecord]],
-    capacity: Capacity,
-    path: Path,
-) -> list[_Kept | BadRecord]:
-    """Runs in workers: one task, its records to ``path``."""
-    items: list[_Kept | BadRecord] = []
+    task: tuple[Any, ...], convert: Callable[..., Iterator[Scenario | BadRecord]], path: Path
+) -> list[Scenario | BadRecord]:
+    """Run one task in a worker: its records go to ``path``, the rest comes back."""
+    items: list[Scenario | BadRecord] = []
     if not path.parent.is_dir():
         return items
     with path.open("wb") as file:
         for item in convert(*task):
             if not path.exists():
                 break
-            if isinstance(item, BadRecord):
-                items.append(item)
-                continue
-            file.write(item.record.tobytes())
-            items.append(_Kept(item.source, item.overflow, item.tags))
+            if isinstance(item, Scenario):
+                file.write(item.record.tobytes())
+            items.append(replace(item, record=_SPOOLED) if isinstance(item, Scenario) else item)
     return items
 
 
 def _unspool(
-    future: Future[list[_Kept | BadRecord]], path: Path, capacity: Capacity
+    future: Future[list[Scenario | BadRecord]], path: Path, capacity: Capacity
 ) -> Iterator[Scenario | BadRecord]:
     try:
         items = future.result()
@@ -110,6 +93,6 @@ def _unspool(
         for item in items:
             if isinstance(item, BadRecord):
                 yield item
-                continue
-            record = np.frombuffer(file.read(dtype.itemsize), dtype).reshape(())
-            yield Scenario(record, capacity, item.source, item.overflow, tags=item.tags)
+            else:
+                record = np.frombuffer(file.read(dtype.itemsize), dtype).reshape(())
+                yield replace(item, record=record)

@@ -7,7 +7,7 @@ from .episode_table import Trajectories as Trajectories
 from .observation_statistics import observation_statistics as observation_statistics
 from .pairing import comparable as comparable
 from .plan import ComparisonPlan as ComparisonPlan
-from .run_evaluation import EvaluationConfig as EvaluationConfig
-from .run_evaluation import format_summary as format_summary
-from .run_evaluation import run_evaluation as run_evaluation
+from .runner import EvaluationConfig as EvaluationConfig
 from .runner import evaluate as evaluate
+from .runner import format_summary as format_summary
+from .runner import run_evaluation as run_evaluation

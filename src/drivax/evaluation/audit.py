@@ -1,7 +1,6 @@
 """Audit scenarios: replay each log through the metrics. Any violation of the expert is a defect of map or converter.
 
-Steps without a logged ego are not evaluated; :data:`~drivax.scenario.select.selection.FINDINGS`
-says what each finding means.
+Steps without a logged ego are not evaluated; :data:`~drivax.scenario.select.selection.FINDINGS` explains each finding.
 """
 
 from __future__ import annotations
@@ -24,9 +23,8 @@ from drivax.tasks.actions import PHYSICAL, PUBLISHED
 
 Finding = dict[str, float | int | bool | str | None]
 
-#: Logs that are replayed in one batch.
+#: Logs per batch.
 BATCH = 64
-
 #: A route leads to the goal when the log ends within this distance of it (semantics, ``reached_goal``).
 GOAL_M = 3.0
 _READ = (
@@ -38,15 +36,12 @@ _SPACES = {"clipped_physical": PHYSICAL, "clipped_published": PUBLISHED}
 
 
 def scenario_names(scenarios: Sequence[Scenario]) -> list[dict[str, str]]:
-    """``dataset``, ``scenario_id`` and ``segment`` of scenarios, as tables carry them."""
+    """Return ``dataset``, ``scenario_id`` and ``segment`` of scenarios, the keys of tables."""
     return [{name: s.text(name) for name in ("dataset", "scenario_id", "segment")} for s in scenarios]
 
 
 def audit(scenarios: Sequence[Scenario]) -> list[Finding]:
-    """Replay the logs of scenarios exactly, from the current step to their end.
-
-    Args:
-        scenarios: All of one capacity.
+    """Replay the logs of scenarios of one capacity exactly, from the current step to their end.
 
     Returns:
         Findings by name, one mapping per scenario. None means not applicable (a route deviation without a route);
@@ -55,14 +50,12 @@ def audit(scenarios: Sequence[Scenario]) -> list[Finding]:
     usable = [scenario for scenario in scenarios if Flag.NO_FUTURE not in scenario.has]
     batches = (usable[first : first + BATCH] for first in range(0, len(usable), BATCH))
     replayed = iter([row for batch in batches for row in _replayed(batch)])
-    return [
-        (next(replayed) if Flag.NO_FUTURE not in scenario.has else {}) | _known(scenario)
-        for scenario in scenarios
-    ]
+    futures = ((scenario, Flag.NO_FUTURE not in scenario.has) for scenario in scenarios)
+    return [(next(replayed) if future else {}) | _known(scenario) for scenario, future in futures]
 
 
 def _known(scenario: Scenario) -> Finding:
-    """Findings that need no replay."""
+    """Return findings that need no replay."""
     flags = scenario.has
     return {
         "lights_seen": int((scenario.light_state >= 0).any(axis=0).sum()),
@@ -75,56 +68,41 @@ def _known(scenario: Scenario) -> Finding:
 class _Watch:
     """A task without observation, reward, metrics and termination, which keeps the program small."""
 
-    @property
-    def reads(self) -> frozenset[str]:
-        """What the findings are made from."""
-        return frozenset(_READ)
+    reads = frozenset(_READ)
 
     def motion(self, motion: Array, action: Array, length: Any) -> Array:
-        """The kinematic bicycle under the default action space."""
         return PHYSICAL.move(motion, action, length)
 
     def actuated(self, motion: Array, action: Array, last: Array) -> Array:
-        """The action within its bounds."""
         return PHYSICAL.actuated(motion, action, last)
 
     def first_action(self, history: Array, length: Any) -> Array:
-        """None."""
         return PHYSICAL.first(history, length)
 
     def observe(
         self, bank: ScenarioBank, context: AgentContext, agents: Any, frame: Frame
     ) -> Mapping[str, Any]:
-        """Nothing."""
         return {}
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Array]:
-        """Nothing."""
         return {}
 
     def ended(self, bank: ScenarioBank, context: AgentContext, facts: Facts) -> tuple[Array, Array]:
-        """Never."""
         return jnp.zeros((), bool), jnp.zeros((), bool)
 
     def episode_start(self) -> None:
-        """Nothing."""
+        pass
 
     def episode_add(self, episode: Any, situation: Situation, start: Array, final: Array) -> None:
-        """Nothing."""
+        pass
 
 
 @partial(jax.jit, static_argnames="driven")
 def replay(bank: ScenarioBank, index: Int[Array, " B"], driven: bool = False) -> dict[str, Array]:
-    """Facts of every scenario at the current step and at every step after it.
+    """Return facts of scenarios (rows of the bank) at the current step and at every step after it, ``[B, 81]`` each.
 
-    Args:
-        bank: The scenarios.
-        index: Rows of the bank.
-        driven: Follow the log through the dynamics instead of putting ego where it was logged.
-
-    Returns:
-        ``[B, 81]`` each, by the names of ``simulator.types.Facts``; and whether the action that follows the log to this
-        step is outside of an action space, ``clipped_<space>``.
+    By the names of ``simulator.types.Facts``; ``clipped_<space>``: the action that follows the log to this step is
+    outside of an action space. With ``driven``, ego follows the log through the dynamics instead of being put there.
     """
     simulator = Simulator(_Watch())
 
@@ -154,7 +132,7 @@ def _read(facts: Facts) -> dict[str, Array]:
 
 
 def _replayed(scenarios: Sequence[Scenario]) -> list[Finding]:
-    """Findings of one batch. It is filled up and not trimmed, so that one compiled program serves every batch."""
+    """Return findings of one batch, padded and not trimmed, so that one compiled program serves every batch."""
     filled = [*scenarios, *[scenarios[-1]] * (BATCH - len(scenarios))]
     bank = ScenarioBank.from_scenarios(filled, trim=False)
     series = jax.tree.map(np.asarray, replay(bank, jnp.arange(BATCH)))
@@ -165,7 +143,7 @@ def _replayed(scenarios: Sequence[Scenario]) -> list[Finding]:
 
 
 def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) -> Finding:
-    """Findings of one replay; entry 0 of the series is the current step, which only the first steps look at."""
+    """Return findings of one replay; entry 0 of the series, the current step, counts only for ``first_*_step``."""
     flags, logged = scenario.has, series["logged"]
     evaluated = logged.copy()
     evaluated[0] = False
@@ -173,6 +151,7 @@ def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) ->
     hit, off, red = (series[name] & evaluated for name in ("collision", "offroad", "red_light"))
     deviation = series["route_deviation_m"][evaluated] if Flag.ROUTE in flags else np.zeros(0)
     ran_red = bool(red.any()) if Flag.LIGHTS in flags else None
+    reached = bool((series["goal_distance_m"][evaluated][-1:] <= GOAL_M).all())
     return {
         "log_collides": bool(hit.any()),
         "first_collision_step": _first(hit),
@@ -184,9 +163,7 @@ def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) ->
         "distance_m": _rounded(series["moved_m"][evaluated].sum()),
         "route_deviation_mean_m": _rounded(deviation.mean()) if len(deviation) else None,
         "route_deviation_max_m": _rounded(deviation.max()) if len(deviation) else None,
-        "route_reaches_goal": bool(series["goal_distance_m"][evaluated][-1] <= GOAL_M)
-        if len(deviation)
-        else None,
+        "route_reaches_goal": reached if len(deviation) else None,
         "ignored_overlaps": int(series["ignored"].max()),
         **{name: _share(series[name], evaluated) for name in _SPACES},
         "clean": not hit.any() and not off.any() and not ran_red if mapped else None,
@@ -194,7 +171,7 @@ def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) ->
 
 
 def _share(clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:
-    """Share of the steps between evaluated steps, or from the current step, whose action a space clips."""
+    """Return the share of steps from an evaluated (or the current) step whose action a space clips."""
     steps = evaluated.copy()
     steps[2:] &= evaluated[1:-1]
     return _rounded(clipped[steps].mean(), 4) if steps.any() else None

@@ -16,44 +16,26 @@ from jaxtyping import Bool, Float64
 
 from drivax import settings
 from drivax.errors import UsageError
-from drivax.evaluation.decision import Decision, MetricComparison, Sensitivity, decide, with_winner
+from drivax.evaluation import pairing
 from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interval_of
-from drivax.evaluation.pairing import Pairs, check_metric, check_pairs, undefined_metric
-from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.split import Split, assign, strata_of
+from drivax.evaluation.pairing import Pairs, Split
+from drivax.evaluation.plan import ComparisonPlan, Decision, MetricComparison, Sensitivity, decide
+from drivax.stats import effects, significance
 from drivax.stats.clusters import defined, design_effect
-from drivax.stats.effects import (
-    ROUNDING,
-    cohens_d,
-    cohens_d_paired,
-    detectable,
-    pooled_deviation,
-    power,
-    scenarios_needed,
-)
 from drivax.stats.intervals import Interval, interquartile_bootstrap, paired_bootstrap, split_bootstrap
 from drivax.stats.seeds import Crossed, difference_interval, seeds_interval
-from drivax.stats.significance import (
-    Evidence,
-    holm,
-    mcnemar,
-    paired_bootstrap_test,
-    paired_permutation,
-    split_permutation,
-)
+from drivax.stats.significance import Evidence
 
-#: Without a smallest difference of its own, a plan takes this share of the standard deviation.
-SMALL_EFFECT = 0.1
+#: Smallest difference that matters by default, as a share of the standard deviation.
+_SMALL_EFFECT = 0.1
 Values = Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
 class SeedSpread:
-    """How the seeds of a policy differ in the primary metric.
+    """Means of a policy's seeds in the primary metric (None: undefined throughout), and their interquartile mean.
 
-    Attributes:
-        means: Of each seed; None where it is undefined throughout.
-        interquartile: Interquartile mean over seeds, with an interval that resamples seeds and recordings.
+    The interval of the interquartile mean resamples seeds and recordings.
     """
 
     means: tuple[float | None, ...]
@@ -65,18 +47,12 @@ class Comparison:
     """The result of a comparison.
 
     Attributes:
-        plan: The plan.
-        names: Names of A and B.
-        folders: Run folders of A and B.
+        names, folders: Names and run folders of A and B.
         traffic: Traffic model of both.
-        scenarios: Of A and of B; the same ones where they are paired.
-        recordings: Of A and of B.
+        scenarios, recordings: Numbers of A and of B; the same ones where they are paired.
         strata: Number of strata of the split; 1 without.
-        primary: The metric that decides.
-        secondary: The others.
         sensitivity: Of the primary metric; None where it does not vary.
         seeds: Spread over seeds of A and B; None for a single one.
-        decision: The decision.
     """
 
     plan: ComparisonPlan
@@ -93,7 +69,7 @@ class Comparison:
     decision: Decision
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; null where undefined."""
+        """Return plain values for JSON; null where undefined."""
         folders = [None if folder is None else str(folder) for folder in self.folders]
         values = asdict(self) | {"plan": settings.plain(self.plan), "folders": folders}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
@@ -101,7 +77,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Side:
-    """One planner: the evaluations of its seeds, and its scenarios among the common ones."""
+    """One planner: the evaluations of its seeds, and which of the common scenarios are its own."""
 
     tables: Sequence[EpisodeTable]
     pairs: Pairs
@@ -111,7 +87,7 @@ class _Side:
         return np.stack([self.pairs.values(table, metric) for table in self.tables])
 
     def values(self, metric: str) -> Values:
-        """Mean over the seeds; NaN where one of them leaves it undefined, and outside of the arm."""
+        """Return the mean over the seeds; NaN where undefined for a seed, and outside of the arm."""
         return np.where(self.arm, self.by_seed(metric).mean(axis=0), np.nan)
 
     @property
@@ -128,6 +104,25 @@ class _Side:
     def recordings(self) -> int:
         return len({cluster for cluster, mine in zip(self.pairs.clusters, self.arm, strict=True) if mine})
 
+    def interval(self, plan: ComparisonPlan, metric: str, counts: Bool[np.ndarray, " n"]) -> Interval:
+        """Return mean and interval over the scenarios that count."""
+        clusters = self.pairs.clusters
+        if len(self.tables) == 1:
+            x = np.where(counts, self.values(metric), np.nan)
+            return interval_of(metric, x, clusters, plan.confidence, plan.seed)
+        x = np.where(counts, self.by_seed(metric), np.nan)
+        return seeds_interval(x, clusters, confidence=plan.confidence, share=metric in SHARES)
+
+    def spread(self, plan: ComparisonPlan) -> SeedSpread | None:
+        if len(self.tables) == 1:
+            return None
+        x = np.where(self.arm, self.by_seed(plan.primary), np.nan)
+        middle = interquartile_bootstrap(
+            x, self.pairs.clusters, plan.confidence, plan.resamples, seed=plan.seed
+        )
+        means = [row[~np.isnan(row)] for row in x]
+        return SeedSpread(tuple(float(row.mean()) if row.size else None for row in means), middle)
+
 
 def compare(
     plan: ComparisonPlan,
@@ -135,20 +130,16 @@ def compare(
     b: Sequence[EpisodeTable],
     entries: Sequence[Mapping[str, Any]] = (),
 ) -> Comparison:
-    """Compare two planners by a plan.
+    """Compare two planners by a plan, each with an evaluation per seed.
 
-    Args:
-        plan: What to compare and how to decide.
-        a: The evaluations of A's seeds; one for a planner without.
-        b: B's.
-        entries: What the manifest of the set says about each scenario, for a stratified split.
+    Manifest ``entries`` of the scenarios are for a stratified split.
 
     Raises:
         UsageError: The evaluations cannot be compared, or lack a metric of the plan.
     """
-    check_pairs(a, b)
+    pairing.check_pairs(a, b)
     for metric in (plan.primary, *plan.secondary):
-        check_metric(metric, (*a, *b), primary=metric == plan.primary)
+        pairing.check_metric(metric, (*a, *b), primary=metric == plan.primary)
     pairs = Pairs.of(*a, *b)
     if not pairs.keys:
         raise UsageError("A and B have no scenario in common", cure="evaluate both on the same scenarios")
@@ -158,13 +149,12 @@ def compare(
     whole = np.ones(len(pairs.keys), bool)
     arms = (whole, whole) if split is None else (split.first, ~split.first)
     sides = _Side(a, pairs, arms[0]), _Side(b, pairs, arms[1])
-    first = _compared(plan, plan.primary, sides, split)
+    first, *others = (_compared(plan, metric, sides, split) for metric in (plan.primary, *plan.secondary))
     if min(first.a.n, first.b.n) == 0:
-        raise undefined_metric(plan.primary, (*a, *b))
-    others = [_compared(plan, metric, sides, split) for metric in plan.secondary]
-    adjusted = holm([metric.evidence.p for metric in others])
-    secondary = tuple(with_winner(plan, metric, p) for metric, p in zip(others, adjusted, strict=True))
-    primary = with_winner(plan, first, first.evidence.p)
+        raise pairing.undefined_metric(plan.primary, (*a, *b))
+    adjusted = significance.holm([metric.evidence.p for metric in others])
+    secondary = tuple(metric.with_winner(plan, p) for metric, p in zip(others, adjusted, strict=True))
+    primary = first.with_winner(plan, first.evidence.p)
     sensitivity = _sensitivity(plan, sides, split)
     return Comparison(
         plan=plan,
@@ -177,7 +167,7 @@ def compare(
         primary=primary,
         secondary=secondary,
         sensitivity=sensitivity,
-        seeds=(_spread(plan, sides[0]), _spread(plan, sides[1])),
+        seeds=(sides[0].spread(plan), sides[1].spread(plan)),
         decision=decide(plan, primary, secondary, sensitivity),
     )
 
@@ -195,11 +185,10 @@ def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, An
         known = {(entry["dataset"], entry["scenario_id"]): entry for entry in entries}
         missing = next((key for key in pairs.keys if key not in known), None)
         if missing is not None:
-            raise UsageError(
-                f"nothing tells the stratum of {missing[1]}", cure="name the set that was driven with --data"
-            )
-        strata = strata_of([known[key] for key in pairs.keys], plan.strata)
-    return assign(pairs.clusters, strata, plan.ratio, plan.seed)
+            cure = "pass the set that was evaluated with --data"
+            raise UsageError(f"nothing tells the stratum of {missing[1]}", cure=cure)
+        strata = pairing.strata_of([known[key] for key in pairs.keys], plan.strata)
+    return pairing.assign(pairs.clusters, strata, plan.ratio, plan.seed)
 
 
 def _compared(
@@ -215,7 +204,7 @@ def _compared(
     if split is not None:
         values = np.where(split.first, x, y)
         difference = split_bootstrap(values, split.first, clusters, strata=split.strata, **draws)
-        evidence = split_permutation(
+        evidence = significance.split_permutation(
             values, split.first, clusters, split.strata, plan.resamples, seed=plan.seed
         )
     elif seeds == 1:
@@ -225,51 +214,39 @@ def _compared(
         difference, crossed = _of_seeds(plan, metric, sides)
         p, units = (None, 0) if crossed is None else (crossed.p, crossed.clusters)
         evidence = Evidence("t", p, units, exact=False)
-    effects = asdict(cohens_d_paired(x, y)) if split is None else {"d": cohens_d(x, y)}
-    a, b = (_interval(plan, metric, side, both) for side in sides)
+    size = {"d": effects.cohens_d(x, y)} if split else asdict(effects.cohens_d_paired(x, y))
+    a, b = (side.interval(plan, metric, both) for side in sides)
     column = sides[0].tables[0].metric(metric)
     unit, better = ("", "-") if column is None else (column.unit, column.better)
     return MetricComparison(
-        metric, unit, better, a, b, difference, effects, evidence, None, None, seeds, *undefined
+        metric, unit, better, a, b, difference, size, evidence, None, None, seeds, *undefined
     )
 
 
 def _of_seeds(
     plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side]
 ) -> tuple[Interval, Crossed | None]:
-    """A difference that other seeds and other recordings would show again."""
+    """Return a difference whose interval covers other seeds and other recordings."""
     x, y = (side.by_seed(metric) for side in sides)
     return difference_interval(x, y, sides[0].pairs.clusters, plan.confidence)
-
-
-def _interval(plan: ComparisonPlan, metric: str, side: _Side, counts: Bool[np.ndarray, " n"]) -> Interval:
-    """Of one planner, over the scenarios that count."""
-    clusters = side.pairs.clusters
-    if len(side.tables) == 1:
-        x = np.where(counts, side.values(metric), np.nan)
-        return interval_of(metric, x, clusters, plan.confidence, plan.seed)
-    x = np.where(counts, side.by_seed(metric), np.nan)
-    return seeds_interval(x, clusters, confidence=plan.confidence, share=metric in SHARES)
-
-
-def _is_binary(x: Values) -> bool:
-    return bool(np.isin(x[~np.isnan(x)], (0.0, 1.0)).all())
 
 
 def _paired_test(
     plan: ComparisonPlan, metric: str, x: Values, y: Values, clusters: Sequence[str]
 ) -> Evidence:
-    """McNemar's test of rates in independent pairs; else the plan's test of means, by recordings."""
+    """Apply McNemar's test to rates in independent pairs; else the plan's test of means, by recordings."""
     _, labels = defined(x, clusters)
-    alone = labels.size == 0 or int(labels.max()) + 1 == labels.size
-    if metric in RATES and alone and _is_binary(x) and _is_binary(y):
-        return mcnemar(x, y)
-    test = paired_permutation if plan.test == "permutation" else paired_bootstrap_test
+    independent = labels.size == 0 or int(labels.max()) + 1 == labels.size
+    known = np.concatenate((x, y))
+    if metric in RATES and independent and np.isin(known[~np.isnan(known)], (0.0, 1.0)).all():
+        return significance.mcnemar(x, y)
+    permutation = plan.test == "permutation"
+    test = significance.paired_permutation if permutation else significance.paired_bootstrap_test
     return test(x, y, clusters, plan.resamples, seed=plan.seed)
 
 
 def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split | None) -> Sensitivity | None:
-    """What the primary metric could have shown."""
+    """Return what the primary metric could have shown."""
     x, y = (side.values(plan.primary) for side in sides)
     if split is None:
         apart, labels = defined(x - y, sides[0].pairs.clusters)
@@ -279,51 +256,37 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
         apart, labels = defined(residuals, sides[0].pairs.clusters)
         a, b = x[~np.isnan(x)], y[~np.isnan(y)]
         share = a.size / apart.size
-        deviation = pooled_deviation(a, b) if apart.size > 2 else 0.0
+        deviation = effects.pooled_deviation(a, b) if apart.size > 2 else 0.0
     if apart.size < 2:
         return None
     inflation = design_effect(apart, labels)
+    smallest = plan.smallest_difference or _SMALL_EFFECT * deviation
     if max(len(side.tables) for side in sides) > 1:
-        return _sensitivity_of_seeds(
-            plan, _of_seeds(plan, plan.primary, sides)[1], apart.size, deviation, inflation
-        )
-    if deviation <= ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
+        crossed = _of_seeds(plan, plan.primary, sides)[1]
+        return _sensitivity_of_seeds(plan, crossed, apart.size, deviation, inflation, smallest)
+    if deviation <= effects.ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
         return None
-    smallest = plan.smallest_difference or SMALL_EFFECT * deviation
-    effect = smallest / deviation
-    n = apart.size / inflation
-    seen = detectable(n, plan.power, plan.confidence, share)
+    effect, n = smallest / deviation, apart.size / inflation
+    seen = effects.detectable(n, plan.power, plan.confidence, share)
     return Sensitivity(
         deviation=deviation,
         design_effect=inflation,
         smallest=smallest,
-        power=power(effect, n, plan.confidence, share),
+        power=effects.power(effect, n, plan.confidence, share),
         detectable=None if seen is None else seen * deviation,
-        needed=math.ceil(inflation * scenarios_needed(effect, plan.power, plan.confidence, share)),
+        needed=math.ceil(inflation * effects.scenarios_needed(effect, plan.power, plan.confidence, share)),
     )
 
 
 def _sensitivity_of_seeds(
-    plan: ComparisonPlan, effect: Crossed | None, n: int, deviation: float, inflation: float
+    plan: ComparisonPlan, effect: Crossed | None, n: int, deviation: float, inflation: float, smallest: float
 ) -> Sensitivity | None:
-    """The same where seeds vary too, which more scenarios do not change."""
+    """Return the sensitivity where seeds vary too, which more scenarios do not change."""
     if effect is None or effect.error == 0.0:
         return None
-    smallest = plan.smallest_difference or SMALL_EFFECT * deviation
     chance, needed = effect.power(smallest, plan.confidence), n
     if chance < plan.power:
         clusters = replace(effect, difference=smallest).clusters_needed(plan.power, plan.confidence)
         needed = None if clusters is None else math.ceil(clusters * n / effect.clusters)
-    return Sensitivity(
-        deviation, inflation, smallest, chance, effect.detectable(plan.power, plan.confidence), needed
-    )
-
-
-def _spread(plan: ComparisonPlan, side: _Side) -> SeedSpread | None:
-    if len(side.tables) == 1:
-        return None
-    x = np.where(side.arm, side.by_seed(plan.primary), np.nan)
-    clusters = side.pairs.clusters
-    middle = interquartile_bootstrap(x, clusters, plan.confidence, plan.resamples, seed=plan.seed)
-    means = [row[~np.isnan(row)] for row in x]
-    return SeedSpread(tuple(float(row.mean()) if row.size else None for row in means), middle)
+    least = effect.detectable(plan.power, plan.confidence)
+    return Sensitivity(deviation, inflation, smallest, chance, least, needed)

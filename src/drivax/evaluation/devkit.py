@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float64, Int
 
+from drivax.metrics.catalogue import NUPLAN_WEIGHTS
 from drivax.metrics.comfort import (
     JERK,
     JERK_MAGNITUDE_MPS3,
@@ -29,7 +30,6 @@ from drivax.metrics.comfort import (
     YAW_RATE_RPS,
     savgol_matrix,
 )
-from drivax.metrics.scores import NUPLAN_WEIGHTS
 from drivax.scenario.schema import DT_S, AgentKind
 
 #: Rear axle to centre of nuPlan's car (Chrysler Pacifica), m.

@@ -6,10 +6,11 @@ import csv
 import json
 import math
 import zipfile
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,16 +27,11 @@ from drivax.tracking.run_folder import RunFolder, existing
 #: Columns of ``episodes.csv`` before the metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
 #: Columns that an evaluation adds to the metrics.
+_CRASHED = "the planner raised an error, or its action was not finite: a failed episode"
+_ACTION_JERK = "standard deviation of the change of the action from step to step; 0.82 for random actions"
 ADDED = {
-    "crashed": Column(
-        "-", "low", "the planner raised an error, or its action was not finite: a failed episode", kind="rate"
-    ),
-    "action_jerk": Column(
-        "-",
-        "low",
-        "standard deviation of the change of the action from step to step; 0.82 for random actions",
-    ),
-}
+    "crashed": Column("-", "low", _CRASHED, kind="rate"), "action_jerk": Column("-", "low", _ACTION_JERK)
+}  # fmt: skip
 _COLUMNS: dict[str, Column] = {**METRICS, **ADDED}
 #: Columns of zeros and ones: their interval is Wilson's.
 RATES = names_of(_COLUMNS, "rate")
@@ -51,6 +47,8 @@ _RERUN = "run drivax evaluate again"
 Array = np.ndarray[Any, Any]
 #: ``(dataset, scenario_id)``.
 ScenarioKey = tuple[str, str]
+#: Tags of scenarios by name.
+Tags = Mapping[ScenarioKey, Mapping[str, str]]
 
 
 @dataclass(frozen=True)
@@ -65,14 +63,14 @@ class Crash:
 
 @dataclass(frozen=True)
 class Trajectories:
-    """What ego and traffic did, one row per episode, in each scenario's local frame.
+    """Trajectories of ego and traffic, one row per episode, in each scenario's local frame.
 
     Attributes:
         ego: x, y [m], heading [rad], speed [m/s] at every step from ``start`` on.
         action: Executed action at every step from ``start`` on, NaN after a crash; no columns where unknown.
         start: Step of the log at which the planner took over.
         events: Step of the first event by name (:data:`EVENTS`), -1 for none.
-        others: Poses of the other agents (``evaluation.traffic_trajectories``); None where they replayed the log.
+        others: Packed poses of the other agents (``evaluation.rollout.pack_poses``); None where they replayed the log.
     """
 
     ego: Float32[Array, "episode step 4"]
@@ -87,12 +85,11 @@ class EpisodeTable:
     """Episodes of one planner on one scenario set.
 
     Attributes:
-        folder: Run folder; None for episodes in memory only.
+        folder, info: Run folder (None for episodes in memory), and content of ``run.json``.
         name: Planner name in tables.
-        info: Content of ``run.json``.
         keys: Columns :data:`KEYS` as text.
         metrics: Values by metric name, NaN where undefined.
-        crashes: Episodes that failed because the planner crashed.
+        crashes: Episodes whose planner crashed.
         in_memory: Trajectories of an evaluation that has just run.
     """
 
@@ -116,10 +113,9 @@ class EpisodeTable:
         """
         run = RunFolder.open(path)
         if run.kind != "evaluation":
+            cure = "give a folder written by drivax evaluate"
             raise DataError(
-                f"run is of kind {run.kind!r}, not evaluation",
-                file=run.path / "run.json",
-                cure="give a folder written by drivax evaluate",
+                f"run is of kind {run.kind!r}, not evaluation", file=run.path / "run.json", cure=cure
             )
         keys, metrics = _read_columns(run.path / "episodes.csv")
         name = str(run.info.get("planner", run.path.name))
@@ -127,11 +123,7 @@ class EpisodeTable:
 
     @classmethod
     def read_seeds(cls, path: str | Path) -> tuple[EpisodeTable, ...]:
-        """Read the evaluation in a folder, or those in its sub-folders: one per training seed, ordered by name.
-
-        Raises:
-            DataError: As :meth:`read`.
-        """
+        """Read the evaluation in a folder, or those in its sub-folders: one per training seed, ordered by name."""
         path = Path(path)
         inside = sorted(file.parent for file in path.glob("*/episodes.csv"))
         if (path / "run.json").is_file() or not inside:
@@ -151,11 +143,9 @@ class EpisodeTable:
     @property
     def own_metrics(self) -> Mapping[str, Column]:
         """Unit, direction and text of user-defined metrics."""
-        info = self.info.get("own_metrics") or {}
-        return {
-            name: Column(str(m["unit"]), cast(Direction, str(m["better"])), str(m["text"]))
-            for name, m in info.items()
-        }
+        info = (self.info.get("own_metrics") or {}).items()
+        texts = {name: [str(metric[key]) for key in ("unit", "better", "text")] for name, metric in info}
+        return {name: Column(unit, cast(Direction, way), text) for name, (unit, way, text) in texts.items()}
 
     @property
     def data(self) -> Mapping[str, Any]:
@@ -194,9 +184,8 @@ class EpisodeTable:
             return self.in_memory
         if self.folder is None:
             raise DataError("episodes have no trajectories", cure="evaluate again, or read a run folder")
-        return _read_trajectories(
-            self.folder / "trajectories.npz", self.keys["scenario_id"], self.traffic == "log"
-        )
+        path = self.folder / "trajectories.npz"
+        return _read_trajectories(path, self.keys["scenario_id"], self.traffic == "log")
 
     def metric(self, name: str) -> Column | None:
         """Unit and direction of a metric; None where unknown."""
@@ -204,32 +193,25 @@ class EpisodeTable:
 
     def by_scenario(self, metric: str) -> dict[ScenarioKey, float]:
         """Mean of a metric per scenario over its defined episodes; NaN where there is none."""
-        column = self.metrics.get(metric)
-        by_key: dict[ScenarioKey, list[float]] = {}
-        for row, key in enumerate(self.scenarios):
-            by_key.setdefault(key, []).append(math.nan if column is None else float(column[row]))
-        means = {}
-        for key, values in by_key.items():
-            defined = [value for value in values if not math.isnan(value)]
-            means[key] = float(np.mean(defined)) if defined else math.nan
-        return means
+        column = self.metrics.get(metric, np.full(len(self), np.nan))
+        defined: dict[ScenarioKey, list[float]] = {key: [] for key in self.scenarios}
+        for key, value in zip(self.scenarios, column.tolist(), strict=True):
+            if not math.isnan(value):
+                defined[key].append(value)
+        return {key: float(np.mean(values)) if values else math.nan for key, values in defined.items()}
 
     def summary(self) -> dict[str, Any]:
-        """Mean and 95 % interval of every metric, the content of ``summary.json``.
+        """Return mean and 95 % interval of every metric (:func:`interval_of`), the content of ``summary.json``.
 
-        Rates have Wilson's interval over the effective number of recordings, other means a bootstrap over them. A
-        metric that is defined nowhere has mean null and n 0.
+        A metric that is defined nowhere has mean null and n 0.
         """
         clusters = np.array(self.clusters)
-        table = {
-            name: interval_of(name, values, clusters).as_dict()
-            for name, values in self.metrics.items()
-            if name not in NOT_SUMMARISED
-        }
+        shown = {name: values for name, values in self.metrics.items() if name not in NOT_SUMMARISED}
+        table = {name: interval_of(name, values, clusters).as_dict() for name, values in shown.items()}
         return {"planner": self.planner, "traffic": self.traffic, "metrics": table}
 
     def rows(self) -> list[dict[str, str]]:
-        """Rows of ``episodes.csv``: undefined metrics are empty cells, booleans 0 or 1."""
+        """Return the rows of ``episodes.csv``: undefined metrics are empty cells, booleans 0 or 1."""
         columns = {name: self.keys[name] for name in KEYS} | {
             name: [_cell(value) for value in values] for name, values in self.metrics.items()
         }
@@ -237,13 +219,15 @@ class EpisodeTable:
 
     def write(self, folder: Path) -> None:
         """Write ``episodes.csv``, ``summary.json``, ``trajectories.npz`` and, after crashes, ``crashes.json``."""
+        records: dict[str, Any] = {"summary.json": self.summary()}
         if self.crashes:
-            _write_json(folder / "crashes.json", [asdict(crash) for crash in self.crashes])
+            records["crashes.json"] = [asdict(crash) for crash in self.crashes]
+        for name, record in records.items():
+            (folder / name).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, [*KEYS, *self.metrics], lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows())
-        _write_json(folder / "summary.json", self.summary())
         driven = self.trajectories
         arrays = {f"{name}_step": driven.events[name].astype(np.int16) for name in EVENTS}
         arrays |= {} if driven.others is None else {"others": driven.others}
@@ -258,10 +242,7 @@ class EpisodeTable:
         )
 
     def open_set(self, data: Path | None = None) -> ScenarioSet:
-        """Open the scenario set that was evaluated.
-
-        Args:
-            data: Where the set is, if it has moved.
+        """Open the scenario set that was evaluated; ``data`` is its path if it has moved.
 
         Raises:
             DataError: The set is missing, or has another hash.
@@ -272,27 +253,20 @@ class EpisodeTable:
             raise DataError("names no scenario set", file=file, cure="pass it with --data SET")
         path = data if data is not None else Path(str(run_path))
         if data is None and not path.exists():
-            raise DataError(
-                "scenario set of this run not found", file=path, cure="pass its new path with --data SET"
-            )
+            cure = "pass its new path with --data SET"
+            raise DataError("scenario set of this run not found", file=path, cure=cure)
         scenarios, expected = ScenarioSet.open(path), str(self.data.get("hash") or "")
         if expected and scenarios.hash != expected:
-            raise DataError(
-                f"not the set that {self.name!r} was evaluated on (hash {scenarios.hash[:12]}, not {expected[:12]})",
-                file=path,
-                cure="pass the set that was evaluated with --data SET",
-            )
+            hashes = f"hash {scenarios.hash[:12]}, not {expected[:12]}"
+            problem = f"not the set that {self.name!r} was evaluated on ({hashes})"
+            raise DataError(problem, file=path, cure="pass the set that was evaluated with --data SET")
         return scenarios
 
 
 def fail_crashed(metrics: Mapping[str, Array], crashed: Any) -> dict[str, Array]:
     """Set the metrics :data:`FAILED` of crashed episodes to 0 where defined, and add the column ``crashed``.
 
-    So crashing never improves a score. All other metrics are those measured until the crash.
-
-    Args:
-        metrics: Values by name, NaN where undefined; user-defined metrics last.
-        crashed: Boolean per episode.
+    So crashing never improves a score. All other metrics are as measured until the crash; user-defined ones come last.
     """
     values = {
         name: np.where(crashed & ~np.isnan(column), 0.0, column) if name in FAILED else column
@@ -303,7 +277,7 @@ def fail_crashed(metrics: Mapping[str, Array], crashed: Any) -> dict[str, Array]
 
 
 def interval_of(name: str, values: Any, clusters: Any, confidence: float = 0.95, seed: int = 0) -> Interval:
-    """Mean and interval over the episodes that define the metric; Wilson's interval for rates."""
+    """Return mean and interval over the episodes that define the metric: Wilson's for rates, else a bootstrap."""
     if name in RATES:
         return rate(values, clusters, confidence)
     return bootstrap_mean(values, clusters, confidence, seed=seed)
@@ -315,12 +289,8 @@ def _cell(value: Any) -> str:
     return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
 
 
-def _write_json(path: Path, value: Any) -> None:
-    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
-
-
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
-    """Columns of ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN where undefined."""
+    """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN where undefined."""
     with existing(path, _RERUN).open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     header = rows[0] if rows else []
@@ -356,20 +326,18 @@ def _read_metric(path: Path, name: str, cells: Sequence[str]) -> Array:
 
 
 def _read_crashes(path: Path) -> tuple[Crash, ...]:
-    """Content of ``crashes.json``, which only exists after crashes."""
+    """Read ``crashes.json``, which only exists after crashes."""
     if not path.is_file():
         return ()
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
-        return tuple(
-            Crash(row["dataset"], row["scenario_id"], int(row["step"]), str(row["error"])) for row in rows
-        )
+        return tuple(Crash(r["dataset"], r["scenario_id"], int(r["step"]), str(r["error"])) for r in rows)
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
 
 
 def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: bool) -> Trajectories:
-    """Content of ``trajectories.npz``, in the order of ``scenario_ids``; those repeated are matched in order."""
+    """Read ``trajectories.npz`` in the order of ``scenario_ids``; repeated ids are matched in order."""
     try:
         with existing(path, _RERUN).open("rb") as file, np.load(file, allow_pickle=False) as stored:
             ids = [_text(value) for value in stored["scenario_id"]]
@@ -394,25 +362,17 @@ def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: boo
         rows = [row_of[key] for key in _numbered(scenario_ids)]
     except KeyError as error:
         raise DataError("lacks an episode", file=path, record=error.args[0][0], cure=_RERUN) from None
-    if rows == list(range(n)):
-        return Trajectories(ego, action, start, events, others)
+    order = slice(None) if rows == list(range(n)) else rows
+    events = {name: steps[order] for name, steps in events.items()}
     return Trajectories(
-        ego[rows],
-        action[rows],
-        start[rows],
-        {name: steps[rows] for name, steps in events.items()},
-        None if others is None else others[rows],
+        ego[order], action[order], start[order], events, None if others is None else others[order]
     )
 
 
 def _numbered(ids: Sequence[str]) -> list[tuple[str, int]]:
-    """Each id with the number of its earlier occurrences."""
-    seen: Counter[str] = Counter()
-    keys = []
-    for name in ids:
-        keys.append((name, seen[name]))
-        seen[name] += 1
-    return keys
+    """Return each id with the number of its earlier occurrences."""
+    seen: dict[str, Iterator[int]] = defaultdict(count)
+    return [(name, next(seen[name])) for name in ids]
 
 
 def _text(value: Any) -> str:

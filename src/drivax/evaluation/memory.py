@@ -12,18 +12,18 @@ import jax
 
 from drivax.errors import DrivaxError
 
-#: More scenarios are never loaded at a time, however much memory there is: their bank is then some 6 GB.
+#: Scenarios loaded at a time at most, whatever the memory; their bank then takes about 6 GB.
 MOST = 10_000
-#: What a program may take per scenario that it drives; PDM-Closed takes half (docs/log/2026-11-22-evaluation.md).
+#: Bytes that a program may need per scenario; PDM-Closed needs half (docs/log/2026-11-22-evaluation.md).
 _PROGRAM_BYTES = 8_000_000
-#: What a control group (of a container, a job) says: its limit, and what counts against it.
+#: Files of a control group (of a container or a job): its limit, and its use.
 _GROUP_FILES = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
 _GROUPS, _OUR_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _MACHINE = Path("/proc/meminfo")
 
 
 def memory_of(device: Any, share: int = 1) -> int | None:
-    """Bytes that a device has for us; of a CPU the machine's or the container's memory, divided by ``share``."""
+    """Return the bytes available on a device; on a CPU the memory of machine or container, over ``share``."""
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return int(stats["bytes_limit"])
@@ -34,10 +34,7 @@ def memory_of(device: Any, share: int = 1) -> int | None:
 
 
 def free_memory(device: Any) -> int | None:
-    """Bytes that a device has left; None where it does not say.
-
-    Files that Linux keeps in memory only because there is room for them count as free.
-    """
+    """Return the free bytes of a device, None where unknown; the page cache of Linux counts as free."""
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))
@@ -51,12 +48,9 @@ def free_memory(device: Any) -> int | None:
 
 
 def scenarios_at_a_time(scenario_bytes: int, lanes: int, free: int | None) -> int:
-    """How many scenarios are loaded at a time: what fits in half of the free memory, but as many as are driven at once.
+    """Return the number of scenarios that fit in half of the free memory, at least those of one program call (lanes).
 
-    Args:
-        scenario_bytes: What one takes; it is there twice while a bank is made.
-        lanes: How many a program drives side by side.
-        free: Free bytes; None where unknown.
+    A scenario exists twice while a bank is made. Free bytes are None where unknown.
     """
     if free is None:
         return MOST
@@ -65,32 +59,21 @@ def scenarios_at_a_time(scenario_bytes: int, lanes: int, free: int | None) -> in
 
 
 @contextmanager
-def telling_out_of_memory(count: int) -> Iterator[None]:
-    """Turns an error of memory into one line.
-
-    Args:
-        count: How many scenarios are loaded.
-
-    Raises:
-        DrivaxError: The memory did not suffice.
-    """
+def report_out_of_memory(count: int) -> Iterator[None]:
+    """Turn an out-of-memory error with ``count`` scenarios loaded into a :class:`DrivaxError`."""
     try:
         yield
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        raise DrivaxError(
-            f"out of memory with {count:,} scenarios loaded",
-            cure="load fewer at a time (--batch), drive fewer (--limit), or free memory",
-        ) from error
+        cure = "load fewer at a time (--batch), evaluate fewer (--limit), or free memory"
+        raise DrivaxError(f"out of memory with {count:,} scenarios loaded", cure=cure) from error
 
 
 def _group_limits(groups: Path = _GROUPS, ours: Path = _OUR_GROUPS) -> list[tuple[int, int]]:
-    """Limit and use (bytes) of every control group that we are in and that has a limit, files in memory not counted.
+    """Return limit and use (bytes, without the page cache) of every control group of this process that has a limit.
 
-    Args:
-        groups: Where the system shows them.
-        ours: The file that names ours: ``hierarchy:controllers:path`` (cgroups(7)).
+    The file ``ours`` names them as ``hierarchy:controllers:path`` (cgroups(7)), ``groups`` is their folder.
     """
     limits = []
     rows = ours.read_text(encoding="utf-8").splitlines() if ours.is_file() else []
@@ -112,7 +95,7 @@ def _group_limits(groups: Path = _GROUPS, ours: Path = _OUR_GROUPS) -> list[tupl
 
 
 def _number(file: Path) -> int | None:
-    """The number that a file holds; None where it cannot be read, or holds none ("max")."""
+    """Return the number in a file; None where it cannot be read or holds none ("max")."""
     try:
         text = file.read_text(encoding="ascii").strip()
     except OSError:
@@ -121,6 +104,6 @@ def _number(file: Path) -> int | None:
 
 
 def _table(file: Path) -> dict[str, int]:
-    """Names and numbers of a file with both in every line."""
+    """Return names and numbers of a file with both in every line."""
     rows = (line.split() for line in file.read_text(encoding="ascii").splitlines())
     return {row[0]: int(row[1]) for row in rows if len(row) > 1 and row[1].isdecimal()}

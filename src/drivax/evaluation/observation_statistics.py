@@ -1,12 +1,12 @@
-"""What the features of an observation are like, and which of them matter: for failures, and to a policy.
+"""Statistics of the features of an observation, and which of them matter: for failures, and to a policy.
 
-Moments of closed-loop episodes are looked at, ``every`` steps apart. Of each column of each group: mean, spread and
-extremes over all valid rows; how many entries are not finite; how it goes with collisions; how much the planner's
-action depends on it.
+States of closed-loop episodes are sampled ``every`` steps. Of each column of each group: mean, standard deviation and
+extremes over all valid rows, entries that are not finite, correlation with collisions, and importance to the planner.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.errors import UsageError
-from drivax.evaluation.rollout import advanced, episode_keys, judging
+from drivax.evaluation.rollout import advance, check_actions, episode_keys, evaluation_task
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
@@ -30,21 +29,16 @@ from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.features import Features, feature_names
 from drivax.tasks.task import Task
 
-#: Steps between two looks, scenarios that run side by side, and states on which features are permuted.
+#: Steps between two sampled states, scenarios per program call, and states on which features are permuted.
 EVERY, BATCH, PERMUTED = 10, 64, 512
 Values = np.ndarray[Any, Any]
 
 
 @record
 class Looks:
-    """Moments of episodes, ``[episode, look]``.
+    """Sampled states of episodes, ``[episode, look]``, with the planner's carry, random key and observation.
 
-    Attributes:
-        state, carry: What the planner acts on in addition to the observation.
-        key: What it draws from.
-        observation: The observation.
-        hit: Whether ego has collided by then.
-        collides: Whether it collides at all until the end of the log, ``[episode]``.
+    ``hit``: ego has collided by then; ``collides``: it collides before the end of the log, ``[episode]``.
     """
 
     state: SimState
@@ -57,13 +51,11 @@ class Looks:
 
 @dataclass(frozen=True)
 class FeatureStatistics:
-    """One column of one group. What cannot be said is NaN.
+    """Statistics of one column of one group; NaN where undefined.
 
     Attributes:
-        group, name: The group and the column.
-        count: Finite entries of valid rows.
+        count: Finite entries of valid rows, which ``mean``, ``std``, ``low`` and ``high`` are of.
         broken: Entries that are NaN or infinite, of masked rows too.
-        mean, std, low, high: Of the finite entries of valid rows.
         collision: Correlation with collisions (:func:`collision_correlation`).
         importance: Change of the planner's action when the column is permuted (:func:`importances`).
     """
@@ -82,14 +74,13 @@ class FeatureStatistics:
 
 @dataclass(frozen=True)
 class ObservationStatistics:
-    """Statistics of all columns.
+    """Statistics of all columns, group by group.
 
     Attributes:
         planner: Name of the planner.
-        episodes, collisions: How many episodes, and how many of them with a collision.
-        states: Moments that were looked at.
-        permuted: Moments on which features were permuted; 0 for none.
-        features: Statistics of each column, group by group.
+        episodes, collisions: Numbers of episodes, and of those with a collision.
+        states, permuted: Numbers of sampled states, and of those on which features were permuted.
+        features: Statistics of each column.
         groups: Importance of each group as a whole, where features were permuted.
     """
 
@@ -107,42 +98,41 @@ class ObservationStatistics:
         return sum(feature.broken for feature in self.features)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; what cannot be said is null."""
-        rows = [{name: _plain(value) for name, value in asdict(feature).items()} for feature in self.features]
-        about = {
-            name: getattr(self, name) for name in ("planner", "episodes", "collisions", "states", "permuted")
-        }
-        return about | {"groups": {n: _plain(v) for n, v in self.groups.items()}, "features": rows}
+        """Return plain values for JSON; null where undefined."""
+        names = ("planner", "episodes", "collisions", "states", "permuted")
+        features = [_plain(asdict(feature)) for feature in self.features]
+        about = {name: getattr(self, name) for name in names}
+        return about | {"groups": _plain(self.groups), "features": features}
 
 
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    undefined = {
+        name for name, value in values.items() if isinstance(value, float) and not np.isfinite(value)
+    }
+    return {name: None if name in undefined else value for name, value in values.items()}
 
 
 def observation_statistics(
     planner: Planner, bank: ScenarioBank, task: Task, *, permute: bool, traffic: Traffic | None = None,
     every: int = EVERY, seed: int = 0,
 ) -> ObservationStatistics:  # fmt: skip
-    """Drives every scenario of a bank from its current step to the end, and describes what was observed on the way.
+    """Drive every scenario of a bank from its current step to the end, and describe the observations.
 
     Args:
-        planner: The driver; ``expert`` for the log itself.
+        planner: The planner; ``expert`` for the log itself.
         bank: The scenarios.
-        task: Whose observations, and whose actions.
-        traffic: How the others move; as recorded by default.
+        task: Observations and actions.
         permute: Whether to measure the importance of features to the planner.
-        every: Steps between two looks.
-        seed: Of the planner, as in an evaluation, and of the permutations.
+        traffic: Traffic model; log replay by default.
+        every: Steps between two sampled states.
+        seed: Seed of the planner, as in an evaluation, and of the permutations.
 
     Raises:
         UsageError: The planner acts in another action space than the task.
     """
-    if getattr(planner, "actions", task.actions) != task.actions:
-        raise UsageError(
-            f"planner {planner.name} acts in another action space than the task", cure="use the task's"
-        )
+    check_actions(planner, task)
     traffic = traffic or LogTraffic()
-    simulator, bank = Simulator(judging(task), traffic), prepare_bank(traffic, bank)
+    simulator, bank = Simulator(evaluation_task(task), traffic), prepare_bank(traffic, bank)
     looks = look_at(simulator, planner, bank, every, seed)
     seen = {name: np.asarray(leaf) for name, leaf in looks.observation.items()}
     hit, collides = np.asarray(looks.hit), np.asarray(looks.collides)
@@ -153,65 +143,50 @@ def observation_statistics(
         *rest, shown = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], known)
         act = partial(_actions, simulator, planner, bank, *rest)
         columns, groups = importances(act, jax.device_get(shown), seed)
-    features = described(task.observation.features, seen, hit, collides, columns)
+    features = column_statistics(task.observation.features, seen, hit, collides, columns)
     return ObservationStatistics(
         planner.name, len(collides), int(collides.sum()), hit.size, permuted, features, groups
     )
 
 
-def described(
-    features: Features,
-    observation: Mapping[str, Values],
-    hit: Values,
-    collides: Values,
+def column_statistics(
+    features: Features, observation: Mapping[str, Values], hit: Values, collides: Values,
     importance: Mapping[tuple[str, int], float],
-) -> tuple[FeatureStatistics, ...]:
-    """Statistics of every column of what was observed.
+) -> tuple[FeatureStatistics, ...]:  # fmt: skip
+    """Return statistics of every column of observations ``[episode, look, ...]`` by group; see :class:`Looks`.
 
-    Args:
-        features: Features of our own groups.
-        observation: What was observed, ``[episode, look, ...]`` by group.
-        hit: Whether ego has collided by then, ``[episode, look]``.
-        collides: Whether it collides at all, ``[episode]``.
-        importance: Of columns that were permuted, by group and number.
+    ``importance`` has permuted columns by group and number.
     """
     names = feature_names(features, {name: values.shape[2:] for name, values in observation.items()})
     statistics = []
-    for group, parts in names.items():
-        for column, name in enumerate(parts):
+    for group, columns in names.items():
+        for column, name in enumerate(columns):
             values = observation[group][..., column]
             valid = observation.get(f"{group}_mask", np.ones(values.shape, bool))
             before = valid & ~hit.reshape(*hit.shape, *(1,) * (valid.ndim - hit.ndim))
-            moments = _moments(values, valid)
             correlation = collision_correlation(values, before, collides)
-            importance_here = importance.get((group, column), float("nan"))
-            statistics.append(FeatureStatistics(group, name, *moments, correlation, importance_here))
+            last = importance.get((group, column), math.nan)
+            statistics.append(FeatureStatistics(group, name, *_moments(values, valid), correlation, last))
     return tuple(statistics)
 
 
 def look_at(simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0) -> Looks:
-    """Moments of one episode per scenario; the episodes are those of an evaluation with this seed."""
-    parts = []
+    """Return sampled states of one episode per scenario; the episodes are those of an evaluation with this seed."""
+    batches, size = [], min(BATCH, len(bank))
     for first in range(0, len(bank), BATCH):
         rows = np.arange(first, min(first + BATCH, len(bank)))
-        size = min(BATCH, len(bank))
         # A short last batch repeats its last scenario, so that one compilation serves all.
         index = jnp.asarray(np.pad(rows, (0, size - len(rows)), mode="edge"), jnp.int32)
         looks = _looks(simulator, planner, bank, index, episode_keys(bank, index, seed), every)
         kept = len(rows)
-        parts.append(jax.tree.map(lambda leaf, kept=kept: leaf[:kept], looks))
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+        batches.append(jax.tree.map(lambda leaf, kept=kept: leaf[:kept], looks))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
 
 
 @partial(jax.jit, static_argnames=("simulator", "every"))
 def _looks(
-    simulator: Simulator,
-    planner: Planner,
-    bank: ScenarioBank,
-    index: Int[Array, " B"],
-    keys: Array,
-    every: int,
-) -> Looks:
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, index: Int[Array, " B"], keys: Array, every: int
+) -> Looks:  # fmt: skip
     return jax.vmap(partial(_episode, simulator, planner, bank, every))(index, keys)
 
 
@@ -226,7 +201,7 @@ def _episode(
 
     def step(now: Any, key: Array) -> tuple[Any, None]:
         state, carry, hit = now
-        state, carry, _ = advanced(simulator, planner, bank, state, carry, key)
+        state, carry, _ = advance(simulator, planner, bank, state, carry, key)
         return (state, carry, hit | state.facts.collision), None
 
     def look(now: Any, keys: Array) -> tuple[Any, Any]:
@@ -246,7 +221,7 @@ def _actions(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any, key: Array,
     observation: dict[str, Array],
 ) -> Float[Array, "M D"]:  # fmt: skip
-    """What the planner would do in these states, had it observed this."""
+    """Return the planner's actions in these states for these observations."""
 
     def act(state: SimState, carry: Any, key: Array, observation: dict[str, Array]) -> Array:
         return planner.act(carry, bank, state, simulator.situation(bank, state), observation, key)[0]
@@ -255,29 +230,20 @@ def _actions(
 
 
 def _moments(values: Values, valid: Values) -> tuple[int, int, float, float, float, float]:
-    """How many entries count and how many are broken; mean, standard deviation, smallest and largest of the former."""
+    """Return count, broken, mean, std, low and high of :class:`FeatureStatistics`."""
     finite = np.isfinite(values)
     kept, broken = values[valid & finite].astype(np.float64), int((~finite).sum())
     if not kept.size:
-        nothing = float("nan")
-        return 0, broken, nothing, nothing, nothing, nothing
+        return 0, broken, math.nan, math.nan, math.nan, math.nan
     return kept.size, broken, float(kept.mean()), float(kept.std()), float(kept.min()), float(kept.max())
 
 
 def collision_correlation(values: Values, valid: Values, collides: Values) -> float:
-    """Point-biserial correlation of a column with collisions, over episodes.
+    """Return the point-biserial correlation of a column with collisions, over episodes (Tate 1954).
 
-    Correlated are, per episode, the mean of the column over the valid rows of its looks before the first collision, and
-    whether the episode has a collision (1) or none (0). Episodes in which nothing counts are left out.
-
-    Args:
-        values: ``[episode, look, ...]``.
-        valid: Which entries count, same shape.
-        collides: ``[episode]``.
-
-    Returns:
-        Pearson's r, which for a quantity of two values is the point-biserial one (Tate 1954); NaN where all episodes
-        are of one kind or have the same mean.
+    Pearson's r of the column's mean over its valid entries ``[episode, look, ...]`` and whether the episode has a
+    collision (1) or none (0). Episodes without valid entries are left out; NaN where all episodes are of one kind or
+    have the same mean.
     """
     counts = (valid & np.isfinite(values)).reshape(len(values), -1)
     total = np.where(counts, values.reshape(len(values), -1), 0.0).sum(axis=1, dtype=np.float64)
@@ -286,27 +252,25 @@ def collision_correlation(values: Values, valid: Values, collides: Values) -> fl
     outcome = collides[there].astype(np.float64)
     # A column that is constant but for rounding correlates with nothing.
     if len(mean) < 3 or outcome.std() == 0 or mean.std() <= 1e-6 * max(np.abs(mean).max(), 1e-6):
-        return float("nan")
+        return math.nan
     return float(((mean - mean.mean()) * (outcome - outcome.mean())).mean() / (mean.std() * outcome.std()))
 
 
 def importances(
     act: Callable[[dict[str, Any]], Any], observation: Mapping[str, Values], seed: int = 0
 ) -> tuple[dict[tuple[str, int], float], dict[str, float]]:
-    """How much actions change when a feature is permuted (Breiman 2001; of the action, not of a loss).
+    """Return how much actions change when a feature is permuted, by (group, column) and by group.
 
-    A column's entries in valid rows change places among all states, rows and past steps; masks stay. A group as a whole
-    is exchanged between states, mask included. The change is the root mean square over states and action numbers of the
-    difference to the action for what was really observed, each number divided by its standard deviation over the
-    states: 0 means that the feature does not matter, 1.41 that the action is as good as that of another state.
+    Permutation importance (Breiman 2001), of the action instead of a loss. A column's entries are permuted among the
+    valid rows of all states; a whole group is exchanged between states, mask included. The change is the root mean
+    square difference to the action for the true observation, over states and action dimensions, each divided by its
+    standard deviation over the states: 0 means that the feature does not matter, 1.41 that the action might be another
+    state's. NaN where the action is the same in all states.
 
     Args:
         act: From a batch of observations to actions ``[state, D]``.
-        observation: What was observed, ``[state, ...]`` by group.
-        seed: Of the permutations.
-
-    Returns:
-        The change by (group, column), and by group; NaN where the action never changes from state to state.
+        observation: Observations ``[state, ...]`` by group.
+        seed: Seed of the permutations.
     """
     rng = np.random.default_rng(seed)
     before = np.asarray(act(dict(observation)), np.float64)
@@ -315,7 +279,7 @@ def importances(
 
     def change(altered: dict[str, Values]) -> float:
         if not varies.any():
-            return float("nan")
+            return math.nan
         apart = (np.asarray(act(dict(observation) | altered), np.float64) - before)[:, varies] / std[varies]
         return float(np.sqrt(np.mean(apart**2)))
 

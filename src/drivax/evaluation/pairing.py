@@ -1,20 +1,24 @@
-"""Pair the episodes of evaluations by scenario, and refuse those that cannot be compared."""
+"""Pair the episodes of evaluations by scenario, or split the scenarios into two arms, one for each planner."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int64
 
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.episode_table import NOT_SUMMARISED, EpisodeTable, ScenarioKey
+from drivax.stats.clusters import dense, stratum_of_clusters
 
 #: Settings of an evaluation that must agree between paired episodes.
 _STARTS = ("noisy_start", "start_step")
+#: Strata of fewer recordings are merged.
+_LEAST = 10
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Pairs:
         return cls(keys, tuple(cluster[key] for key in keys))
 
     def values(self, table: EpisodeTable, metric: str) -> Float64[np.ndarray[Any, Any], " scenario"]:
-        """A metric of one evaluation per scenario; repeated episodes are averaged."""
+        """Return a metric of one evaluation per scenario; repeated episodes are averaged."""
         means = table.by_scenario(metric)
         return np.array([means[key] for key in self.keys], np.float64)
 
@@ -63,11 +67,7 @@ def comparable(a: EpisodeTable, b: EpisodeTable) -> bool:
 
 
 def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
-    """Refuse evaluations whose episodes cannot be paired.
-
-    Args:
-        a: The evaluations of A, one per training seed.
-        b: Those of B.
+    """Refuse evaluations of A and B, one per training seed, whose episodes cannot be paired.
 
     Raises:
         UsageError: A run is named twice, a side holds several planners, or sets, traffic or starts differ.
@@ -79,11 +79,10 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
         # Seeds are numbered at the end of the name, before the checkpoint; two checkpoints are two planners.
         planners = {re.sub(r"^(.*?)[0-9]*(@[0-9]+)?$", r"\1\2", table.name): table.name for table in side}
         if len(planners) > 1:
-            raise UsageError(
-                f"holds evaluations of several planners ({', '.join(sorted(planners.values()))})",
-                file=None if side[0].folder is None else side[0].folder.parent,
-                cure=f"name one of them, as {side[0].folder}",
-            )
+            problem = f"holds evaluations of several planners ({', '.join(sorted(planners.values()))})"
+            folder = side[0].folder
+            file = None if folder is None else folder.parent
+            raise UsageError(problem, file=file, cure=f"name one of them, as {folder}")
     for table in tables[1:]:
         if problem := mismatch(tables[0], table):
             names = [run.folder or run.name for run in (tables[0], table)]
@@ -99,16 +98,13 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
     for table in tables:
         if metric not in table.metrics:
             known = [name for name in table.metrics if all(name in other.metrics for other in tables)]
-            raise UsageError(
-                f"{table.folder or table.name} has no metric {metric!r}", cure=did_you_mean(metric, known)
-            )
+            problem = f"{table.folder or table.name} has no metric {metric!r}"
+            raise UsageError(problem, cure=did_you_mean(metric, known))
     if metric in NOT_SUMMARISED:
         raise UsageError(f"{metric} is a code or count without a mean", cure="choose another metric")
     if metric.endswith("_partial"):
-        raise UsageError(
-            f"{metric} combines different inputs in different scenarios, so its mean has no meaning",
-            cure=f"choose {metric.removesuffix('_partial')}, or one of its inputs",
-        )
+        problem = f"{metric} combines different inputs in different scenarios, so its mean has no meaning"
+        raise UsageError(problem, cure=f"choose {metric.removesuffix('_partial')}, or one of its inputs")
     info = tables[0].metric(metric)
     if primary and (info is None or info.better == "-"):
         raise UsageError(f"{metric} is neither better high nor low", cure="choose another primary metric")
@@ -118,10 +114,74 @@ def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
     """Return the error for a primary metric without a single pair of values."""
     partial = [table.metrics.get(f"{metric}_partial", np.full(1, np.nan)) for table in tables]
     if any(not np.isnan(values).all() for values in partial):
-        return UsageError(
-            f"every {metric} is partial: one of its inputs is undefined in these scenarios",
-            cure="choose another primary metric, as success or accuracy",
-        )
-    return UsageError(
-        f"{metric} is defined for A and B in no common scenario", cure="choose another primary metric"
-    )
+        problem = f"every {metric} is partial: one of its inputs is undefined in these scenarios"
+        return UsageError(problem, cure="choose another primary metric, as success or accuracy")
+    problem = f"{metric} is defined for A and B in no common scenario"
+    return UsageError(problem, cure="choose another primary metric")
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which scenario is in which arm; the scenarios of a recording are in the same one.
+
+    Attributes:
+        first: Which scenarios are in the first arm.
+        strata: Number of the stratum of each scenario; all 0 where the split is random.
+    """
+
+    first: Bool[np.ndarray, " n"]
+    strata: Int64[np.ndarray, " n"]
+
+    @property
+    def strata_count(self) -> int:
+        """Number of strata."""
+        return int(self.strata.max()) + 1
+
+
+def strata_of(entries: Sequence[Mapping[str, Any]], tags: Sequence[str]) -> list[str]:
+    """Return the stratum of each scenario (manifest entry): the values of its tags.
+
+    Raises:
+        UsageError: No scenario has one of the tags.
+    """
+    known = {name: None for entry in entries for name in entry["tags"]}
+    for tag in tags:
+        if tag not in known:
+            raise UsageError(f"no scenario has a tag {tag!r}", cure=did_you_mean(tag, list(known)))
+    return [" ".join(str(entry["tags"].get(tag, "unknown")) for tag in tags) for entry in entries]
+
+
+def assign(clusters: Sequence[str], strata: Sequence[str] | None, ratio: float, seed: int) -> Split:
+    """Assign whole clusters to two arms at random, in each stratum (None: in all) a share of ``ratio`` to the first.
+
+    A cluster belongs to the most frequent stratum of its scenarios (the first by name among equals). Strata of fewer
+    than ten clusters are merged. Rounding in one stratum is made up for in the next.
+
+    Raises:
+        UsageError: An arm is empty.
+    """
+    labels = dense(clusters, len(clusters), "cluster")
+    count = int(labels.max()) + 1
+    of = np.zeros(count, np.int64)
+    if strata is not None:
+        of = stratum_of_clusters(_most_frequent(labels, strata), labels, _LEAST)
+    rng, first, seen, assigned = np.random.default_rng(seed), np.zeros(count, bool), 0, 0
+    for stratum in range(int(of.max()) + 1):
+        inside = rng.permutation(np.flatnonzero(of == stratum))
+        seen += inside.size
+        count_here = round(ratio * seen) - assigned
+        first[inside[:count_here]] = True
+        assigned += count_here
+    if not first.any() or first.all():
+        problem = f"{count} recordings at a ratio of {ratio} leave an arm empty"
+        raise UsageError(problem, cure="use split: paired, or evaluate more scenarios")
+    return Split(first[labels], of[labels])
+
+
+def _most_frequent(labels: Int64[np.ndarray, " n"], strata: Sequence[str]) -> list[str]:
+    """Return for each scenario the stratum that its cluster belongs to."""
+    votes: dict[int, Counter[str]] = {}
+    for label, stratum in zip(labels, strata, strict=True):
+        votes.setdefault(int(label), Counter())[stratum] += 1
+    winner = {label: min(counts, key=lambda name: (-counts[name], name)) for label, counts in votes.items()}
+    return [winner[int(label)] for label in labels]

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from drivax.evaluation.devkit import DevkitVerdict, EgoMotion, Road, RoadObject, Tracks, devkit_verdict
 from drivax.evaluation.episode_table import EpisodeTable, Trajectories
-from drivax.evaluation.traffic_trajectories import unpacked
+from drivax.evaluation.rollout import unpack_poses
 from drivax.files import write_text
 from drivax.geometry.boxes import corners
 from drivax.scenario.bank.queries import LEVEL_M, around_lanes, offroad_distance
@@ -110,7 +110,7 @@ def devkit_episode(scenario: Scenario, driven: Trajectories, row: int, sizes: Si
     ego = _ego(scenario, driven.ego[row, : steps.stop - start].astype(np.float64), start)
     valid = scenario.agent_valid[steps, 0]
     expert = scenario.agent_xy[steps, 0][valid].astype(np.float64)
-    others = None if driven.others is None else unpacked(driven.others[row, : steps.stop - start])
+    others = None if driven.others is None else unpack_poses(driven.others[row, : steps.stop - start])
     return devkit_verdict(ego, _tracks(scenario, steps, others), _road(scenario, steps, sizes), expert)
 
 

@@ -1,4 +1,4 @@
-"""Closed loop on the device: a planner drives a batch of scenarios from a start step to the end of the log."""
+"""Closed-loop rollouts on the device: a planner drives a batch of scenarios from a start step to the end of the log."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Int16
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Int, Int16
 
+from drivax.errors import UsageError
 from drivax.evaluation.episode_table import FAILED
-from drivax.evaluation.traffic_trajectories import packed
 from drivax.metrics.episode import episode_metrics, event_steps
-from drivax.metrics.scores import Value
+from drivax.metrics.steps import Value
 from drivax.planners.planner import Planner
 from drivax.planners.simple import logged_motion
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
@@ -26,20 +28,24 @@ from drivax.tasks.task import Task
 
 #: What the key of an episode is folded with to draw its start.
 _START = 1
+#: Units of packed positions (m) and headings (rad), and the reach of int16 from a scenario's origin.
+_METRES, _RADIANS, _REACH_M = 0.02, 1e-4, 650.0
+#: Stands for "absent" in a packed pose.
+_ABSENT = -32768
 
 
 @record
 class Episodes:
-    """What a batch of episodes came to.
+    """The outcome of a batch of episodes.
 
     Attributes:
         metrics: Every metric by name.
         events: Step of the first collision, off-road step and red light, -1 for none.
         motion: x, y, heading, speed of the driven agent from the start step to the end.
-        actions: What was carried out in each step: within bounds, and as the actuators let it be.
-        others: Poses of the other agents at each step (``evaluation.traffic_trajectories``); None in log traffic.
+        actions: Executed actions, after bounds and actuators.
+        others: Packed poses of the other agents at each step (:func:`pack_poses`); None in log traffic.
         offroad_steps: Number of steps off the road.
-        crashed: First step whose action was no number, -1 for none. Nothing is measured from there on; motion stays.
+        crashed: First step whose action was not finite, -1 for none; nothing is measured from there on.
     """
 
     metrics: dict[str, Value]
@@ -52,14 +58,21 @@ class Episodes:
 
 
 def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Array:
-    """A random key for each scenario, which follows from the seed and from who it is, not from where it stands."""
+    """Return a random key for each scenario; it depends on the seed and the scenario's identity, not on its row."""
     return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), bank.identity[index])
 
 
-def judging(task: Task) -> Task:
-    """The task as evaluation runs it: failures are recorded, episodes go on to the end of the log, with all metrics."""
+def evaluation_task(task: Task) -> Task:
+    """Return the task as evaluation runs it: with all metrics, and episodes that go on to the end of the log."""
     own = task.metrics if isinstance(task.metrics, tuple) else ()
     return replace(task, to_the_end=True, metrics=("full", *own))
+
+
+def check_actions(planner: Planner, task: Task) -> None:
+    """Refuse a planner that acts in another action space than the task."""
+    if getattr(planner, "actions", task.actions) != task.actions:
+        problem = f"planner {planner.name} acts in another action space than the task"
+        raise UsageError(problem, cure="use the task's")
 
 
 @partial(jax.jit, static_argnames=("simulator", "start_step"))
@@ -67,42 +80,29 @@ def drive(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, index: Int[Array, " B"], keys: Array,
     start_step: int = CURRENT_STEP, slot: Any = 0,
 ) -> Episodes:  # fmt: skip
-    """Run one planner on scenarios ``index``; one compilation per planner kind, batch size and start step.
+    """Run one planner on rows ``index`` of a bank; one compilation per planner kind, batch size and start step.
 
-    Args:
-        simulator: With a task whose episodes do not end early (:func:`judging`).
-        planner: The driver.
-        bank: The scenarios.
-        index: Rows of the bank.
-        keys: A random key each.
-        start_step: Step of the log at which to begin.
-        slot: Which agent is driven.
+    The task's episodes must not end early (:func:`evaluation_task`); ``slot`` is the driven agent.
     """
     episode = partial(_episode, simulator, planner, bank, start_step, slot)
     return jax.vmap(episode)(index, keys)
 
 
 def _episode(
-    simulator: Simulator,
-    planner: Planner,
-    bank: ScenarioBank,
-    start_step: int,
-    slot: Any,
-    index: Array,
-    key: Array,
-) -> Episodes:
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, start_step: int, slot: Any, index: Array, key: Array
+) -> Episodes:  # fmt: skip
     state = simulator.reset(bank, index, start_step, slot, jax.random.fold_in(key, _START))
     begin_key, key = jax.random.split(key)
     carry = planner.init(bank, state, begin_key)
 
     def others(state: SimState) -> Int16[Array, "A 3"] | None:
         traffic = simulator.traffic
-        return None if traffic.name == LogTraffic.name else packed(traffic.agents(bank, state.context, 0))
+        return None if traffic.name == LogTraffic.name else pack_poses(traffic.agents(bank, state.context, 0))
 
     def step(now: Any, key: Array) -> Any:
         state, kept, carry, sound = now
-        state, carry, step_sound = advanced(simulator, planner, bank, state, carry, key)
-        sound &= step_sound
+        state, carry, finite = advance(simulator, planner, bank, state, carry, key)
+        sound &= finite
         kept = state if planner.replays else jax.tree.map(partial(jnp.where, sound), state, kept)
         context = kept.context
         seen = context.history[-1], context.action, sound & state.facts.offroad, sound, others(state)
@@ -111,29 +111,28 @@ def _episode(
     keys = jax.random.split(key, bank.steps - 1 - start_step)
     first = (state, state, carry, jnp.ones((), bool))
     (last, final, _, _), (motion, actions, offroad, sound, moved) = jax.lax.scan(step, first, keys)
-    began = others(state)
+    others_first = others(state)
     metrics, to_the_end = episode_metrics(bank, final), episode_metrics(bank, last)
     # What a scenario defines does not depend on how soon its planner crashed.
-    failed = {
-        name: replace(metrics[name], defined=to_the_end[name].defined) for name in FAILED if name in metrics
-    }
+    names = [name for name in FAILED if name in metrics]
+    failed = {name: replace(metrics[name], defined=to_the_end[name].defined) for name in names}
     return Episodes(
         metrics=metrics | failed,
         events=event_steps(final.episode),
         motion=jnp.concatenate([state.context.history[-1][None], motion]),
         actions=actions,
-        others=None if began is None else jnp.concatenate([began[None], moved]),
+        others=None if others_first is None else jnp.concatenate([others_first[None], moved]),
         offroad_steps=offroad.sum().astype(jnp.int32),
         crashed=jnp.where(sound.all(), -1, start_step + jnp.argmin(sound)),
     )
 
 
-def advanced(
+def advance(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any, key: Array
 ) -> tuple[SimState, Any, Bool[Array, ""]]:
-    """State and carry one step later, the planner driving or, where it replays, the log; and whether it gave numbers.
+    """Return state and carry one step later, and whether the action was finite; replaying planners follow the log.
 
-    Where it did not, nothing is asked of the car (``Task.first_action``), so that its state stays one of a car.
+    An action that is not finite is replaced by ``Task.first_action``, so that the state stays finite.
     """
     situation = simulator.situation(bank, state)
     observation = simulator.observe(bank, state.context)
@@ -146,3 +145,18 @@ def advanced(
     length_m = bank.length_m(context.index, context.slot)
     nothing = simulator.task.first_action(context.history, length_m)
     return simulator.step(bank, state, jnp.where(sound, action, nothing))[0], carry, sound
+
+
+def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
+    """Pack positions and headings of bank rows; agents further than 650 m from the origin count as absent."""
+    xy = agents[..., AgentColumn.XY]
+    heading = jnp.arctan2(agents[..., AgentColumn.SIN], agents[..., AgentColumn.COS])
+    poses = jnp.concatenate([xy / _METRES, heading[..., None] / _RADIANS], axis=-1)
+    present = (agents[..., AgentColumn.VALID] > 0) & (jnp.abs(xy) < _REACH_M).all(axis=-1)
+    return jnp.where(present[..., None], jnp.round(poses), _ABSENT).astype(jnp.int16)
+
+
+def unpack_poses(rows: Int16[np.ndarray, "*batch A 3"]) -> Float32[np.ndarray, "*batch A 3"]:
+    """Return positions (m) and headings (rad), NaN where absent."""
+    poses = rows * np.array([_METRES, _METRES, _RADIANS], np.float32)
+    return np.where(rows == _ABSENT, np.nan, poses).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Evaluate a planner on every scenario of a set.
+"""Evaluate a planner on every scenario of a set, in memory or into a run folder.
 
 An episode depends on planner, task, traffic, start, seed and scenario alone. Random keys follow from the scenario's
 identity (``bank.identity``), and each program runs a fixed number of scenarios (a short batch is padded) in banks of
@@ -7,41 +7,55 @@ fixed sizes. So neither order nor batch size nor the other scenarios of a batch 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, UInt32
+from jaxtyping import Array, Float, Float64, Int, UInt32
 
 from drivax.errors import DataError, DrivaxError, UsageError
-from drivax.evaluation.actions import action_jerk, until_crash
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import ADDED, KEYS, Crash, EpisodeTable, Trajectories, fail_crashed
-from drivax.evaluation.memory import free_memory, scenarios_at_a_time, telling_out_of_memory
-from drivax.evaluation.rollout import Episodes, drive, episode_keys, judging
+from drivax.evaluation.memory import free_memory, report_out_of_memory, scenarios_at_a_time
+from drivax.evaluation.rollout import Episodes, check_actions, drive, episode_keys, evaluation_task
+from drivax.files import replace_folder
 from drivax.metrics.catalogue import METRICS, Metric
-from drivax.metrics.selection import metric_specs
+from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
+from drivax.scenario.select.selection import select_scenarios
+from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.starts import LogStart, Start
+from drivax.simulator.starts import LogStart, NoisyStart, Start
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
+from drivax.table import Cell, Column, Table
 from drivax.tasks.task import Task
+from drivax.tracking.progress import Progress as ProgressBar
+from drivax.tracking.run_folder import RunFolder, learned_from
 
 #: Scenarios per program call on a CPU, where more leave the caches and fewer cost overhead
 #: (docs/log/2026-11-22-evaluation.md), and on other devices.
 LANES, LANES_ELSEWHERE = 16, 256
-#: No more scenarios than these are named in an error.
-_NAMED = 5
+#: Scenarios that an error names, and crashes that are listed one by one.
+_NAMED = _LISTED = 5
+#: Columns of the headline table, with their short names.
+HEADLINE = {
+    "success": "success", "accuracy": "accuracy", "at_fault_collision": "at fault", "collision": "collision",
+    "offroad": "off-road", "red_light": "red light", "progress_ratio": "progress", "comfortable": "comfort",
+    "vmax_score": "vmax",
+}  # fmt: skip
 Names = Sequence[Mapping[str, str]]
 Progress = Callable[[int, int], None]
 
@@ -51,16 +65,124 @@ def lanes() -> int:
     return LANES if jax.default_backend() == "cpu" else LANES_ELSEWHERE
 
 
-class Options(TypedDict, total=False):
-    """Keyword options of :func:`evaluate`.
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """What is evaluated; stored as ``config.yaml``.
 
     Attributes:
-        start_step: Step of the log at which episodes start, by default the current step.
-        seed: Seed of all random numbers, by default 0.
-        batch: Stored scenarios loaded at a time, by default as many as memory allows; no result depends on it.
-        sizes: Sizes of the banks, by default what the scenarios use. Subsets of a set that are given the sizes of the
-            whole share its compiled program.
-        progress: Called with (done, total) after every batch.
+        planner: Planner to evaluate: a name, module:name of your own, the run folder of a training run (RUN or
+            RUN@STEP for an earlier checkpoint), or zoo:NAME.
+        traffic: Traffic model: log replays the log, idm lets vehicles react to ego, a run folder or zoo:NAME drives
+            the vehicles near ego (with +idm appended the others react), or module:name of your own.
+        noisy_start: Start after a second of perturbed driving, drawn per scenario from the seed
+            (docs/guide/dynamics.md).
+        start_step: Step of the log at which episodes start.
+        filter: Only scenarios that meet this condition (NAME=A|B, NAME!=A, NAME>=N); repeat it to combine several.
+        scenarios: Only scenarios with these ids, or with the ids in a file, one per line.
+        limit: Only the first N scenarios that remain after filtering.
+        metrics: Metrics to print in addition to the headline: a set (training, full), names, or module:name of your
+            own (docs/guide/custom.md). All built-in metrics are always computed and written.
+        seed: Seed of all random numbers: noisy starts and planners that sample.
+        sample: Let a trained policy sample its actions instead of taking the mode.
+        batch: Scenarios loaded at a time; as many as memory allows by default. Results do not depend on it.
+        task: Action space and observation of the planner.
+    """
+
+    planner: str
+    traffic: str = "log"
+    noisy_start: bool = False
+    start_step: int = CURRENT_STEP
+    filter: tuple[str, ...] = ()
+    scenarios: tuple[str, ...] = ()
+    limit: int | None = None
+    seed: int = 0
+    metrics: tuple[str, ...] = ()
+    sample: bool = False
+    batch: int | None = None
+    task: Task = field(default_factory=Task)
+
+
+def run_evaluation(
+    config: EvaluationConfig, planner: Planner, data: ScenarioSet, out: str | Path, *, traffic: Traffic | None = None,
+    sizes: Sizes | None = None, overwrite: bool = False,
+) -> EpisodeTable:  # fmt: skip
+    """Evaluate a planner on the scenarios of a set that ``config`` selects, and write the run folder.
+
+    The folder appears once all episodes are done. The traffic model is by default the built-in one named
+    ``config.traffic``; ``sizes`` are those that the whole set uses, if they are known already.
+    """
+    scenarios = [data[row] for row in select_scenarios(data, config.filter, config.scenarios, config.limit)]
+    RunFolder.check(Path(out), overwrite, "evaluation")
+    with ProgressBar(f"evaluating {planner.name}", "scenarios", len(scenarios)) as bar:
+        table = evaluate(
+            planner,
+            scenarios,
+            task=with_metrics(config.task, config.metrics),
+            traffic=traffic or make_traffic(config.traffic),
+            start=NoisyStart() if config.noisy_start else LogStart(),
+            start_step=config.start_step,
+            seed=config.seed,
+            batch=config.batch,
+            # The scenarios to evaluate have been verified; of the others only the sizes are read.
+            sizes=sizes or Sizes.used(ScenarioSet.open(data.path, verify=False)),
+            progress=lambda done, total: bar.update(done),
+        )
+    info: dict[str, Any] = {"kind": "evaluation", **table.info}
+    if trained := learned_from(config.planner):
+        info["trained_on"] = trained
+    with replace_folder(Path(out)) as partial_folder:
+        RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)
+        table.write(partial_folder)
+    return table
+
+
+def with_metrics(task: Task, more: tuple[str, ...]) -> Task:
+    """Return the task with further metrics."""
+    metrics = task.metrics if isinstance(task.metrics, tuple) else (task.metrics,)
+    return replace(task, metrics=tuple(dict.fromkeys((*metrics, *more)))) if more else task
+
+
+def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
+    """Format headline metrics of planners as a table of at most 100 columns; undefined means are empty."""
+    rows = []
+    for summary in summaries:
+        means = (summary["metrics"][name]["mean"] for name in HEADLINE)
+        texts = ("" if mean is None else f"{mean:.3f}" for mean in means)
+        rows.append((Cell(summary["planner"]), *map(Cell, texts)))
+    columns = (Column("planner", label=True), *map(Column, HEADLINE.values()))
+    return Table("summary", columns, tuple(rows)).text()
+
+
+def format_metrics(summary: Mapping[str, Any], names: tuple[str, ...]) -> str:
+    """Format metrics of one planner as a table: mean, 95 % interval and n; names are those of ``metrics.selection``."""
+    rows = []
+    for name in select_metrics(names).names:
+        if (metric := summary["metrics"].get(name)) is not None:
+            numbers = (metric[key] for key in ("mean", "low", "high"))
+            mean, low, high = ("" if number is None else f"{number:.4g}" for number in numbers)
+            rows.append(tuple(map(Cell, (name, mean, f"{low} to {high}" if low else "", f"{metric['n']:,}"))))
+    columns = (Column("metric", label=True), *map(Column, ("mean", "95 % interval", "n")))
+    return Table("metrics", columns, tuple(rows)).text()
+
+
+def format_crashes(table: EpisodeTable) -> str:
+    """Format the first crashes, a line each; empty without any."""
+    if not table.crashes:
+        return ""
+    count = len(table.crashes)
+    lines = [f"{table.planner} crashed in {count} of {len(table)} episodes, which count as failed:"]
+    lines += [f"  {crash.scenario_id}, step {crash.step}: {crash.error}" for crash in table.crashes[:_LISTED]]
+    if count > _LISTED:
+        lines.append(f"  and {count - _LISTED} more, in crashes.json")
+    return "\n".join(lines)
+
+
+class Options(TypedDict, total=False):
+    """Keyword options of :func:`evaluate`: start step (default: current step), seed (default: 0), and more.
+
+    ``batch`` is the number of stored scenarios loaded at a time, by default what fits in memory; no result depends on
+    it. ``sizes`` of the banks are by default what the scenarios use; subsets with the sizes of the whole set share its
+    compiled program. ``progress`` is called with (done, total) after every batch.
     """
 
     start_step: int
@@ -71,25 +193,18 @@ class Options(TypedDict, total=False):
 
 
 def evaluate(
-    planner: Planner,
-    scenarios: ScenarioBank | Sequence[Scenario],
-    names: Names | None = None,
-    *,
-    task: Task | None = None,
-    traffic: Traffic | None = None,
-    start: Start | None = None,
-    **options: Unpack[Options],
-) -> EpisodeTable:
+    planner: Planner, scenarios: ScenarioBank | Sequence[Scenario], names: Names | None = None, *,
+    task: Task | None = None, traffic: Traffic | None = None, start: Start | None = None, **options: Unpack[Options],
+) -> EpisodeTable:  # fmt: skip
     """Run a planner on every scenario to the end of its log, and measure each episode.
 
     Args:
         planner: The planner.
         scenarios: A bank, or stored scenarios of one capacity.
-        names: ``dataset``, ``scenario_id`` and ``segment`` of every scenario of a bank; stored scenarios know theirs.
-        task: Action space and observation of the planner; the default task if None. All metrics are measured, and no
-            episode ends early.
-        traffic: Traffic model, log replay if None; what it needs is precomputed here.
-        start: How episodes start, as logged if None. Random starts are the same for every planner.
+        names: ``dataset``, ``scenario_id`` and ``segment`` of every scenario of a bank.
+        task: Action space and observation of the planner. All metrics are measured, and no episode ends early.
+        traffic: Traffic model, log replay by default; what it needs is precomputed here.
+        start: How episodes start, as logged by default. Random starts are the same for every planner.
         options: See :class:`Options`.
 
     Raises:
@@ -114,37 +229,39 @@ def evaluate(
         size = min(batch or _fitting(simulator.traffic, scenarios, sizes), len(scenarios))
         banks = _banks(scenarios, identity, size, sizes)
     episodes, done = [], 0
-    with raised() as errors, telling_out_of_memory(size):
+    with raised() as errors, report_out_of_memory(size):
         for bank in banks:
             for finished in evaluation.episodes(bank):
                 episodes.append(finished)
                 done += len(finished.crashed)
                 if progress is not None:
                     progress(done, len(names))
-    return evaluation.table(_joined(episodes), names, identity, errors)
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *episodes)
+    return evaluation.table(joined, names, identity, errors)
 
 
 def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
     """Check the names of a bank, and that episodes can start there."""
     if len(names) != len(bank):
-        raise UsageError(
-            f"{len(names)} scenario names for a bank of {len(bank)}", cure="name every scenario of the bank"
-        )
-    _check_future(names, np.asarray(bank.flags) & Flag.NO_FUTURE != 0)
-    _check_present(names, np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0, start_step)
+        problem = f"{len(names)} scenario names for a bank of {len(bank)}"
+        raise UsageError(problem, cure="name every scenario of the bank")
+    present = np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0
+    _check_starts(names, np.asarray(bank.flags) & Flag.NO_FUTURE != 0, present, start_step)
     return names
 
 
 def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
     """Return the names of stored scenarios, and check that episodes can start there."""
     names = scenario_names(scenarios)
-    _check_future(names, [Flag.NO_FUTURE in scenario.has for scenario in scenarios])
-    _check_present(names, [scenario.agent_valid[start_step, 0] for scenario in scenarios], start_step)
+    no_future = [Flag.NO_FUTURE in scenario.has for scenario in scenarios]
+    _check_starts(
+        names, no_future, [scenario.agent_valid[start_step, 0] for scenario in scenarios], start_step
+    )
     return names
 
 
 def _fitting(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> int:
-    """How many scenarios fit in memory at a time."""
+    """Return the number of scenarios that fit in memory at a time."""
     single = prepare_bank(traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes))
     return scenarios_at_a_time(single.nbytes, lanes(), free_memory(jax.devices()[0]))
 
@@ -152,7 +269,7 @@ def _fitting(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> i
 def _banks(
     scenarios: Sequence[Scenario], identity: UInt32[np.ndarray, " n"], size: int, sizes: Sizes
 ) -> Iterator[ScenarioBank]:
-    """Banks of ``size`` scenarios, each with the identities that they have in the whole."""
+    """Yield banks of ``size`` scenarios with the identities that they have in the whole."""
     for first in range(0, len(scenarios), size):
         rows = slice(first, first + size)
         bank = ScenarioBank.from_scenarios(scenarios[rows], trim=sizes)
@@ -161,7 +278,7 @@ def _banks(
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """What is evaluated, and how: the simulator has the task of :func:`~drivax.evaluation.rollout.judging`."""
+    """What is evaluated, and how; the simulator has the task of :func:`evaluation_task`."""
 
     simulator: Simulator
     planner: Planner
@@ -179,16 +296,11 @@ class _Evaluation:
             raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
         if not 0 <= start_step < steps - 1:
             raise UsageError(f"start step {start_step} leaves no action", cure=f"use 0 to {steps - 2}")
-        if getattr(planner, "actions", task.actions) != task.actions:
-            raise UsageError(
-                f"planner {planner.name} acts in another action space than the task", cure="use the task's"
-            )
+        check_actions(planner, task)
         if planner.replays and simulator.start != LogStart():
-            raise UsageError(
-                f"planner {planner.name} replays the log and cannot start elsewhere",
-                cure="use expert_actions",
-            )
-        task = judging(task)
+            problem = f"planner {planner.name} replays the log and cannot start elsewhere"
+            raise UsageError(problem, cure="use expert_actions")
+        task = evaluation_task(task)
         metrics = metric_specs(task.metrics)
         if taken := sorted({*KEYS, *ADDED} & metrics.keys()):
             raise UsageError(f"there is another column {taken[0]!r}", cure="give your metric another name")
@@ -218,27 +330,20 @@ class _Evaluation:
         }
         columns = {key: tuple(row[key] for row in names) for key in ("dataset", "scenario_id", "segment")}
         columns |= {"planner": (planner,) * n, "seed": (str(self.seed),) * n, "traffic": (traffic,) * n}
-        own = {
-            name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
-            for name, metric in self.metrics.items()
-            if name not in METRICS
-        }
+        theirs = {name: metric for name, metric in self.metrics.items() if name not in METRICS}
+        own = {name: {"unit": m.unit, "better": m.better, "text": m.definition} for name, m in theirs.items()}
+        crashes: list[Crash] = []
+        for row in np.flatnonzero(crashed >= 0).tolist():
+            step = int(crashed[row])
+            error = errors.get((int(identity[row]), step), "action is not finite")
+            crashes.append(Crash(names[row]["dataset"], names[row]["scenario_id"], step, error))
         return EpisodeTable(
             folder=None,
             name=planner,
             info={"planner": planner, "traffic": traffic} | ({"own_metrics": own} if own else {}),
             keys={name: columns[name] for name in KEYS},
             metrics=fail_crashed(metrics, crashed >= 0),
-            crashes=tuple(
-                Crash(
-                    columns["dataset"][row],
-                    columns["scenario_id"][row],
-                    step,
-                    errors.get((int(identity[row]), step), "action is not finite"),
-                )
-                for row, step in enumerate(crashed.tolist())
-                if step >= 0
-            ),
+            crashes=tuple(crashes),
             in_memory=Trajectories(
                 ego=np.asarray(episodes.motion),
                 action=actions,
@@ -249,46 +354,56 @@ class _Evaluation:
         )
 
 
+def until_crash(
+    actions: Float[np.ndarray, "episode step D"], crashed: Int[np.ndarray, " episode"], start: int
+) -> Float[np.ndarray, "episode step D"]:
+    """Return actions with NaN from the step on at which the planner crashed (-1: never).
+
+    ``start`` is the step of the log of the first action.
+    """
+    step = start + np.arange(actions.shape[1])
+    own = (crashed[:, None] < 0) | (step < crashed[:, None])
+    return np.where(own[..., None], actions, np.nan)
+
+
+def action_jerk(actions: Float[np.ndarray, "episode step D"]) -> Float64[np.ndarray, " episode"]:
+    """Return the standard deviation of the change of the action from step to step; NaN with fewer than two actions.
+
+    ``sqrt(mean_d var_t(a[t + 1, d] - a[t, d]))`` with the population's variance, in units of the action space; NaN
+    actions are left out. A steady change (a ramp) has none; uniform random actions in [-1, 1] have about
+    ``sqrt(2 / 3) = 0.82``.
+    """
+    change = np.diff(np.asarray(actions, np.float64), axis=1)
+    with warnings.catch_warnings():
+        # NumPy warns of fewer than two actions, which have no change.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.sqrt(np.nanvar(change, axis=1).mean(axis=-1))
+
+
 @partial(jax.jit, static_argnames="seed")
 def _batch(bank: ScenarioBank, rows: Int[Array, " W"], seed: int) -> tuple[ScenarioBank, Array]:
-    """These rows of a bank as a bank of their own, and their keys."""
+    """Return these rows of a bank as a bank of their own, and their keys."""
     batch = bank.part(rows)
     return batch, episode_keys(batch, jnp.arange(len(rows)), seed)
 
 
-def _joined(batches: Sequence[Episodes]) -> Episodes:
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *batches)
-
-
-def _check_future(names: Names, no_future: Sequence[bool] | Any) -> None:
-    short = [row["scenario_id"] for row, missing in zip(names, no_future, strict=True) if missing]
-    if short:
-        raise DataError(
-            f"no logged future (a short log or a test split) in {len(short)} of {len(names)} scenarios",
-            record=short[0],
-            cure="leave them out with --filter flag!=NO_FUTURE",
-        )
-
-
-def _check_present(names: Names, present: Sequence[bool] | Any, start_step: int) -> None:
-    absent = [row["scenario_id"] for row, valid in zip(names, present, strict=True) if not valid]
-    if absent:
-        cure = "start at another step"
-        if len(absent) <= _NAMED:
-            cure += f", or leave them out: --filter 'scenario_id!={'|'.join(absent)}'"
-        raise UsageError(
-            f"ego is not in the log at step {start_step} in {len(absent)} of {len(names)} scenarios",
-            record=absent[0],
-            cure=cure,
-        )
+def _check_starts(names: Names, no_future: Any, present: Any, start_step: int) -> None:
+    """Refuse scenarios without a logged future, and those without ego at the start."""
+    ids = [row["scenario_id"] for row in names]
+    if short := [name for name, missing in zip(ids, no_future, strict=True) if missing]:
+        problem = f"no logged future (a short log or a test split) in {len(short)} of {len(names)} scenarios"
+        raise DataError(problem, record=short[0], cure="leave them out with --filter flag!=NO_FUTURE")
+    if absent := [name for name, valid in zip(ids, present, strict=True) if not valid]:
+        problem = f"ego is not in the log at step {start_step} in {len(absent)} of {len(names)} scenarios"
+        leave_out = f", or leave them out: --filter 'scenario_id!={'|'.join(absent)}'"
+        cure = "start at another step" + (leave_out if len(absent) <= _NAMED else "")
+        raise UsageError(problem, record=absent[0], cure=cure)
 
 
 def _check_finite(episodes: Episodes, names: Names) -> None:
     """Refuse motion that is not finite although all actions were: a defect of action space or traffic."""
     broken = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
     if broken.size:
-        raise DrivaxError(
-            f"ego's motion is not finite in {broken.size} scenarios",
-            record=names[int(broken[0])]["scenario_id"],
-            cure="check the action space and the traffic",
-        )
+        problem, record = f"ego's motion is not finite in {broken.size} scenarios", names[int(broken[0])]
+        cure = "check the action space and the traffic"
+        raise DrivaxError(problem, record=record["scenario_id"], cure=cure)

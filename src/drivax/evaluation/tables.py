@@ -11,14 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.episode_table import (
-    ADDED,
-    NOT_SUMMARISED,
-    RATES,
-    EpisodeTable,
-    ScenarioKey,
-    interval_of,
-)
+from drivax.evaluation.episode_table import ADDED, NOT_SUMMARISED, RATES, EpisodeTable, Tags, interval_of
 from drivax.evaluation.pairing import Pairs, mismatch
 from drivax.metrics.catalogue import METRICS
 from drivax.metrics.catalogue import headline as headline_metrics
@@ -52,13 +45,10 @@ _ARROWS = {"high": " ↑", "low": " ↓", "-": ""}
 
 @dataclass(frozen=True)
 class MetricLabel:
-    """How a metric is shown.
+    """How a metric is shown: label with unit, better direction (``-`` for none), unit, and explanation.
 
-    Attributes:
-        text: Its label, with the unit where it has one.
-        better: Whether ``high`` or ``low`` is better; ``-`` for neither.
-        unit: ``rate`` for a share of episodes, ``share`` for another number without a unit, else the unit.
-        explanation: One sentence; empty for unknown metrics.
+    The unit is ``rate`` for a share of episodes, ``share`` for another number without a unit; the explanation of an
+    unknown metric is empty.
     """
 
     text: str
@@ -80,11 +70,11 @@ class MetricLabel:
 
 def metric_label(name: str, runs: Sequence[EpisodeTable] = ()) -> MetricLabel:
     """Return how to show a metric; ``runs`` describe the user's own metrics."""
-    known = METRICS.get(name) or ADDED.get(name)
-    metric = known or next((run.own_metrics[name] for run in runs if name in run.own_metrics), None)
-    text = (metric.label if metric else None) or name.replace("_", " ")
+    own = (run.own_metrics[name] for run in runs if name in run.own_metrics)
+    metric = METRICS.get(name) or ADDED.get(name) or next(own, None)
     if metric is None:
-        return MetricLabel(text, "-", "", "")
+        return MetricLabel(name.replace("_", " "), "-", "", "")
+    text = metric.label or name.replace("_", " ")
     plain = metric.unit == "-"
     if not plain:
         text = f"{text} [{metric.unit.replace('s2', 's²').replace('s3', 's³')}]"
@@ -109,12 +99,9 @@ def ordered(names: Sequence[str]) -> list[str]:
 
 
 def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interval:
-    """Return the mean of a metric over episodes, with the interval that ``summary.json`` gives.
+    """Return the mean of a metric over episodes (``rows``), with the interval that ``summary.json`` gives.
 
-    Args:
-        run: The evaluation; one without the metric gives an empty interval.
-        metric: Name of the metric.
-        rows: Which episodes, as an index of an array; all by default.
+    It is empty where the evaluation lacks the metric.
     """
     if metric not in run.metrics:
         return NOTHING
@@ -129,34 +116,20 @@ def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> In
 
 
 def paired_differences(results: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
-    """Return :func:`paired_difference` of two evaluations in memory.
-
-    Raises:
-        UsageError: If their scenarios differ.
-    """
+    """Return :func:`paired_difference` of two evaluations of one set; others raise :class:`UsageError`."""
     if set(results.scenarios) != set(other.scenarios):
         raise UsageError("the scenarios of the evaluations differ", cure="evaluate both on one set")
     return paired_difference(results, other, metric)
 
 
-@dataclass(frozen=True)
-class Difference:
-    """A metric of one planner minus another's, over their common scenarios.
+def difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> tuple[Interval, str]:
+    """Return the paired difference ``run - other`` of a metric with its verdict.
 
-    Attributes:
-        interval: Mean difference with its interval and the number of pairs.
-        verdict: ``better``, ``worse``, ``unclear`` (the interval holds 0), ``same`` (no pair differs) or ``none`` (no
-            direction, no interval).
+    The verdict is ``better``, ``worse``, ``unclear`` (the interval holds 0), ``same`` (no pair differs) or ``none``
+    (no direction, no interval).
     """
-
-    interval: Interval
-    verdict: str
-
-
-def difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> Difference:
-    """Return the paired difference ``run - other`` of a metric with its verdict."""
     interval = paired_difference(run, other, metric)
-    return Difference(interval, _verdict(interval, metric_label(metric, [run]).better))
+    return interval, _verdict(interval, metric_label(metric, [run]).better)
 
 
 def _verdict(interval: Interval, better: str) -> str:
@@ -172,14 +145,14 @@ def _verdict(interval: Interval, better: str) -> str:
 
 def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
     """Return a table with planners in rows and metrics in columns, the best mean of each column marked."""
-    columns = [[summarise(run, name) for run in runs] for name in metrics]
-    best = [_best(column, metric_label(name, runs)) for name, column in zip(metrics, columns, strict=True)]
+    means = [[summarise(run, name) for run in runs] for name in metrics]
+    best = [_best(column, metric_label(name, runs)) for name, column in zip(metrics, means, strict=True)]
     rows = []
     for place, run in enumerate(runs):
         label = Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic")
         cells = [
             _cell(runs, name, column[place], {"run": run.name, "metric": name}, top)
-            for name, column, top in zip(metrics, columns, best, strict=True)
+            for name, column, top in zip(metrics, means, best, strict=True)
         ]
         rows.append((label, *cells))
     heads = (Column("planner", label=True), *_metric_columns(metrics, runs))
@@ -195,12 +168,8 @@ def _best(intervals: Sequence[Interval], label: MetricLabel) -> float | None:
 
 
 def _cell(
-    runs: Sequence[EpisodeTable],
-    metric: str,
-    interval: Interval,
-    link: Mapping[str, Any],
-    best: float | None = None,
-) -> Cell:
+    runs: Sequence[EpisodeTable], metric: str, interval: Interval, link: Mapping[str, Any], best: float | None = None
+) -> Cell:  # fmt: skip
     if interval.mean is None:
         return interval_cell(interval, "", metric)
     style = "best" if best is not None and interval.mean == best else ""
@@ -217,21 +186,15 @@ def _metric_cell(metric: str, runs: Sequence[EpisodeTable]) -> Cell:
     return Cell(label.heading, metric=metric, title=label.title or metric)
 
 
-def _run_columns(runs: Sequence[EpisodeTable]) -> list[Column]:
-    return [Column(run.name, run.name) for run in runs]
-
-
 def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
     """Return a table with metrics in rows and runs in columns."""
-    rows = tuple(
-        (
-            _metric_cell(name, runs),
-            *(_cell(runs, name, summarise(run, name), {"run": run.name, "metric": name}) for run in runs),
-        )
-        for name in metrics
-    )
-    columns = (Column("metric", "metric", label=True), *_run_columns(runs))
-    return Table("results", columns, rows, f"Mean and {CONFIDENCE:.0%} interval", "planner")
+    rows = []
+    for name in metrics:
+        links = [(run, {"run": run.name, "metric": name}) for run in runs]
+        cells = (_cell(runs, name, summarise(run, name), link) for run, link in links)
+        rows.append((_metric_cell(name, runs), *cells))
+    columns = (Column("metric", "metric", label=True), *(Column(run.name, run.name) for run in runs))
+    return Table("results", columns, tuple(rows), f"Mean and {CONFIDENCE:.0%} interval", "planner")
 
 
 #: Words of a verdict; the sign repeats in shape what the colour says.
@@ -245,21 +208,18 @@ def differences_table(policy: EpisodeTable, others: Sequence[EpisodeTable], metr
         for name in metrics
     )
     caption = f"{policy.name} minus the others, paired by scenario, with {CONFIDENCE:.0%} interval"
-    columns = (Column("metric", "metric", label=True), *_run_columns(others))
+    columns = (Column("metric", "metric", label=True), *(Column(run.name, run.name) for run in others))
     return Table("differences", columns, rows, caption, "against")
 
 
 def _difference_cell(policy: EpisodeTable, other: EpisodeTable, metric: str) -> Cell:
     if unmatched := mismatch(policy, other):
         return Cell(f"no pairs: {unmatched[0]}", style="undefined")
-    compared = difference(policy, other, metric)
-    if compared.interval.mean is None:
-        title = "no scenario where both are defined"
-        return interval_cell(compared.interval, "", metric, signed=True, title=title)
-    return interval_cell(
-        compared.interval, metric_label(metric, [policy]).unit, metric, signed=True, style=compared.verdict,
-        mark=_MARKS[compared.verdict], link={"run": policy.name, "metric": metric},
-    )  # fmt: skip
+    interval, verdict = difference(policy, other, metric)
+    if interval.mean is None:
+        return interval_cell(interval, "", metric, signed=True, title="no scenario where both are defined")
+    more = {"style": verdict, "mark": _MARKS[verdict], "link": {"run": policy.name, "metric": metric}}
+    return interval_cell(interval, metric_label(metric, [policy]).unit, metric, signed=True, **more)
 
 
 def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
@@ -279,24 +239,12 @@ def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
             cells.append(_cell(runs, "collision", share, {"run": run.name, "kind": int(code)}))
         rows.append((Cell(name), *cells))
     caption = f"First collisions by kind: share of {of} with {CONFIDENCE:.0%} interval"
-    columns = (Column("first collision", label=True), *_run_columns(runs))
+    columns = (Column("first collision", label=True), *(Column(run.name, run.name) for run in runs))
     return Table("collisions", columns, tuple(rows), caption, "planner")
 
 
-def strata_table(
-    runs: Sequence[EpisodeTable],
-    tags: Mapping[ScenarioKey, Mapping[str, str]],
-    tag: str,
-    metrics: Sequence[str],
-) -> Table:
-    """Return a table with a row per value of a tag and run, metrics in columns.
-
-    Args:
-        runs: Evaluations.
-        tags: The tags of their scenarios; a scenario without the tag counts as ``unknown``.
-        tag: The tag.
-        metrics: Columns.
-    """
+def strata_table(runs: Sequence[EpisodeTable], tags: Tags, tag: str, metrics: Sequence[str]) -> Table:
+    """Return a table with a row per value of a tag and run, metrics in columns; without the tag it is ``unknown``."""
     values = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
     order = {value: place for place, value in enumerate(TAGS.get(tag, ()))}
     every = {value for of_run in values.values() for value in of_run}
@@ -306,10 +254,8 @@ def strata_table(
             inside = np.flatnonzero(np.array(values[run.name]) == value)
             if inside.size:
                 link = {"run": run.name, "tags": {tag: value}}
-                cells = (
-                    _cell(runs, name, summarise(run, name, inside), link | {"metric": name})
-                    for name in metrics
-                )
+                means = ((name, summarise(run, name, inside)) for name in metrics)
+                cells = (_cell(runs, name, mean, link | {"metric": name}) for name, mean in means)
                 rows.append((Cell(value), Cell(run.name), *cells))
     caption = f"By {tag}: mean and {CONFIDENCE:.0%} interval"
     labels = (Column(tag, label=True), Column("planner", label=True))
@@ -318,14 +264,12 @@ def strata_table(
 
 def set_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     """Return unique short names of all data sets that runs were evaluated or trained on, by their key."""
-    entries = {set_key(entry): entry for run in runs for entry in (run.data, *_trained_on(run))}
+    entries = {
+        set_key(entry): entry for run in runs for entry in (run.data, *(run.info.get("trained_on") or ()))
+    }
     named = {key: _set_name(entry) for key, entry in entries.items()}
     names = list(named.values())
     return {key: name if names.count(name) == 1 else f"{name} {key[:6]}" for key, name in named.items()}
-
-
-def _trained_on(run: EpisodeTable) -> Sequence[Mapping[str, Any]]:
-    return run.info.get("trained_on") or ()
 
 
 def set_key(entry: Mapping[str, Any]) -> str:
@@ -350,9 +294,8 @@ def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     for key, name in own.items():
         paths = [Path(other).parts for other in own if other != key and own[other] == name]
         parts = Path(key).parts
-        take = next(
-            (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in paths)), len(parts)
-        )
+        unique = (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in paths))
+        take = next(unique, len(parts))
         named[key] = "/".join(parts[-take:]) if paths else name
     return named
 
@@ -367,23 +310,18 @@ def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
     evaluated = [names[set_key(run.data)] for run in runs]
     cells: dict[tuple[str, ...], dict[str, Cell]] = {}
     for run, where in zip(runs, evaluated, strict=True):
-        trained = ", ".join(names[set_key(entry)] for entry in _trained_on(run)) or "–"
+        trained = ", ".join(names[set_key(entry)] for entry in run.info.get("trained_on") or ()) or "–"
         labels = (planners[_planner_key(run)], trained, run.traffic)
         if where in cells.get(labels, {}):
             labels = (run.name, *labels[1:])
         link = {"run": run.name, "metric": metric}
         cells.setdefault(labels, {})[where] = _cell(runs, metric, summarise(run, metric), link)
-    columns = tuple(dict.fromkeys(evaluated))
+    sets = tuple(dict.fromkeys(evaluated))
     rows = tuple(
-        (*map(Cell, labels), *(row.get(name, Cell(style="undefined")) for name in columns))
+        (*map(Cell, labels), *(row.get(name, Cell(style="undefined")) for name in sets))
         for labels, row in cells.items()
     )
     heads = [Column(key, label=True) for key in ("planner", "trained on", "traffic")]
+    columns = (*heads, *(Column(name, name) for name in sets))
     caption = f"By training and evaluation data: mean and {CONFIDENCE:.0%} interval"
-    return Table(
-        f"transfer-{metric}",
-        (*heads, *(Column(name, name) for name in columns)),
-        rows,
-        caption,
-        "evaluated on",
-    )
+    return Table(f"transfer-{metric}", columns, rows, caption, "evaluated on")

@@ -18,15 +18,15 @@ AuxiliaryLoss = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 
 @runtime_checkable
 class LearnerState(Protocol):
-    """A pytree with all that a run needs to continue: a frozen ``scenario.record.record``, so that leaves have names.
+    """A pytree with all that a run needs to continue: a ``scenario.record.record``, so that leaves have names.
 
-    A class attribute ``networks`` names the fields that fine-tuning takes over from another run (without it only
-    ``parameters``); a field may be such a state itself.
+    A class attribute ``networks`` names the fields that fine-tuning takes over from another run, by default
+    ``parameters``; a field may be such a state itself.
     """
 
     @property
     def parameters(self) -> Any:
-        """Parameters of the planner; an evaluation restores nothing else."""
+        """Parameters of the planner, which is all that an evaluation restores."""
         ...
 
     @property
@@ -37,7 +37,7 @@ class LearnerState(Protocol):
 
 @runtime_checkable
 class Learner(Protocol):
-    """An algorithm in one environment. Holds configuration; everything computed is in the state.
+    """An algorithm in one environment; everything computed is in the state.
 
     A learner that divides its batches among devices (``program.divided``) has their size as attribute ``batch``.
     """
@@ -47,15 +47,14 @@ class Learner(Protocol):
         ...
 
     def iterate(self, data: Any, state: Any) -> tuple[Any, dict[str, Array]]:
-        """Return the state after one iteration, and values to log by name.
+        """Return the state after one iteration, and values to log by name (``loop.mean_logs``).
 
-        Pure; compiled with the state donated. Sums of ``environment.collect``, passed on as ``rollout/<name>``, are
-        logged as means; other names are logged as they are.
+        Pure; compiled with the state donated.
         """
         ...
 
     def planner(self, parameters: Any, name: str, samples: bool) -> Planner:
-        """Return the planner with these parameters; it samples its actions or takes the mode."""
+        """Return the planner with these parameters, which samples its actions or takes the mode."""
         ...
 
 
@@ -63,9 +62,8 @@ class Learner(Protocol):
 class Agent(Learner, Protocol):
     """A learner that interacts with its environment, in parts for a training loop of your own.
 
-    ``iterate`` is a rollout of :meth:`sample_action` followed by ``update``. Off-policy agents also have a ``buffer``:
-    add the rollout to ``state.replay`` with ``buffer.add``, then call ``update(data, state)``. On-policy agents take
-    the rollout: ``update(data, state, rollout)``.
+    ``iterate`` is a rollout of :meth:`sample_action`, then ``update(data, state, rollout)`` on-policy; off-policy
+    ``buffer.add`` to ``state.replay`` and ``update(data, state)``.
     """
 
     environment: Any
@@ -120,20 +118,12 @@ def training_data(
 ) -> Any:
     """Return the data of a learner's iterations: the environment's, or the logged experience in them.
 
-    Args:
-        config: The algorithm.
-        environment: What it learns in.
-        data: The environment's data.
-        weights: ``[N, T]`` of every logged step, at least 0; None: uniform.
-
-    Raises:
-        UsageError: There are weights, but the algorithm is not offline.
+    ``weights`` are ``[N, T]`` of every logged step, at least 0 (None: uniform); UsageError unless the algorithm is
+    offline.
     """
     if isinstance(config, OfflineAlgorithm):
         return config.experience(environment, data, weights)
     if weights is not None:
-        raise UsageError(
-            f"{type(config).__name__} does not learn from logged steps, so weights have no effect",
-            cure="leave out the weights, or use bc, cql, iql or td3_bc",
-        )
+        problem = f"{type(config).__name__} does not learn from logged steps, so weights have no effect"
+        raise UsageError(problem, cure="leave out the weights, or use bc, cql, iql or td3_bc")
     return data

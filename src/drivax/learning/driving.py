@@ -12,15 +12,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.learning.environment import Environments, Outcome, in_any
-from drivax.learning.experience import ExpertSteps, StepIndex
+from drivax.learning.experience import ExpertActions, ExpertSteps, StepIndex
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, STEPS
-from drivax.simulator.simulator import Simulator
-from drivax.simulator.sparse import map_where
+from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.starts import LogStart
 from drivax.simulator.types import AgentContext, EpisodeStart, Frame, SimState
 from drivax.tasks.actions import Discrete
@@ -36,8 +35,8 @@ class Driving:
 
     Attributes:
         simulator: Task, traffic and kind of start.
-        latest_start: Episodes begin at a random step of the log between ``earliest_start`` and this one.
-        earliest_start: See ``latest_start``; where the ego is not valid yet, they begin at step 10.
+        latest_start, earliest_start: Episodes begin at a random step of the log between the two, or at step 10 where
+            the ego is not valid yet.
     """
 
     simulator: Simulator
@@ -48,19 +47,16 @@ class Driving:
         if self.earliest_start < 0:
             raise UsageError(f"earliest_start is {self.earliest_start}", cure="use 0 or more")
         if not self.earliest_start <= self.latest_start < STEPS - 2:
-            raise UsageError(
-                f"latest_start is {self.latest_start}",
-                cure=f"use {self.earliest_start} (earliest_start) to {STEPS - 3}",
-            )
+            cure = f"use {self.earliest_start} (earliest_start) to {STEPS - 3}"
+            raise UsageError(f"latest_start is {self.latest_start}", cure=cure)
 
     @property
     def task(self) -> Task:
         """The simulator's task; raises UsageError if it has no action space."""
-        if not isinstance(self.simulator.task, Task):
-            raise UsageError(
-                f"{type(self.simulator.task).__name__} has no action space", cure="use drivax.tasks.task.Task"
-            )
-        return self.simulator.task
+        task = self.simulator.task
+        if not isinstance(task, Task):
+            raise UsageError(f"{type(task).__name__} has no action space", cure="use drivax.tasks.task.Task")
+        return task
 
     @property
     def action_size(self) -> int:
@@ -87,7 +83,7 @@ class Driving:
         return {name: tuple(value.shape) for name, value in observation.items()}
 
     def start(self, data: ScenarioBank, key: Array, count: int) -> Environments:
-        """Reset environments to random steps of the log, so that their episodes end at different times."""
+        """Reset environments to random steps of the log."""
         index, step, keys = _draw(data, key, count, self.earliest_start, data.steps - 3)
         state = jax.vmap(self.simulator.reset, (None, 0, 0, None, 0))(data, index, step, 0, keys)
         observation = self.observe_all(data, state.context)
@@ -113,32 +109,24 @@ class Driving:
         self, data: ScenarioBank, now: Environments, cache: Frame, action: Float[Array, "B D"], key: Array
     ) -> tuple[Environments, Outcome]:
         """Step every environment, or reset it to another scenario where its episode is over."""
-        count = now.over.shape[0]
-        index, step, keys = _draw(data, key, count, self.earliest_start, self.latest_start)
-        fresh = map_where(now.over, partial(self._beginning, data), index, step, keys)
+
+        def new_episode(index: Array, step: Array, key: Array) -> EpisodeStart:
+            return self.simulator.new_episode(data, index, step, 0, key)
+
+        start = _draw(data, key, now.over.shape[0], self.earliest_start, self.latest_start)
         step_all = jax.vmap(self.simulator.step_or_reset, (None, 0, 0, 0, 0, 0))
-        state, made = step_all(data, now.state, action, now.over, fresh, cache)
-        over = made.terminated | made.truncated
-        outcome = Outcome(
-            reward=made.reward,
-            terminated=made.terminated,
-            truncated=made.truncated,
-            cache=self.cache(data, state),
-            totals=_totals(data, state, made.reward_terms, over, now.over),
-        )
+        fresh = map_where(now.over, new_episode, *start)
+        state, result = step_all(data, now.state, action, now.over, fresh, cache)
+        over = result.terminated | result.truncated
+        totals = _totals(data, state, result.reward_terms, over, now.over)
+        outcome = Outcome(result.reward, result.terminated, result.truncated, self.cache(data, state), totals)
         return Environments(state, over, self.observe_all(data, state.context)), outcome
 
-    def _beginning(self, data: ScenarioBank, index: Array, step: Array, key: Array) -> EpisodeStart:
-        return self.simulator.new_episode(data, index, step, 0, key)
+    def demonstrations(self, data: ScenarioBank, key: Array, count: int) -> ExpertActions:
+        """Return the expert's actions at random steps of the log.
 
-    def demonstrations(
-        self, data: ScenarioBank, key: Array, count: int
-    ) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
-        """Return observations, expert actions, and whether those were clipped, at random steps of the log.
-
-        Steps lie between the current step and the third last, since an expert's action looks two steps ahead, in
-        scenarios drawn with replacement. They are observed as if the expert had driven there in the simulator: the last
-        action is that of the expert, as executed.
+        Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
+        observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
         """
         index, step, _ = _draw(data, key, count, CURRENT_STEP, data.steps - 3)
 
@@ -150,16 +138,13 @@ class Driving:
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
         """Observe logged steps as in :meth:`demonstrations`."""
-
-        def observe(scenario: Array, step: Array) -> dict[str, Array]:
-            return dict(self._logged.observe(data, self._logged_context(data, scenario, step)))
-
-        return jax.vmap(observe)(*index)
+        contexts = partial(self._logged_context, data)
+        return jax.vmap(lambda *index: dict(self._logged.observe(data, contexts(*index))))(*index)
 
     def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
         """Return the log as a rollout of the expert from the current step on, with the simulator's rewards and ends.
 
-        All agents follow the log, because only for them the outcome of the expert's actions is known.
+        All agents follow the log, because the outcome of the expert's actions is only known among these.
         """
         scenarios = jnp.arange(len(data))
         rollouts = jax.lax.map(partial(self._rollout, data), scenarios, batch_size=min(len(data), _BATCH))
@@ -177,10 +162,8 @@ class Driving:
         """The simulator with all agents as logged and without metrics."""
         return Simulator(replace(self.task, metrics="none"))
 
-    def _logged_context(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]
-    ) -> AgentContext:
-        """AgentContext of a logged step as if the expert had driven there."""
+    def _logged_context(self, bank: ScenarioBank, index: Array, step: Array) -> AgentContext:
+        """Return the context of a logged step as if the expert had driven there."""
         context, before = (self._logged.context(bank, index, t) for t in (step, jnp.maximum(step - 1, 0)))
         return replace(context, action=self._expert_action(bank, before)[0])
 
@@ -200,8 +183,8 @@ class Driving:
 
         def step(state: SimState, _: None) -> tuple[SimState, tuple[Array, ...]]:
             action, clipped = self._expert_action(bank, state.context)
-            after, made = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
-            return after, (action, made.reward, made.terminated, made.truncated, clipped)
+            after, result = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
+            return after, (action, result.reward, result.terminated, result.truncated, clipped)
 
         return jax.lax.scan(step, first, None, bank.steps - 1 - CURRENT_STEP)[1]
 
@@ -215,9 +198,8 @@ def _draw(
     step = jax.random.randint(step_key, (count,), earliest, latest + 1)
     # The ego is always valid at the current step.
     step = jnp.where(bank.agents[index, step, 0, AgentColumn.VALID] > 0, step, CURRENT_STEP)
-    keys = jax.random.split(
-        jax.random.fold_in(step_key, 1), count
-    )  # unused, and not computed, with logged starts
+    # Unused, and not computed, with logged starts.
+    keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
     return index, step, keys
 
 
@@ -231,7 +213,7 @@ def _has_expert_action(bank: ScenarioBank) -> Bool[Array, "N T"]:
 def _totals(
     bank: ScenarioBank, state: SimState, terms: dict[str, Array], done: Array, over: Array
 ) -> dict[str, Array]:
-    """Sums over the batch: metrics of episodes that end now, and reward terms of steps that are no resets."""
+    """Sum, over the batch, metrics of episodes that end now and reward terms of steps that are no resets."""
     logged = [name for name in state.episode.selection.names if name not in CODES]
 
     def of_episodes() -> dict[str, Array]:
@@ -246,6 +228,5 @@ def _totals(
     # Most steps end no episode; one condition for the whole program lets the branch be skipped.
     zeros = {name: jnp.zeros(()) for metric in logged for name in (metric, f"{metric}/n")}
     totals: dict[str, Any] = jax.lax.cond(in_any(done), of_episodes, lambda: zeros)
-    for name, term in terms.items():
-        totals[f"reward/{name}"] = jnp.sum(jnp.where(over, 0.0, term))
-    return totals
+    rewards = {f"reward/{name}": jnp.sum(jnp.where(over, 0.0, term)) for name, term in terms.items()}
+    return totals | rewards

@@ -1,8 +1,7 @@
 """The environment protocol, and rollouts of a batch of environments that reset themselves.
 
-``learning.driving`` implements it for scenarios; a control task with known results can take its place. An environment
-is configuration only: its data (for driving the scenario bank) is an argument of every function, and all functions but
-:meth:`Environment.observe` act on a batch.
+``learning.driving`` implements it for scenarios. An environment is configuration only: its data (for driving the
+scenario bank) is an argument of every function, and all functions but :meth:`Environment.observe` act on a batch.
 """
 
 from __future__ import annotations
@@ -20,15 +19,9 @@ from drivax.scenario.record import record
 
 @record
 class Environments:
-    """A batch of environments between two rollouts.
+    """State and observation of a batch of environments; where an episode is ``over``, the next step resets it."""
 
-    Attributes:
-        state: State of each environment.
-        over: Whether the episode has ended; the next step resets the environment.
-        observation: Current observation of each environment.
-        environment_axis: The axis that counts environments, which several devices divide.
-    """
-
+    #: The axis that counts environments, which several devices divide.
     environment_axis: ClassVar[int] = 0
 
     state: Any
@@ -42,11 +35,11 @@ class Outcome:
 
     Attributes:
         reward: Rewards.
-        terminated: Episode ended for good: bootstrap zero.
-        truncated: Episode was cut off: bootstrap the value of the state that the step led to.
+        terminated: The episode ended by a failure: bootstrap zero.
+        truncated: The episode was cut off: bootstrap the value of the state that the step led to.
         cache: :meth:`Environment.cache` of the new state.
-        totals: Sums over the batch to log: ``"<name>"`` with its count ``"<name>/n"``, or ``"reward/<name>"`` over
-            steps. Environments that were over are left out.
+        totals: Sums to log over environments that were not over: ``"<name>"`` with its count ``"<name>/n"``, or
+            ``"reward/<name>"`` over steps.
     """
 
     reward: Float[Array, " B"]
@@ -79,7 +72,7 @@ class Environment(Protocol):
         ...
 
     def stored(self, state: Any) -> Any:
-        """Return what the replay buffer stores of states: the least that an observation can be made of."""
+        """Return what the replay buffer stores of states, from which they can be observed again."""
         ...
 
     def observe(self, data: Any, stored: Any) -> dict[str, Array]:
@@ -91,7 +84,7 @@ class Environment(Protocol):
         ...
 
     def cache(self, data: Any, state: Any) -> Any:
-        """Return what a step computes from states and the next step can reuse; never stored."""
+        """Return what a step computes from states and the next step reuses."""
         ...
 
     def step(
@@ -109,7 +102,7 @@ class Rollout:
     """Experience ``[time, batch]``. ``alive`` is false for steps that only reset an environment; mask them out.
 
     The row after row t holds what row t led to, final states included; the last row led to the environments' current
-    state. Of ``observation`` and ``state`` (what the replay buffer stores) one is kept, the other is None.
+    state. One of ``observation`` and ``state`` (what the replay buffer stores) is kept, the other is None.
     """
 
     observation: dict[str, Array] | None
@@ -123,27 +116,28 @@ class Rollout:
 
 
 class SampledAction(NamedTuple):
-    """What a policy samples from its distribution, the action in [-1, 1] that it stands for, and extras to store."""
+    """A sampled raw action, its action in [-1, 1], and extras to store."""
 
     raw_action: Array
     action: Array
     extra: dict[str, Array]
 
 
-#: From observations and a key to (raw action, action in [-1, 1], extras to store).
-Actor = Callable[[Mapping[str, Array], Array], tuple[Array, Array, dict[str, Array]]]
-#: Whether a rollout keeps observations, or states that observations can be made of again.
+#: The fields of :class:`SampledAction`; an actor samples them, given observations and a key.
+Sampled = tuple[Array, Array, dict[str, Array]]
+Actor = Callable[[Mapping[str, Array], Array], Sampled]
+#: What a rollout keeps: observations, or states that can be observed again.
 Store = Literal["state", "observation"]
 
 
 def transition(
     environment: Environment,
     now: Environments,
-    sampled: tuple[Array, Array, dict[str, Array]],
+    sampled: Sampled,
     outcome: Outcome,
     keep: Store = "observation",
 ) -> Rollout:
-    """Return one row of a rollout: the environments before the step, the sampled actions, and the outcome."""
+    """Return one row of a rollout, given the environments before the step, the sampled actions, and the outcome."""
     raw_action, _, extra = sampled
     return Rollout(
         observation=now.observation if keep == "observation" else None,
@@ -169,8 +163,8 @@ def collect(
     """Unroll ``steps`` steps in every environment.
 
     Returns:
-        The environments afterwards, the rollout, and sums to log: ``Outcome.totals``, the ``episodes`` that ended, and
-        the ``steps`` that were alive.
+        The environments afterwards, the rollout, and sums to log: ``Outcome.totals``, and the numbers of ``episodes``
+        that ended and of ``steps`` that were alive.
     """
 
     def step(carry: tuple[Environments, Any, Array], _: None) -> tuple[Any, Any]:
@@ -192,8 +186,7 @@ def collect(
 def in_any(condition: Bool[Array, "*batch"]) -> Bool[Array, ""]:
     """Whether a condition holds anywhere: in the batch, and under ``vmap`` in any learner.
 
-    ``jax.lax.cond`` on one condition per learner computes both branches; on this single condition it branches. Learners
-    that train side by side are in the same iteration, so phases of a run lose nothing by it.
+    ``jax.lax.cond`` on one condition per learner computes both branches; on this single condition it branches.
     """
     return condition.any()
 

@@ -1,10 +1,10 @@
-"""Logged experience: what an expert did at each step, what reward it got, and how steps are drawn by weight.
+"""Logged experience: actions of an expert, their outcome, and the weights that steps are drawn by.
 
-No observation is stored: a step is an index (scenario, step), observed when it is drawn by the function that observes
-simulated steps. Rewards and ends depend on all earlier steps, so they are replayed once before training.
+No observation is stored: a step is an index (scenario, step), observed when it is drawn. Rewards and ends depend on all
+earlier steps, so they are replayed once before training.
 
 Steps are drawn by the inverse of the cumulative distribution in integers: float32 would round a weight among a million
-others by a twentieth, 32 bits by a five-thousandth, and no number leads to a step of weight zero.
+others by a twentieth, 32 bits by a five-thousandth, and no step of weight zero is ever drawn.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from drivax.scenario.record import record, static
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.intervals import effective_size
 
-#: What follows the weights: all learning, or only the policy, while values are learned from uniform steps.
-Weighted = Literal["all", "policy"]
-#: Scenarios and steps that were drawn.
+#: Scenarios and steps.
 StepIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
+#: Observations, expert actions within the bounds, and whether those were clipped.
+ExpertActions = tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]
 
 _LAST = 2**32 - 1
 
@@ -47,19 +47,19 @@ class Sampler:
 
     Attributes:
         cumulative: Share of all weight up to each step, scenario by scenario, in units of ``1 / (2^32 - 1)``.
-        effective: Effective sample size (:func:`~drivax.stats.intervals.effective_size`).
+        effective: Effective sample size.
         steps: Steps per scenario.
     """
 
-    cumulative: UInt[Array, " places"]
+    cumulative: UInt[Array, " steps"]
     effective: Float[Array, ""]
     steps: int = static()
 
 
 def sampler(weights: np.ndarray) -> Sampler:
-    """Return a sampler that draws each step in proportion to its weight ``[N, T]``, at least 0.
+    """Return a sampler of steps in proportion to weights ``[N, T]`` of at least 0; DataError if none is above 0.
 
-    A step with a share of all weight below ``2^-32`` may never be drawn. Raises DataError if no weight is above 0.
+    A step with a share of all weight below ``2^-32`` may never be drawn.
     """
     total = np.cumsum(weights.reshape(-1), dtype=np.float64)
     if not total[-1] > 0.0:
@@ -78,38 +78,25 @@ def draw(sampler: Sampler, key: Array, shape: tuple[int, ...]) -> StepIndex:
 
 
 def check_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return weights ``[N, T]`` in double precision.
-
-    Raises:
-        UsageError: They have another shape, are negative, or not finite.
-    """
+    """Return weights ``[N, T]`` in double precision; UsageError for a wrong shape or a negative or infinite weight."""
     weights = np.asarray(weights)
     if weights.shape != shape:
-        raise UsageError(
-            f"weights of shape {weights.shape} for {shape[0]} scenarios of {shape[1]} steps",
-            cure="make weights for every step of this scenario set",
-        )
+        problem = f"weights of shape {weights.shape} for {shape[0]} scenarios of {shape[1]} steps"
+        raise UsageError(problem, cure="make weights for every step of this scenario set")
     bad = np.argwhere(~(np.isfinite(weights) & (weights >= 0.0)))
     if len(bad):
         scenario, step = bad[0]
-        raise UsageError(
-            f"the weight of step {step} of scenario {scenario} is {weights[scenario, step]}",
-            cure="use finite numbers of at least 0",
-        )
+        problem = f"the weight of step {step} of scenario {scenario} is {weights[scenario, step]}"
+        raise UsageError(problem, cure="use finite numbers of at least 0")
     return weights.astype(np.float64)
 
 
 @record
 class ExpertSteps:
-    """What an expert did at each of T steps of N scenarios, and the outcome.
+    """Actions of an expert, within the bounds, at T steps of N scenarios, and their outcome.
 
-    Attributes:
-        action: Actions within the bounds.
-        reward: Rewards.
-        terminated: Episode ended for good: bootstrap zero.
-        truncated: Episode was cut off: bootstrap the value of the state that the step led to.
-        usable: Whether a step can be learned from (:meth:`Recorded.expert_steps`); elsewhere all else is undefined.
-        clipped: The expert did what no action does, so the action does not lead to its next state.
+    Steps that are not ``usable`` are undefined. An action that was ``clipped`` to the bounds does not lead to the next
+    state.
     """
 
     action: Float[Array, "N T D"]
@@ -129,30 +116,29 @@ class Recorded(Environment, Protocol):
         ...
 
     def observe_recorded(self, data: Any, index: StepIndex) -> dict[str, Array]:
-        """Observe a batch of logged steps as the environment shows them when the expert acts."""
+        """Observe a batch of logged steps as if the expert had acted in the environment."""
         ...
 
 
 def recorded(environment: Environment) -> Recorded:
     """Return the environment; raises UsageError if it has no expert episodes."""
     if not isinstance(environment, Recorded):
-        raise UsageError(
-            f"{type(environment).__name__} has no logged episodes", cure="implement `expert_steps`"
-        )
+        problem = f"{type(environment).__name__} has no logged episodes"
+        raise UsageError(problem, cure="implement `expert_steps`")
     return environment
 
 
 @record
 class Experience:
-    """What offline algorithms learn from.
+    """The steps that offline algorithms learn from, and their samplers.
 
     Attributes:
         data: The environment's data.
         expert: The expert's steps.
         usable: Steps to learn from.
-        uniform: Draws usable steps uniformly.
-        critic: Draws the steps that values are learned from.
-        policy: Draws the steps that the policy is improved at; None: the critic's steps.
+        uniform: Sampler of usable steps without weights.
+        critic: Sampler of the steps that values are learned from.
+        policy: Sampler of the steps that the policy is improved at; None: the critic's.
     """
 
     data: Any
@@ -164,11 +150,8 @@ class Experience:
 
     def sizes(self) -> dict[str, Float[Array, ""]]:
         """Return effective sample sizes to log."""
-        policy = self.policy or self.critic
-        return {
-            "sampler/critic_effective": self.critic.effective,
-            "sampler/policy_effective": policy.effective,
-        }
+        samplers = {"critic": self.critic, "policy": self.policy or self.critic}
+        return {f"sampler/{name}_effective": sampler.effective for name, sampler in samplers.items()}
 
 
 @dataclass(frozen=True)
@@ -176,20 +159,17 @@ class ExperienceConfig:
     """Which logged steps are learned from.
 
     Attributes:
-        mask_clipped: Leave out steps at which the expert did what no action does. Otherwise they have the nearest
-            action, which does not lead to the expert's next state.
-        weighted: What follows the weights of a training: ``all``, or only the ``policy``.
+        mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
+        weighted: What learns from weighted steps: ``all``, or only the ``policy``, with values from uniform steps.
     """
 
     mask_clipped: bool = True
-    weighted: Weighted = "all"
+    weighted: Literal["all", "policy"] = "all"
 
     def of(self, environment: Environment, data: Any, weights: np.ndarray | None = None) -> Experience:
         """Return the experience in an environment's data, drawn by ``weights`` ``[N, T]`` or uniformly.
 
-        Raises:
-            UsageError: The environment has no expert, or the weights do not fit the data.
-            DataError: No step is usable.
+        Raises UsageError if there is no expert or the weights do not fit the data, DataError if no step is usable.
         """
         expert = _expert_steps(recorded(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)
@@ -207,10 +187,8 @@ def _expert_steps(environment: Recorded, data: Any) -> ExpertSteps:
     return environment.expert_steps(data)
 
 
-def expert_actions(
-    environment: Recorded, experience: Experience, index: StepIndex
-) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
-    """Return observations of logged steps, the expert's actions, and whether those were clipped."""
+def expert_actions(environment: Recorded, experience: Experience, index: StepIndex) -> ExpertActions:
+    """Return the expert's actions at logged steps."""
     expert = experience.expert
     observation = environment.observe_recorded(experience.data, index)
     return observation, expert.action[index], expert.clipped[index]

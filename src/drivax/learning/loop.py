@@ -1,11 +1,11 @@
-"""The training loop: iterate on the device, log, validate, write checkpoints, stop, resume."""
+"""The training loop: iterate on the device, log, validate, write checkpoints, stop, resume, fine-tune."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,39 +13,40 @@ from typing import Any
 import jax
 import numpy as np
 
-from drivax.errors import UsageError
-from drivax.learning.algorithm import Agent, HeldOutMetrics, Learner, LearnerState, training_data
+from drivax.errors import DataError, UsageError
+from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.experience import WeightedSet
-from drivax.learning.policies import find_traffic
-from drivax.learning.pretrained import Pretrained, first_state, pretrained_networks, with_step
+from drivax.learning.policies import POLICY_FILE, find_traffic, open_policy
 from drivax.learning.program import Program, Seeds
 from drivax.learning.training_log import Preempted, StopSignal, TrainingLog, Validation, validate
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RunFolder, seed_folders
+from drivax.tracking.run_folder import RunFolder, run_and_step, seed_folders, trained_on
+
+#: Problem and option, where inputs of a resumed run differ.
+_RESUMED_WITH_OTHER = {
+    "validation": ("was validated on other scenarios", "--validation"),
+    "weights": ("was trained with other weights", "weights"),
+    "data": ("was trained on other scenarios", "--data"),
+}
 
 
 def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
     """Return the :class:`Agent` that ``drivax train`` trains, in parts for a training loop of your own.
 
-    Args:
-        config: Task, algorithm, traffic and starts.
-        bank: Scenarios to train on, prepared for reactive traffic (``simulator.traffic.bank_data.prepare_bank``); only
-            shapes are read.
-
-    Raises:
-        UsageError: The algorithm does not interact with an environment (bc, cql, iql, td3_bc).
+    Only shapes of the bank are read, which ``simulator.traffic.bank_data.prepare_bank`` prepares. Raises UsageError if
+    the algorithm does not interact with an environment (bc, cql, iql, td3_bc).
     """
-    learner = _learner(config, config.environment(find_traffic(config.traffic)), bank)
+    environment = config.environment(find_traffic(config.traffic))
+    learner = config.algorithm.build(environment, bank, config.iterations)
     if not isinstance(learner, Agent):
-        raise UsageError(
-            f"{type(config.algorithm).__name__} has no parts for a loop of your own",
-            cure="use ppo or sac, or drivax.train",
-        )
+        problem = f"{type(config.algorithm).__name__} has no parts for a loop of your own"
+        raise UsageError(problem, cure="use ppo or sac, or drivax.train")
     return learner
 
 
@@ -70,8 +71,8 @@ def train(
         validation: Scenarios that rank checkpoints.
         resume: Continue the run in ``out`` from its newest checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder.
-        seeds: Number of seeds to train in one program, from ``config.seed`` on; several have a run folder each inside
-            ``out``: ``seed-0``, ``seed-1``, ...
+        seeds: Number of seeds to train in one program, from ``config.seed`` on; several have run folders
+            ``out/seed-0``, ``out/seed-1``, ...
         log: Called with lines about memory, pretrained networks, and seeds that stop early.
 
     Raises:
@@ -81,27 +82,32 @@ def train(
         Preempted: SIGTERM stopped it, after a checkpoint.
     """
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
-    out = Path(out)
+    out, notes = Path(out), hashes(validation, weights)
     folders: list[RunFolder] = []
     if resume:
-        config, folders = _resumed_folders(data, validation, weights, out, seeds)
+        config, folders = _resumed_folders(data, notes, out, seeds)
     else:
         RunFolder.check(out, overwrite, "training")
-        config = with_step(config)
-    _check(config, validation, seeds)
+        if config.begin_from is not None:
+            # With its step, so that resuming finds the same checkpoint.
+            config = replace(config, begin_from=str(Pretrained.of(config.begin_from)))
+    if config.patience and validation is None:
+        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+    if seeds < 1:
+        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
     environment, bank = _environment(config, data)
-    learner = _learner(config, environment, bank)
+    learner = config.algorithm.build(environment, bank, config.iterations)
     held_out = None if validation is None else Validation.of(validation)
     held_out_data = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
-    numbers = tuple(config.seed + number for number in range(len(folders) or seeds))
+    numbers = range(config.seed, config.seed + (len(folders) or seeds))
     experience = training_data(config.algorithm, environment, bank, weights)
-    program = Program(Seeds(learner, numbers), experience, config.devices)
+    program = Program(Seeds(learner, tuple(numbers)), experience, config.devices)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.check()
     log(memory.text())
     # Before any folder is made: they may not fit.
     networks = None if resume else pretrained_networks(config.begin_from, program, log)
-    folders = folders or _create_folders(config, data, validation, weights, out, numbers, overwrite)
+    folders = folders or _create_folders(config, data, notes, out, numbers, overwrite)
     with contextlib.ExitStack() as stack:
         rules = (config.checkpoint_rule, config.keep, config.patience)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
@@ -110,17 +116,13 @@ def train(
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
-    """Return which logged steps ``[N, T]`` an offline training draws from, for weights to be normalised over.
-
-    Raises:
-        UsageError: The algorithm does not learn from logged steps.
-    """
+    """Return which logged steps ``[N, T]`` an offline training draws from; UsageError for other algorithms."""
     environment, bank = _environment(config, data)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
     return np.asarray(experience.usable)
 
 
-def hashes(validation: ScenarioSet | None, weights: np.ndarray | None) -> dict[str, str | None]:
+def hashes(validation: ScenarioSet | None, weights: np.ndarray | None) -> dict[str, Any]:
     """Return hashes of the validation set and of the weights, for ``run.json``."""
     digest = None if weights is None else hashlib.sha256(np.asarray(weights, "<f8").tobytes()).hexdigest()
     return {"validation": None if validation is None else validation.hash, "weights": digest}
@@ -145,18 +147,6 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
     return row
 
 
-def _check(config: TrainConfig, validation: ScenarioSet | None, seeds: int) -> None:
-    """Raise UsageError for impossible settings before any work is done."""
-    if config.patience and validation is None:
-        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
-    if seeds < 1:
-        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
-
-
-def _learner(config: TrainConfig, environment: Driving, bank: ScenarioBank) -> Learner:
-    return config.algorithm.build(environment, bank, config.iterations)
-
-
 def _environment(config: TrainConfig, data: ScenarioSet) -> tuple[Driving, ScenarioBank]:
     """Environment of a training, and its bank."""
     environment = config.environment(find_traffic(config.traffic))
@@ -164,44 +154,29 @@ def _environment(config: TrainConfig, data: ScenarioSet) -> tuple[Driving, Scena
 
 
 def _create_folders(
-    config: TrainConfig,
-    data: ScenarioSet,
-    validation: ScenarioSet | None,
-    weights: np.ndarray | None,
-    out: Path,
-    seeds: tuple[int, ...],
-    overwrite: bool,
+    config: TrainConfig, data: ScenarioSet, notes: dict[str, Any], out: Path, seeds: range, overwrite: bool
 ) -> list[RunFolder]:
     """Create the run folder of each seed: ``out``, or for several ``out/seed-<seed>``."""
-    notes: dict[str, Any] = hashes(validation, weights)
     if config.begin_from is not None:
-        notes["networks_from"] = Pretrained.of(config.begin_from).notes()
+        notes = {**notes, "networks_from": Pretrained.of(config.begin_from).notes()}
     if len(seeds) == 1:
         return [RunFolder.create(out, config, [data], overwrite, kind="training", **notes)]
     RunFolder.create(out, config, [data], overwrite, kind="seeds", seeds=len(seeds), **notes)
-    return [
-        RunFolder.create(out / f"seed-{seed}", replace(config, seed=seed), [data], kind="training", **notes)
-        for seed in seeds
-    ]
+    configs = {out / f"seed-{seed}": replace(config, seed=seed) for seed in seeds}
+    return [RunFolder.create(path, own, [data], kind="training", **notes) for path, own in configs.items()]
 
 
 def _resumed_folders(
-    data: ScenarioSet, validation: ScenarioSet | None, weights: np.ndarray | None, out: Path, seeds: int
+    data: ScenarioSet, notes: Mapping[str, Any], out: Path, seeds: int
 ) -> tuple[TrainConfig, list[RunFolder]]:
-    """Return the configuration of a run, and the folder of each of its seeds.
-
-    Raises:
-        UsageError: Training scenarios, validation scenarios, weights or the number of seeds differ.
-    """
-    folder, now = RunFolder.open(out), hashes(validation, weights)
-    if folder.info.get("validation") != now["validation"]:
-        raise UsageError(
-            "was validated on other scenarios", file=out, cure="resume with the same --validation"
-        )
-    if folder.info.get("weights") != now["weights"]:
-        raise UsageError("was trained with other weights", file=out, cure="resume with the same weights")
-    if [entry.get("hash") for entry in folder.info.get("data", [])] != [data.hash]:
-        raise UsageError("was trained on other scenarios", file=out, cure="resume with the same --data")
+    """Return the configuration of a run, and the folder of each of its seeds; UsageError if inputs differ."""
+    folder = RunFolder.open(out)
+    before = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
+    before |= {name: folder.info.get(name) for name in ("validation", "weights")}
+    for name, now in {**notes, "data": [data.hash]}.items():
+        if before[name] != now:
+            problem, option = _RESUMED_WITH_OTHER[name]
+            raise UsageError(problem, file=out, cure=f"resume with the same {option}")
     folders = [RunFolder.open(path) for path in seed_folders(out)]
     if seeds not in (1, len(folders)):
         raise UsageError(f"holds {len(folders)} seeds, not {seeds}", file=out, cure="resume without --seeds")
@@ -234,24 +209,20 @@ def _learn(run: _Run) -> None:
             if all(log.stopped for log in run.logs):
                 break
             started = time.perf_counter()
-            state, raw = program.step(state)
-            values = jax.device_get(raw)
+            state, values = program.step(state)
+            values = jax.device_get(values)
             rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
             # Read once, so that every seed has a checkpoint of the same iteration.
             stops = stop.received and iteration < config.iterations
-            rows = [
-                mean_logs(program.seeds.member(values, number)) | {"steps_per_second": rate}
-                for number in range(len(run.logs))
-            ]
+            logged = (mean_logs(program.seeds.member(values, number)) for number in range(len(run.logs)))
+            rows = [row | {"steps_per_second": rate} for row in logged]
             _record(run, iteration, state, rows, stops)
             success = [row["rollout/success"] for row in rows if "rollout/success" in row]
             text = f"success {sum(success) / len(success):.2f}" if success else ""
             progress.update(run.steps(iteration), text)
             if stops:
-                raise Preempted(
-                    f"SIGTERM stopped the training after {run.steps(iteration):,} steps",
-                    cure="continue it with --resume",
-                )
+                problem = f"SIGTERM stopped the training after {run.steps(iteration):,} steps"
+                raise Preempted(problem, cure="continue it with --resume")
 
 
 def _start(run: _Run) -> tuple[int, Any]:
@@ -293,12 +264,10 @@ def _record(
             row |= _validation(run, run.validation, state, number)
         rank = log.write(steps, row)
         if last or due or stops or iteration % config.checkpoint_every == 0:
-            log.save(steps, run.program.seeds.member(state, number), rank)
+            log.checkpoints.save(steps, run.program.seeds.member(state, number), rank)
         if log.stopped and not last:
-            run.log(
-                f"seed {run.program.seeds.seeds[number]}: no better for {config.patience} validations, "
-                f"stopped at {steps:,} steps"
-            )
+            seed, patience = run.program.seeds.seeds[number], config.patience
+            run.log(f"seed {seed}: no better for {patience} validations, stopped at {steps:,} steps")
 
 
 def _validation(run: _Run, validation: Validation, state: LearnerState, number: int) -> dict[str, float]:
@@ -312,3 +281,109 @@ def _validation(run: _Run, validation: Validation, state: LearnerState, number: 
         metrics = seeds.learner.held_out_metrics(run.held_out_data, member)
         row |= {f"validation/{name}": value for name, value in metrics.items()}
     return row
+
+
+@dataclass(frozen=True)
+class Pretrained:
+    """A checkpoint of another run, and the data sets that it was trained on, as in its ``run.json``."""
+
+    run: Path
+    step: int
+    data: list[dict[str, Any]]
+
+    @classmethod
+    def of(cls, name: str) -> Pretrained:
+        """Find the checkpoint ``RUN@STEP``, or of ``RUN`` the best, or the newest without a validation.
+
+        Raises UsageError if the folder holds several seeds or an exported policy, DataError if it is no training run or
+        has no checkpoint.
+        """
+        run, step = run_and_step(name)
+        folder, _ = open_policy(run)
+        if (folder.path / POLICY_FILE).is_file():
+            problem = "is an exported policy, which cannot be fine-tuned"
+            raise UsageError(problem, file=run, cure="name the training run")
+        if step is None:
+            step = Checkpoints(folder.checkpoints).best_or_newest()
+        if step is None:
+            raise DataError("has no checkpoint", file=run, cure="name a run that wrote one")
+        return cls(Path(run), step, trained_on(folder.info))
+
+    def __str__(self) -> str:
+        return f"{self.run}@{self.step}"
+
+    def notes(self) -> dict[str, Any]:
+        """Return the entry of ``run.json``."""
+        return {"run": str(self.run), "step": self.step, "data": self.data}
+
+    def networks(self, state: Any) -> dict[str, Any]:
+        """Return the stored networks by the paths that they replace in a fresh state of one seed, or its shapes.
+
+        Networks that the checkpoint lacks are left out. Raises DataError for the first array that does not fit.
+        """
+        checkpoints = Checkpoints(self.run / "checkpoints")
+        stored = [leaf["name"] for leaf in checkpoints.about(self.step)["leaves"]]
+        networks = _networks(state)
+        sources = {path: source for path in networks if (source := _source(path, stored))}
+        templates = {source: networks[path] for path, source in sources.items()}
+        cure = "begin from a run with the same network, observation and actions"
+        restored = checkpoints.restore_parts(templates, self.step, cure)
+        return {path: restored[source] for path, source in sources.items()}
+
+
+def pretrained_networks(name: str | None, program: Program, log: Callable[[str], None]) -> dict[str, Any]:
+    """Return the networks of the run ``RUN`` or ``RUN@STEP`` by their paths in the state, and log them."""
+    if name is None:
+        return {}
+    run = Pretrained.of(name)
+    networks = run.networks(program.seeds.member_shapes(program.shapes))
+    log(f"begins with {', '.join(path.removeprefix('.') for path in networks)} of {run}")
+    return networks
+
+
+def first_state(program: Program, networks: Mapping[str, Any]) -> Any:
+    """Return the first state of all seeds, each with these networks in place of its own."""
+    fresh, seeds = program.first_state(), program.seeds
+    if not networks:
+        return fresh
+    states = [with_networks(seeds.member(fresh, number), networks) for number in range(len(seeds.seeds))]
+    return program.state_of(states)
+
+
+def with_networks(state: Any, networks: Mapping[str, Any], at: str = "") -> Any:
+    """Return a state with these networks, by their paths, in place of its own."""
+    fields = {
+        name: with_networks(value, networks, path) if _is_state(value) else networks.get(path, value)
+        for name, path, value in _fields(state, at)
+    }
+    return replace(state, **fields)
+
+
+def _networks(state: Any, at: str = "") -> dict[str, Any]:
+    """Networks of a state by their paths."""
+    networks: dict[str, Any] = {}
+    for _, path, value in _fields(state, at):
+        if _is_state(value):
+            networks |= _networks(value, path)
+        elif jax.tree.leaves(value):
+            networks[path] = value
+    return networks
+
+
+def _fields(state: Any, at: str) -> Iterable[tuple[str, str, Any]]:
+    """Name, path and value of the fields of a state that hold networks."""
+    for name in getattr(type(state), "networks", ("parameters",)):
+        yield name, f"{at}.{name}", getattr(state, name)
+
+
+def _is_state(value: Any) -> bool:
+    return hasattr(type(value), "networks")
+
+
+def _source(path: str, stored: Iterable[str]) -> str | None:
+    """Path of a network in a checkpoint: its name in the state, or in the learner of a warm start."""
+    name = path[path.rindex(".") :]
+    for source in (name, f".learner{name}"):
+        if any(is_part(leaf, [source]) for leaf in stored):
+            return source
+    return name if name == ".parameters" else None

@@ -14,13 +14,12 @@ from drivax.learning.config import TrainConfig, split_traffic
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import PlannerTraffic, with_driver
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
-from drivax.tracking.run_folder import RunFolder, seed_folders, trained_on
-from drivax.tracking.zoo import policy_folder
+from drivax.tracking.run_folder import RunFolder, policy_folder, seed_folders, trained_on
 
 #: What an exported policy has instead of checkpoints.
 POLICY_FILE = "policy.npz"
@@ -33,12 +32,9 @@ _AS_LOGGED = ("--traffic", "log", "--start.kind", "log_start")
 def open_policy(run: str | Path) -> tuple[RunFolder, TrainConfig]:
     """Open the folder of a trained policy and its configuration, with traffic and starts as logged.
 
-    Args:
-        run: Run folder of ``drivax train``, folder of :func:`export_policy`, or ``zoo:NAME``.
+    ``run`` is a run folder of ``drivax train``, a folder of :func:`export_policy`, or ``zoo:NAME``.
 
-    Raises:
-        UsageError: The folder holds several seeds, or the zoo has no such policy.
-        DataError: The folder is no training run.
+    Raises UsageError if the folder holds several seeds or the zoo has no such policy, DataError if it is no run.
     """
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":
@@ -53,14 +49,11 @@ def load_policy(
     """Load a trained policy as a planner, and the task that it was trained for.
 
     Args:
-        run: Run folder of ``drivax train``, folder of :func:`export_policy`, or ``zoo:NAME``.
+        run: As for :func:`open_policy`, with its errors; DataError if the parameters are missing or damaged.
         bank: Any bank; only shapes of its observations are read.
         step: Step of the checkpoint, shown in the planner's name; None: the best, or the newest without a validation.
+            UsageError for a step of an exported policy.
         samples: Whether to sample actions instead of taking the mode.
-
-    Raises:
-        UsageError: As :func:`open_policy`, or a step of an exported policy is requested.
-        DataError: The folder is no training run, or its parameters are missing or damaged.
     """
     folder, config = open_policy(run)
     learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
@@ -73,12 +66,11 @@ def load_policy(
     exported = folder.path / POLICY_FILE
     if exported.is_file():
         if step is not None:
-            raise UsageError(
-                "is an exported policy without steps", file=folder.path, cure=f"leave out @{step}"
-            )
+            problem = "is an exported policy without steps"
+            raise UsageError(problem, file=folder.path, cure=f"leave out @{step}")
         return unpack(exported, jax.eval_shape(planner, template)), config.task
     checkpoints = Checkpoints(folder.checkpoints)
-    chosen = checkpoints.best() if step is None else step
+    chosen = checkpoints.best_or_newest() if step is None else step
     return planner(checkpoints.restore(template, chosen, part=".parameters")), config.task
 
 
@@ -96,19 +88,14 @@ def export_policy(
     hashes of data sets, but no path of the machine).
 
     Args:
-        run: Run folder of ``drivax train``.
+        run: As for :func:`load_policy`, with its errors.
         out: Folder to write; its name is that of the policy.
         bank: Any bank; only shapes of its observations are read.
         notes: More entries for ``run.json``, plain JSON values.
         overwrite: Replace ``out`` if it is a run folder.
-
-    Raises:
-        UsageError: As :func:`load_policy`, or ``out`` exists.
-        DataError: As :func:`load_policy`.
     """
     folder, _ = open_policy(run)
-    checkpoints = Checkpoints(folder.checkpoints)
-    step = checkpoints.best() or max(checkpoints.steps(), default=None)
+    step = Checkpoints(folder.checkpoints).best_or_newest()
     planner, _ = load_policy(run, bank, step=step)
     about = {name: folder.info.get(name) for name in _PROVENANCE}
     data = [{name: entry[name] for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
@@ -123,12 +110,7 @@ def export_policy(
 
 @dataclass(frozen=True)
 class PolicyTraffic(PlannerTraffic):
-    """Traffic in which the policy of a run drives the vehicles nearest to ego; made by :func:`policy_traffic`.
-
-    Attributes:
-        run: Folder of the policy.
-        samples: Whether the policy samples its actions instead of taking the mode.
-    """
+    """Traffic in which the policy of a folder drives the vehicles nearest to ego, made by :func:`policy_traffic`."""
 
     run: str = ""
     samples: bool = False
@@ -140,11 +122,7 @@ class PolicyTraffic(PlannerTraffic):
         return f"driven_by_{Path(self.run).name}{base}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """Return the bank with the policy, and with what ``base`` needs.
-
-        Raises:
-            DataError: The checkpoint is missing or damaged.
-        """
+        """Return the bank with the policy, and with what ``base`` needs; DataError if the checkpoint is damaged."""
         bank = super().prepare(bank)
         return with_driver(bank, load_policy(self.run, bank, samples=self.samples)[0])
 
@@ -155,14 +133,10 @@ def policy_traffic(
     """Return traffic in which the best policy of a training run drives up to ``count`` vehicles nearest to ego.
 
     Args:
-        run: Run folder of ``drivax train``, folder of ``export_policy``, or ``zoo:NAME``.
+        run: As for :func:`open_policy`, with its errors.
         count: Largest number of vehicles that it drives.
         base: Traffic of all other agents; the log by default.
         samples: Whether to sample actions instead of taking the mode.
-
-    Raises:
-        UsageError: The folder holds several seeds, or the zoo has no such policy.
-        DataError: The folder is no training run.
     """
     folder, config = open_policy(run)
     return PolicyTraffic(config.task, count, base or LogTraffic(), run=str(folder.path), samples=samples)
@@ -171,14 +145,9 @@ def policy_traffic(
 def find_traffic(name: str) -> Traffic:
     """Return the traffic of a name in a command line or a configuration.
 
-    Args:
-        name: One of ``simulator.traffic.catalogue.TRAFFIC``; ``package.module:name``; or the folder of a trained
-            policy or ``zoo:NAME``, which drives the vehicles nearest to ego while all others follow the log, or the
-            traffic named after a plus sign: ``zoo:NAME+idm``.
-
-    Raises:
-        UsageError: There is no such traffic.
-        DataError: A folder is no training run.
+    It is one of ``simulator.traffic.reactive.TRAFFIC``; ``package.module:name``; or the folder of a trained policy or
+    ``zoo:NAME``, which drives the vehicles nearest to ego while all others follow the log, or the traffic named after a
+    plus sign: ``zoo:NAME+idm``. Raises UsageError if there is none, DataError if a folder is no training run.
     """
     run, base = split_traffic(name)
     return make_traffic(base) if run is None else policy_traffic(run, base=make_traffic(base))

@@ -1,8 +1,7 @@
 """One iteration of all seeds as a compiled program: its layout over devices, and the memory that it takes.
 
-Seeds are divided among devices where they can be, otherwise the environments or batches of each seed. Everything is one
-program on one mesh, and the compiler divides the work by where arrays lie, so results do not depend on the number of
-devices except for the order of sums.
+Seeds are divided among devices where they can be, otherwise the environments or batches of each seed. Results do not
+depend on the number of devices except for the order of sums.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.memory import memory_of
 from drivax.learning.algorithm import Learner
 
-#: Enough threads that some thread never waits for another.
+#: Threads of XLA's pool, enough that one never waits for another.
 _THREADS = 8
 _AXIS = "devices"
 
@@ -91,15 +90,9 @@ class Seeds:
 
 
 class Program:
-    """What a run executes, compiled before any array of the state is allocated.
+    """An iteration of all seeds on some data, compiled before any array of the state is allocated.
 
-    Args:
-        seeds: The learner and its seeds.
-        data: What it is trained on.
-        devices: Number of devices; None: all that can be divided among.
-
-    Raises:
-        UsageError: The devices are missing, or nothing can be divided among them.
+    ``devices`` is as ``requested`` of :func:`choose_devices`, with its errors.
     """
 
     def __init__(self, seeds: Seeds, data: Any, devices: int | None = 1) -> None:
@@ -114,11 +107,9 @@ class Program:
             data = jax.device_put(data, NamedSharding(self._mesh, PartitionSpec()))
             shapes = jax.tree.map(
                 lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place),
-                shapes,
-                self._layout,
-            )
-        self.data = data
-        self.shapes = shapes
+                shapes, self._layout,
+            )  # fmt: skip
+        self.data, self.shapes = data, shapes
         outputs = None if self._layout is None else (self._layout, None)
         iterate = jax.jit(seeds.iterate, donate_argnums=1, out_shardings=outputs)
         # Learners divide their work among devices unless whole seeds are divided.
@@ -145,22 +136,15 @@ class Program:
 
 
 def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | None = None) -> list[Any]:
-    """Return the devices of a run.
+    """Return the requested number of devices; None: all of this machine that work can be divided among.
 
-    Args:
-        requested: Number of devices; None: all of this machine that can be divided among.
-        seeds: Number of seeds.
-        state: Their state, or its shapes.
-        batch: Batch size of an algorithm that learns from data alone.
-
-    Raises:
-        UsageError: There are fewer devices, or nothing can be divided among them.
+    That is seeds, the environments of their state (or its shapes), or the batch of an algorithm that learns from data
+    alone. Raises UsageError if there are fewer devices, or nothing can be divided among them.
     """
     available = jax.local_devices()
     if requested is not None and not 1 <= requested <= len(available):
-        raise UsageError(
-            f"{requested} devices, but there are {len(available)}", cure=f"use 1 to {len(available)}"
-        )
+        problem = f"{requested} devices, but there are {len(available)}"
+        raise UsageError(problem, cure=f"use 1 to {len(available)}")
     count = len(available) if requested is None else requested
     if count == 1 or seeds % count == 0:
         return available[:count]
@@ -189,20 +173,15 @@ def divided(tree: Any, axis: int) -> Any:
 
 
 def _layout(mesh: Mesh, seeds: int, state: Any) -> Any:
-    """Sharding of each array of a state: divided by seeds, by environments, or whole on every device."""
+    """Return the sharding of each array of a state: divided by seeds, by environments, or whole on every device."""
     by_seeds = seeds > 1 and seeds % mesh.size == 0
-
-    def sharding(axis: int | None) -> NamedSharding:
-        if by_seeds:
-            axis = 0
-        return NamedSharding(mesh, PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, _AXIS))
-
-    shardings = [sharding(axis) for _, axis in _divisible(state, seeds)]
-    return jax.tree.unflatten(jax.tree.structure(state), shardings)
+    axes = (0 if by_seeds else axis for _, axis in _divisible(state, seeds))
+    specs = [PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, _AXIS) for axis in axes]
+    return jax.tree.unflatten(jax.tree.structure(state), [NamedSharding(mesh, spec) for spec in specs])
 
 
 def _divisible(state: Any, seeds: int) -> list[tuple[Any, int | None]]:
-    """Leaves of a state with the axis that counts environments, as ``environment_axis`` of their records says."""
+    """Return the leaves of a state with the axis that counts environments, or None, as their records say."""
 
     def axis_of(node: Any) -> int | None:
         return getattr(type(node), "environment_axis", None)
@@ -211,22 +190,14 @@ def _divisible(state: Any, seeds: int) -> list[tuple[Any, int | None]]:
     for node in jax.tree.leaves(state, is_leaf=lambda node: axis_of(node) is not None):
         axis = axis_of(node)
         axis = None if axis is None else axis + (seeds > 1)
-        leaves += [
-            (leaf, axis if axis is not None and len(leaf.shape) > axis else None)
-            for leaf in jax.tree.leaves(node)
-        ]
+        for leaf in jax.tree.leaves(node):
+            leaves.append((leaf, axis if axis is not None and len(leaf.shape) > axis else None))
     return leaves
 
 
 @dataclass(frozen=True)
 class MemoryAccount:
-    """Bytes that a run takes on its fullest device.
-
-    Attributes:
-        sizes: Bytes by what takes them; ``program`` is what a compiled iteration needs in addition.
-        limit: Memory of the device; None if unknown.
-        device: Name of the device.
-    """
+    """Bytes that a run takes on its fullest device by purpose, and the device's memory, None if unknown."""
 
     sizes: Mapping[str, int]
     limit: int | None
@@ -253,17 +224,13 @@ class MemoryAccount:
 def account(
     data: Any, validation: Any, state: Any, compiled: jax.stages.Compiled, devices: Sequence[Any]
 ) -> MemoryAccount:
-    """Return the memory of a run.
+    """Return the memory of a run: training data on every device, validation data on the first, state, and iteration.
 
-    Args:
-        data: Training data, whole on every device.
-        validation: Validation data, on the first device.
-        state: State of the learners, or its shapes with their sharding.
-        compiled: One iteration.
-        devices: What it runs on.
+    ``state`` may be the shapes of the learners' state with their sharding.
     """
-    sizes = {"scenarios": _bytes(data), "validation": _bytes(validation), "replay": 0, "environments": 0}
-    sizes[_REST] = 0
+    sizes = {"scenarios": _bytes(data), "validation": _bytes(validation)} | dict.fromkeys(
+        (*_FIELDS, _REST), 0
+    )
     for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
         names = [getattr(key, "name", "") for key in path]
         sizes[next((name for name in names if name in _FIELDS), _REST)] += _leaf_bytes(leaf)

@@ -1,11 +1,10 @@
 """Replay buffer: a ring of transitions, stored as states that are observed when they are sampled.
 
-A state in log traffic is a tenth of its observation, and the same function observes stored and current states. The
-price is that every sampled step is observed twice, before and after; ``store: observation`` stores observations in
-bfloat16 instead.
+A state in log traffic takes a tenth of the memory of its observation, but every sampled step is observed twice, before
+and after; ``store: observation`` stores observations in bfloat16 instead.
 
 A row holds one step of all environments. What row t led to is in the next row, the final state of an episode in the
-row that resets it, so nothing is stored twice. The newest row has no next row yet and is not sampled.
+row that resets it. The newest row has no next row yet and is not sampled.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ class ReplayConfig:
 
     Attributes:
         capacity: Steps over all environments; new steps replace the oldest.
-        store: ``state``: the least that an observation can be made of; ``observation``: observations in bfloat16, which
-            take more memory and less time.
+        store: ``state``, or ``observation`` in bfloat16, which takes more memory and less time.
     """
 
     capacity: int = 100_000
@@ -39,10 +37,8 @@ class ReplayConfig:
         """Return the number of rows; raises UsageError below two, a step and its successor."""
         rows = self.capacity // environments
         if rows < 2:
-            raise UsageError(
-                f"replay capacity of {self.capacity} steps is too small for {environments} environments",
-                cure=f"set replay.capacity to {2 * environments} or more",
-            )
+            problem = f"replay capacity of {self.capacity} steps is too small for {environments} environments"
+            raise UsageError(problem, cure=f"set replay.capacity to {2 * environments} or more")
         return rows
 
 
@@ -51,16 +47,15 @@ class Replay:
     """Contents of the buffer ``[row, environment]``.
 
     Attributes:
-        stored: States, or observations in bfloat16.
+        stored: States, or observations in bfloat16, as ``store`` says.
         action: Actions in [-1, 1].
         reward: Rewards.
-        terminated: Episode ended for good.
+        terminated: Whether the episode ended by a failure.
         alive: Whether the row is a step; false where it only resets an environment or nothing was written yet.
         next_row: Row to write next: the oldest, once the ring is full.
-        store: What ``stored`` holds.
-        environment_axis: The axis that counts environments, which several devices divide.
     """
 
+    #: The axis that counts environments, which several devices divide.
     environment_axis: ClassVar[int] = 1
 
     stored: Any
@@ -98,54 +93,43 @@ class ReplayBuffer:
         """Return an empty buffer for these environments."""
         count = environments.over.shape[0]
         rows = self.config.rows(count)
-        like = (
-            _cast(environments.observation, jnp.bfloat16)
-            if self.config.store == "observation"
-            else self.environment.stored(environments.state)
-        )
-
-        def empty(*shape: int, dtype: Any = jnp.float32) -> Array:
-            return jnp.zeros((rows, count, *shape), dtype)
-
+        if self.config.store == "observation":
+            like = _cast(environments.observation, jnp.bfloat16)
+        else:
+            like = self.environment.stored(environments.state)
         return Replay(
             stored=jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape), leaf.dtype), like),
-            action=empty(self.environment.action_size),
-            reward=empty(),
-            terminated=empty(dtype=jnp.bool_),
-            alive=empty(dtype=jnp.bool_),
+            action=jnp.zeros((rows, count, self.environment.action_size)),
+            reward=jnp.zeros((rows, count)),
+            terminated=jnp.zeros((rows, count), jnp.bool_),
+            alive=jnp.zeros((rows, count), jnp.bool_),
             next_row=jnp.zeros((), jnp.int32),
             store=self.config.store,
         )
 
     def add(self, replay: Replay, rollout: Rollout) -> Replay:
-        """Write a rollout over the oldest rows.
+        """Write a rollout over the oldest rows; UsageError if it has more steps than the buffer has rows.
 
         The rollout continues the last one, keeps states or observations as ``store`` says, and its raw actions are
-        actions in [-1, 1]. Raises UsageError if it has more steps than the buffer has rows.
+        actions in [-1, 1].
         """
         rows, steps = replay.reward.shape[0], rollout.reward.shape[0]
         if steps > rows:
-            raise UsageError(
-                f"{steps} steps do not fit a replay buffer of {rows} rows", cure="raise replay.capacity"
-            )
-        new = {
-            "stored": rollout.state
-            if rollout.observation is None
-            else _cast(rollout.observation, jnp.bfloat16),
-            "action": rollout.raw_action,
-            "reward": rollout.reward,
-            "terminated": rollout.terminated,
-            "alive": rollout.alive,
-        }
+            problem = f"{steps} steps do not fit a replay buffer of {rows} rows"
+            raise UsageError(problem, cure="raise replay.capacity")
+        observation = rollout.observation
+        new = {name: getattr(rollout, name) for name in ("reward", "terminated", "alive")}
+        new |= {"action": rollout.raw_action}
+        new |= {"stored": rollout.state if observation is None else _cast(observation, jnp.bfloat16)}
         old = {name: getattr(replay, name) for name in new}
         index = (replay.next_row + jnp.arange(steps)) % rows
         written = jax.tree.map(lambda ring, values: ring.at[index].set(values), old, new)
         return replace(replay, **written, next_row=(replay.next_row + steps) % rows)
 
     def draw(self, replay: Replay, key: Array, shape: tuple[int, ...]) -> ReplayIndex:
-        """Draw steps that have a successor, uniformly with replacement.
+        """Draw steps uniformly, with replacement, among those with a successor, of which there must be one.
 
-        Call it once for all batches of an iteration, because it reads every row. Some step must have a successor.
+        Call it once for all batches of an iteration, because it reads every row.
         """
         rows, environments = replay.reward.shape
         newest = (replay.next_row - 1) % rows

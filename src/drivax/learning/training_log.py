@@ -1,4 +1,4 @@
-"""What is written of one seed's run: logged values, checkpoints, and the validations that rank them."""
+"""The log of one seed's training: metrics, checkpoints, and the validations that rank them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -24,8 +24,8 @@ from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.sinks import MetricLog
 
-#: ``score``: the V-Max score. ``lexicographic``: fewest failures, then progress, then comfort. ``fitted_q``: the return
-#: that fitted-Q evaluation expects of the policy on held-out steps.
+#: How checkpoints are ranked. ``score``: the V-Max score. ``lexicographic``: fewest failures, then progress, then
+#: comfort. ``fitted_q``: the return that fitted-Q evaluation expects on held-out steps; needs ``fitted_q.updates``.
 Rule = Literal["score", "lexicographic", "fitted_q"]
 
 _SCORES = ("vmax_score", "vmax_score_partial")
@@ -50,41 +50,29 @@ class Validation:
 
 
 def validate(planner: Planner, validation: Validation, task: Task, traffic: Traffic) -> dict[str, float]:
-    """Evaluate a planner in closed loop on held-out scenarios.
+    """Evaluate a planner in closed loop on held-out scenarios; DrivaxError if actions are not finite.
 
-    Returns:
-        ``validation/<metric>``: means over the scenarios that define it.
-
-    Raises:
-        DrivaxError: Actions are not finite, because learning has diverged.
+    Returns ``validation/<metric>``: means over the scenarios that define it.
     """
     results = evaluate(planner, validation.bank, validation.names, task=task, traffic=traffic)
     if results.crashes:
-        raise DrivaxError(
-            f"actions of the policy are not finite in {len(results.crashes)} of {len(results)} episodes",
-            cure="lower the learning rate, or resume from an earlier checkpoint",
-        )
+        problem = f"actions of the policy are not finite in {len(results.crashes)} of {len(results)} episodes"
+        raise DrivaxError(problem, cure="lower the learning rate, or resume from an earlier checkpoint")
+    values = {name: x for name, x in results.metrics.items() if np.isfinite(x).any()}
     # Full scores where there are any; partial scores are never mixed with them.
-    score = next(name for name in _SCORES if np.isfinite(results.metrics[name]).any())
-    row = {}
-    for name in (score, *_METRICS):
-        values = results.metrics[name]
-        if np.isfinite(values).any():
-            row[f"validation/{name}"] = float(np.nanmean(values))
-    return row
+    score = next(name for name in _SCORES if name in values)
+    return {
+        f"validation/{name}": float(np.nanmean(values[name])) for name in (score, *_METRICS) if name in values
+    }
 
 
 def rank(rule: Rule, row: Mapping[str, Any]) -> tuple[float, ...] | None:
     """Return what a checkpoint is ranked by (higher is better), given its row of ``metrics.jsonl``.
 
-    The lexicographic rule compares ``accuracy`` (share of episodes without a failure), then progress, then comfort.
     Undefined values rank last. None if the row has no validation.
     """
-    values = {
-        name.removeprefix("validation/"): value
-        for name, value in row.items()
-        if name.startswith("validation/")
-    }
+    prefix = "validation/"
+    values = {name.removeprefix(prefix): value for name, value in row.items() if name.startswith(prefix)}
     if not values:
         return None
     if rule == "fitted_q":
@@ -100,9 +88,7 @@ def _or_last(value: float | None, last: float = -1.0) -> float:
 
 def patience_exceeded(ranks: Sequence[tuple[float, ...]], patience: int) -> bool:
     """Whether the last ``patience`` validations did not improve on the best before them; never if it is 0."""
-    if not patience or len(ranks) <= patience:
-        return False
-    return max(ranks[-patience:]) <= max(ranks[:-patience])
+    return 0 < patience < len(ranks) and max(ranks[-patience:]) <= max(ranks[:-patience])
 
 
 class Preempted(DrivaxError):
@@ -114,8 +100,7 @@ class Preempted(DrivaxError):
 class StopSignal:
     """Context that notes SIGTERM instead of ending the process; a second SIGTERM ends it.
 
-    Batch systems send it some seconds before they take a machine away. Outside of the main thread, where Python has no
-    signals, it notes nothing.
+    Batch systems send it some seconds before they take a machine away. Threads but the main one have no signals.
     """
 
     def __init__(self) -> None:
@@ -127,9 +112,7 @@ class StopSignal:
             self._previous = signal.signal(signal.SIGTERM, self._receive)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._previous is not None:
             signal.signal(signal.SIGTERM, self._previous)
 
@@ -141,11 +124,7 @@ class StopSignal:
 class TrainingLog:
     """The run folder of one seed during training: metrics, checkpoints, and the ranks of its validations.
 
-    Args:
-        folder: The run folder.
-        rule: How checkpoints are ranked.
-        keep: Number of newest checkpoints to keep in addition to the best.
-        patience: Validations without improvement after which the seed stops; 0: never.
+    ``rule``, ``keep`` and ``patience`` are those of the training's configuration.
     """
 
     def __init__(self, folder: RunFolder, rule: Rule, keep: int, patience: int) -> None:
@@ -178,8 +157,7 @@ class TrainingLog:
 
     def _read_ranks(self, step: int) -> None:
         """Read the ranks of the validations up to a step."""
-        rows = [row for row in self.folder.read_metrics() if row["step"] <= step]
-        ranks = [rank(self._rule, row) for row in rows]
+        ranks = (rank(self._rule, row) for row in self.folder.read_metrics() if row["step"] <= step)
         self._ranks = [values for values in ranks if values is not None]
 
     def write(self, step: int, row: Mapping[str, float]) -> tuple[float, ...] | None:
@@ -192,15 +170,9 @@ class TrainingLog:
             self._ranks.append(values)
         return values
 
-    def save(self, step: int, state: Any, rank: tuple[float, ...] | None) -> None:
-        """Store a checkpoint."""
-        self.checkpoints.save(step, state, rank)
-
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._log is not None:
             self._log.close()

@@ -1,23 +1,23 @@
-"""Specification of every episode metric: unit, direction, operator, label, definition and requirements."""
+"""Specification of every episode metric: unit, direction, operator, label, definition, requirements; and the scores."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from drivax.metrics.scores import NUPLAN_INPUTS, VMAX_INPUTS, Value, nuplan_score, vmax_score
-from drivax.metrics.steps import STEP_VALUES, StepValue
+from drivax.metrics.steps import STEP_VALUES, StepValue, Value
 from drivax.scenario.bank.queries import is_mapped
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import Flag
 from drivax.simulator.contact import TTC_HORIZON_S
 
-#: How the values of an episode's steps become one: ``worst_second`` is the largest sum over ten consecutive steps.
+#: How the step values of an episode are reduced: ``worst_second`` is the largest sum over ten consecutive steps.
 Operator = Literal["any", "sum", "mean", "min", "max", "last", "first", "worst_second"]
 #: ``rate``: 0 or 1 per episode (Wilson's interval); ``score``: from 0 to 1; ``code``: has no mean.
 Kind = Literal["rate", "score", "quantity", "code"]
@@ -26,7 +26,7 @@ Direction = Literal["low", "high", "-"]
 
 @dataclass(frozen=True)
 class Column:
-    """What tables and reports say about a column of ``episodes.csv``.
+    """Description of a column of ``episodes.csv`` for tables and reports.
 
     Attributes:
         unit: Unit, ``-`` for shares and booleans.
@@ -86,6 +86,14 @@ class EpisodeEnd:
 
 #: Values of the metrics that a metric is computed from, by name.
 Inputs = Mapping[str, Value]
+#: Weights of the two scores, and the metrics that multiply them.
+NUPLAN_WEIGHTS = {"ttc_ok": 5.0, "progress_ratio": 5.0, "speed_compliance": 4.0, "comfortable": 2.0}
+VMAX_WEIGHTS = {**NUPLAN_WEIGHTS, "lane_keeping": 3.0}
+NUPLAN_GATES = ("at_fault_collision", "offroad")
+VMAX_GATES = (*NUPLAN_GATES, "red_light")
+_PASSES = ("making_progress", "direction")
+NUPLAN_INPUTS = (*NUPLAN_WEIGHTS, *NUPLAN_GATES, *_PASSES)
+VMAX_INPUTS = (*VMAX_WEIGHTS, *VMAX_GATES, *_PASSES)
 #: Time to collision that counts as safe, and mean speeding at which compliance is 0 (nuPlan).
 _SAFE_TTC_S, _SPEEDING_MPS = 0.95, 2.23
 
@@ -94,10 +102,14 @@ def _boolean(value: Bool[Array, ""], defined: Any = True) -> Value:
     return Value(value.astype(jnp.float32), jnp.asarray(defined))
 
 
-def _graded(value: Value, good: float, fair: float) -> Value:
-    """Return 1 up to ``good``, 0.5 up to ``fair``, else 0."""
-    grade = jnp.where(value.value <= good, 1.0, jnp.where(value.value <= fair, 0.5, 0.0))
-    return Value(grade, value.defined)
+def _graded(name: str, good: float, fair: float, end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    """Return 1 where an input is up to ``good``, 0.5 up to ``fair``, else 0."""
+    grade = jnp.where(inputs[name].value <= good, 1.0, jnp.where(inputs[name].value <= fair, 0.5, 0.0))
+    return Value(grade, inputs[name].defined)
+
+
+def _at_least(name: str, threshold: float, end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    return _boolean(inputs[name].value >= threshold, inputs[name].defined)
 
 
 def _on_a_map(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
@@ -121,10 +133,6 @@ def _progress_ratio(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     return Value(ratio, gain.defined)
 
 
-def _making_progress(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    return _boolean(inputs["progress_ratio"].value >= 0.2, inputs["progress_ratio"].defined)
-
-
 def _reached_goal(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     near = inputs["goal_distance"].value <= 3.0
     return _boolean(near | (inputs["progress_ratio"].value >= 0.95), inputs["progress_ratio"].defined)
@@ -137,37 +145,16 @@ def _ttc_ok(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     return _boolean(safe, end.steps > 0)
 
 
-def _comfortable(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    return _boolean(inputs["comfort"].value >= 1.0 - 1e-6, inputs["comfort"].defined)
-
-
 def _speed_compliance(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     mean = inputs["speeding_mean"]
     return Value(jnp.maximum(0.0, 1.0 - mean.value / _SPEEDING_MPS), mean.defined)
 
 
-def _direction(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    return _graded(inputs["wrong_way_worst"], 2.0, 6.0)
-
-
-def _lane_keeping(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    # Sums of 0.1 s in float32: a hundredth of a step keeps 3.4 s on the right side.
-    return _graded(inputs["lane_straddle"], 3.401, 5.701)
-
-
-def _without(collision: str, inputs: Inputs) -> Value:
+def _without(collision: str, end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     """Whether there is no such collision, off-road step or red light; a red light counts where lights are known."""
     ran_red = inputs["red_light"].defined & (inputs["red_light"].value > 0)
     clean = ~(inputs[collision].value > 0) & ~(inputs["offroad"].value > 0) & ~ran_red
     return _boolean(clean, inputs[collision].defined & inputs["offroad"].defined)
-
-
-def _accuracy(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    return _without("collision", inputs)
-
-
-def _accuracy_at_fault(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    return _without("at_fault_collision", inputs)
 
 
 def _success(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
@@ -180,8 +167,38 @@ def _success_moving(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     return Value(inputs["success"].value, inputs["success"].defined & moves)
 
 
-def _score(score: Callable[[Inputs], tuple[Value, Value]], partial: bool) -> Callable[..., Value]:
-    return lambda end, value, inputs: score(inputs)[int(partial)]
+def score(metrics: Inputs, weights: Mapping[str, float], gates: tuple[str, ...]) -> tuple[Value, Value]:
+    """Return a full and a partial score: a weighted mean of metrics, times one minus each gate, progress and direction.
+
+    The full score is defined where every input is; the partial one where some input is undefined: undefined terms leave
+    the mean, undefined gates count as passed.
+    """
+    terms = jnp.stack([jnp.clip(metrics[name].value, 0.0, 1.0) for name in weights])
+    known = jnp.stack([metrics[name].defined for name in weights])
+    share = jnp.asarray(list(weights.values()))[(...,) + (None,) * (terms.ndim - 1)] * known
+    total = share.sum(axis=0)
+    mean = (share * terms).sum(axis=0) / jnp.maximum(total, 1e-9)
+    complete = known.all(axis=0)
+    factors = [(metrics[name].defined, 1.0 - metrics[name].value) for name in gates]
+    for defined, factor in factors + [(metrics[name].defined, metrics[name].value) for name in _PASSES]:
+        mean = mean * jnp.where(defined, factor, 1.0)
+        complete = complete & defined
+    return Value(mean, complete), Value(mean, ~complete & (total > 0))
+
+
+def nuplan_score(metrics: Inputs) -> tuple[Value, Value]:
+    """Return nuPlan's closed-loop score, full and partial."""
+    return score(metrics, NUPLAN_WEIGHTS, NUPLAN_GATES)
+
+
+def vmax_score(metrics: Inputs) -> tuple[Value, Value]:
+    """Return the V-Max score: nuPlan's terms and lane keeping, gated by red lights too; full and partial."""
+    return score(metrics, VMAX_WEIGHTS, VMAX_GATES)
+
+
+def _score(score: Callable[[Inputs], tuple[Value, Value]], number: int) -> Callable[..., Value]:
+    """Return the full (0) or the partial (1) score as a computation of a metric."""
+    return lambda end, value, inputs: score(inputs)[number]
 
 
 def _accumulated(
@@ -204,10 +221,10 @@ _SCORE = {"kind": "score", "fails_on_crash": True}
 # fmt: off
 METRICS: dict[str, Metric] = {
     "accuracy": _computed(
-        _accuracy, ("collision", "offroad", "red_light"), "high", "no collision, not off the road, no red light run",
-        headline=3, **_OUTCOME),
+        partial(_without, "collision"), ("collision", "offroad", "red_light"), "high",
+        "no collision, not off the road, no red light run", headline=3, **_OUTCOME),
     "accuracy_at_fault": _computed(
-        _accuracy_at_fault, ("at_fault_collision", "offroad", "red_light"), "high",
+        partial(_without, "at_fault_collision"), ("at_fault_collision", "offroad", "red_light"), "high",
         "no at-fault collision, not off the road, no red light run", label="accuracy, at-fault only", **_OUTCOME),
     "success": _computed(
         _success, ("accuracy", "reached_goal"), "high", "accuracy and the goal reached", headline=1, **_OUTCOME),
@@ -215,16 +232,16 @@ METRICS: dict[str, Metric] = {
         _success_moving, ("success",), "high", "success where the log drives more than 5 m",
         label="success, moving", headline=2, **_OUTCOME),
     "vmax_score": _computed(
-        _score(vmax_score, False), VMAX_INPUTS, "high", "safety gates times ttc, progress, speed, lanes and comfort",
+        _score(vmax_score, 0), VMAX_INPUTS, "high", "safety gates times ttc, progress, speed, lanes and comfort",
         label="V-Max score", headline=11, **_SCORE),
     "nuplan_score": _computed(
-        _score(nuplan_score, False), NUPLAN_INPUTS, "high", "nuPlan's closed-loop score by our definitions",
+        _score(nuplan_score, 0), NUPLAN_INPUTS, "high", "nuPlan's closed-loop score by our definitions",
         label="nuPlan-style score", headline=12, **_SCORE),
     "vmax_score_partial": _computed(
-        _score(vmax_score, True), VMAX_INPUTS, "high", "vmax_score where an input is undefined",
+        _score(vmax_score, 1), VMAX_INPUTS, "high", "vmax_score where an input is undefined",
         label="partial V-Max score", **_SCORE),
     "nuplan_score_partial": _computed(
-        _score(nuplan_score, True), NUPLAN_INPUTS, "high", "nuplan_score where an input is undefined",
+        _score(nuplan_score, 1), NUPLAN_INPUTS, "high", "nuplan_score where an input is undefined",
         label="partial nuPlan-style score", **_SCORE),
     "collision": _accumulated("collision", "any", "-", "low", "boxes overlap", headline=4, **_RATE),
     "at_fault_collision": _accumulated(
@@ -245,7 +262,8 @@ METRICS: dict[str, Metric] = {
         _ttc_ok, ("min_ttc",), "high", "time to collision always at least 0.95 s", label="TTC ok", headline=9, **_RATE),
     "comfort": _accumulated("comfort", "mean", "-", "high", "share of steps within nuPlan's limits"),
     "comfortable": _computed(
-        _comfortable, ("comfort",), "high", "every step within nuPlan's limits", headline=10, **_RATE),
+        partial(_at_least, "comfort", 1.0 - 1e-6), ("comfort",), "high", "every step within nuPlan's limits",
+        headline=10, **_RATE),
     "max_jerk": _accumulated("jerk", "max", "m/s3", "low", "largest jerk magnitude"),
     "max_lateral_acceleration": _accumulated(
         "lateral_acceleration", "max", "m/s2", "low", "largest lateral acceleration"),
@@ -258,18 +276,21 @@ METRICS: dict[str, Metric] = {
         "wrong_way", "worst_second", "m", "low", "most distance against traffic within 1 s",
         label="wrong way within 1 s", needs=_LANES),
     "direction": _computed(
-        _direction, ("wrong_way_worst",), "high", "1, 0.5 or 0: at most 2 m, 6 m or more against traffic in 1 s"),
+        partial(_graded, "wrong_way_worst", 2.0, 6.0), ("wrong_way_worst",), "high",
+        "1, 0.5 or 0: at most 2 m, 6 m or more against traffic in 1 s"),
     "lane_straddle": _accumulated(
         "lane_straddle", "sum", "s", "low", "time across the border of ego's lanes", needs=_LANES),
+    # Sums of 0.1 s in float32: a hundredth of a step keeps 3.4 s on the right side.
     "lane_keeping": _computed(
-        _lane_keeping, ("lane_straddle",), "high", "1, 0.5 or 0: straddling at most 3.4 s, 5.7 s or longer"),
+        partial(_graded, "lane_straddle", 3.401, 5.701), ("lane_straddle",), "high",
+        "1, 0.5 or 0: straddling at most 3.4 s, 5.7 s or longer"),
     "progress": _accumulated(
         "progress", "last", "m", "high", "distance gained along the route",
         label="progress along the route", needs=_ROUTE, compute=_progress),
     "progress_ratio": _computed(
         _progress_ratio, ("progress",), "high", "progress as a share of the log's", label="progress", headline=8),
     "making_progress": _computed(
-        _making_progress, ("progress_ratio",), "high", "progress ratio at least 0.2", **_RATE),
+        partial(_at_least, "progress_ratio", 0.2), ("progress_ratio",), "high", "progress ratio at least 0.2", **_RATE),
     "route_deviation_mean": _accumulated(
         "route_deviation", "mean", "m", "low", "mean distance to the route", needs=_ROUTE),
     "route_deviation_max": _accumulated(

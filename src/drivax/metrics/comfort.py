@@ -28,18 +28,13 @@ SMOOTH, JERK, YAW_RATE, YAW_ACCELERATION = (8, 2, 0), (15, 2, 1), (5, 2, 1), (5,
 _SAMPLES, _SETTLED = 23, 4
 #: nuPlan's closed-loop limits: m/s2, m/s2, m/s3, m/s3, rad/s, rad/s2.
 LONGITUDINAL_MPS2 = (-4.05, 2.40)
-LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS2 = (
-    4.89,
-    4.13,
-    8.37,
-    0.95,
-    1.93,
-)
+LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3 = 4.89, 4.13, 8.37
+YAW_RATE_RPS, YAW_ACCELERATION_RPS2 = 0.95, 1.93
 
 
 @cache
 def savgol_tail_matrix(window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
-    """The Savitzky-Golay filter as a matrix ``[19, 22]`` from the last 22 samples to the values at the last 19.
+    """Return the Savitzky-Golay filter as a matrix ``[19, 22]`` from the last 22 samples to the values at the last 19.
 
     Row 0 is an interior point; the last ``window // 2`` rows are read off the last window's polynomial.
     """
@@ -49,7 +44,7 @@ def savgol_tail_matrix(window: int, order: int, derivative: int) -> np.ndarray[A
 
 @cache
 def savgol_matrix(samples: int, window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
-    """The Savitzky-Golay filter of a number of samples as a matrix ``[samples, samples]``.
+    """Return the Savitzky-Golay filter of a number of samples as a matrix ``[samples, samples]``.
 
     Least-squares polynomial of ``order`` over ``window`` samples, differentiated ``derivative`` times per sample
     (Savitzky and Golay 1964). Rows near an end are read off the polynomial of the first or last window. As in SciPy,
@@ -66,7 +61,7 @@ def savgol_matrix(samples: int, window: int, order: int, derivative: int) -> np.
 
 
 def _weights(window: int, order: int, derivative: int, where: float) -> np.ndarray[Any, Any]:
-    """Weights that give the derivative of the fitted polynomial at sample position ``where``."""
+    """Return the weights of the derivative of the fitted polynomial at sample position ``where``."""
     powers = (np.arange(window) - where)[:, None] ** np.arange(order + 1)
     factorial = float(np.prod(np.arange(1, derivative + 1))) if derivative else 1.0
     return np.linalg.pinv(powers)[derivative] * factorial
@@ -74,7 +69,7 @@ def _weights(window: int, order: int, derivative: int, where: float) -> np.ndarr
 
 @record
 class ComfortSteps:
-    """Steps on end, oldest first: whether each is comfortable, and what was measured."""
+    """Comfort and measurements of consecutive steps, oldest first."""
 
     comfortable: Bool[Array, " steps"]
     jerk_mps3: Float[Array, " steps"]
@@ -82,22 +77,23 @@ class ComfortSteps:
 
 
 def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
-    """Evaluate every step of a trip (x, y, heading, speed; at least 23 rows) from row 11 on, for plots and tables.
+    """Evaluate a trip (x, y, heading, speed; at least 23 rows) from row 11 on, the first with centred windows.
 
-    An episode evaluates the same, step by step; nothing before row 11 can be evaluated as a centred window asks for.
+    For plots and tables; an episode evaluates the same steps one by one.
     """
     windows = jnp.arange(len(motion) - _SAMPLES + 1)[:, None] + jnp.arange(_SAMPLES)
-    judged = jax.vmap(check_comfort)(motion[windows])
-    return jax.tree.map(lambda part: jnp.concatenate([part[:-1, 0], part[-1]]), judged)
+    steps = jax.vmap(check_comfort)(motion[windows])
+    return jax.tree.map(lambda part: jnp.concatenate([part[:-1, 0], part[-1]]), steps)
 
 
 def check_comfort(history: Float[Array, "history 4"]) -> ComfortSteps:
     """Evaluate the last twelve steps of a motion history (23 rows of x, y, heading, speed) against the limits.
 
-    Row 0, eleven steps back, is final; the later rows are what SciPy's edge mode would say if the history ended now.
+    Row 0, eleven steps back, is final; the later rows are those of SciPy's edge mode if the history ended now.
     """
     speed = history[:, 3]
     turned = wrap(history[1:, 2] - history[:-1, 2])
+    heading = jnp.cumsum(turned)
     along = (speed[1:] - speed[:-1]) / DT_S
     lateral = (speed[1:] + speed[:-1]) / 2 * turned / DT_S
 
@@ -109,22 +105,12 @@ def check_comfort(history: Float[Array, "history 4"]) -> ComfortSteps:
         matrix = savgol_matrix(_SAMPLES, *JERK)[-TAIL:, _SETTLED:]
         return jnp.asarray(matrix, jnp.float32) @ smoothed / DT_S
 
-    smooth_along, smooth_lateral = filtered(along, SMOOTH), filtered(lateral, SMOOTH)
-    magnitude = jerk(filtered(jnp.sqrt(along**2 + lateral**2 + 1e-12), SMOOTH))
-    heading = jnp.cumsum(turned)
-    smooth_along, smooth_lateral, yaw_rate, yaw_acceleration = (
-        values[-TAIL:]
-        for values in (
-            smooth_along,
-            smooth_lateral,
-            filtered(heading, YAW_RATE),
-            filtered(heading, YAW_ACCELERATION),
-        )
-    )
-    fine = (smooth_along >= LONGITUDINAL_MPS2[0]) & (smooth_along <= LONGITUDINAL_MPS2[1])
-    fine &= jnp.abs(smooth_lateral) <= LATERAL_MPS2
-    fine &= jnp.abs(jerk(filtered(along, SMOOTH))) <= JERK_MPS3
-    fine &= jnp.abs(magnitude) <= JERK_MAGNITUDE_MPS3
-    fine &= jnp.abs(yaw_rate) <= YAW_RATE_RPS
-    fine &= jnp.abs(yaw_acceleration) <= YAW_ACCELERATION_RPS2
-    return ComfortSteps(fine, jnp.abs(magnitude), jnp.abs(smooth_lateral))
+    smooth = filtered(along, SMOOTH)
+    lateral_mps2 = jnp.abs(filtered(lateral, SMOOTH)[-TAIL:])
+    magnitude = jnp.abs(jerk(filtered(jnp.sqrt(along**2 + lateral**2 + 1e-12), SMOOTH)))
+    fine = (smooth[-TAIL:] >= LONGITUDINAL_MPS2[0]) & (smooth[-TAIL:] <= LONGITUDINAL_MPS2[1])
+    fine &= (lateral_mps2 <= LATERAL_MPS2) & (magnitude <= JERK_MAGNITUDE_MPS3)
+    fine &= jnp.abs(jerk(smooth)) <= JERK_MPS3
+    fine &= jnp.abs(filtered(heading, YAW_RATE)[-TAIL:]) <= YAW_RATE_RPS
+    fine &= jnp.abs(filtered(heading, YAW_ACCELERATION)[-TAIL:]) <= YAW_ACCELERATION_RPS2
+    return ComfortSteps(fine, magnitude, lateral_mps2)

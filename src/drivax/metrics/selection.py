@@ -24,7 +24,7 @@ class MetricSelection:
     Attributes:
         names: The requested metrics.
         metrics: These and their inputs, inputs first.
-        reads: Facts that their step values read; all of them for the full set, which planners may read too.
+        reads: Facts that their step values read; all facts for the full set, for planners.
     """
 
     names: tuple[str, ...]
@@ -44,11 +44,9 @@ class MetricSelection:
 
 @cache
 def select_metrics(names: MetricNames) -> MetricSelection:
-    """Return the metrics that a configuration names.
+    """Return the metrics that a configuration names: a set, or a tuple of sets, metrics and dotted names.
 
-    Args:
-        names: ``none``, ``training`` or ``full``; or a tuple of such sets, names of metrics, and dotted names
-            (``package.module:name``) of the user's own metrics, which take their last word as name.
+    The last word of a dotted name (``package.module:name``) is the name of the user's metric.
 
     Raises:
         UsageError: There is no such set or metric, or two metrics have the same name.
@@ -65,9 +63,8 @@ def select_metrics(names: MetricNames) -> MetricSelection:
     metrics: dict[str, Metric] = {}
     for name in requested:
         _add_with_inputs(name, METRICS | own, metrics)
-    reads = frozenset[str]().union(
-        *(m.step_value.reads for m in metrics.values() if m.step_value is not None)
-    )
+    values = [metric.step_value for metric in metrics.values() if metric.step_value is not None]
+    reads = frozenset[str]().union(*(value.reads for value in values))
     if set(METRICS) <= set(requested):
         reads |= FACTS
     return MetricSelection(tuple(requested), tuple(metrics.items()), reads)

@@ -1,8 +1,6 @@
-"""Step values: what is read off a measured step, before an episode adds it up.
+"""Step values: numbers of one measured step, which an episode accumulates to metrics.
 
-A step value reads a :class:`Moment` and gives numbers with weights: 0 where it is undefined. ``reads`` names the facts
-that it looks at, so that what no selected metric needs is neither measured nor carried; one that does not say reads
-them all.
+A step value names the facts that it reads: facts that no selected metric needs are neither measured nor carried.
 """
 
 from __future__ import annotations
@@ -13,12 +11,20 @@ from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.metrics.comfort import TAIL, ComfortSteps, check_comfort
-from drivax.metrics.scores import Value
+from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
 from drivax.simulator.types import FACTS, Facts, Situation
+
+
+@record
+class Value:
+    """A metric's value and whether it is defined."""
+
+    value: Float[Array, "*batch"]
+    defined: Bool[Array, "*batch"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +32,8 @@ class Moment:
     """One measured step of an episode.
 
     Attributes:
-        found: The situation.
-        start: Step at which the episode began.
+        situation: Context, facts and surroundings.
+        start: First step of the episode.
         final: Whether the episode ends here, so that the comfort of its last steps is evaluated too.
     """
 
@@ -37,18 +43,18 @@ class Moment:
 
     @property
     def facts(self) -> Facts:
-        """What was measured."""
+        """Facts of the situation."""
         return self.situation.facts
 
     @cached_property
     def comfort(self) -> tuple[ComfortSteps, Bool[Array, " tail"]]:
-        """The last twelve steps, and which of them are evaluated now: the oldest, and all at the end."""
+        """Comfort of the last twelve steps, and which of them count now: the oldest, at the end all."""
         step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
         return check_comfort(self.situation.context.history), counts
 
 
-#: Numbers, of no axis or one, and whether each is defined.
+#: A number, or several on one axis, and whether each is defined.
 Read = Callable[[Moment], tuple[Array, Any]]
 
 
@@ -57,11 +63,11 @@ class StepValue:
     """A number of a step.
 
     Attributes:
-        name: What it is called.
+        name: Its name.
         unit: Its unit, ``-`` for booleans and codes.
-        read: The value at a moment and whether it is defined (a boolean, or a plain True).
-        reads: Names of the facts that ``read`` looks at.
-        delayed: Judged some steps later, several at once; not a number of its own step.
+        read: Function from a moment to the value and whether it is defined (a boolean, or a plain True).
+        reads: Names of the facts that ``read`` needs; by default all.
+        delayed: Whether it is evaluated some steps later, several steps at once.
     """
 
     name: str
@@ -71,15 +77,22 @@ class StepValue:
     delayed: bool = False
 
 
-def _fact(name: str, unit: str, fact: str) -> StepValue:
-    """A fact that is always defined."""
-    return StepValue(name, unit, lambda m: (getattr(m.facts, fact), True), frozenset({fact}))
+def _fact(name: str, unit: str, fact: str, defined: str = "") -> StepValue:
+    """Return the step value of a fact, defined where the fact ``defined`` holds."""
+    reads = frozenset({fact, defined} if defined else {fact})
+    return StepValue(
+        name, unit, lambda m: (getattr(m.facts, fact), not defined or getattr(m.facts, defined)), reads
+    )
 
 
 def _speeding(moment: Moment) -> tuple[Array, Array]:
     over = jnp.maximum(0.0, moment.facts.speed_mps - moment.facts.limit_mps)
     known = moment.facts.limit_mps > 0
     return jnp.where(known, over, 0.0), known
+
+
+def _wrong_way(moment: Moment) -> tuple[Array, bool]:
+    return jnp.where(moment.facts.wrong_way, moment.facts.moved_m, 0.0), True
 
 
 def _comfort(name: str, unit: str, part: str) -> StepValue:
@@ -97,25 +110,13 @@ _ALL = (
     _fact("offroad", "-", "offroad"),
     _fact("left_map", "-", "left_map"),
     _fact("red_light", "-", "red_light"),
-    StepValue(
-        "ttc", "s", lambda m: (m.facts.ttc_s, m.facts.ttc_defined), frozenset({"ttc_s", "ttc_defined"})
-    ),
+    _fact("ttc", "s", "ttc_s", "ttc_defined"),
     StepValue("speeding", "m/s", _speeding, frozenset({"speed_mps", "limit_mps"})),
-    StepValue(
-        "wrong_way",
-        "m",
-        lambda m: (jnp.where(m.facts.wrong_way, m.facts.moved_m, 0.0), True),
-        frozenset({"wrong_way", "moved_m"}),
-    ),
+    StepValue("wrong_way", "m", _wrong_way, frozenset({"wrong_way", "moved_m"})),
     StepValue("lane_straddle", "s", lambda m: (m.facts.straddling * DT_S, True), frozenset({"straddling"})),
     _fact("route_deviation", "m", "route_deviation_m"),
     _fact("off_route", "-", "off_route"),
-    StepValue(
-        "log_divergence",
-        "m",
-        lambda m: (m.facts.log_divergence_m, m.facts.logged),
-        frozenset({"log_divergence_m", "logged"}),
-    ),
+    _fact("log_divergence", "m", "log_divergence_m", "logged"),
     _fact("goal_distance", "m", "goal_distance_m"),
     _fact("progress", "m", "progress_m"),
     _fact("distance", "m", "moved_m"),
@@ -128,16 +129,12 @@ STEP_VALUES: dict[str, StepValue] = {value.name: value for value in _ALL}
 
 
 def step_metrics(situation: Situation, values: Sequence[StepValue] | None = None) -> dict[str, Value]:
-    """Step values of one situation, for tables and plots.
+    """Return step values of one situation, for tables and plots; by default all that belong to one step.
 
-    Comfort needs the seven steps that follow; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
-
-    Args:
-        situation: Its facts must hold what the values read (a task with ``metrics: full`` holds all).
-        values: Which; by default all that belong to one step.
+    The facts of the situation must hold what the values read (a task with ``metrics: full`` holds all). Comfort needs
+    the seven steps that follow; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
     """
-    never = jnp.zeros((), bool)
-    moment = Moment(situation, situation.context.step, never)
+    moment = Moment(situation, situation.context.step, jnp.zeros((), bool))
     result = {}
     for value in values or [v for v in STEP_VALUES.values() if not v.delayed]:
         number, defined = value.read(moment)

@@ -8,8 +8,8 @@ from .distributions import Distribution as Distribution
 from .encoders import Encoder as Encoder
 from .encoders import EncoderConfig as EncoderConfig
 from .encoders import MlpConfig as MlpConfig
+from .encoders import NormalisedEncoder as NormalisedEncoder
 from .entity import EntityConfig as EntityConfig
-from .normalised import NormalisedEncoder as NormalisedEncoder
 from .transformers import LqConfig as LqConfig
 from .transformers import LqhConfig as LqhConfig
 from .transformers import MtrConfig as MtrConfig

@@ -17,6 +17,8 @@ from drivax.networks.distributions import (
     parameters_of,
 )
 from drivax.networks.encoders import (
+    ACTIVATIONS,
+    Activation,
     Encoder,
     EncoderConfig,
     Groups,
@@ -25,11 +27,9 @@ from drivax.networks.encoders import (
     dense_layers,
 )
 from drivax.networks.entity import EntityConfig
-from drivax.networks.pooling import ACTIVATIONS, Activation
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 
-#: What ``encoder:`` can be; ``kind:`` in YAML is ``mlp``, ``lq``, ``lqh``, ``mtr``, ``wayformer``, ``entity``, or a
-#: dotted name.
+#: Built-in encoders by ``kind``, or a configuration of your own.
 EncoderSettings = (
     MlpConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig | EntityConfig | EncoderConfig
 )
@@ -40,14 +40,13 @@ class NetworkConfig:
     """Architecture of policy, value and critics.
 
     Attributes:
-        encoder: The encoder; policy, value and each critic have their own, unless ``shared_encoder``.
+        encoder: The encoder; policy, value and each critic have their own.
         head: Hidden layers between embedding and output.
-        activation: After each hidden layer of a head; outputs are linear.
-        first_scale: Standard deviation of an untrained policy: before squashing (gaussian), of the action (beta), or
-            of the Gaussian whose density weights the levels (grid).
-        distribution: Action distribution: a squashed Gaussian, a mixture of three, a Beta, or a grid of levels for
-            ``discrete`` actions.
-        shared_encoder: Whether policy and value share one encoder. Critics never share.
+        activation: Activation after each hidden layer of a head; outputs are linear.
+        first_scale: Standard deviation of an untrained policy: before squashing (gaussian, mixture), of the action
+            (beta), or of the Gaussian whose density weights the levels (grid).
+        distribution: Action distribution; ``grid`` is for ``discrete`` actions.
+        shared_encoder: Whether policy and value share one encoder.
     """
 
     encoder: EncoderSettings = field(default_factory=MlpConfig)

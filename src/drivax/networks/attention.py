@@ -1,32 +1,34 @@
-"""Masked attention and pre-norm residual layers (Vaswani et al. 2017, arXiv 1706.03762).
+"""Masked attention, pre-norm residual layers (Vaswani et al. 2017, arXiv 1706.03762), and groups as rows of tokens.
 
 Parameters are float32. ``dtype`` bfloat16 applies to matrix products; softmax, norms and residuals stay float32.
+
+A group with a mask is a set of rows; further axes are times, in order. A group without a mask is one valid row with its
+times in order. Agents ``[rows, time, F]`` are a set of series, route points ``[rows, F]`` a set, and the ego's history
+``[time, F]`` is one series.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float
+
+from drivax.networks.encoders import Groups, GroupSpec, dense_layers, group_names
 
 Dtype = Literal["float32", "bfloat16"]
 
 #: Logit of masked tokens: finite, because a softmax over masked tokens alone must stay finite.
-_NOWHERE = -1e30
+_MASKED = -1e30
 
 
 class Attention(nnx.Module):
-    """Multi-head scaled dot-product attention without biases: with all tokens masked the output is zero.
-
-    Args:
-        width: Size of queries, tokens and outputs, a multiple of ``heads``.
-        heads: Number of heads.
-        rngs: For the parameters.
-        dtype: Type of the matrix products.
-    """
+    """Multi-head scaled dot-product attention without biases; ``width`` is a multiple of ``heads``."""
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
         self.dtype = dtype
@@ -44,10 +46,7 @@ class Attention(nnx.Module):
         tokens: Float[Array, "*batch k width"],
         mask: Bool[Array, "*batch k"] | None = None,
     ) -> Float[Array, "*batch q width"]:
-        """Return ``softmax(Q K^T / sqrt(width / heads)) V`` over the tokens in ``mask`` (None: all); float32.
-
-        Zeros where no token is valid.
-        """
+        """Return ``softmax(Q K^T / sqrt(width / heads)) V`` over tokens in ``mask`` (None: all); zeros without any."""
         _, heads, size = self.query.shape
         if queries.shape[-2] * heads < self.query.shape[0]:
             return self._few(queries, tokens, mask)
@@ -55,15 +54,12 @@ class Attention(nnx.Module):
         key = self._times("...kd,dhc->...khc", tokens, self.key)
         value = self._times("...kd,dhc->...khc", tokens, self.value)
         weights = _weights(self._times("...qhc,...khc->...hqk", query, key), mask)
-        return self._times(
-            "...qhc,hcd->...qd", self._times("...hqk,...khc->...qhc", weights, value), self.out
-        )
+        mean = self._times("...hqk,...khc->...qhc", weights, value)
+        return self._times("...qhc,hcd->...qd", mean, self.out)
 
     def _few(self, queries: Array, tokens: Array, mask: Array | None) -> Array:
-        """The same for few queries: keys are applied to queries and values to outputs, never to all tokens.
-
-        ``(W_q x) . (W_k y) = (W_k^T W_q x) . y``, and the mean of ``W_v y`` is ``W_v`` times the mean of ``y``.
-        """
+        # For few queries, keys are applied to queries and values to outputs, never to all tokens:
+        # ``(W_q x) . (W_k y) = (W_k^T W_q x) . y``, and the mean of ``W_v y`` is ``W_v`` times the mean of ``y``.
         query = self._times("...qd,dhc->...qhc", queries, self.query) * self.query.shape[2] ** -0.5
         projected = self._times("...qhc,dhc->...qhd", query, self.key)
         weights = _weights(self._times("...qhd,...kd->...hqk", projected, tokens), mask)
@@ -89,16 +85,13 @@ def _weights(
 ) -> Float[Array, "*batch h q k"]:
     if mask is None:
         return jax.nn.softmax(logits)
-    there = mask[..., None, None, :]
+    valid = mask[..., None, None, :]
     # With all tokens masked the softmax is uniform; the second mask makes it zero.
-    return jnp.where(there, jax.nn.softmax(jnp.where(there, logits, _NOWHERE)), 0.0)
+    return jnp.where(valid, jax.nn.softmax(jnp.where(valid, logits, _MASKED)), 0.0)
 
 
 class Attend(nnx.Module):
-    """``x + attention(norm(x), tokens)``; self-attention without ``tokens``.
-
-    ``tokens`` are normalised already.
-    """
+    """``x + attention(norm(x), tokens)`` with normalised ``tokens``; self-attention without them."""
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
         self.norm = nnx.LayerNorm(width, rngs=rngs)
@@ -148,3 +141,102 @@ def masked_mean(
     """Return the mean over valid rows; zeros without any."""
     total = jnp.sum(jnp.where(mask[..., None], rows, 0.0), axis=-2)
     return total / jnp.maximum(mask.sum(axis=-1, keepdims=True), 1)
+
+
+@dataclass(frozen=True)
+class Form:
+    """Shape of a group in one observation, features last, and whether it has a mask."""
+
+    shape: tuple[int, ...]
+    masked: bool
+
+    @property
+    def features(self) -> int:
+        """Width of a token."""
+        return self.shape[-1]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return self.shape[0] if self.masked else 1
+
+    @property
+    def series(self) -> bool:
+        """Whether there is a time axis, possibly of length 1."""
+        return len(self.shape) > (2 if self.masked else 1)
+
+    @property
+    def times(self) -> int:
+        """Number of tokens of a row."""
+        return math.prod(self.shape[:-1]) // self.rows
+
+
+class Rows(NamedTuple):
+    """Rows of tokens and their mask."""
+
+    value: Float[Array, "*batch rows time width"]
+    mask: Bool[Array, "*batch rows time"]
+
+    def flat(self) -> tuple[Float[Array, "*batch tokens width"], Bool[Array, "*batch tokens"]]:
+        """Return all tokens along one axis."""
+        *lead, rows, times, width = self.value.shape
+        return self.value.reshape(*lead, rows * times, width), self.mask.reshape(*lead, rows * times)
+
+
+def forms(spec: GroupSpec) -> dict[str, Form]:
+    """Return the shape of each group."""
+    return {name: Form(tuple(spec[name]), f"{name}_mask" in spec) for name in group_names(spec)}
+
+
+def raw_rows(groups: Groups, name: str, form: Form) -> Rows:
+    """Return a group's features as rows of times; masked ones are zero."""
+    value = groups[name].astype(jnp.float32)
+    axes = (*value.shape[: value.ndim - len(form.shape)], form.rows, form.times)
+    value = value.reshape(*axes, form.features)
+    mask = groups[f"{name}_mask"].reshape(axes) if form.masked else jnp.ones(axes, bool)
+    return Rows(jnp.where(mask[..., None], value, 0.0) if form.masked else value, mask)
+
+
+def time_code(times: int, width: int) -> Float[np.ndarray, "time width"]:
+    """Return the sinusoidal encoding of time, counted back from the last step (Vaswani et al. 2017, section 3.5)."""
+    back = np.arange(times - 1, -1, -1)[:, None]
+    angle = back / 10_000 ** (2 * np.arange((width + 1) // 2) / width)
+    return np.stack([np.sin(angle), np.cos(angle)], axis=-1).reshape(times, -1)[:, :width].astype(np.float32)
+
+
+class Embedding(nnx.Module):
+    """Map features to normalised tokens: dense layers per group, plus a time encoding for series.
+
+    Features are embedded in float32: in bfloat16 a point 50 m away would move by 20 cm.
+    """
+
+    def __init__(
+        self, spec: GroupSpec, width: int, hidden: tuple[int, ...], rngs: nnx.Rngs, dtype: Dtype
+    ) -> None:
+        self.forms = forms(spec)
+        self.dtype = dtype
+        self.hidden, self.out, self.norms = nnx.Dict(), nnx.Dict(), nnx.Dict()
+        for name, form in self.forms.items():
+            self.hidden[name] = dense_layers(form.features, hidden, rngs)
+            self.out[name] = nnx.Linear(hidden[-1] if hidden else form.features, width, rngs=rngs)
+            self.norms[name] = nnx.LayerNorm(width, rngs=rngs)
+        self.width = width
+
+    def __call__(self, groups: Groups) -> dict[str, Rows]:
+        """Return the tokens of each group by name."""
+        return {name: self._rows(groups, name) for name in self.forms}
+
+    def _rows(self, groups: Groups, name: str) -> Rows:
+        form = self.forms[name]
+        x, mask = raw_rows(groups, name, form)
+        for layer in self.hidden[name]:
+            x = nnx.relu(layer(x))
+        x = self.out[name](x)
+        if form.series:
+            x = x + jnp.asarray(time_code(form.times, self.width))
+        return Rows(self.norms[name](x).astype(self.dtype), mask)
+
+
+def concatenate_groups(groups: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Concatenate tokens and masks of several groups."""
+    return jnp.concatenate([x for x, _ in groups], axis=-2), jnp.concatenate([m for _, m in groups], axis=-1)

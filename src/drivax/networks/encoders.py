@@ -1,27 +1,45 @@
-"""Encoders: from named groups with masks to one vector."""
+"""Encoders: from named groups with masks to one vector; dense layers, maximum over rows, and normalisation.
+
+The gradient of a maximum concerns one row per output. Plain differentiation takes the gradients of all rows, mostly
+zeros, through all layers; :func:`largest` embeds only the maximal rows again where that is less work.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from typing import Any, Literal, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
-from drivax.networks.pooling import Activation, Layers, dense, largest
 
 Groups = Mapping[str, Array]
 #: Shapes of one observation, by group.
 GroupSpec = Mapping[str, tuple[int, ...]]
+#: Mean and standard deviation of each feature, by group.
+Statistics = Mapping[str, tuple[Float[Array, " F"], Float[Array, " F"]]]
+#: Kernel and bias of each layer.
+Layers = Sequence[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
+
+Activation = Literal["relu", "tanh", "gelu", "silu"]
+ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "gelu": jax.nn.gelu, "silu": jax.nn.silu}
+
+#: Lower bound of deviations: a nearly constant feature is not amplified.
+_MIN_DEVIATION = 1e-3
+#: Normalised features are clipped at this many deviations.
+_MAX_DEVIATIONS = 10.0
 
 
 @runtime_checkable
 class Encoder(Protocol):
-    """An ``nnx.Module`` whose state consists of ``nnx.Param`` only: a pure function of parameters and input."""
+    """An ``nnx.Module`` whose state consists of ``nnx.Param`` only."""
 
     @property
     def width(self) -> int:
@@ -47,10 +65,9 @@ class MlpConfig:
     """Dense layers over all groups, concatenated.
 
     Attributes:
-        rows: Layers shared by the rows of each masked group, before a maximum over rows (order-invariant); empty: rows
-            are flattened in order.
+        rows: Layers shared by the rows of each masked group, before a maximum over rows; empty: rows are flattened.
         hidden: Width of each following layer; the last is the size of the embedding.
-        activation: After each layer.
+        activation: Activation after each layer.
     """
 
     kind: Literal["mlp"] = "mlp"
@@ -64,7 +81,7 @@ class MlpConfig:
 
 
 class MlpEncoder(nnx.Module):
-    """Flatten or pool each group (masked rows have no effect), then apply dense layers."""
+    """Flatten or pool each group, then apply dense layers."""
 
     def __init__(self, config: MlpConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         self.pools = bool(config.rows)
@@ -86,25 +103,23 @@ class MlpEncoder(nnx.Module):
         self.width = config.hidden[-1]
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
-        """Encodes one observation or a batch of them."""
-        x = jnp.concatenate([self._part(name, groups) for name in self.names], axis=-1)
+        """Encode one observation or a batch."""
+        x = jnp.concatenate([self._group(name, groups) for name in self.names], axis=-1)
         return dense(self.activation, _weights(self.layers), x)
 
-    def _part(self, name: str, groups: Groups) -> Float[Array, "*batch part"]:
+    def _group(self, name: str, groups: Groups) -> Float[Array, "*batch features"]:
         value, mask = groups[name].astype(jnp.float32), groups.get(f"{name}_mask")
         lead = value.shape[: value.ndim - len(self.shapes[name])]
         if mask is None:
             return value.reshape(*lead, -1)
         value = jnp.where(mask[..., None], value, 0.0)
+        axes = (*lead, self.shapes[name][0], -1) if self.pools else (*lead, -1)
+        mask = mask.reshape(axes)
+        row = jnp.concatenate([value.reshape(axes), mask.astype(jnp.float32)], axis=-1)
         if not self.pools:
-            return jnp.concatenate(
-                [value.reshape(*lead, -1), mask.reshape(*lead, -1).astype(jnp.float32)], axis=-1
-            )
-        rows = self.shapes[name][0]
-        there = mask.reshape(*lead, rows, -1)
-        row = jnp.concatenate([value.reshape(*lead, rows, -1), there.astype(jnp.float32)], axis=-1)
-        # A row counts when any of its times does; without rows the embedding is zero.
-        return largest(self.activation, _weights(self.shared[name]), row, there.any(axis=-1))
+            return row
+        # A row is valid if any of its times is; without rows the embedding is zero.
+        return largest(self.activation, _weights(self.shared[name]), row, mask.any(axis=-1))
 
 
 def dense_layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
@@ -120,19 +135,163 @@ def _weights(layers: Any) -> Layers:
     return tuple((layer.kernel[...], layer.bias[...]) for layer in layers)
 
 
-def group_spec(observation: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the groups of one (unbatched) observation."""
-    return {name: tuple(value.shape) for name, value in observation.items()}
-
-
 def group_names(spec: GroupSpec) -> tuple[str, ...]:
-    """Return the non-empty groups that are not masks, in alphabetical order.
-
-    Raises:
-        UsageError: All groups are empty.
-    """
+    """Return the non-empty groups that are not masks, in alphabetical order; raises UsageError if there are none."""
     groups = (n for n in spec if not (n.endswith("_mask") and n.removesuffix("_mask") in spec))
     names = tuple(sorted(name for name in groups if math.prod(spec[name])))
     if not names:
         raise UsageError("nothing to encode: all groups are empty", cure="observe at least one row")
     return names
+
+
+def dense(
+    activation: Activation, layers: Layers, x: Float[Array, "*batch inputs"]
+) -> Float[Array, "*batch outputs"]:
+    """Apply dense layers with an activation after each."""
+    for kernel, bias in layers:
+        x = ACTIVATIONS[activation](x @ kernel + bias)
+    return x
+
+
+def largest(
+    activation: Activation,
+    layers: Layers,
+    rows: Float[Array, "*batch row inputs"],
+    there: Bool[Array, "*batch row"],
+) -> Float[Array, "*batch outputs"]:
+    """Return the maximum of zero and the valid rows after the layers."""
+    if only_winners(rows.shape[-2], [rows.shape[-1], *(bias.shape[0] for _, bias in layers)]):
+        return _of_layers(activation, tuple(layers), rows, there)
+    return _of_rows(dense(activation, layers, rows), there)
+
+
+def only_winners(rows: int, sizes: Sequence[int]) -> bool:
+    """Whether it is less work to differentiate the maximal rows only, given the widths of a row and of each layer.
+
+    A backward pass takes two products per layer and row. A maximal row takes three, because it is embedded again, but
+    only one output of the last layer.
+    """
+    products = [inputs * outputs for inputs, outputs in pairwise(sizes)]
+    return 3 * sizes[-1] * (sum(products[:-1]) + sizes[-2]) < 2 * rows * sum(products)
+
+
+@jax.custom_vjp
+def _of_rows(
+    embedded: Float[Array, "*batch row outputs"], there: Bool[Array, "*batch row"]
+) -> Float[Array, "*batch outputs"]:
+    return jnp.max(embedded, axis=-2, initial=0.0, where=there[..., None])
+
+
+def _of_rows_forward(embedded: Array, there: Array) -> tuple[Array, tuple[Array, Array, int]]:
+    largest, winner, counts = _winners(embedded, there)
+    return largest, (winner, counts, embedded.shape[-2])
+
+
+def _of_rows_backward(kept: tuple[Array, Array, int], gradient: Array) -> tuple[Array, None]:
+    winner, counts, rows = kept
+    won = jnp.arange(rows)[:, None] == winner[..., None, :]
+    return jnp.where(won, jnp.where(counts, gradient, 0.0)[..., None, :], 0.0), None
+
+
+_of_rows.defvjp(_of_rows_forward, _of_rows_backward)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _of_layers(
+    activation: Activation,
+    layers: Layers,
+    rows: Float[Array, "*batch row inputs"],
+    there: Bool[Array, "*batch row"],
+) -> Float[Array, "*batch outputs"]:
+    return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=there[..., None])
+
+
+def _of_layers_forward(
+    activation: Activation, layers: Layers, rows: Array, there: Array
+) -> tuple[Array, Any]:
+    largest, winner, counts = _winners(dense(activation, layers, rows), there)
+    return largest, (layers, rows, winner, counts)
+
+
+def _of_layers_backward(activation: Activation, kept: Any, gradient: Array) -> tuple[Any, Array, None]:
+    layers, rows, winner, counts = kept
+
+    def again(layers: Layers, rows: Array) -> Array:
+        """Return each output from the row that attains it."""
+        won = dense(activation, layers[:-1], jnp.take_along_axis(rows, winner[..., None], axis=-2))
+        kernel, bias = layers[-1]
+        return ACTIVATIONS[activation](jnp.sum(won * kernel.T, axis=-1) + bias)
+
+    _, pull = jax.vjp(again, layers, rows)
+    return *pull(jnp.where(counts, gradient, 0.0)), None
+
+
+_of_layers.defvjp(_of_layers_forward, _of_layers_backward)
+
+
+def _winners(embedded: Array, there: Array) -> tuple[Array, Array, Array]:
+    """Return the maximum, its row, and whether it is above zero, so that it has a gradient."""
+    # Invalid rows are never above zero.
+    candidates = jnp.where(there[..., None], embedded, 0.0)
+    maximum = jnp.max(candidates, axis=-2)
+    return jnp.maximum(maximum, 0.0), jnp.argmax(candidates, axis=-2), maximum > 0.0
+
+
+def feature_statistics(groups: Groups) -> dict[str, tuple[Float[Array, " F"], Float[Array, " F"]]]:
+    """Return mean and standard deviation of each feature over all valid rows; 0 and 1 without any.
+
+    Groups may have any leading axes. Rows share their statistics, so that neither order nor padding matters.
+    """
+    names = group_names({name: value.shape for name, value in groups.items()})
+    return {name: _group_statistics(groups[name], groups.get(f"{name}_mask")) for name in names}
+
+
+def _group_statistics(value: Array, mask: Array | None) -> tuple[Array, Array]:
+    rows = value.reshape(-1, value.shape[-1]).astype(jnp.float32)
+    counts = jnp.ones(len(rows)) if mask is None else mask.reshape(-1).astype(jnp.float32)
+    share = (counts / jnp.maximum(counts.sum(), 1.0))[:, None]
+    mean = jnp.sum(jnp.where(share > 0, rows, 0.0) * share, axis=0)
+    # Of the residuals, not of squares: differences of large squares cancel.
+    variance = jnp.sum(jnp.where(share > 0, rows - mean, 0.0) ** 2 * share, axis=0)
+    return mean, jnp.where(counts.sum() > 0, jnp.sqrt(variance), 1.0)
+
+
+@dataclass(frozen=True)
+class NormalisedConfig:
+    """An encoder of normalised features."""
+
+    encoder: EncoderConfig
+
+    def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> NormalisedEncoder:
+        """Return the encoder with fresh parameters; it normalises nothing until statistics are set."""
+        return NormalisedEncoder(self.encoder.build(spec, rngs), spec)
+
+
+class NormalisedEncoder(nnx.Module):
+    """Shift and scale features, then encode. Statistics are parameters without gradients."""
+
+    def __init__(self, encoder: Encoder, spec: GroupSpec) -> None:
+        self.encoder = encoder
+        self.width = encoder.width
+        sizes = {name: spec[name][-1] for name in group_names(spec)}
+        self.mean = nnx.Dict({name: nnx.Param(jnp.zeros(size)) for name, size in sizes.items()})
+        self.deviation = nnx.Dict({name: nnx.Param(jnp.ones(size)) for name, size in sizes.items()})
+
+    def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
+        """Return the embedding of an observation or a batch."""
+        return self.encoder(dict(groups) | {name: self._scaled(name, groups[name]) for name in self.mean})
+
+    def _scaled(self, name: str, value: Array) -> Array:
+        mean, deviation = (jax.lax.stop_gradient(values[name][...]) for values in (self.mean, self.deviation))
+        return jnp.clip(
+            (value - mean) / jnp.maximum(deviation, _MIN_DEVIATION), -_MAX_DEVIATIONS, _MAX_DEVIATIONS
+        )
+
+
+def set_statistics(network: nnx.Module, statistics: Statistics) -> None:
+    """Set the statistics of all normalised encoders of a network."""
+    for _, node in nnx.iter_graph(network):
+        if isinstance(node, NormalisedEncoder):
+            for name, (mean, deviation) in statistics.items():
+                node.mean[name][...] = mean
+                node.deviation[name][...] = deviation

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from drivax.networks.attention import Attention, Dtype, masked_mean
+from drivax.networks.attention import Attention, Dtype, Form, concatenate_groups, forms, masked_mean, raw_rows
 from drivax.networks.encoders import Groups, GroupSpec
-from drivax.networks.tokens import Form, concatenate_groups, forms, raw_rows
 
-#: Parts of the embedding, in its order.
+#: Parts of the embedding, in order.
 _PARTS = ("ego", "others", "goal", "context")
 
 
@@ -21,13 +20,11 @@ _PARTS = ("ego", "others", "goal", "context")
 class EntityConfig:
     """Embed each row with one relu layer; the ego and its goal attend to the other rows.
 
-    Groups are distinguished by their masks, and by name in ``goal`` and ``context``; missing names are ignored.
-
     Attributes:
-        size: ``published``: width 64; ``small``: 32; 4 heads either way.
+        size: Width: 64 if ``published``, 32 if ``small``.
         width: Width of a row, a multiple of ``heads``; the embedding concatenates several.
         heads: Number of attention heads.
-        goal: Groups whose mean is added to the query.
+        goal: Groups whose mean is added to the query; missing names are ignored, here and in ``context``.
         context: Groups whose mean is appended to the embedding.
         dtype: Type of the attention's matrix products; the rest is float32.
     """
@@ -66,20 +63,18 @@ class EntityEncoder(nnx.Module):
         self.parts = {name: _part(config, name, form) for name, form in self.forms.items()}
         self.order = tuple(part for part in _PARTS if part in self.parts.values())
         self.width = width * len(self.order)
-        self.layers = nnx.Dict(
-            {name: nnx.Linear(_numbers(form), width, rngs=rngs) for name, form in self.forms.items()}
-        )
+        # The width of a row is that of its features at all times, and of the mask of a series.
+        sizes = {n: form.times * (form.features + form.series) for n, form in self.forms.items()}
+        self.layers = nnx.Dict({name: nnx.Linear(size, width, rngs=rngs) for name, size in sizes.items()})
         self.attention = Attention(width, config.heads, rngs, config.dtype)
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch; float32."""
-        rows = {
-            part: concatenate_groups(
-                [self._entities(groups, n) for n, its in self.parts.items() if its == part]
-            )
-            for part in self.order
-        }
+        rows = {}
+        for part in self.order:
+            names = [name for name, own in self.parts.items() if own == part]
+            rows[part] = concatenate_groups([self._entities(groups, name) for name in names])
         means = {part: masked_mean(*rows[part]) for part in self.order}
         if "others" in means:
             query = sum((means[part] for part in ("ego", "goal") if part in means), jnp.zeros(()))
@@ -90,16 +85,10 @@ class EntityEncoder(nnx.Module):
     def _entities(self, groups: Groups, name: str) -> tuple[Array, Array]:
         """Return an embedding per row, and whether any of its times is valid."""
         value, mask = raw_rows(groups, name, self.forms[name])
-        lead = value.shape[:-2]
-        numbers = [value.reshape(*lead, -1)]
+        x = value.reshape(*value.shape[:-2], -1)
         if self.forms[name].series:
-            numbers.append(mask.astype(jnp.float32))
-        return nnx.relu(self.layers[name](jnp.concatenate(numbers, axis=-1))), mask.any(axis=-1)
-
-
-def _numbers(form: Form) -> int:
-    """Return the width of a row: its features at all times, and the mask of a series."""
-    return form.times * form.features + (form.times if form.series else 0)
+            x = jnp.concatenate([x, mask.astype(jnp.float32)], axis=-1)
+        return nnx.relu(self.layers[name](x)), mask.any(axis=-1)
 
 
 def _part(config: EntityConfig, name: str, form: Form) -> str:

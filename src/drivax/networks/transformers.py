@@ -12,9 +12,18 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
-from drivax.networks.attention import Attend, Dtype, FeedForward, SelfAttention, masked_mean
+from drivax.networks.attention import (
+    Attend,
+    Dtype,
+    Embedding,
+    FeedForward,
+    Rows,
+    SelfAttention,
+    concatenate_groups,
+    forms,
+    masked_mean,
+)
 from drivax.networks.encoders import Groups, GroupSpec
-from drivax.networks.tokens import Embedding, Rows, concatenate_groups, forms
 
 
 @dataclass(frozen=True)
@@ -37,12 +46,11 @@ SIZES = {
 
 @dataclass(frozen=True)
 class TransformerConfig:
-    """Settings of all transformers. Missing sizes come from ``size``.
+    """Settings of all transformers.
 
     Attributes:
-        kind: Which encoder.
-        size: ``published`` (width 256, 8 heads, 4 layers, 16 latents, linear embedding) or ``small`` (64, 4, 2, 8, one
-            hidden layer of 64).
+        kind: Kind of encoder.
+        size: ``published`` or ``small``: all sizes that are not set, see :data:`SIZES`.
         width: Width of tokens and of the embedding; a multiple of ``heads``.
         heads: Number of attention heads.
         layers: Depth.
@@ -69,19 +77,13 @@ class TransformerConfig:
     @property
     def sizes(self) -> Sizes:
         """All sizes, with those of ``size`` where none is set."""
-        given = {field.name: getattr(self, field.name, None) for field in fields(Sizes)}
-        return replace(
-            SIZES[self.size], **{name: value for name, value in given.items() if value is not None}
-        )
+        sizes = {field.name: getattr(self, field.name, None) for field in fields(Sizes)}
+        return replace(SIZES[self.size], **{n: value for n, value in sizes.items() if value is not None})
 
 
 @dataclass(frozen=True)
 class LatentConfig(TransformerConfig):
-    """A transformer with latent queries.
-
-    Attributes:
-        latents: Number of latent queries.
-    """
+    """A transformer with ``latents`` latent queries."""
 
     latents: int | None = None
 
@@ -94,7 +96,7 @@ class LqConfig(LatentConfig):
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
         """Return the encoder with fresh parameters."""
-        return LatentEncoder(self.sizes, Fusion(0, self.sizes.layers, again=True), spec, rngs)
+        return LatentEncoder(self.sizes, Fusion(0, self.sizes.layers, every_layer=True), spec, rngs)
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class LqhConfig(LatentConfig):
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
         """Return the encoder with fresh parameters."""
-        fusion = Fusion(max(self.local_layers, 1), self.sizes.layers, again=True)
+        fusion = Fusion(max(self.local_layers, 1), self.sizes.layers, every_layer=True)
         return LatentEncoder(self.sizes, fusion, spec, rngs)
 
 
@@ -121,7 +123,7 @@ class WayformerConfig(LatentConfig):
     Attributes:
         fusion: ``early``: one encoder over all tokens; ``late``: one per group, latents averaged; ``hierarchical``: one
             layer per group, then ``layers`` over all latents.
-        factorised: Whether each group's tokens first attend over times, then over rows.
+        factorised: Whether tokens of a group first attend over times, then over rows.
     """
 
     kind: Literal["wayformer"] = "wayformer"
@@ -132,7 +134,7 @@ class WayformerConfig(LatentConfig):
         """Return the encoder with fresh parameters."""
         layers = self.sizes.layers
         local, whole = {"early": (0, layers), "late": (layers, 0), "hierarchical": (1, layers)}[self.fusion]
-        fusion = Fusion(local, whole, again=False, factorised=self.factorised)
+        fusion = Fusion(local, whole, every_layer=False, factorised=self.factorised)
         return LatentEncoder(self.sizes, fusion, spec, rngs)
 
 
@@ -158,23 +160,23 @@ class Fusion:
     Attributes:
         local: Layers of latents per group; 0: none.
         whole: Layers of latents over all groups; 0: none.
-        again: Whether latents attend to the tokens before each layer, or before the first only.
-        factorised: Whether tokens of a group first attend over times, then over rows.
+        every_layer: Whether latents attend to the tokens before each layer, or before the first only.
+        factorised: See :class:`WayformerConfig`.
     """
 
     local: int
     whole: int
-    again: bool
+    every_layer: bool
     factorised: bool = False
 
 
 class _Latents(nnx.Module):
     """Learned queries with cross-attention to tokens and self-attention."""
 
-    def __init__(self, sizes: Sizes, layers: int, again: bool, rngs: nnx.Rngs) -> None:
+    def __init__(self, sizes: Sizes, layers: int, every_layer: bool, rngs: nnx.Rngs) -> None:
         width, heads, dtype = sizes.width, sizes.heads, sizes.dtype
         self.first = nnx.Param(nnx.initializers.normal(0.02)(rngs.params(), (sizes.latents, width)))
-        looks = layers if again else 1
+        looks = layers if every_layer else 1
         self.looks = nnx.List([Attend(width, heads, rngs, dtype) for _ in range(looks)])
         self.layers = nnx.List([SelfAttention(width, heads, rngs, dtype) for _ in range(layers)])
         self.norm = nnx.LayerNorm(width, rngs=rngs)
@@ -213,23 +215,23 @@ class LatentEncoder(nnx.Module):
         self.embedding = Embedding(spec, sizes.width, sizes.embedding, rngs, sizes.dtype)
         names = tuple(self.embedding.forms)
         self.before = nnx.Dict({name: _Factorised(sizes, rngs) for name in names if fusion.factorised})
-        self.local = nnx.Dict(
-            {name: _Latents(sizes, fusion.local, fusion.again, rngs) for name in names if fusion.local}
-        )
-        self.whole = nnx.List(
-            [_Latents(sizes, fusion.whole, fusion.again, rngs) for _ in range(min(fusion.whole, 1))]
-        )
+
+        def latents(layers: int) -> _Latents:
+            return _Latents(sizes, layers, fusion.every_layer, rngs)
+
+        self.local = nnx.Dict({name: latents(fusion.local) for name in names if fusion.local})
+        self.whole = nnx.List([latents(fusion.whole)] if fusion.whole else [])
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch; float32."""
-        parts = []
+        tokens = []
         for name, rows in self.embedding(groups).items():
             x, mask = (self.before[name](rows) if name in self.before else rows).flat()
             if name in self.local:
                 x = self.local[name](x, mask)
                 mask = jnp.ones(x.shape[:-1], bool)
-            parts.append((x, mask))
-        x, mask = concatenate_groups(parts)
+            tokens.append((x, mask))
+        x, mask = concatenate_groups(tokens)
         for latents in self.whole:
             x = latents(x, mask)
         return jnp.mean(x.astype(jnp.float32), axis=-2)
@@ -250,9 +252,8 @@ class MtrEncoder(nnx.Module):
         self.own = tuple(name for name in self.movers if not kinds[name].masked)
         self.time = SelfAttention(width, heads, rngs, dtype)
         self.among = nnx.List([Attend(width, heads, rngs, dtype) for _ in range(sizes.layers)])
-        self.around = nnx.List(
-            [Attend(width, heads, rngs, dtype) for _ in range(sizes.layers if self.map else 0)]
-        )
+        depth = sizes.layers if self.map else 0
+        self.around = nnx.List([Attend(width, heads, rngs, dtype) for _ in range(depth)])
         self.feed_forward = nnx.List([FeedForward(width, rngs, dtype) for _ in range(sizes.layers)])
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 

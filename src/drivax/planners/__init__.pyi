@@ -2,10 +2,9 @@ from .catalogue import PLANNERS as PLANNERS
 from .catalogue import as_planner as as_planner
 from .catalogue import make_planner as make_planner
 from .functions import FunctionPlanner as FunctionPlanner
+from .functions import NetworkPlanner as NetworkPlanner
 from .functions import jax_planner as jax_planner
 from .functions import python_planner as python_planner
-from .idm import IdmPlanner as IdmPlanner
-from .network_planner import NetworkPlanner as NetworkPlanner
 from .pdm import EmergencyBrake as EmergencyBrake
 from .pdm import PdmConfig as PdmConfig
 from .pdm import PdmPlanner as PdmPlanner
@@ -16,6 +15,7 @@ from .planner_traffic import PlannerTraffic as PlannerTraffic
 from .planner_traffic import with_driver as with_driver
 from .simple import ConstantVelocity as ConstantVelocity
 from .simple import Expert as Expert
+from .simple import IdmPlanner as IdmPlanner
 from .simple import RandomActions as RandomActions
 from .simple import expert_action as expert_action
 from .simple import logged_motion as logged_motion

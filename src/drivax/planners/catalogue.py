@@ -7,10 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from drivax.errors import UsageError
-from drivax.planners.idm import IdmPlanner
 from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
-from drivax.planners.simple import ConstantVelocity, Expert, RandomActions
+from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner, RandomActions
 from drivax.plugins import check_arguments, find_named, is_dotted
 from drivax.tasks.actions import ActionSpace
 
@@ -25,29 +24,23 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
 
 
 def make_planner(name: str, actions: ActionSpace | None = None) -> Planner:
-    """Return the planner of a name.
+    """Return the planner of a name in :data:`PLANNERS`, or of ``package.module:name`` (a planner or what makes one).
 
-    Args:
-        name: One of :data:`PLANNERS`, or ``package.module:name`` of your own planner or of a function that makes one.
-        actions: Action space for a planner that has a field ``actions``; None: the planner's own.
+    ``actions`` replaces the planner's own action space, if it has one.
 
     Raises:
-        KeyError: If there is none.
-        UsageError: If a dotted name leads to no planner.
+        KeyError: Unknown name.
+        UsageError: A dotted name leads to no planner.
     """
     planner = as_planner(find_named(name), name) if is_dotted(name) else PLANNERS[name]()
     return replace(planner, actions=actions) if actions and hasattr(planner, "actions") else planner  # type: ignore
 
 
 def as_planner(thing: Any, name: str) -> Planner:
-    """The planner that something of the user's is, or makes when it is called without arguments.
-
-    Args:
-        thing: A planner, its class, or a function that makes one.
-        name: What messages call it.
+    """Return a planner of the user's: ``thing`` itself, or what its class or function makes without arguments.
 
     Raises:
-        UsageError: It is none and makes none.
+        UsageError: It is no planner and makes none; the message uses ``name``.
     """
     if isinstance(thing, Planner) and not isinstance(thing, type):
         return thing

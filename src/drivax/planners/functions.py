@@ -1,4 +1,4 @@
-"""Planners defined by one user function, in JAX or in plain Python.
+"""Planners defined by one user function, in JAX or in plain Python, or by a trained policy.
 
 A function maps the situation and observation of one scenario to an action of the task's action space. A planner with
 memory or random numbers is a class (``planners.planner.Planner``).
@@ -16,12 +16,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from flax import nnx
+from jaxtyping import Array
 
 from drivax.planners.planner import Memoryless
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
-from drivax.simulator.types import SimState, Situation
+from drivax.simulator.types import Action, Situation
 
 Drive = Callable[[Situation, Any], Any]
 
@@ -40,35 +41,25 @@ class FunctionPlanner(Memoryless):
 
     function: Drive = static()
     in_python: bool = static(default=False)
-    replays: bool = static(default=False)
 
     @property
     def name(self) -> str:
         """Name of the function."""
         return str(getattr(self.function, "__name__", type(self.function).__name__))
 
-    def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
-        key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
         """Return the function's action; NaN where it raised an error."""
         if not self.in_python:
-            return jnp.asarray(self.function(situation, observation), jnp.float32), carry
+            return jnp.asarray(self.function(situation, observation), jnp.float32)
         # The traffic state is internal.
         seen = replace(situation, context=replace(situation.context, traffic=()))
-        identity, size = bank.identity[state.context.index], state.context.action.shape
+        identity, size = bank.identity[situation.context.index], situation.context.action.shape
 
         def answer(identity: Any, *seen: Any) -> Any:
             return _answers(self.function, np.asarray(identity), jax.tree.map(np.asarray, seen), size)
 
         result = jax.ShapeDtypeStruct(size, jnp.float32)
-        action = jax.pure_callback(answer, result, identity, seen, observation, vmap_method="broadcast_all")
-        return action, carry
+        return jax.pure_callback(answer, result, identity, seen, observation, vmap_method="broadcast_all")
 
 
 def jax_planner(function: Drive) -> FunctionPlanner:
@@ -86,6 +77,27 @@ def python_planner(function: Drive) -> FunctionPlanner:
     (``evaluation.runner``). It must not call JAX, which waits for it.
     """
     return FunctionPlanner(function, in_python=True)
+
+
+@record
+class NetworkPlanner(Memoryless):
+    """A policy network that acts by its mode, or by a sample.
+
+    Attributes:
+        parameters: Weights of the network.
+        graph: Structure of the network.
+        samples: Whether to act by a sample.
+    """
+
+    parameters: Any
+    graph: Any = static()
+    name: str = static(default="policy")
+    samples: bool = static(default=False)
+
+    def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
+        """Return the policy's action for the observation."""
+        distribution = nnx.merge(self.graph, self.parameters)(observation)
+        return distribution.action(distribution.sample(key)) if self.samples else distribution.mode()
 
 
 @contextmanager

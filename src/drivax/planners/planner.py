@@ -5,10 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, Protocol, runtime_checkable
 
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.types import SimState, Situation
+from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
+from drivax.simulator.types import Action, SimState, Situation
 from drivax.tasks.actions import ActionSpace
 
 
@@ -35,24 +35,32 @@ class Planner(Protocol):
         ...
 
     def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    ) -> tuple[Action, Any]:  # fmt: skip
         """Return an action of the task's action space, which the simulator clips, and the carry of the next step."""
         ...
 
 
 class Memoryless:
-    """Base of planners that carry nothing from step to step."""
+    """Base of planners that carry nothing from step to step; implement ``choose``, or ``act`` itself."""
+
+    replays: bool = False
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
         """Return an empty carry."""
         return ()
+
+    def act(
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
+        key: Array,
+    ) -> tuple[Action, Any]:  # fmt: skip
+        """Return the chosen action."""
+        return self.choose(bank, situation, observation, key), carry
+
+    def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
+        """Return an action of the task's action space."""
+        raise NotImplementedError
 
 
 class RuleBased(Memoryless, ABC):
@@ -61,19 +69,11 @@ class RuleBased(Memoryless, ABC):
     actions: ActionSpace
 
     @abstractmethod
-    def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Scalar, Scalar]:
         """Return acceleration (m/s2) and curvature (1/m)."""
 
-    def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
-        key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
         """Return the action of the controls."""
         context = situation.context
         length_m = bank.length_m(context.index, context.slot)
-        return self.actions.action(context.history[-1], *self.controls(bank, situation), length_m), carry
+        return self.actions.action(context.history[-1], *self.controls(bank, situation), length_m)

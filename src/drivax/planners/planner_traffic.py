@@ -20,7 +20,7 @@ from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.situation import measure
 from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_bank, with_data
-from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
+from drivax.simulator.traffic.log import LogTraffic, agent_rows, alone, frame_of
 from drivax.simulator.types import HISTORY, AgentContext, Frame, SimState, Traffic
 from drivax.tasks.task import Task
 
@@ -41,17 +41,11 @@ class TrafficPolicy(TrafficData):
 
 @record
 class PlannerTrafficState:
-    """State of the K agents that the planner drives.
+    """State of the K agents that the planner drives."""
 
-    Attributes:
-        begin: First step of the episode; until then all agents moved as logged.
-        contexts: One context per agent; slots beyond the moving agents are empty.
-        base: State of the traffic around them.
-    """
-
-    begin: Int[Array, "*batch"]
-    contexts: AgentContext
-    base: Any
+    begin: Int[Array, "*batch"]  # First step of the episode; until then all agents moved as logged
+    contexts: AgentContext  # One context per agent; slots beyond the moving agents are empty
+    base: Any  # State of the traffic around them
 
 
 @dataclass(frozen=True)
@@ -106,18 +100,16 @@ class PlannerTraffic:
             apart = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
             lights = remember_lights(bank, agent)
             situation, contacts, lights = measure(bank, agent, frame, frames(1), apart, lights)
-            state = SimState(
-                situation.context, situation.facts, contacts, lights, self.task.episode_start(), now.begin
-            )
-            key = jax.random.fold_in(jax.random.key(self.seed), bank.identity[agent.index])
-            key = jax.random.fold_in(key, agent.step)
+            episode = self.task.episode_start()
+            state = SimState(situation.context, situation.facts, contacts, lights, episode, now.begin)
+            key = jax.random.key(self.seed)
+            for number in (bank.identity[agent.index], agent.step, agent.slot):
+                key = jax.random.fold_in(key, number)
             seen = self.task.observe(bank, situation.context, frames, frame)
-            asked, _ = data_of(bank, TrafficPolicy).planner.act(
-                (), bank, state, situation, seen, jax.random.fold_in(key, agent.slot)
-            )
-            motion, length = agent.history[-1], bank.length_m(agent.index, agent.slot)
-            action = self.task.actuated(motion, asked, agent.action)
-            motion = self.task.motion(motion, action, length)
+            requested, _ = data_of(bank, TrafficPolicy).planner.act((), bank, state, situation, seen, key)
+            action = self.task.actuated(agent.history[-1], requested, agent.action)
+            length_m = bank.length_m(agent.index, agent.slot)
+            motion = self.task.motion(agent.history[-1], action, length_m)
             history = jnp.concatenate([agent.history[1:], motion[None]])
             return replace(situation.context, step=agent.step + 1, history=history, action=action)
 
@@ -128,30 +120,23 @@ class PlannerTraffic:
         """Return the rows of ``base`` with the driven vehicles at their simulated poses."""
         now = context.traffic
         rows = self.base.agents(bank, replace(context, traffic=now.base), back)
-        x, y, heading, speed = jnp.moveaxis(now.contexts.history[:, HISTORY - 1 - back], -1, 0)
-        cos, sin = jnp.cos(heading), jnp.sin(heading)
-        parts = [x, y, now.contexts.z, cos, sin, speed * cos, speed * sin, jnp.ones_like(x)]
         slot = jnp.where(context.step - back > now.begin, now.contexts.slot, rows.shape[0])
-        return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
+        motion, z = now.contexts.history[:, HISTORY - 1 - back], now.contexts.z
+        return rows.at[slot].set(agent_rows(motion, z, jnp.ones_like(z)), mode="drop")
 
     def _slots(self, bank: ScenarioBank, index: Any, step: Any) -> Int[Array, " K"]:
         """Slots of the driven vehicles, nearest to ego first, padded with empty slots."""
-        rows = bank.agents[index]
-        here = rows[step]
-        moved = ((rows[..., AgentColumn.XY] - here[:, AgentColumn.XY]) ** 2).sum(axis=-1)
-        later = (rows[..., AgentColumn.VALID] > 0) & (jnp.arange(bank.steps) > step)[:, None]
-        slots = jnp.arange(here.shape[0])
-        chosen = (
-            (here[:, AgentColumn.VALID] > 0) & (slots > 0) & (later & (moved > _TRAVELS_M**2)).any(axis=0)
-        )
-        chosen &= bank.agent_box[index, : here.shape[0], SizeColumn.KIND] == int(AgentKind.VEHICLE)
-        distance = jnp.where(
-            chosen, ((here[:, AgentColumn.XY] - here[0, AgentColumn.XY]) ** 2).sum(axis=-1), jnp.inf
-        )
+        rows, count = bank.agents[index], bank.agents.shape[2]
+        xy, valid = rows[..., AgentColumn.XY], rows[..., AgentColumn.VALID] > 0
+        moved = ((xy - xy[step]) ** 2).sum(axis=-1)
+        later = valid & (jnp.arange(bank.steps) > step)[:, None]
+        chosen = valid[step] & (jnp.arange(count) > 0) & (later & (moved > _TRAVELS_M**2)).any(axis=0)
+        chosen &= bank.agent_box[index, :count, SizeColumn.KIND] == int(AgentKind.VEHICLE)
+        distance = jnp.where(chosen, ((xy[step] - xy[step, 0]) ** 2).sum(axis=-1), jnp.inf)
         order = jnp.argsort(distance)[: self.count]
-        order = jnp.pad(order, (0, self.count - order.shape[0]), constant_values=here.shape[0])
+        order = jnp.pad(order, (0, self.count - order.shape[0]), constant_values=count)
         far = jnp.isinf(distance.at[order].get(mode="fill", fill_value=jnp.inf))
-        return jnp.where(far, here.shape[0], order).astype(jnp.int32)
+        return jnp.where(far, count, order).astype(jnp.int32)
 
 
 def with_driver(bank: ScenarioBank, driver: Planner) -> ScenarioBank:

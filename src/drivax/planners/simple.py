@@ -1,4 +1,4 @@
-"""Reference planners: the expert (replayed or driven), constant velocity, and random actions."""
+"""Reference planners: the expert (replayed or driven), constant velocity, random actions, and IDM along the route."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.planners.planner import Memoryless, RuleBased
-from drivax.scenario.bank.columns import AgentColumn
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn, RouteColumn
+from drivax.scenario.bank.queries import route_ahead
+from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
-from drivax.simulator.types import AgentContext, SimState, Situation
+from drivax.simulator.ahead import ahead
+from drivax.simulator.idm import IdmParameters
+from drivax.simulator.types import MOTION_SPEED, Action, AgentContext, Motion, Situation
 from drivax.tasks.actions import ActionSpace, Physical
 
 
-def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Float[Array, "4"]:
+def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Motion:
     """Return the logged motion of the agent ``ahead`` steps from now; its present motion where the log has none.
 
     Beyond the end of the log its last motion continues at constant velocity.
@@ -31,7 +34,7 @@ def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Floa
     return jnp.where(logged[AgentColumn.VALID] > 0, motion, context.history[-1])
 
 
-def expert_action(bank: ScenarioBank, context: AgentContext, actions: ActionSpace) -> Float[Array, " D"]:
+def expert_action(bank: ScenarioBank, context: AgentContext, actions: ActionSpace) -> Action:
     """Return the action that follows the log from here; not clipped, for ``actions.clipped``."""
     ahead, beyond = logged_motion(bank, context, 1), logged_motion(bank, context, 2)
     return actions.expert(context.history[-1], ahead, beyond, bank.length_m(context.index, context.slot))
@@ -49,17 +52,9 @@ class Expert(Memoryless):
         """``expert`` or ``expert_actions``."""
         return "expert" if self.replays else "expert_actions"
 
-    def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
-        key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
         """Return the action that follows the log."""
-        return expert_action(bank, state.context, self.actions), carry
+        return expert_action(bank, situation.context, self.actions)
 
 
 @record
@@ -68,9 +63,8 @@ class ConstantVelocity(RuleBased):
 
     actions: ActionSpace = static(default=Physical())
     name: str = static(default="constant_velocity")
-    replays: bool = static(default=False)
 
-    def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Scalar, Scalar]:
         """Return zeros."""
         return jnp.zeros(()), jnp.zeros(())
 
@@ -80,16 +74,42 @@ class RandomActions(Memoryless):
     """Draws actions uniformly from the action space, independently at every step."""
 
     name: str = static(default="random")
-    replays: bool = static(default=False)
 
-    def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
-        key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
         """Return independent numbers in [-1, 1)."""
-        return jax.random.uniform(key, state.context.action.shape, minval=-1.0, maxval=1.0), carry
+        return jax.random.uniform(key, situation.context.action.shape, minval=-1.0, maxval=1.0)
+
+
+@record
+class IdmPlanner(RuleBased):
+    """Follow the leader along the route by IDM, stop for red lights, slow down in curves, steer by pure pursuit.
+
+    Reads the true situation, not observations. The desired speed is the limit, 13.4 m/s where none is known. In a
+    scenario without a route on lanes it follows the path of the log.
+    """
+
+    actions: ActionSpace = static(default=Physical())
+    parameters: IdmParameters = static(default=IdmParameters())
+    name: str = static(default="idm")
+
+    def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Scalar, Scalar]:
+        """Return IDM acceleration and pure-pursuit curvature."""
+        context, frame = situation.context, situation.surroundings.frame
+        me, speed = frame.box[context.slot], context.history[-1, MOTION_SPEED]
+        seen = ahead(bank, context, frame, self.parameters.min_gap_m)
+        ahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
+        left_m = bank.route_points[context.index, 0] - 1 - context.route_m
+        ahead_m = jnp.minimum(ahead_m, jnp.maximum(left_m, 0.0))
+        points, _ = route_ahead(bank, context.index, context.route_m, ahead_m[None])
+        return seen.acceleration(speed, self.parameters), pursuit(me, points[0, RouteColumn.XY] - me[:2])
+
+
+def pursuit(me: Float[Array, " pose"], target: Float[Array, " 2"]) -> Scalar:
+    """Return the curvature of the arc from a pose or box to a point relative to it; 0 where the point lies behind.
+
+    Pure pursuit (Coulter 1992): k = 2 y / L^2, with the point at (x, y) in the box's frame and L away.
+    """
+    forward = target[0] * me[2] + target[1] * me[3]
+    left = target[1] * me[2] - target[0] * me[3]
+    arc = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
+    return jnp.where(forward > 1.0, arc, 0.0)

@@ -1,5 +1,10 @@
-from .comparison import comparison_text as comparison_text
+from .charts import chart as chart
+from .charts import curve_sections as curve_sections
+from .charts import distribution_charts as distribution_charts
+from .charts import histogram as histogram
+from .charts import signals as signals
 from .inspection import Inspection as Inspection
+from .pages.comparison import comparison_text as comparison_text
 from .pages.comparison import write_comparison as write_comparison
 from .pages.inspection import write_histograms as write_histograms
 from .pages.report import write_report as write_report

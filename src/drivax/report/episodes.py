@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError
-from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable
-from drivax.evaluation.traffic_trajectories import unpacked
-from drivax.report.charts.motion import COMMANDED
+from drivax.evaluation.rollout import unpack_poses
+from drivax.report.charts import COMMANDED
 from drivax.report.pictures.drawing import Rollout
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
@@ -36,12 +37,9 @@ _SUCCESS_SHARE = 0.25
 
 @dataclass(frozen=True)
 class EpisodeGroup:
-    """The episodes of all runs in one scenario.
+    """The episodes of all runs in one scenario: a row of each run, None where it has none.
 
-    Attributes:
-        dataset, scenario_id: The scenario.
-        rows: Episode of that scenario in each run, None where the run lacks it.
-        outcome: Outcome of the policy: a kind of failure, or ``success``.
+    ``outcome`` is that of the policy: a kind of failure, or ``success``.
     """
 
     dataset: str
@@ -71,8 +69,8 @@ def worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> list[
 
     Among equals those come first that more of the other runs completed without failure, then by scenario id.
     """
-    order = [words for words, _, _ in FAILURES]
-    rank = {words: place for place, words in enumerate([*order, "unjudged", "success"])}
+    order = (*(words for words, _, _ in FAILURES), "unjudged", "success")
+    rank = {words: place for place, words in enumerate(order)}
     completed: Counter[ScenarioKey] = Counter()
     for other in others:
         if comparable(run, other):
@@ -96,18 +94,12 @@ def choose(runs: Sequence[EpisodeTable], count: int) -> list[EpisodeGroup]:
     kinds: dict[str, list[EpisodeGroup]] = {}
     for group in ranked(runs):
         kinds.setdefault(group.outcome, []).append(group)
-    successes = sorted(
-        kinds.pop("success", []), key=lambda group: (_completed(runs, group), group.scenario_id)
-    )
-    failures = _in_turn(list(kinds.values()))
+    successes = kinds.pop("success", [])
+    successes.sort(key=lambda group: (_completed(runs, group), group.scenario_id))
+    in_turn = zip_longest(*kinds.values())  # the first of each kind, then the second of each, and so on
+    failures = [group for turn in in_turn for group in turn if group is not None]
     most = max(count - len(successes), count - round(_SUCCESS_SHARE * count))
     return (failures[:most] + successes[: count - min(most, len(failures))])[:count]
-
-
-def _in_turn(kinds: list[list[EpisodeGroup]]) -> list[EpisodeGroup]:
-    """Return the first of each kind, then the second of each, and so on."""
-    longest = max(map(len, kinds), default=0)
-    return [groups[place] for place in range(longest) for groups in kinds if place < len(groups)]
 
 
 def _completed(runs: Sequence[EpisodeTable], group: EpisodeGroup) -> int:
@@ -129,10 +121,7 @@ def ranked(runs: Sequence[EpisodeTable]) -> list[EpisodeGroup]:
 
 def _first_rows(run: EpisodeTable) -> dict[ScenarioKey, int]:
     """Return the first episode of each scenario."""
-    rows: dict[ScenarioKey, int] = {}
-    for row, key in enumerate(run.scenarios):
-        rows.setdefault(key, row)
-    return rows
+    return {key: row for row, key in reversed([*enumerate(run.scenarios)])}
 
 
 def _value(run: EpisodeTable, metric: str, row: int) -> float:
@@ -141,21 +130,12 @@ def _value(run: EpisodeTable, metric: str, row: int) -> float:
 
 
 class EvaluatedSet:
-    """The scenarios of an evaluation.
-
-    Args:
-        run: The evaluation.
-        data: Path of its scenario set, if it has moved.
-
-    Raises:
-        DataError: The set is missing, or has another hash.
-    """
+    """The scenarios of an evaluation, opened by :meth:`EpisodeTable.open_set`."""
 
     def __init__(self, run: EpisodeTable, data: Path | None = None) -> None:
         self.scenarios: ScenarioSet = run.open_set(data)
-        self._rows = {
-            (entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(self.scenarios.entries)
-        }
+        entries = enumerate(self.scenarios.entries)
+        self._rows = {(entry["dataset"], entry["scenario_id"]): row for row, entry in entries}
 
     def scenario(self, key: ScenarioKey) -> Scenario:
         """Return a scenario by data set and id.
@@ -163,17 +143,12 @@ class EvaluatedSet:
         Raises:
             DataError: It is not in the set.
         """
-        row = self._rows.get(key)
-        if row is None:
-            raise DataError(
-                "is not in the scenario set",
-                file=self.scenarios.path,
-                record=key[1],
-                cure="pass the set that was evaluated with --data SET",
-            )
-        return self.scenarios[row]
+        if key not in self._rows:
+            cure = "pass the set that was evaluated with --data SET"
+            raise DataError("is not in the scenario set", file=self.scenarios.path, record=key[1], cure=cure)
+        return self.scenarios[self._rows[key]]
 
-    def tags(self) -> dict[ScenarioKey, Mapping[str, str]]:
+    def tags(self) -> Tags:
         """Return the tags of every scenario."""
         return {key: self.scenarios.entries[row]["tags"] for key, row in self._rows.items()}
 
@@ -200,7 +175,7 @@ def _rollout(run: EpisodeTable, row: int, scenario: Scenario) -> Rollout:
     others = None
     if stored.others is not None:
         others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
-        others[start : start + len(motion)] = unpacked(stored.others[row, : steps - start])
+        others[start : start + len(motion)] = unpack_poses(stored.others[row, : steps - start])
     return Rollout(run.name, ego, start, events, outcome(run, row), action, others)
 
 

@@ -1,10 +1,14 @@
-"""Contents of scenario sets as numbers: opened, tested, selected and summed up for tables and pages."""
+"""Contents of scenario sets as numbers, and the tables of ``drivax inspect``: one set, or several side by side."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from itertools import groupby
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError
+from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
+from drivax.report.charts import short
 from drivax.scenario.schema import DT_S, Scenario
 from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
+from drivax.table import MISSING, Cell, Column, Table
 
 Array = np.ndarray[Any, Any]
 Entry = Mapping[str, Any]
@@ -35,14 +42,10 @@ def described(entry: Entry) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Inspection:
-    """An opened scenario set.
+    """An opened scenario set, with the rows of its selected scenarios (at least one).
 
-    Attributes:
-        name: Its name in tables.
-        scenarios: The set.
-        rows: Rows of the selected scenarios, at least one.
-        unknown: Number of scenarios that lack what a filter asks for, by filter.
-        checked: Whether every checksum was tested.
+    ``unknown`` has the number of scenarios that lack what a filter asks for, by filter; ``checked`` says whether every
+    checksum was tested.
     """
 
     name: str
@@ -53,12 +56,7 @@ class Inspection:
 
     @classmethod
     def open(cls, path: Path, selection: Selection, check: bool = True) -> Inspection:
-        """Open a set.
-
-        Args:
-            path: Its folder.
-            selection: Which scenarios to look at.
-            check: Read the whole set and test every checksum.
+        """Open a set; ``check`` reads all of it and tests every checksum.
 
         Raises:
             DataError: The set is damaged, or no scenario is selected.
@@ -66,16 +64,13 @@ class Inspection:
         scenarios = ScenarioSet.open(path, verify=check)
         if check:
             scenarios.check()
-        rows = tuple(selection.rows(scenarios.entries))
-        unknown = selection.unknown(scenarios.entries)
+        rows, unknown = tuple(selection.rows(scenarios.entries)), selection.unknown(scenarios.entries)
         if not rows:
             text = " and ".join(condition.text for condition in selection.filters)
             lacking = ", ".join(f"{count:,} lack what {name!r} asks for" for name, count in unknown.items())
-            raise DataError(
-                f"none of {len(scenarios):,} scenarios has {text}" + (f" ({lacking})" if lacking else ""),
-                file=path,
-                cure="drivax inspect without --filter shows what there is",
-            )
+            problem = f"none of {len(scenarios):,} scenarios has {text}{f' ({lacking})' if lacking else ''}"
+            cure = "drivax inspect without --filter shows what there is"
+            raise DataError(problem, file=path, cure=cure)
         return cls(path.resolve().name, scenarios, rows, unknown, check)
 
     def __len__(self) -> int:
@@ -88,7 +83,7 @@ class Inspection:
 
     @property
     def source(self) -> Mapping[str, Any]:
-        """The origin of the set, and what was read and left out; empty for sets that were written by hand."""
+        """Origin of the set, and what was read and left out; empty for sets that were written by hand."""
         return self.scenarios.manifest["source"]
 
     def sample(self, most: int | None = None) -> Iterator[Scenario]:
@@ -153,18 +148,6 @@ class Inspection:
         return [value for value in values if value is not None]
 
 
-def _counted(name: str) -> Callable[[Entry], Any]:
-    return lambda entry: entry["source"][name]
-
-
-def _mapped(name: str) -> Callable[[Entry], Any]:
-    return lambda entry: entry["source"]["map_features"].get(name, 0)
-
-
-def _audited(name: str) -> Callable[[Entry], Any]:
-    return lambda entry: entry["audit"].get(name)
-
-
 @dataclass(frozen=True)
 class Quantity:
     """A number of a scenario in tables and histograms."""
@@ -173,35 +156,34 @@ class Quantity:
     unit: str
     read: Callable[[Entry], Any]
 
+    @classmethod
+    def of(cls, label: str, *keys: str, unit: str = "", default: int | None = None) -> Quantity:
+        """Return the quantity at nested keys of an entry; ``default`` where the last key is missing."""
+        *path, name = keys
+        return cls(label, unit, lambda entry: reduce(getitem, path, entry).get(name, default))
+
 
 #: Numbers of every scenario: of its source, before cropping and capping, and of its audit.
 QUANTITIES = (
-    Quantity("agents now", "", _counted("tracks_valid_now")),
-    Quantity("tracks", "", _counted("tracks")),
-    Quantity("steps", "", _counted("steps")),
-    Quantity("lanes", "", _mapped("lane")),
-    Quantity("road lines", "", _mapped("road_line")),
-    Quantity("road edges", "", _mapped("road_edge")),
-    Quantity("crosswalks", "", _mapped("crosswalk")),
-    Quantity("stop signs", "", _mapped("stop_sign")),
-    Quantity("map points", "", _counted("map_points")),
-    Quantity("stored segments", "", lambda entry: entry["segments"]),
-    Quantity("lights", "", _counted("lights")),
-    Quantity("ego drives", "m", _audited("distance_m")),
-    Quantity("log to route, mean", "m", _audited("route_deviation_mean_m")),
-    Quantity("log to route, most", "m", _audited("route_deviation_max_m")),
+    Quantity.of("agents now", "source", "tracks_valid_now"),
+    Quantity.of("tracks", "source", "tracks"),
+    Quantity.of("steps", "source", "steps"),
+    *(
+        Quantity.of(f"{name.replace('_', ' ')}s", "source", "map_features", name, default=0)
+        for name in ("lane", "road_line", "road_edge", "crosswalk", "stop_sign")
+    ),
+    Quantity.of("map points", "source", "map_points"),
+    Quantity.of("stored segments", "segments"),
+    Quantity.of("lights", "source", "lights"),
+    Quantity.of("ego drives", "audit", "distance_m", unit="m"),
+    Quantity.of("log to route, mean", "audit", "route_deviation_mean_m", unit="m"),
+    Quantity.of("log to route, most", "audit", "route_deviation_max_m", unit="m"),
 )
 
 
 @dataclass(frozen=True)
 class Speeds:
-    """Speeds in sampled scenarios, m/s.
-
-    Attributes:
-        ego: Ego at every step of its log.
-        vehicles: Other moving vehicles at the current step.
-        scenarios: Number of sampled scenarios.
-    """
+    """Speeds in sampled scenarios, m/s: ego's at every step of its log, other moving vehicles' at the current step."""
 
     ego: Float[Array, " step"]
     vehicles: Float[Array, " vehicle"]
@@ -210,12 +192,256 @@ class Speeds:
 
 def speeds(inspection: Inspection) -> Speeds:
     """Return speeds from the records of a sample."""
-    ego, vehicles = [np.zeros(0)], [np.zeros(0)]
-    count = 0
-    for count, scenario in enumerate(inspection.sample(), 1):  # noqa: B007
+    ego, vehicles = [], []
+    for scenario in inspection.sample():
         speed = np.linalg.norm(scenario.agent_velocity, axis=-1)
         valid, now = scenario.agent_valid, int(scenario.current_step)
         ego.append(speed[valid[:, 0], 0])
         others = valid[now, 1:] & (scenario.agent_kind[1:] == 1)
         vehicles.append(speed[now, 1:][others])
-    return Speeds(np.concatenate(ego), np.concatenate(vehicles), count)
+    ego_mps, vehicles_mps = (np.concatenate(values, dtype=np.float64) for values in (ego, vehicles))
+    return Speeds(ego_mps, vehicles_mps, len(ego))
+
+
+#: Maximum numbers of listed scenarios, named values of a tag, sets per table, and causes of unreadable records.
+LISTED, NAMED, ACROSS, _CAUSES = 30, 6, 4, 3
+#: A label and one text per set.
+Row = tuple[str, list[str]]
+
+
+def overview(inspection: Inspection) -> Table:
+    """Return the facts of a set: counts, size, tags, flags, overflow."""
+    scenarios, count = inspection.scenarios, len(inspection)
+    manifest, capacity = scenarios.manifest, scenarios.capacity
+    segments = f"recorded segments: {inspection.recordings:,}, shards: {len(manifest['shards']):,}"
+    rows = [("set", str(scenarios.path)), ("scenarios", f"{_selected(inspection)} ({segments})")]
+    unknown = inspection.unknown.items()
+    rows += [("", f"{lacking:,} lack what {name!r} asks for and are left out") for name, lacking in unknown]
+    size = f"{inspection.megabytes:,.1f} MB, {manifest['record_bytes'] / 1e3:,.0f} kB per scenario"
+    sizes = (
+        f"{capacity.name}: {capacity.agents} moving and {capacity.parked} parked agents, {capacity.segments:,} map "
+        f"segments, {capacity.lanes} lanes, {capacity.lights} lights"
+    )
+    rows += [
+        ("data sets", _counted(inspection.words(lambda entry: [entry["dataset"]]), count)),
+        ("duration", f"{_hours(inspection)} at {_rate(inspection)}"),
+        ("size", size),
+        ("capacity", sizes),
+        ("written by", f"drivax {manifest['drivax_version']}, schema {manifest['schema_version']}"),
+        *_left_out(inspection.source),
+        *((name, _counted(values, count)) for name, values in inspection.tags().items()),
+        ("flags", _counted(inspection.words(lambda entry: entry["flags"]), count)),
+        ("did not fit", _totals(inspection.totals(lambda entry: entry["overflow"]))),
+        ("left out", _totals(inspection.totals(lambda entry: entry["source"].get("lost", {})))),
+        ("integrity", "every checksum is right" if inspection.checked else "not tested (--no-check)"),
+    ]
+    return _table("overview", ["", ""], [(label, [text]) for label, text in rows], left=True)
+
+
+def _left_out(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield what a conversion read and did not store: counts, and the first causes."""
+    bad, filtered = source.get("skipped_records", []), source.get("filtered", 0)
+    if bad:
+        yield "skipped", f"{len(bad):,} record{'s' if len(bad) > 1 else ''} that could not be converted"
+    for row in bad[:_CAUSES]:
+        record = "" if row["record"] is None else f"record {row['record']}: "
+        yield "", f"{row['file']}: {record}{row['problem']}"
+    if len(bad) > _CAUSES:
+        yield "", f"{len(bad) - _CAUSES:,} more in manifest.json"
+    if filtered:
+        filters = " and ".join(source["filters"])
+        yield "filtered", f"{filtered:,} scenario{'s' if filtered > 1 else ''} left out by {filters}"
+
+
+def audit_table(inspection: Inspection) -> Table | None:
+    """Return the findings of the log replay; None where no scenario was audited."""
+    names = inspection.findings()
+    if not names:
+        return None
+    columns = (Column("audit", label=True), Column("found", left=True), Column("n"))
+    values = {name: inspection.finding(name) for name in names}
+    rows = ((name, finding_text(known), f"{len(known):,}") for name, known in values.items())
+    return Table("audit", columns, tuple(tuple(map(Cell, row)) for row in rows))
+
+
+def finding_text(values: Sequence[Any]) -> str:
+    """Return booleans as a count, numbers as mean, median and largest, words as counts."""
+    if not values:
+        return MISSING
+    if all(isinstance(value, bool) for value in values):
+        return f"{sum(values):,} of {len(values):,} ({_percent(sum(values), len(values))})"
+    if all(isinstance(value, str) for value in values):
+        return _counted({word: values.count(word) for word in sorted(set(values))}, len(values))
+    numbers = np.array(values, np.float64)
+    return f"mean {short(numbers.mean())}, median {short(np.median(numbers))}, most {short(numbers.max())}"
+
+
+def listing(inspection: Inspection) -> Table:
+    """Return the first scenarios with the counts of their source."""
+    names = ("steps", "tracks", "now", "lanes", "lines", "edges", "others", "points", "lights", "segments")
+    columns = (Column("scenario", label=True, most=24), *map(Column, names))
+    listed = inspection.entries[:LISTED]
+    rows = ((entry["scenario_id"], *(f"{count:,}" for count in _counts(entry))) for entry in listed)
+    return Table("scenarios", columns, tuple(tuple(map(Cell, row)) for row in rows))
+
+
+def _counts(entry: Entry) -> tuple[int, ...]:
+    source, kinds = entry["source"], entry["source"]["map_features"]
+    shown = [kinds.get(name, 0) for name in ("lane", "road_line", "road_edge")]
+    first = [source[name] for name in ("steps", "tracks", "tracks_valid_now")]
+    others = sum(kinds.values()) - sum(shown)
+    return (*first, *shown, others, source["map_points"], source["lights"], entry["segments"])
+
+
+def comparison(inspections: Sequence[Inspection]) -> list[Table]:
+    """Return several sets side by side, ``ACROSS`` per table: sizes, averages per scenario, shares of tags."""
+    groups = [inspections[first : first + ACROSS] for first in range(0, len(inspections), ACROSS)]
+    return [content_table(group, _share_rows(group), most=24) for group in groups]
+
+
+def content_table(inspections: Sequence[Inspection], more: Sequence[Row] = (), **columns: Any) -> Table:
+    """Return sizes of sets and averages of their scenarios, one column per set."""
+    rows: list[Row] = [
+        (label, [text(inspection) for inspection in inspections]) for label, text in _CONTENT.items()
+    ]
+    for quantity in QUANTITIES:
+        known = [inspection.values(quantity.read) for inspection in inspections]
+        label = f"{quantity.label}, {quantity.unit}" if quantity.unit else quantity.label
+        rows.append((label, [short(values.mean()) if len(values) else MISSING for values in known]))
+    names = ["", *(inspection.name for inspection in inspections)]
+    return _table("sets", names, [*rows, *more], **columns)
+
+
+#: Rows of the table of contents before the quantities.
+_CONTENT: Mapping[str, Callable[[Inspection], str]] = {
+    "scenarios": lambda of_set: _selected(of_set),
+    "recordings": lambda of_set: f"{of_set.recordings:,}",
+    "data sets": lambda of_set: ", ".join(of_set.words(lambda entry: [entry["dataset"]])),
+    "places": lambda of_set: _places(of_set),
+    "duration": lambda of_set: _hours(of_set),
+    "rate": lambda of_set: _rate(of_set),
+    "skipped": lambda of_set: f"{of_set.source.get('skipped', 0):,}",
+    "MB": lambda of_set: f"{of_set.megabytes:,.1f}",
+}
+
+
+def _table(name: str, headings: Sequence[str], rows: Sequence[Row], **columns: Any) -> Table:
+    """Return a table of texts under one label column."""
+    heads = (Column(headings[0], label=True), *(Column(heading, **columns) for heading in headings[1:]))
+    return Table(name, heads, tuple((Cell(label), *map(Cell, texts)) for label, texts in rows))
+
+
+def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
+    """Return shares of scenarios with a finding, a value of a tag, a flag."""
+    sizes = [len(inspection) for inspection in inspections]
+    rows = _percents("", true_findings(inspections))
+    tagged = [inspection.tags() for inspection in inspections]
+    for name in dict.fromkeys(name for tags in tagged for name in tags if name != "place"):
+        counts = [tags.get(name, {}) for tags in tagged]
+        shares = of_all(counts, sizes)
+        if len(shares) > 2 * NAMED:
+            rows.append((name, [f"{len(of_set):,} values" if of_set else MISSING for of_set in counts]))
+        else:
+            rows += _percents(f"{name} ", shares)
+    flags = [inspection.words(lambda entry: entry["flags"]) for inspection in inspections]
+    return rows + _percents("flag ", of_all(flags, sizes))
+
+
+#: Per value, ``(count, of)`` for each set.
+Counts = dict[str, list[tuple[int, int]]]
+
+
+def true_findings(inspections: Sequence[Inspection]) -> Counts:
+    """Return for each yes-or-no finding of the audit in how many of how many scenarios it is true."""
+    findings = {}
+    for name in dict.fromkeys(name for inspection in inspections for name in inspection.findings()):
+        known = [inspection.finding(name) for inspection in inspections]
+        if any(isinstance(value, bool) for values in known for value in values):
+            findings[name] = [(sum(map(bool, values)), len(values)) for values in known]
+    return findings
+
+
+def of_all(counts: Sequence[Mapping[str, int]], sizes: Sequence[int]) -> Counts:
+    """Return the counts of each value with the sizes of the sets."""
+    values = dict.fromkeys(value for of_set in counts for value in of_set)
+    return {
+        value: [(of_set.get(value, 0), size) for of_set, size in zip(counts, sizes, strict=True)]
+        for value in values
+    }
+
+
+def _percents(prefix: str, counts: Counts) -> list[Row]:
+    return [(prefix + value, [_percent(*count) for count in sets]) for value, sets in counts.items()]
+
+
+def _percent(count: int, of: int) -> str:
+    return f"{100 * count / of:.3g} %" if of else MISSING
+
+
+def _selected(inspection: Inspection) -> str:
+    count, whole = len(inspection), len(inspection.scenarios)
+    return f"{count:,}" if count == whole else f"{count:,} of {whole:,}"
+
+
+def _hours(inspection: Inspection) -> str:
+    hours = inspection.hours
+    return f"{short(hours)} h" if hours >= 1 else f"{short(60 * hours)} min"
+
+
+def _rate(inspection: Inspection) -> str:
+    low, high = inspection.rate_hz()
+    return f"{low:.3g} Hz" if high - low < 0.05 else f"{low:.3g} to {high:.3g} Hz"
+
+
+def _places(inspection: Inspection) -> str:
+    places = inspection.words(lambda entry: [entry["tags"]["place"]] if "place" in entry["tags"] else [])
+    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
+    return ", ".join(list(places)[:NAMED]) + more if places else MISSING
+
+
+def _counted(counts: Mapping[str, int], of: int) -> str:
+    shown = list(counts.items())[: 2 * NAMED]
+    texts = [name if count == of else f"{name} ({count:,} of {of:,})" for name, count in shown]
+    more = len(counts) - len(texts)
+    return ", ".join(texts) + (f" and {more:,} more" if more else "") or "none"
+
+
+def _totals(totals: Mapping[str, tuple[int, int]]) -> str:
+    texts = [f"{name} {count:,} (in {scenarios:,})" for name, (count, scenarios) in totals.items()]
+    return ", ".join(texts) or "nothing"
+
+
+def observation_overview(statistics: ObservationStatistics) -> str:
+    """Return the size of the statistics in one line, with the number of NaN or infinite entries."""
+    broken = f"{statistics.broken:,} entries are NaN or infinite"
+    return (
+        f"{statistics.states:,} states of {statistics.episodes:,} episodes of {statistics.planner}, "
+        f"{statistics.collisions:,} with a collision; {broken if statistics.broken else 'every number is finite'}"
+    )
+
+
+def observation_table(statistics: ObservationStatistics) -> Table:
+    """Return a row per column of each group, under a row for the group."""
+    names = ["n", "mean", "std", "min", "max", "NaN, Inf", "r collision"]
+    names += ["importance"] if statistics.permuted else []
+    rows = []
+    for group, features in groupby(statistics.features, lambda feature: feature.group):
+        empty = (Cell(""),) * (len(names) - 1)
+        last = statistics.groups[group] if statistics.permuted else math.nan
+        rows.append((Cell(group, style="group"), *empty, Cell(_decimal(last))))
+        for feature in features:
+            texts = _feature_texts(feature)[: len(names)]
+            rows.append((Cell(f"  {feature.name}"), *map(Cell, texts)))
+    columns = (Column("feature", label=True), *map(Column, names))
+    return Table("observations", columns, tuple(rows))
+
+
+def _feature_texts(feature: FeatureStatistics) -> list[str]:
+    numbers = map(_decimal, (feature.mean, feature.std, feature.low, feature.high))
+    broken = f"{feature.broken:,}" if feature.broken else ""
+    return [f"{feature.count:,}", *numbers, broken, *map(_decimal, (feature.collision, feature.importance))]
+
+
+def _decimal(value: float) -> str:
+    """Return a number with two decimals; empty for NaN."""
+    return "" if math.isnan(value) else f"{value:.2f}".replace("-0.00", "0.00")

@@ -36,8 +36,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
         raise UsageError("name every run once, and at least one", cure="drivax report RUN [RUN ...]")
     evaluations, trainings = [], []
     # A training and the evaluation of its policy may share a name: no table holds both.
-    names: set[str] = set()
-    charts: set[str] = set()
+    names, charts = set[str](), set[str]()
     for folder in folders:
         run = RunFolder.open(folder)
         if run.kind == "training":
@@ -48,11 +47,9 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
             _ = table.trajectories  # read now, so that damage is reported before any work
             evaluations.append(table)
         else:
-            raise DataError(
-                f"is of kind {run.kind!r}, not evaluation or training",
-                file=folder / "run.json",
-                cure="give folders written by drivax evaluate or drivax train",
-            )
+            problem = f"is of kind {run.kind!r}, not evaluation or training"
+            cure = "give folders written by drivax evaluate or drivax train"
+            raise DataError(problem, file=folder / "run.json", cure=cure)
     return evaluations, trainings
 
 

@@ -2,25 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation.episode_table import ADDED, EpisodeTable, ScenarioKey
+from drivax.evaluation import tables
+from drivax.evaluation.episode_table import ADDED, EpisodeTable, Tags
 from drivax.evaluation.pairing import comparable
-from drivax.evaluation.tables import (
-    STRATA,
-    collisions_table,
-    differences_table,
-    headline,
-    metric_names,
-    ordered,
-    results_table,
-    set_key,
-    strata_table,
-    summarise,
-    transfer_table,
-)
 from drivax.files import check_output, write_text
 from drivax.metrics.catalogue import METRICS, SETS
 from drivax.report.episodes import EvaluatedSet
@@ -33,27 +21,18 @@ KEY_METRICS = (
 )  # fmt: skip
 #: Metrics of a transfer matrix.
 TRANSFERRED = ("success", "vmax_score")
-Tags = Mapping[ScenarioKey, Mapping[str, str]]
 
 
 def write_tables(
-    runs: Sequence[Path],
-    out: Path,
-    data: Path | None = None,
-    overwrite: bool = False,
-    metrics: Sequence[str] = (),
-) -> list[Path]:
+    runs: Sequence[Path], out: Path, data: Path | None = None, overwrite: bool = False, metrics: Sequence[str] = ()
+) -> list[Path]:  # fmt: skip
     """Write every table of a report into a folder, each as ``.csv``, ``.md`` and ``.tex``; returns the files.
 
     ``results`` and, of several runs, ``differences``; ``collisions`` where kinds of collision are known; ``by-TAG`` for
     the tags of the scenarios; ``transfer-METRIC`` where runs were evaluated on several data sets.
 
-    Args:
-        runs: Run folders; the last evaluation is the policy.
-        out: The folder.
-        data: The scenario set of the evaluation, where it has moved.
-        overwrite: Replace existing files.
-        metrics: Further metrics (columns of ``episodes.csv``, or a set) for ``results``, ``differences``, ``by-TAG``.
+    The last evaluation is the policy. ``data`` is its scenario set, where it has moved; ``metrics`` are further columns
+    of ``episodes.csv``, or a set of metrics, for ``results``, ``differences`` and ``by-TAG``.
 
     Raises:
         DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.
@@ -61,9 +40,8 @@ def write_tables(
     """
     texts = {}
     for table in _tables(read_evaluations(runs), data, metrics):
-        texts[f"{table.name}.csv"] = table.csv()
-        texts[f"{table.name}.md"] = table.markdown()
-        texts[f"{table.name}.tex"] = table.latex()
+        kinds = {"csv": table.csv(), "md": table.markdown(), "tex": table.latex()}
+        texts |= {f"{table.name}.{kind}": text for kind, text in kinds.items()}
     for name in texts:
         check_output(out / name, overwrite)
     for name, text in texts.items():
@@ -77,28 +55,28 @@ def exported_metrics(runs: Sequence[EpisodeTable], more: Sequence[str] = ()) -> 
     Raises:
         UsageError: No run has such a column.
     """
-    names = ordered(metric_names(runs))
+    names = tables.ordered(tables.metric_names(runs))
     requested = {"progress"}
     for entry in more:
         if entry not in SETS and entry not in names:
             raise UsageError(f"no run has a mean of {entry!r}", cure=did_you_mean(entry, names))
         requested.update(SETS.get(entry, (entry,)))
-    first = headline(names)
+    first = tables.headline(names)
     rest = [name for name in names if name in requested or name not in (*METRICS, *ADDED)]
     return [*first, *(name for name in rest if name not in first)] or names
 
 
 def _tables(runs: Sequence[EpisodeTable], data: Path | None, more: Sequence[str]) -> list[Table]:
     usual, metrics = exported_metrics(runs), exported_metrics(runs, more)
-    tables = [results_table(runs, metrics)]
+    results = [tables.results_table(runs, metrics)]
     if len(runs) > 1:
         others = [run for run in runs[:-1] if comparable(runs[-1], run)]
-        tables.append(differences_table(runs[-1], others, metrics))
+        results.append(tables.differences_table(runs[-1], others, metrics))
     if any("collision_type" in run.metrics for run in runs):
-        tables.append(collisions_table(runs))
+        results.append(tables.collisions_table(runs))
     added = [name for name in metrics if name not in usual]
-    tables += strata_tables(runs, EvaluatedSet(runs[-1], data).tags(), added)
-    return tables + transfer_tables(runs)
+    results += strata_tables(runs, EvaluatedSet(runs[-1], data).tags(), added)
+    return results + transfer_tables(runs)
 
 
 def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, more: Sequence[str] = ()) -> list[Table]:
@@ -107,12 +85,12 @@ def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, more: Sequence[str] 
     known = {name for values in tags.values() for name in values}
     names = dict.fromkeys((*KEY_METRICS, *more))
     metrics = [name for name in names if any(name in run.metrics for run in evaluated)]
-    return [strata_table(evaluated, tags, tag, metrics) for tag in STRATA if tag in known]
+    return [tables.strata_table(evaluated, tags, tag, metrics) for tag in tables.STRATA if tag in known]
 
 
 def transfer_tables(runs: Sequence[EpisodeTable]) -> list[Table]:
     """Return a matrix of training and evaluation data for each metric; none where all runs share one set."""
-    if len({set_key(run.data) for run in runs}) < 2:
+    if len({tables.set_key(run.data) for run in runs}) < 2:
         return []
-    known = [name for name in TRANSFERRED if any(summarise(run, name).n for run in runs)]
-    return [transfer_table(runs, name) for name in known]
+    known = [name for name in TRANSFERRED if any(tables.summarise(run, name).n for run in runs)]
+    return [tables.transfer_table(runs, name) for name in known]

@@ -3,8 +3,8 @@
 A configuration record holds scalars, strings, literals, paths, tuples, other records, and unions of records, which
 carry a ``kind`` key in YAML (:func:`kind_of`). Missing keys keep the defaults of the enclosing record. In a record with
 presets (a class method ``preset(name)``) the key ``preset`` names one to start from. An unknown key or a value of the
-wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. YAML follows the 1.2
-core rules: ``3e-4`` is a number and ``no`` is a string. A class variable ``renamed`` maps former keys to present ones.
+wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. A class variable
+``renamed`` maps former keys to present ones.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.settings.structure import Flag, kind_of, plain, structure
-from drivax.settings.text import parse_yaml, write_yaml
+from drivax.settings.structure import Flag, kind_of, parse_yaml, plain, structure, write_yaml
 
 __all__ = ["dump", "kind_of", "load", "parse_yaml", "plain", "preset", "presets"]
 
@@ -53,11 +52,7 @@ def dump(record: Any) -> str:
 
 
 def preset(name: str) -> Path:
-    """Return the path of the packaged configuration file ``configs/<name>.yaml``.
-
-    Raises:
-        UsageError: Unknown name.
-    """
+    """Return the path of the packaged configuration file ``configs/<name>.yaml``; UsageError for an unknown name."""
     names = presets()
     if name not in names:
         raise UsageError(f"no preset or file {name!r}", cure=did_you_mean(name, names))
@@ -83,13 +78,11 @@ def _find(source: str | Path) -> Path:
         return path
     # A folder may have the name of a preset: `drivax demo` writes one called demo.
     if path.is_dir() and source not in presets():
-        raise UsageError(
-            "not a configuration file but a folder", file=path, cure="name a .yaml file or a preset"
-        )
+        problem = "not a configuration file but a folder"
+        raise UsageError(problem, file=path, cure="name a .yaml file or a preset")
     if isinstance(source, Path) or path.suffix in (".yaml", ".yml"):
-        raise UsageError(
-            "file not found", file=path, cure=f"name a file or a preset ({', '.join(presets())})"
-        )
+        cure = f"name a file or a preset ({', '.join(presets())})"
+        raise UsageError("file not found", file=path, cure=cure)
     return preset(source)
 
 
@@ -103,16 +96,15 @@ def _read(file: Path) -> str:
 def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     for path, text in _pairs(overrides):
         *parents, last = path
-        place = values
+        section = values
         for name in parents:
-            inner = place.get(name)
-            if not isinstance(inner, dict):
-                # A record that is missing, null or set by a flag starts from its defaults.
-                inner = place[name] = {}
-            place = inner
-        if last == "kind" and str(place.get("kind")) != text:
-            place.clear()
-        place[last] = Flag(text)
+            # A record that is missing, null or set by a flag starts from its defaults.
+            if not isinstance(section.get(name), dict):
+                section[name] = {}
+            section = section[name]
+        if last == "kind" and str(section.get("kind")) != text:
+            section.clear()
+        section[last] = Flag(text)
     return values
 
 

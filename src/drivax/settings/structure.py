@@ -1,4 +1,7 @@
-"""Plain values to configuration records and back; errors name the dotted path of the wrong value."""
+"""YAML to plain values to configuration records and back; errors name the line, or the dotted path of the wrong value.
+
+YAML follows the 1.2 core rules: ``3e-4`` is a number, ``no`` a string, ``010`` ten; duplicate keys are errors.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +15,21 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 import cattrs
+import yaml
 from cattrs.errors import ClassValidationError, ForbiddenExtraKeysError, IterableValidationError
 from cattrs.gen import make_dict_structure_fn
 
 from drivax.errors import DrivaxError, UsageError, did_you_mean
 from drivax.plugins import check_arguments, check_protocol, dotted_name, find_named, is_dotted
-from drivax.settings.text import parse_yaml
 
 _UNIONS = (Union, types.UnionType)
+#: Types of values that are accepted for a scalar, and its name in messages.
+_SCALARS: dict[Any, tuple[Any, str]] = {
+    bool: (bool, "true or false"),
+    int: (int, "a whole number"),
+    float: (int | float, "a number"),
+    type(None): (type(None), "null"),
+}
 
 
 class _Problem(ValueError):
@@ -38,11 +48,7 @@ class Flag(str):
 
 
 def structure(values: Any, cls: Any) -> Any:
-    """Return an instance of ``cls`` from plain values.
-
-    Raises:
-        ValueError: ``path: problem; cure`` of the first wrong value.
-    """
+    """Return an instance of ``cls`` from plain values; ValueError ``path: problem; cure`` of the first wrong value."""
     try:
         return _converter().structure(values, cls)
     except Exception as error:
@@ -76,26 +82,14 @@ def _refuse(value: Any, expected: str) -> ValueError:
     return ValueError(f"{str(value) if isinstance(value, Flag) else value!r} is not {expected}")
 
 
-def _to_bool(value: Any, _: Any) -> bool:
-    if not isinstance(result := _value(value), bool):
-        raise _refuse(value, "true or false")
-    return result
-
-
-def _to_int(value: Any, _: Any) -> int:
+def _to_scalar(value: Any, cls: Any) -> Any:
     result = _value(value)
-    if isinstance(result, float) and result.is_integer():
-        return int(result)  # steps: 25e6
-    if isinstance(result, bool) or not isinstance(result, int):
-        raise _refuse(value, "a whole number")
-    return result
-
-
-def _to_float(value: Any, _: Any) -> float:
-    result = _value(value)
-    if isinstance(result, bool) or not isinstance(result, int | float):
-        raise _refuse(value, "a number")
-    return float(result)
+    if cls is int and isinstance(result, float) and result.is_integer():
+        result = int(result)  # steps: 25e6
+    accepted, name = _SCALARS[cls]
+    if isinstance(result, bool) != (cls is bool) or not isinstance(result, accepted):
+        raise _refuse(value, name)
+    return float(result) if cls is float else result
 
 
 def _to_str(value: Any, _: Any) -> str:
@@ -106,11 +100,6 @@ def _to_str(value: Any, _: Any) -> str:
 
 def _to_path(value: Any, _: Any) -> Path:
     return Path(value if isinstance(value, Path) else _to_str(value, None))
-
-
-def _to_none(value: Any, _: Any) -> None:
-    if _value(value) is not None:
-        raise _refuse(value, "null")
 
 
 def _to_literal(value: Any, cls: Any) -> Any:
@@ -172,23 +161,17 @@ def _kind(value: Any) -> Any:
 
 
 def _to_own(value: Any, cls: Any) -> Any:
-    """Return the user's own object: a dotted name, or a section whose kind is one.
-
-    A dataclass is built from the rest of the section; any other object is used as it is.
-    """
+    """Return the user's own object, named by a dotted name or the kind of a section, whose rest a dataclass takes."""
     value = _value(value)
     name = _kind(value)
     if not isinstance(name, str):
-        raise ValueError(
-            f"{value!r} is neither a dotted name (package.module:name) nor a section with such a kind"
-        )
+        expected = "a dotted name (package.module:name) nor a section with such a kind"
+        raise ValueError(f"{value!r} is neither {expected}")
     thing = find_named(name)
+    rest = {key: item for key, item in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
     if _is_record(thing):
-        rest = (
-            {key: item for key, item in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
-        )
         thing = _converter().structure(rest, thing)
-    elif isinstance(value, Mapping) and len(value) > 1:
+    elif rest:
         raise ValueError(f"{name!r} takes no settings; make it a frozen dataclass")
     if _is_protocol(cls):
         check_protocol(thing, name, cls)
@@ -221,9 +204,8 @@ def _to_record_of_kind(value: dict[str, Any], records: dict[str, Any]) -> Any:
 
 
 def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
-    build = make_dict_structure_fn(
-        cls, converter, _cattrs_forbid_extra_keys=True, _cattrs_detailed_validation=True
-    )
+    options: dict[str, Any] = {"_cattrs_forbid_extra_keys": True, "_cattrs_detailed_validation": True}
+    build = make_dict_structure_fn(cls, converter, **options)
 
     def hook(value: Any, _: Any) -> Any:
         value = {} if value is None else _value(value)
@@ -233,9 +215,8 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
                 raise ValueError(f"{value!r} is not a {cls.__name__}")
             return record
         if not isinstance(value, Mapping):
-            raise _refuse(
-                value, f"a section of settings ({', '.join(f.name for f in dataclasses.fields(cls))})"
-            )
+            names = ", ".join(field.name for field in dataclasses.fields(cls))
+            raise _refuse(value, f"a section of settings ({names})")
         renamed = getattr(cls, "renamed", {})
         value = {renamed.get(key, key): item for key, item in value.items()}
         if _names_preset(cls, value):
@@ -255,9 +236,7 @@ def _on_defaults(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
         default = field.default
         if field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
-        if not _is_record(type(default)):
-            continue
-        section = _value(given.get(field.name))
+        section = _value(given.get(field.name)) if _is_record(type(default)) else None
         if isinstance(section, Mapping):
             result[field.name] = _completed(_plain(default, hints[field.name]), default, section)
     return result
@@ -270,9 +249,8 @@ def _names_preset(cls: Any, given: Mapping[str, Any]) -> bool:
 
 
 def _completed(base: dict[str, Any], default: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    if "kind" in given and str(given["kind"]) != kind_of(type(default)):
-        return dict(given)
-    if _names_preset(type(default), given):
+    other_kind = "kind" in given and str(given["kind"]) != kind_of(type(default))
+    if other_kind or _names_preset(type(default), given):
         return dict(given)
     result = base | dict(given)
     for name, value in given.items():
@@ -302,9 +280,8 @@ def _is_open(cls: Any) -> bool:
 @functools.cache
 def _converter() -> cattrs.Converter:
     converter = cattrs.Converter()
-    for cls, hook in ((bool, _to_bool), (int, _to_int), (float, _to_float), (str, _to_str), (Path, _to_path)):
+    for cls, hook in {**dict.fromkeys(_SCALARS, _to_scalar), str: _to_str, Path: _to_path}.items():
         converter.register_structure_hook(cls, hook)
-    converter.register_structure_hook(type(None), _to_none)
     converter.register_structure_hook_func(lambda cls: get_origin(cls) is Literal, _to_literal)
     converter.register_structure_hook_func(lambda cls: cls is tuple or get_origin(cls) is tuple, _to_tuple)
     converter.register_structure_hook_func(lambda cls: get_origin(cls) in _UNIONS, _to_union)
@@ -370,3 +347,67 @@ def _item_type(declared: Any, number: int) -> Any:
             members = get_args(candidate)
             return members[0] if members[-1] is Ellipsis or len(members) <= number else members[number]
     return Any
+
+
+def parse_yaml(text: str, file: Path | None = None) -> Any:
+    """Return the plain values of a YAML text; raises UsageError with the line of invalid YAML or a duplicate key."""
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        problem = getattr(error, "problem", None) or "invalid"
+        place = "YAML" if mark is None else f"line {mark.line + 1}"
+        raise UsageError(f"{place}: {problem}", file=file, cure="fix the file") from error
+
+
+def write_yaml(values: Any) -> str:
+    """Return mappings, lists and scalars as YAML; :func:`parse_yaml` is the inverse."""
+    options: dict[str, Any] = {"sort_keys": False, "default_flow_style": None, "allow_unicode": True}
+    return yaml.dump(values, Dumper=_Dumper, width=100, **options)
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads YAML 1.2 core scalars and refuses duplicate keys."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str) or key in seen:
+                problem = "appears twice" if isinstance(key, str) else "is not a string"
+                mark = key_node.start_mark
+                raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} {problem}", mark)
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes strings that the loader would read as other types."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+_NUMBER = r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+_FLOAT = rf"^(?:{_NUMBER}|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+_RULES = (
+    ("tag:yaml.org,2002:bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
+    ("tag:yaml.org,2002:int", r"^[-+]?[0-9][0-9_]*$", "-+0123456789"),
+    ("tag:yaml.org,2002:float", _FLOAT, "-+.0123456789"),
+    ("tag:yaml.org,2002:null", r"^(?:~|null|Null|NULL|None|)$", ["~", "n", "N", ""]),
+)
+
+
+def _set_rules(cls: Any) -> None:
+    cls.yaml_implicit_resolvers = {}
+    for tag, pattern, first in _RULES:
+        cls.add_implicit_resolver(tag, re.compile(pattern), list(first))
+
+
+def _construct_int(loader: Any, node: Any) -> int:
+    return int(loader.construct_scalar(node))  # 010 is ten
+
+
+_set_rules(_Loader)
+_set_rules(_Dumper)
+_Loader.add_constructor("tag:yaml.org,2002:int", _construct_int)

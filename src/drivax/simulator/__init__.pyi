@@ -6,9 +6,9 @@ from .potentials import collision_potential as collision_potential
 from .potentials import fault_potential as fault_potential
 from .potentials import offroad_potential as offroad_potential
 from .simulator import Simulator as Simulator
+from .simulator import slots_of as slots_of
 from .starts import LogStart as LogStart
 from .starts import NoisyStart as NoisyStart
-from .together import slots_of as slots_of
 from .types import AgentContext as AgentContext
 from .types import Facts as Facts
 from .types import Frame as Frame

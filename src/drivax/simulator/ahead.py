@@ -1,4 +1,4 @@
-"""What a driver on its route has ahead: the nearest thing in the way, lights that ask to stop, the speed it wants."""
+"""What a driver has ahead on its route: the nearest obstacle, lights that require a stop, and the desired speed."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.scenario.bank.columns import LightRow, RouteColumn
-from drivax.scenario.bank.queries import LEVEL_M, route_ahead
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.queries import route_ahead
+from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
-from drivax.scenario.schema import LightState
+from drivax.simulator.contact import others_on_level
 from drivax.simulator.idm import IdmParameters, idm_acceleration
+from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.traffic.corridor import FREE_M, LEAST_GAP_M, closest, reaching
 from drivax.simulator.types import AgentContext, Frame
 
@@ -20,53 +21,41 @@ _STEP_M, _POINTS = 2.0, 46
 _FALLBACK_LIMIT_MPS = 13.4
 #: Free space kept next to the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
-#: Things further along the route than this, and ego's half width, are not looked at, m.
+#: Agents further from the route than this and half of ego's width are left out, m.
 _NEAR_M = 0.4
-#: A yellow light is a red one for a car that can stop with this deceleration, m/s2.
+#: A yellow light counts as red for a car that can stop with this deceleration, m/s2.
 _YELLOW_BRAKING_MPS2 = 3.0
-#: Where to stand before a stop line, m.
+#: Distance at which to stand before a stop line, m.
 STOP_SHORT_M = 1.0
 
 
 @record
 class Ahead:
-    """What a car-following driver looks at.
+    """Inputs of a car-following driver."""
 
-    Attributes:
-        gap: To the nearest thing in the way, bumper to bumper, or a little less than to a light that asks to stop, m;
-            10 km where there is neither.
-        leader: Speed of that thing along the route, m/s; 0 for a light.
-        desired: The limit here, or what the curves ahead allow; 13.4 where none is known, 0 at the route's end, m/s.
-    """
+    # To the nearest obstacle, bumper to bumper, or a little less than to a light that requires a stop, m; else 10 km
+    gap: Scalar
+    leader: Scalar  # Speed of the obstacle along the route, m/s; 0 for a light
+    desired: Scalar  # Limit (13.4 if unknown), or what curves ahead allow; 0 at the route's end, m/s
 
-    gap: Float[Array, ""]
-    leader: Float[Array, ""]
-    desired: Float[Array, ""]
-
-    def acceleration(self, speed: Float[Array, ""], parameters: IdmParameters) -> Float[Array, ""]:
-        """What the IDM does with it at a speed, m/s2."""
+    def acceleration(self, speed: Scalar, parameters: IdmParameters) -> Scalar:
+        """Return the IDM acceleration at a speed, m/s2."""
         return idm_acceleration(speed, self.desired, self.gap, self.leader, parameters)
 
 
 def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: float) -> Ahead:
-    """Looks 90 m along the route from where the driven agent is.
+    """Look 90 m ahead of the driven agent along its route.
 
-    Args:
-        bank: The scenarios.
-        context: The context.
-        frame: All agents now.
-        min_gap_m: What the driver keeps from a thing, so that it stands 1 m before a stop line.
+    ``min_gap_m`` is the gap that the driver keeps at standstill; it stops 1 m before a stop line.
     """
     me = frame.box[context.slot]
     offsets = jnp.arange(_POINTS) * _STEP_M
     path, there = route_ahead(bank, context.index, context.route_m, offsets)
-    others = frame.valid & (jnp.arange(frame.valid.shape[0]) != context.slot)
-    others &= jnp.abs(frame.z - frame.z[context.slot]) <= LEVEL_M
-    # Only the closest of those that come near the route are measured against all of its points.
+    # Only the closest agents near the route are measured against all of its points.
     nodes = jnp.where(there[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
     near = reaching(boxes, nodes, (me[5:6] / 2 + _NEAR_M)[None], 2.0 * _STEP_M, 2.0 * _STEP_M, 9)
-    slots, real = closest(near & others, me[None], boxes)
+    slots, real = closest(near & others_on_level(frame, context.slot), me[None], boxes)
     box, velocity = frame.box[slots[0]], frame.velocity[slots[0]]
     along, lateral, cos, sin = project(path, there, offsets, box[:, :2], box[:, 2:4])
     half_length = jnp.abs(cos) * box[:, 4] / 2 + jnp.abs(sin) * box[:, 5] / 2
@@ -77,27 +66,23 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
     stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
     gap = jnp.minimum(gaps[nearest], stop)
-    return Ahead(
-        gap=jnp.where(jnp.isfinite(gap), gap, FREE_M),
-        leader=jnp.where(stop < gaps[nearest], 0.0, speed[nearest]),
-        desired=jnp.where(there[1], desired_speed(path, there, offsets), 0.0),
-    )
+    leader = jnp.where(stop < gaps[nearest], 0.0, speed[nearest])
+    desired = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
+    return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
 
 
-def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Float[Array, ""]:
-    """Distance from the front bumper to the nearest stop line of the route whose light asks to stop; inf: none does."""
+def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
+    """Return the distance from the front bumper to the nearest stop line that requires a stop, m; infinite for none."""
     line, state = bank.light_line[context.index], frame.lights
     front = line[LightRow.ARC] - context.route_m - frame.box[context.slot, 4] / 2
     speed = context.history[-1, 3]
     can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
-    red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
-    yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
-    asks = (red | (yellow & can_stop)) & (front > 0.0) & (front < _POINTS * _STEP_M)
-    return jnp.min(jnp.where(asks, front, jnp.inf))
+    stops = (is_red(state) | (is_yellow(state) & can_stop)) & (front > 0.0) & (front < _POINTS * _STEP_M)
+    return jnp.min(jnp.where(stops, front, jnp.inf))
 
 
-def desired_speed(path: Array, there: Array, offsets: Array) -> Float[Array, ""]:
-    """The limit here, and what the curves ahead allow with gentle braking."""
+def desired_speed(path: Array, there: Array, offsets: Array) -> Scalar:
+    """Return the speed limit here, or what the curves ahead allow with gentle braking, m/s."""
     limit = jnp.where(path[0, RouteColumn.LIMIT] > 0, path[0, RouteColumn.LIMIT], _FALLBACK_LIMIT_MPS)
     cos, sin = path[:, RouteColumn.COS], path[:, RouteColumn.SIN]
     dot, cross = cos[1:] * cos[:-1] + sin[1:] * sin[:-1], cos[:-1] * sin[1:] - cos[1:] * sin[:-1]
@@ -111,13 +96,15 @@ def project(
     path: Float[Array, "K 7"], there: Array, offsets: Float[Array, " K"], xy: Float[Array, "S 2"],
     heading: Float[Array, "S 2"],
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Arc length ahead and lateral offset of points on a path, and cosine and sine of headings relative to it."""
+    """Return arc length ahead and lateral offset of points on a path, and relative cosine and sine of headings.
+
+    Beyond either end of the path the tangent goes on, and the lateral offset is infinite.
+    """
     dx, dy = xy[:, None, 0] - path[:, 0], xy[:, None, 1] - path[:, 1]
     nearest = first_smallest(jnp.where(there, dx * dx + dy * dy, jnp.inf))
     row = path[nearest]
     x, y = xy[:, 0] - row[:, 0], xy[:, 1] - row[:, 1]
     cos, sin = row[:, RouteColumn.COS], row[:, RouteColumn.SIN]
-    # Beyond either end of the path the tangent goes on; nothing there is on it.
     forward, left = x * cos + y * sin, y * cos - x * sin
     on = jnp.abs(forward) <= 2.0 * _STEP_M
     relative_cos = heading[:, 0] * cos + heading[:, 1] * sin

@@ -1,4 +1,4 @@
-"""Contacts of one agent with the others: overlap, who is at fault, what kind of collision, time to collision."""
+"""Contacts of one agent with the others: overlap, fault, kind of collision, time to collision, gap."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, gap, overlap, time_to_overlap
 from drivax.scenario.bank.queries import LEVEL_M
+from drivax.scenario.bank.scenario_bank import Integer, Scalar
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import Frame
 
@@ -22,11 +23,11 @@ REAR_AXLE = 1.461 / 5.176
 
 
 class Contact(enum.IntEnum):
-    """What there is between the evaluated agent and another.
+    """Contact of the evaluated agent with another.
 
-    ``IGNORED`` overlapped when it appeared and counts for nothing until it parts; ``HIT`` touches without the evaluated
-    agent's fault, ``AT_FAULT`` with it; ``PARTED`` is apart again, its fault decided once and for all; ``GONE``, of
-    these three, is absent.
+    ``IGNORED`` has overlapped since it appeared and does not count until it separates; ``HIT`` touches without the
+    evaluated agent's fault, ``AT_FAULT`` with it; ``PARTED`` is apart again, after a contact that keeps its fault;
+    ``GONE`` is absent after any of these three.
     """
 
     ABSENT = 0
@@ -56,42 +57,41 @@ class CollisionType(enum.IntEnum):
     STOPPED_OBJECT = 6
 
 
-def overlaps(frame: Frame, slot: Int[Array, ""]) -> Bool[Array, " S"]:
-    """Which valid others overlap the agent now, on its level."""
+def others_on_level(frame: Frame, slot: Integer) -> Bool[Array, " S"]:
+    """Mask of the valid agents other than ``slot`` that are on its level."""
     others = frame.valid & (jnp.arange(frame.valid.shape[0]) != slot)
-    level = jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M
-    return overlap(frame.box[slot], frame.box) & others & level
+    return others & (jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M)
+
+
+def overlaps(frame: Frame, slot: Integer) -> Bool[Array, " S"]:
+    """Mask of the other agents that overlap the agent now, on its level."""
+    return overlap(frame.box[slot], frame.box) & others_on_level(frame, slot)
 
 
 def first_contacts(before: Int[Array, " S"], touching: Bool[Array, " S"]) -> Bool[Array, " S"]:
-    """Which overlaps count and begin now: the other was there and apart, and has never been hit before."""
+    """Mask of the overlaps that begin now and count: with agents that were apart and have never been hit."""
     return touching & (before == Contact.APART)
 
 
 def next_contacts(
     before: Int[Array, " S"], touching: Bool[Array, " S"], valid: Bool[Array, " S"], fault: Bool[Array, " S"]
 ) -> Int[Array, " S"]:
-    """Contact code of every slot, one step later.
+    """Return the contact code of every slot, one step after ``before``.
 
-    Args:
-        before: Codes of the step before.
-        touching: Who overlaps now.
-        valid: Who is there now.
-        fault: For those whose first contact is now: whether it is the evaluated agent's fault.
+    ``fault`` tells for contacts that begin now whether they are the evaluated agent's fault.
     """
     c = Contact
     appears = (before == c.IGNORED) | (before == c.ABSENT) | (before == c.GONE)
-    known = jnp.where(
-        before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), jnp.where(before == c.PARTED, c.HIT, before)
-    )
+    known = jnp.where(before == c.PARTED, c.HIT, before)
+    known = jnp.where(before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), known)
     contact = jnp.where(appears, c.IGNORED, known)
-    judged = (before == c.HIT) | (before == c.AT_FAULT) | (before == c.PARTED) | (before == c.GONE)
-    apart, absent = jnp.where(judged, c.PARTED, c.APART), jnp.where(judged, c.GONE, c.ABSENT)
+    hit = (before == c.HIT) | (before == c.AT_FAULT) | (before == c.PARTED) | (before == c.GONE)
+    apart, absent = jnp.where(hit, c.PARTED, c.APART), jnp.where(hit, c.GONE, c.ABSENT)
     return jnp.where(valid, jnp.where(touching, contact, apart), absent).astype(jnp.int8)
 
 
-def relative(frame: Frame, slot: Int[Array, ""]) -> tuple[Array, Array, Array, Array]:
-    """Every slot's centre in the agent's frame (ahead, left) and cosine and sine of its heading there."""
+def relative(frame: Frame, slot: Integer) -> tuple[Array, Array, Array, Array]:
+    """Return the centre of every slot in the agent's frame (ahead, left), and cosine and sine of its heading there."""
     me = frame.box[slot]
     dx, dy = frame.box[:, X] - me[X], frame.box[:, Y] - me[Y]
     cos = frame.box[:, COS] * me[COS] + frame.box[:, SIN] * me[SIN]
@@ -100,86 +100,58 @@ def relative(frame: Frame, slot: Int[Array, ""]) -> tuple[Array, Array, Array, A
 
 
 def classify_contacts(
-    frame: Frame, slot: Int[Array, ""], fresh: Bool[Array, " S"], speed: Float[Array, ""],
-    others_speed: Float[Array, " S"], unlawful: Bool[Array, ""],
-) -> tuple[Bool[Array, " S"], Int[Array, ""]]:  # fmt: skip
-    """Fault and type of contacts that began at this step.
+    frame: Frame, slot: Integer, fresh: Bool[Array, " S"], speed: Scalar, others_speed: Float[Array, " S"],
+    unlawful: Bool[Array, ""],
+) -> tuple[Bool[Array, " S"], Integer]:  # fmt: skip
+    """Return which of the contacts that began at this step (``fresh``) are at fault, and the type of the nearest one.
 
     Fault follows nuPlan's order: agent itself stopped: no; the other stopped: yes; the other behind: no; hit with the
-    front: yes; sideways: yes when the agent leaves its lane or the road.
-
-    Args:
-        frame: All agents now.
-        slot: The evaluated agent.
-        fresh: Slots whose contact began at this step.
-        speed: The larger speed of the agent before and after the step.
-        others_speed: The same for every slot.
-        unlawful: The agent is in several lanes or off the road.
-
-    Returns:
-        Which fresh contacts are the agent's fault, and the type of the nearest one.
+    front: yes; sideways: yes when the agent is ``unlawful``, in several lanes or off the road. Speeds are the larger
+    ones of before and after the step.
     """
     me = frame.box[slot]
     ahead, left, cos, _ = relative(frame, slot)
     bearing = jnp.arctan2(jnp.abs(left), ahead + REAR_AXLE * me[LENGTH])
     behind = bearing > 5 * jnp.pi / 6
     # The front bumper as a thin box.
-    bumper = jnp.stack(
-        [me[X] + me[LENGTH] / 2 * me[COS], me[Y] + me[LENGTH] / 2 * me[SIN], me[COS], me[SIN],
-         jnp.full((), 0.02), me[WIDTH]]
-    )  # fmt: skip
+    x, y = me[X] + me[LENGTH] / 2 * me[COS], me[Y] + me[LENGTH] / 2 * me[SIN]
+    bumper = jnp.stack([x, y, me[COS], me[SIN], jnp.full((), 0.02), me[WIDTH]])
     front = overlap(bumper, frame.box)
     stopped, other_stopped = speed < STOPPED_MPS, others_speed < STOPPED_MPS
     fault = ~stopped & (other_stopped | (~behind & (front | unlawful)))
     vulnerable = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
     head_on, same_way = cos < -(0.5**0.5), cos > 0.5**0.5
-    kind = jnp.where(
-        vulnerable,
-        CollisionType.VULNERABLE,
-        jnp.where(
-            other_stopped & front,
-            CollisionType.STOPPED_OBJECT,
-            jnp.where(
-                head_on & (front | ~behind),
-                CollisionType.HEAD_ON,
-                jnp.where(
-                    front & same_way,
-                    CollisionType.REAR_END,
-                    jnp.where(behind, CollisionType.REAR_ENDED, CollisionType.SIDE_SWIPE),
-                ),
-            ),
-        ),
+    c = CollisionType
+    kind = jnp.select(
+        [vulnerable, other_stopped & front, head_on & (front | ~behind), front & same_way, behind],
+        [c.VULNERABLE, c.STOPPED_OBJECT, c.HEAD_ON, c.REAR_END, c.REAR_ENDED],
+        c.SIDE_SWIPE,
     )
     nearest = jnp.argmin(jnp.where(fresh, ahead**2 + left**2, jnp.inf))
-    return fresh & fault, jnp.where(fresh.any(), kind[nearest], CollisionType.NONE).astype(jnp.int8)
+    return fresh & fault, jnp.where(fresh.any(), kind[nearest], c.NONE).astype(jnp.int8)
 
 
-def time_to_collision(frame: Frame, slot: Int[Array, ""], left_out: Bool[Array, " S"]) -> Float[Array, ""]:
-    """Seconds to the first overlap at constant velocities and fixed headings, at most 5 (semantics, ``ttc``).
+def time_to_collision(frame: Frame, slot: Integer, left_out: Bool[Array, " S"]) -> Scalar:
+    """Return the time to the first overlap at constant velocities and headings, s, at most 5 (semantics, ``ttc``).
 
-    Agents that lie entirely behind the rear axle are followers and never count; nor does one that has run into the
-    agent without its fault, which ``left_out`` names. Of the rest, agents that overlap within
-    the horizon is ahead or comes into the lane that the agent sweeps; no cone narrows the view.
+    Agents entirely behind the rear axle are followers and never count, nor do those in ``left_out``, such as one that
+    ran into the agent without its fault. All others count, in whatever direction: one that overlaps within the horizon
+    is ahead or comes into the lane that the agent sweeps.
     """
     me = frame.box[slot]
     ahead, _, cos, sin = relative(frame, slot)
     reach = jnp.abs(cos) * frame.box[:, LENGTH] / 2 + jnp.abs(sin) * frame.box[:, WIDTH] / 2
-    counts = frame.valid & ~left_out & (jnp.arange(frame.valid.shape[0]) != slot)
-    counts &= (ahead + reach > -REAR_AXLE * me[LENGTH]) & (jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M)
+    counts = others_on_level(frame, slot) & ~left_out & (ahead + reach > -REAR_AXLE * me[LENGTH])
     times = time_to_overlap(me, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)
     return jnp.min(jnp.where(counts, times, TTC_HORIZON_S))
 
 
-def nearest_gap(frame: Frame, slot: Int[Array, ""], left_out: Bool[Array, " S"]) -> Float[Array, ""]:
-    """Distance between the agent's box and the nearest other on its level, m, at most 50; 0 where they overlap.
+def nearest_gap(frame: Frame, slot: Integer, left_out: Bool[Array, " S"]) -> Scalar:
+    """Return the gap to the nearest other box on the agent's level, m, at most 50; 0 where they overlap.
 
-    Args:
-        frame: All agents now.
-        slot: The agent.
-        left_out: Who does not count: those that overlapped it when they appeared, until they part.
+    Agents in ``left_out`` do not count, such as those that have overlapped it since they appeared.
     """
-    counts = frame.valid & ~left_out & (jnp.arange(frame.valid.shape[0]) != slot)
-    counts &= jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M
+    counts = others_on_level(frame, slot) & ~left_out
     # Boxes of empty slots may hold anything; the agent's own one, pushed away, keeps gradients finite.
     gaps = gap(frame.box[slot], jnp.where(counts[:, None], frame.box, frame.box[slot]))
     return jnp.min(jnp.where(counts, jnp.minimum(gaps, FARTHEST_GAP_M), FARTHEST_GAP_M))

@@ -1,38 +1,31 @@
-"""How a driven agent moves in one step of 0.1 s. Motions are (x, y, heading, speed); speed is never negative.
+"""Dynamics of a driven agent over one step of 0.1 s.
 
-:func:`bicycle` is the default; :func:`displace` moves by a displacement in the agent's own frame (``delta_local``);
-a state that is given outright (``direct_state``) needs no function. Everything is differentiable, with gradients that
-are finite at a standstill, at the turn of the circle and at every limit.
+:func:`bicycle` is the default; :func:`displace` moves by a displacement in the agent's own frame (``delta_local``).
+Everything is differentiable, with finite gradients at standstill, where headings wrap, and at every limit.
 """
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from drivax.geometry.vectors import norm, rotate, wrap
+from drivax.scenario.bank.scenario_bank import Scalar, Vector
 from drivax.scenario.schema import DT_S
+from drivax.simulator.types import Motion
 
 #: Grip limit |curvature| v^2, m/s2.
 GRIP_MPS2 = 8.0
-#: Moves shorter than this say nothing about curvature, m.
+#: Shorter moves count as straight, m.
 _STILL_M = 0.1
 #: Gain on the along-track error when following a log, 1/s.
 _ALONG_GAIN = 1.0
 
 
-def bicycle(
-    motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""]
-) -> Float[Array, " 4"]:
-    """One step of 0.1 s: the car drives the distance it really travels and turns by curvature times distance.
+def bicycle(motion: Motion, acceleration: Scalar, curvature: Scalar) -> Motion:
+    """Drive at an acceleration (m/s2) along an arc of a curvature (1/m, positive to the left).
 
-    A car that would go below zero speed stops inside the step after ``v^2 / (2 |a|)`` and stays: no creep, no reverse.
-    The curvature is limited to what grip allows at the present speed, ``|k| v^2 <= 8 m/s2``.
-
-    Args:
-        motion: x, y (m), heading (rad), speed (m/s, not negative).
-        acceleration: m/s2.
-        curvature: 1/m, positive to the left.
+    A car that would reach a negative speed stops within the step after ``v^2 / (2 |a|)``: no creep, no reverse. Grip
+    limits the curvature at the present speed, ``|k| v^2 <= 8 m/s2``.
     """
     x, y, heading, speed = motion[0], motion[1], motion[2], motion[3]
     limit = GRIP_MPS2 / jnp.maximum(speed * speed, 1e-3)
@@ -49,55 +42,37 @@ def bicycle(
     )
 
 
-def displace(
-    motion: Float[Array, " 4"], shift: Float[Array, " 2"], turn: Float[Array, ""]
-) -> Float[Array, " 4"]:
-    """Moves by ``shift`` metres (ahead, left) in the agent's own frame, then turns by ``turn`` rad.
+def displace(motion: Motion, shift: Vector, turn: Scalar) -> Motion:
+    """Move by ``shift`` metres (ahead, left) in the agent's own frame, then turn by ``turn`` rad.
 
-    The new speed is the distance over the step, so that a chain of displacements has the speed of its path. Nothing
-    limits it: there is no grip, and an agent may slide sideways.
+    The new speed is the distance over the step. Grip does not limit it, and an agent may slide sideways.
     """
-    step = rotate(shift, jnp.cos(motion[2]), jnp.sin(motion[2]))
-    place = motion[:2] + step
-    return jnp.stack([place[0], place[1], wrap(motion[2] + turn), norm(shift) / DT_S])
+    x, y = motion[:2] + rotate(shift, jnp.cos(motion[2]), jnp.sin(motion[2]))
+    return jnp.stack([x, y, wrap(motion[2] + turn), norm(shift) / DT_S])
 
 
-def displacement(
-    motion: Float[Array, " 4"], target: Float[Array, " 4"]
-) -> tuple[Float[Array, " 2"], Float[Array, ""]]:
-    """The inverse of :func:`displace`: shift (ahead, left, m) and turn (rad) from a motion to another."""
+def displacement(motion: Motion, target: Motion) -> tuple[Vector, Scalar]:
+    """Return shift (ahead, left, m) and turn (rad) from a motion to another; the inverse of :func:`displace`."""
     shift = rotate(target[:2] - motion[:2], jnp.cos(motion[2]), -jnp.sin(motion[2]))
     return shift, wrap(target[2] - motion[2])
 
 
-def command_between(
-    before: Float[Array, " 4"], now: Float[Array, " 4"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The acceleration and curvature that :func:`bicycle` was driven with, from the motions around a step.
-
-    Moves under 0.1 m say nothing about curvature and count as straight.
-    """
+def command_between(before: Motion, now: Motion) -> tuple[Scalar, Scalar]:
+    """Return the acceleration and curvature by which :func:`bicycle` moved; below 0.1 m the move counts as straight."""
     distance = (before[3] + now[3]) / 2.0 * DT_S
     turn = wrap(now[2] - before[2])
     curvature = jnp.where(distance > _STILL_M, turn / jnp.maximum(distance, _STILL_M), 0.0)
     return (now[3] - before[3]) / DT_S, curvature
 
 
-def follow(
-    motion: Float[Array, " 4"], target: Float[Array, " 4"], beyond: Float[Array, " 4"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Acceleration and curvature that follow a log (semantics, ``expert_actions``).
+def follow(motion: Motion, target: Motion, beyond: Motion) -> tuple[Scalar, Scalar]:
+    """Return acceleration and curvature that follow a log, from its motions one and two steps ahead.
 
     The speed error is closed in one step, plus 1/s times the along-track error; the curvature is that of the circle
-    through the position logged two steps ahead; moves under 0.1 m steer straight.
-
-    Args:
-        motion: The car now.
-        target: Logged motion one step ahead.
-        beyond: Logged motion two steps ahead.
+    through the second position, straight below 0.1 m (semantics, ``expert_actions``).
     """
     cos, sin = jnp.cos(motion[2]), jnp.sin(motion[2])
-    # Where the car gets to if it keeps its speed on average, against where the log is.
+    # Position of the log relative to that of the car at the mean speed.
     ahead = target[:2] - motion[:2]
     along = ahead[0] * cos + ahead[1] * sin - (motion[3] + target[3]) / 2 * DT_S
     acceleration = (target[3] - motion[3]) / DT_S + _ALONG_GAIN * along

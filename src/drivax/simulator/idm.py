@@ -24,7 +24,7 @@ class IdmParameters:
 def idm_acceleration(
     speed: Any, desired_speed: Any, gap: Any, leader_speed: Any, parameters: IdmParameters
 ) -> Any:
-    """Acceleration of a driver who follows a leader.
+    """Return the acceleration of a driver who follows a leader, m/s2.
 
     ``a = a_max [1 - (v / v0)^d - (s* / s)^2]`` with ``s* = s0 + max(0, v T + v (v - v_l) / (2 sqrt(a_max b)))``
     (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000), limited to ``[-max_braking, a_max]``.
@@ -35,9 +35,6 @@ def idm_acceleration(
         gap: Bumper-to-bumper distance, m; below 0.1 m it counts as 0.1. Infinite for a free road.
         leader_speed: Speed of the leader along the own path, m/s.
         parameters: The driver.
-
-    Returns:
-        Acceleration, m/s2.
     """
     xp = speed.__array_namespace__()
     p = parameters

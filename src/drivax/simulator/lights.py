@@ -1,4 +1,4 @@
-"""Running a red light (semantics, ``red_light``): stop lines, right turns after a stop, lights off the route."""
+"""Red-light violations (semantics, ``red_light``): stop lines, right turns after a stop, lights off the route."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ JUDGED_AFTER = 20
 
 
 def _fronts(context: AgentContext, length_m: Float[Array, ""]) -> Float[Array, "history 2"]:
-    """Front bumper at every step of the context's history."""
+    """Return the front bumper at every step of the context's history."""
     past = context.history
     ahead = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
     return past[:, :2] + ahead * length_m / 2
 
 
 def remember_lights(bank: ScenarioBank, context: AgentContext) -> LightMemory:
-    """The memory that a context's recent motion implies, as if it had been driven."""
+    """Return the stop-line memory that the recent motion of a context implies."""
     length = bank.length_m(context.index, context.slot)
     ground = context.z - bank.height_m(context.index, context.slot) / 2
     pause = jnp.full(bank.light_line.shape[2], PAUSE_STEPS + 1, jnp.int32)
@@ -41,34 +41,33 @@ def remember_lights(bank: ScenarioBank, context: AgentContext) -> LightMemory:
 
 
 def nothing_crossed(memory: LightMemory) -> LightMemory:
-    """As an episode begins: lines that were crossed before it are not charged to it."""
+    """Return the memory at the start of an episode, which is not charged with lines crossed before."""
     return LightMemory(memory.pause, jnp.zeros_like(memory.crossed))
 
 
 def check_lights(
-    bank: ScenarioBank, context: AgentContext,
-    me: Float[Array, " 6"], ground: Float[Array, ""], on_route: Bool[Array, ""],
-    memory: LightMemory,
+    bank: ScenarioBank, context: AgentContext, me: Float[Array, " 6"], ground: Float[Array, ""],
+    on_route: Bool[Array, ""], memory: LightMemory,
 ) -> tuple[Bool[Array, ""], LightMemory]:  # fmt: skip
-    """Whether a red light was run, found out at this step, and what to remember.
+    """Return whether a red-light violation was established at this step, and the new memory.
 
-    On the route only its own lights count, at once. Off it, of the lines that were crossed together the one counts
-    whose lane ends most nearly in the heading that the agent has two seconds later, or at the end of the log.
+    On the route only its own lights count, at once. Off it, of the lines crossed together the one counts whose lane
+    ends closest to the heading that the agent has two seconds later, or at the end of the log.
     """
     front_before, front = _fronts(context, me[4])[-2:]
     crossed, before_m = light_crossing(bank, context.index, front_before, front, ground)
     last = bank.steps - 1
     now = bank.light_state[context.index, jnp.clip(context.step, 0, last)]
     then = bank.light_state[context.index, jnp.clip(context.step - 1, 0, last)]
-    is_red = _red(now) & _red(then)
+    red = is_red(now) & is_red(then)
     # A stop shortly before the line, then a right turn, is lawful unless the light is a red arrow.
     arrow = (now == LightState.ARROW_STOP) | (then == LightState.ARROW_STOP)
     line = bank.light_line[context.index]
-    is_red &= ~((line[LightRow.RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
-    ran = (crossed & is_red & (line[LightRow.ARC] < NEVER_M)).any() & on_route
+    red &= ~((line[LightRow.RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
+    ran = (crossed & red & (line[LightRow.ARC] < NEVER_M)).any() & on_route
 
     begins = crossed & ~on_route
-    age = jnp.where(begins, jnp.where(is_red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
+    age = jnp.where(begins, jnp.where(red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
     # What is still open when the log ends is evaluated then.
     due = (jnp.abs(age) > JUDGED_AFTER) | ((age != 0) & (context.step >= last))
     fit = jnp.where(due, line[LightRow.EXIT_COS] * me[2] + line[LightRow.EXIT_SIN] * me[3], -2.0)
@@ -79,5 +78,11 @@ def check_lights(
     return ran, LightMemory(pause.astype(jnp.int8), age.astype(jnp.int8))
 
 
-def _red(state: Int[Array, " L"]) -> Bool[Array, " L"]:
+def is_red(state: Int[Array, "*L"]) -> Bool[Array, "*L"]:
+    """Mask of the red lights, arrows included."""
     return (state == LightState.ARROW_STOP) | (state == LightState.STOP)
+
+
+def is_yellow(state: Int[Array, "*L"]) -> Bool[Array, "*L"]:
+    """Mask of the yellow lights, arrows included."""
+    return (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)

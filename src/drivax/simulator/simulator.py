@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -18,18 +18,24 @@ from drivax.simulator.contact import Contact
 from drivax.simulator.lights import nothing_crossed, remember_lights
 from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
-from drivax.simulator.together import is_driven
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
 from drivax.simulator.types import (
+    Action,
     AgentContext,
     EpisodeStart,
     Frame,
+    Motion,
     SimState,
     Situation,
     Task,
     Traffic,
     Transition,
 )
+
+#: Elements computed together: more than start in most steps, and enough to fill vectors.
+AT_ONCE = 8
+#: The next state, and the step to it.
+Step = tuple[SimState, Transition]
 
 
 @dataclass(frozen=True)
@@ -68,16 +74,9 @@ class Simulator:
         """Return the context at a step: logged, or drawn by ``start``."""
         index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
         history, route_m = LogStart().begin(bank, index, step, slot)
-        context = AgentContext(
-            index=index,
-            step=step,
-            slot=slot,
-            history=history,
-            action=self.task.first_action(history, bank.length_m(index, slot)),
-            route_m=route_m,
-            z=bank.agents[index, step, slot, AgentColumn.Z],
-            traffic=self.traffic.start(bank, index, step),
-        )
+        action = self.task.first_action(history, bank.length_m(index, slot))
+        z, traffic = bank.agents[index, step, slot, AgentColumn.Z], self.traffic.start(bank, index, step)
+        context = AgentContext(index, step, slot, history, action, route_m, z, traffic)
         if isinstance(self.start, LogStart):
             return context
         agents = self.traffic.agents(bank, context, 0)
@@ -94,30 +93,25 @@ class Simulator:
 
     def frame(self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int) -> Frame:
         """Return all agents ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses."""
-        return frame_of(
-            bank, context.index, context.step, self.traffic.agents(bank, context, back), driven, back
-        )
+        agents = self.traffic.agents(bank, context, back)
+        return frame_of(bank, context.index, context.step, agents, driven, back)
 
     def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
         """Return all agents now, around one driven agent."""
         return self.frame(bank, context, alone(context), 0)
 
-    def step(
-        self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"]
-    ) -> tuple[SimState, Transition]:
+    def step(self, bank: ScenarioBank, state: SimState, action: Action) -> Step:
         """Drive one step of 0.1 s with an action of the task's action space."""
         return self._drive(bank, state, action, None)
 
-    def replay(
-        self, bank: ScenarioBank, state: SimState, motion: Float[Array, " 4"], action: Float[Array, " D"]
-    ) -> tuple[SimState, Transition]:
+    def replay(self, bank: ScenarioBank, state: SimState, motion: Motion, action: Action) -> Step:
         """Move the agent to ``motion`` without dynamics (exact expert); ``action`` is only recorded."""
         return self._drive(bank, state, action, motion)
 
     def reset_together(
         self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP
     ) -> SimState:
-        """Return the stacked states of K agents of one scenario (``simulator.together.slots_of`` selects slots).
+        """Return the stacked states of K agents of one scenario, at slots from :func:`slots_of`.
 
         All start as logged: a noisy start supports a single driven agent.
         """
@@ -126,24 +120,18 @@ class Simulator:
 
     def step_together(
         self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None
-    ) -> tuple[SimState, Transition]:
+    ) -> Step:
         """Drive K agents of one scenario; they see each other, and traffic sees them.
 
-        Args:
-            bank: The scenarios.
-            states: Stacked states. Slots beyond the moving agents are padding: never rewarded or terminated, with
-                undefined facts.
-            actions: One action per agent.
-            over: ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics. None means
-                no agent.
+        Slots beyond the moving agents are padding: never rewarded or terminated, with undefined facts. ``over`` is the
+        ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics.
         """
         first = jax.tree.map(lambda leaf: leaf[0], states.context)
         seen = self.frame(bank, first, states.context, 0)
         traffic = self.traffic.advance(bank, first, seen)
         moved = jax.vmap(lambda s, a: self._move_agent(bank, s.context, a, None, traffic))(states, actions)
-        after, done = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))(
-            states, moved, actions
-        )
+        settle = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))
+        after, done = settle(states, moved, actions)
         counts = is_driven(bank, states) & (True if over is None else ~over)
         choose = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
         after = replace(after, episode=choose(counts, after.episode, states.episode))
@@ -167,37 +155,23 @@ class Simulator:
     ) -> Mapping[str, Any]:
         """Return the task's observation of a context, live or from a replay buffer."""
         driven = alone(context) if driven is None else driven
-
-        def frames(back: int) -> Frame:
-            return self.frame(bank, context, driven, back)
-
+        frames = partial(self.frame, bank, context, driven)
         return self.task.observe(bank, context, frames, frames(0))
 
     def step_or_reset(
-        self,
-        bank: ScenarioBank,
-        state: SimState,
-        action: Float[Array, " D"],
-        over: Bool[Array, ""],
-        fresh: EpisodeStart,
-        seen: Frame | None = None,
-    ) -> tuple[SimState, Transition]:
+        self, bank: ScenarioBank, state: SimState, action: Action, over: Bool[Array, ""],
+        fresh: EpisodeStart, seen: Frame | None = None,
+    ) -> Step:  # fmt: skip
         """Step, or start a new episode where the current one is ``over``.
 
         For collectors: the end of an episode costs one call that only resets, with a meaningless transition to mask. In
         exchange nothing is measured or observed twice, and a policy sees every state, final ones included, once.
-
-        Args:
-            bank: The scenarios.
-            state: The state.
-            action: Action of the agent where its episode continues.
-            over: Whether the episode has ended.
-            fresh: The :meth:`new_episode`; read only where ``over``, so a batch may compute it only there
-                (:func:`simulator.sparse.map_where`).
-            seen: ``now(bank, state.context)``, if already computed.
+        ``fresh`` (:meth:`new_episode`) is read only where ``over``: :func:`map_where` computes it only
+        there. ``seen`` is ``now(bank, state.context)``, if already computed.
         """
         seen = self.now(bank, state.context) if seen is None else seen
-        moved = self._move(bank, state.context, seen, action, None)
+        traffic = self.traffic.advance(bank, state.context, seen)
+        moved = self._move_agent(bank, state.context, action, None, traffic)
         context = jax.tree.map(partial(jnp.where, over), fresh.context, moved)
         before = replace(
             state,
@@ -208,25 +182,17 @@ class Simulator:
         )
         after, transition = self._settle(bank, before, context, alone(context), seen, action)
         first = self.task.episode_start()
-        episode = jax.tree.map(lambda new, old: jnp.where(over, new, old), first, after.episode)
+        episode = jax.tree.map(partial(jnp.where, over), first, after.episode)
         lights = jax.tree.map(partial(jnp.where, over), nothing_crossed(after.lights), after.lights)
         after = replace(after, episode=episode, lights=lights)
         flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
         return after, replace(transition, after=after, **flags)
 
-    def _drive(
-        self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None
-    ) -> tuple[SimState, Transition]:
+    def _drive(self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None) -> Step:
         seen = self.now(bank, state.context)
-        moved = self._move(bank, state.context, seen, action, motion)
+        traffic = self.traffic.advance(bank, state.context, seen)
+        moved = self._move_agent(bank, state.context, action, motion, traffic)
         return self._settle(bank, state, moved, alone(moved), seen, action)
-
-    def _move(
-        self, bank: ScenarioBank, context: AgentContext, seen: Frame, action: Array, motion: Array | None
-    ) -> AgentContext:
-        """Move all agents one step without measuring."""
-        traffic = self.traffic.advance(bank, context, seen)
-        return self._move_agent(bank, context, action, motion, traffic)
 
     def _move_agent(
         self, bank: ScenarioBank, context: AgentContext, action: Array, motion: Array | None, traffic: Any
@@ -235,23 +201,13 @@ class Simulator:
         if motion is None:
             action = self.task.actuated(context.history[-1], action, context.action)
             motion = self.task.motion(context.history[-1], action, bank.length_m(context.index, context.slot))
-        return replace(
-            context,
-            step=context.step + 1,
-            history=jnp.concatenate([context.history[1:], motion[None]]),
-            action=action,
-            traffic=traffic,
-        )
+        history = jnp.concatenate([context.history[1:], motion[None]])
+        return replace(context, step=context.step + 1, history=history, action=action, traffic=traffic)
 
     def _settle(
-        self,
-        bank: ScenarioBank,
-        before: SimState,
-        moved: AgentContext,
-        driven: AgentContext,
-        seen: Frame,
+        self, bank: ScenarioBank, before: SimState, moved: AgentContext, driven: AgentContext, seen: Frame,
         action: Array,
-    ) -> tuple[SimState, Transition]:
+    ) -> Step:  # fmt: skip
         """Measure an agent after all agents have moved, and build the transition."""
         now = self.frame(bank, moved, driven, 0)
         situation, contacts, lights = measure(
@@ -264,3 +220,43 @@ class Simulator:
         after = SimState(situation.context, situation.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))
         return after, Transition(before, after, action, reward, terms, terminated, truncated)
+
+
+def slots_of(
+    bank: ScenarioBank, index: Any, mask: Bool[Array, " A"], count: int, step: Any = CURRENT_STEP
+) -> Int[Array, " K"]:
+    """Return ``count`` slots of the moving agents of a mask that the log has at ``step``.
+
+    Missing ones are padded with A (an empty slot); further agents are left to traffic.
+    """
+    there = mask & (bank.agents[index, step, :, AgentColumn.VALID] > 0)
+    return jnp.nonzero(there, size=count, fill_value=mask.shape[0])[0].astype(jnp.int32)
+
+
+def is_driven(bank: ScenarioBank, states: SimState) -> Bool[Array, " K"]:
+    """Mask of the states that belong to an agent; the others are padding."""
+    return states.context.slot < bank.agents.shape[2]
+
+
+def map_where(requested: Bool[Array, " B"], function: Callable[..., Any], *arguments: Any) -> Any:
+    """``jax.vmap(function)`` where ``requested``, zeros elsewhere; cost grows with the number requested.
+
+    ``function`` maps one element of each argument (pytrees of arrays ``[B, ...]``) to a pytree of arrays. A loop
+    computes 8 elements at a time; it has no reverse-mode derivative.
+    """
+    count, batched = requested.shape[0], jax.vmap(function)
+    chunk = min(AT_ONCE, count)
+    element = jax.eval_shape(function, *jax.tree.map(lambda leaf: leaf[0], arguments))
+    zeros = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), element)
+    # The first requested element ranks highest; top_k of floats is the cheapest way to find a few of them.
+    rank = jnp.arange(count, 0, -1).astype(jnp.float32)
+
+    def compute(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        left, results = carry
+        top_rank, index = jax.lax.top_k(jnp.where(left, rank, 0.0), chunk)
+        index = jnp.where(top_rank > 0.0, index, count)
+        values = batched(*jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), arguments))
+        results = jax.tree.map(lambda total, value: total.at[index].set(value, mode="drop"), results, values)
+        return left.at[index].set(False, mode="drop"), results
+
+    return jax.lax.while_loop(lambda carry: carry[0].any(), compute, (requested, zeros))[1]

@@ -11,29 +11,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, wrap
+from drivax.scenario.bank import queries
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.passages import lane_passage
-from drivax.scenario.bank.queries import (
-    OFFROAD_TOLERANCE_M,
-    LaneHits,
-    around_lanes,
-    is_mapped,
-    left_the_map,
-    offroad_distance,
-    project_on_route,
-)
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.scenario.schema import DT_S, Flag
-from drivax.simulator.contact import (
-    STOPPED_MPS,
-    Contact,
-    classify_contacts,
-    first_contacts,
-    nearest_gap,
-    next_contacts,
-    overlaps,
-    time_to_collision,
-)
+from drivax.simulator import contact
+from drivax.simulator.contact import STOPPED_MPS, Contact
 from drivax.simulator.lights import check_lights
 from drivax.simulator.types import (
     FACTS,
@@ -75,11 +59,11 @@ def measure(
     around = surroundings(bank, context, frame)
     lanes, route, me = around.lanes, around.route, frame.box[context.slot]
     ground = _ground(bank, context, frame)
-    beyond, left_map, offroad = _off_the_road(bank, context.index, me, ground, lanes)
+    beyond, left_map, offroad = off_the_road(bank, context.index, me, ground, lanes)
     z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
     context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
     # Off the map a lateral hit is a fault as it is off the road.
-    beyond_road = lanes.leaving_lane | (beyond > OFFROAD_TOLERANCE_M)
+    beyond_road = lanes.leaving_lane | (beyond > queries.OFFROAD_TOLERANCE_M)
     codes, fault, kind, ttc = _touch(context, frame, previous, contacts, beyond_road, reads)
     routed = ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
     red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
@@ -131,9 +115,11 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     """Return all agents, the lanes around the driven agent, and its position on its route."""
     me = frame.box[context.slot]
     ground = _ground(bank, context, frame)
-    lanes = around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground)
+    lanes = queries.around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground)
     ahead_m = 1.5 * _moved(context) + 2.0
-    return Surroundings(frame, lanes, project_on_route(bank, context.index, me[:2], context.route_m, ahead_m))
+    return Surroundings(
+        frame, lanes, queries.project_on_route(bank, context.index, me[:2], context.route_m, ahead_m)
+    )
 
 
 def _ground(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
@@ -157,34 +143,30 @@ def _touch(
     fault, kind, ttc = jnp.zeros(contacts.shape, bool), jnp.zeros((), jnp.int8), jnp.zeros(())
     if not reads & _CONTACTS:
         return contacts, fault.any(), kind, ttc
-    touching = overlaps(frame, context.slot)
+    touching = contact.overlaps(frame, context.slot)
     if reads & _FAULTS:
-        fresh = first_contacts(contacts, touching)
+        fresh = contact.first_contacts(contacts, touching)
         speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
-        others_speed = jnp.maximum(_speed(frame), jnp.where(previous.valid, _speed(previous), 0.0))
-        fault, kind = classify_contacts(frame, context.slot, fresh, speed, others_speed, unlawful)
-    codes = next_contacts(contacts, touching, frame.valid, fault)
+        others_speed = jnp.where(previous.valid, norm(previous.velocity), 0.0)
+        others_speed = jnp.maximum(norm(frame.velocity), others_speed)
+        fault, kind = contact.classify_contacts(frame, context.slot, fresh, speed, others_speed, unlawful)
+    codes = contact.next_contacts(contacts, touching, frame.valid, fault)
     if "ttc_s" in reads:
-        ttc = time_to_collision(frame, context.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT))
+        ttc = contact.time_to_collision(
+            frame, context.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT)
+        )
     return codes, fault.any(), kind, ttc
 
 
 def _requested(
-    bank: ScenarioBank,
-    context: AgentContext,
-    frame: Frame,
-    codes: Int[Array, " S"],
-    reads: frozenset[str],
+    bank: ScenarioBank, context: AgentContext, frame: Frame, codes: Int[Array, " S"], reads: frozenset[str],
     strand: Any,
-) -> dict[str, Array]:
+) -> dict[str, Array]:  # fmt: skip
     """Return the facts measured on request; those outside ``reads`` are zero."""
-    none, no = jnp.int16(-1), jnp.zeros((), bool)
-    zero = jnp.zeros(())
-    facts: dict[str, Array] = {
-        "gap_m": zero, "lag_m": zero, "strand": none, "lane_changed": no, "merged": no
-    }  # fmt: skip
+    facts: dict[str, Array] = dict.fromkeys(("gap_m", "lag_m"), jnp.zeros(()))
+    facts |= {"strand": jnp.int16(-1)} | dict.fromkeys(("lane_changed", "merged"), jnp.zeros((), bool))
     if "gap_m" in reads:
-        facts["gap_m"] = nearest_gap(frame, context.slot, codes == Contact.IGNORED)
+        facts["gap_m"] = contact.nearest_gap(frame, context.slot, codes == Contact.IGNORED)
     if "lag_m" in reads:
         me, logged = frame.box[context.slot], bank.agents[context.index, context.step, context.slot]
         facts["lag_m"] = jnp.sum((logged[AgentColumn.XY] - me[:2]) * me[2:4])
@@ -201,7 +183,7 @@ def _requested(
 
 
 def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
-    """The facts that are requested; None in place of the others."""
+    """Return the facts with None in place of those that are not requested."""
     # The next passage is evaluated from the strand of this one.
     desired = reads | ({"strand"} if reads & _PASSAGES else frozenset())
 
@@ -211,21 +193,21 @@ def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
     return facts if desired >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(keep, facts)
 
 
-def _off_the_road(
-    bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: LaneHits
-) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:  # fmt: skip
-    """How far a box's worst corner is off the road (m), whether it left the map, or only the road."""
-    beyond = offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
-    left_map = left_the_map(bank, index, me[:2])
-    return beyond, left_map, (beyond > OFFROAD_TOLERANCE_M) & ~left_map & is_mapped(bank, index)
-
-
-def _speed(frame: Frame) -> Float[Array, " S"]:
-    return norm(frame.velocity)
+def off_the_road(
+    bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: queries.LaneHits
+) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
+    """Return how far the worst corner of a box is off the road (m), whether it left the map, or only the road."""
+    beyond = queries.offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
+    left_map = queries.left_the_map(bank, index, me[:2])
+    return (
+        beyond,
+        left_map,
+        (beyond > queries.OFFROAD_TOLERANCE_M) & ~left_map & queries.is_mapped(bank, index),
+    )
 
 
 def _rates(history: Float[Array, "history 4"]) -> tuple[Scalar, Scalar, Scalar]:
-    """Causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
+    """Return causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
     speed, heading = history[:, 3], history[:, 2]
     acceleration = (speed[-1] - speed[-6]) / (5 * DT_S)
     before = (speed[-6] - speed[-11]) / (5 * DT_S)

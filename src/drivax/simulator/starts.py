@@ -15,19 +15,16 @@ from jaxtyping import Array, Bool, Float
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.scenario.bank.queries import (
-    OFFROAD_TOLERANCE_M,
-    around_lanes,
-    is_mapped,
-    left_the_map,
-    offroad_distance,
-    project_on_route,
-)
+from drivax.scenario.bank.queries import around_lanes, project_on_route
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.simulator.contact import overlaps
 from drivax.simulator.dynamics import bicycle
+from drivax.simulator.situation import off_the_road
 from drivax.simulator.traffic.log import alone, frame_of, logged_history
-from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext
+from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext, History
+
+#: Rows of all moving agents at one step, as in ``bank.agents``.
+Rows = Float[Array, "A 8"]
 
 #: Acceleration (m/s2) and curvature (1/m) of an action of 1 in the published description.
 _ACCELERATION, _CURVATURE = 6.0, 0.3
@@ -44,9 +41,8 @@ class Start(Protocol):
     """Motion of the driven agent before the first step of an episode."""
 
     def begin(
-        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
-        agents: Float[Array, "A 8"], key: Any,
-    ) -> tuple[Float[Array, "history 4"], Scalar]:  # fmt: skip
+        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Rows, key: Any
+    ) -> tuple[History, Scalar]:
         """Return the motions of the steps up to ``step``, and the arc length along the route at ``step``.
 
         ``agents`` are the rows of all moving agents at ``step``, from the traffic model.
@@ -59,10 +55,9 @@ class LogStart:
     """Start as logged."""
 
     def begin(
-        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
-        agents: Any = None, key: Any = None,
-    ) -> tuple[Float[Array, "history 4"], Scalar]:  # fmt: skip
-        """Return the logged motion; needs no key."""
+        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Any = None, key: Any = None
+    ) -> tuple[History, Scalar]:  # fmt: skip
+        """Return the logged motion."""
         return logged_history(bank, index, step, slot), bank.log_progress[index, step]
 
 
@@ -94,9 +89,8 @@ class NoisyStart:
             raise UsageError(f"{self} cannot be drawn", cure="strong in [0, 1], scale >= 0, tries >= 1")
 
     def begin(
-        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
-        agents: Float[Array, "A 8"], key: Any,
-    ) -> tuple[Float[Array, "history 4"], Scalar]:  # fmt: skip
+        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Rows, key: Any
+    ) -> tuple[History, Scalar]:
         """Return the first acceptable of ``tries`` draws.
 
         Raises:
@@ -104,15 +98,14 @@ class NoisyStart:
         """
         if key is None:
             raise UsageError("a noisy start needs a random key", cure="reset(bank, index, step, slot, key)")
-        # Only steps at which the log has the agent can be replaced.
+        # Only steps at which the log has the agent are replaced.
         back = jnp.arange(1, self.steps + 1)
-        known = (bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0) & (
-            back <= step
-        )
+        known = bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0
+        known &= back <= step
         count = jnp.cumprod(known.astype(jnp.int32)).sum()
         base = logged_history(bank, index, step - count, slot)
 
-        def draw_history(key: Array) -> tuple[Float[Array, "history 4"], Bool[Array, ""]]:
+        def draw_history(key: Array) -> tuple[History, Bool[Array, ""]]:
             history = self._driven(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
             return history, _acceptable(bank, index, step, slot, agents, history)
 
@@ -135,9 +128,7 @@ class NoisyStart:
         bound = _BOUND[0] + (_BOUND[1] - _BOUND[0]) * jnp.minimum(speed / _BOUND_MPS, 1.0)
         return self.scale * _ACCELERATION * share, self.scale * _CURVATURE * bound * turn
 
-    def _driven(
-        self, history: Float[Array, "history 4"], count: Integer, acceleration: Scalar, curvature: Scalar
-    ) -> Float[Array, "history 4"]:
+    def _driven(self, history: History, count: Integer, acceleration: Scalar, curvature: Scalar) -> History:
         """Return a history after ``count`` steps of one action."""
 
         def advance(history: Array, place: Array) -> tuple[Array, None]:
@@ -148,20 +139,13 @@ class NoisyStart:
 
 
 def _acceptable(
-    bank: ScenarioBank,
-    index: Integer,
-    step: Integer,
-    slot: Integer,
-    agents: Float[Array, "A 8"],
-    history: Float[Array, "history 4"],
+    bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Rows, history: History
 ) -> Bool[Array, ""]:
     """Whether an agent with this history touches none of the others and is on the road at ``step``."""
     zero, z = jnp.zeros(()), bank.agents[index, step, slot, AgentColumn.Z]
     context = AgentContext(index, step, slot, history, jnp.zeros(2), zero, z, ())
     frame = frame_of(bank, index, step, agents, alone(context), 0)
     box, ground = frame.box[slot], z - bank.height_m(index, slot) / 2
-    points = corners(box)
-    near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
-    beyond = offroad_distance(bank, index, box[:2], points, near, ground).max()
-    off = (beyond > OFFROAD_TOLERANCE_M) & is_mapped(bank, index)
-    return ~(overlaps(frame, slot).any() | off | left_the_map(bank, index, box[:2]))
+    lanes = around_lanes(bank, index, box[:2], box[2:4], corners(box), ground)
+    _, left_map, off = off_the_road(bank, index, box, ground, lanes)
+    return ~(overlaps(frame, slot).any() | off | left_map)

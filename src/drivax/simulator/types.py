@@ -14,7 +14,13 @@ from drivax.scenario.record import record
 
 #: Steps of recent motion in a context: comfort is a window of 15 accelerations, each smoothed over 8.
 HISTORY = 23
+#: x, y (m), heading (rad), speed (m/s, never negative).
+Motion = Float[Array, " 4"]
 MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
+#: Motions of the last 23 steps, the present one last.
+History = Float[Array, "history 4"]
+#: D numbers of an action space.
+Action = Float[Array, " D"]
 
 
 @record
@@ -134,15 +140,11 @@ class Situation:
 
 @record
 class LightMemory:
-    """Memory of stop lines.
+    """Memory of stop lines."""
 
-    Attributes:
-        pause: Steps since the agent last stood before the line; saturates.
-        crossed: Steps since the agent crossed the line off its route, until evaluation: positive at red, negative
-            otherwise, 0 for none.
-    """
-
-    pause: Int[Array, "*batch L"]
+    pause: Int[Array, "*batch L"]  # Steps since the agent last stood before the line; saturates
+    # Steps since the agent crossed the line off its route, until evaluation: positive at red, negative otherwise, 0
+    # for none
     crossed: Int[Array, "*batch L"]
 
 
@@ -231,19 +233,15 @@ class Task(Protocol):
         """Names of the facts to measure."""
         ...
 
-    def motion(
-        self, motion: Float[Array, " 4"], action: Float[Array, " D"], length: Any
-    ) -> Float[Array, " 4"]:
+    def motion(self, motion: Motion, action: Action, length: Any) -> Motion:
         """Return the next motion of the driven agent."""
         ...
 
-    def actuated(
-        self, motion: Float[Array, " 4"], action: Float[Array, " D"], last: Float[Array, " D"]
-    ) -> Float[Array, " D"]:
+    def actuated(self, motion: Motion, action: Action, last: Action) -> Action:
         """Return the executed action for a requested ``action``, given the ``last`` executed one."""
         ...
 
-    def first_action(self, history: Float[Array, "history 4"], length: Any) -> Float[Array, " D"]:
+    def first_action(self, history: History, length: Any) -> Action:
         """Return the previous action at the start of an episode; its size is that of every action."""
         ...
 

@@ -1,7 +1,6 @@
-"""Values of episodes in clusters: windows of one recording are not independent of each other.
+"""Values of episodes in clusters: windows of one recording (``segment``) are not independent of each other.
 
-A cluster is a recording (``segment``); whole clusters are resampled, flipped or assigned. Clusters may lie in strata
-(kinds of scenario), within which they are resampled or assigned.
+Whole clusters are resampled, flipped or assigned, within strata (kinds of scenario) where these are given.
 """
 
 from __future__ import annotations
@@ -38,9 +37,8 @@ def numbers(values: Any) -> Values:
     """Return values as float64 with NaN where undefined; refuse infinite ones."""
     x = np.asarray(values, dtype=np.float64)
     if x.ndim != 1 or np.isinf(x).any():
-        raise UsageError(
-            "values must be a list of finite numbers, NaN or None", cure="leave infinite ones undefined"
-        )
+        problem = "values must be a list of finite numbers, NaN or None"
+        raise UsageError(problem, cure="leave infinite ones undefined")
     return x
 
 
@@ -48,10 +46,8 @@ def differences(a: Any, b: Any) -> Values:
     """Return ``a - b`` pair by pair, NaN where either is undefined."""
     first, second = numbers(a), numbers(b)
     if first.shape != second.shape:
-        raise UsageError(
-            f"pairs need two lists of one length, not {first.size} and {second.size}",
-            cure="pair by scenario first",
-        )
+        problem = f"pairs need two lists of one length, not {first.size} and {second.size}"
+        raise UsageError(problem, cure="pair by scenario first")
     return first - second
 
 
@@ -65,15 +61,13 @@ def defined(values: Any, clusters: Any = None) -> tuple[Values, Labels]:
 def dense(labels: Any, count: int, kind: str) -> Labels:
     """Return labels as numbers from 0 on; None gives each of ``count`` values its own.
 
-    Raises:
-        UsageError: There are not ``count`` labels; the message calls them ``kind``.
+    Raises UsageError unless there are ``count`` labels; the message calls them ``kind``.
     """
     if labels is None:
         return np.arange(count, dtype=np.int64)
     if len(labels) != count:
-        raise UsageError(
-            f"{len(labels)} {kind} labels for {count} values", cure=f"give one {kind} label per value"
-        )
+        problem = f"{len(labels)} {kind} labels for {count} values"
+        raise UsageError(problem, cure=f"give one {kind} label per value")
     return np.unique(np.asarray(labels), return_inverse=True)[1].astype(np.int64)
 
 
@@ -102,15 +96,10 @@ def design_effect(x: Values, labels: Labels) -> float:
 
 
 def stratum_of_clusters(strata: Any, labels: Labels, least: int = 2) -> Strata:
-    """Return the stratum of each cluster; small strata are pooled (Cochran 1977, section 5A.12, "collapsed strata").
+    """Return the stratum of each cluster, given stratum and dense cluster label of each value.
 
-    Args:
-        strata: Labels of strata, one per value; all values of a cluster have the same.
-        labels: Dense cluster label of each value.
-        least: Strata with fewer clusters are pooled; a pool that is still smaller joins the smallest other stratum.
-
-    Raises:
-        UsageError: A cluster lies in two strata.
+    Strata with fewer than ``least`` clusters are pooled; a pool that is still smaller joins the smallest other stratum
+    (Cochran 1977, section 5A.12, "collapsed strata"). Raises UsageError if a cluster lies in two strata.
     """
     own = dense(strata, labels.size, "stratum")
     _, first = np.unique(labels, return_index=True)

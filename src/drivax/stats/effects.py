@@ -22,9 +22,7 @@ _MOST = 10**12
 class PairedEffect:
     """Standardised mean differences of pairs; None where nothing varies or fewer than two pairs are defined.
 
-    Attributes:
-        d_z: Mean difference over the standard deviation of the differences: what power depends on.
-        d_av: Mean difference over the root mean variance of the two planners: comparable with an unpaired d.
+    Power depends on ``d_z``; ``d_av`` is comparable with an unpaired d.
     """
 
     d_z: float | None
@@ -69,7 +67,7 @@ def _over(difference: Any, deviation: Any) -> float | None:
 
 
 def power(effect: float, n: float, confidence: float = 0.95, share: float | None = None) -> float:
-    """Probability that a two-sided t-test detects an effect of this size.
+    """Return the probability that a two-sided t-test detects an effect of this size.
 
     ``P(|T| > t)`` with ``T`` noncentral t: for pairs ``n - 1`` degrees of freedom and noncentrality ``d sqrt(n)``, for
     two arms ``n - 2`` and ``d sqrt(n w (1 - w))`` (Cohen 1988, section 2.3; Johnson, Kotz and Balakrishnan, Continuous
@@ -82,9 +80,8 @@ def power(effect: float, n: float, confidence: float = 0.95, share: float | None
         share: ``w``, the share of the first arm; None for pairs.
     """
     if not (0 < confidence < 1 and (share is None or 0 < share < 1) and n > 0):
-        raise UsageError(
-            "confidence, share or n out of range", cure="confidence and share lie between 0 and 1, n above 0"
-        )
+        cure = "confidence and share lie between 0 and 1, n above 0"
+        raise UsageError("confidence, share or n out of range", cure=cure)
     freedom = n - (1 if share is None else 2)
     if freedom <= 0:
         return 0.0
@@ -105,10 +102,8 @@ def scenarios_needed(
     :func:`power`.
     """
     if effect == 0 or not 0 < target < 1:
-        raise UsageError(
-            f"no number of scenarios detects an effect of {effect} with power {target}",
-            cure="give an effect, and a power between 0 and 1",
-        )
+        problem = f"no number of scenarios detects an effect of {effect} with power {target}"
+        raise UsageError(problem, cure="give an effect, and a power between 0 and 1")
     low, high = 1, 2
     while not power(effect, high, confidence, share) >= target and high < _MOST:
         low, high = high, 2 * high

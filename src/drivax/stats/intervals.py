@@ -1,14 +1,14 @@
 """Confidence intervals for rates, means and paired differences.
 
 Every function takes one value per episode; ``None`` or NaN means undefined: the episode is left out and does not count
-in ``n``. Episodes that share a cluster (a ``segment``: windows of one recording, seeds of one scenario) are not
-independent, so whole clusters are resampled, within strata where these are given. Results are repeatable: seeds are
-explicit.
+in ``n``. Labels (one per episode) assign episodes to clusters, which are resampled as a whole; None: every episode is
+its own. ``confidence`` is the coverage, ``seed`` that of the random numbers.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -31,16 +31,15 @@ from drivax.stats.clusters import (
 )
 
 RESAMPLES = 10_000
-#: Random indices drawn at once: bounds the memory of a bootstrap to about 16 MB.
+#: Random numbers drawn at once: bounds the memory to about 16 MB.
 _CHUNK = 2_000_000
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with its interval and the number of episodes (or pairs) where it was defined.
+    """An estimate with its interval and the number of episodes or pairs where it is defined.
 
-    ``mean`` is None where nothing is defined; ``low`` and ``high`` are None where the spread cannot be
-    estimated (nothing defined, or a bootstrap of a single cluster).
+    ``mean`` is None if there are none; ``low`` and ``high`` are None if the spread cannot be estimated.
     """
 
     mean: float | None
@@ -50,7 +49,7 @@ class Interval:
 
     def as_dict(self) -> dict[str, float | int | None]:
         """Return the four numbers by name, as ``summary.json`` stores them."""
-        return {"mean": self.mean, "low": self.low, "high": self.high, "n": self.n}
+        return asdict(self)
 
 
 NOTHING = Interval(None, None, None, 0)
@@ -102,30 +101,16 @@ def rate(values: Any, clusters: Any = None, confidence: float = 0.95) -> Interva
 
 
 def bootstrap_mean(
-    values: Any,
-    clusters: Any = None,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    *,
-    strata: Any = None,
-    seed: int,
-) -> Interval:
+    values: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES,
+    *, strata: Any = None, seed: int,
+) -> Interval:  # fmt: skip
     """Percentile bootstrap interval of a mean, resampling whole clusters, within strata where these are given.
 
     Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3; clusters: Davison and Hinkley,
     Bootstrap Methods, 1997, section 3.8: draw as many clusters as there are, with replacement; the mean of a
-    resample is its sum over its number of episodes. Strata: of the ``C_h`` clusters of each draw ``C_h - 1`` and weigh
-    them by ``C_h / (C_h - 1)``, so that the variance is right however small strata are (Rao, Wu and Yue, Surv.
-    Methodol. 18, 1992).
-
-    Args:
-        values: Numbers or undefined, one per episode.
-        clusters: Labels of the clusters, one per episode; None: every episode is its own.
-        confidence: Coverage, between 0 and 1.
-        resamples: Number of resamples.
-        strata: Labels of the strata, one per episode, the same throughout a cluster; None: no strata. Strata of a
-            single cluster are pooled.
-        seed: Seed of the random numbers.
+    resample is its sum over its number of episodes. Strata, of which those of a single cluster are pooled: of the
+    ``C_h`` clusters of each draw ``C_h - 1`` and weigh them by ``C_h / (C_h - 1)``, so that the variance is right
+    however small strata are (Rao, Wu and Yue, Surv. Methodol. 18, 1992).
     """
     check_draws(confidence, resamples)
     x, labels = defined(values, clusters)
@@ -143,15 +128,9 @@ def bootstrap_mean(
 
 
 def split_bootstrap(
-    values: Any,
-    first: Bool[np.ndarray, " n"],
-    clusters: Any = None,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    *,
-    strata: Any = None,
-    seed: int,
-) -> Interval:
+    values: Any, first: Bool[np.ndarray, " n"], clusters: Any = None, confidence: float = 0.95,
+    resamples: int = RESAMPLES, *, strata: Any = None, seed: int,
+) -> Interval:  # fmt: skip
     """Percentile bootstrap interval of the difference of the means of two arms that share no cluster, first - second.
 
     Each arm is resampled separately, as :func:`bootstrap_mean` does (Efron and Tibshirani 1993, section 8.3). ``first``
@@ -175,13 +154,7 @@ def split_bootstrap(
 
 
 def paired_bootstrap(
-    a: Any,
-    b: Any,
-    clusters: Any = None,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    *,
-    seed: int,
+    a: Any, b: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES, *, seed: int
 ) -> Interval:
     """Percentile bootstrap interval of ``mean(a - b)`` over the pairs where both are defined.
 
@@ -191,25 +164,14 @@ def paired_bootstrap(
 
 
 def interquartile_bootstrap(
-    values: Any,
-    clusters: Any = None,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    *,
-    seed: int,
+    values: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES, *, seed: int
 ) -> Interval:
     """Percentile bootstrap interval of the interquartile mean over training seeds of their mean episode.
 
     Seeds and clusters are crossed: every seed is evaluated on every scenario. Each resample draws as many of both as
     there are, independently and with replacement (Owen, Ann. Appl. Stat. 1, 2007, "The pigeonhole bootstrap"). With few
-    seeds it is too narrow, as every bootstrap; for means see :func:`~drivax.stats.seeds.seeds_interval`.
-
-    Args:
-        values: ``[seed, episode]``, NaN where undefined; ``n`` of the result counts the defined ones.
-        clusters: Labels of the clusters, one per episode; None: every episode is its own.
-        confidence: Coverage, between 0 and 1.
-        resamples: Number of resamples.
-        seed: Seed of the random numbers.
+    seeds it is too narrow, as every bootstrap; for means see :func:`~drivax.stats.seeds.seeds_interval`. ``values`` are
+    ``[seed, episode]``; ``n`` counts the defined ones.
     """
     check_draws(confidence, resamples)
     rows = [numbers(row) for row in values]
@@ -249,8 +211,7 @@ def interquartile_mean(values: Any) -> float | None:
 
     More robust to a failed seed than the mean, more efficient than the median (Agarwal et al., NeurIPS 2021, "Deep
     reinforcement learning at the edge of the statistical precipice"). The value of rank ``i`` of ``n`` covers the
-    quantiles from ``i / n`` to ``(i + 1) / n`` and is weighted by their overlap with [1/4, 3/4], so that any number of
-    values has one; of three values the outer ones weigh a sixth each.
+    quantiles from ``i / n`` to ``(i + 1) / n`` and is weighted by their overlap with [1/4, 3/4].
     """
     x = np.sort(numbers(values))
     x = x[~np.isnan(x)]
@@ -264,7 +225,7 @@ def _interquartile(draws: Labels, sums: Totals, counts: Totals) -> float:
     """Interquartile mean of the means of the drawn seeds."""
     means = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
     mean = interquartile_mean(np.repeat(means, draws))
-    return float("nan") if mean is None else mean
+    return math.nan if mean is None else mean
 
 
 def check_draws(confidence: float, resamples: int) -> None:
@@ -307,12 +268,15 @@ def _drawn_totals(
     sums: Totals, counts: Totals, draws: int, resamples: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "2 resample"]:
     """Return sum and number of the values of ``draws`` clusters drawn with replacement, ``resamples`` times."""
-    drawn_totals = np.empty((2, resamples))
-    rows = max(1, _CHUNK // draws)
-    same = bool((counts == counts[0]).all())
-    for begin in range(0, resamples, rows):
-        end = min(begin + rows, resamples)
-        drawn = rng.integers(0, sums.size, size=(end - begin, draws), dtype=np.int32)
-        drawn_totals[0, begin:end] = sums[drawn].sum(axis=1)
-        drawn_totals[1, begin:end] = counts[0] * draws if same else counts[drawn].sum(axis=1)
-    return drawn_totals
+    chunks, same = [], bool((counts == counts[0]).all())
+    for size in chunk_sizes(resamples, draws):
+        drawn = rng.integers(0, sums.size, size=(size, draws), dtype=np.int32)
+        number = np.full(size, counts[0] * draws) if same else counts[drawn].sum(axis=1)
+        chunks.append((sums[drawn].sum(axis=1), number))
+    return np.concatenate(chunks, axis=1)
+
+
+def chunk_sizes(resamples: int, width: int) -> list[int]:
+    """Split resamples that take ``width`` random numbers each into chunks of bounded memory."""
+    rows = max(1, _CHUNK // max(1, width))
+    return [min(rows, resamples - begin) for begin in range(0, resamples, rows)]

@@ -1,8 +1,10 @@
-"""Ranking quality of scores: AUC, precision at the base rate, and rank correlation."""
+"""Ranking quality of scores: AUC, precision at the base rate, and rank correlation.
+
+Functions of labels (true for positives) raise UsageError without positives or negatives.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,28 +18,14 @@ Labels = Bool[np.ndarray[Any, Any], " n"]
 
 
 def roc_auc(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Probability that a positive scores above a negative; a tie counts half (Hanley and McNeil, 1982).
-
-    Args:
-        scores: Scores.
-        labels: True for positives.
-        weights: Weight of each; equally by default.
-
-    Raises:
-        UsageError: There are no positives, or no negatives.
-    """
-    _check(labels)
-    return _auc(*_masses(_places(scores), labels, np.ones(len(scores)) if weights is None else weights))
+    """Return the probability that a positive scores above a negative; a tie counts half (Hanley and McNeil, 1982)."""
+    return _auc(*_masses(_ranks(scores, labels), labels, weights))
 
 
 def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> tuple[float, float]:
-    """Interval of :func:`roc_auc`, by DeLong, DeLong and Clarke-Pearson (Biometrics 44, 1988), within [0, 1].
+    """Return the interval of :func:`roc_auc` by DeLong, DeLong and Clarke-Pearson (Biometrics 44, 1988), within [0, 1].
 
-    The variance is that of each one's share of others that it is ranked rightly against, over their number, summed
-    over both kinds.
-
-    Raises:
-        UsageError: There are fewer than two positives or negatives.
+    Raises UsageError for fewer than two positives or negatives.
     """
     positive, negative = scores[labels], scores[~labels]
     if min(len(positive), len(negative)) < 2:
@@ -52,43 +40,23 @@ def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> t
 
 
 def precision_at_base_rate(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Share of positives among the highest scores, of which as many are taken as there are positives.
+    """Return the share of positives among as many of the highest scores; of equal ones at the edge a share is taken.
 
-    1 for a perfect ranking, the base rate itself for one by chance. Of equal scores at the edge a share is taken.
-
-    Raises:
-        UsageError: There are no positives, or no negatives.
+    1 for a perfect ranking, the base rate for a random one.
     """
-    _check(labels)
-    return _precision(*_masses(_places(scores), labels, np.ones(len(scores)) if weights is None else weights))
+    return _precision(*_masses(_ranks(scores, labels), labels, weights))
 
 
 def bootstrap_intervals(
-    scores: Numbers,
-    labels: Labels,
-    weights: Numbers,
-    clusters: Int[np.ndarray[Any, Any], " n"],
-    resamples: int = 500,
-    confidence: float = 0.95,
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Intervals of :func:`roc_auc` and :func:`precision_at_base_rate`, by percentiles of a cluster bootstrap.
+    scores: Numbers, labels: Labels, weights: Numbers, clusters: Int[np.ndarray[Any, Any], " n"],
+    resamples: int = 500, confidence: float = 0.95,
+) -> tuple[tuple[float, float], tuple[float, float]]:  # fmt: skip
+    """Return intervals of :func:`roc_auc` and :func:`precision_at_base_rate`, by percentiles of a cluster bootstrap.
 
     Whole clusters are drawn with replacement (Davison and Hinkley, Bootstrap Methods, 1997, 3.8): those with
     a positive and those without are drawn separately, so that the base rate stays.
-
-    Args:
-        scores: Scores.
-        labels: True for positives.
-        weights: Weight of each.
-        clusters: What belongs together: the scenario of a step.
-        resamples: How often.
-        confidence: Of both intervals.
-
-    Raises:
-        UsageError: There are no positives, or no negatives.
     """
-    _check(labels)
-    place, rng = _places(scores), np.random.default_rng(0)
+    rank, rng = _ranks(scores, labels), np.random.default_rng(0)
     number, cluster = np.unique(clusters, return_inverse=True)
     holds = np.bincount(cluster, labels, len(number)) > 0
     kinds = [np.flatnonzero(holds), np.flatnonzero(~holds)]
@@ -96,24 +64,31 @@ def bootstrap_intervals(
     for _ in range(resamples):
         drawn = np.concatenate([rng.choice(kind, len(kind)) for kind in kinds if len(kind)])
         times = np.bincount(drawn, minlength=len(number))[cluster]
-        masses = _masses(place, labels, weights * times)
+        masses = _masses(rank, labels, weights * times)
         samples.append((_auc(*masses), _precision(*masses)))
-    tail = (1.0 - confidence) / 2
-    low, high = np.quantile(samples, (tail, 1.0 - tail), axis=0)
+    low, high = _bounds(samples, confidence)
     return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
 
-def _places(scores: Numbers) -> Int[np.ndarray[Any, Any], " n"]:
-    """Rank of every score among the different ones, the lowest first."""
+def _bounds(samples: Any, confidence: float) -> np.ndarray[Any, Any]:
+    tail = (1.0 - confidence) / 2
+    return np.quantile(samples, (tail, 1.0 - tail), axis=0)
+
+
+def _ranks(scores: Numbers, labels: Labels) -> Int[np.ndarray[Any, Any], " n"]:
+    """Return the rank of every score among the distinct ones, the lowest first."""
+    if labels.all() or not labels.any():
+        cure = "use a set that has positives and negatives"
+        raise UsageError("labels are all true or all false", cure=cure)
     return np.unique(scores, return_inverse=True)[1]
 
 
 def _masses(
-    place: Int[np.ndarray[Any, Any], " n"], labels: Labels, weights: Numbers
+    rank: Int[np.ndarray[Any, Any], " n"], labels: Labels, weights: Numbers | None
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Return the weight of positives and of negatives, by score."""
-    count = int(place.max()) + 1
-    return np.bincount(place, weights * labels, count), np.bincount(place, weights * ~labels, count)
+    count, weights = int(rank.max()) + 1, np.ones(len(rank)) if weights is None else weights
+    return np.bincount(rank, weights * labels, count), np.bincount(rank, weights * ~labels, count)
 
 
 def _auc(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
@@ -130,45 +105,26 @@ def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -
 
 
 def rank_correlation(first: Numbers, second: Numbers) -> float:
-    """The correlation of mid-ranks (Spearman, Am. J. Psychol. 15, 1904); NaN where one is constant."""
+    """Return the correlation of mid-ranks (Spearman, Am. J. Psychol. 15, 1904); NaN if a list is constant."""
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(rankdata(first), rankdata(second))[0, 1])
 
 
 def correlation_interval(
-    first: Numbers,
-    second: Numbers,
-    clusters: Sequence[Any] | np.ndarray[Any, Any],
-    resamples: int = 200,
-    confidence: float = 0.95,
+    first: Numbers, second: Numbers, clusters: Any, resamples: int = 200, confidence: float = 0.95
 ) -> tuple[float, float]:
-    """Interval of :func:`rank_correlation`, by percentiles of a bootstrap that draws whole clusters.
+    """Return the interval of :func:`rank_correlation`, by percentiles of a bootstrap of whole clusters.
 
-    Davison and Hinkley, Bootstrap Methods, 1997, 3.8. From -1 to 1 where nothing can be said: of a single cluster, or
-    where nearly all scores are the same.
-
-    Args:
-        first: Some scores.
-        second: Others of the same.
-        clusters: What belongs together: the recording of a scenario, the scenario of a step.
-        resamples: How often.
-        confidence: Of the interval.
+    Davison and Hinkley, Bootstrap Methods, 1997, 3.8. (-1, 1) if there is a single cluster, or nearly all scores are
+    equal.
     """
     number = np.unique(np.asarray(clusters), return_inverse=True)[1]
-    parts = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
+    members = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
     rng, samples = np.random.default_rng(0), []
     for _ in range(resamples):
-        rows = np.concatenate([parts[place] for place in rng.integers(len(parts), size=len(parts))])
-        samples.append(rank_correlation(first[rows], second[rows]))
-    if len(parts) < 2 or np.isnan(samples).any():
+        drawn = np.concatenate([members[n] for n in rng.integers(len(members), size=len(members))])
+        samples.append(rank_correlation(first[drawn], second[drawn]))
+    if len(members) < 2 or np.isnan(samples).any():
         return -1.0, 1.0
-    tail = (1.0 - confidence) / 2
-    low, high = np.quantile(samples, (tail, 1.0 - tail))
+    low, high = _bounds(samples, confidence)
     return float(low), float(high)
-
-
-def _check(labels: Labels) -> None:
-    if labels.all() or not labels.any():
-        raise UsageError(
-            "labels are all true or all false", cure="use a set that has positives and negatives"
-        )

@@ -1,6 +1,8 @@
 """Differences between policies trained with several seeds: seeds and scenarios are crossed random effects.
 
-The variances of seeds and scenarios are added, so that an interval covers other seeds and other scenarios.
+The variances of seeds and scenarios are added, so that an interval covers other seeds and other scenarios. Values have
+a row per seed and a column per scenario; scenarios that some seed leaves undefined, or of weight 0, are left out.
+``clusters`` are labels of scenarios (None: every scenario is its own), ``weights`` say how much each counts.
 """
 
 from __future__ import annotations
@@ -19,14 +21,15 @@ from drivax.stats.clusters import dense
 from drivax.stats.effects import ROUNDING
 from drivax.stats.intervals import Interval, effective_size, wilson
 
-#: Values of one policy, a row per training seed, a column per scenario.
-Values = Float64[np.ndarray, "agent scenario"]
+Values = Float64[np.ndarray, "seed scenario"]
 #: Values of another policy, with more or fewer seeds.
-Others = Float64[np.ndarray, "other_agent other_scenario"]
+Others = Float64[np.ndarray, "other_seed other_scenario"]
 Weights = Float64[np.ndarray, " scenario"]
 #: Defaults of a planned comparison.
 _CONFIDENCE, _POWER = 0.95, 0.80
-#: The largest number that is considered, and how many up to there.
+#: Infinite degrees of freedom are replaced by these.
+_MOST_FREEDOM = 1e9
+#: The largest number of seeds or clusters that is considered, and how many numbers up to it.
 _MOST, _TRIED = 10**6, 400
 
 
@@ -34,21 +37,20 @@ _MOST, _TRIED = 10**6, 400
 class Crossed:
     """A mean difference of two policies with several seeds each, all evaluated on the same scenarios.
 
-    The squared standard error adds what the choice of seeds and the choice of scenarios contribute, and takes away once
-    what is in both: ``se^2 = s_a^2 / K_a + s_b^2 / K_b + v - e_a - e_b``. These are the variances of the means of
-    agents; the variance of the mean over scenarios by clusters, ``v = C / (C - 1) sum((S_c - m W_c)^2) / W^2`` (a ratio
-    of totals; Cochran, Sampling Techniques, 1977, section 6.3); and of each kind what seeds and scenarios do together,
+    The squared standard error is ``se^2 = s_a^2 / K_a + s_b^2 / K_b + v - e_a - e_b``, at least the larger of the
+    variances of seeds and of scenarios: the variances of the means of seeds; the variance of the mean over scenarios by
+    clusters, ``v = C / (C - 1) sum((S_c - m W_c)^2) / W^2`` (a ratio of totals; Cochran, Sampling Techniques, 1977,
+    section 6.3); and of each policy the interaction of seeds and scenarios, which is in both,
     ``e = C / (C - 1) sum(R_kc^2) / (K (K - 1) W^2)`` with totals ``R_kc`` of the residuals of a two-way layout (Owen,
-    Ann. Appl. Stat. 1, 2007). It is never taken below the larger of the two. Degrees of freedom are those of
-    Satterthwaite (Biometrics Bulletin 2, 1946).
+    Ann. Appl. Stat. 1, 2007). Degrees of freedom are those of Satterthwaite (Biometrics Bulletin 2, 1946).
 
     Attributes:
         difference: The mean difference.
-        seeds: What the choice of seeds adds to the squared error, by kind of agent.
-        scenarios: What the choice of scenarios adds.
-        agents: Agents of each kind.
-        clusters: Clusters of scenarios.
-        both: What is in both, by kind of agent.
+        seeds: Variance from the choice of seeds, by policy.
+        scenarios: Variance from the choice of scenarios.
+        agents: Number of seeds, by policy.
+        clusters: Number of clusters.
+        both: Variance of the interaction, by policy.
     """
 
     difference: float
@@ -60,7 +62,7 @@ class Crossed:
 
     @property
     def error(self) -> float:
-        """Standard error."""
+        """Standard error of the difference."""
         seeds = sum(self.seeds)
         return math.sqrt(max(seeds + self.scenarios - sum(self.both), seeds, self.scenarios))
 
@@ -74,58 +76,56 @@ class Crossed:
 
     @property
     def p(self) -> float:
-        """Two-sided probability of so large a difference if there were none."""
+        """Two-sided p-value of the null hypothesis of no difference."""
         if self.error == 0.0:
             return 1.0 if self.difference == 0.0 else 0.0
-        return float(2.0 * special.stdtr(_finite(self.freedom), -abs(self.difference) / self.error))
+        return 2.0 * self._probability(-abs(self.difference) / self.error)
 
     def interval(self, confidence: float = _CONFIDENCE) -> tuple[float, float]:
-        """Confidence interval of the difference."""
-        half = _quantile(self.freedom, (1.0 + confidence) / 2.0) * self.error
+        """Return the confidence interval of the difference."""
+        half = self._quantile((1.0 + confidence) / 2.0) * self.error
         return self.difference - half, self.difference + half
 
     def detectable(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> float:
         """Return the smallest difference that is detected with probability ``power``."""
-        return self.error * (
-            _quantile(self.freedom, (1.0 + confidence) / 2.0) + _quantile(self.freedom, power)
-        )
+        return self.error * (self._quantile((1.0 + confidence) / 2.0) + self._quantile(power))
 
     def power(self, difference: float, confidence: float = _CONFIDENCE) -> float:
-        """Probability to detect a difference of this size."""
+        """Return the probability that a difference of this size is detected."""
         if self.error == 0.0:
             return float(difference != 0.0)
-        reach = abs(difference) / self.error - _quantile(self.freedom, (1.0 + confidence) / 2.0)
-        return float(special.stdtr(_finite(self.freedom), reach))
+        return self._probability(abs(difference) / self.error - self._quantile((1.0 + confidence) / 2.0))
 
     def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Seeds of each kind, more than now, with which this difference would be found; None: no number of them."""
+        """Return the seeds per policy, more than now, that detect this difference; None if no number does."""
         return self._least(self._with_seeds, max(self.agents), power, confidence)
 
     def clusters_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Clusters, more than now, with which as many seeds would find this difference; None: no number of them."""
+        """Return the clusters, more than now, that detect this difference; None if no number does."""
         return self._least(self._with_clusters, self.clusters, power, confidence)
+
+    def _probability(self, t: float) -> float:
+        return float(special.stdtr(min(self.freedom, _MOST_FREEDOM), t))
+
+    def _quantile(self, share: float) -> float:
+        return float(special.stdtrit(min(self.freedom, _MOST_FREEDOM), share))
 
     def _with_seeds(self, number: int) -> Crossed:
         """Extrapolate to ``number`` seeds of each policy with the same variance."""
-        shares = [count / number for count in self.agents]
-        seeds, both = (
-            [x * share for x, share in zip(xs, shares, strict=True)] for xs in (self.seeds, self.both)
+        (a, b), (both_a, both_b) = self.seeds, self.both
+        share_a, share_b = (count / number for count in self.agents)
+        both = both_a * share_a, both_b * share_b
+        scenarios = max(self.scenarios - sum(self.both), 0.0) + sum(both)
+        return Crossed(
+            self.difference, (a * share_a, b * share_b), scenarios, (number, number), self.clusters, both
         )
-        alone = max(self.scenarios - sum(self.both), 0.0)
-        return replace(
-            self, seeds=(seeds[0], seeds[1]), both=(both[0], both[1]), scenarios=alone + sum(both),
-            agents=(number, number),
-        )  # fmt: skip
 
     def _with_clusters(self, number: int) -> Crossed:
         """Extrapolate to ``number`` clusters with the same variance."""
-        share = self.clusters / number
-        both = [x * share for x in self.both]
-        seeds = [max(x - own, 0.0) + own * share for x, own in zip(self.seeds, self.both, strict=True)]
-        return replace(
-            self, seeds=(seeds[0], seeds[1]), both=(both[0], both[1]), scenarios=self.scenarios * share,
-            clusters=number,
-        )  # fmt: skip
+        (a, b), (both_a, both_b), share = self.seeds, self.both, self.clusters / number
+        seeds = max(a - both_a, 0.0) + both_a * share, max(b - both_b, 0.0) + both_b * share
+        both = both_a * share, both_b * share
+        return Crossed(self.difference, seeds, self.scenarios * share, self.agents, number, both)
 
     def _least(
         self, at: Callable[[int], Crossed], present: int, power: float, confidence: float
@@ -134,11 +134,8 @@ class Crossed:
             return abs(self.difference) >= at(number).detectable(power, confidence)
 
         # More is not always better: the fewer degrees of freedom are left, the more the part that stays alone weighs.
-        numbers = (
-            np.unique(np.round(np.geomspace(present + 1, max(_MOST, present + 1), _TRIED)))
-            .astype(int)
-            .tolist()
-        )
+        numbers = np.unique(np.round(np.geomspace(present + 1, max(_MOST, present + 1), _TRIED)))
+        numbers = numbers.astype(int).tolist()
         at_least = next((place for place, number in enumerate(numbers) if detected(number)), None)
         if self.difference == 0.0 or at_least is None:
             return None
@@ -150,23 +147,15 @@ class Crossed:
 
 
 def crossed_mean(values: Values, clusters: Any = None, weights: Weights | None = None) -> Crossed:
-    """The mean of one kind of agents, with an error as that of :func:`crossed_difference`; one agent alone is certain.
+    """Return the mean of one policy, with the error of :func:`crossed_difference`; one seed alone is certain.
 
-    Of differences between the same agents, one row per agent, it is a comparison in pairs.
-
-    Args:
-        values: One row per agent, one column per scenario; scenarios that some agent leaves undefined are left out.
-        clusters: Labels of the clusters of scenarios; None: every scenario is its own.
-        weights: How much each scenario counts; None: equally.
-
-    Raises:
-        UsageError: There are fewer than two clusters of scenarios that all define.
+    Of differences between the same seeds it is a paired comparison. Raises UsageError with fewer than two clusters.
     """
     return crossed_difference(certain(values), np.zeros((2, values.shape[1])), clusters, weights)
 
 
 def certain(values: Values) -> Others:
-    """Agents whose number says how they vary; one alone stands for itself, as a planner does that learned nothing."""
+    """Return the values with a single seed repeated: without variance, as of a planner that is not trained."""
     return values if len(values) > 1 else np.repeat(values, 2, axis=0)
 
 
@@ -178,18 +167,10 @@ def seeds_interval(
     *,
     share: bool = False,
 ) -> Interval:
-    """The mean of one kind of agents with the interval of :func:`crossed_mean`.
+    """Return the mean of one policy with the interval of :func:`crossed_mean`; no bounds with fewer than two clusters.
 
-    Args:
-        values: As there, like the next two.
-        clusters: The same.
-        weights: The same.
-        confidence: Coverage.
-        share: The interval lies within 0 and 1; where all is 0, or all is 1, it is Wilson's of as many clusters (with
-            weights of their effective number, Kish 1965).
-
-    Returns:
-        ``n`` counts scenarios that all agents define; no bounds with fewer than two clusters of them.
+    A ``share`` lies within 0 and 1; if all values are 0, or all are 1, the interval is Wilson's of as many clusters
+    (with weights, of their effective number, Kish 1965).
     """
     weight, keep = _counted(values, values, weights)
     number = int(keep.sum())
@@ -209,40 +190,25 @@ def seeds_interval(
 
 
 def crossed_difference(a: Values, b: Others, clusters: Any = None, weights: Weights | None = None) -> Crossed:
-    """The difference of the means of two kinds of agents.
-
-    Args:
-        a: A row per seed, a column per scenario; scenarios that some seed leaves undefined are left out.
-        b: The other kind's, in the same scenarios.
-        clusters: Labels of the clusters of scenarios; None: every scenario is its own.
-        weights: How much each scenario counts, as where some kinds were drawn more often than they occur; those of 0
-            are left out. None: equally.
-
-    Raises:
-        UsageError: There are fewer than two agents of a kind, or clusters of scenarios that all define.
-    """
+    """Return the difference of the means of two policies; UsageError for fewer than two seeds of one, or clusters."""
     if a.shape[1] != b.shape[1]:
         raise UsageError("seeds have different scenarios", cure="give one value per seed and scenario")
     labels = dense(clusters, a.shape[1], "cluster")
     weight, keep = _counted(a, b, weights)
     labels = np.unique(labels[keep], return_inverse=True)[1]
     if min(len(a), len(b)) < 2 or not keep.any() or labels.max() < 1:
-        raise UsageError(
-            "nothing to tell chance by",
-            cure="train two seeds or more of each, and drive two recordings or more",
-        )
+        cure = "train two seeds or more of each, and drive two recordings or more"
+        raise UsageError("nothing to tell chance by", cure=cure)
     share, number = weight[keep] / weight[keep].sum(), int(labels.max()) + 1
-    more = number / (number - 1)
-    kinds = [policy[:, keep] for policy in (a, b)]
-    apart = kinds[0].mean(axis=0) - kinds[1].mean(axis=0)
-    # What sums of equal numbers differ by is no difference.
-    apart = np.where(
-        np.abs(apart) <= ROUNDING * max(float(np.abs(policy).max()) for policy in kinds), 0.0, apart
-    )
+    more, policies = number / (number - 1), (a[:, keep], b[:, keep])
+    apart = policies[0].mean(axis=0) - policies[1].mean(axis=0)
+    # Differences of sums of equal numbers are rounding.
+    rounding = ROUNDING * max(float(np.abs(policy).max()) for policy in policies)
+    apart = np.where(np.abs(apart) <= rounding, 0.0, apart)
     mean = float(apart @ share)
     scenarios = more * float(np.square(np.bincount(labels, share * (apart - mean), number)).sum())
     seeds, both = [], []
-    for policy in kinds:
+    for policy in policies:
         agents, count = policy @ share, len(policy)
         seeds.append(float(agents.var(ddof=1)) / count)
         rest = (policy - agents[:, None] - policy.mean(axis=0) + agents.mean()) * share
@@ -254,11 +220,9 @@ def crossed_difference(a: Values, b: Others, clusters: Any = None, weights: Weig
 def difference_interval(
     a: Values, b: Others, clusters: Any = None, confidence: float = _CONFIDENCE
 ) -> tuple[Interval, Crossed | None]:
-    """The difference of two kinds of agents, either of which may be one agent alone (:func:`certain`).
+    """Return the interval of a difference of policies, each of one seed or several, and its :class:`Crossed`.
 
-    Returns:
-        The interval, ``n`` counting scenarios that all define, and what it is from; fewer than two clusters of them
-        have no bounds and nothing behind them.
+    With fewer than two clusters there are neither bounds nor a :class:`Crossed`.
     """
     _, keep = _counted(a, b, None)
     number = int(keep.sum())
@@ -271,17 +235,7 @@ def difference_interval(
 
 
 def log_ratio(a: Values, b: Others, clusters: Any = None, weights: Weights | None = None) -> Crossed | None:
-    """``ln(mean(a) / mean(b))`` with its error (delta method).
-
-    Args:
-        a: As for :func:`crossed_difference`, of values that are at least 0.
-        b: The same.
-        clusters: The same.
-        weights: The same.
-
-    Returns:
-        The logarithm as ``difference``; None where a mean is not above 0.
-    """
+    """Return ``ln(mean(a) / mean(b))`` of values at least 0 with its error (delta method); None if a mean is 0."""
     weight, keep = _counted(a, b, weights)
     if not keep.any():
         return None
@@ -297,11 +251,3 @@ def _counted(
 ) -> tuple[Float64[np.ndarray, " scenario"], Bool[np.ndarray, " scenario"]]:
     weight = np.ones(a.shape[1]) if weights is None else np.asarray(weights, np.float64)
     return weight, np.asarray(~np.isnan(np.concatenate([a, b])).any(axis=0) & (weight > 0.0))
-
-
-def _finite(freedom: float) -> float:
-    return min(freedom, 1e9)
-
-
-def _quantile(freedom: float, share: float) -> float:
-    return float(special.stdtrit(_finite(freedom), share))

@@ -1,7 +1,7 @@
 """Significance tests of two planners on the same scenarios, or on two arms of a split.
 
 Every test is two-sided and takes one value per scenario; ``None`` or NaN means undefined and leaves the scenario (or
-pair) out. Scenarios of one cluster (recording) stay together. Results are repeatable: seeds are explicit.
+pair) out. Scenarios of one cluster (recording; None: every scenario is its own) stay together.
 """
 
 from __future__ import annotations
@@ -16,10 +16,8 @@ from scipy import special
 
 from drivax.errors import UsageError
 from drivax.stats.clusters import Totals, defined, dense, differences, numbers, stratum_of_clusters, totals
-from drivax.stats.intervals import RESAMPLES, check_draws
+from drivax.stats.intervals import RESAMPLES, check_draws, chunk_sizes
 
-#: Random numbers drawn at once: bounds the memory to about 16 MB.
-_CHUNK = 2_000_000
 #: Resampled statistics this close to the observed one, relative to its size, are ties.
 _TIE = 1e-9
 
@@ -30,7 +28,7 @@ class Evidence:
 
     Attributes:
         name: Name of the test.
-        p: Probability of a difference at least as large under the null hypothesis; None where nothing is defined.
+        p: Probability of a difference at least as large under the null hypothesis; None if nothing is defined.
         units: Number of exchanged units: discordant pairs, or clusters whose values differ.
         exact: Whether every permutation was counted, rather than a sample.
     """
@@ -47,12 +45,7 @@ def mcnemar(a: Any, b: Any, *, mid: bool = True) -> Evidence:
     Under the null hypothesis the ``n`` pairs in which only one planner fails (discordant pairs) are tosses of a fair
     coin: ``p = 2 P(X <= k)``, at most 1, with ``X ~ Binomial(n, 1/2)`` and ``k`` the rarer of both (McNemar,
     Psychometrika 12, 1947). The mid-p value, ``p - P(X = k)``, is less conservative and keeps its level nearly always
-    (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013).
-
-    Args:
-        a: 0, 1 or undefined, one per scenario; scenarios are independent.
-        b: The other planner's, in the same order.
-        mid: Mid-p rather than exact.
+    (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013). Scenarios are independent.
     """
     for values in (numbers(a), numbers(b)):
         if not np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
@@ -79,13 +72,6 @@ def paired_permutation(
     section 3.2). All ``2^C`` sign patterns are counted where they are no more than ``resamples``, else random ones:
     ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol. Biol. 9, 2010). For 0/1
     values in clusters of one this is McNemar's exact test.
-
-    Args:
-        a: Numbers or undefined, one per scenario.
-        b: The other planner's, in the same order.
-        clusters: Labels of the clusters, one per scenario; None: every scenario is its own.
-        resamples: Number of sign patterns.
-        seed: Seed of the random numbers.
     """
     check_draws(0.95, resamples)
     x, labels = defined(differences(a, b), clusters)
@@ -100,7 +86,7 @@ def paired_permutation(
         signs = 1.0 - 2.0 * (np.arange(2**sums.size)[:, None] >> np.arange(sums.size) & 1)
         return Evidence("permutation", float((np.abs(signs @ sums) >= least).mean()), sums.size, exact=True)
     rng, beyond = np.random.default_rng(seed), 0
-    for count in _chunks(resamples, sums.size):
+    for count in chunk_sizes(resamples, sums.size):
         kept = rng.integers(0, 2, size=(count, sums.size), dtype=np.int8).astype(np.float64)
         beyond += int((np.abs(2.0 * (kept @ sums) - sums.sum()) >= least).sum())
     return Evidence("permutation", (1 + beyond) / (1 + resamples), sums.size, exact=False)
@@ -114,7 +100,6 @@ def paired_bootstrap_test(
     ``t = m / se`` is compared with ``t* = (m* - m) / se*`` of resamples, ``p = (1 + #{|t*| >= |t|}) / (1 + resamples)``
     (Efron and Tibshirani 1993, section 16.4; symmetric bootstrap-t: Hall, The Bootstrap and Edgeworth Expansion, 1992,
     section 3.6), with the standard error of a ratio of totals, ``se^2 = C / (C - 1) sum((S_c - m n_c)^2) / n^2``.
-    Arguments as for :func:`paired_permutation`.
     """
     check_draws(0.95, resamples)
     x, labels = defined(differences(a, b), clusters)
@@ -128,7 +113,7 @@ def paired_bootstrap_test(
     if error == 0.0:
         return Evidence("bootstrap", 1.0 / (1 + resamples), sums.size, exact=False)
     rng, beyond = np.random.default_rng(seed), 0
-    for count in _chunks(resamples, sums.size):
+    for count in chunk_sizes(resamples, sums.size):
         times = rng.multinomial(sums.size, np.full(sums.size, 1.0 / sums.size), size=count)
         means, errors = _mean_and_error(times @ moments, sums.size)
         # A resample without variance supports the null hypothesis, unless it repeats the mean.
@@ -148,29 +133,14 @@ def _mean_and_error(
 
 
 def split_permutation(
-    values: Any,
-    first: Bool[np.ndarray, " n"],
-    clusters: Any = None,
-    strata: Any = None,
-    resamples: int = RESAMPLES,
-    *,
-    seed: int,
-) -> Evidence:
+    values: Any, first: Bool[np.ndarray, " n"], clusters: Any = None, strata: Any = None,
+    resamples: int = RESAMPLES, *, seed: int,
+) -> Evidence:  # fmt: skip
     """Permutation test of the means of two arms: whole clusters are reassigned, keeping their number in each arm.
 
     Under the null hypothesis every assignment is as likely as the observed one, and the test is exact (Fisher 1935;
-    Good 2005, section 3.3); strata keep their numbers in each arm.
-
-    Args:
-        values: Numbers or undefined, one per scenario.
-        first: Which scenarios are in the first arm; all of a cluster, or none.
-        clusters: Labels of the clusters, one per scenario; None: every scenario is its own.
-        strata: Labels of the strata, one per scenario, the same throughout a cluster; None: no strata.
-        resamples: Number of assignments.
-        seed: Seed of the random numbers.
-
-    Raises:
-        UsageError: A cluster is in both arms or in two strata.
+    Good 2005, section 3.3); strata keep their numbers in each arm. ``first`` marks the scenarios of the first arm.
+    Raises UsageError if a cluster is in both arms or in two strata.
     """
     check_draws(0.95, resamples)
     keep = ~np.isnan(numbers(values))
@@ -188,7 +158,7 @@ def split_permutation(
     tie = _TIE * float(np.abs(x).max())
     least = abs(float(_between(mine[None], sums, counts)[0])) - tie
     rng, beyond = np.random.default_rng(seed), 0
-    for count in _chunks(resamples, sums.size):
+    for count in chunk_sizes(resamples, sums.size):
         drawn = np.empty((count, sums.size), bool)
         for stratum in range(int(of.max()) + 1):
             inside = of == stratum
@@ -201,8 +171,7 @@ def _between(
     mine: Bool[np.ndarray, "draw cluster"], sums: Totals, counts: Totals
 ) -> Float64[np.ndarray, " draw"]:
     """Return the difference of the means of two arms."""
-    weight = mine.astype(np.float64)
-    total, number = weight @ sums, weight @ counts
+    total, number = (mine.astype(np.float64) @ values for values in (sums, counts))
     return total / number - (sums.sum() - total) / (counts.sum() - number)
 
 
@@ -219,9 +188,3 @@ def holm(ps: Sequence[float | None]) -> list[float | None]:
         largest = max(largest, min(1.0, (len(order) - rank) * p))
         adjusted[place] = largest
     return adjusted
-
-
-def _chunks(resamples: int, width: int) -> list[int]:
-    """Split resamples into chunks of bounded memory."""
-    rows = max(1, _CHUNK // max(1, width))
-    return [min(rows, resamples - begin) for begin in range(0, resamples, rows)]

@@ -25,13 +25,12 @@ from drivax.geometry.boxes import corners
 from drivax.learning.policies import find_traffic
 from drivax.metrics.episode import episode_add, episode_metrics
 from drivax.metrics.selection import MetricNames
-from drivax.planners.idm import IdmPlanner
+from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank.queries import around_lanes, left_of_edges, project_on_route
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
-from drivax.simulator.simulator import Simulator
-from drivax.simulator.sparse import map_where
+from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import Frame, SimState

@@ -14,10 +14,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from drivax import settings
-from drivax.curation.controls import permute_scores
 from drivax.curation.ensemble import EnsembleConfig
 from drivax.curation.scores import ScoreTable
-from drivax.curation.weights import Scale, WeightConfig, sampling_weights
+from drivax.curation.weights import Scale, WeightConfig, permute_scores, sampling_weights
 from drivax.errors import UsageError, did_you_mean
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet

@@ -11,7 +11,7 @@ from typing import Any
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
-from drivax.evaluation.run_evaluation import EvaluationConfig, format_summary, run_evaluation
+from drivax.evaluation.runner import EvaluationConfig, format_summary, run_evaluation
 from drivax.evaluation.tables import paired_differences
 from drivax.files import write_json
 from drivax.learning.config import TrainConfig

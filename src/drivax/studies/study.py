@@ -15,16 +15,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from drivax.curation.controls import event_kinds
 from drivax.curation.logged import score_steps
-from drivax.curation.methods import Request, check_current, curate
+from drivax.curation.methods import Request, check_current, curate, event_kinds
 from drivax.curation.rarity import ExpertActions
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.subset import top_rows
 from drivax.curation.weights import draw_statistics
 from drivax.errors import UsageError
 from drivax.evaluation.episode_table import EpisodeTable
-from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
+from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.files import write_json
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet

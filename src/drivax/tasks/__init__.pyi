@@ -5,6 +5,7 @@ from .actions import Discrete as Discrete
 from .actions import Physical as Physical
 from .actions import Published as Published
 from .features import Features as Features
+from .features import View as View
 from .observations import ObservationConfig as ObservationConfig
 from .observations import OwnGroup as OwnGroup
 from .observations import observe as observe
@@ -14,4 +15,3 @@ from .rewards import OwnTerm as OwnTerm
 from .rewards import RewardConfig as RewardConfig
 from .rewards import reward_term as reward_term
 from .task import Task as Task
-from .view import View as View

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.geometry.vectors import wrap
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, Vector
 from drivax.scenario.schema import DT_S
 from drivax.simulator.dynamics import bicycle, command_between, displace, displacement, follow
+from drivax.simulator.types import History, Motion
 
 #: Wheelbase as a share of the length, for steering angles (semantics, ``published``).
 _WHEELBASE = 0.6
@@ -36,46 +38,31 @@ class Physical:
         steering_rate: Largest change of the curvature per second, 1/m/s; unlimited by default.
     """
 
+    size: ClassVar[int] = 2
     braking_mps2: float = 6.0
     acceleration_mps2: float = 6.0
     steering: float = 0.3
     jerk_mps3: float | None = None
     steering_rate: float | None = None
 
-    @property
-    def size(self) -> int:
-        """Dimension of an action."""
-        return 2
-
-    def command(self, action: Float[Array, " 2"], length_m: Any) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def command(self, action: Vector, length_m: Any) -> tuple[Scalar, Scalar]:
         """Return acceleration (m/s2) and curvature (1/m) of an action, clipped to [-1, 1]."""
         acceleration, steering = self._quantities(jnp.clip(action, -1.0, 1.0))
         return acceleration, self._curvature(steering, length_m)
 
-    def action(
-        self, motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""],
-        length_m: Any,
-    ) -> Float[Array, " 2"]:  # fmt: skip
+    def action(self, motion: Motion, acceleration: Scalar, curvature: Scalar, length_m: Any) -> Vector:
         """Return the action of an acceleration and a curvature, not clipped."""
         return self._action(acceleration, self._steering(curvature, length_m))
 
-    def expert(
-        self,
-        motion: Float[Array, " 4"],
-        target: Float[Array, " 4"],
-        beyond: Float[Array, " 4"],
-        length_m: Any,
-    ) -> Float[Array, " 2"]:
+    def expert(self, motion: Motion, target: Motion, beyond: Motion, length_m: Any) -> Vector:
         """Return the action that follows the log, from its motions one and two steps ahead; not clipped."""
         return self.action(motion, *follow(motion, target, beyond), length_m)
 
-    def clipped(self, action: Float[Array, " 2"]) -> Bool[Array, ""]:
+    def clipped(self, action: Vector) -> Bool[Array, ""]:
         """Whether an action is outside the bounds."""
         return (jnp.abs(action) > 1.0 + _ROUNDING).any()
 
-    def actuated(
-        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], last: Float[Array, " 2"]
-    ) -> Float[Array, " 2"]:
+    def actuated(self, motion: Motion, action: Vector, last: Vector) -> Vector:
         """Return the executed action, given the one executed a step ago.
 
         Clips to the bounds and the actuator rates. At standstill the last acceleration counts as at least zero.
@@ -93,9 +80,7 @@ class Physical:
             steering = jnp.clip(steering, steered - reach, steered + reach)
         return self._action(acceleration, steering)
 
-    def move(
-        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], length_m: Any
-    ) -> Float[Array, " 4"]:
+    def move(self, motion: Motion, action: Vector, length_m: Any) -> Motion:
         """Return the motion one step later."""
         return bicycle(motion, *self.command(action, length_m))
 
@@ -103,25 +88,25 @@ class Physical:
         """Return the largest curvature, 1/m."""
         return self._curvature(jnp.asarray(self.steering), length_m)
 
-    def first(self, history: Float[Array, "history 4"], length_m: Any) -> Float[Array, " 2"]:
+    def first(self, history: History, length_m: Any) -> Vector:
         """Return the last action at the start of an episode: zero, or that of the log if actuator rates are limited."""
         if self.jerk_mps3 is None and self.steering_rate is None:
             return jnp.zeros(2)
         command = command_between(history[-2], history[-1])
         return jnp.clip(self.action(history[-1], *command, length_m), -1.0, 1.0)
 
-    def _quantities(self, action: Float[Array, " 2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def _quantities(self, action: Vector) -> tuple[Scalar, Scalar]:
         scale = jnp.where(action[0] < 0, self.braking_mps2, self.acceleration_mps2)
         return action[0] * scale, action[1] * self.steering
 
-    def _action(self, acceleration: Float[Array, ""], steering: Float[Array, ""]) -> Float[Array, " 2"]:
+    def _action(self, acceleration: Scalar, steering: Scalar) -> Vector:
         scale = jnp.where(acceleration < 0, self.braking_mps2, self.acceleration_mps2)
         return jnp.stack([acceleration / scale, steering / self.steering])
 
-    def _curvature(self, steering: Float[Array, ""], length_m: Any) -> Float[Array, ""]:
+    def _curvature(self, steering: Scalar, length_m: Any) -> Scalar:
         return steering
 
-    def _steering(self, curvature: Float[Array, ""], length_m: Any) -> Float[Array, ""]:
+    def _steering(self, curvature: Scalar, length_m: Any) -> Scalar:
         return curvature
 
 
@@ -139,10 +124,10 @@ class Published(Physical):
     braking_mps2: float = 4.0
     acceleration_mps2: float = 2.0
 
-    def _curvature(self, steering: Float[Array, ""], length_m: Any) -> Float[Array, ""]:
+    def _curvature(self, steering: Scalar, length_m: Any) -> Scalar:
         return jnp.tan(steering) / (_WHEELBASE * jnp.maximum(length_m, 1.0))
 
-    def _steering(self, curvature: Float[Array, ""], length_m: Any) -> Float[Array, ""]:
+    def _steering(self, curvature: Scalar, length_m: Any) -> Scalar:
         return jnp.arctan(curvature * _WHEELBASE * jnp.maximum(length_m, 1.0))
 
 
@@ -179,20 +164,18 @@ class Discrete(Physical):
         """Return the levels of both actions in [-1, 1], ascending."""
         return _levels(self.accelerations, self.density), _levels(self.curvatures, self.density)
 
-    def of_index(self, index: Int[Array, ""]) -> Float[Array, " 2"]:
+    def of_index(self, index: Integer) -> Vector:
         """Return action number ``index``: acceleration level ``index // curvatures``, curvature level the remainder."""
         accelerations, curvatures = self.levels()
         return jnp.stack([accelerations[index // self.curvatures], curvatures[index % self.curvatures]])
 
-    def index(self, action: Float[Array, " 2"]) -> Int[Array, ""]:
+    def index(self, action: Vector) -> Integer:
         """Return the number of the nearest action."""
         accelerations, curvatures = self.levels()
         row = jnp.argmin(jnp.abs(accelerations - action[0]))
         return row * self.curvatures + jnp.argmin(jnp.abs(curvatures - action[1]))
 
-    def actuated(
-        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], last: Float[Array, " 2"]
-    ) -> Float[Array, " 2"]:
+    def actuated(self, motion: Motion, action: Vector, last: Vector) -> Vector:
         """Return the nearest level, limited as in :class:`Physical`."""
         return super().actuated(motion, self.of_index(self.index(action)), last)
 
@@ -211,31 +194,20 @@ class DeltaLocal:
         turn_rad: Turn at 1 of the third.
     """
 
+    size: ClassVar[int] = 3
     ahead_m: float = 6.0
     left_m: float = 6.0
     turn_rad: float = math.pi
 
-    @property
-    def size(self) -> int:
-        """Dimension of an action."""
-        return 3
-
     def action(
-        self, motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""],
-        length_m: Any,
-    ) -> Float[Array, " 3"]:  # fmt: skip
+        self, motion: Motion, acceleration: Scalar, curvature: Scalar, length_m: Any
+    ) -> Float[Array, " 3"]:
         """Return the displacement along an arc of this curvature at the accelerated speed; not clipped."""
         distance = jnp.maximum(motion[3] + acceleration * DT_S, 0.0) * DT_S
         turn = curvature * distance
         return self._action(distance * jnp.stack([jnp.cos(turn / 2), jnp.sin(turn / 2)]), turn)
 
-    def expert(
-        self,
-        motion: Float[Array, " 4"],
-        target: Float[Array, " 4"],
-        beyond: Float[Array, " 4"],
-        length_m: Any,
-    ) -> Float[Array, " 3"]:
+    def expert(self, motion: Motion, target: Motion, beyond: Motion, length_m: Any) -> Float[Array, " 3"]:
         """Return the displacement to the logged motion one step ahead; not clipped."""
         return self._action(*displacement(motion, target))
 
@@ -244,29 +216,26 @@ class DeltaLocal:
         return (jnp.abs(action) > 1.0 + _ROUNDING).any() | (action[0] * self.ahead_m < -1e-3)
 
     def actuated(
-        self, motion: Float[Array, " 4"], action: Float[Array, " 3"], last: Float[Array, " 3"]
+        self, motion: Motion, action: Float[Array, " 3"], last: Float[Array, " 3"]
     ) -> Float[Array, " 3"]:
         """Return the action clipped to its bounds."""
         return jnp.clip(action, jnp.array([0.0, -1.0, -1.0]), 1.0)
 
-    def move(
-        self, motion: Float[Array, " 4"], action: Float[Array, " 3"], length_m: Any
-    ) -> Float[Array, " 4"]:
+    def move(self, motion: Motion, action: Float[Array, " 3"], length_m: Any) -> Motion:
         """Return the motion one step later."""
         action = self.actuated(motion, action, action)
-        return displace(
-            motion, action[:2] * jnp.array([self.ahead_m, self.left_m]), action[2] * self.turn_rad
-        )
+        shift = action[:2] * jnp.array([self.ahead_m, self.left_m])
+        return displace(motion, shift, action[2] * self.turn_rad)
 
     def sharpest(self, length_m: Any) -> Any:
         """Return the largest curvature: unlimited, 1/m."""
         return jnp.inf
 
-    def first(self, history: Float[Array, "history 4"], length_m: Any) -> Float[Array, " 3"]:
+    def first(self, history: History, length_m: Any) -> Float[Array, " 3"]:
         """Return zeros."""
         return jnp.zeros(3)
 
-    def _action(self, shift: Float[Array, " 2"], turn: Float[Array, ""]) -> Float[Array, " 3"]:
+    def _action(self, shift: Vector, turn: Scalar) -> Float[Array, " 3"]:
         return jnp.stack([shift[0] / self.ahead_m, shift[1] / self.left_m, turn / self.turn_rad])
 
 
@@ -277,41 +246,25 @@ class DirectState:
     For planners that output trajectories and for trajectory optimisation; not for learning.
     """
 
-    @property
-    def size(self) -> int:
-        """Dimension of an action."""
-        return 4
+    size: ClassVar[int] = 4
 
-    def action(
-        self, motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""],
-        length_m: Any,
-    ) -> Float[Array, " 4"]:  # fmt: skip
+    def action(self, motion: Motion, acceleration: Scalar, curvature: Scalar, length_m: Any) -> Motion:
         """Return the motion of the bicycle one step later."""
         return bicycle(motion, acceleration, curvature)
 
-    def expert(
-        self,
-        motion: Float[Array, " 4"],
-        target: Float[Array, " 4"],
-        beyond: Float[Array, " 4"],
-        length_m: Any,
-    ) -> Float[Array, " 4"]:
+    def expert(self, motion: Motion, target: Motion, beyond: Motion, length_m: Any) -> Motion:
         """Return the logged motion one step ahead."""
         return target
 
-    def clipped(self, action: Float[Array, " 4"]) -> Bool[Array, ""]:
+    def clipped(self, action: Motion) -> Bool[Array, ""]:
         """Return False."""
         return jnp.zeros((), bool)
 
-    def actuated(
-        self, motion: Float[Array, " 4"], action: Float[Array, " 4"], last: Float[Array, " 4"]
-    ) -> Float[Array, " 4"]:
+    def actuated(self, motion: Motion, action: Motion, last: Motion) -> Motion:
         """Return the motion with heading in [-pi, pi) and nonnegative speed."""
         return jnp.stack([action[0], action[1], wrap(action[2]), jnp.maximum(action[3], 0.0)])
 
-    def move(
-        self, motion: Float[Array, " 4"], action: Float[Array, " 4"], length_m: Any
-    ) -> Float[Array, " 4"]:
+    def move(self, motion: Motion, action: Motion, length_m: Any) -> Motion:
         """Return the motion one step later."""
         return self.actuated(motion, action, action)
 
@@ -319,7 +272,7 @@ class DirectState:
         """Return the largest curvature: unlimited, 1/m."""
         return jnp.inf
 
-    def first(self, history: Float[Array, "history 4"], length_m: Any) -> Float[Array, " 4"]:
+    def first(self, history: History, length_m: Any) -> Motion:
         """Return the current motion."""
         return history[-1]
 
@@ -328,6 +281,5 @@ class DirectState:
 #: ``direct_state``.
 ActionSpace = Physical | Published | Discrete | DeltaLocal | DirectState
 
-PHYSICAL, PUBLISHED, DISCRETE, DELTA_LOCAL, DIRECT_STATE = (
-    Physical(), Published(), Discrete(), DeltaLocal(), DirectState()
-)  # fmt: skip
+PHYSICAL, PUBLISHED, DISCRETE = Physical(), Published(), Discrete()
+DELTA_LOCAL, DIRECT_STATE = DeltaLocal(), DirectState()

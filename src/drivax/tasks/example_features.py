@@ -15,12 +15,12 @@ from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
-from drivax.scenario.schema import LightState
 from drivax.simulator.ahead import ahead
 from drivax.simulator.idm import IdmParameters
+from drivax.simulator.lights import is_red
 from drivax.simulator.types import MOTION_SPEED, AgentContext
 from drivax.tasks import features
-from drivax.tasks.view import POSITION_M, SPEED_MPS, Frames, View
+from drivax.tasks.features import POSITION_M, SPEED_MPS, Frames, View
 
 #: Number of agents with a relative velocity; spacing (m) and number of route points.
 _OTHERS, _STEP_M, _POINTS = 8, 5.0, 10
@@ -74,9 +74,8 @@ def recommended_speed(
     offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
     _, there = route_ahead(bank, context.index, context.route_m, offsets)
     curvature = features.route_curvature(bank, context.index, context.route_m + offsets)
-    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there & features.has_route(
-        bank, context
-    )
+    there &= features.has_route(bank, context)
+    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there
 
 
 def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
@@ -90,17 +89,12 @@ def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float
     others = now.valid & (jnp.arange(len(now.valid)) != context.slot)
     leading = others & (place[:, 0] > 0) & (jnp.abs(place[:, 1]) < _STRIPE_M)
     half = bank.length_m(context.index, context.slot) / 2
-    gap = jnp.where(
-        leading, jnp.maximum(place[:, 0] - half - _reach(view.vector(now.box[:, 2:4]), now.box), 0.0), jnp.inf
-    )
+    direction = jnp.abs(view.vector(now.box[:, 2:4]))
+    # How far boxes extend from their centres along ego's heading.
+    reach = (direction[:, 0] * now.box[:, 4] + direction[:, 1] * now.box[:, 5]) / 2
+    gap = jnp.where(leading, jnp.maximum(place[:, 0] - half - reach, 0.0), jnp.inf)
     time = jnp.min(gap) / jnp.maximum(context.history[-1, 3], _SLOWEST_MPS)
-    share = jnp.minimum(time / _LONGEST_S, 1.0)
-    return jnp.stack([share, leading.any().astype(jnp.float32)])
-
-
-def _reach(direction: Float[Array, "S 2"], box: Float[Array, "S 6"]) -> Float[Array, " S"]:
-    """Return how far boxes of these directions (ego frame) extend from their centres along ego's heading, m."""
-    return (jnp.abs(direction[:, 0]) * box[:, 4] + jnp.abs(direction[:, 1]) * box[:, 5]) / 2
+    return jnp.stack([jnp.minimum(time / _LONGEST_S, 1.0), leading.any().astype(jnp.float32)])
 
 
 def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 6"]:
@@ -113,20 +107,10 @@ def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> 
     speed = context.history[-1, MOTION_SPEED]
     seen = ahead(bank, context, frames(0), _IDM.min_gap_m)
     leads = seen.gap < _FARTHEST_M
-    speeds = jnp.stack([speed - seen.leader, seen.leader]) * leads
-    return jnp.concatenate(
-        [
-            jnp.minimum(seen.gap, _FARTHEST_M)[None] / POSITION_M,
-            speeds / SPEED_MPS,
-            jnp.stack(
-                [
-                    leads.astype(jnp.float32),
-                    seen.desired / SPEED_MPS,
-                    seen.acceleration(speed, _IDM) / _HARDEST_MPS2,
-                ]
-            ),
-        ]
-    )
+    gap = jnp.minimum(seen.gap, _FARTHEST_M) / POSITION_M
+    speeds = jnp.stack([speed - seen.leader, seen.leader]) * leads / SPEED_MPS
+    acceleration = seen.acceleration(speed, _IDM) / _HARDEST_MPS2
+    return jnp.stack([gap, *speeds, leads.astype(jnp.float32), seen.desired / SPEED_MPS, acceleration])
 
 
 def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
@@ -140,6 +124,6 @@ def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Floa
     real = bank.light_line[context.index, LightRow.ARC] < NEVER_M
     there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
     nearest = jnp.argmin(jnp.where(there, gap, jnp.inf))
-    red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
     distance = jnp.where(there.any(), gap[nearest] / POSITION_M, 1.0)
-    return jnp.stack([distance, *((there & kind)[nearest].astype(jnp.float32) for kind in (red, True))])
+    flags = jnp.stack([there & is_red(state), there])[:, nearest].astype(jnp.float32)
+    return jnp.stack([distance, *flags])

@@ -1,4 +1,4 @@
-"""Features of observation groups: names, columns, order, and how the optional ones are computed.
+"""Features of observation groups: names, columns, order, frame and units, and the computation of the optional ones.
 
 The columns of a group follow the order of :data:`COLUMNS`, not that of a configuration.
 """
@@ -13,13 +13,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError, did_you_mean
+from drivax.geometry.vectors import rotate
 from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.record import record
 from drivax.scenario.schema import Flag
-from drivax.simulator.types import AgentContext
-from drivax.tasks.view import PIECE_M, POSITION_M
+from drivax.simulator.types import AgentContext, Frame
 
+#: Units of positions, speeds, sizes and lengths of road pieces.
+POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 #: Unit of curvature, 1/m: a turn of 10 m radius is 1.
 CURVATURE_PM = 0.1
 #: Cap of curvatures, in these units.
@@ -48,11 +51,7 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
             "limit": ("", "known"),
             "curvature": ("",),
         },
-        "lights": {
-            "position": ("x", "y"),
-            "state": ("unknown", "green", "yellow", "red"),
-            "on_route": ("",),
-        },
+        "lights": {"position": ("x", "y"), "state": ("unknown", "green", "yellow", "red"), "on_route": ("",)},
         "route": {
             "position": ("x", "y"),
             "heading": ("sin", "cos"),
@@ -61,6 +60,32 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
         },
     }
 )
+
+#: Frame of all agents 0 to 15 steps ago; the number is static.
+Frames = Callable[[int], Frame]
+
+
+@record
+class View:
+    """The ego frame: x ahead, y left."""
+
+    xy: Float[Array, " 2"]
+    cos: Float[Array, ""]
+    sin: Float[Array, ""]
+
+    @classmethod
+    def of(cls, context: AgentContext) -> View:
+        """Return the frame of the driven agent now."""
+        now = context.history[-1]
+        return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
+
+    def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+        """Transform a position, m."""
+        return rotate(xy - self.xy, self.cos, -self.sin)
+
+    def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+        """Transform a direction or velocity."""
+        return rotate(xy, self.cos, -self.sin)
 
 
 @dataclass(frozen=True)
@@ -96,14 +121,9 @@ class Features:
 
 
 def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> dict[str, tuple[str, ...]]:
-    """Return the column names of each group, without masks.
+    """Return a name per column of each group, such as ``velocity ahead``, without masks.
 
-    Args:
-        features: Features of the built-in groups.
-        shapes: Shapes of one observation, by group.
-
-    Returns:
-        A name per column by group, as ``velocity ahead``; columns of the user's groups are numbered.
+    ``shapes`` are those of one observation, by group. Columns of the user's groups are numbered.
     """
     names = {}
     for group, shape in shapes.items():
@@ -122,12 +142,9 @@ def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> di
 def joined(
     chosen: Sequence[str], parts: Mapping[str, Callable[[], Array]], rows: tuple[int, ...]
 ) -> Float[Array, "... F"]:
-    """Concatenate the columns of the selected features; others are not computed.
+    """Concatenate the columns of the selected features, computed by ``parts`` (``[*rows, columns]`` each).
 
-    Args:
-        chosen: Selected features; those without a function are ignored.
-        parts: Function of each feature, to ``[*rows, columns]``.
-        rows: Shape of the rows if nothing is selected.
+    Selected features that ``parts`` lacks are skipped; other features are not computed.
     """
     columns = [parts[name]() for name in chosen if name in parts]
     return jnp.concatenate(columns, axis=-1) if columns else jnp.zeros((*rows, 0))
@@ -168,9 +185,8 @@ def route_curvature(
     (c0, s0), (c1, s1) = ((rows[:, RouteColumn.COS], rows[:, RouteColumn.SIN]) for rows in (start, end))
     apart = behind - before
     # Without a route its rows are zero and have no angle.
-    turn = jnp.where(
-        apart > 0, jnp.arctan2(c0 * s1 - s0 * c1, jnp.where(apart > 0, c0 * c1 + s0 * s1, 1.0)), 0.0
-    )
+    angle = jnp.arctan2(c0 * s1 - s0 * c1, jnp.where(apart > 0, c0 * c1 + s0 * s1, 1.0))
+    turn = jnp.where(apart > 0, angle, 0.0)
     return turn / jnp.maximum(apart, 1.0)
 
 

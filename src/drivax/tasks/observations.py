@@ -20,22 +20,12 @@ from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer, RouteC
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import DT_S, LightState
+from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.types import HISTORY, AgentContext
-from drivax.tasks.features import (
-    COLUMNS,
-    Features,
-    columns_of,
-    cut_rows,
-    goal_ahead,
-    has_route,
-    joined,
-    recommended_speed,
-    route_curvature,
-    shown_curvature,
-)
+from drivax.tasks import features
+from drivax.tasks.features import COLUMNS, PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Features, Frames, View
 from drivax.tasks.own import check_unique, name_of
-from drivax.tasks.perception import Perception, moved_lights, moved_road, perceived
-from drivax.tasks.view import PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Frames, View
+from drivax.tasks.perception import MOVED_LIGHTS, MOVED_ROAD, Perception, perceived, position_errors
 
 #: Block size of the running count.
 _BLOCK = 8
@@ -44,8 +34,6 @@ _PASSED_M = 5.0
 Observation = dict[str, Array]
 #: Names of the groups of this module.
 GROUPS = tuple(COLUMNS)
-
-
 #: Features ``[F]`` or rows of them ``[..., F]``, or a pair of rows and a mask over them.
 Feature = Callable[[ScenarioBank, AgentContext, Frames], Any]
 
@@ -136,6 +124,11 @@ class ObservationConfig:
         return PRESETS[name]
 
 
+_PUBLISHED = Features(
+    ego_static=("length", "width", "height"),
+    agents=("position", "heading", "velocity", "length", "width", "height", "type"),
+    route=("position", "heading", "recommended_speed"),
+)
 #: ``published`` is the observation of the published description with road pieces of at most 10 m: 2,000 rows are 400
 #: pieces cut into five each, in a box of 100 m instead of a circle.
 PRESETS = MappingProxyType(
@@ -150,11 +143,7 @@ PRESETS = MappingProxyType(
             road_behind_m=100.0,
             road_side_m=100.0,
             road_cut=5,
-            features=Features(
-                ego_static=("length", "width", "height"),
-                agents=("position", "heading", "velocity", "length", "width", "height", "type"),
-                route=("position", "heading", "recommended_speed"),
-            ),
+            features=_PUBLISHED,
         ),
     }
 )
@@ -163,30 +152,23 @@ PRESETS = MappingProxyType(
 def observe(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> Observation:
-    """Return the observation of a context.
+    """Return the observation of a context; ``frames(k)`` is the frame of all agents k steps ago.
 
-    Args:
-        config: Groups, sizes and features.
-        bank: The scenarios.
-        context: The context of the observing agent.
-        frames: Frame of all agents some steps ago.
-
-    Returns:
-        By default ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last
-        action; ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
-        ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's groups.
+    By default ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last
+    action; ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
+    ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's groups.
     """
-    view, features = View.of(context), config.features
+    view, chosen = View.of(context), config.features
     if config.perception.of_agents:
         frames = perceived(config.perception, bank, context, frames)
     result = _ego(config, bank, context, view)
-    if features.agents:
+    if chosen.agents:
         result |= _agents(config, bank, context, view, frames)
-    if config.road and features.road:
+    if config.road and chosen.road:
         result |= _shown_road(config, bank, context, view)
-    if features.lights:
+    if chosen.lights:
         result |= _lights(config, bank, context, view, frames(0).lights)
-    if features.route:
+    if chosen.route:
         result |= _route(config, bank, context, view)
     for group in config.own:
         result |= group.observe(bank, context, frames)
@@ -200,7 +182,7 @@ def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> O
 def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     past = context.history[HISTORY - config.steps :]
     turned = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
-    size = bank.agent_box[context.index, context.slot, SizeColumn.FOOTPRINT] / SIZE_M
+    size = bank.agent_box[context.index, context.slot, : SizeColumn.KIND] / SIZE_M
     moving = {
         "position": lambda: view.point(past[:, :2]) / POSITION_M,
         "heading": lambda: turned[:, ::-1],
@@ -209,22 +191,18 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, v
     }
     static = {
         "length": lambda: size[:1],
-        "width": lambda: size[1:],
-        "height": lambda: bank.agent_box[context.index, context.slot, SizeColumn.HEIGHT][..., None] / SIZE_M,
+        "width": lambda: size[1:2],
+        "height": lambda: size[2:],
         "last_action": lambda: context.action,
     }
-    result = {}
-    for name, parts in (("ego", moving), ("ego_static", static)):
-        if chosen := getattr(config.features, name):
-            result[name] = joined(chosen, parts, ())
-    return result
+    groups = (("ego", config.features.ego, moving), ("ego_static", config.features.ego_static, static))
+    return {name: features.joined(chosen, parts, ()) for name, chosen, parts in groups if chosen}
 
 
 def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
     """Return the indices of the smallest entries, nearest first; padded with 0."""
-    count_there = min(count, distance.shape[0])
-    chosen = jax.lax.top_k(-distance, count_there)[1]
-    return jnp.concatenate([chosen, jnp.zeros(count - count_there, chosen.dtype)])
+    chosen = jax.lax.top_k(-distance, min(count, distance.shape[0]))[1]
+    return jnp.pad(chosen, (0, count - chosen.shape[0]))
 
 
 def _agents(
@@ -241,23 +219,19 @@ def _agents(
     def row(back: int) -> tuple[Float[Array, "K F"], Bool[Array, " K"]]:
         frame = now if back == 0 else frames(back)
         box, x = frame.box[chosen], context.history[HISTORY - 1 - back]
-
-        def relative() -> Float[Array, "K 2"]:
-            own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
-            return view.vector(frame.velocity[chosen] - own) / SPEED_MPS
-
+        own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
         parts = {
             "position": lambda: view.point(box[:, :2]) / POSITION_M,
             "heading": lambda: view.vector(box[:, 2:4])[:, ::-1],
             "velocity": lambda: view.vector(frame.velocity[chosen]) / SPEED_MPS,
-            "relative_velocity": relative,
+            "relative_velocity": lambda: view.vector(frame.velocity[chosen] - own) / SPEED_MPS,
             "time": lambda: jnp.full((config.agents, 1), -DT_S * back),
         }
-        return joined(chosen_features, parts, (config.agents,)), frame.valid[chosen]
+        return features.joined(chosen_features, parts, (config.agents,)), frame.valid[chosen]
 
-    rows = [row(back) for back in range(config.steps - 1, -1, -1)]
-    moving = jnp.stack([features for features, _ in rows], axis=1)
-    mask = jnp.stack([valid for _, valid in rows], axis=1) & there[:, None]
+    past = [row(back) for back in range(config.steps - 1, -1, -1)]
+    moving, mask = (jnp.stack(rows, axis=1) for rows in zip(*past, strict=True))
+    mask &= there[:, None]
     size = now.box[chosen, 4:6] / SIZE_M
     parts = {
         "length": lambda: size[:, :1],
@@ -265,7 +239,7 @@ def _agents(
         "height": lambda: bank.agent_box[context.index, chosen, SizeColumn.HEIGHT][..., None] / SIZE_M,
         "type": lambda: (now.kind[chosen, None] == jnp.arange(1, 5)).astype(jnp.float32),
     }
-    static = joined(chosen_features, parts, (config.agents,))
+    static = features.joined(chosen_features, parts, (config.agents,))
     static = jnp.broadcast_to(static[:, None], (*moving.shape[:2], static.shape[-1]))
     return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
@@ -281,10 +255,12 @@ def _shown_road(
         return group
     rows, mask = group["road"], group["road_mask"]
     if config.road_cut > 1:
-        rows, mask = cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
+        rows, mask = features.cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
     if noisy:
-        rows = rows.at[:, :2].add(moved_road(config.perception, bank, context, config.road) / POSITION_M)
-    columns = columns_of("road", selected) + ([rows.shape[-1] - 1] if "curvature" in selected else [])
+        errors = position_errors(config.perception, bank, context, MOVED_ROAD, config.road)
+        rows = rows.at[:, :2].add(errors / POSITION_M)
+    columns = features.columns_of("road", selected)
+    columns += [rows.shape[-1] - 1] if "curvature" in selected else []
     return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
 
@@ -294,31 +270,21 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
     ahead, left = dx * view.cos + dy * view.sin, dy * view.cos - dx * view.sin
     inside = (ahead < config.road_ahead_m) & (ahead > -config.road_behind_m)
     inside &= (jnp.abs(left) < config.road_side_m) & (layer != RoadLayer.NONE)
-    layers = (
-        (config.lanes, RoadLayer.LANE),
-        (config.edges, RoadLayer.EDGE),
-        (config.crosswalks, RoadLayer.AREA),
-    )
-    for hidden in [kind for shown, kind in layers if not shown]:
-        inside &= layer != hidden
+    kinds = (RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA)
+    for shown, kind in zip((config.lanes, config.edges, config.crosswalks), kinds, strict=True):
+        inside &= shown or layer != kind
     # Compact without sorting: the running count is the target of each row inside.
     running = running_count(inside)
     place = jnp.where(inside, running - 1, config.road)
     take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(len(inside)), mode="drop")
     rows = bank.road[context.index, take]
-    parts = [view.point(rows[:, RoadColumn.XY]) / POSITION_M, view.vector(rows[:, RoadColumn.DIRECTION])]
-    types = (
-        rows[:, RoadColumn.LAYER, None] == jnp.asarray([RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA])
-    ).astype(jnp.float32)
+    types = (rows[:, RoadColumn.LAYER, None] == jnp.asarray(kinds)).astype(jnp.float32)
     limit = rows[:, RoadColumn.LIMIT, None]
-    parts += [
-        rows[:, RoadColumn.LENGTH, None] / PIECE_M,
-        types,
-        jnp.maximum(limit, 0.0) / SPEED_MPS,
-        (limit > 0).astype(jnp.float32),
-    ]
+    parts = [view.point(rows[:, RoadColumn.XY]) / POSITION_M, view.vector(rows[:, RoadColumn.DIRECTION])]
+    parts += [rows[:, RoadColumn.LENGTH, None] / PIECE_M, types]
+    parts += [jnp.maximum(limit, 0.0) / SPEED_MPS, (limit > 0).astype(jnp.float32)]
     if "curvature" in config.features.road:
-        parts.append(shown_curvature(bank.road_curvature[context.index, take])[:, None])
+        parts.append(features.shown_curvature(bank.road_curvature[context.index, take])[:, None])
     return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
 
 
@@ -354,7 +320,8 @@ def _lights(
     def position() -> Float[Array, "K 2"]:
         middle = view.point(line[LightRow.XY, chosen].T)
         if perception.noise_m > 0:
-            middle = middle + moved_lights(perception, bank, context, state.shape[0])[chosen]
+            errors = position_errors(perception, bank, context, MOVED_LIGHTS, state.shape[0])
+            middle = middle + errors[chosen]
         return middle / POSITION_M
 
     parts = {
@@ -362,33 +329,32 @@ def _lights(
         "state": lambda: _colour(state[chosen]),
         "on_route": lambda: on_route[chosen, None].astype(jnp.float32),
     }
-    return _masked("lights", joined(config.features.lights, parts, ()), there)
+    return _masked("lights", features.joined(config.features.lights, parts, ()), there)
 
 
 def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
     """Return one-hot unknown, green, yellow, red. Flashing lights count as unknown, not red."""
     green = (state == LightState.GO) | (state == LightState.ARROW_GO)
-    yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
-    red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
+    yellow, red = is_yellow(state), is_red(state)
     return jnp.stack([~(green | yellow | red), green, yellow, red], axis=-1).astype(jnp.float32)
 
 
 def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, there = route_ahead(bank, context.index, context.route_m, offsets)
-    there &= has_route(bank, context)
+    there &= features.has_route(bank, context)
     limit = rows[:, RouteColumn.LIMIT, None]
 
     def curvature() -> Float[Array, "K 1"]:
-        return route_curvature(bank, context.index, context.route_m + offsets)[:, None]
+        return features.route_curvature(bank, context.index, context.route_m + offsets)[:, None]
 
     goal = bank.goal[context.index]
     parts = {
         "position": lambda: view.point(rows[:, RouteColumn.XY]) / POSITION_M,
         "heading": lambda: view.vector(rows[:, RouteColumn.HEADING])[:, ::-1],
         "limit": lambda: jnp.where(limit > 0, limit / SPEED_MPS, 0.0),
-        "curvature": lambda: shown_curvature(curvature()),
-        "recommended_speed": lambda: recommended_speed(curvature()) / SPEED_MPS,
-        "goal": lambda: jnp.broadcast_to(goal_ahead(view.point(goal)), (config.route, 2)),
+        "curvature": lambda: features.shown_curvature(curvature()),
+        "recommended_speed": lambda: features.recommended_speed(curvature()) / SPEED_MPS,
+        "goal": lambda: jnp.broadcast_to(features.goal_ahead(view.point(goal)), (config.route, 2)),
     }
-    return _masked("route", joined(config.features.route, parts, ()), there)
+    return _masked("route", features.joined(config.features.route, parts, ()), there)

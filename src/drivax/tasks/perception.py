@@ -1,12 +1,11 @@
-"""What ego perceives: range, lines of sight, drop-out and noise. Observations only; metrics use the truth.
+"""Perception of ego: range, occlusion, drop-out and noise. It affects observations only; metrics use the truth.
 
-It works as a tracker would. At every step a sensor on ego reports who is in range, in free view and not missed by
-chance, each at a place with that step's error; the tracker keeps what was reported. So a past step of an agent is shown
-as it was seen then, from where ego was then, the same in every observation that holds it; a step at which the agent was
-not seen is masked; and an agent that is not seen now is not there, history included.
+At every step a sensor on ego detects the agents in range, in view and not dropped, each with that step's position
+error; a tracker keeps the detections. A past step of an agent is therefore the same in every observation that holds it;
+steps without a detection are masked, and an agent that is not detected now is absent with its history.
 
-All chance follows from the state: the key is the seed with the scenario's identity, step, driven slot and the other's
-slot folded in. A replayed observation therefore equals the live one, and nothing has to be carried.
+Random numbers follow from the state: the key is the seed with the scenario's identity, step, driven slot and the
+agent's slot folded in. A replayed observation equals the live one, and nothing is carried.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import HISTORY, AgentContext, Frame
 
-#: What the key of a step is folded with, by what is drawn from it.
+#: Numbers folded into the key of a step, by what is drawn.
 #: Added to step numbers, since keys are folded with numbers from 0 on.
 _BEFORE = 16
-_DROPPED, _MOVED, _DROPPED_LIGHTS, _MOVED_LIGHTS, _MOVED_ROAD = range(5)
+_DROPPED, _MOVED, _DROPPED_LIGHTS, MOVED_LIGHTS, MOVED_ROAD = range(5)
 
 
 @dataclass(frozen=True)
@@ -58,9 +57,8 @@ class Perception:
         for name in ("range_m", "dropout_m"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(
-                    f"observation.perception.{name} is {value}; use a positive number, or null for none"
-                )
+                place = f"observation.perception.{name}"
+                raise ValueError(f"{place} is {value}; use a positive number, or null for none")
         if not 0.0 <= self.noise_m < math.inf:
             raise ValueError(f"observation.perception.noise_m is {self.noise_m}; use 0 or a positive number")
 
@@ -78,23 +76,11 @@ class Perception:
 def perceived(
     config: Perception, bank: ScenarioBank, context: AgentContext, frames: Callable[[int], Frame]
 ) -> Callable[[int], Frame]:
-    """Return the frames as ego perceived them; ego itself is exact.
+    """Return the frames as ego perceives them: unseen agents not valid, unseen lights -1, and positions with errors.
 
-    Args:
-        config: The errors.
-        bank: The scenarios.
-        context: The context of ego.
-        frames: True frame of all agents some steps ago.
-
-    Returns:
-        Frames in which unseen agents are not valid, unseen lights are -1, and positions have errors.
+    Ego itself is exact. ``frames`` returns the true frame of all agents some steps ago.
     """
-
-    @cache
-    def seen(back: int) -> Frame:
-        return _sensed(config, bank, context, frames(back), back)
-
-    return seen
+    return cache(lambda back: _sensed(config, bank, context, frames(back), back))
 
 
 def _sensed(config: Perception, bank: ScenarioBank, context: AgentContext, frame: Frame, back: int) -> Frame:
@@ -125,13 +111,8 @@ def in_view(
 ) -> Bool[Array, " S"]:
     """Return which agents are visible from a point: those with a visible centre or corner.
 
-    A box blocks a line of sight through its inside; touching does not block. No box blocks itself, and a box
-    around the eye blocks nothing. All S x S x 5 pairs are tested, about 40 operations each.
-
-    Args:
-        eye: Viewpoint, m.
-        box: All agents (``geometry.boxes``).
-        blocks: Which agents block lines of sight.
+    A box of ``blocks`` blocks lines of sight through its inside; touching does not block. No box blocks itself, and a
+    box around the eye blocks nothing. All S x S x 5 pairs are tested, about 40 operations each.
     """
     dx, dy = eye[0] - box[:, 0], eye[1] - box[:, 1]
     along, across = dx * box[:, 2] + dy * box[:, 3], dy * box[:, 2] - dx * box[:, 3]
@@ -144,29 +125,19 @@ def in_view(
 
 
 def lights_seen(
-    config: Perception,
-    bank: ScenarioBank,
-    context: AgentContext,
-    distance_m: Float[Array, " L"],
+    config: Perception, bank: ScenarioBank, context: AgentContext, distance_m: Float[Array, " L"],
     back: int = 0,
-) -> Bool[Array, " L"]:
+) -> Bool[Array, " L"]:  # fmt: skip
     """Return which stop lines were seen ``back`` steps ago, at these distances."""
     key = jax.random.fold_in(_key(config, bank, context, back), _DROPPED_LIGHTS)
     return _reported(config, key, distance_m)
 
 
-def moved_lights(
-    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
+def position_errors(
+    config: Perception, bank: ScenarioBank, context: AgentContext, drawn: int, count: int
 ) -> Float[Array, "count 2"]:
-    """Return position errors of lights in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_LIGHTS), count)
-
-
-def moved_road(
-    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
-) -> Float[Array, "count 2"]:
-    """Return position errors of road pieces in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_ROAD), count)
+    """Return position errors of ``MOVED_LIGHTS`` or ``MOVED_ROAD`` in the ego frame, m."""
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), drawn), count)
 
 
 def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: int = 0) -> Array:

@@ -9,17 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, make_dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
+from drivax.scenario.bank.scenario_bank import Scalar
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import FARTHEST_GAP_M, TTC_HORIZON_S
 from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Surroundings
 from drivax.tasks.own import check_unique, name_of
 
-Term = Callable[[Facts, Facts, Surroundings], Float[Array, ""]]
+Term = Callable[[Facts, Facts, Surroundings], Scalar]
 
 #: Progress of one step that earns the whole progress reward: 12 m/s.
 _FULL_PROGRESS_M = 12.0 * DT_S
@@ -37,19 +38,16 @@ _GOAL_M = 3.0
 
 @dataclass(frozen=True)
 class RewardTerm:
-    """A built-in term.
+    """A built-in term: a function of the facts that it ``reads``.
 
-    Attributes:
-        function: From the facts before, the facts now and the surroundings to the term.
-        reads: Facts that it reads; no others are measured for it.
-        option: Field of :class:`RewardConfig` passed as a fourth argument, if any.
+    ``option`` is the field of :class:`RewardConfig` that it takes as a fourth argument, if any.
     """
 
-    function: Callable[..., Float[Array, ""]]
+    function: Callable[..., Scalar]
     reads: frozenset[str]
     option: str | None = None
 
-    def __call__(self, before: Facts, now: Facts, around: Surroundings, *option: float) -> Float[Array, ""]:
+    def __call__(self, before: Facts, now: Facts, around: Surroundings, *option: float) -> Scalar:
         """Return the term."""
         return self.function(before, now, around, *option)
 
@@ -68,44 +66,35 @@ def reward_term(*reads: str, option: str | None = None) -> Callable[[Any], Any]:
     return register
 
 
-def _event(happens: Bool[Array, ""]) -> Float[Array, ""]:
+def _event(happens: Bool[Array, ""]) -> Scalar:
     return happens.astype(jnp.float32)
 
 
+def _event_term(name: str, fact: str) -> None:
+    """Register a term that is 1 at the steps at which a boolean fact holds."""
+    TERMS[name] = RewardTerm(lambda before, now, around: _event(getattr(now, fact)), frozenset({fact}))
+
+
 @reward_term("collision", option="collision_margin_m")
-def collision(
-    before: Facts, now: Facts, around: Surroundings, collision_margin_m: float = 0.0
-) -> Float[Array, ""]:
+def collision(before: Facts, now: Facts, around: Surroundings, collision_margin_m: float = 0.0) -> Scalar:
     """1 while the agent touches another, or is closer than the margin."""
     return _event(now.collision | (now.gap_m < collision_margin_m) if collision_margin_m else now.collision)
 
 
-@reward_term("offroad")
-def offroad(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 while a corner is off the road."""
-    return _event(now.offroad)
-
-
-@reward_term("red_light")
-def red_light(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 at the step that runs a red light."""
-    return _event(now.red_light)
-
-
-@reward_term("off_route")
-def off_route(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 while off the corridor of the route; 0 without a route."""
-    return _event(now.off_route)
+# 1 while a corner is off the road; at the step that runs a red light; while off the corridor of the route.
+_event_term("offroad", "offroad")
+_event_term("red_light", "red_light")
+_event_term("off_route", "off_route")
 
 
 @reward_term("routed", "progress_m")
-def progress(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def progress(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Progress along the route as a share of that at 12 m/s, in [0, 1]; 0 without a route."""
     return now.routed * jnp.clip((now.progress_m - before.progress_m) / _FULL_PROGRESS_M, 0.0, 1.0)
 
 
 @reward_term("acceleration_mps2", "lateral_acceleration_mps2", "jerk_mps3")
-def discomfort(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def discomfort(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Largest of acceleration, lateral acceleration and jerk over nuPlan's limits, squared, in [0, 1].
 
     Causal differences over 0.5 s: the reward never needs the future.
@@ -116,19 +105,19 @@ def discomfort(before: Facts, now: Facts, around: Surroundings) -> Float[Array, 
 
 
 @reward_term("limit_mps", "speed_mps")
-def speeding(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def speeding(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """1 while faster than a known limit by more than 2.23 m/s."""
     return _event((now.limit_mps > 0) & (now.speed_mps > now.limit_mps + _SPEEDING_MPS))
 
 
 @reward_term("routed", "progress_m")
-def any_progress(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def any_progress(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """1 on any progress along the route (published); 0 without a route."""
     return _event(now.routed & (now.progress_m > before.progress_m))
 
 
 @reward_term("lateral_acceleration_mps2", "jerk_mps3")
-def comfort(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def comfort(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """1 - min(1, (jerk + lateral acceleration) / max), in [0, 1] (published).
 
     Magnitudes in m/s3 and m/s2, causal over 0.5 s; ``max`` is 8.37 + 4.89, nuPlan's limits of both.
@@ -138,76 +127,68 @@ def comfort(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]
 
 
 @reward_term("limit_mps", "speed_mps")
-def any_speeding(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def any_speeding(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """1 while faster than a known limit (published)."""
     return _event((now.limit_mps > 0) & (now.speed_mps > now.limit_mps))
 
 
 @reward_term("ttc_s", "ttc_defined", option="ttc_s")
-def ttc(before: Facts, now: Facts, around: Surroundings, ttc_s: float = 1.5) -> Float[Array, ""]:
+def ttc(before: Facts, now: Facts, around: Surroundings, ttc_s: float = 1.5) -> Scalar:
     """1 while the time to collision is below ``ttc_s``; 0 while standing."""
     return _event(now.ttc_defined & (now.ttc_s < ttc_s))
 
 
 @reward_term("ttc_s", "ttc_defined")
-def ttc_shortfall(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def ttc_shortfall(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Shortfall of the time to collision from 1 s, in [0, 1]; 0 while standing."""
     return now.ttc_defined * jnp.clip(1.0 - now.ttc_s / _SHORT_S, 0.0, 1.0)
 
 
 @reward_term("gap_m", option="close_m")
-def close(before: Facts, now: Facts, around: Surroundings, close_m: float = 1.0) -> Float[Array, ""]:
+def close(before: Facts, now: Facts, around: Surroundings, close_m: float = 1.0) -> Scalar:
     """1 while the gap to the nearest agent is below ``close_m``."""
     return _event(now.gap_m < close_m)
 
 
-@reward_term("wrong_way")
-def wrong_way(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 while in a lane against its direction."""
-    return _event(now.wrong_way)
+# 1 while in a lane against its direction.
+_event_term("wrong_way", "wrong_way")
 
 
 @reward_term("straddling")
-def straddling(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def straddling(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """1 while a corner is outside every lane in the agent's direction; 0 where no lane is near."""
     return _event(now.straddling & around.lanes.near)
 
 
 @reward_term("log_divergence_m", "logged")
-def log_divergence(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def log_divergence(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Distance to the agent's logged position at this step, m, at most 10; 0 without one."""
     return now.logged * jnp.minimum(now.log_divergence_m, _FAR_FROM_LOG_M)
 
 
 @reward_term("lag_m", "logged")
-def lag(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def lag(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Distance by which the agent is behind its logged position along its heading, m, 0 to 10; 0 without one."""
     return now.logged * jnp.clip(now.lag_m, 0.0, _FAR_FROM_LOG_M)
 
 
 @reward_term("limit_mps", "speed_mps")
-def speed_ratio(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def speed_ratio(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Speed as a share of the limit, in [0, 1]; 0 where no limit is known."""
     known = now.limit_mps > 0
     return known * jnp.clip(now.speed_mps / jnp.where(known, now.limit_mps, 1.0), 0.0, 1.0)
 
 
 @reward_term("routed", "goal_distance_m")
-def goal(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+def goal(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """1 at the step that comes within 3 m of the goal; 0 without a route."""
     return _event(now.routed & (now.goal_distance_m <= _GOAL_M) & (before.goal_distance_m > _GOAL_M))
 
 
-@reward_term("lane_changed")
-def lane_change(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 at the step that enters a neighbouring lane of the same direction (``scenario.bank.passages``)."""
-    return _event(now.lane_changed)
-
-
-@reward_term("merged")
-def merge(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 at the step that leaves a lane that ends within 100 m, or joins another (``scenario.bank.passages``)."""
-    return _event(now.merged)
+# 1 at the step that enters a neighbouring lane of the same direction; at the step that leaves a lane that ends within
+# 100 m, or joins another (``scenario.bank.passages``).
+_event_term("lane_change", "lane_changed")
+_event_term("merge", "merged")
 
 
 SAFETY = {"collision": -1.0, "offroad": -1.0, "red_light": -1.0}
@@ -216,13 +197,9 @@ BEHAVIOUR = NAVIGATION | {"discomfort": -0.2, "speeding": -0.1}
 PUBLISHED = SAFETY | {"off_route": -0.2, "any_progress": 0.2, "comfort": 0.2, "any_speeding": -0.1}
 AGGRESSIVE = PUBLISHED | {"ttc_shortfall": -0.5, "speed_ratio": 0.3, "lane_change": 0.2, "merge": 0.2}
 Preset = Literal["safety", "navigation", "behaviour", "published", "aggressive"]
-PRESETS: dict[str, dict[str, float]] = {
-    "safety": SAFETY,
-    "navigation": NAVIGATION,
-    "behaviour": BEHAVIOUR,
-    "published": PUBLISHED,
-    "aggressive": AGGRESSIVE,
-}
+PRESETS: dict[str, dict[str, float]] = dict(
+    zip(get_args(Preset), (SAFETY, NAVIGATION, BEHAVIOUR, PUBLISHED, AGGRESSIVE), strict=True)
+)
 
 
 @dataclass(frozen=True)
@@ -249,11 +226,8 @@ class OwnTerm:
 
 
 #: ``preset`` and a weight per built-in term.
-_Weights: Any = make_dataclass(
-    "_Weights",
-    [("preset", Preset, "navigation"), *((name, float | None, None) for name in TERMS)],
-    frozen=True,
-)
+_FIELDS = [("preset", Preset, "navigation"), *((name, float | None, None) for name in TERMS)]
+_Weights: Any = make_dataclass("_Weights", _FIELDS, frozen=True)
 
 
 @dataclass(frozen=True)
@@ -300,7 +274,7 @@ class RewardConfig(_Weights):
             reads["collision"] = reads["collision"] | {"gap_m"}
         return frozenset[str]().union(*(reads[name] for name in self.weights()))
 
-    def weigh(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
+    def weigh(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Scalar]:
         """Return the weighted and scaled terms by name."""
         own = {term.name: term.term for term in self.own}
         result = {}

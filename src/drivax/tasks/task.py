@@ -12,7 +12,16 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.metrics.episode import Episode, episode_add, episode_start
 from drivax.metrics.selection import MetricNames, select_metrics
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.types import AgentContext, Facts, Frame, Situation, Surroundings
+from drivax.simulator.types import (
+    Action,
+    AgentContext,
+    Facts,
+    Frame,
+    History,
+    Motion,
+    Situation,
+    Surroundings,
+)
 from drivax.tasks.actions import ActionSpace, Physical
 from drivax.tasks.observations import Observation, ObservationConfig, observe
 from drivax.tasks.rewards import RewardConfig
@@ -50,19 +59,15 @@ class Task:
         ends = frozenset() if self.to_the_end else frozenset({*self.ends, "left_map"})
         return select_metrics(self.metrics).reads | self.rewards.reads | ends
 
-    def motion(
-        self, motion: Float[Array, " 4"], action: Float[Array, " D"], length: Any
-    ) -> Float[Array, " 4"]:
+    def motion(self, motion: Motion, action: Action, length: Any) -> Motion:
         """Return the next motion by the dynamics of the action space."""
         return self.actions.move(motion, action, length)
 
-    def actuated(
-        self, motion: Float[Array, " 4"], action: Float[Array, " D"], last: Float[Array, " D"]
-    ) -> Float[Array, " D"]:
+    def actuated(self, motion: Motion, action: Action, last: Action) -> Action:
         """Return the executed action, within bounds and actuator rates."""
         return self.actions.actuated(motion, action, last)
 
-    def first_action(self, history: Float[Array, "history 4"], length: Any) -> Float[Array, " D"]:
+    def first_action(self, history: History, length: Any) -> Action:
         """Return the last action at the start of an episode."""
         return self.actions.first(history, length)
 

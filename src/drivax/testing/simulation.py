@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from drivax.evaluation.rollout import judging
+from drivax.evaluation.rollout import evaluation_task
 from drivax.planners.catalogue import make_planner
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.columns import AgentColumn
@@ -19,8 +19,8 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import prepare_bank
-from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import alone, logged_history
+from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import AgentContext, SimState, Traffic
 from drivax.tasks.observations import View
 from drivax.tasks.task import Task
@@ -68,7 +68,7 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
     cure = "give it name, replays, init and act (planners.planner.Planner)"
     expect(valid, f"{planner!r} is not a planner", cure)
     what = f"planner {planner.name!r}"
-    simulator, bank = Simulator(judging(task or Task())), worlds.worlds()
+    simulator, bank = Simulator(evaluation_task(task or Task())), worlds.worlds()
     _check_layout(what, simulator, planner, bank)
     index, step = (axis.ravel() for axis in np.meshgrid(np.arange(len(bank)), _STARTS, indexing="ij"))
     actions_of = _driven(simulator, planner)

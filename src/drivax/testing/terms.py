@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.metrics.catalogue import EpisodeEnd, Metric
-from drivax.metrics.scores import Value
-from drivax.metrics.steps import Moment
+from drivax.metrics.steps import Moment, Value
 from drivax.plugins import find_named
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
@@ -106,7 +105,9 @@ def check_feature(feature: Feature | str) -> None:
     results = program.check_pure(bank, contexts)
     check_numbers(what, results)
     largest = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(results))
-    expect(largest <= LARGEST, f"{what} reaches {largest:g}", "scale it to about [-1, 1] (units: tasks.view)")
+    expect(
+        largest <= LARGEST, f"{what} reaches {largest:g}", "scale it to about [-1, 1] (units: tasks.features)"
+    )
     check_numbers(what, program(worlds.without_others(bank), contexts))
     check_variants(what, results, worlds.BANK_VARIANTS, lambda change: program(change(bank), contexts))
     present = np.asarray(contexts.step) == _NOW
@@ -179,6 +180,6 @@ def _check_computed(what: str, metric: Metric) -> None:
         rows = (jnp.arange(12) % len(bank), jnp.linspace(0.0, 1.0, 12), jnp.full(12, defined))
         result = program.check_pure(*rows) if defined else program(*rows)
         valid = isinstance(result, Value) and result.value.shape == (12,) and result.defined.dtype == bool
-        cure = "return drivax.metrics.scores.Value(number, defined)"
+        cure = "return drivax.metrics.steps.Value(number, defined)"
         expect(valid, f"{what} does not compute a Value of one number and one boolean", cure)
         check_numbers(what, jax.tree.map(lambda leaf, d=result.defined: np.where(d, leaf, 0.0), result.value))

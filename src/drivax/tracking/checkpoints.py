@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.errors import DataError
-from drivax.files import write_text
+from drivax.files import atomic_write, replace_folder, write_text
 
 ABOUT = "about.json"
 #: Fields of training states that checkpoints of version 0.1.0 store under another name.
@@ -36,45 +36,35 @@ State = TypeVar("State")
 
 
 class Checkpoints:
-    """The checkpoints of one run: the newest few, and the best one by a score.
-
-    Args:
-        folder: Where they lie; made when first needed. Each is a sub-folder ``step-000001000``.
-        keep: How many of the newest stay.
-        keep_best: Whether the one with the highest score stays too.
-    """
+    """The checkpoints of one run, in sub-folders ``step-000001000``: the newest ``keep``, and the best by score."""
 
     def __init__(self, folder: str | Path, keep: int = 2, keep_best: bool = True) -> None:
         if keep < 1:
             raise ValueError("keep at least one checkpoint")
-        self.folder = Path(folder)
-        self.keep = keep
-        self.keep_best = keep_best
+        self.folder, self.keep, self.keep_best = Path(folder), keep, keep_best
 
     def steps(self) -> list[int]:
-        """Steps of all complete checkpoints, ascending."""
+        """Return the steps of all complete checkpoints, ascending."""
         names = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if path.is_dir())
         return sorted(int(name) for name in names if name.isdecimal())
 
     def best(self) -> int | None:
-        """The step with the highest score (the later one of equals), None when no checkpoint has a score."""
+        """Return the step with the highest score, the later of equal ones; None without scores."""
         scores = [(self.about(step)["score"], step) for step in self.steps()]
-        # One number, or several of which the first that differs decides.
         known = [(tuple(np.atleast_1d(score)), step) for score, step in scores if score is not None]
         return max(known)[1] if known else None
 
-    def about(self, step: int) -> dict[str, Any]:
-        """What ``about.json`` says of a checkpoint: step, score, leaves.
+    def best_or_newest(self) -> int | None:
+        """Return the best step, or the newest without scores; None if there is no checkpoint."""
+        best = self.best()
+        return max(self.steps(), default=None) if best is None else best
 
-        Raises:
-            DataError: There is no such checkpoint, or its description is damaged.
-        """
+    def about(self, step: int) -> dict[str, Any]:
+        """Return step, score and leaves of a checkpoint; raises DataError if it is missing or damaged."""
         file = self._path(step) / ABOUT
         if not file.is_file():
-            have = ", ".join(map(str, self.steps())) or "none"
-            raise DataError(
-                f"there is no checkpoint of step {step}", file=self.folder, cure=f"there are: {have}"
-            )
+            cure = f"there are: {', '.join(map(str, self.steps())) or 'none'}"
+            raise DataError(f"there is no checkpoint of step {step}", file=self.folder, cure=cure)
         try:
             about = json.loads(file.read_bytes())
             for leaf in about.get("leaves", ()):
@@ -84,73 +74,49 @@ class Checkpoints:
             raise DataError(f"is damaged ({error})", file=file, cure="use another checkpoint") from error
 
     def save(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
-        """Store a state and drop checkpoints that need not stay.
+        """Store a pytree of JAX or numpy arrays (typed keys too) and numbers, drop others, and return the folder.
 
-        Args:
-            step: Training step; an existing checkpoint of it is replaced.
-            state: Pytree of JAX or numpy arrays (typed keys too) and Python numbers.
-            score: What "best" compares; higher is better. Of several numbers the first that differs decides. NaN
-                counts as none.
-
-        Returns:
-            The folder of the checkpoint.
+        Higher scores are better; of several numbers the first that differs decides. NaN counts as none.
         """
         arrays, leaves = _describe(state)
         score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
         final = self._path(step)
-        partial = self.folder / f".step-{step}.partial-{os.getpid()}"
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        try:
+        about = {"step": step, "score": score, "leaves": leaves}
+        with replace_folder(final) as partial:
             if arrays:
                 _save_arrays(partial / _ARRAYS, arrays)
-            write_text(
-                partial / ABOUT, json.dumps({"step": step, "score": score, "leaves": leaves}, indent=1)
-            )
-            shutil.rmtree(final, ignore_errors=True)
-            partial.rename(final)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            write_text(partial / ABOUT, json.dumps(about, indent=1))
         self._drop()
         return final
 
     def drop_after(self, step: int) -> None:
-        """Drop all checkpoints of later steps: they belong to a run that was cut off."""
+        """Drop all checkpoints of later steps, which belong to a run that was cut off."""
         for later in self.steps():
             if later > step:
                 self._remove(later)
 
     def restore(self, template: State, step: int | None = None, part: str = "") -> State:
-        """The stored state, or a part of it.
+        """Return the stored state, or a part of it, as ``.parameters``, given such a pytree or its shapes.
 
-        Args:
-            template: A state of the same structure (values do not matter; ``jax.ShapeDtypeStruct`` leaves will do).
-            step: Which; None: the newest.
-            part: Path of a part of the state (``.parameters``), of which ``template`` then is.
-
-        Raises:
-            DataError: No such checkpoint, it is damaged, or it does not fit the template; names the first leaf.
+        ``step`` None is the newest checkpoint. Raises DataError with the first leaf if the checkpoint is missing,
+        damaged, or does not fit the template.
         """
         return self.restore_parts({part: template}, step)[part]
 
     def restore_parts(
         self, templates: Mapping[str, State], step: int | None = None, cure: str = _CURE
     ) -> dict[str, State]:
-        """Several parts of a stored state, by their paths, read at once; otherwise as :meth:`restore`.
-
-        ``cure`` is what an error says of a template that does not fit.
-        """
-        steps = self.steps()
+        """Return several parts of a stored state by their paths, as :meth:`restore`; ``cure`` if one does not fit."""
         if step is None:
-            if not steps:
-                raise DataError("there is no checkpoint", file=self.folder, cure="train without --resume")
-            step = steps[-1]
+            step = max(self.steps(), default=None)
+        if step is None:
+            raise DataError("there is no checkpoint", file=self.folder, cure="train without --resume")
         stored = self.about(step)["leaves"]
         path = self._path(step)
         requested = {
-            part + jax.tree_util.keystr(key): leaf
+            part + name: leaf
             for part, template in templates.items()
-            for key, leaf in jax.tree_util.tree_flatten_with_path(template)[0]
+            for name, leaf in _named_leaves(template)
         }
         numbers = {leaf["name"]: n for n, leaf in enumerate(stored) if is_part(leaf["name"], templates)}
         _compare(path, [stored[number] for number in numbers.values()], list(requested.items()), cure)
@@ -163,9 +129,7 @@ class Checkpoints:
 
     def _drop(self) -> None:
         steps = self.steps()
-        stay = set(steps[-self.keep :])
-        if self.keep_best:
-            stay.add(self.best() or steps[-1])
+        stay = {*steps[-self.keep :], *([self.best()] if self.keep_best else [])}
         for step in steps:
             if step not in stay:
                 self._remove(step)
@@ -188,63 +152,41 @@ def _present_name(leaf: str) -> str:
 
 
 def pack(file: Path, tree: Any) -> None:
-    """Writes the leaves of a pytree to one ``.npz``, by name, which NumPy alone can read; a zip has checksums.
-
-    Args:
-        file: The file; it is either the old one or the whole new one.
-        tree: Arrays of NumPy's own types.
-    """
-    named: dict[str, Any] = {
-        jax.tree_util.keystr(key): np.asarray(leaf) for key, leaf in jax.tree.leaves_with_path(tree)
-    }
-    partial = file.with_name(f".{file.name}.partial-{os.getpid()}")
-    with partial.open("wb") as out:
+    """Write a pytree of arrays to one ``.npz``, by name, atomically; NumPy alone can read it."""
+    named: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree)}
+    with atomic_write(file) as out:
         np.savez(out, **named)
-    partial.replace(file)
 
 
 def unpack(file: Path, template: State) -> State:
-    """What :func:`pack` wrote.
-
-    Args:
-        file: The file.
-        template: A pytree of the same structure; ``jax.ShapeDtypeStruct`` leaves will do.
-
-    Raises:
-        DataError: It is damaged, or does not fit the template; names the first leaf.
-    """
+    """Return what :func:`pack` wrote, given a pytree of the same structure, or its shapes; errors as in restoring."""
     try:
         with zipfile.ZipFile(file) as archive:
             # Read to the end, which is when a zip compares its checksum.
-            members = {
-                name.removesuffix(".npy"): io.BytesIO(archive.read(name)) for name in archive.namelist()
-            }
-        arrays = {name: np.load(member, allow_pickle=False) for name, member in members.items()}
+            members = {name: io.BytesIO(archive.read(name)) for name in archive.namelist()}
+        arrays = {
+            name.removesuffix(".npy"): np.load(member, allow_pickle=False) for name, member in members.items()
+        }
     except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
         raise DataError(f"is damaged ({error})", file=file, cure="use another copy") from error
-    requested, structure = jax.tree_util.tree_flatten_with_path(template)
-    named = [(jax.tree_util.keystr(key), leaf) for key, leaf in requested]
-    stored = [
-        {"name": name, "type": str(array.dtype), "shape": list(array.shape)} for name, array in arrays.items()
-    ]
-    _compare(file, stored, named, _CURE)
-    return jax.tree_util.tree_unflatten(structure, [jnp.asarray(arrays[name]) for name, _ in named])
+    requested = _named_leaves(template)
+    stored = [{"name": n, "type": str(array.dtype), "shape": array.shape} for n, array in arrays.items()]
+    _compare(file, stored, requested, _CURE)
+    return jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[n]) for n, _ in requested])
+
+
+def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
+    return [(jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree.leaves_with_path(tree)]
 
 
 def _describe(state: Any) -> tuple[dict[str, np.ndarray[Any, Any]], list[dict[str, Any]]]:
-    """Arrays by number, and name, type, shape and checksum of every leaf. Orbax refuses arrays without elements."""
+    """Return arrays by number, and name, type, shape and checksum of every leaf; Orbax refuses empty arrays."""
     arrays, leaves = {}, []
-    for number, (key, leaf) in enumerate(jax.tree_util.tree_flatten_with_path(state)[0]):
+    for number, (name, leaf) in enumerate(_named_leaves(state)):
         array = np.asarray(_to_numpy(leaf), order="C")
-        leaves.append(
-            {
-                "name": jax.tree_util.keystr(key),
-                "type": _type_name(leaf),
-                "shape": list(np.shape(leaf)),
-                "stored": [str(array.dtype), list(array.shape)],
-                "crc": zlib.crc32(array.tobytes()),
-            }
-        )
+        stored, crc = [str(array.dtype), list(array.shape)], zlib.crc32(array.tobytes())
+        shape = list(np.shape(leaf))
+        leaves.append({"name": name, "type": _type_name(leaf), "shape": shape, "stored": stored, "crc": crc})
         if array.size:
             arrays[f"{number:05d}"] = array
     return arrays, leaves
@@ -274,8 +216,10 @@ def _compare(path: Path, stored: list[dict[str, Any]], requested: list[tuple[str
         if name not in need:
             raise DataError(f"the checkpoint holds {name}, which the template lacks", file=path, cure=cure)
         if have[name] != need[name]:
-            is_, want = (f"{kind}{list(shape)}" for kind, shape in (have[name], need[name]))
-            raise DataError(f"{name} is {is_} in the checkpoint, not {want}", file=path, cure=cure)
+            stored_as, requested_as = (f"{kind}{list(shape)}" for kind, shape in (have[name], need[name]))
+            raise DataError(
+                f"{name} is {stored_as} in the checkpoint, not {requested_as}", file=path, cure=cure
+            )
 
 
 def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
@@ -296,9 +240,8 @@ def _load_arrays(path: Path, leaves: list[dict[str, Any]]) -> list[np.ndarray[An
             with ocp.StandardCheckpointer() as checkpointer:
                 restored = checkpointer.restore((path / _ARRAYS).resolve(), target)
         except Exception as error:
-            raise DataError(
-                f"arrays cannot be read ({error})", file=path, cure="use another checkpoint"
-            ) from error
+            problem = f"arrays cannot be read ({error})"
+            raise DataError(problem, file=path, cure="use another checkpoint") from error
     arrays = [np.asarray(restored.get(f"{number:05d}", array)) for number, array in enumerate(empty)]
     for array, leaf in zip(arrays, leaves, strict=True):
         if zlib.crc32(array.tobytes()) != leaf["crc"]:
@@ -310,12 +253,8 @@ def _rebuild(array: np.ndarray[Any, Any], like: Any) -> Any:
     if type(like) in _SCALARS:
         return type(like)(array)
     if _is_key(like):
-        return jax.random.wrap_key_data(jnp.asarray(array), impl=_key_name(like))
+        # "key<fry>": the dtype is all that a ShapeDtypeStruct has.
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=like.dtype._impl.name)
     if isinstance(like, np.ndarray | np.generic):
         return array[()] if isinstance(like, np.generic) else array
     return jnp.asarray(array)
-
-
-def _key_name(like: Any) -> str:
-    # "key<fry>": the dtype is all that a ShapeDtypeStruct has.
-    return like.dtype._impl.name

@@ -1,11 +1,10 @@
-"""Progress of long work: a bar with rate and time left on a terminal, plain lines now and then in a log."""
+"""Progress of long work: a bar with rate and remaining time on a terminal, a line every few seconds in a log."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any, Self
 
 #: Seconds between two lines in a log.
@@ -13,17 +12,15 @@ INTERVAL_S = 10.0
 
 
 class Progress:
-    """Shows how far a long job is, how fast it goes and how long it still takes.
-
-    Use as a context manager and call :meth:`update`; the end prints one line with the total rate.
+    """A context manager that reports progress, rate and remaining time; the end prints one line with the total rate.
 
     Args:
-        what: What is going on ("converting").
+        what: Name of the work ("converting").
         unit: What is counted ("scenarios").
-        total: How many there will be; None where unknown.
+        total: Final count; None if unknown.
         stream: Text file to write to; standard error by default, so that results on standard output stay clean.
-        interval_s: Seconds between two lines where ``stream`` is no terminal.
-        clock: Seconds; a test may pass its own.
+        interval_s: Seconds between two lines if ``stream`` is no terminal.
+        clock: Returns the time in seconds.
     """
 
     def __init__(
@@ -36,9 +33,7 @@ class Progress:
         interval_s: float = INTERVAL_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.what = what
-        self.unit = unit
-        self.total = total
+        self.what, self.unit, self.total = what, unit, total
         self.done = 0
         self._stream = sys.stderr if stream is None else stream
         self._interval_s = interval_s
@@ -53,16 +48,14 @@ class Progress:
             self._start_bar()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
         if kind is None:
-            self._say(self.summary())
+            self._print(self.summary())
 
     def update(self, done: int, note: str = "", total: int | None = None) -> None:
-        """Tell how many are done; ``note`` is shown behind (a loss, a count of skipped records)."""
+        """Report the count so far, and a note to show behind it."""
         self.done = done
         self.total = self.total if total is None else total
         if self._bar is not None:
@@ -72,37 +65,30 @@ class Progress:
         now = self._clock()
         if now - self._last >= self._interval_s:
             self._last = now
-            self._say(self.line(note))
+            self._print(self.line(note))
 
     def advance(self, count: int = 1, note: str = "") -> None:
-        """Tell that ``count`` more are done."""
+        """Report ``count`` more."""
         self.update(self.done + count, note)
 
     def rate(self) -> float:
-        """Per second, since the beginning."""
+        """Return the rate per second since the beginning."""
         return self.done / max(self._clock() - self._begin, 1e-9)
 
     def line(self, note: str = "") -> str:
-        """One line about now."""
-        parts = [f"{self.what}: {self.done:,}"]
-        rate = self.rate()
+        """Return the progress so far as one line."""
+        rate, count, left = self.rate(), f"{self.done:,} {self.unit}", ""
         if self.total:
-            parts[0] += f" of {self.total:,} {self.unit} ({100 * self.done / self.total:.0f} %)"
-        else:
-            parts[0] += f" {self.unit}"
-        parts.append(f"{_number(rate)}/s")
-        if self.total and rate > 0:
-            parts.append(f"{duration((self.total - self.done) / rate)} left")
-        if note:
-            parts.append(note)
-        return ", ".join(parts)
+            count = f"{self.done:,} of {self.total:,} {self.unit} ({100 * self.done / self.total:.0f} %)"
+            left = f"{duration((self.total - self.done) / rate)} left" if rate > 0 else ""
+        return ", ".join(part for part in (f"{self.what}: {count}", f"{_number(rate)}/s", left, note) if part)
 
     def summary(self) -> str:
-        """One line about the whole."""
+        """Return the whole as one line."""
         seconds = self._clock() - self._begin
         return f"{self.what}: {self.done:,} {self.unit} in {duration(seconds)}, {_number(self.rate())}/s"
 
-    def _say(self, text: str) -> None:
+    def _print(self, text: str) -> None:
         self._stream.write(text + "\n")
         self._stream.flush()
 
@@ -111,21 +97,17 @@ class Progress:
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as Bar
 
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
+        description, rate, note = map(
+            TextColumn, ("{task.description}", "{task.fields[rate]}", "{task.fields[note]}")
         )
+        columns = (description, BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn(), note)
         self._bar = Bar(*columns, console=Console(file=self._stream), transient=True)
         self._task = self._bar.add_task(self.what, total=self.total, rate="", note="")
         self._bar.start()
 
 
 def duration(seconds: float) -> str:
-    """Seconds as a person writes them: ``4.2 s``, ``3 min 5 s``, ``2 h 10 min``."""
+    """Format seconds as ``4.2 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"
     whole = round(seconds)

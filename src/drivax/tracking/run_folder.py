@@ -26,10 +26,12 @@ from drivax.errors import DataError, UsageError
 from drivax.files import check_output, replace_folder, write_text
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.sinks import read_rows
-from drivax.tracking.zoo import is_policy, policy_folder
 
 CONFIG_FILE = "config.yaml"
 RUN_FILE = "run.json"
+#: Prefix of the policies that come with the package.
+ZOO = "zoo:"
+_ZOO_FOLDER = Path(__file__).resolve().parent.parent / "zoo"
 _TRAININGS = ("training", "seeds")
 _PACKAGES = ("drivax", "jax", "jaxlib", "flax", "optax", "numpy")
 
@@ -56,13 +58,10 @@ class RunFolder:
 
         Args:
             path: Folder to create.
-            config: Configuration record (a dataclass).
+            config: Configuration record.
             data: Scenario sets that the run reads.
-            overwrite: Replace an existing run folder; other folders are never replaced.
+            overwrite: See :meth:`check`, which may raise UsageError.
             info: Further entries of ``run.json``, plain JSON values.
-
-        Raises:
-            UsageError: As :meth:`check`.
         """
         path = Path(path)
         cls.check(path, overwrite, info.get("kind"))
@@ -74,15 +73,9 @@ class RunFolder:
 
     @staticmethod
     def check(path: Path, overwrite: bool, kind: str | None = None) -> None:
-        """Refuse an output folder, before any work is done.
+        """Raise UsageError, before any work is done, if a run cannot be written to a folder.
 
-        Args:
-            path: The folder.
-            overwrite: Whether an existing run may be replaced.
-            kind: Kind of the new run; a training only replaces a training, and nothing else replaces one.
-
-        Raises:
-            UsageError: The folder exists and is no run folder, holds another kind, or ``overwrite`` is not given.
+        Only run folders are replaced, with ``overwrite``; a training (``kind``) only by a training, and nothing else.
         """
         if not path.exists() or (path.is_dir() and not any(path.iterdir())):
             return
@@ -90,26 +83,18 @@ class RunFolder:
             raise UsageError("output exists and is not a run folder", file=path, cure="choose another name")
         present = _kind(path)
         if kind is not None and present is not None and (present in _TRAININGS) != (kind in _TRAININGS):
-            raise UsageError(
-                f"output folder holds a run of kind {present}, not {kind}",
-                file=path,
-                cure="choose another name",
-            )
+            problem = f"output folder holds a run of kind {present}, not {kind}"
+            raise UsageError(problem, file=path, cure="choose another name")
         check_output(path, overwrite, folder=True)
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
-        """Open an existing run folder.
-
-        Raises:
-            DataError: The folder or its ``run.json`` is missing or damaged.
-        """
+        """Open a run folder; raises DataError if it or its ``run.json`` is missing or damaged."""
         path, cure = Path(path), "give a folder written by drivax evaluate or drivax train"
-        if not path.is_dir():
-            raise DataError("run folder not found", file=path, cure=cure)
         file = path / RUN_FILE
         if not file.is_file():
-            raise DataError(f"not a run folder: no {RUN_FILE}", file=path, cure=cure)
+            problem = f"not a run folder: no {RUN_FILE}" if path.is_dir() else "run folder not found"
+            raise DataError(problem, file=path, cure=cure)
         try:
             info = json.loads(file.read_bytes())
         except ValueError as error:
@@ -126,9 +111,7 @@ class RunFolder:
     def config(self, cls: type[Record], overrides: Sequence[str] = ()) -> Record:
         """Return the run's configuration as a record, with overrides as on a command line.
 
-        Raises:
-            DataError: ``config.yaml`` is missing.
-            UsageError: ``config.yaml`` does not fit ``cls``.
+        Raises DataError if ``config.yaml`` is missing, UsageError if it does not fit ``cls``.
         """
         return settings.load(cls, existing(self.path / CONFIG_FILE, "run the command again"), overrides)
 
@@ -156,20 +139,12 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """Rows of ``metrics.jsonl``, without a last one that was cut off.
-
-        Raises:
-            DataError: The file is missing or damaged.
-        """
+        """Return the rows of ``metrics.jsonl`` as :func:`read_rows`; raises DataError if there is none."""
         return list(read_rows(existing(self.metrics, "train again")))
 
 
 def existing(path: Path, cure: str) -> Path:
-    """Return the path of a file that has to exist.
-
-    Raises:
-        DataError: The file does not exist.
-    """
+    """Return the path of a file; raises DataError if there is none."""
     if not path.is_file():
         raise DataError("file not found", file=path, cure=cure)
     return path
@@ -189,28 +164,41 @@ def seed_folders(path: str | Path) -> list[Path]:
 
 
 def _kind(path: Path) -> str | None:
-    """Kind of the run in a folder; None where it cannot be read."""
-    try:
-        info = json.loads((path / RUN_FILE).read_bytes())
-    except (OSError, ValueError):
-        return None
-    return info.get("kind") if isinstance(info, dict) else None
+    """Return the kind of the run in a folder; None if it cannot be read."""
+    with contextlib.suppress(DataError, OSError):
+        return RunFolder.open(path).kind
+    return None
 
 
 def run_and_step(name: str) -> tuple[str, int | None]:
-    """Split ``RUN@STEP`` or ``RUN``, which leaves the step None.
-
-    Raises:
-        UsageError: The step is not a number.
-    """
+    """Split ``RUN@STEP`` or ``RUN``, which leaves the step None; raises UsageError if the step is not a number."""
     run, at, step = name.partition("@")
     if at and not step.isdecimal():
         raise UsageError(f"{step!r} is not a checkpoint step", cure="write RUN@STEP, as runs/a@100000")
     return run, int(step) if at else None
 
 
+def zoo() -> list[str]:
+    """Return the names of the trained policies that come with the package: ``zoo:NAME``."""
+    return sorted(ZOO + path.parent.name for path in _ZOO_FOLDER.glob("*/run.json"))
+
+
+def policy_folder(name: str | Path) -> Path:
+    """Return the folder of a policy of the zoo, or the path itself; raises UsageError for an unknown ``zoo:NAME``."""
+    if not str(name).startswith(ZOO):
+        return Path(name)
+    if name not in zoo():
+        raise UsageError(f"there is no policy {str(name)!r} in the zoo", cure=f"use {', '.join(zoo())}")
+    return _ZOO_FOLDER / str(name).removeprefix(ZOO)
+
+
+def is_policy(name: str | Path) -> bool:
+    """Whether a name is that of a trained policy: ``zoo:NAME``, or a folder."""
+    return str(name).startswith(ZOO) or Path(name).is_dir()
+
+
 def learned_from(planner: str) -> list[dict[str, Any]]:
-    """Training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), pretraining included; none for others."""
+    """Return the training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), pretraining included, else none."""
     folder = planner.partition("@")[0]
     path = policy_folder(folder) if is_policy(folder) else Path(folder)
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
@@ -218,7 +206,7 @@ def learned_from(planner: str) -> list[dict[str, Any]]:
 
 
 def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Data sets that a training's ``run.json`` names, its own first, each once."""
+    """Return the data sets that a training's ``run.json`` names, its own first, each once."""
     known: dict[str, dict[str, Any]] = {}
     for entry in (*info.get("data", ()), *info.get("networks_from", {}).get("data", ())):
         known.setdefault(entry["hash"], entry)
@@ -262,7 +250,7 @@ def machine() -> dict[str, Any]:
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:
-    """Commit of the checkout around ``folder``, and whether package or presets differ from it; None outside of one."""
+    """Return the commit of the checkout around a folder, and whether package or presets differ; None outside of one."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(folder), *arguments]

@@ -16,11 +16,9 @@ Result = TypeVar("Result")
 
 
 def worker_pool(workers: int, cores: Sequence[int] | None = None) -> ProcessPoolExecutor:
-    """A pool of fresh processes: on Ctrl-C they die silently, and a parent that is killed takes them along.
+    """Return a pool of new processes that end silently on Ctrl-C, and with their parent if it is killed.
 
-    Args:
-        workers: Number of processes.
-        cores: The one core that each may use; None: any.
+    Each may use one of ``cores``; None: any.
     """
     processes = multiprocessing.get_context("spawn")
     free: Any = None
@@ -34,14 +32,10 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> ProcessPool
 def one_core_each(
     call: Callable[[Task], Result], tasks: Sequence[Task], cores: int | None = None
 ) -> Iterator[tuple[Task, Result]]:
-    """Calls a function of every task in a process that has one core, and yields each result when it is there.
+    """Call an importable function with each task in a process that has one core; yield results as they finish.
 
-    So trainings run side by side: none waits for another, and none changes another's bits.
-
-    Args:
-        call: A function of a module, which a new process can import.
-        tasks: What it is called with.
-        cores: How many cores to use at most; None: all that this process may use.
+    Trainings that run side by side neither wait for each other nor change each other's results. At most ``cores`` cores
+    are used; None: all that this process may use.
     """
     known = sorted(os.sched_getaffinity(0))[:cores]
     with worker_pool(len(known), known) as pool:
@@ -69,7 +63,7 @@ def _start(free: Any) -> None:
 
 
 def _die_with_parent() -> None:
-    """A parent that is killed cannot stop its workers, and they would wait for work for ever."""
+    # A parent that is killed cannot stop its workers, and they would wait for work for ever.
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,41 +22,38 @@ Array = np.ndarray[Any, Any]
 #: Name of a map next to a log.
 MAP_PATTERN = "log_map_archive_*.json"
 _AGAIN = "download the map again"
-#: A local map spans some hundred metres; a point this far from the others is damaged.
+#: A local map spans some hundred metres; a point this far from the others is damage.
 _SPREAD_M = 20_000.0
 #: Centre lines and widths are sampled at least this densely.
 _SPACING_M = 2.0
 _LANES = {"VEHICLE": RoadKind.LANE_SURFACE, "BUS": RoadKind.LANE_SURFACE, "BIKE": RoadKind.LANE_BIKE}
-#: Where one side is dashed and the other solid, WOMD has a code for yellow only; white ones forbid crossing from one
-#: side and become double solid.
+#: WOMD has no white lines that are dashed on one side and solid on the other: they become double solid.
 _MARKS = {
     "DASHED_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,
     "DOUBLE_DASH_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,
     "SOLID_WHITE": RoadKind.LINE_SOLID_SINGLE_WHITE,
-    "DOUBLE_SOLID_WHITE": RoadKind.LINE_SOLID_DOUBLE_WHITE,
-    "DASH_SOLID_WHITE": RoadKind.LINE_SOLID_DOUBLE_WHITE,
-    "SOLID_DASH_WHITE": RoadKind.LINE_SOLID_DOUBLE_WHITE,
+    **dict.fromkeys(
+        ("DOUBLE_SOLID_WHITE", "DASH_SOLID_WHITE", "SOLID_DASH_WHITE"), RoadKind.LINE_SOLID_DOUBLE_WHITE
+    ),
     "DASHED_YELLOW": RoadKind.LINE_BROKEN_SINGLE_YELLOW,
     "DOUBLE_DASH_YELLOW": RoadKind.LINE_BROKEN_DOUBLE_YELLOW,
     "SOLID_YELLOW": RoadKind.LINE_SOLID_SINGLE_YELLOW,
     "DOUBLE_SOLID_YELLOW": RoadKind.LINE_SOLID_DOUBLE_YELLOW,
-    "DASH_SOLID_YELLOW": RoadKind.LINE_PASSING_DOUBLE_YELLOW,
-    "SOLID_DASH_YELLOW": RoadKind.LINE_PASSING_DOUBLE_YELLOW,
+    **dict.fromkeys(("DASH_SOLID_YELLOW", "SOLID_DASH_YELLOW"), RoadKind.LINE_PASSING_DOUBLE_YELLOW),
 }
 
 
-@dataclass(frozen=True)
-class ArgoverseMap:
-    """A map's features, and what was left out, by name."""
+class ArgoverseMap(NamedTuple):
+    """A map's features, and numbers of what was left out."""
 
     features: tuple[MapFeature, ...]
     lost: dict[str, int]
 
 
 def read_map(path: Path) -> ArgoverseMap:
-    """Reads a local map: lanes, painted lines (once each), road edges and crossings, in the city's frame, metres.
+    """Read a local map: lanes, painted lines (once each), road edges and crossings, in the city's frame, metres.
 
-    Lanes keep their ids, their links (some lead outside the local map) and all neighbours, oncoming ones included.
+    Lanes keep their ids, their links (some dangle) and all neighbours, oncoming ones included.
     """
     try:
         return _decode(parsing.load_json(path))
@@ -75,22 +71,29 @@ def _decode(content: Any) -> ArgoverseMap:
     rings: list[Area] = [(_points(area, "area_boundary"), ()) for area in areas]
     walks = [np.concatenate((_points(walk, "edge1"), _points(walk, "edge2")[::-1])) for walk in crossings]
     walks = [walk for walk in walks if len(walk) >= 3]
-    _check_extent([lane.points for lane in lanes], [line for _, line in lines], [r for r, _ in rings], walks)
+    _check_extent(
+        [*(lane.points for lane in lanes), *(line for _, line in lines), *(r for r, _ in rings), *walks]
+    )
     free = 1 + max((lane.feature_id for lane in lanes), default=0)
     edges = road_edges(rings, free)
-    free += len(edges)
     drawn = [*lines, *((RoadKind.CROSSWALK, walk) for walk in walks)]
-    rest = [MapFeature(free + number, kind, points) for number, (kind, points) in enumerate(drawn)]
+    rest = [
+        MapFeature(number, kind, points) for number, (kind, points) in enumerate(drawn, free + len(edges))
+    ]
     lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes))
     return ArgoverseMap((*lanes, *edges, *rest), lost)
 
 
 def _lane(segment: Any) -> MapFeature | None:
-    """A lane, or None where its boundaries have no length."""
+    """A lane, or None if a boundary has no length."""
     left, right = _points(segment, "left_lane_boundary"), _points(segment, "right_lane_boundary")
-    if min(arc_lengths(left).max(initial=0.0), arc_lengths(right).max(initial=0.0)) < 1e-3:
+    lengths = [arc_lengths(line).max(initial=0.0) for line in (left, right)]
+    if min(lengths) < 1e-3:
         return None
-    left, right = _resample_boundaries(left, right)
+    # Sampled at the same fractions of their lengths, points of one row face each other.
+    count = int(min(max(lengths), 2 * _SPREAD_M) / _SPACING_M) + 2
+    fraction = np.linspace(0.0, 1.0, max(len(left), len(right), count))
+    left, right = _at(left, fraction), _at(right, fraction)
     return MapFeature(
         feature_id=_id(segment.get("id")),
         kind=_LANES.get(str(segment.get("lane_type")), RoadKind.LANE_UNDEFINED),
@@ -104,16 +107,6 @@ def _lane(segment: Any) -> MapFeature | None:
     )
 
 
-def _resample_boundaries(
-    left: Float[Array, "left 3"], right: Float[Array, "right 3"]
-) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
-    """Both boundaries at the same fractions of their lengths, so that points of the same row face each other."""
-    longest = max(arc_lengths(left)[-1], arc_lengths(right)[-1])
-    count = int(min(longest, 2 * _SPREAD_M) / _SPACING_M) + 2
-    fraction = np.linspace(0.0, 1.0, max(len(left), len(right), count))
-    return _at(left, fraction), _at(right, fraction)
-
-
 def _at(line: Float[Array, "point 3"], fraction: Float[Array, " sample"]) -> Float[Array, "sample 3"]:
     """Points at fractions of a line's length."""
     arc = arc_lengths(line)
@@ -121,22 +114,19 @@ def _at(line: Float[Array, "point 3"], fraction: Float[Array, " sample"]) -> Flo
 
 
 def _centre(segment: Any, middle: Float[Array, "point 3"]) -> Float[Array, "centre 3"]:
-    """The centre line: the given one where there is one, else the middle between the boundaries.
-
-    Forecasting maps give centre lines on z = 0; heights are those between the boundaries.
-    """
+    """The segment's own centre line at the height of the middle (forecasting maps have z = 0), else the middle."""
     if segment.get("centerline") is None:
         return middle
-    given = _points(segment, "centerline")
-    arc = arc_lengths(given)
+    centre = _points(segment, "centerline")
+    arc = arc_lengths(centre)
     if arc.max(initial=0.0) < 1e-3:
         return middle
-    given[:, 2] = _at(middle, arc / arc[-1])[:, 2]
-    return given
+    centre[:, 2] = _at(middle, arc / arc[-1])[:, 2]
+    return centre
 
 
 def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]]:
-    """Painted boundaries, each once: adjacent lanes both name the line between them."""
+    """Painted boundaries, each once: adjacent lanes share the line between them."""
     lines: dict[bytes, tuple[RoadKind, Array]] = {}
     for segment in segments:
         for side in ("left", "right"):
@@ -183,11 +173,8 @@ def _id(value: Any) -> int:
     return value
 
 
-def _check_extent(*groups: Sequence[Float[Array, "_ 3"]]) -> None:
-    """Refuse maps with points far away from the others: lines of that length would be cut into millions of segments."""
-    lines = [line for group in groups for line in group if len(line)]
-    if not lines:
-        return
-    points = np.concatenate(lines)
-    if not (np.abs(points - np.median(points, axis=0)) <= _SPREAD_M).all():
+def _check_extent(lines: Sequence[Float[Array, "_ 3"]]) -> None:
+    """Refuse points far away from the others: lines of that length would be cut into millions of segments."""
+    points = np.concatenate([np.zeros((0, 3)), *lines])
+    if len(points) and not (np.abs(points - np.median(points, axis=0)) <= _SPREAD_M).all():
         raise DataError("a point of the map is nowhere near the others", cure=_AGAIN)

@@ -11,23 +11,10 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from drivax.datasets import parsing
+from drivax.datasets.argoverse import tables
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
-from drivax.datasets.argoverse.tables import (
-    CENTRE_AHEAD_M,
-    DATASET,
-    EGO_SIZE,
-    FARTHEST_M,
-    FASTEST_MPS,
-    MOST_STATES,
-    PARQUET_MAGIC,
-    Kind,
-    Table,
-    Words,
-    has_magic,
-    read_table,
-)
-from drivax.datasets.elevation import lift
-from drivax.datasets.parsing import place_tags
+from drivax.datasets.argoverse.tables import Kind, Table, Words, read_table
+from drivax.datasets.parsing import lift, place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -39,23 +26,11 @@ Array = np.ndarray[Any, Any]
 EGO = "AV"
 #: Values of ``object_category``.
 _SCORED = 2
+_STATE = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
 _COLUMNS: dict[str, Kind] = {
-    "track_id": "text",
-    "object_type": "text",
-    "object_category": "whole",
-    "timestep": "whole",
-    "position_x": "number",
-    "position_y": "number",
-    "heading": "number",
-    "velocity_x": "number",
-    "velocity_y": "number",
-    "scenario_id": "text",
-    "start_timestamp": "number",
-    "end_timestamp": "number",
-    "num_timestamps": "whole",
-    "focal_track_id": "text",
-    "city": "text",
-    "slice_id": "text",
+    **dict.fromkeys(("track_id", "object_type", "scenario_id", "focal_track_id", "city", "slice_id"), "text"),
+    **dict.fromkeys(("object_category", "timestep", "num_timestamps"), "whole"),
+    **dict.fromkeys((*_STATE, "start_timestamp", "end_timestamp"), "number"),
 }
 #: Kind and size (length, width, height in metres) of each ``object_type``: the files hold no sizes. Medians of the
 #: boxes of sensor logs; cyclists with the length of their vehicle and the height of a person.
@@ -77,18 +52,18 @@ _SKIP = "skip this scenario, or download it again"
 
 @dataclass(frozen=True)
 class ArgoverseMotion:
-    """Reads motion forecasting scenarios: 110 steps at 10 Hz (50 in the test split), lane graph, no box sizes."""
+    """Reader of motion forecasting scenarios: 110 steps at 10 Hz (50 in the test split), lane graph, no box sizes."""
 
     name: str = "av2-motion"
     patterns: tuple[str, ...] = ("scenario_*.parquet",)
     companions: tuple[str, ...] = (MAP_PATTERN,)
 
     def recognise(self, path: Path) -> bool:
-        """Whether a parquet file is called as the scenarios are."""
-        return path.match(self.patterns[0]) and has_magic(path, PARQUET_MAGIC)
+        """Whether a parquet file has the name of a scenario."""
+        return path.match(self.patterns[0]) and tables.has_magic(path, tables.PARQUET_MAGIC)
 
     def describe(self, path: Path) -> Description:
-        """Tracks, steps, city and split of one scenario."""
+        """Tracks, steps and city of one scenario."""
         table = read_table(path, _COLUMNS)
         steps = 1 + int(table.numbers["timestep"].max())
         map_path = _map_path(path)
@@ -104,11 +79,11 @@ class ArgoverseMotion:
         )
 
     def count(self, path: Path) -> int:
-        """One: every scenario gives one window."""
-        return int(has_magic(path, PARQUET_MAGIC))
+        """One: every scenario becomes one window."""
+        return int(tables.has_magic(path, tables.PARQUET_MAGIC))
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recording in a file, or why it cannot be read."""
+        """The recording of a scenario, or the bad record in its place."""
         try:
             yield decode(path)
         except DataError as error:
@@ -116,15 +91,15 @@ class ArgoverseMotion:
 
 
 def _map_path(path: Path) -> Path:
-    """Where the map of a scenario lies."""
+    """The map of a scenario."""
     return path.with_name(f"log_map_archive_{path.stem.removeprefix('scenario_')}.json")
 
 
 def decode(path: Path) -> Recording:
     """The recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` next to it.
 
-    The city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; heights are
-    those of the map; sizes those of the class; velocities as given, smoothed by the source.
+    In the city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; heights are
+    those of the map, sizes those of the class, velocities as the source smoothed them.
     """
     table = read_table(path, _COLUMNS)
     local_map = read_map(_map_path(path))
@@ -138,7 +113,7 @@ def decode(path: Path) -> Recording:
     category = _of_track(table.numbers["object_category"], names)
     return Recording(
         scenario_id=scenario_id,
-        dataset=DATASET,
+        dataset=tables.DATASET,
         segment=table.texts["slice_id"].text(0) or scenario_id,
         timestamps_s=_timestamps(table, steps),
         current_step=min(CURRENT_STEP, steps - 1),
@@ -166,19 +141,18 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
         raise DataError(f"has no track {EGO}")
     if not 0 <= step.min() <= step.max() < _MOST_STEPS:
         raise DataError(f"timesteps run from {step.min()} to {step.max()}")
-    if len(names.words) * (int(step.max()) + 1) > MOST_STATES:
+    if len(names.words) * (int(step.max()) + 1) > tables.MOST_STATES:
         raise DataError(f"{len(names.words)} tracks of {step.max() + 1} steps are too many")
     ego, row = names.words.index(EGO), names.of_row
-    columns = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
-    states = np.zeros((len(names.words), int(step.max()) + 1, len(columns)))
+    states = np.zeros((len(names.words), int(step.max()) + 1, len(_STATE)))
     valid = np.zeros(states.shape[:2], bool)
-    states[row, step], valid[row, step] = table.stacked(columns), True
-    parsing.check_within(FARTHEST_M, states[..., :3])
-    parsing.check_within(FASTEST_MPS, states[..., 3:])
+    states[row, step], valid[row, step] = table.stacked(_STATE), True
+    parsing.check_within(tables.FARTHEST_M, states[..., :3])
+    parsing.check_within(tables.FASTEST_MPS, states[..., 3:])
     heading = np.where(valid, wrap(states[..., 2]), 0.0)
     xy = states[..., :2].copy()
-    there = valid[ego]
-    xy[ego, there] = parsing.box_centre(xy[ego, there], heading[ego, there], CENTRE_AHEAD_M)
+    there = ego, valid[ego]
+    xy[there] = parsing.box_centre(xy[there], heading[there], tables.CENTRE_AHEAD_M)
     kinds, sizes = _classes(table.texts["object_type"], names, ego)
     return Tracks(
         xy=xy,
@@ -196,19 +170,18 @@ def _classes(types: Words, names: Words, ego: int) -> tuple[Array, Float64[Array
     """Kinds and sizes of all tracks."""
     known = [_TYPES.get(types.words[code], _TYPES["unknown"]) for code in _of_track(types.of_row, names)]
     sizes = np.array([size for _, size in known], np.float64)
-    sizes[ego] = EGO_SIZE
+    sizes[ego] = tables.EGO_SIZE
     return np.array([kind for kind, _ in known], np.int8), sizes
 
 
 def _track_ids(words: tuple[str, ...]) -> Int[Array, " track"]:
-    """The ids as numbers, the ego's as 0; row numbers where some are no numbers of their own."""
-    given = [
-        0 if word == EGO else int(word) if word.isascii() and word.isdecimal() and len(word) < 10 else -1
-        for word in words
-    ]
-    if min(given) < 0 or len(set(given)) < len(given):
-        return np.arange(len(words), dtype=np.int64)
-    return np.array(given, np.int64)
+    """The ids as numbers, the ego's as 0; row numbers if some id is no number or not unique."""
+    texts = ["0" if word == EGO else word for word in words]
+    if all(text.isascii() and text.isdecimal() and len(text) < 10 for text in texts):
+        ids = [int(text) for text in texts]
+        if len(set(ids)) == len(ids):
+            return np.array(ids, np.int64)
+    return np.arange(len(words), dtype=np.int64)
 
 
 def _timestamps(table: Table, steps: int) -> Float64[Array, " step"]:

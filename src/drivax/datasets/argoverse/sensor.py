@@ -11,21 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from drivax.datasets import parsing
+from drivax.datasets.argoverse import tables
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
-from drivax.datasets.argoverse.tables import (
-    AXLE_HEIGHT_M,
-    CENTRE_AHEAD_M,
-    DATASET,
-    EGO_SIZE,
-    FARTHEST_M,
-    FEATHER_MAGIC,
-    LARGEST_M,
-    MOST_STATES,
-    Kind,
-    Table,
-    has_magic,
-    read_table,
-)
+from drivax.datasets.argoverse.tables import Kind, Table, read_table
 from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
@@ -37,6 +25,7 @@ Array = np.ndarray[Any, Any]
 EGO = "EGO_VEHICLE"
 POSES = "city_SE3_egovehicle.feather"
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_AHEAD = np.array([1.0, 0.0, 0.0])
 _SIZE = ("length_m", "width_m", "height_m")
 _POSE_COLUMNS: dict[str, Kind] = {"timestamp_ns": "whole", **dict.fromkeys(_POSE, "number")}
 _BOX_COLUMNS: dict[str, Kind] = {
@@ -64,40 +53,34 @@ _SKIP = "skip this log, or download it again"
 
 @dataclass(frozen=True)
 class ArgoverseSensor:
-    """Reads sensor logs: about 156 frames at 10 Hz with measured boxes, heights, and the local map."""
+    """Reader of sensor logs: about 156 frames at 10 Hz with measured boxes, heights, and the local map."""
 
     name: str = "av2-sensor"
     patterns: tuple[str, ...] = ("annotations.feather", "annotations_with_ego.feather")
     companions: tuple[str, ...] = (
-        POSES,
-        MAP_PATTERN,
-        "*___img_Sim2_city.json",
-        "*_ground_height_surface_*.npy",
-    )
+        POSES, MAP_PATTERN, "*___img_Sim2_city.json", "*_ground_height_surface_*.npy"
+    )  # fmt: skip
 
     def recognise(self, path: Path) -> bool:
-        """Whether a feather file is called as the annotations of a log are."""
-        return path.name in self.patterns and has_magic(path, FEATHER_MAGIC)
+        """Whether a feather file has the name of a log's annotations."""
+        return path.name in self.patterns and tables.has_magic(path, tables.FEATHER_MAGIC)
 
     def describe(self, path: Path) -> Description:
         """Frames, tracks and city of a log."""
         table = read_table(path, {"timestamp_ns": "whole", "track_uuid": "text"})
         frames, tracks = len(np.unique(table.numbers["timestamp_ns"])), len(table.texts["track_uuid"].words)
         map_path = _map_path(path)
-        poses = path.with_name(POSES)
+        needed = {POSES: path.with_name(POSES).is_file(), f"map/{MAP_PATTERN}": map_path is not None}
         return Description(
             dataset="Argoverse 2 Sensor",
             flavour=f"one log of {frames} frames in {_places(map_path).get('place', 'an unknown city')}",
             recordings=1,
             notes=(f"{tracks} tracks", "there are no speed limits, lights or stop signs"),
-            missing=(
-                *(() if poses.is_file() else (POSES,)),
-                *(() if map_path is not None else (f"map/{MAP_PATTERN}",)),
-            ),
+            missing=tuple(name for name, there in needed.items() if not there),
         )
 
     def count(self, path: Path) -> int:
-        """How many windows the frames of a log give."""
+        """The number of windows of a log."""
         try:
             times = read_table(path, {"timestamp_ns": "whole"}).numbers["timestamp_ns"]
         except DataError:
@@ -105,7 +88,7 @@ class ArgoverseSensor:
         return parsing.windows_of(len(np.unique(times)))
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recording in a log, or why it cannot be read."""
+        """The recording of a log, or the bad record in its place."""
         try:
             yield decode(path)
         except DataError as error:
@@ -113,7 +96,7 @@ class ArgoverseSensor:
 
 
 def _map_path(path: Path) -> Path | None:
-    """Where the map of a log lies, if it is there."""
+    """The map of a log, if it is there."""
     return next(iter(sorted((path.parent / "map").glob(MAP_PATTERN))), None)
 
 
@@ -126,16 +109,15 @@ def _places(map_path: Path | None) -> dict[str, str]:
 def decode(path: Path) -> Recording:
     """The recording of a log: its annotations, ``city_SE3_egovehicle.feather`` and ``map/log_map_archive_*.json``.
 
-    The city's frame, metres. Boxes are given in the car's frame and moved with its pose of the same time stamp; the
-    ego is moved from its rear axle to the middle of its box; velocities are differences of positions.
+    In the city's frame, metres. Boxes are moved from the car's frame with its pose of the same time stamp, the ego from
+    its rear axle to the middle of its box; velocities are differences of positions.
     """
     boxes = read_table(path, _BOX_COLUMNS)
     poses = read_table(path.with_name(POSES), _POSE_COLUMNS)
     map_path = _map_path(path)
     if map_path is None:
-        raise DataError(
-            f"has no map/{MAP_PATTERN} next to it", file=path, cure="download the folder map of the log"
-        )
+        problem = f"has no map/{MAP_PATTERN} next to it"
+        raise DataError(problem, file=path, cure="download the folder map of the log")
     local_map = read_map(map_path)
     log_id = path.resolve().parent.name
     try:
@@ -145,7 +127,7 @@ def decode(path: Path) -> Recording:
         raise DataError(error.problem, file=path, cure=error.cure or _SKIP) from error
     return Recording(
         scenario_id=log_id,
-        dataset=DATASET,
+        dataset=tables.DATASET,
         segment=log_id,
         timestamps_s=clock * 1e-9,
         current_step=min(CURRENT_STEP, len(clock) - 1),
@@ -159,7 +141,7 @@ def decode(path: Path) -> Recording:
 
 
 def _clock(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
-    """Time stamps of the frames with a pose, nanoseconds, and how many have none."""
+    """Time stamps of the frames with a pose, nanoseconds, and how many frames have none."""
     frames = np.unique(boxes.numbers["timestamp_ns"])
     posed = np.isin(frames, poses.numbers["timestamp_ns"])
     if not posed.any():
@@ -175,7 +157,7 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
     is_ego = np.array([word == EGO for word in category.words])[category.of_row]
     rows = np.flatnonzero(np.isin(stamp, clock) & ~is_ego)
     codes, first, row = np.unique(code[rows], return_index=True, return_inverse=True)
-    if (1 + len(codes)) * len(clock) > MOST_STATES:
+    if (1 + len(codes)) * len(clock) > tables.MOST_STATES:
         raise DataError(f"{len(codes)} tracks of {len(clock)} frames are too many")
     step = np.searchsorted(clock, stamp[rows])
     table = _boxes(boxes, rows, pose[step])
@@ -200,7 +182,7 @@ def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:
     """The pose of the car at every frame: quaternion (w, x, y, z) and translation in the city."""
     known, first = np.unique(poses.numbers["timestamp_ns"], return_index=True)
     pose = poses.stacked(_POSE)[first[np.searchsorted(known, clock)]]
-    parsing.check_within(FARTHEST_M, pose[:, 4:])
+    parsing.check_within(tables.FARTHEST_M, pose[:, 4:])
     pose[:, :4] = _unit(pose[:, :4])
     return pose
 
@@ -208,22 +190,21 @@ def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:
 def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) -> Float[Array, "box 7"]:
     """Boxes in the city's frame: x, y, z, heading, length, width, height."""
     table = boxes.stacked((*_POSE, *_SIZE))[rows]
-    parsing.check_within(FARTHEST_M, table[:, 4:7])
-    parsing.check_within(LARGEST_M, table[:, 7:])
-    forward = rotate(pose[:, :4], rotate(_unit(table[:, :4]), np.array([1.0, 0.0, 0.0])))
+    parsing.check_within(tables.FARTHEST_M, table[:, 4:7])
+    parsing.check_within(tables.LARGEST_M, table[:, 7:])
+    forward = rotate(pose[:, :4], rotate(_unit(table[:, :4]), _AHEAD))
     heading = np.arctan2(forward[:, 1], forward[:, 0])
     return np.column_stack((rotate(pose[:, :4], table[:, 4:7]) + pose[:, 4:], heading, table[:, 7:]))
 
 
 def _ego(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "step 7"]) -> Float[Array, "step 7"]:
-    """The ego's boxes like those of :func:`_boxes`.
-
-    Some logs hold boxes of the car itself; their sizes are right, their centres are the rear axle again.
-    """
-    size = np.median(boxes.stacked(_SIZE)[rows], axis=0) if len(rows) else np.array(EGO_SIZE)
-    parsing.check_within(LARGEST_M, size)
-    centre = rotate(pose[:, :4], np.array([CENTRE_AHEAD_M, 0.0, size[2] / 2 - AXLE_HEIGHT_M])) + pose[:, 4:]
-    forward = rotate(pose[:, :4], np.array([1.0, 0.0, 0.0]))
+    """The ego's boxes like those of :func:`_boxes`."""
+    # Some logs hold boxes of the car itself: the sizes are right, the centres are the rear axle again.
+    size = np.median(boxes.stacked(_SIZE)[rows], axis=0) if len(rows) else np.array(tables.EGO_SIZE)
+    parsing.check_within(tables.LARGEST_M, size)
+    offset = np.array([tables.CENTRE_AHEAD_M, 0.0, size[2] / 2 - tables.AXLE_HEIGHT_M])
+    centre = rotate(pose[:, :4], offset) + pose[:, 4:]
+    forward = rotate(pose[:, :4], _AHEAD)
     heading = np.arctan2(forward[:, 1], forward[:, 0])
     return np.column_stack((centre, heading, np.broadcast_to(size, (len(pose), 3))))
 

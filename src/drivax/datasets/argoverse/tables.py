@@ -16,27 +16,24 @@ from drivax.errors import DataError
 DATASET = "av2"
 #: The recording car, a Ford Fusion: length, width and height of its box in the sensor logs, metres.
 EGO_SIZE = (4.877, 2.0, 1.473)
-#: Its poses are those of the middle of the rear axle, one wheel radius above ground. On the real logs the axis that
-#: does not slip sideways in turns is within 0.3 m of the pose, and the map 0.33 m below it. The body's middle is half
-#: the wheelbase of 2.85 m ahead, less 0.09 m, because the rear overhang is longer than the front one.
+#: Its poses are those of the middle of the rear axle, one wheel radius above ground: on real logs the axis that does
+#: not slip sideways in turns is within 0.3 m of the pose, and the map 0.33 m below it. The body's middle is half the
+#: wheelbase of 2.85 m ahead, less 0.09 m, because the rear overhang is longer than the front one.
 CENTRE_AHEAD_M = 1.34
 AXLE_HEIGHT_M = 0.33
 #: Limits of what can be in a log: city coordinates in metres, speeds in m/s, sizes in metres, tracks times steps.
 FARTHEST_M, FASTEST_MPS, LARGEST_M, MOST_STATES = 1e6, 200.0, 100.0, 2_000_000
-
-
-Array = np.ndarray[Any, Any]
-
 PARQUET_MAGIC, FEATHER_MAGIC = b"PAR1", b"ARROW1"
 #: The longest logs have some ten thousand rows; damaged files can claim any number.
 MOST_ROWS = 1_000_000
 _AGAIN = "download it again"
+Array = np.ndarray[Any, Any]
 Kind = Literal["number", "whole", "text"]
 
 
 @dataclass(frozen=True)
 class Words:
-    """A column of text: the different words in order of appearance, and the word of every row."""
+    """A column of text: its words in order of appearance, and the word of every row."""
 
     words: tuple[str, ...]
     of_row: Int[Array, " row"]
@@ -69,23 +66,15 @@ def has_magic(path: Path, magic: bytes) -> bool:
 
 
 def read_table(path: Path, columns: Mapping[str, Kind]) -> Table:
-    """Reads columns of a parquet or feather file.
-
-    Args:
-        path: The file.
-        columns: Name and kind of the columns: any number, whole numbers, or text. Other columns are not read.
-    """
+    """Read columns of a parquet or feather file, by name and kind: any number, whole numbers, or text."""
     pa = import_extra("pyarrow")
     try:
         table = _load(path, list(columns))
         if table.num_rows == 0:
             raise DataError("holds no rows", file=path, cure=_AGAIN)
         texts = {name: _words(table.column(name)) for name, kind in columns.items() if kind == "text"}
-        numbers = {
-            name: _numbers(table.column(name), kind == "whole", name)
-            for name, kind in columns.items()
-            if kind != "text"
-        }
+        others = [(name, kind) for name, kind in columns.items() if kind != "text"]
+        numbers = {name: _numbers(table.column(name), kind == "whole", name) for name, kind in others}
     except FileNotFoundError as error:
         raise DataError("is missing", file=path, cure=_AGAIN) from error
     except DataError as error:
@@ -108,9 +97,8 @@ def _load(path: Path, columns: Sequence[str]) -> Any:
         else:
             names = pa.ipc.open_file(source).schema.names
             _check(names, columns, 0)
-            options = pa.ipc.IpcReadOptions(
-                use_threads=False, included_fields=[names.index(name) for name in columns]
-            )
+            included = [names.index(name) for name in columns]
+            options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=included)
             table = pa.ipc.open_file(source, options=options).read_all()
     _check(table.schema.names, columns, table.num_rows)
     table.validate(full=True)

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from drivax.datasets import parsing
-from drivax.datasets.elevation import flatten
 from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, features_around, find_map
 from drivax.datasets.nuplan.sqlite import Database, open_database
+from drivax.datasets.parsing import flatten
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import rotate, wrap

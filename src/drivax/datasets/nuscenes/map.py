@@ -15,9 +15,12 @@ from jaxtyping import Bool, Float
 from drivax.datasets.parsing import load_json
 from drivax.datasets.road_edges import Area, road_edges
 from drivax.errors import DataError
+from drivax.geometry.polylines import headings
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import EDGE_KINDS, LINE_KINDS, RoadKind
+
+Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
@@ -33,23 +36,16 @@ class Box:
         return cls(xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m)
 
     def touches(self, a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> Bool[Array, " segment"]:
-        """Whether the bounding boxes of segments reach into it."""
+        """Whether the bounding boxes of segments touch it."""
         return np.all((np.maximum(a, b) >= self.low) & (np.minimum(a, b) <= self.high), axis=-1)
 
     def pieces(self, points: Float[Array, "point dim"]) -> Iterator[Float[Array, "part dim"]]:
-        """The parts of a polyline that reach into the box: runs of whole segments, in order.
-
-        A polyline that lies inside as a whole comes out unchanged, so that rings stay closed.
-        """
-        if len(points) < 2:
-            return
+        """The runs of whole segments of a polyline that touch the box; a polyline inside stays as it is."""
         near = self.touches(points[:-1, :2], points[1:, :2])
         change = np.flatnonzero(np.diff(np.concatenate(([False], near, [False]))))
         for start, end in zip(change[::2], change[1::2], strict=True):
             yield points[start : end + 1]
 
-
-Array = np.ndarray[Any, Any]
 
 _AGAIN = "unpack the map expansion again"
 #: Points of centre lines.
@@ -64,16 +60,12 @@ _WIDTHS_M = (2.0, 6.0)
 
 @dataclass(frozen=True)
 class City:
-    """The map of one city.
+    """The map of one city in metres from its south-west corner, z = 0.
 
-    Attributes:
-        features: Everything, in the frame of the city (metres from its south-west corner), z = 0.
-        version: Version that the file names.
-        lost: Elements that could not be used, or name others that do not exist, by kind; of the whole city.
+    ``lost`` counts by kind the elements of the whole city that could not be used, or name others that do not exist.
     """
 
     features: tuple[MapFeature, ...]
-    version: str
     lost: Mapping[str, int]
 
     def around(self, xy: Float[Array, "point 2"], margin_m: float) -> tuple[MapFeature, ...]:
@@ -82,18 +74,15 @@ class City:
         number = len(self.features)
         kept: list[MapFeature] = []
         for feature in self.features:
-            pieces = list(box.pieces(feature.points))
-            if not pieces and not (
-                len(feature.points) == 1 and box.touches(*([feature.points[:, :2]] * 2)).any()
-            ):
-                continue
+            # A stop sign is one point.
+            points = np.repeat(feature.points, 2, axis=0) if len(feature.points) == 1 else feature.points
+            pieces = list(box.pieces(points))
             if feature.kind not in (*EDGE_KINDS, *LINE_KINDS):
-                kept.append(feature)
+                kept += [feature] if pieces else []
                 continue
-            kept.append(replace(feature, points=pieces[0]))
-            for piece in pieces[1:]:
-                number += 1
-                kept.append(replace(feature, feature_id=number, points=piece))
+            for i, piece in enumerate(pieces):
+                number += i > 0
+                kept.append(replace(feature, feature_id=number if i else feature.feature_id, points=piece))
         return tuple(kept)
 
 
@@ -114,7 +103,7 @@ class _Layers:
         self._content = content
         self._nodes = {node["token"]: (float(node["x"]), float(node["y"])) for node in content["node"]}
         if not np.isfinite(np.array(list(self._nodes.values()))).all():
-            raise ValueError("a node is nowhere")
+            raise ValueError("a node is not finite")
         self._lines = {line["token"]: line["node_tokens"] for line in content["line"]}
         self._polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
         self._lost: dict[str, int] = {}
@@ -127,14 +116,13 @@ class _Layers:
         stops = self._stops(lanes, len(lanes) + len(numbered))
         areas = [area for row in self._layer("drivable_area") for area in self._areas(row["polygon_tokens"])]
         edges = road_edges(areas, len(lanes) + len(numbered) + len(stops))
-        version = str(self._content.get("version", "unknown"))
-        return City((*lanes, *numbered, *stops, *edges), version, self._lost)
+        return City((*lanes, *numbered, *stops, *edges), self._lost)
 
     def _layer(self, name: str) -> Sequence[Mapping[str, Any]]:
         return self._content.get(name, ())
 
     def _points(self, tokens: Sequence[str]) -> Float[Array, "point 3"]:
-        """Nodes by token; those that do not exist are left out and counted."""
+        """Nodes by token; missing ones are left out and counted."""
         nodes = [self._nodes[token] for token in tokens if token in self._nodes]
         self._count("nodes", len(tokens) - len(nodes))
         return np.column_stack((np.array(nodes, np.float64).reshape(-1, 2), np.zeros(len(nodes))))
@@ -180,7 +168,7 @@ class _Layers:
         return with_neighbours(lanes)
 
     def _width(self, row: Mapping[str, Any], line: Float[Array, "point 2"]) -> float | None:
-        """Area of the lane's polygon over the length of its centre line; None where that is no lane's width."""
+        """Area of the lane's polygon over the length of its centre line; None if that is no lane's width."""
         length = float(np.hypot(*np.diff(line, axis=0).T).sum())
         for exterior, _ in self._areas([row["polygon_token"]]):
             x, y = exterior[:, 0], exterior[:, 1]
@@ -190,7 +178,7 @@ class _Layers:
         return None
 
     def _dividers(self) -> Iterator[MapFeature]:
-        """Painted lane dividers in runs of one kind, and road dividers, of which the map does not tell the paint."""
+        """Painted lane dividers in runs of one kind, and road dividers, whose paint the map does not tell."""
         for row in self._layer("lane_divider"):
             segments = row["lane_divider_segments"]
             for name, run in groupby(enumerate(segments), key=lambda item: str(item[1]["segment_type"])):
@@ -217,14 +205,9 @@ class _Layers:
 
         stops: list[MapFeature] = []
         rows = [row for row in self._layer("stop_line") if row.get("stop_line_type") == "STOP_SIGN"]
-        areas = [
-            exterior
-            for row in rows
-            for exterior, _ in self._areas([row["polygon_token"]])
-            if len(exterior) > 2
-        ]
+        areas = [exterior for row in rows for exterior, _ in self._areas([row["polygon_token"]])]
         ends = shapely.points(np.array([lane.points[-1, :2] for lane in lanes]).reshape(-1, 2))
-        for exterior in areas:
+        for exterior in (exterior for exterior in areas if len(exterior) > 2):
             polygon = shapely.make_valid(shapely.Polygon(exterior[:, :2]))
             near = np.flatnonzero(shapely.dwithin(ends, polygon, 1.0)).tolist()
             ending = tuple(i for i in near if not lanes[i].interpolating)
@@ -234,10 +217,10 @@ class _Layers:
 
 
 def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
-    """Points about 0.5 m apart along a lane's arc lines.
+    """Points about 0.5 m apart along a lane's arc lines (Dubins' curves; nuScenes map expansion).
 
-    Each arc line starts at ``start_pose`` (x, y, heading) and has three parts of lengths ``segment_length``, bent left
-    (L), straight (S) or right (R) by ``shape``, with ``radius`` (Dubins' curves; nuScenes map expansion).
+    Each starts at ``start_pose`` (x, y, heading) and has three segments of lengths ``segment_length``, which turn left
+    (L), go straight (S) or turn right (R) by ``shape``, with ``radius``.
 
     Raises:
         ValueError: A number is not finite, the radius is not positive, or the lane is longer than 5 km.
@@ -256,40 +239,28 @@ def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
             s = np.linspace(0.0, length, int(np.ceil(length / SPACING_M)) + 1)
             along = heading + bend * s
             if bend == 0.0:
-                points = np.stack((x + s * np.cos(heading), y + s * np.sin(heading)), axis=-1)
+                xs, ys = x + s * np.cos(heading), y + s * np.sin(heading)
             else:
-                points = np.stack(
-                    (
-                        x + (np.sin(along) - np.sin(heading)) / bend,
-                        y - (np.cos(along) - np.cos(heading)) / bend,
-                    ),
-                    axis=-1,
-                )
-            parts.append(points)
-            (x, y), heading = points[-1], float(along[-1])
+                xs = x + (np.sin(along) - np.sin(heading)) / bend
+                ys = y - (np.cos(along) - np.cos(heading)) / bend
+            parts.append(np.stack((xs, ys), axis=-1))
+            x, y, heading = xs[-1], ys[-1], float(along[-1])
     line = np.concatenate(parts)
     return line[np.append(True, np.hypot(*np.diff(line, axis=0).T) > 1e-6)] if len(line) else line
 
 
 def marking(name: str) -> RoadKind | None:
-    """The kind of a painted divider by its nuScenes name; None where nothing is painted (NIL)."""
+    """The kind of a painted divider by its nuScenes name; None if nothing is painted (NIL)."""
     if name == "NIL":
         return None
-    double, broken, yellow = "DOUBLE" in name, "DASHED" in name, "YELLOW" in name
-    if yellow and broken:
-        return RoadKind.LINE_BROKEN_DOUBLE_YELLOW if double else RoadKind.LINE_BROKEN_SINGLE_YELLOW
-    if yellow:
-        return RoadKind.LINE_SOLID_DOUBLE_YELLOW if double else RoadKind.LINE_SOLID_SINGLE_YELLOW
-    if broken:
-        return RoadKind.LINE_BROKEN_SINGLE_WHITE
-    return RoadKind.LINE_SOLID_DOUBLE_WHITE if double else RoadKind.LINE_SOLID_SINGLE_WHITE
+    style = "BROKEN" if "DASHED" in name else "SOLID"
+    colour = "YELLOW" if "YELLOW" in name else "WHITE"
+    double = "DOUBLE" in name and (style, colour) != ("BROKEN", "WHITE")  # WOMD has no such kind
+    return RoadKind[f"LINE_{style}_{'DOUBLE' if double else 'SINGLE'}_{colour}"]
 
 
 def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
-    """Lanes with their neighbours, which the map does not name: lanes that run parallel at 2.2 to 5.5 m.
-
-    Looked up at the middle of each lane; lane connectors have none.
-    """
+    """Lanes with their neighbours, parallel lanes at 2.2 to 5.5 m from their middles; lane connectors have none."""
     from scipy.spatial import KDTree
 
     rows = [i for i, lane in enumerate(lanes) if not lane.interpolating and len(lane.points) > 2]
@@ -297,12 +268,12 @@ def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
         return list(lanes)
     owner = np.concatenate([np.full(len(lanes[i].points), i) for i in rows])
     points = np.concatenate([lanes[i].points[:, :2] for i in rows])
-    heading = np.concatenate([_headings(lanes[i].points[:, :2]) for i in rows])
+    heading = np.concatenate([headings(lanes[i].points) for i in rows])
     tree = KDTree(points)
     result = list(lanes)
     for i in rows:
         middle = len(lanes[i].points) // 2
-        at, course = lanes[i].points[middle, :2], _headings(lanes[i].points[:, :2])[middle]
+        at, course = lanes[i].points[middle, :2], headings(lanes[i].points)[middle]
         near = np.array(tree.query_ball_point(at, _NEIGHBOUR_M[1] + 0.5), dtype=np.int64)
         near = near[(owner[near] != i) & (np.abs(wrap(heading[near] - course)) < _PARALLEL_RAD)]
         offset = points[near] - at
@@ -315,8 +286,3 @@ def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
         }
         result[i] = replace(result[i], **sides)
     return result
-
-
-def _headings(xy: Float[Array, "point 2"]) -> Float[Array, " point"]:
-    step = np.gradient(xy, axis=0)
-    return np.arctan2(step[:, 1], step[:, 0])

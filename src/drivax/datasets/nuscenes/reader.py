@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+import math
+import re
+from array import array
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
-from drivax.datasets.elevation import flatten
 from drivax.datasets.nuscenes.map import city
-from drivax.datasets.nuscenes.tables import Scene, Tables, has_annotations, scene_rows
-from drivax.datasets.parsing import box_centre, check_finite, place_tags, windows_of
+from drivax.datasets.parsing import box_centre, check_finite, flatten, place_tags, windows_of
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -26,7 +28,7 @@ _TABLES = (
     "category", "ego_pose", "instance", "log", "sample", "sample_annotation", "sample_data", "scene",
 )  # fmt: skip
 _OTHERS = ("attribute", "calibrated_sensor", "map", "sensor", "visibility", "lidarseg", "panoptic")
-#: Keyframes are 0.5 s apart; nothing is made up over a missing one.
+#: Keyframes are 0.5 s apart; the gap of a missing one is not interpolated.
 LONGEST_GAP_S = 0.75
 #: Scenes last 20 s; a longer one is damage.
 _LONGEST_S = 120.0
@@ -35,33 +37,43 @@ MARGIN_M = 150.0
 #: The ego is a Renault Zoe: length, width, height, and how far its centre lies ahead of the rear axle (half the length
 #: less the rear overhang), from the maker's data sheet; poses are of the rear axle (nuscenes-devkit, issue 108).
 EGO_SIZE_M, CENTRE_AHEAD_M = (4.084, 1.730, 1.562), 1.385
+#: Tables are read in chunks; no row is longer than ``_LONGEST``.
+_CHUNK, _LONGEST = 1 << 20, 1 << 24
+_BETWEEN = re.compile(r"[ \t\r\n,]*")
+_AGAIN = "unpack the metadata archive again"
+#: Categories by the beginning of their names; the first that fits counts.
+_KINDS = (
+    ("vehicle.bicycle", AgentKind.CYCLIST),
+    ("vehicle.motorcycle", AgentKind.CYCLIST),
+    ("vehicle.", AgentKind.VEHICLE),
+    ("human.", AgentKind.PEDESTRIAN),
+    ("movable_object.", AgentKind.STATIC),
+    ("static_object.", AgentKind.STATIC),
+)
+#: Poses are those of the lidar's frames (20 Hz); frames of other sensors lie in between.
+_CLOCK = "LIDAR_TOP"
 
 
 @dataclass(frozen=True)
 class NuScenes:
-    """Reads the tables of one version (``v1.0-mini``, ``v1.0-trainval``); each scene is a recording."""
+    """Reader of the tables of one version (``v1.0-mini``, ``v1.0-trainval``); each scene is a recording."""
 
     name: str = "nuscenes"
     patterns: tuple[str, ...] = ("v1.0-*/scene.json",)
     companions: tuple[str, ...] = (
         *(f"v1.0-*/{table}.json" for table in (*_TABLES[:-1], *_OTHERS)),
-        "maps/*.png",
-        "maps/*.json",
-        "expansion/*.json",
-        "maps/*/*.json",
-        "maps/*/*.png",
-    )
+        "maps/*.png", "maps/*.json", "expansion/*.json", "maps/*/*.json", "maps/*/*.png",
+    )  # fmt: skip
 
     def recognise(self, path: Path) -> bool:
         """Whether it is ``scene.json`` with the other tables next to it."""
         return path.name == "scene.json" and (path.parent / "sample.json").is_file()
 
     def describe(self, path: Path) -> Description:
-        """Version, number of scenes, and what of the tables and maps is missing."""
+        """Version, number of scenes, missing tables and maps."""
         folder = path.parent
-        missing = [
-            f"{folder.name}/{table}.json" for table in _TABLES if not (folder / f"{table}.json").is_file()
-        ]
+        absent = (table for table in _TABLES if not (folder / f"{table}.json").is_file())
+        missing = [f"{folder.name}/{table}.json" for table in absent]
         expansion = sorted(path.name for path in _maps(path).glob("*.json"))
         if not expansion:
             missing.append("maps/expansion/*.json (the map expansion pack)")
@@ -71,14 +83,8 @@ class NuScenes:
         ]
         if not has_annotations(folder):
             notes.append("no annotations (as in the test split): there is nothing to convert")
-        return Description(
-            dataset="nuScenes",
-            flavour="tables of 2 Hz keyframes",
-            version=folder.name,
-            recordings=len(scene_rows(folder)),
-            notes=tuple(notes),
-            missing=tuple(missing),
-        )
+        flavour, scenes = "tables of 2 Hz keyframes", len(scene_rows(folder))
+        return Description("nuScenes", flavour, folder.name, scenes, tuple(notes), tuple(missing))
 
     def count(self, path: Path) -> int:
         """Scenes times the windows of 20 s."""
@@ -88,7 +94,7 @@ class NuScenes:
             return 0
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The scenes in the order of the file, and in their place those that cannot be read."""
+        """The scenes in file order, and a bad record in place of each that cannot be read."""
         try:
             tables = Tables.read(path.parent)
         except DataError as error:
@@ -97,30 +103,29 @@ class NuScenes:
         for row, about in enumerate(tables.scenes):
             try:
                 scene = tables.scene(row)
-                yield recording(scene, _maps(path) / f"{Path(scene.location).name}.json", path.parent.name)
+                yield recording(scene, _maps(path) / f"{Path(scene.location).name}.json")
             except DataError as error:
                 yield BadRecord.of(error, path, about["name"])
 
 
 def _maps(path: Path) -> Path:
-    """The folder of city maps: where the devkit wants it, or where people unpack the pack, which brings a folder."""
+    """The folder of city maps: where the devkit expects it, or where the archive, a folder itself, was unpacked."""
     root = path.parent.parent
     expansion = root / "maps" / "expansion"
-    return next(
-        (f for f in (expansion, root / "maps", root / "expansion") if any(f.glob("*.json"))), expansion
-    )
+    folders = (expansion, root / "maps", root / "expansion")
+    return next((folder for folder in folders if any(folder.glob("*.json"))), expansion)
 
 
-def recording(scene: Scene, map_file: Path, version: str) -> Recording:
-    """One scene at 10 Hz in the city's frame."""
+def recording(scene: Scene, map_file: Path) -> Recording:
+    """The recording of one scene: at 10 Hz, in the city's frame."""
     begin = scene.keyframes_s[0]
     duration = float(scene.keyframes_s[-1] - begin)
     if not duration <= _LONGEST_S:
-        raise DataError(f"the scene lasts {duration:.0f} s", cure="unpack the metadata archive again")
+        raise DataError(f"the scene lasts {duration:.0f} s", cure=_AGAIN)
     times = np.arange(int(round(duration / DT_S, 6)) + 1) * DT_S
     tracks = _tracks(scene, begin + times)
     if not tracks.valid[0].any():
-        raise DataError("the ego has no pose during the scene", cure="unpack the metadata archive again")
+        raise DataError("the ego has no pose during the scene", cure=_AGAIN)
     whole = city(map_file)
     tracks, features = flatten(tracks, whole.around(tracks.xy[0][tracks.valid[0]], MARGIN_M))
     return Recording(
@@ -139,13 +144,13 @@ def recording(scene: Scene, map_file: Path, version: str) -> Recording:
 
 
 def _tracks(scene: Scene, times: Float64[Array, " time"]) -> Tracks:
-    """The ego in row 0 and every instance, at the given times."""
+    """The ego (row 0) and every instance at some times."""
     poses = scene.poses[:, 1:].copy()
     poses[:, :2] = box_centre(poses[:, :2], poses[:, 2], CENTRE_AHEAD_M)
-    check_finite(poses, *scene.observations.values())
+    check_finite(poses, *scene.observations)
     moved = [interpolate(scene.poses[:, 0], poses, times)]
-    moved += [interpolate(table[:, 0], table[:, 1:4], times) for table in scene.observations.values()]
-    sizes = [EGO_SIZE_M, *(np.median(table[:, 4:7], axis=0) for table in scene.observations.values())]
+    moved += [interpolate(table[:, 0], table[:, 1:4], times) for table in scene.observations]
+    sizes = [EGO_SIZE_M, *(np.median(table[:, 4:7], axis=0) for table in scene.observations)]
     state = np.stack([states for states, _ in moved])
     valid = np.stack([seen for _, seen in moved])
     return Tracks(
@@ -155,7 +160,7 @@ def _tracks(scene: Scene, times: Float64[Array, " time"]) -> Tracks:
         velocity=state[..., 3:5],
         size=np.where(valid[..., None], np.array(sizes)[:, None], 0.0),
         valid=valid,
-        kind=np.array([AgentKind.VEHICLE, *scene.kinds.values()], np.int8),
+        kind=np.array([AgentKind.VEHICLE, *scene.kinds], np.int8),
         track_id=np.arange(len(moved), dtype=np.int64),
     )
 
@@ -165,10 +170,9 @@ def interpolate(
 ) -> tuple[Float64[Array, "time 5"], Bool[Array, " time"]]:
     """Position, heading and velocity between observations.
 
-    Positions follow a cubic Hermite spline through the observations whose tangents are central differences
-    (one-sided at the ends), velocities are its derivative, headings are linear after unwrapping. Nothing is made up
-    before the first and after the last observation or over a gap of more than 0.75 s; an observation without
-    neighbours counts at the nearest step alone.
+    Positions follow a cubic Hermite spline whose tangents are central differences (one-sided at the ends), velocities
+    are its derivative, headings are linear after unwrapping. Steps before the first and after the last observation and
+    in gaps of more than 0.75 s are not valid; an observation without neighbours counts at the nearest step alone.
 
     Args:
         seen_s: Times of the observations, increasing, seconds.
@@ -176,7 +180,7 @@ def interpolate(
         times: Where to interpolate, evenly spaced, seconds.
 
     Returns:
-        x, y, heading, velocity x and y (zeros where not valid), and whether each step is valid.
+        x, y, heading, velocity x and y (zeros if not valid), and whether each step is valid.
     """
     from scipy.interpolate import CubicHermiteSpline
 
@@ -195,3 +199,234 @@ def interpolate(
         valid |= inside
     state[:, 2] = np.where(valid, wrap(state[:, 2]), 0.0)
     return state, valid
+
+
+@dataclass
+class Scene:
+    """One scene of the tables, cut from a log (``logfile``) in a city (``location``).
+
+    Attributes:
+        keyframes_s: Times of the keyframes, seconds since the epoch, increasing.
+        poses: Ego poses: time [s], x, y, heading; of the centre of the rear axle.
+        observations: Annotations of every instance: time [s], x, y, heading [rad], length, width, height [m].
+        kinds: Class of every instance.
+    """
+
+    name: str
+    location: str
+    logfile: str
+    keyframes_s: Float64[Array, " keyframe"]
+    poses: Float64[Array, "pose 4"]
+    observations: list[Float64[Array, "_ 7"]]
+    kinds: list[AgentKind]
+
+
+@dataclass
+class Tables:
+    """What is needed of a version's tables, in arrays of numbers.
+
+    Attributes:
+        scenes: Rows of ``scene.json``.
+        logs: Location and logfile of each log by token.
+        sample_scene: Row of the scene of every sample; ``sample_time`` is its time in seconds.
+        poses: Scene row, time [s], x, y, heading of every lidar frame's pose.
+        annotations: Sample row, instance row, x, y, heading, length, width, height.
+        kinds: Class of every instance.
+    """
+
+    scenes: list[dict[str, str]]
+    logs: Mapping[str, tuple[str, str]]
+    sample_scene: Int64[Array, " sample"]
+    sample_time: Float64[Array, " sample"]
+    poses: Float64[Array, "pose 5"]
+    annotations: Float64[Array, "annotation 8"]
+    kinds: list[AgentKind]
+
+    @classmethod
+    def read(cls, folder: Path) -> Tables:
+        """Read the tables of one version (``v1.0-mini``, ...), the large ones row by row."""
+        if not has_annotations(folder):
+            raise DataError(
+                "holds no annotations: the ego would be the only agent",
+                file=folder / "sample_annotation.json",
+                cure="convert v1.0-trainval or v1.0-mini; the test split has none",
+            )
+        scenes = scene_rows(folder)
+        scene_index = {row["token"]: i for i, row in enumerate(scenes)}
+        logs = {
+            row.text("token"): (row.text("location"), row.text("logfile")) for row in _table(folder, "log")
+        }
+        samples = [
+            (row.text("token"), scene_index.get(row.text("scene_token"), -1), row.number("timestamp") * 1e-6)
+            for row in _table(folder, "sample")
+        ]
+        sample_index = {token: i for i, (token, *_) in enumerate(samples)}
+        sample_scene = np.array([scene for _, scene, _ in samples], np.int64)
+        sample_time = np.array([seconds for *_, seconds in samples], np.float64)
+        names = {row.text("token"): row.text("name") for row in _table(folder, "category")}
+        instances = [
+            (row.text("token"), kind_of(names.get(row.text("category_token"), "")))
+            for row in _table(folder, "instance")
+        ]
+        instance_index = {token: i for i, (token, _) in enumerate(instances)}
+        poses = _poses(folder, sample_index, sample_scene)
+        annotations = _annotations(folder, sample_index, instance_index)
+        return cls(
+            scenes, logs, sample_scene, sample_time, poses, annotations, [kind for _, kind in instances]
+        )
+
+    def scene(self, row: int) -> Scene:
+        """One scene."""
+        about = self.scenes[row]
+        location, logfile = self.logs.get(about["log_token"], ("", ""))
+        samples = np.flatnonzero(self.sample_scene == row)
+        poses = self.poses[self.poses[:, 0] == row, 1:]
+        if len(samples) < 2 or len(poses) < 2 or not location:
+            problem = f"{len(samples)} keyframes, {len(poses)} ego poses, log {location or 'unknown'}"
+            raise DataError(f"the scene cannot be used: {problem}", record=about["name"], cure=_AGAIN)
+        annotations = self.annotations[np.isin(self.annotations[:, 0], samples)]
+        times = self.sample_time[annotations[:, 0].astype(np.int64)]
+        table = np.column_stack((times, annotations[:, 2:]))
+        instances = np.unique(annotations[:, 1]).astype(np.int64).tolist()
+        return Scene(
+            name=about["name"],
+            location=location,
+            logfile=logfile,
+            keyframes_s=np.unique(self.sample_time[samples]),
+            poses=_in_time(poses),
+            observations=[_in_time(table[annotations[:, 1] == instance]) for instance in instances],
+            kinds=[self.kinds[instance] for instance in instances],
+        )
+
+
+def _in_time(table: Float64[Array, "row column"]) -> Float64[Array, "kept column"]:
+    """Rows in the order of their first column, the first of several at one time."""
+    _, first = np.unique(table[:, 0], return_index=True)
+    return table[first]
+
+
+def _poses(folder: Path, samples: Mapping[str, int], scene_of: Array) -> Float64[Array, "pose 5"]:
+    """Ego poses of the lidar's frames: scene row, time, x, y, heading."""
+    scene_of_pose: dict[str, int] = {}
+    for row in _table(folder, "sample_data"):
+        sample = samples.get(row.text("sample_token"), -1)
+        if sample >= 0 and _CLOCK in str(row.values.get("filename", "")):
+            scene_of_pose[row.text("ego_pose_token")] = int(scene_of[sample])
+    table = array("d")
+    for row in _table(folder, "ego_pose"):
+        scene = scene_of_pose.get(row.text("token"))
+        if scene is not None:
+            x, y, _ = row.vector("translation", 3)
+            seconds = row.number("timestamp") * 1e-6
+            table.extend((scene, seconds, x, y, yaw(*row.vector("rotation", 4))))
+    return np.array(table, np.float64).reshape(-1, 5)
+
+
+def _annotations(
+    folder: Path, samples: Mapping[str, int], instances: Mapping[str, int]
+) -> Float64[Array, "annotation 8"]:
+    """Annotations: sample row, instance row, x, y, heading, length, width, height."""
+    table = array("d")
+    for row in _table(folder, "sample_annotation"):
+        sample = samples.get(row.text("sample_token"), -1)
+        instance = instances.get(row.text("instance_token"), -1)
+        if sample < 0 or instance < 0:
+            continue
+        x, y, _ = row.vector("translation", 3)
+        width, length, height = row.vector("size", 3)  # in this order
+        heading = yaw(*row.vector("rotation", 4))
+        table.extend((sample, instance, x, y, heading, length, width, height))
+    return np.array(table, np.float64).reshape(-1, 8)
+
+
+def scene_rows(folder: Path) -> list[dict[str, str]]:
+    """The rows of ``scene.json``: token, name and log_token of each."""
+    names = ("token", "name", "log_token")
+    return [{name: row.text(name) for name in names} for row in _table(folder, "scene")]
+
+
+def has_annotations(folder: Path) -> bool:
+    """Whether a version has annotations, unlike the test split; True if the table cannot be read."""
+    try:
+        return next(rows(folder / "sample_annotation.json"), None) is not None
+    except DataError:
+        return True
+
+
+def kind_of(category: str) -> AgentKind:
+    """The class of a nuScenes category (``vehicle.car``, ``human.pedestrian.adult``, ...)."""
+    return next((kind for start, kind in _KINDS if category.startswith(start)), AgentKind.OTHER)
+
+
+def yaw(w: float, x: float, y: float, z: float) -> float:
+    """Heading of a unit quaternion (w, x, y, z): the direction of its x axis in the plane, radians."""
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+class _Row:
+    """A row of a table; values are checked when they are read."""
+
+    def __init__(self, values: Mapping[str, Any], file: Path) -> None:
+        self.values, self._file = values, file
+
+    def text(self, name: str) -> str:
+        value = self.values.get(name)
+        if not isinstance(value, str):
+            raise DataError(f"a row without {name}", file=self._file, cure=_AGAIN)
+        return value
+
+    def number(self, name: str) -> float:
+        value = self.values.get(name)
+        if not _is_number(value):
+            raise DataError(f"a row whose {name} is no number", file=self._file, cure=_AGAIN)
+        return float(value)  # type: ignore[arg-type]
+
+    def vector(self, name: str, size: int) -> list[float]:
+        value = self.values.get(name)
+        if not isinstance(value, list) or len(value) != size or not all(map(_is_number, value)):
+            raise DataError(f"a row whose {name} is not {size} numbers", file=self._file, cure=_AGAIN)
+        return [float(item) for item in value]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18
+
+
+def _table(folder: Path, name: str) -> Iterator[_Row]:
+    file = folder / f"{name}.json"
+    return (_Row(row, file) for row in rows(file))
+
+
+def rows(path: Path) -> Iterator[dict[str, Any]]:
+    """The objects of a file that holds one array of objects; it is never held in memory as a whole."""
+    decoder = json.JSONDecoder()
+    number = 0
+    try:
+        with path.open(encoding="utf-8") as file:
+            text = file.read(_CHUNK).lstrip()
+            if not text.startswith("["):
+                raise DataError("is not a table (an array of objects)", file=path, cure="download it again")
+            place = 1
+            while True:
+                # Only ``place`` moves: cutting the text after every row would copy it thousands of times.
+                if between := _BETWEEN.match(text, place):
+                    place = between.end()
+                if text.startswith("]", place):
+                    return
+                try:
+                    row, end = decoder.raw_decode(text, place)
+                except ValueError:
+                    more = file.read(_CHUNK)
+                    if not more or len(text) - place > _LONGEST:
+                        raise
+                    text, place = text[place:] + more, 0
+                    continue
+                if not isinstance(row, dict):
+                    raise DataError("is no object", file=path, record=number, cure="download it again")
+                yield row
+                place, number = end, number + 1
+    except FileNotFoundError as error:
+        raise DataError("is missing", file=path, cure=_AGAIN) from error
+    except (ValueError, RecursionError) as error:
+        problem = f"is damaged after {number} rows ({error})"
+        raise DataError(problem, file=path, cure="unpack the metadata archive again") from error

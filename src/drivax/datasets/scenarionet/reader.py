@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from drivax.datasets import parsing
-from drivax.datasets.elevation import flatten, lift
 from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M
+from drivax.datasets.parsing import flatten, lift
 from drivax.datasets.reader import BadRecord, Description
 from drivax.datasets.scenarionet import pickles
 from drivax.datasets.scenarionet.map import RoadMap, road_map

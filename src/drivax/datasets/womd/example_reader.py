@@ -1,60 +1,221 @@
-"""Reader of WOMD tf.Examples in TFRecord files (motion dataset v1.0 to v1.3.1).
+"""Reader of WOMD tf.Examples in TFRecord files (motion dataset v1.0 to v1.3.1), and of their layout by other writers.
 
-They hold less than the protos: at most 128 tracks, no lane graph, no speed limits, no lanes of stop signs, the map
-as one list of points that the writer cut off at 20,000 or 30,000, and at most 16 lights per step.
+They hold less than the protos: at most 128 tracks in flat lists, split into past, current and future; no lane graph,
+no speed limits, no lanes of stop signs; the map as one list of points that the writer cut off at 20,000 or 30,000; at
+most 16 lights per step.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from drivax.datasets import parsing
 from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd import tf_example
+from drivax.datasets.womd.messages import SKIP, Features, features_of
 from drivax.datasets.womd.tfrecord import count_records
-from drivax.scenario.recording import Recording
-from drivax.scenario.schema import Flag
+from drivax.errors import DataError
+from drivax.geometry.vectors import wrap
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, Flag, RoadKind
+
+#: Floats hold every whole number up to here; beyond, ids stored as floats may have been rounded.
+_EXACT = 2**24
+Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
 class WomdExample(womd.TfRecordReader):
-    """Reads tf.Examples: tracks, map points grouped into features, lights re-keyed by lane."""
+    """Reader of tf.Examples: tracks, map points grouped into features, lights re-keyed by lane."""
 
     name: str = womd.EXAMPLE_FORMAT
     companions: tuple[str, ...] = ("export.json",)
 
     def decode(self, payload: bytes) -> Recording:
-        """Return the recording in a payload."""
+        """The recording in a payload."""
         return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by sampling and features, truncated map, paths."""
+        """What the first record shows: version by the spacing of map points, truncated map, paths."""
         recording = self.first(path)
-        notes = [
-            *womd.notes_of(recording),
-            "no lane graph and no speed limits: lanes are chained by geometry",
-        ]
+        no_graph = "no lane graph and no speed limits: lanes are chained by geometry"
+        notes = [*womd.notes_of(recording), no_graph]
         if Flag.TRUNCATED_MAP in recording.flags:
             notes.append(
                 "the list of map points is full, the map is cut off; the Scenario protos hold all of it"
             )
         if "paths" in recording.lost:
             notes.append("path_samples are not used: routes are computed again")
-        newer = bool(recording.features) and tf_example.is_coarse(recording.features)
+        version = "1.2 or later" if _is_coarse(recording.features) else "1.0 or 1.1"
         return Description(
-            dataset=womd.FULL_NAME,
-            flavour="tf.Examples in TFRecord",
-            version=None if not recording.features else "1.2 or later" if newer else "1.0 or 1.1",
-            recordings=count_records(path),
-            notes=tuple(notes),
+            womd.FULL_NAME,
+            "tf.Examples in TFRecord",
+            version if recording.features else None,
+            count_records(path),
+            tuple(notes),
         )
 
 
 def decode(payload: bytes) -> Recording:
-    """Return the recording in a serialised tf.Example; rows without an id are padding."""
-    table = tf_example.features_of(payload)
+    """The recording in a serialised tf.Example; rows without an id are padding."""
+    table = features_of(payload)
     used = np.flatnonzero(table.numbers("state/id") != -1)
-    return tf_example.recording(table, payload, used, womd.DATASET, womd.EXAMPLE_FORMAT)
+    return recording(table, payload, used, womd.DATASET, womd.EXAMPLE_FORMAT)
+
+
+def recording(table: Features, payload: bytes, used: Array, dataset: str, source_format: str) -> Recording:
+    """The recording in the rows used.
+
+    Invalid entries (-1 in the file) become zeros, headings are wrapped. Lights are keyed by lane because the 16 slots
+    hold different lanes over time. ``path_samples`` count as lost: the route among them was marked with the log's
+    future.
+    """
+    tracks = _tracks(table, used)
+    features, truncated = _map_features(table)
+    scenario_id = table.scenario_id(payload)
+    return Recording(
+        scenario_id=scenario_id,
+        dataset=dataset,
+        segment=scenario_id,
+        timestamps_s=_timestamps(table, used, tracks.valid),
+        current_step=table.spans["past"],
+        ego=_ego_row(table, used),
+        tracks=tracks,
+        features=features,
+        lights=_lights(table),
+        to_predict=table.marked("state/tracks_to_predict", used),
+        of_interest=table.marked("state/objects_of_interest", used),
+        tags={"source_format": source_format},
+        lost=parsing.nonzero(paths=_paths(table), one_point_features=parsing.one_point_features(features)),
+        flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
+        split_gap_m=2.0 if _is_coarse(features) else 1.0,  # twice the nominal spacing of points
+    )
+
+
+def _track_ids(features: Features, used: Array) -> Array:
+    """Ids of the rows used: stored as floats, but WOMD's are far below 2**24."""
+    ids = features.numbers("state/id")[used]
+    if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
+        raise DataError("state/id holds numbers that are no exact whole numbers", cure=SKIP)
+    if (ids < 0).any() or len(np.unique(ids)) < len(ids):
+        raise DataError("state/id names a track twice, or negatively", cure=SKIP)
+    return ids.astype(np.int64)
+
+
+def _tracks(features: Features, used: Array) -> Tracks:
+    """The tracks in the rows used."""
+    track_id = _track_ids(features, used)
+    valid = features.over_time("valid", used) == 1
+
+    def measured(*names: str) -> Array:
+        values = [np.where(valid, features.over_time(name, used).astype(np.float64), 0.0) for name in names]
+        parsing.check_finite(*values)
+        return values[0] if len(values) == 1 else np.stack(values, axis=-1)
+
+    kinds = np.nan_to_num(features.numbers("state/type", (features.numbers("state/id").size,))[used])
+    return Tracks(
+        xy=measured("x", "y"),
+        z=measured("z"),
+        size=measured("length", "width", "height"),
+        heading=np.where(valid, wrap(measured("bbox_yaw")), 0.0),
+        velocity=measured("velocity_x", "velocity_y"),
+        valid=valid,
+        kind=np.array([womd.agent_kind(int(kind)) for kind in kinds], np.int8),
+        track_id=track_id,
+    )
+
+
+def _timestamps(features: Features, used: Array, valid: Array) -> Array:
+    """Seconds of every step; where no valid state has a time, 10 Hz from the nearest step that has one."""
+    micros = np.where(valid, features.over_time("timestamp_micros", used), -1).max(axis=0, initial=-1)
+    return parsing.seconds(np.where(micros >= 0, micros * 1e-6, np.nan))
+
+
+def _ego_row(features: Features, used: Array) -> int:
+    """The ego's row among the rows used."""
+    ego = features.marked("state/is_sdc", used)
+    if len(ego) != 1:
+        raise DataError(f"state/is_sdc marks {len(ego)} rows, not 1", cure=SKIP)
+    return ego[0]
+
+
+def _lights(features: Features) -> tuple[Light, ...]:
+    """Lights by lane."""
+    collector = parsing.Lights(sum(features.spans.values()))
+    start = 0
+    for span, steps in features.spans.items():
+        base = f"traffic_light_state/{span}/"
+        if steps and features.has(base + "id"):
+            slots = features.numbers(base + "id").size // steps
+            lanes = features.integers(base + "id", (steps, slots))
+            states, valid = (features.numbers(base + name, (steps, slots)) for name in ("state", "valid"))
+            points = np.stack([features.numbers(base + axis, (steps, slots)) for axis in "xyz"], axis=-1)
+            seen = (valid == 1) & (lanes >= 0) & np.isfinite(states) & np.isfinite(points).all(axis=-1)
+            for step, slot in np.argwhere(seen).tolist():
+                collector.observe(
+                    start + step, int(lanes[step, slot]), int(states[step, slot]), points[step, slot].tolist()
+                )
+        start += steps
+    return collector.collected()
+
+
+def _map_features(features: Features) -> tuple[tuple[MapFeature, ...], bool]:
+    """Map features in order of first appearance, and whether the list of points is full, so probably cut off."""
+    base = "roadgraph_samples/"
+    if not features.has(base + "id"):
+        return (), False
+    ids = features.integers(base + "id")
+    kinds = features.numbers(base + "type", ids.shape)
+    points = features.numbers(base + "xyz", (ids.size, 3)).astype(np.float64)
+    valid = features.numbers(base + "valid", ids.shape) == 1
+    keep = np.flatnonzero(valid & np.isin(kinds, [int(kind) for kind in RoadKind]))
+    parsing.check_finite(points[keep])
+    limits = _limits(features, ids.size)
+    mapped = []
+    for group in _groups(ids, keep):
+        kind = RoadKind(int(kinds[group[0]]))
+        limit = float(limits[group].max()) * parsing.MPS_PER_MPH if kind in LANE_KINDS else 0.0
+        line = _unclosed(points[group]) if kind in POLYGON_KINDS else points[group]
+        mapped.append(MapFeature(int(ids[group[0]]), kind, line, limit_mps=limit if limit > 0 else None))
+    return tuple(mapped), bool(valid.all())
+
+
+def _groups(ids: Array, keep: Array) -> list[Array]:
+    """Point numbers of each feature, features in order of first appearance."""
+    order = keep[np.argsort(ids[keep], kind="stable")]
+    groups = np.split(order, np.flatnonzero(np.diff(ids[order])) + 1)
+    return sorted(groups, key=lambda group: group[0]) if keep.size else []
+
+
+def _limits(features: Features, count: int) -> Array:
+    """Speed limits of map points in mph, 0 if unknown: only ScenarioMax writes them."""
+    name = "roadgraph_samples/speed_limit"
+    if not features.has(name):
+        return np.zeros(count)
+    limits = features.numbers(name, (count,))
+    return np.where(np.isfinite(limits) & (limits > 0), limits, 0.0)
+
+
+def _unclosed(points: Array) -> Array:
+    """A ring without its repeated last point: map features are closed implicitly."""
+    closed = len(points) > 1 and np.allclose(points[0], points[-1], rtol=0, atol=1e-3)
+    return points[:-1] if closed else points
+
+
+def _is_coarse(mapped: Sequence[MapFeature]) -> bool:
+    """Whether the map is sampled at 1 m (from v1.2 on) rather than at 0.5 m."""
+    return (parsing.spacing_m(mapped) or 0.5) > 0.75
+
+
+def _paths(features: Features) -> int:
+    """How many paths of the ego the file holds."""
+    if not (features.has("path_samples/valid") and features.has("path_samples/on_route")):
+        return 0
+    valid = features.numbers("path_samples/valid") == 1
+    rows = features.numbers("path_samples/on_route").size
+    return int(valid.reshape(rows, -1).any(axis=1).sum()) if valid.size % rows == 0 else rows

@@ -8,9 +8,10 @@ in a descriptor pool of their own and so never clash with an installed ``waymo-o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -19,124 +20,95 @@ from jaxtyping import Float64
 from drivax.datasets.parsing import import_extra
 from drivax.errors import DataError
 
+SKIP = "skip this record, or download the file again"
+_Array = np.ndarray[Any, Any]
 #: (name, number, type): ``*`` marks a repeated field, ``?`` a member of the message's one-of ``kind``.
 _Field = tuple[str, int, str]
 
-#: Messages of the Scenario proto. States and points of polylines are kept as bytes (:func:`read_table` reads them).
-MESSAGES: dict[str, tuple[_Field, ...]] = {
-    "Scenario": (
-        ("timestamps_seconds", 1, "double*"),
-        ("tracks", 2, "Track*"),
-        ("objects_of_interest", 4, "int32*"),
-        ("scenario_id", 5, "string"),
-        ("sdc_track_index", 6, "int32"),
-        ("dynamic_map_states", 7, "DynamicMapState*"),
-        ("map_features", 8, "MapFeature*"),
-        ("current_time_index", 10, "int32"),
-        ("tracks_to_predict", 11, "RequiredPrediction*"),
+
+def _fields(text: str) -> tuple[_Field, ...]:
+    """Fields written as ``name number type``, separated by commas."""
+    parts = (field.split() for field in text.split(","))
+    return tuple((name, int(number), kind) for name, number, kind in parts)
+
+
+_MESSAGES: dict[str, tuple[_Field, ...]] = {
+    # The Scenario proto; states and points of polylines are kept as bytes (:func:`read_table` reads them).
+    "Scenario": _fields(
+        "timestamps_seconds 1 double*, tracks 2 Track*, objects_of_interest 4 int32*, scenario_id 5 string,"
+        "sdc_track_index 6 int32, dynamic_map_states 7 DynamicMapState*, map_features 8 MapFeature*,"
+        "current_time_index 10 int32, tracks_to_predict 11 RequiredPrediction*"
     ),
-    "RequiredPrediction": (("track_index", 1, "int32"), ("difficulty", 2, "int32")),
-    "Track": (("id", 1, "int32"), ("object_type", 2, "int32"), ("states", 3, "bytes*")),
-    "ObjectState": (
-        ("center_x", 2, "double"),
-        ("center_y", 3, "double"),
-        ("center_z", 4, "double"),
-        ("length", 5, "float"),
-        ("width", 6, "float"),
-        ("height", 7, "float"),
-        ("heading", 8, "float"),
-        ("velocity_x", 9, "float"),
-        ("velocity_y", 10, "float"),
-        ("valid", 11, "bool"),
+    "RequiredPrediction": _fields("track_index 1 int32, difficulty 2 int32"),
+    "Track": _fields("id 1 int32, object_type 2 int32, states 3 bytes*"),
+    "ObjectState": _fields(
+        "center_x 2 double, center_y 3 double, center_z 4 double, length 5 float, width 6 float, height 7 float,"
+        "heading 8 float, velocity_x 9 float, velocity_y 10 float, valid 11 bool"
     ),
-    "DynamicMapState": (("lane_states", 1, "LaneState*"),),
-    "LaneState": (("lane", 1, "int64"), ("state", 2, "int32"), ("stop_point", 3, "MapPoint")),
-    "MapPoint": (("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")),
-    "MapFeature": (
-        ("id", 1, "int64"),
-        ("lane", 3, "Lane?"),
-        ("road_line", 4, "Polyline?"),
-        ("road_edge", 5, "Polyline?"),
-        ("stop_sign", 7, "StopSign?"),
-        ("crosswalk", 8, "Polygon?"),
-        ("speed_bump", 9, "Polygon?"),
-        ("driveway", 10, "Polygon?"),
+    "DynamicMapState": _fields("lane_states 1 LaneState*"),
+    "LaneState": _fields("lane 1 int64, state 2 int32, stop_point 3 MapPoint"),
+    "MapPoint": _fields("x 1 double, y 2 double, z 3 double"),
+    "MapFeature": _fields(
+        "id 1 int64, lane 3 Lane?, road_line 4 Polyline?, road_edge 5 Polyline?, stop_sign 7 StopSign?,"
+        "crosswalk 8 Polygon?, speed_bump 9 Polygon?, driveway 10 Polygon?"
     ),
-    "Lane": (
-        ("speed_limit_mph", 1, "double"),
-        ("type", 2, "int32"),
-        ("interpolating", 3, "bool"),
-        ("polyline", 8, "bytes*"),
-        ("entry_lanes", 9, "int64*"),
-        ("exit_lanes", 10, "int64*"),
-        ("left_neighbors", 11, "LaneNeighbor*"),
-        ("right_neighbors", 12, "LaneNeighbor*"),
+    "Lane": _fields(
+        "speed_limit_mph 1 double, type 2 int32, interpolating 3 bool, polyline 8 bytes*, entry_lanes 9 int64*,"
+        "exit_lanes 10 int64*, left_neighbors 11 LaneNeighbor*, right_neighbors 12 LaneNeighbor*"
     ),
-    "LaneNeighbor": (("feature_id", 1, "int64"),),
-    "Polyline": (("type", 1, "int32"), ("polyline", 2, "bytes*")),
-    "StopSign": (("lane", 1, "int64*"), ("position", 2, "bytes")),
-    "Polygon": (("polygon", 1, "bytes*"),),
+    "LaneNeighbor": _fields("feature_id 1 int64"),
+    "Polyline": _fields("type 1 int32, polyline 2 bytes*"),
+    "StopSign": _fields("lane 1 int64*, position 2 bytes"),
+    "Polygon": _fields("polygon 1 bytes*"),
+    # tf.Example; a map field is on the wire a repeated message of key and value. Parsers take lists packed or not.
+    "Example": _fields("features 1 Features"),
+    "Features": _fields("feature 1 Entry*"),
+    "Entry": _fields("key 1 string, value 2 Feature"),
+    "Feature": _fields("bytes_list 1 BytesList?, float_list 2 FloatList?, int64_list 3 Int64List?"),
+    "BytesList": _fields("value 1 bytes*"),
+    "FloatList": _fields("value 1 float*"),
+    "Int64List": _fields("value 1 int64*"),
+    # What tells the Waymo perception and end-to-end driving data sets from motion data.
+    "Context": _fields("name 1 bytes"),
+    "Frame": _fields(
+        "context 1 Context, timestamp_micros 2 int64, pose 3 bytes, images 4 bytes*, lasers 5 bytes*"
+    ),
+    "E2EDFrame": _fields("frame 1 Frame, future_states 2 bytes, past_states 3 bytes"),
 }
 
-#: A map field is on the wire a repeated message of key and value; lists are packed or not, parsers take both.
-_EXAMPLE: dict[str, tuple[_Field, ...]] = {
-    "Example": (("features", 1, "Features"),),
-    "Features": (("feature", 1, "Entry*"),),
-    "Entry": (("key", 1, "string"), ("value", 2, "Feature")),
-    "Feature": (
-        ("bytes_list", 1, "BytesList?"),
-        ("float_list", 2, "FloatList?"),
-        ("int64_list", 3, "Int64List?"),
-    ),
-    "BytesList": (("value", 1, "bytes*"),),
-    "FloatList": (("value", 1, "float*"),),
-    "Int64List": (("value", 1, "int64*"),),
-}
-
-_PACKAGES = {"drivax.womd": MESSAGES, "drivax.example": _EXAMPLE}
+_PACKAGE = "drivax"
 
 
-def scenario_class(name: str = "Scenario") -> Any:
-    """The message class of a WOMD ``Scenario``, or of one of its parts."""
-    return _class("drivax.womd", name)
-
-
-def example_class() -> Any:
-    """The message class of a ``tf.Example``, its map of features declared as repeated entries."""
-    return _class("drivax.example", "Example")
-
-
-def parse(message_class: Any, payload: bytes) -> Any | None:
-    """The message in a payload, or None where the payload is not such a message."""
+def parse(name: str, payload: bytes) -> Any | None:
+    """The message of this name in a payload, or None if the payload is no such message."""
+    message = message_class(name)
     from google.protobuf.message import DecodeError
 
     try:
-        return message_class.FromString(payload)
+        return message.FromString(payload)
     except DecodeError:
         return None
 
 
 @cache
-def _class(package: str, name: str) -> Any:
-    descriptor = _pool(package).FindMessageTypeByName(f"{package}.{name}")
-    from google.protobuf import message_factory
-
-    return message_factory.GetMessageClass(descriptor)
+def message_class(name: str) -> Any:
+    """The class of a message: ``Scenario``, ``Example`` (its map of features as repeated entries), ..."""
+    descriptor = _pool().FindMessageTypeByName(f"{_PACKAGE}.{name}")
+    return import_extra("google.protobuf.message_factory").GetMessageClass(descriptor)
 
 
 @cache
-def _pool(package: str) -> Any:
+def _pool() -> Any:
     descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2")
-    descriptor_pool = import_extra("google.protobuf.descriptor_pool")
-    file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto2")
-    for message_name, fields in _PACKAGES[package].items():
-        _declare(file.message_type.add(name=message_name), fields, package)
-    pool = descriptor_pool.DescriptorPool()
+    file = descriptor_pb2.FileDescriptorProto(name="drivax.proto", package=_PACKAGE, syntax="proto2")
+    for name, fields in _MESSAGES.items():
+        _declare(file.message_type.add(name=name), fields)
+    pool = import_extra("google.protobuf.descriptor_pool").DescriptorPool()
     pool.Add(file)
     return pool
 
 
-def _declare(message: Any, fields: tuple[_Field, ...], package: str) -> None:
+def _declare(message: Any, fields: tuple[_Field, ...]) -> None:
     if any(kind.endswith("?") for _, _, kind in fields):
         message.oneof_decl.add(name="kind")
     for name, number, kind in fields:
@@ -146,51 +118,37 @@ def _declare(message: Any, fields: tuple[_Field, ...], package: str) -> None:
             field.oneof_index = 0
         plain = kind.rstrip("*?")
         if plain[0].isupper():
-            field.type, field.type_name = field.TYPE_MESSAGE, f".{package}.{plain}"
+            field.type, field.type_name = field.TYPE_MESSAGE, f".{_PACKAGE}.{plain}"
         else:
             field.type = getattr(field, f"TYPE_{plain.upper()}")
 
 
-_Array = np.ndarray[Any, Any]
 #: Wire types of protocol buffers and what numpy reads there; a bool is a varint of one byte.
 _WIRE = {"double": (1, "<f8"), "float": (5, "<f4"), "bool": (0, "u1")}
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """A message of numbers.
-
-    Attributes:
-        name: Its name.
-        fields: Name, number and type (``double``, ``float``, ``bool``) of every field, in the order of columns.
-        forms: Which fields (by column) may be there together and are read fast, in order of their numbers.
-    """
+    """A message of numbers: its name, and which of its fields may be there together and are read fast."""
 
     name: str
-    fields: tuple[tuple[str, int, str], ...]
-    forms: tuple[tuple[int, ...], ...]
+    forms: tuple[tuple[str, ...], ...]
 
-    @classmethod
-    def of(cls, name: str, forms: Sequence[Sequence[str]]) -> Numbers:
-        """The message of this name, with forms by the names of their fields."""
-        fields = MESSAGES[name]
-        columns = {field: column for column, (field, _, _) in enumerate(fields)}
-        return cls(name, fields, tuple(tuple(columns[field] for field in form) for form in forms))
+    @property
+    def fields(self) -> tuple[_Field, ...]:
+        """Every field, in the order of columns."""
+        return _MESSAGES[self.name]
 
 
 @cache
-def _layouts(numbers: Numbers) -> tuple[tuple[np.dtype[Any], tuple[int, ...]], ...]:
-    """Packed record types of every form in both orders, with its columns."""
-    layouts = []
-    for form in numbers.forms:
-        for order in (form, form[::-1]):
-            parts = []
-            for column in order:
-                _, number, kind = numbers.fields[column]
-                parts += [(f"tag{column}", "u1"), (str(column), _WIRE[kind][1])]
-                assert number << 3 | _WIRE[kind][0] < 128, "a tag of one byte"
-            layouts.append((np.dtype(parts), order))
-    return tuple(layouts)
+def _layouts(numbers: Numbers) -> tuple[np.dtype[Any], ...]:
+    """Packed record types of every form in both orders: each field after its tag of one byte, ``#name``."""
+    types = {name: _WIRE[kind][1] for name, _, kind in numbers.fields}
+    orders = [order for form in numbers.forms for order in (form, form[::-1])]
+    return tuple(
+        np.dtype([column for name in order for column in ((f"#{name}", "u1"), (name, types[name]))])
+        for order in orders
+    )
 
 
 def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, "message field"]:
@@ -198,21 +156,21 @@ def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, 
     out = np.zeros((len(blobs), len(numbers.fields)))
     todo = np.ones(len(blobs), dtype=bool)
     sizes = np.fromiter(map(len, blobs), np.int64, len(blobs))
-    for layout, columns in _layouts(numbers):
+    for layout in _layouts(numbers):
         rows = np.flatnonzero(todo & (sizes == layout.itemsize))
         if not rows.size:
             continue
         whole = rows.size == len(blobs)
         records = np.frombuffer(b"".join(blobs if whole else [blobs[row] for row in rows.tolist()]), layout)
+        present = [(i, *field) for i, field in enumerate(numbers.fields) if field[0] in (layout.names or ())]
         same = np.ones(len(rows), dtype=bool)
-        for column in columns:
-            _, number, kind = numbers.fields[column]
-            same &= records[f"tag{column}"] == number << 3 | _WIRE[kind][0]
+        for _, name, number, kind in present:
+            same &= records[f"#{name}"] == number << 3 | _WIRE[kind][0]
             if kind == "bool":
-                same &= records[str(column)] < 2
+                same &= records[name] < 2
         with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
-            for column in columns:
-                out[rows[same], column] = records[str(column)][same]
+            for column, name, *_ in present:
+                out[rows[same], column] = records[name][same]
         todo[rows[same]] = False
     for row in np.flatnonzero(todo).tolist():
         out[row] = read_one(blobs[row], numbers)
@@ -221,13 +179,94 @@ def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, 
 
 def read_one(blob: bytes, numbers: Numbers) -> list[float]:
     """One row as protobuf reads it."""
-    message = parse(scenario_class(numbers.name), blob)
+    message = parse(numbers.name, blob)
     if message is None:
-        raise DataError(
-            f"a message {numbers.name} is damaged", cure="skip this record, or download the file again"
-        )
+        raise DataError(f"a message {numbers.name} is damaged", cure=SKIP)
     return [float(getattr(message, name)) for name, _, _ in numbers.fields]
 
 
-STATES = Numbers.of("ObjectState", [[name for name, _, _ in MESSAGES["ObjectState"]], ["center_z", "valid"]])
-POINTS = Numbers.of("MapPoint", ["xyz"])
+STATES = Numbers(
+    "ObjectState", (tuple(name for name, _, _ in _MESSAGES["ObjectState"]), ("center_z", "valid"))
+)
+POINTS = Numbers("MapPoint", (("x", "y", "z"),))
+
+
+def features_of(payload: bytes) -> Features:
+    """The features in a serialised tf.Example."""
+    message = parse("Example", payload)
+    if message is None or not message.features.feature:
+        raise DataError("the payload is not a tf.Example", cure=SKIP)
+    return Features(message)
+
+
+class Features:
+    """The features of one tf.Example by name; float lists (float32 in the file) become float64, int64 lists int64."""
+
+    def __init__(self, message: Any) -> None:
+        self._values: Mapping[str, Any] = {entry.key: entry.value for entry in message.features.feature}
+
+    def _list(self, name: str) -> tuple[str | None, Sequence[Any]]:
+        """Which list holds a feature, and its values."""
+        value = self._values.get(name)
+        kind = None if value is None else value.WhichOneof("kind")
+        return kind, () if kind is None else getattr(value, kind).value
+
+    def has(self, name: str) -> bool:
+        """Whether the feature exists and is not empty."""
+        return len(self._list(name)[1]) > 0
+
+    def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> _Array:
+        """A numeric feature in a shape that its size must match."""
+        kind, listed = self._list(name)
+        if kind not in ("float_list", "int64_list"):
+            raise DataError(f"numeric feature {name} is missing", cure=SKIP)
+        dtype = np.float64 if kind == "float_list" else np.int64
+        with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
+            values = np.array(listed, dtype)
+        if shape is None:
+            return values
+        count = int(np.prod(shape))
+        if values.size != count:
+            raise DataError(f"feature {name} has {values.size} values, not {count}", cure=SKIP)
+        return values.reshape(shape)
+
+    def integers(self, name: str, shape: tuple[int, ...] | None = None) -> _Array:
+        """A feature that must be stored as integers: floats would round the ids of lanes."""
+        values = self.numbers(name, shape)
+        if values.dtype != np.int64:
+            raise DataError(f"feature {name} holds floats, not integers", cure=SKIP)
+        return values
+
+    def marked(self, name: str, used: _Array) -> tuple[int, ...]:
+        """Rows among those used whose value is 1; none if the file lacks the feature."""
+        if not self.has(name):
+            return ()
+        values = self.numbers(name, (self.numbers("state/id").size,))[used]
+        return tuple(np.flatnonzero(values == 1).tolist())
+
+    def scenario_id(self, payload: bytes) -> str:
+        """The scenario's id, or the first 16 digits of the payload's SHA-256 if the file has none."""
+        value = self._values.get("scenario/id")
+        text = "" if value is None else b"".join(value.bytes_list.value[:1]).decode("ascii", "replace")
+        return text or hashlib.sha256(payload).hexdigest()[:16]
+
+    @cached_property
+    def spans(self) -> dict[str, int]:
+        """Steps of past, current and future; the future of the test split is missing or invalid throughout."""
+        tracks = max(self.numbers("state/id").size, 1)
+        steps = {}
+        for span in ("past", "current", "future"):
+            name = f"state/{span}/valid"
+            present = self.has(name) and (span != "future" or bool((self.numbers(name) == 1).any()))
+            steps[span] = self.numbers(name).size // tracks if present else 0
+        if steps["current"] != 1:
+            raise DataError(f"state/current holds {steps['current']} steps, not 1", cure=SKIP)
+        return steps
+
+    def over_time(self, name: str, used: _Array) -> _Array:
+        """``state/{past,current,future}/<name>`` joined, of the rows used: ``[track, time]``."""
+        count = self.numbers("state/id").size
+        spans = [(span, steps) for span, steps in self.spans.items() if steps]
+        return np.concatenate(
+            [self.numbers(f"state/{span}/{name}", (count, steps))[used] for span, steps in spans], axis=1
+        )

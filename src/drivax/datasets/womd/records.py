@@ -1,8 +1,9 @@
-"""What TFRecords of motion data share: telling the forms apart, reading and counting records, object types."""
+"""What the formats of motion data in TFRecord files share: detection, the base of their readers, object types."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +11,11 @@ import numpy as np
 
 from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord
-from drivax.datasets.womd.messages import example_class, parse, scenario_class
-from drivax.datasets.womd.tf_example import Features, is_motion
+from drivax.datasets.womd.messages import Features, parse
 from drivax.datasets.womd.tfrecord import count_records, looks_framed, read_records
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.recording import Recording
+from drivax.scenario.schema import AgentKind
 
 DATASET = "womd"
 FULL_NAME = "Waymo Open Motion Dataset"
@@ -26,38 +27,34 @@ _CONTENTS = {
     EXAMPLE_FORMAT: "WOMD tf.Examples",
     SCENARIOMAX_FORMAT: "ScenarioMax tf.Examples",
 }
-#: Signs of ScenarioMax's writer that an example must show at least; one alone may be damage or another exporter.
+#: Signs of ScenarioMax's writer that an example must show; a single one may be damage or another exporter.
 _SIGNS = 2
 
 
 def flavour(payload: bytes) -> str | None:
-    """The format of a record's payload by its content, None where it is no form of motion data that is known."""
-    example = parse(example_class(), payload)
-    if example is not None and is_motion(example):
+    """The format of a record's payload by its content, None if it is no known motion data."""
+    example = parse("Example", payload)
+    if example is not None and any(entry.key == "state/current/x" for entry in example.features.feature):
         return SCENARIOMAX_FORMAT if scenariomax_signs(Features(example)) >= _SIGNS else EXAMPLE_FORMAT
-    scenario = parse(scenario_class(), payload)
+    scenario = parse("Scenario", payload)
     if scenario is not None and scenario.scenario_id and scenario.tracks:
         return SCENARIO_FORMAT
     return None
 
 
 def scenariomax_signs(features: Features) -> int:
-    """How many of three signs an example shows that tell ScenarioMax's from WOMD's, which shows none.
+    """How many of ScenarioMax's three signs an example shows; WOMD's examples show none.
 
-    ScenarioMax leaves out the prediction difficulty, renumbers tracks 0, 1, 2, ... with the ego first, and knows no
-    times (-1 throughout).
+    The prediction difficulty is missing; tracks are numbered 0, 1, 2, ... with the ego first; all times are -1.
     """
     renumbered = untimed = False
-    try:
+    with suppress(DataError):
         ids, valid = features.numbers("state/id"), features.numbers("state/current/valid") == 1
         rows = np.flatnonzero(valid) if valid.size == ids.size else np.zeros(0, np.int64)
         ego = np.flatnonzero(features.numbers("state/is_sdc") == 1)
         renumbered = rows.size > 0 and bool((ids[rows] == rows).all()) and ego.tolist() == [0]
-        micros = features.numbers("state/current/timestamp_micros")
-        untimed = bool((micros < 0).all())
-    except DataError:
-        pass
-    return int(not features.has("state/difficulty_level")) + int(renumbered) + int(untimed)
+        untimed = bool((features.numbers("state/current/timestamp_micros") < 0).all())
+    return sum((not features.has("state/difficulty_level"), renumbered, untimed))
 
 
 def _first(path: Path) -> bytes:
@@ -72,33 +69,29 @@ def _first(path: Path) -> bytes:
 
 @dataclass(frozen=True)
 class TfRecordReader:
-    """Base of the readers of TFRecord files that hold one recording per record."""
+    """Base of the readers of TFRecord files with one recording per record."""
 
     name: str
     patterns: tuple[str, ...] = PATTERNS
     companions: tuple[str, ...] = ()
 
     def decode(self, payload: bytes) -> Recording:
-        """Return the recording in a payload."""
+        """The recording in a payload."""
         raise NotImplementedError
 
     def recognise(self, path: Path) -> bool:
-        """Whether the first readable record is of this format; never raises.
-
-        Where the packages that decode it are not installed, a TFRecord counts as Scenario protos: reading it then
-        names the package to install.
-        """
-        if not looks_framed(path):
-            return False
+        """Whether the first readable record is of this format; never raises."""
         try:
-            return flavour(_first(path)) == self.name
-        except UsageError:
+            return looks_framed(path) and flavour(_first(path)) == self.name
+        except (
+            UsageError
+        ):  # without the packages it counts as Scenario protos: reading then names the package
             return self.name == SCENARIO_FORMAT
         except DataError:
             return False
 
     def first(self, path: Path) -> Recording:
-        """Return the recording of the first readable record."""
+        """The recording of the first readable record."""
         payload = _first(path)
         try:
             return self.decode(payload)
@@ -107,14 +100,14 @@ class TfRecordReader:
             raise DataError(better.problem, file=path, cure=better.cure) from error
 
     def count(self, path: Path) -> int:
-        """Return the number of records times the windows of the first; 0 where it cannot be read."""
+        """The number of records times the windows of the first."""
         try:
             return count_records(path) * parsing.windows_of(len(self.decode(_first(path)).timestamps_s))
         except DrivaxError:
             return 0
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """Yield the recordings of a file, with a bad record in place of each that cannot be decoded."""
+        """The recordings, and a bad record in place of each that cannot be decoded."""
         for number, record in read_records(path):
             if isinstance(record, DataError):
                 yield BadRecord.of(record, path, number)
@@ -125,13 +118,17 @@ class TfRecordReader:
                 yield BadRecord.of(self._explain(error, record), path, number)
 
     def _explain(self, error: DataError, payload: bytes) -> DrivaxError:
-        """Return the error, or a better one where the payload is of another format."""
+        """The error, or a better one if the payload is of another format."""
         other = flavour(payload)
-        if other is None or other == self.name:
+        if other in (None, self.name):
             return error
-        return DataError(
-            f"holds {_CONTENTS[other]}, not {_CONTENTS[self.name]}", cure=f"use --format {other}"
-        )
+        problem = f"holds {_CONTENTS[other]}, not {_CONTENTS[self.name]}"
+        return DataError(problem, cure=f"use --format {other}")
+
+
+def agent_kind(code: int) -> AgentKind:
+    """The class of a WOMD object type; 0 (unset) and codes of later versions are OTHER."""
+    return AgentKind(code) if 1 <= code <= 4 else AgentKind.OTHER
 
 
 def notes_of(recording: Recording) -> tuple[str, ...]:

@@ -13,8 +13,7 @@ from jaxtyping import Float64
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd.messages import POINTS, STATES, parse, read_table, scenario_class
-from drivax.datasets.womd.tf_example import agent_kind
+from drivax.datasets.womd.messages import POINTS, SKIP, STATES, parse, read_table
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -23,27 +22,22 @@ from drivax.scenario.schema import LANE_KINDS, RoadKind
 
 #: Points are 0.5 m apart; twice that is a jump where the map was clipped, not road.
 _SPLIT_GAP_M = 1.0
-_SKIP = "skip this record, or download the file again"
-_POLYGONS = {
-    "crosswalk": RoadKind.CROSSWALK,
-    "speed_bump": RoadKind.SPEED_BUMP,
-    "driveway": RoadKind.DRIVEWAY,
-}
+_POLYGONS = {kind: RoadKind[kind.upper()] for kind in ("crosswalk", "speed_bump", "driveway")}
 _Points = Float64[np.ndarray, "point 3"]
 
 
 @dataclass(frozen=True)
 class WomdScenario(womd.TfRecordReader):
-    """Reads Scenario protos: dense tracks, map with lane graph and speed limits, lights by lane."""
+    """Reader of Scenario protos: dense tracks, map with lane graph and speed limits, lights by lane."""
 
     name: str = womd.SCENARIO_FORMAT
 
     def decode(self, payload: bytes) -> Recording:
-        """Return the recording in a payload."""
+        """The recording in a payload."""
         return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by kinds of features, length, lane graph, lights."""
+        """What the first record shows: version by kinds of features, lane graph, lights."""
         recording = self.first(path)
         lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
         linked = any(lane.successors or lane.predecessors for lane in lanes)
@@ -51,25 +45,20 @@ class WomdScenario(womd.TfRecordReader):
         if not linked:
             notes.append("no lane graph in the first record: lanes are chained by geometry")
         driveways = any(feature.kind == RoadKind.DRIVEWAY for feature in recording.features)
-        return Description(
-            dataset=womd.FULL_NAME,
-            flavour="Scenario protos in TFRecord",
-            version="1.2 or later" if driveways else "1.1 or later" if linked else None,
-            recordings=count_records(path),
-            notes=tuple(notes),
-        )
+        version = "1.2 or later" if driveways else "1.1 or later" if linked else None
+        flavour = "Scenario protos in TFRecord"
+        return Description(womd.FULL_NAME, flavour, version, count_records(path), tuple(notes))
 
 
 def decode(payload: bytes) -> Recording:
     """The recording in a serialised ``Scenario``.
 
-    Positions stay in the proto's map frame, metres, float64. Headings are wrapped (the files hold up to 10 rad),
-    invalid states are zeros (the files keep a z there), speed limits are m/s and None where the file says 0.
-    Links to lanes that the file does not hold are kept.
+    Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad), invalid
+    states are zeros (files keep a z there), speed limits are m/s, None for 0. Dangling links are kept.
     """
-    message = parse(scenario_class(), payload)
+    message = parse("Scenario", payload)
     if message is None or not message.scenario_id:
-        raise DataError("the payload is not a WOMD Scenario proto", cure=_SKIP)
+        raise DataError("the payload is not a WOMD Scenario proto", cure=SKIP)
     steps = len(message.timestamps_seconds)
     _check(message, steps)
     features, lost = _features(message.map_features)
@@ -85,9 +74,7 @@ def decode(payload: bytes) -> Recording:
         features=features,
         lights=_lights(message.dynamic_map_states, steps),
         to_predict=parsing.rows_within(
-            [prediction.track_index for prediction in message.tracks_to_predict],
-            len(message.tracks),
-            "tracks_to_predict",
+            [track.track_index for track in message.tracks_to_predict], len(rows), "tracks_to_predict"
         ),
         # These are track ids, tracks_to_predict are rows.
         of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
@@ -99,20 +86,20 @@ def decode(payload: bytes) -> Recording:
 
 def _check(message: Any, steps: int) -> None:
     if not isinstance(message.scenario_id, str):  # protobuf gives bytes where a string is no UTF-8
-        raise DataError("scenario_id is no text", cure=_SKIP)
+        raise DataError("scenario_id is no text", cure=SKIP)
     if steps == 0 or not message.tracks:
-        raise DataError("the scenario has no steps or no tracks", cure=_SKIP)
+        raise DataError("the scenario has no steps or no tracks", cure=SKIP)
     if not 0 <= message.current_time_index < steps:
-        raise DataError(f"current_time_index is {message.current_time_index} of {steps} steps", cure=_SKIP)
+        raise DataError(f"current_time_index is {message.current_time_index} of {steps} steps", cure=SKIP)
     parsing.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
     if len(message.dynamic_map_states) > steps:
-        raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=_SKIP)
+        raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=SKIP)
     seen = set()
     for track in message.tracks:
         if len(track.states) != steps:
-            raise DataError(f"track {track.id} has {len(track.states)} states, {steps} steps", cure=_SKIP)
+            raise DataError(f"track {track.id} has {len(track.states)} states, {steps} steps", cure=SKIP)
         if track.id in seen:
-            raise DataError(f"two tracks have the id {track.id}", cure=_SKIP)
+            raise DataError(f"two tracks have the id {track.id}", cure=SKIP)
         seen.add(track.id)
 
 
@@ -129,7 +116,7 @@ def _tracks(tracks: Any, steps: int) -> Tracks:
         heading=np.where(valid, wrap(table[..., 6]), 0.0),
         velocity=table[..., 7:9].copy(),
         valid=valid,
-        kind=np.array([agent_kind(track.object_type) for track in tracks], np.int8),
+        kind=np.array([womd.agent_kind(track.object_type) for track in tracks], np.int8),
         track_id=np.array([track.id for track in tracks], np.int64),
     )
 
@@ -145,8 +132,7 @@ def _lights(states: Any, steps: int) -> tuple[Light, ...]:
 
 def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
     """The map's features, and how many were left out for what reason."""
-    ids: set[int] = set()
-    parts: list[tuple[int, str, Any, Sequence[bytes]]] = []
+    kept: dict[int, tuple[str, Any, Sequence[bytes]]] = {}
     unknown = twice = empty = 0
     for message in messages:
         kind = message.WhichOneof("kind")
@@ -157,16 +143,15 @@ def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
         blobs = _blobs(kind, body)
         if not blobs:
             empty += 1
-        elif message.id in ids:
+        elif message.id in kept:
             twice += 1
         else:
-            ids.add(message.id)
-            parts.append((message.id, kind, body, blobs))
-    points = read_table([blob for *_, blobs in parts for blob in blobs], POINTS)
-    ends = np.cumsum([len(blobs) for *_, blobs in parts])[:-1] if parts else []
+            kept[message.id] = kind, body, blobs
+    points = read_table([blob for *_, blobs in kept.values() for blob in blobs], POINTS)
+    ends = np.cumsum([len(blobs) for *_, blobs in kept.values()], dtype=np.int64)[:-1]
     features = tuple(
         _feature(feature_id, kind, body, line.copy())
-        for (feature_id, kind, body, _), line in zip(parts, np.split(points, ends), strict=False)
+        for (feature_id, (kind, body, _)), line in zip(kept.items(), np.split(points, ends), strict=False)
     )
     lost = parsing.nonzero(
         unknown_features=unknown,

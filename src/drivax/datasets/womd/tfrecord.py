@@ -24,14 +24,18 @@ _Array = np.ndarray[Any, Any]
 _LENGTH, _BYTES, _FLOATS, _INTEGERS = 2, 1, 2, 3
 #: Values that encode in seven bits a byte: at most ten bytes for 64 bits.
 _GROUPS = np.arange(10, dtype=np.uint64)
+_HEADER_BYTES, _FOOTER_BYTES = 12, 4
+_MASK = 0xA282EAD8
+#: Protocol buffers end here; a longer record is damage, whatever its checksum says.
+_LONGEST_BYTES = 2**31 - 1
+_FETCH = "copy or download the file again"
 
 
 def example(features: Mapping[str, bytes | _Array]) -> bytes:
     """A serialised tf.Example, its features in order of their names.
 
-    Args:
-        features: By name: bytes (a list of one), an integer array (int64 list) or a floating-point array (float32
-            list); arrays are flattened row by row.
+    Values are bytes (a list of one), integer arrays (int64 lists) or floating-point arrays (float32 lists); arrays are
+    flattened row by row.
     """
     entries = b"".join(
         _field(1, _field(1, name.encode()) + _field(2, _feature(features[name]))) for name in sorted(features)
@@ -57,11 +61,8 @@ def varints(values: _Array) -> bytes:
     groups = bits >> (np.uint64(7) * _GROUPS)
     more = groups >= 128
     used = np.concatenate((np.ones_like(more[:, :1]), more[:, :-1]), axis=1)
-    return (
-        ((groups & np.uint64(127)) | (more.astype(np.uint64) << np.uint64(7)))
-        .astype(np.uint8)[used]
-        .tobytes()
-    )
+    encoded = (groups & np.uint64(127)) | (more.astype(np.uint64) << np.uint64(7))
+    return encoded.astype(np.uint8)[used].tobytes()
 
 
 def shard_name(name: str, number: int, shards: int) -> str:
@@ -71,18 +72,11 @@ def shard_name(name: str, number: int, shards: int) -> str:
 
 def write_record(file: BinaryIO, payload: bytes) -> None:
     """Append one record."""
-    crc32c = import_extra("google_crc32c").value
+    crc32c = _crc32c()
     length = struct.pack("<Q", len(payload))
     for part in (length, payload):
         file.write(part)
         file.write(struct.pack("<I", masked(crc32c(part))))
-
-
-_HEADER_BYTES, _FOOTER_BYTES = 12, 4
-_MASK = 0xA282EAD8
-#: Protocol buffers end here; a longer record is damage, whatever its checksum says.
-_LONGEST_BYTES = 2**31 - 1
-_FETCH = "copy or download the file again"
 
 
 def masked(crc: int) -> int:
@@ -91,16 +85,10 @@ def masked(crc: int) -> int:
 
 
 def read_records(path: str | Path) -> Iterator[tuple[int, bytes | DataError]]:
-    """Record numbers (from 0) with their payloads, or with the error that stands in a record's place.
+    """Yield record numbers (from 0) with their payloads, or with an error in place of a damaged record.
 
-    Records after one whose payload is damaged are read; where a length is damaged or the file ends early, nothing
-    after it can be found and the iteration ends with the error.
-
-    Args:
-        path: The file.
-
-    Yields:
-        (record number, payload or error). An empty file yields one error.
+    Records after a damaged payload are read; after a damaged length, or where the file ends early, no further record
+    can be located and the error is the last item. An empty file yields one error.
     """
     crc32c = _crc32c()
     path = Path(path)
@@ -114,53 +102,47 @@ def read_records(path: str | Path) -> Iterator[tuple[int, bytes | DataError]]:
             yield 0, DataError("the file is empty", file=path, record=0, cure=_FETCH)
         number = 0
         while file.tell() < size:
-            record = _read_one(file, size, crc32c)
-            lost = isinstance(record, DataError) and record.record == _LOST
-            if isinstance(record, DataError):
-                record = DataError(record.problem, file=path, record=number, cure=record.cure)
-            yield number, record
-            if lost:
+            try:
+                record = _read_one(file, size, crc32c)
+            except _Lost as error:
+                yield number, DataError(error.problem, file=path, record=number, cure=error.cure)
                 return
+            if record is None:
+                problem = "the payload is damaged (checksum mismatch)"
+                yield number, DataError(problem, file=path, record=number, cure=_FETCH)
+            else:
+                yield number, record
             number += 1
 
 
-#: Marks an error after which the next record cannot be found.
-_LOST = "lost"
+class _Lost(DataError):
+    """An error after which the next record cannot be located."""
+
+    def __init__(self, problem: str, cure: str = _FETCH) -> None:
+        super().__init__(problem, cure=cure)
 
 
-def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> bytes | DataError:
+def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> bytes | None:
+    """The payload of the next record, None if its checksum differs."""
     start = file.tell()
     header = file.read(_HEADER_BYTES)
     if len(header) < _HEADER_BYTES:
-        return DataError(
-            f"truncated: {len(header)} bytes where a record's header of {_HEADER_BYTES} should be",
-            record=_LOST,
-            cure=_FETCH,
-        )
+        raise _Lost(f"truncated: {len(header)} bytes where a record's header of {_HEADER_BYTES} should be")
     length, length_crc = struct.unpack("<QI", header)
     if masked(crc32c(header[:8])) != length_crc:
-        return _bad_length(header, start)
+        raise _bad_length(header, start)
     left = size - file.tell()
     if length > _LONGEST_BYTES or length + _FOOTER_BYTES > left:
-        return DataError(
-            f"truncated: the record needs {length + _FOOTER_BYTES} bytes, the file has {left} left",
-            record=_LOST,
-            cure=_FETCH,
-        )
+        raise _Lost(f"truncated: the record needs {length + _FOOTER_BYTES} bytes, the file has {left} left")
     payload = file.read(length)
     footer = file.read(_FOOTER_BYTES)
     if len(footer) < _FOOTER_BYTES:
-        return DataError("the file became shorter while it was read", record=_LOST, cure=_FETCH)
-    if masked(crc32c(payload)) != struct.unpack("<I", footer)[0]:
-        return DataError("the payload is damaged (checksum mismatch)", cure=_FETCH)
-    return payload
+        raise _Lost("the file became shorter while it was read")
+    return payload if masked(crc32c(payload)) == struct.unpack("<I", footer)[0] else None
 
 
 def count_records(path: str | Path) -> int:
-    """How many records the file seems to hold: lengths are followed, nothing is checked, payloads are not read.
-
-    Needs no package. 0 where the file cannot be opened; a record that the file's end cuts off is not counted.
-    """
+    """Number of complete records by their lengths, without checks; 0 if the file cannot be opened. Needs no package."""
     try:
         with Path(path).open("rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -175,15 +157,14 @@ def count_records(path: str | Path) -> int:
 
 
 def looks_framed(path: str | Path) -> bool:
-    """Whether the file begins as a TFRecord does: a length with the right checksum. Needs no package, never raises."""
+    """Whether the file begins with a length and its checksum. Needs no package, never raises."""
     try:
         with Path(path).open("rb") as file:
             header = file.read(_HEADER_BYTES)
     except (OSError, ValueError):
         return False
-    if len(header) < _HEADER_BYTES:
-        return False
-    return masked(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
+    whole = len(header) == _HEADER_BYTES
+    return whole and masked(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
 
 
 def _crc32c_slowly(data: bytes) -> int:
@@ -196,21 +177,17 @@ def _crc32c_slowly(data: bytes) -> int:
     return crc ^ 0xFFFFFFFF
 
 
-def _bad_length(header: bytes, start: int) -> DataError:
-    if start == 0 and header[:2] == b"\x1f\x8b":
-        return DataError("the file is gzip-compressed", record=_LOST, cure="decompress it first (gunzip)")
-    if start == 0 and header[0] == 0x78 and int.from_bytes(header[:2], "big") % 31 == 0:
-        return DataError("the file is zlib-compressed", record=_LOST, cure="decompress it first (zlib)")
-    if start == 0:
-        return DataError(
-            "not a TFRecord file, or damaged (checksum mismatch in the first record's length)",
-            record=_LOST,
-            cure=f"give an uncompressed TFRecord; if it should be one, {_FETCH}",
-        )
-    return DataError(
-        "the length is damaged (checksum mismatch), so the rest of the file cannot be read",
-        record=_LOST,
-        cure=_FETCH,
+def _bad_length(header: bytes, start: int) -> _Lost:
+    """The error for a length whose checksum differs; ``start`` is where the record begins."""
+    if start > 0:
+        return _Lost("the length is damaged (checksum mismatch), so the rest of the file cannot be read")
+    if header[:2] == b"\x1f\x8b":
+        return _Lost("the file is gzip-compressed", "decompress it first (gunzip)")
+    if header[0] == 0x78 and int.from_bytes(header[:2], "big") % 31 == 0:
+        return _Lost("the file is zlib-compressed", "decompress it first (zlib)")
+    return _Lost(
+        "not a TFRecord file, or damaged (checksum mismatch in the first record's length)",
+        f"give an uncompressed TFRecord; if it should be one, {_FETCH}",
     )
 
 

@@ -14,13 +14,21 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
+from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.optimisers import check_falling, clipped_adam
 from drivax.learning.environment import Environment
-from drivax.learning.experience import Experience, ExperienceConfig, draw, expert_actions, recorded
+from drivax.learning.experience import (
+    Experience,
+    ExperienceConfig,
+    ExpertActions,
+    draw,
+    expert_actions,
+    recorded,
+)  # fmt: skip
 from drivax.learning.program import divided
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
-from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.functions import NetworkPlanner
 from drivax.scenario.record import record
 
 #: From parameters and a batch of observations to action distributions.
@@ -33,10 +41,8 @@ Carry = tuple[Any, Any]
 class Demonstrated(Environment, Protocol):
     """An environment whose data hold actions of an expert."""
 
-    def demonstrations(
-        self, data: Any, key: Array, count: int
-    ) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
-        """Return observations of random steps, expert actions within bounds, and whether those were clipped."""
+    def demonstrations(self, data: Any, key: Array, count: int) -> ExpertActions:
+        """Return the expert's actions at random steps."""
         ...
 
 
@@ -47,13 +53,12 @@ class Cloning:
     Attributes:
         loss: ``mse``: squared error of the policy's mode, in action units; ``likelihood``: negative log-likelihood of
             the expert's action, which also fits the standard deviation.
-        batch: Steps per update, drawn again from the logs for each.
+        batch: Logged steps per update.
         updates: Updates per iteration.
-        learning_rate: Of Adam, falling linearly to ``last_rate`` times itself.
-        last_rate: See ``learning_rate``; 1: constant.
+        learning_rate, last_rate: The rate of Adam falls linearly to ``last_rate`` times itself; 1: constant.
         falling: Share of the run over which it falls; then it stays.
         gradient_norm: Gradients are clipped to this global norm; None: no clipping.
-        mask_clipped: Leave out steps at which the expert did what no action does.
+        mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
     """
 
     loss: Literal["mse", "likelihood"] = "mse"
@@ -79,7 +84,12 @@ class Cloning:
         self, policy: PolicyFunction, parameters: Any, environment: Demonstrated, data: Any, key: Array
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
         """Return the imitation loss on a random batch of expert actions, and values to log."""
-        observation, action, clipped = divided(_draw(environment, data, key, self.batch), axis=0)
+        if isinstance(data, Experience):
+            index = draw(data.policy or data.critic, key, (self.batch,))
+            batch = expert_actions(recorded(environment), data, index)
+        else:
+            batch = environment.demonstrations(data, key, self.batch)
+        observation, action, clipped = divided(batch, axis=0)
         return self.imitation_loss(policy(parameters, observation), action, ~(clipped & self.mask_clipped))
 
     def imitation_loss(
@@ -88,7 +98,7 @@ class Cloning:
         """Return the mean loss of expert actions where ``mask`` holds, and values to log."""
         error = policy.mode() - action
         squared = self.loss == "mse"
-        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.choice_of(action))
+        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.raw_action(action))
         share = 1.0 / jnp.maximum(mask.sum(dtype=jnp.float32), 1.0)
         mean = jnp.sum(loss * mask) * share
         logs = {
@@ -99,11 +109,7 @@ class Cloning:
         return mean, logs
 
     def run_updates(
-        self,
-        carry: Carry,
-        optimiser: optax.GradientTransformation,
-        loss: Callable[[Any, Array], tuple[Array, dict[str, Array]]],
-        key: Array,
+        self, carry: Carry, optimiser: optax.GradientTransformation, loss: AuxiliaryLoss, key: Array
     ) -> tuple[Carry, dict[str, Array]]:
         """Take the updates of one iteration, and return the means of what the loss logs."""
 
@@ -116,11 +122,7 @@ class Cloning:
 
 @dataclass(frozen=True)
 class BcConfig(Cloning):
-    """Behaviour cloning: supervised learning of the expert's actions at random steps of the logs.
-
-    Attributes:
-        network: The policy.
-    """
+    """Behaviour cloning: supervised learning of the expert's actions at random steps of the logs."""
 
     kind: Literal["bc"] = "bc"
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -132,10 +134,9 @@ class BcConfig(Cloning):
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
         """Return the data, from which steps are drawn uniformly, or experience drawn by weight."""
-        if weights is None:
-            return data
         # The loss masks clipped steps, and logs their share.
-        return ExperienceConfig(mask_clipped=False).of(environment, data, weights)
+        config = ExperienceConfig(mask_clipped=False)
+        return data if weights is None else config.of(environment, data, weights)
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Bc:
         """Return behaviour cloning in an environment."""
@@ -153,7 +154,7 @@ class BcState:
 
 
 class Bc:
-    """Behaviour cloning in one environment. Holds configuration and the network's graph."""
+    """Behaviour cloning in one environment."""
 
     def __init__(self, config: BcConfig, environment: Environment, data: Any, iterations: int) -> None:
         self.config, self.environment, self.batch = config, demonstrated(environment), config.batch
@@ -208,28 +209,16 @@ def imitation_update(
     return (optax.apply_updates(parameters, change), state), logs
 
 
-def _draw(
-    environment: Demonstrated, data: Any, key: Array, count: int
-) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
-    """Draw expert actions: by the weights of experience, or uniformly."""
-    if isinstance(data, Experience):
-        return expert_actions(recorded(environment), data, draw(data.policy or data.critic, key, (count,)))
-    return environment.demonstrations(data, key, count)
-
-
 def demonstrated(environment: Environment) -> Demonstrated:
     """Return the environment; raises UsageError if it has no expert actions."""
     if not isinstance(environment, Demonstrated):
-        raise UsageError(
-            f"{type(environment).__name__} has no expert to imitate", cure="implement `demonstrations`"
-        )
+        problem = f"{type(environment).__name__} has no expert to imitate"
+        raise UsageError(problem, cure="implement `demonstrations`")
     return environment
 
 
 def check_loss(cloning: Cloning, network: NetworkConfig) -> None:
     """Raise UsageError for a squared error of a mode without gradient: of levels or mixtures."""
     if cloning.loss == "mse" and network.distribution not in REPARAMETRISED:
-        raise UsageError(
-            f"the mode of {network.distribution!r} has no gradient for the loss 'mse'",
-            cure="use loss: likelihood",
-        )
+        problem = f"the mode of {network.distribution!r} has no gradient for the loss 'mse'"
+        raise UsageError(problem, cure="use loss: likelihood")

@@ -18,8 +18,7 @@ from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBat
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.networks.distributions import Distribution
-from drivax.rl.offline import conservative_penalty, penalty_weight_loss, scaled_policy_loss
-from drivax.rl.online import td_target
+from drivax.rl.equations import conservative_penalty, penalty_weight_loss, scaled_policy_loss, td_target
 
 #: Largest logarithm of the Lagrange multiplier.
 _LARGEST_WEIGHT = math.log(1e6)
@@ -33,13 +32,12 @@ class CqlConfig(OfflineConfig):
         penalty: Weight of the conservative penalty relative to half the squared TD error; with a ``gap`` the first one.
         gap: Target penalty of a Lagrange multiplier that replaces the weight; None: constant weight.
         penalty_rate: Learning rate of the multiplier.
-        actions: Actions from each distribution that the penalty samples.
-        next_actions: Sample the penalty's actions from the policy at the next state, too, in addition to uniform ones
-            and those of the policy at the state.
+        actions: Actions that the penalty samples from each distribution: uniform, and the policy at the state.
+        next_actions: Sample the penalty's actions from the policy at the next state, too.
         backup_actions: Actions of the policy at the next state; the highest value (of the smaller critic) is backed up.
             A single one has on average less value than the expert's next action, which accumulates over steps.
         importance: Divide each by its density; otherwise the logged action is among the actions instead.
-        penalty_temperature: Of the penalty's soft maximum.
+        penalty_temperature: Temperature of the penalty's soft maximum.
         imitation: Weight of the squared error of the policy's mode from the expert's action. Above 0, the policy's loss
             is divided by the mean absolute Q, so that the weight does not depend on the scale of rewards.
         temperature: Initial temperature of the policy's entropy.
@@ -64,18 +62,13 @@ class CqlConfig(OfflineConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_gradient()
-        if (
-            min(self.actions, self.backup_actions) < 1
-            or min(self.temperature, self.penalty_temperature) <= 0.0
-        ):
-            raise UsageError(
-                "actions, backup_actions or a temperature of CQL is too small", cure="use more than 0"
-            )
+        temperature = min(self.temperature, self.penalty_temperature)
+        if min(self.actions, self.backup_actions) < 1 or temperature <= 0.0:
+            problem = "actions, backup_actions or a temperature of CQL is too small"
+            raise UsageError(problem, cure="use more than 0")
         if self.penalty < 0.0 or self.imitation < 0.0 or (self.gap is not None and self.penalty == 0.0):
-            raise UsageError(
-                "penalty or imitation is negative, or penalty is 0 with a gap",
-                cure="use 0 or more, and with a gap more than 0",
-            )
+            problem = "penalty or imitation is negative, or penalty is 0 with a gap"
+            raise UsageError(problem, cure="use 0 or more, and with a gap more than 0")
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Cql:
         """Return CQL in an environment."""
@@ -92,9 +85,9 @@ class Cql(Offline[CqlConfig]):
     def scalars(self) -> dict[str, float]:
         """Return logarithms of the temperature, and of the multiplier if there is one."""
         scalars = {"log_temperature": math.log(self.config.temperature)}
-        return (
-            scalars if self.config.gap is None else scalars | {"log_penalty": math.log(self.config.penalty)}
-        )
+        if self.config.gap is not None:
+            scalars["log_penalty"] = math.log(self.config.penalty)
+        return scalars
 
     def optimisers(self) -> dict[Hashable, optax.GradientTransformation]:
         """Return the optimisers of networks and scalars."""
@@ -146,8 +139,7 @@ class Cql(Offline[CqlConfig]):
         config = self.config
         uniform_key, policy_key, next_key = jax.random.split(key, 3)
         shape = (config.actions, *logged.shape)
-        uniform = jax.random.uniform(uniform_key, shape, minval=-1.0)
-        actions = [uniform]
+        actions = [jax.random.uniform(uniform_key, shape, minval=-1.0)]
         densities = [jnp.full(shape[:-1], -logged.shape[-1] * math.log(2.0))]
         sources = ((policy, policy_key), (next_policy, next_key))
         for distribution, sample_key in sources[: 2 if config.next_actions else 1]:

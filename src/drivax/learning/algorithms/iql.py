@@ -18,7 +18,7 @@ from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBat
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Value
-from drivax.rl.offline import advantage_weights, expectile_loss
+from drivax.rl.equations import advantage_weights, expectile_loss
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,8 @@ class IqlConfig(OfflineConfig):
         if not 0.0 < self.expectile < 1.0:
             raise UsageError(f"an expectile of {self.expectile:g}", cure="use more than 0 and less than 1")
         if self.inverse_temperature < 0.0 or self.largest_weight <= 0.0:
-            raise UsageError(
-                "inverse_temperature or largest_weight is too small",
-                cure="use 0 or more, and a largest_weight above 0",
-            )
+            problem = "inverse_temperature or largest_weight is too small"
+            raise UsageError(problem, cure="use 0 or more, and a largest_weight above 0")
         if self.loss == "mse":
             self.check_gradient()
 
@@ -72,7 +70,7 @@ class Iql(Offline[IqlConfig]):
     ) -> tuple[Array, dict[str, Array]]:
         """Return the sum of expectile regression, the critics' loss, and advantage-weighted imitation."""
         config, (observation, expert) = self.config, policy_batch
-        target_q = self._smaller_q(target, batch.observation, batch.action)
+        target_q = self._min_q(target, batch.observation, batch.action)
         value = self._value(trained["value"], batch.observation)
         value_loss = jnp.mean(expectile_loss(target_q - value, config.expectile))
 
@@ -81,13 +79,13 @@ class Iql(Offline[IqlConfig]):
 
         advantage = target_q - value
         if observation is not batch.observation:
-            value_of_policy = self._value(trained["value"], observation)
-            advantage = self._smaller_q(target, observation, expert) - value_of_policy
+            policy_value = self._value(trained["value"], observation)
+            advantage = self._min_q(target, observation, expert) - policy_value
         weights = advantage_weights(advantage, config.inverse_temperature, config.largest_weight)
         policy = self.distribution(trained["policy"], observation)
         error = policy.mode() - expert
         squared = config.loss == "mse"
-        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.choice_of(expert))
+        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.raw_action(expert))
         imitation = jnp.mean(weights * loss)
         return value_loss + critic_loss + imitation, {
             "value": value_loss,
@@ -101,10 +99,9 @@ class Iql(Offline[IqlConfig]):
             "imitation_error": jnp.mean(jnp.abs(error)),
         }
 
-    def _smaller_q(
+    def _min_q(
         self, target: Any, observation: dict[str, Array], action: Float[Array, "B D"]
     ) -> Float[Array, " B"]:
-        """Smaller value of the target critics."""
         return jnp.min(self.q_values(target["critic"], observation, action), axis=0)
 
     def _value(self, parameters: Any, observation: dict[str, Array]) -> Float[Array, " B"]:

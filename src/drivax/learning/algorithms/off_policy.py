@@ -1,8 +1,4 @@
-"""What off-policy algorithms share, online (SAC) and offline (CQL, IQL, TD3+BC).
-
-A policy with twin critics, TD errors, the losses of a soft actor, and one update: a gradient step of all losses, then
-the target networks.
-"""
+"""Base of off-policy algorithms, online (SAC) and offline (CQL, IQL, TD3+BC): policy, twin critics, and one update."""
 
 from __future__ import annotations
 
@@ -19,8 +15,8 @@ from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
 from drivax.networks.distributions import Actions, Distribution
-from drivax.planners.network_planner import NetworkPlanner
-from drivax.rl.online import polyak, soft_policy_loss, td_target, temperature_loss
+from drivax.planners.functions import NetworkPlanner
+from drivax.rl.equations import polyak, soft_policy_loss, td_target, temperature_loss
 
 
 @runtime_checkable
@@ -29,7 +25,7 @@ class OffPolicyConfig(Protocol):
 
     @property
     def network(self) -> NetworkConfig:
-        """Policy and critics, with an encoder each."""
+        """Architecture of policy and critics."""
         ...
 
     @property
@@ -51,7 +47,7 @@ Carry = tuple[Trained, dict[str, Any], Any]
 
 
 class SoftActor(NamedTuple):
-    """The soft actor's losses, and what they are made of."""
+    """The losses of a soft actor, and their ingredients."""
 
     policy: Distribution
     q_values: Float[Array, "2 B"]
@@ -71,10 +67,7 @@ def target_entropy(config: Any, environment: Environment) -> float:
 
 
 class OffPolicy(Generic[Config]):
-    """An off-policy algorithm in one environment: a subclass adds its losses and optimisers.
-
-    Holds configuration and the networks' graphs; everything computed is in the state.
-    """
+    """An off-policy algorithm in one environment: a subclass adds its losses and optimisers."""
 
     #: Names of networks that have a target network.
     targets: ClassVar[tuple[str, ...]] = ("critic",)
@@ -115,8 +108,8 @@ class OffPolicy(Generic[Config]):
         """Return the policy as a planner."""
         return NetworkPlanner(parameters, self.graphs["policy"], name, samples)
 
-    #: The sum of all losses, each of which reaches its own parameters only, and values to log: of what is trained, the
-    #: target networks, and a batch.
+    #: From what is trained, target networks and a batch to the sum of all losses, each of which reaches its own
+    #: parameters only, and values to log.
     loss: Callable[..., tuple[Array, dict[str, Array]]]
 
     def update_networks(self, carry: Carry, *batch: Any) -> tuple[Carry, dict[str, Array]]:
@@ -146,9 +139,8 @@ class OffPolicy(Generic[Config]):
         policy = self.distribution(trained["policy"], observation)
         raw_action = policy.sample(key)
         log_prob = policy.log_prob(raw_action)
-        q_values = self.q_values(
-            jax.lax.stop_gradient(trained["critic"]), observation, policy.action(raw_action)
-        )
+        critic = jax.lax.stop_gradient(trained["critic"])
+        q_values = self.q_values(critic, observation, policy.action(raw_action))
         return SoftActor(
             policy,
             q_values,

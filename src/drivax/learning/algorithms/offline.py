@@ -1,4 +1,4 @@
-"""What offline algorithms share: logged steps by weight, normalisation, updates, and evaluation on held-out steps."""
+"""Base of offline algorithms: weighted logged steps, normalisation, updates, and evaluation on held-out steps."""
 
 from __future__ import annotations
 
@@ -32,16 +32,11 @@ from drivax.learning.program import divided
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Critic, NetworkConfig
 from drivax.networks.distributions import REPARAMETRISED, Actions
-from drivax.networks.normalised import (
-    NormalisedConfig,
-    Statistics,
-    feature_statistics,
-    set_statistics,
-)
-from drivax.rl.online import polyak, td_target
+from drivax.networks.encoders import NormalisedConfig, Statistics, feature_statistics, set_statistics
+from drivax.rl.equations import polyak, td_target
 from drivax.scenario.record import record
 
-#: Held-out steps that the mean Q is taken over and steps that feature statistics are taken of; and at a time.
+#: Steps that the mean Q and feature statistics are computed over, and steps per batch.
 _SAMPLES, _BATCH = 2048, 256
 
 
@@ -50,7 +45,7 @@ class FittedQConfig:
     """Settings of fitted-Q evaluation on held-out steps, at every validation.
 
     Attributes:
-        updates: Updates of a critic that starts again at each validation; 0: no such evaluation.
+        updates: Updates of a new critic at each validation; 0: no such evaluation.
         batch: Steps per update.
         rate: Learning rate of Adam, falling linearly to a tenth.
         tau: Step of the target critic per update.
@@ -86,13 +81,8 @@ class FittedQ:
         """Return the estimated discounted return of a policy from where episodes begin.
 
         The critic learns ``Q(s, a) = r + gamma (1 - terminated) Q'(s', pi(s'))`` from logged steps; the result is the
-        mean of ``Q(s, pi(s))`` over the first usable step of every scenario. Draws are the same in every call, so that
-        checkpoints differ by their policies alone.
-
-        Args:
-            data: The logged steps.
-            act: From a batch of observations to the policy's actions.
-            statistics: Statistics of features, if the network normalises them.
+        mean of ``Q(s, pi(s))`` over the first usable step of every scenario. Draws are the same in every call.
+        ``statistics`` are those of features, if the network normalises them.
         """
         network_key, key = jax.random.split(jax.random.key(0))
         actions = Actions(self.environment.action_size, self.environment.levels)
@@ -136,7 +126,7 @@ class OfflineConfig:
     """Settings of every offline algorithm.
 
     Attributes:
-        network: Policy, critics and value, with an encoder each.
+        network: Architecture of policy, critics and value.
         records: Logged steps to learn from.
         batch: Steps per update.
         updates: Updates per iteration.
@@ -181,32 +171,20 @@ class OfflineConfig:
     @property
     def networks(self) -> NetworkConfig:
         """Configuration of the networks, with normalisation if configured."""
-        network = self.network
-        return (
-            replace(network, encoder=NormalisedConfig(encoder=network.encoder)) if self.normalise else network
-        )
+        if not self.normalise:
+            return self.network
+        return replace(self.network, encoder=NormalisedConfig(self.network.encoder))
 
     def check_gradient(self) -> None:
         """Raise UsageError for a policy without a gradient through its actions: of levels or mixtures."""
         if self.network.distribution not in REPARAMETRISED:
-            raise UsageError(
-                f"{type(self).__name__} needs a policy with a gradient through its actions",
-                cure="use gaussian or beta; iql and bc learn all",
-            )
+            problem = f"{type(self).__name__} needs a policy with a gradient through its actions"
+            raise UsageError(problem, cure="use gaussian or beta; iql and bc learn all")
 
 
 @record
 class OfflineState:
-    """Everything that a run needs to continue.
-
-    Attributes:
-        parameters: Parameters of the policy.
-        rest: Everything else that is trained, by name.
-        target: Target networks, by name.
-        optimiser: State of the optimiser.
-        key: Random key.
-        iteration: Finished iterations.
-    """
+    """Everything that a run needs to continue; ``rest`` is all that is trained in addition to the policy, by name."""
 
     networks: ClassVar[tuple[str, ...]] = ("parameters", "rest", "target")
 
@@ -219,15 +197,15 @@ class OfflineState:
 
 
 Config = TypeVar("Config", bound=OfflineConfig)
-#: Where the policy is improved: observations, and the expert's actions.
+#: Observations of the steps that the policy is improved at, and the expert's actions.
 PolicyBatch = tuple[dict[str, Array], Float[Array, "B D"]]
 
 
 class Offline(OffPolicy[Config]):
     """An offline algorithm in one environment.
 
-    Batches of :meth:`loss` are steps that values are learned from, where the policy is improved (the same steps unless
-    weights are for the policy alone), and a key.
+    A batch of :meth:`loss` holds the steps that values are learned from, those that the policy is improved at (the same
+    unless weights are for the policy alone), and a key.
     """
 
     def __init__(self, config: Config, environment: Environment, data: Any, iterations: int) -> None:
@@ -290,7 +268,7 @@ class Offline(OffPolicy[Config]):
         return after, {f"loss/{name}": value.mean() for name, value in logs.items()} | data.sizes()
 
     def _draw(self, data: Experience, key: Array) -> tuple[Transitions, PolicyBatch]:
-        """Draw steps to learn values from, and where to improve the policy."""
+        """Draw steps to learn values from, and steps to improve the policy at."""
         environment, count = recorded(self.environment), (self.config.batch,)
         critic_key, policy_key = jax.random.split(key)
         batch = divided(transitions(environment, data, draw(data.critic, critic_key, count)), axis=0)
@@ -309,8 +287,7 @@ class Offline(OffPolicy[Config]):
     def held_out_metrics(self, data: Experience, state: OfflineState) -> dict[str, float]:
         """Return ``mean_q``: the smaller critic's value of the policy's mode, always over the same held-out steps.
 
-        It compares neither algorithms nor checkpoints, because overestimation raises it, too. ``fitted_q``, if
-        configured, is the return that :class:`FittedQ` estimates.
+        Overestimation raises it, too. ``fitted_q``, if configured, is the return that :class:`FittedQ` estimates.
         """
         metrics = {"mean_q": float(self._mean_q(data, state.parameters, state.rest["critic"]))}
         if self.config.fitted_q.updates:

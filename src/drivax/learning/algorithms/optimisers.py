@@ -28,9 +28,8 @@ def clipped_adam(
         updates: Updates over which the rate falls linearly to ``last`` times the first, then stays; 0: constant.
         last: See ``updates``.
         eps: Epsilon of Adam.
-        per_network: Clip each network (the first level of the tree) by its own norm. Networks that share nothing
-            should be: the value's error is often a hundred times the policy's, and a joint norm would shrink the
-            policy's steps with it.
+        per_network: Clip each network by its own norm, for networks that share nothing: the value's error is often a
+            hundred times the policy's, and a joint norm would shrink the policy's steps with it.
     """
     schedule = optax.linear_schedule(rate, last * rate, updates) if updates else rate
     adam = optax.adam(schedule, eps=eps)

@@ -26,8 +26,8 @@ from drivax.learning.environment import (
 from drivax.learning.program import divided
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig
 from drivax.networks.distributions import Actions, Distribution
-from drivax.planners.network_planner import NetworkPlanner
-from drivax.rl.online import clipped_surrogate_loss, generalised_advantages
+from drivax.planners.functions import NetworkPlanner
+from drivax.rl.equations import clipped_surrogate_loss, generalised_advantages
 from drivax.scenario.record import record
 
 
@@ -36,14 +36,13 @@ class PpoConfig:
     """PPO. The defaults train on two CPU cores; the preset ``published`` has the published sizes.
 
     Attributes:
-        network: Policy and value.
+        network: Architecture of policy and value.
         environments: Environments in parallel.
         unroll: Steps per environment and iteration.
-        epochs, minibatches: Passes over the experience, and updates per pass.
-        learning_rate: Of Adam, falling linearly over the run to ``last_rate`` times itself.
-        last_rate: See ``learning_rate``; 1: constant.
-        gamma, lambda_: Discount, and mixing of advantages.
-        clip: Of the probability ratio.
+        epochs, minibatches: Passes over the rollout, and updates per pass.
+        learning_rate, last_rate: The rate of Adam falls linearly over the run to ``last_rate`` times itself.
+        gamma, lambda_: Discount, and decay of generalised advantages.
+        clip: Bound of the probability ratio's distance from 1.
         value_coefficient, entropy_coefficient: Weights in the loss.
         gradient_norm: Gradients are clipped to this global norm (None: no clipping), separately for policy and value
             unless they share an encoder.
@@ -67,10 +66,9 @@ class PpoConfig:
     def __post_init__(self) -> None:
         if self.environments < 1 or self.unroll < 1 or self.minibatches < 1:
             raise ValueError("environments, unroll and minibatches are at least 1")
-        if self.steps_per_iteration % self.minibatches:
-            raise ValueError(
-                f"environments x unroll = {self.steps_per_iteration} is no multiple of {self.minibatches} minibatches"
-            )
+        steps, minibatches = self.steps_per_iteration, self.minibatches
+        if steps % minibatches:
+            raise ValueError(f"environments x unroll = {steps} is no multiple of {minibatches} minibatches")
 
     @property
     def steps_per_iteration(self) -> int:
@@ -96,7 +94,7 @@ class PpoState:
 
 
 class Ppo:
-    """PPO in one environment. Holds configuration and the network's graph; everything computed is in the state."""
+    """PPO in one environment."""
 
     def __init__(self, config: PpoConfig, environment: Environment, data: Any, iterations: int) -> None:
         self.config, self.environment = config, environment
@@ -121,9 +119,8 @@ class Ppo:
         network_key, environment_key, key = jax.random.split(key, 3)
         parameters = nnx.state(self._network(network_key), nnx.Param)
         environments = self.environment.start(data, environment_key, self.config.environments)
-        return PpoState(
-            parameters, self.optimiser.init(parameters), environments, key, jnp.zeros((), jnp.int32)
-        )
+        optimiser = self.optimiser.init(parameters)
+        return PpoState(parameters, optimiser, environments, key, jnp.zeros((), jnp.int32))
 
     def network(self, parameters: Any) -> ActorCritic:
         """Return the network with these parameters."""
@@ -176,13 +173,9 @@ class Ppo:
     def update(
         self, data: Any, state: PpoState, rollout: Rollout, auxiliary_loss: AuxiliaryLoss | None = None
     ) -> tuple[PpoState, dict[str, Array]]:
-        """Take the updates of one iteration on a rollout that ends at ``state.environments``.
+        """Take the updates of one iteration on a rollout of ``unroll`` steps; ``data`` is unused.
 
-        Args:
-            data: The environment's data, unused.
-            state: The state that the rollout was sampled with, with the environments after it.
-            rollout: ``unroll`` steps.
-            auxiliary_loss: An additional loss of the parameters.
+        The state is the one that the rollout was sampled with, with the environments after it.
         """
         config = self.config
         _, update_key, key = jax.random.split(state.key, 3)
@@ -197,9 +190,7 @@ class Ppo:
             keys = jax.random.split(noise_key, config.minibatches)
             return jax.lax.scan(update, carry, (shuffled, keys))
 
-        def update(
-            carry: tuple[Any, Any], inputs: tuple[dict[str, Any], Array]
-        ) -> tuple[tuple[Any, Any], dict[str, Array]]:
+        def update(carry: tuple[Any, Any], inputs: tuple[Any, Array]) -> tuple[Any, dict[str, Array]]:
             (parameters, optimiser), (minibatch, key) = carry, inputs
             slope = jax.value_and_grad(self._loss, has_aux=True)
             (_, logs), gradient = slope(parameters, minibatch, key, auxiliary_loss)
@@ -218,14 +209,9 @@ class Ppo:
         # The row after a truncated step holds its final state, so this is the value to bootstrap.
         value_tp1 = jnp.concatenate([value_t[1:], last[None]])
         advantage, target = generalised_advantages(
-            rollout.reward,
-            value_t,
-            value_tp1,
-            rollout.terminated,
-            rollout.truncated,
-            self.config.gamma,
+            rollout.reward, value_t, value_tp1, rollout.terminated, rollout.truncated, self.config.gamma,
             self.config.lambda_,
-        )
+        )  # fmt: skip
         batch = {
             "observation": rollout.observation,
             "raw_action": rollout.raw_action,
@@ -251,7 +237,9 @@ class Ppo:
         deviation = jnp.sqrt(mean((minibatch["advantage"] - centre) ** 2)) + 1e-8
         advantage = (minibatch["advantage"] - centre) / deviation
         policy_loss = mean(clipped_surrogate_loss(log_prob, minibatch["log_prob"], advantage, config.clip))
-        value_loss = mean((value - minibatch["target"]) ** 2)
+        target = minibatch["target"]
+        value_loss = mean((value - target) ** 2)
+        variance = jnp.maximum(mean((target - mean(target)) ** 2), 1e-8)
         entropy = mean(policy.entropy_estimate(entropy_key))
         total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
         auxiliary, logs = (0.0, {}) if auxiliary_loss is None else auxiliary_loss(parameters, auxiliary_key)
@@ -262,6 +250,5 @@ class Ppo:
             "entropy": entropy,
             "clipped_share": mean((jnp.abs(ratio - 1.0) > config.clip).astype(jnp.float32)),
             "kl": mean(minibatch["log_prob"] - log_prob),
-            "explained_variance": 1.0
-            - value_loss / jnp.maximum(mean((minibatch["target"] - mean(minibatch["target"])) ** 2), 1e-8),
+            "explained_variance": 1.0 - value_loss / variance,
         }

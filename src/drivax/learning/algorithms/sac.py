@@ -31,7 +31,7 @@ from drivax.learning.environment import (
 from drivax.learning.replay import Replay, ReplayBuffer, ReplayConfig, ReplayIndex, Transitions
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import REPARAMETRISED
-from drivax.rl.online import soft_value
+from drivax.rl.equations import soft_value
 from drivax.scenario.record import record
 
 
@@ -40,7 +40,7 @@ class SacConfig:
     """SAC. The defaults train on two CPU cores; the preset ``published/sac`` has the published sizes.
 
     Attributes:
-        network: Policy and critics; an encoder each.
+        network: Architecture of policy and critics.
         replay: Size and format of the replay buffer.
         environments: Environments in parallel.
         unroll: Steps per environment and iteration.
@@ -50,7 +50,7 @@ class SacConfig:
         explore: Actions before the first update: uniform, or of the policy.
         policy_rate, critic_rate, temperature_rate: Learning rates of Adam.
         gamma: Discount.
-        tau: Step of the target critics toward the critics per update.
+        tau: Step of the target critics per update.
         temperature: Initial temperature.
         target_entropy: Target entropy of the policy; by default minus the size of an action.
         gradient_norm: Gradients of the policy and of the critics are clipped to this global norm; None: no clipping.
@@ -79,19 +79,14 @@ class SacConfig:
             raise ValueError("environments, unroll, updates_per_step and batch are at least 1")
         rows = self.replay.rows(self.environments)
         if self.unroll > rows:
-            raise UsageError(
-                f"unroll of {self.unroll} steps does not fit a replay buffer of {rows} rows",
-                cure="raise replay.capacity",
-            )
+            problem = f"unroll of {self.unroll} steps does not fit a replay buffer of {rows} rows"
+            raise UsageError(problem, cure="raise replay.capacity")
         if self.unroll < 2 and self.warm_up < 2 * self.environments:
-            raise UsageError(
-                "the first update has no step with a successor to sample",
-                cure=f"set warm_up to {2 * self.environments} or more",
-            )
+            cure = f"set warm_up to {2 * self.environments} or more"
+            raise UsageError("the first update has no step with a successor to sample", cure=cure)
         if self.network.distribution not in REPARAMETRISED:
-            raise UsageError(
-                "SAC needs a policy with reparameterised samples", cure="set distribution to gaussian or beta"
-            )
+            cure = "set distribution to gaussian or beta"
+            raise UsageError("SAC needs a policy with reparameterised samples", cure=cure)
 
     @property
     def steps_per_iteration(self) -> int:
@@ -99,7 +94,7 @@ class SacConfig:
         return self.environments * self.unroll
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Sac:
-        """SAC in an environment."""
+        """Return SAC in an environment."""
         return Sac(self, environment, data)
 
 
@@ -167,7 +162,7 @@ class Sac(OffPolicy[SacConfig]):
         )
 
     def with_policy(self, parameters: Any, of: Any) -> Any:
-        """Return parameters with the policy ``of`` others: those, since ``parameters`` are the policy's."""
+        """Return ``of``, because parameters are the policy's."""
         return of
 
     def iterate(
@@ -178,14 +173,10 @@ class Sac(OffPolicy[SacConfig]):
         Returns:
             The next state, and sums to log: ``rollout/*`` of the collector, ``loss/*`` with ``loss/*/n``.
         """
+        actor, key = partial(self.sample_action, state), self.rollout_key(state)
+        unroll, keep = self.config.unroll, self.config.replay.store
         environments, rollout, totals = collect(
-            self.environment,
-            data,
-            state.environments,
-            partial(self.sample_action, state),
-            self.rollout_key(state),
-            self.config.unroll,
-            self.config.replay.store,
+            self.environment, data, state.environments, actor, key, unroll, keep
         )
         state = replace(state, environments=environments, replay=self.buffer.add(state.replay, rollout))
         state, losses = self.update(data, state, auxiliary_loss)
@@ -215,19 +206,13 @@ class Sac(OffPolicy[SacConfig]):
     ) -> tuple[SacState, dict[str, Array]]:
         """Take the updates of one iteration on batches from the buffer; none before ``warm_up`` steps.
 
-        Args:
-            data: The environment's data.
-            state: The state, with the rollout of this iteration in ``replay``.
-            auxiliary_loss: An additional loss of the policy.
+        The state has the rollout of this iteration in ``replay``.
         """
         config = self.config
         _, draw_key, update_key, key = jax.random.split(state.key, 4)
         before = state.iteration * config.steps_per_iteration
-        first: Carry = (
-            Trained(state.parameters, state.critic, state.log_temperature),
-            {"critic": state.target},
-            state.optimiser,
-        )
+        trained = Trained(state.parameters, state.critic, state.log_temperature)
+        first: Carry = (trained, {"critic": state.target}, state.optimiser)
 
         @jax.jit  # so that the shapes of its logs do not trace it a second time
         def learn() -> tuple[Carry, dict[str, Array]]:
@@ -269,21 +254,14 @@ class Sac(OffPolicy[SacConfig]):
         critic_loss, q = self.critic_loss(trained, batch, next_value)
         actor = self.soft_actor(trained, batch.observation, self.target_entropy, key)
         policy_loss = jnp.mean(actor.loss)
-        auxiliary, logs = (
-            (0.0, {}) if auxiliary_loss is None else auxiliary_loss(trained.policy, auxiliary_key)
-        )
-        total = critic_loss + policy_loss + actor.temperature_loss + auxiliary
-        return total, logs | actor.logs | {
-            "critic": critic_loss,
-            "policy": policy_loss,
-            "mean_q": jnp.mean(q),
-        }
+        auxiliary, logs = 0.0, {}
+        if auxiliary_loss is not None:
+            auxiliary, logs = auxiliary_loss(trained.policy, auxiliary_key)
+        logs |= actor.logs | {"critic": critic_loss, "policy": policy_loss, "mean_q": jnp.mean(q)}
+        return critic_loss + policy_loss + actor.temperature_loss + auxiliary, logs
 
 
 def _sums(logs: dict[str, Array]) -> dict[str, Array]:
-    """Sums over updates, with counts."""
-    sums = {}
-    for name, values in logs.items():
-        sums[f"loss/{name}"] = values.sum()
-        sums[f"loss/{name}/n"] = jnp.asarray(float(len(values)))
-    return sums
+    """Return sums over updates, with counts."""
+    sums = {f"loss/{name}": values.sum() for name, values in logs.items()}
+    return sums | {f"loss/{name}/n": jnp.asarray(float(len(values))) for name, values in logs.items()}

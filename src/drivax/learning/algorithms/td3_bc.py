@@ -16,7 +16,7 @@ from drivax.learning.algorithms.off_policy import Trained
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
-from drivax.rl.offline import scaled_policy_loss, smoothed_action
+from drivax.rl.equations import scaled_policy_loss, smoothed_action
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,8 @@ class Td3BcConfig(OfflineConfig):
         super().__post_init__()
         self.check_gradient()
         if min(self.q_weight, self.noise, self.noise_bound) < 0.0 or self.delay < 1:
-            raise UsageError(
-                "q_weight, noise, noise_bound or delay is too small",
-                cure="use 0 or more, and a delay of 1 or more",
-            )
+            problem = "q_weight, noise, noise_bound or delay is too small"
+            raise UsageError(problem, cure="use 0 or more, and a delay of 1 or more")
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Td3Bc:
         """Return TD3+BC in an environment."""

@@ -90,14 +90,9 @@ class EmergencyBrake:
         return self.planner.init(bank, state, key)
 
     def act(
-        self,
-        carry: Any,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, " D"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
         """Return the planner's action, or brake straight ahead."""
         action, carry = self.planner.act(carry, bank, state, situation, observation, key)
         context, around = situation.context, situation.surroundings

@@ -8,11 +8,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, time_to_overlap
 from drivax.geometry.vectors import norm
-from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import Integer, Vector
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
-from drivax.simulator.contact import classify_contacts
+from drivax.simulator.contact import classify_contacts, others_on_level
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, MOTION_X, MOTION_Y, Frame
 
 #: Samples of the next five seconds.
@@ -23,38 +22,21 @@ _FURTHER = 0.02
 
 @record
 class Forecast:
-    """Agents that keep their velocity and heading.
+    """Agents that keep their velocity and heading."""
 
-    Attributes:
-        box: Their boxes now.
-        velocity: m/s.
-        kind: ``scenario.schema.AgentKind``.
-        valid: Mask of present agents.
-    """
-
-    box: Float[Array, "K 6"]
-    velocity: Float[Array, "K 2"]
-    kind: Int[Array, " K"]
-    valid: Bool[Array, " K"]
+    box: Float[Array, "K 6"]  # Their boxes now
+    velocity: Float[Array, "K 2"]  # m/s
+    kind: Int[Array, " K"]  # ``scenario.schema.AgentKind``
+    valid: Bool[Array, " K"]  # Mask of present agents
 
     @classmethod
     def of(
         cls, frame: Frame, slot: Integer, ignored: Bool[Array, " S"], way: Float[Array, "M 2"],
         most: int, radius_m: float,
     ) -> Forecast:  # fmt: skip
-        """Select the agents that come nearest to a path within five seconds.
-
-        Args:
-            frame: All agents now.
-            slot: Ego.
-            ignored: Mask of ignored agents.
-            way: Points of ego's path.
-            most: Largest number of agents.
-            radius_m: Largest present distance from ego.
-        """
+        """Select the ``most`` agents within ``radius_m`` that come nearest to ego's path ``way`` in five seconds."""
         away = norm(frame.box[:, :2] - frame.box[slot, :2])
-        counts = frame.valid & ~ignored & (jnp.arange(away.shape[0]) != slot) & (away <= radius_m)
-        counts &= jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M
+        counts = others_on_level(frame, slot) & ~ignored & (away <= radius_m)
         times = jnp.arange(_LOOKS)[:, None] * _LOOK_S
         x = frame.box[:, X] + times * frame.velocity[:, 0]
         y = frame.box[:, Y] + times * frame.velocity[:, 1]
@@ -99,16 +81,10 @@ def fault_times(
     motion: Float[Array, "T 4"], size: Vector, others: Forecast, soon_s: Float[Array, "T K"],
     unlawful: Bool[Array, " T"],
 ) -> Float[Array, " K"]:  # fmt: skip
-    """Time of the first at-fault collision with each agent, s; infinite for none.
+    """Return the time of the first at-fault collision with each agent, s; infinite for none.
 
-    Fault is decided at the first overlap, by the rule of the metric (``simulator.contact.classify_contacts``).
-
-    Args:
-        motion: Motion of ego.
-        size: Length and width of ego.
-        others: Forecast of the other agents.
-        soon_s: Their :func:`until_overlap`.
-        unlawful: Mask of steps at which ego is in several lanes or off the road.
+    ``simulator.contact.classify_contacts`` decides the fault at the first overlap (``soon_s``: :func:`until_overlap`);
+    ``unlawful`` masks the steps at which ego is in several lanes or off the road.
     """
     steps = jnp.arange(motion.shape[0])
     first = jnp.min(jnp.where(soon_s <= 0.0, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
@@ -119,12 +95,10 @@ def fault_times(
     speeds = norm(others.velocity)
 
     def at_fault(both: Array, kind: Array, speed: Array, other: Array, several: Array) -> Array:
-        two = jnp.zeros(2)
-        frame = Frame(
-            both, jnp.zeros((2, 2)), two, two == 0.0, jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
-        )
-        fresh = jnp.arange(2) == 1
-        return classify_contacts(frame, jnp.zeros((), jnp.int32), fresh, speed, two + other, several)[0][1]
+        two, slot = jnp.zeros(2), jnp.zeros((), jnp.int32)
+        kinds, lights = jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
+        frame = Frame(both, jnp.zeros((2, 2)), two, two == 0.0, kinds, lights)
+        return classify_contacts(frame, slot, jnp.arange(2) == 1, speed, two + other, several)[0][1]
 
     pairs = jnp.stack([me, moved], axis=1)
     fault = jax.vmap(at_fault)(pairs, others.kind, motion[step, MOTION_SPEED], speeds, unlawful[step])

@@ -6,7 +6,7 @@ Planning" (CoRL 2023), and its published implementation; ``docs/guide/planners.m
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -16,16 +16,11 @@ from jaxtyping import Array, Bool, Float
 from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH
 from drivax.geometry.vectors import wrap
+from drivax.planners.pdm import scoring
 from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unroll_idm
-from drivax.planners.pdm.scoring import (
-    ProposalMetrics,
-    ScoringConfig,
-    evaluate_proposal,
-    ground_along,
-    scores,
-)
+from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig
 from drivax.planners.pdm.tracking import Car, TrackingConfig, track
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
@@ -39,14 +34,7 @@ from drivax.tasks.actions import ActionSpace, Physical
 #: Steps over which initial acceleration and curvature are measured, and the distance below which ego stands, m.
 _PAST, _STILL_M = 5, 0.5
 #: IDM of the proposals.
-PUBLISHED_DRIVER = IdmParameters(
-    min_gap_m=1.0,
-    headway_s=1.5,
-    acceleration_mps2=1.5,
-    comfortable_braking_mps2=3.0,
-    exponent=10.0,
-    max_braking_mps2=3.0,
-)
+PUBLISHED_DRIVER = IdmParameters(1.0, 1.5, 1.5, 3.0, exponent=10.0, max_braking_mps2=3.0)
 #: Stride of the route points that are compared with forecasts.
 _SPARSE = 5
 
@@ -94,32 +82,20 @@ class PdmConfig:
 
 @record
 class Memory:
-    """Carry of PDM.
+    """Carry of PDM."""
 
-    Attributes:
-        touched: Agents that have overlapped ego since the episode started; ignored.
-        acceleration: Last requested acceleration, m/s2.
-        steering: Steering angle, rad.
-    """
-
-    touched: Bool[Array, " S"]
-    acceleration: Float[Array, ""]
-    steering: Float[Array, ""]
+    touched: Bool[Array, " S"]  # Agents that have overlapped ego since the episode started; ignored
+    acceleration: Float[Array, ""]  # Last requested acceleration, m/s2
+    steering: Float[Array, ""]  # Steering angle, rad
 
 
 @record
 class ScoredProposals:
-    """Simulated and scored proposals of a step: speeds of one line after each other, lines in order.
+    """Simulated and scored proposals of a step: speeds of one line after each other, lines in order."""
 
-    Attributes:
-        cars: Simulated motion, step by step.
-        metrics: Metrics of each proposal.
-        score: In [0, 1].
-    """
-
-    cars: Car
-    metrics: ProposalMetrics
-    score: Float[Array, " N"]
+    cars: Car  # Simulated motion, step by step
+    metrics: ProposalMetrics  # Metrics of each proposal
+    score: Float[Array, " N"]  # In [0, 1]
 
 
 @record
@@ -150,18 +126,14 @@ class PdmPlanner:
         )
 
     def act(
-        self,
-        carry: Memory,
-        bank: ScenarioBank,
-        state: SimState,
-        situation: Situation,
-        observation: Any,
+        self, carry: Memory, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, " D"], Memory]:
+    ) -> tuple[Float[Array, " D"], Memory]:  # fmt: skip
         """Return the first action of the best proposal, or brake."""
         context = situation.context
         motion, length = context.history[-1], situation.surroundings.frame.box[context.slot, LENGTH]
-        carry = self._touching(carry, situation)
+        touched = carry.touched | overlaps(situation.surroundings.frame, context.slot)
+        carry = replace(carry, touched=touched)
         scored = self.score_proposals(carry, bank, situation)
         best = jnp.argmax(scored.score)
         speed, brake = motion[MOTION_SPEED], self.config.brake
@@ -171,14 +143,14 @@ class PdmPlanner:
         steering = jnp.where(brakes, 0.0, scored.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = self.actions.action(motion, acceleration, curvature, length)
-        return action, Memory(carry.touched, acceleration, steering)
+        return action, Memory(touched, acceleration, steering)
 
     def score_proposals(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> ScoredProposals:
         """Simulate and score all proposals."""
         config, context, around = self.config, situation.context, situation.surroundings
         frame, motion = around.frame, context.history[-1]
-        me = frame.box[context.slot]
-        size, speed = me[LENGTH : WIDTH + 1], motion[MOTION_SPEED]
+        me, speed = frame.box[context.slot], motion[MOTION_SPEED]
+        size = me[LENGTH : WIDTH + 1]
         lines = Lines.along_route(bank, context.index, around.route.along_m, config.offsets_m, me)
         way = lines.points[0, ::_SPARSE, :2]
         others = Forecast.of(frame, context.slot, carry.touched, way, config.agents, config.radius_m)
@@ -190,29 +162,21 @@ class PdmPlanner:
         driver = (config.driver, config.steps, config.leader_every)
         proposals = unroll_idm(lines, others, size, speed, desired, stop_m, driver)
         reference = jax.lax.optimization_barrier(proposals.reference(lines))
-        wheelbase = self._wheelbase(size[0])
-        car = Car(motion, carry.acceleration, carry.steering)
+        wheelbase, car = self._wheelbase(size[0]), Car(motion, carry.acceleration, carry.steering)
         cars = jax.vmap(lambda path: track(car, path, wheelbase, config.tracking))(reference)
         cars = jax.lax.optimization_barrier(cars)
         rows = lines.at(proposals.way).reshape(*reference.pose.shape[:2], -1)
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
         every = config.scoring.ground_every
-        ground = ground_along(bank, context.index, cars.motion, size, z, on_route, every)
+        ground = scoring.ground_along(bank, context.index, cars.motion, size, z, on_route, every)
         ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
         yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
 
-        def evaluate(motion: Array, acceleration: Array, ground: Any, progress_m: Array) -> ProposalMetrics:
-            return evaluate_proposal(
-                motion, acceleration, yaw_rate, size, others, ground, progress_m, config.scoring
-            )
-
-        metrics = jax.vmap(evaluate)(cars.motion, cars.acceleration, ground, ends)
-        return ScoredProposals(cars, metrics, scores(metrics, config.scoring))
-
-    def _touching(self, carry: Memory, situation: Situation) -> Memory:
-        frame, slot = situation.surroundings.frame, situation.context.slot
-        return Memory(carry.touched | overlaps(frame, slot), carry.acceleration, carry.steering)
+        metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, 0, None, None, None, 0, 0, None))(
+            cars.motion, cars.acceleration, yaw_rate, size, others, ground, ends, config.scoring
+        )
+        return ScoredProposals(cars, metrics, scoring.scores(metrics, config.scoring))
 
     def _wheelbase(self, length_m: Float[Array, ""]) -> Float[Array, ""]:
         return self.config.tracking.wheelbase * jnp.maximum(length_m, 1.0)

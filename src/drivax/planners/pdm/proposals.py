@@ -35,36 +35,24 @@ LINE_X, LINE_Y, LINE_COS, LINE_SIN, LINE_BEND, LINE_PLACE, LINE_Z = range(7)
 
 @record
 class Lines:
-    """P lines along the route, each at points 1 m apart along itself, from abreast of ego on.
+    """P lines along the route, each at points 1 m apart along itself, from abreast of ego on."""
 
-    Attributes:
-        points: x, y, cosine and sine of the heading, curvature (1/m), place along the route from ego on (m), and height
-            above where ego is (m).
-        route: Rows of ``bank.routes`` every 2 m ahead; straight on beyond the end.
-        left_m: How much of the route is left.
-        limit: Speed limit of ego's lane, m/s; not positive where unknown.
-    """
-
+    # x, y, cosine and sine of the heading, curvature (1/m), place along the route from ego on (m), and height above
+    # where ego is (m)
     points: Float[Array, "P M 7"]
-    route: Float[Array, "R 7"]
-    left_m: Scalar
-    limit: Scalar
+    route: Float[Array, "R 7"]  # Rows of ``bank.routes`` every 2 m ahead; straight on beyond the end
+    left_m: Scalar  # How much of the route is left
+    limit: Scalar  # Speed limit of ego's lane, m/s; not positive where unknown
 
     @classmethod
     def along_route(
         cls, bank: ScenarioBank, index: Integer, along_m: Scalar,
         offsets_m: tuple[float, ...], me: Float[Array, " 6"],
     ) -> Lines:  # fmt: skip
-        """Build lines at lateral offsets from the route, straight ahead of ego where there is no route.
+        """Build lines at lateral offsets from the route, straight ahead of ego's box where there is no route.
 
-        Parallel lines share their normals, so all of them start abreast of ego.
-
-        Args:
-            bank: The scenarios.
-            index: Row of the bank.
-            along_m: Arc length of ego along its route.
-            offsets_m: Lateral offsets, positive to the left.
-            me: Ego's box.
+        ``along_m`` is ego's arc length along its route; offsets are positive to the left. Parallel lines share their
+        normals, so all of them start abreast of ego.
         """
         left_m = bank.route_points[index, 0] - 1.0 - along_m
         there = bank.route_points[index, 0] > 1
@@ -73,10 +61,8 @@ class Lines:
         def rows(ways: Float[Array, " M"]) -> Float[Array, "M 7"]:
             inside = jnp.clip(ways, 0.0, jnp.maximum(left_m, 0.0))
             row, _ = route_ahead(bank, index, along_m, inside)
-            straight = (
-                jnp.zeros(7).at[RouteColumn.XY].set(me[:2]).at[RouteColumn.HEADING].set(me[COS : SIN + 1])
-            )
-            row = jnp.where(there, row, straight)
+            straight = jnp.zeros(7).at[RouteColumn.XY].set(me[:2])
+            row = jnp.where(there, row, straight.at[RouteColumn.HEADING].set(me[COS : SIN + 1]))
             heading = row[:, RouteColumn.HEADING]
             heading = heading / jnp.maximum(norm(heading), 1e-6)[:, None]
             xy = row[:, RouteColumn.XY] + (ways - inside)[:, None] * heading
@@ -107,13 +93,8 @@ class Lines:
         count = min(first.shape[1], last.shape[1])
         a, b = first[:, :count, : LINE_Y + 1], last[:, :count, : LINE_Y + 1]
         length = jnp.maximum(norm(b - a), 1e-6)
-        parts = (
-            (a + b) / 2,
-            (b - a) / length[..., None],
-            length[..., None],
-            jnp.full((*length.shape, 1), width),
-        )
-        return jnp.concatenate(parts, axis=-1)
+        long = length[..., None]
+        return jnp.concatenate([(a + b) / 2, (b - a) / long, long, jnp.full_like(long, width)], axis=-1)
 
 
 def _line(
@@ -135,32 +116,16 @@ def _line(
     c0, s0, c1, s1 = cos[: -2 * _BEND], sin[: -2 * _BEND], cos[2 * _BEND :], sin[2 * _BEND :]
     bend = jnp.arctan2(c0 * s1 - s0 * c1, c0 * c1 + s0 * s1) / (2.0 * _BEND)
     height = row[:, RouteColumn.Z] - base[0, RouteColumn.Z]
-    xy = shifted(row)
-    return jnp.stack(
-        [
-            xy[:, RouteColumn.X],
-            xy[:, RouteColumn.Y],
-            cos,
-            sin,
-            jnp.pad(bend, _BEND, mode="edge"),
-            place,
-            height,
-        ],
-        1,
-    )
+    bend = jnp.pad(bend, _BEND, mode="edge")
+    return jnp.stack([*shifted(row).T, cos, sin, bend, place, height], axis=1)
 
 
 @record
 class Proposals:
-    """Proposals along P lines with F target speeds, at T steps from now on.
+    """Proposals along P lines with F target speeds, at T steps from now on."""
 
-    Attributes:
-        way: Arc length along the line, m.
-        speed: m/s.
-    """
-
-    way: Float[Array, "P F T"]
-    speed: Float[Array, "P F T"]
+    way: Float[Array, "P F T"]  # Arc length along the line, m
+    speed: Float[Array, "P F T"]  # m/s
 
     def reference(self, lines: Lines) -> Reference:
         """Return the flattened proposals: target speeds of one line after each other."""
@@ -174,19 +139,12 @@ def unroll_idm(
     lines: Lines, others: Forecast, size: Vector, speed: Scalar,
     desired: Float[Array, " F"], stop_m: Scalar, driver: tuple[IdmParameters, int, int],
 ) -> Proposals:  # fmt: skip
-    """Simulate IDM along every line by Euler steps of 0.1 s.
+    """Simulate IDM along every line, from ego's speed to each desired speed (m/s), by Euler steps of 0.1 s.
 
     The leader is updated every few steps: of the agents whose box reaches into the corridor of ego's width and whose
-    centre is ahead, the one nearest to ego's box. Its gap shrinks by ego's motion until the next search.
-
-    Args:
-        lines: The lines.
-        others: Forecast of the other agents.
-        size: Length and width of ego.
-        speed: Of ego, m/s.
-        desired: Target speeds, m/s.
-        stop_m: Distance from ego's front to the nearest stop line that requires a stop; infinite for none.
-        driver: Parameters, number of steps, and steps between searches.
+    centre is ahead, the one nearest to ego's box. Its gap shrinks by ego's motion until the next search. ``stop_m`` is
+    the distance from ego's front to the nearest stop line that requires a stop, infinite for none; ``driver`` holds
+    parameters, the number of steps, and the steps between searches.
     """
     parameters, steps, every = driver
     count = lines.points.shape[0], desired.shape[0]

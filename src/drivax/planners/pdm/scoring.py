@@ -6,6 +6,7 @@ Source: Dauner et al. 2023 and its published implementation, which follows nuPla
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -13,19 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import LENGTH, corners
 from drivax.geometry.vectors import norm, wrap
-from drivax.metrics.comfort import (
-    JERK,
-    JERK_MAGNITUDE_MPS3,
-    JERK_MPS3,
-    LATERAL_MPS2,
-    LONGITUDINAL_MPS2,
-    SMOOTH,
-    YAW_ACCELERATION,
-    YAW_ACCELERATION_RPS2,
-    YAW_RATE,
-    YAW_RATE_RPS,
-    savgol_matrix,
-)
+from drivax.metrics import comfort
 from drivax.planners.pdm.forecast import Forecast, boxes_of, fault_times, until_overlap
 from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, is_mapped, offroad_distance
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
@@ -65,50 +54,35 @@ class ScoringConfig:
 
 @record
 class Ground:
-    """Position relative to lanes and road at each step of a motion.
+    """Position relative to lanes and road at each step of a motion."""
 
-    Attributes:
-        several: In more than one lane.
-        off: Some corner is off the road.
-        astray: The centre is outside the lanes in the route's direction (nuPlan's oncoming traffic).
-    """
-
-    several: Bool[Array, "*T"]
-    off: Bool[Array, "*T"]
+    several: Bool[Array, "*T"]  # In more than one lane
+    off: Bool[Array, "*T"]  # Some corner is off the road
+    # The centre is outside the lanes in the route's direction (nuPlan's oncoming traffic)
     astray: Bool[Array, "*T"]
 
 
 @record
 class ProposalMetrics:
-    """Metrics of a proposal.
+    """Metrics of a proposal."""
 
-    Attributes:
-        collision, road, direction: Gates: 1 passed, 0 failed.
-        progress_m: Along the route.
-        ttc, comfort: 1 within limits, 0 not.
-        fault_s: Time of the first at-fault collision, infinite for none.
-    """
-
+    # Gates: 1 passed, 0 failed
     collision: Float[Array, "*batch"]
     road: Float[Array, "*batch"]
     direction: Float[Array, "*batch"]
-    progress_m: Float[Array, "*batch"]
+    progress_m: Float[Array, "*batch"]  # Along the route
+    # 1 within limits, 0 not
     ttc: Float[Array, "*batch"]
     comfort: Float[Array, "*batch"]
-    fault_s: Float[Array, "*batch"]
+    fault_s: Float[Array, "*batch"]  # Time of the first at-fault collision, infinite for none
 
 
 def ground_at(
     bank: ScenarioBank, index: Integer, box: Float[Array, " 6"], z: Scalar, on_route: Bool[Array, ""]
 ) -> Ground:
-    """Return the position of a box relative to lanes and road.
+    """Return the position of ego's box at a hypothetical pose, on ground of height ``z``, relative to lanes and road.
 
-    Args:
-        bank: The scenarios.
-        index: Row of the bank.
-        box: Ego at a hypothetical pose.
-        z: Height of the ground there.
-        on_route: Whether the route continues there; beyond its end only wrong-way driving is astray.
+    Beyond the end of the route (not ``on_route``) only wrong-way driving is astray.
     """
     points = corners(box)
     lanes = around_lanes(bank, index, box[:2], box[2:4], points, z)
@@ -122,24 +96,13 @@ def ground_along(
     bank: ScenarioBank, index: Integer, motion: Float[Array, "N T 4"], size: Vector,
     z: Float[Array, "N T"], on_route: Bool[Array, "N T"], every: int,
 ) -> Ground:  # fmt: skip
-    """Return :func:`ground_at` along N motions from one pose; each step uses the next look-up.
+    """Return :func:`ground_at` along N motions from one pose.
 
-    Args:
-        bank: The scenarios.
-        index: Row of the bank.
-        motion: The motions.
-        size: Length and width of ego.
-        z: Height of the ground at each step.
-        on_route: Whether the route continues there.
-        every: Steps between look-ups; divides T - 1.
+    Looked up at every ``every``-th step (a divisor of T - 1); the steps between use the next look-up.
     """
-    box = boxes_of(motion, size)
-
-    def look(box: Array, z: Array, on_route: Array) -> Ground:
-        return ground_at(bank, index, box, z, on_route)
-
+    box, few = boxes_of(motion, size), slice(every, None, every)
+    look = partial(ground_at, bank, index)
     now = look(box[0, 0], z[0, 0], on_route[0, 0])
-    few = slice(every, None, every)
     later = jax.vmap(jax.vmap(look))(box[:, few], z[:, few], on_route[:, few])
 
     def spread(first: Array, rest: Array) -> Array:
@@ -153,18 +116,7 @@ def evaluate_proposal(
     motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar, size: Vector,
     others: Forecast, ground: Ground, progress_m: Scalar, config: ScoringConfig,
 ) -> ProposalMetrics:  # fmt: skip
-    """Evaluate one proposal.
-
-    Args:
-        motion: Motion of ego.
-        acceleration: At each step, m/s2.
-        yaw_rate: Of ego now, rad/s.
-        size: Length and width of ego.
-        others: Forecast of the other agents.
-        ground: Position relative to lanes and road at each step.
-        progress_m: Progress along the route.
-        config: Limits.
-    """
+    """Evaluate one proposal: ego's motion and acceleration at each step, with its ``yaw_rate`` now (rad/s)."""
     unlawful = ground.several | ground.off
     soon = until_overlap(motion, size, others, config.ttc_s + DT_S / 10)
     faults = fault_times(motion, size, others, soon, unlawful)
@@ -193,9 +145,8 @@ def scores(metrics: ProposalMetrics, config: ScoringConfig) -> Float[Array, " N"
     allowed = (gates > 0.0).astype(jnp.float32)
     progress = jnp.where(most > config.least_progress_m, gained / jnp.maximum(most, 1e-6), allowed)
     weights = config.progress, config.ttc, config.comfort
-    parts = progress, metrics.ttc, metrics.comfort
-    mean = sum(weight * part for weight, part in zip(weights, parts, strict=True)) / sum(weights)
-    return gates * mean
+    terms = progress, metrics.ttc, metrics.comfort
+    return gates * (sum(weight * term for weight, term in zip(weights, terms, strict=True)) / sum(weights))
 
 
 def _direction(motion: Float[Array, "T 4"], astray: Bool[Array, " T"], config: ScoringConfig) -> Scalar:
@@ -234,13 +185,7 @@ def _foreseen(
 def is_comfortable(
     motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar
 ) -> Bool[Array, ""]:
-    """Whether a motion keeps nuPlan's limits at every step, by the windows of ``metrics.comfort``.
-
-    Args:
-        motion: Motion of ego.
-        acceleration: At each step, m/s2.
-        yaw_rate: Of ego now, rad/s.
-    """
+    """Whether a motion keeps nuPlan's limits at every step, by the windows of ``metrics.comfort``."""
     steps = motion.shape[0]
     turned = wrap(jnp.diff(motion[:, MOTION_HEADING]))
     heading = jnp.concatenate([jnp.zeros(1), jnp.cumsum(turned)])
@@ -249,16 +194,17 @@ def is_comfortable(
     magnitude = jnp.sqrt(acceleration**2 + lateral**2 + 1e-12)
 
     def filtered(signal: Array, window: tuple[int, int, int]) -> Array:
-        return jnp.asarray(savgol_matrix(steps, *window), jnp.float32) @ signal / DT_S ** window[2]
+        return jnp.asarray(comfort.savgol_matrix(steps, *window), jnp.float32) @ signal / DT_S ** window[2]
 
-    smooth = filtered(acceleration, SMOOTH)
-    fine = ((smooth >= LONGITUDINAL_MPS2[0]) & (smooth <= LONGITUDINAL_MPS2[1])).all()
+    low, high = comfort.LONGITUDINAL_MPS2
+    smooth = filtered(acceleration, comfort.SMOOTH)
+    fine = ((smooth >= low) & (smooth <= high)).all()
     for values, limit in (
-        (filtered(lateral, SMOOTH), LATERAL_MPS2),
-        (filtered(smooth, JERK), JERK_MPS3),
-        (filtered(filtered(magnitude, SMOOTH), JERK), JERK_MAGNITUDE_MPS3),
-        (filtered(heading, YAW_RATE), YAW_RATE_RPS),
-        (filtered(heading, YAW_ACCELERATION), YAW_ACCELERATION_RPS2),
+        (filtered(lateral, comfort.SMOOTH), comfort.LATERAL_MPS2),
+        (filtered(smooth, comfort.JERK), comfort.JERK_MPS3),
+        (filtered(filtered(magnitude, comfort.SMOOTH), comfort.JERK), comfort.JERK_MAGNITUDE_MPS3),
+        (filtered(heading, comfort.YAW_RATE), comfort.YAW_RATE_RPS),
+        (filtered(heading, comfort.YAW_ACCELERATION), comfort.YAW_ACCELERATION_RPS2),
     ):
         fine &= (jnp.abs(values) <= limit).all()
     return fine

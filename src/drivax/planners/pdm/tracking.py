@@ -55,65 +55,38 @@ class TrackingConfig:
 
 @record
 class Car:
-    """A car with actuators.
+    """A car with actuators."""
 
-    Attributes:
-        motion: x, y, heading, speed.
-        acceleration: m/s2.
-        steering: Angle of the front wheels, rad.
-    """
-
-    motion: Float[Array, "*batch 4"]
-    acceleration: Float[Array, "*batch"]
-    steering: Float[Array, "*batch"]
+    motion: Float[Array, "*batch 4"]  # x, y, heading, speed
+    acceleration: Float[Array, "*batch"]  # m/s2
+    steering: Float[Array, "*batch"]  # Angle of the front wheels, rad
 
 
 @record
 class Reference:
-    """Reference trajectory, at steps of 0.1 s from now on.
+    """Reference trajectory, at steps of 0.1 s from now on."""
 
-    Attributes:
-        pose: x, y, cosine and sine of the heading.
-        speed: m/s.
-        curvature: Of the path, 1/m.
-    """
-
-    pose: Float[Array, "*batch T 4"]
-    speed: Float[Array, "*batch T"]
-    curvature: Float[Array, "*batch T"]
+    pose: Float[Array, "*batch T 4"]  # x, y, cosine and sine of the heading
+    speed: Float[Array, "*batch T"]  # m/s
+    curvature: Float[Array, "*batch T"]  # Of the path, 1/m
 
 
 def acceleration_to(speed: Scalar, desired: Scalar, config: TrackingConfig) -> Scalar:
-    """Acceleration that minimises ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a``, m/s2.
-
-    Args:
-        speed: v, m/s.
-        desired: v*, the speed to have at the horizon, m/s.
-        config: Weights q and r, and the horizon N.
-    """
+    """Acceleration a that minimises ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a`` and desired speed v*, m/s2."""
     q, r, b = config.speed_weight, config.acceleration_weight, config.horizon * DT_S
     return b * q * (desired - speed) / (b * q * b + r)
 
 
 def steering_rate(
-    error: tuple[Array, Array, Array],
-    speeds: Float[Array, " N"],
-    curvatures: Float[Array, " N"],
-    wheelbase: Scalar,
-    config: TrackingConfig,
-) -> Scalar:
+    error: tuple[Array, Array, Array], speeds: Float[Array, " N"], curvatures: Float[Array, " N"],
+    wheelbase: Scalar, config: TrackingConfig,
+) -> Scalar:  # fmt: skip
     """Constant steering rate u that minimises ``x_N' Q x_N + r u^2``, rad/s.
 
     x is (lateral error e, heading error h, steering angle d), and per step
     ``e += dt v h``, ``h += dt v (d / L - k)``, ``d += dt u``: linear in x and u. With z the state at the horizon for
-    ``u = 0`` and b that for ``x = 0, k = 0, u = 1``, ``u = -b' Q z / (b' Q b + r)``.
-
-    Args:
-        error: x now.
-        speeds: v at each step up to the horizon, m/s.
-        curvatures: k at each step, 1/m.
-        wheelbase: L, m.
-        config: Weights Q and r.
+    ``u = 0`` and b that for ``x = 0, k = 0, u = 1``, ``u = -b' Q z / (b' Q b + r)``. Here x is ``error``, v ``speeds``,
+    k ``curvatures`` and L ``wheelbase``.
     """
     e, h, d = error
     be, bh, bd = (jnp.zeros(()) for _ in range(3))

@@ -1,25 +1,203 @@
-"""A comparison of two planners as one self-contained HTML page."""
+"""A comparison of two planners as text and as one self-contained HTML page: recommendation, reasons, and numbers."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from html import escape
 from importlib import metadata
 from pathlib import Path
 
 from drivax import settings
 from drivax.evaluation.comparison import Comparison
+from drivax.evaluation.plan import MetricComparison
+from drivax.evaluation.tables import MetricLabel, metric_label
 from drivax.files import check_output, write_text
-from drivax.report.comparison import comparison_tables, conditions, effect_name, notes, reasons, title
-from drivax.report.pages.page import facts_html, page
+from drivax.report.pages.page import asset, facts_html, page, section
+from drivax.table import MISSING, Cell, Column, Table, bounds, interval_cell, number, suffix
 
-_STYLE = """
-td svg { display: block; width: 180px; height: 34px; margin-left: auto; }
-td svg line { stroke: var(--soft); stroke-width: 1; }
-td svg .span { stroke: var(--ink); stroke-width: 2; }
-td svg circle { fill: var(--ink); }
-td svg text { font-size: 10px; fill: var(--soft); }
-"""
+#: Size of the picture of a difference, pixels.
+_WIDTH, _HEIGHT = 180, 34
+
+
+def comparison_text(comparison: Comparison) -> str:
+    """Return a comparison as text of at most 100 columns, the recommendation last."""
+    tables = comparison_tables(comparison)
+    arms = zip("AB", comparison.names, comparison.folders, strict=True)
+    lines = [f"{arm}  {name}  ({folder})" for arm, name, folder in arms]
+    lines += [conditions(comparison), "", tables[0].text(*tables[1:]), ""]
+    lines += [f"recommendation: {title(comparison)}", *(f"  {reason}" for reason in reasons(comparison))]
+    return "\n".join([*lines, *(f"  ({note})" for note in notes(comparison))])
+
+
+def comparison_tables(comparison: Comparison, arms: tuple[str, str] = ("A", "B")) -> list[Table]:
+    """Return the tables of the primary metric and, if there are any, of the secondary ones."""
+    tables = [_table(comparison, arms, "primary metric", "p", [comparison.primary])]
+    if secondary := list(comparison.secondary):
+        tables.append(_table(comparison, arms, "secondary metrics", "p (Holm)", secondary))
+    return tables
+
+
+def _table(
+    comparison: Comparison, arms: tuple[str, str], name: str, p: str, metrics: list[MetricComparison]
+) -> Table:
+    columns = (
+        Column(name, label=True), *map(Column, arms), Column("A − B"),
+        Column("next to zero", picture=True), Column(effect_name(comparison)), Column(p), Column("n"), Column("better"),
+    )  # fmt: skip
+    return Table(name, columns, tuple(map(_row, metrics)))
+
+
+def _row(metric: MetricComparison) -> tuple[Cell, ...]:
+    label = _label(metric)
+    effects = ", ".join(f"{name} {value:.3f}" for name, value in metric.effects.items() if value is not None)
+    value = metric.effects.get("d_z", metric.effects.get("d"))
+    intervals = ((metric.a, False), (metric.b, False), (metric.difference, True))
+    means = (interval_cell(interval, label.unit, metric.metric, signed) for interval, signed in intervals)
+    return (
+        Cell(label.heading, title=label.title or metric.metric),
+        *(replace(cell, note="", style="", title="") for cell in means),  # n has a column of its own
+        Cell("", html=_picture(metric, label)),
+        Cell(MISSING if value is None else f"{value:+.2f}".replace("-", "−"), title=effects),
+        Cell(_p_text(metric.p_adjusted), note=_test_name(metric)), Cell(f"{metric.difference.n:,}"),
+        Cell(metric.winner or MISSING),
+    )  # fmt: skip
+
+
+def _picture(metric: MetricComparison, label: MetricLabel) -> str:
+    """Return the interval of the difference around zero: A is higher on the right, B on the left."""
+    mean, low, high = metric.difference.mean, metric.difference.low, metric.difference.high
+    if mean is None or low is None or high is None or low == high:
+        return ""
+    reach = 1.15 * max(abs(low), abs(high))
+    left, middle, right = (_WIDTH / 2 * (1 + value / reach) for value in (low, mean, high))
+    words = f"A − B: {number(mean, label.unit, signed=True)}, {bounds(metric.difference, label.unit, signed=True)}"
+    return (
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(words)}">'
+        f'<line x1="{_WIDTH / 2}" x2="{_WIDTH / 2}" y1="2" y2="22"/>'
+        f'<line class="span" x1="{left:.1f}" x2="{right:.1f}" y1="12" y2="12"/>'
+        f'<circle cx="{middle:.1f}" cy="12" r="4"/>'
+        f'<text x="{_WIDTH / 2}" y="32" text-anchor="middle">0</text></svg>'
+    )
+
+
+def _label(metric: MetricComparison) -> MetricLabel:
+    """Return how a metric is shown; the user's own metrics under their names, with their units."""
+    known = metric_label(metric.metric)
+    if known.explanation or not metric.unit:
+        return known
+    plain = metric.unit == "-"
+    text = known.text if plain else f"{known.text} [{metric.unit}]"
+    return MetricLabel(text, metric.better, "share" if plain else metric.unit, "")
+
+
+def _p_text(p: float | None) -> str:
+    """Return a p-value with three digits, or that it is below 0.001."""
+    return MISSING if p is None else "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def effect_name(comparison: Comparison) -> str:
+    """Return the name of the effect size: ``d_z`` of pairs, ``d`` of a split."""
+    return "d_z" if "d_z" in comparison.primary.effects else "d"
+
+
+def conditions(comparison: Comparison) -> str:
+    """Return what was compared: scenarios and traffic."""
+    (a, b), (recordings_a, recordings_b) = comparison.scenarios, comparison.recordings
+    traffic = f"{comparison.traffic} traffic"
+    if comparison.plan.split == "paired":
+        return f"paired on {a:,} scenarios of {recordings_a:,} recordings, {traffic}"
+    strata = "stratum" if comparison.strata == 1 else "strata"
+    kind = "at random" if comparison.plan.split == "random" else f"within {comparison.strata} {strata}"
+    return (
+        f"split {kind}: {a:,} scenarios of {recordings_a:,} recordings for A, {b:,} of {recordings_b:,} for B, "
+        f"{traffic}"
+    )
+
+
+def _test_name(metric: MetricComparison) -> str:
+    evidence = metric.evidence
+    if evidence.name.startswith("McNemar"):
+        return f"{evidence.name}, {evidence.units:,} discordant pairs"
+    if metric.seeds > 1:
+        return f"{evidence.name} test over seeds and {evidence.units:,} recordings"
+    return f"{evidence.name} test, {'every sign counted' if evidence.exact else 'drawn by recordings'}"
+
+
+def title(comparison: Comparison) -> str:
+    """Return the recommendation in a few words."""
+    kind = comparison.decision.recommendation
+    return f"{kind} ({comparison.names['AB'.index(kind)]})" if kind in ("A", "B") else kind
+
+
+def reasons(comparison: Comparison) -> list[str]:
+    """Return the reasons of the recommendation in full sentences."""
+    decision, n = comparison.decision, f"{comparison.primary.difference.n:,}"
+    sentences = [_test_sentence(comparison)]
+    if decision.because == "minimum":
+        minimum = f"{comparison.plan.minimum_scenarios:,}"
+        sentences.insert(0, f"{n} scenarios count, and the plan asks for at least {minimum}.")
+    if decision.because == "seeds":
+        sentences.append("Seeds differ so much that more scenarios do not help: more seeds are needed.")
+    if decision.because == "equal":
+        same = "the same for A and B in each" if comparison.plan.split == "paired" else "the same in all"
+        sentences = [f"{_label(comparison.primary).text} is {same} of {n} scenarios."]
+    sentences += _power_sentences(comparison)
+    if decision.caveats:
+        names = ", ".join(metric_label(name).text for name in decision.caveats)
+        other = "B" if decision.recommendation == "A" else "A"
+        sentences.append(f"But {other} is better in: {names}.")
+    return [sentence[:1].upper() + sentence[1:] for sentence in sentences]
+
+
+def _test_sentence(comparison: Comparison) -> str:
+    """Return the result of the test of the primary metric."""
+    metric, label = comparison.primary, _label(comparison.primary)
+    if metric.difference.mean is None or metric.evidence.p is None:
+        return f"{label.text} cannot be tested: that takes two recordings at least."
+    p = _p_text(metric.evidence.p)
+    test = f"{bounds(metric.difference, label.unit, signed=True)}, p {p if p[0] == '<' else '= ' + p}"
+    size = number(abs(metric.difference.mean), label.unit) + suffix(label.unit, signed=True)
+    more = "higher" if metric.difference.mean > 0 else "lower"
+    if metric.winner is None:
+        return f"{label.text} is {size} {more} with A ({test}): it may be chance."
+    alone = f" The test alone favours {metric.winner}." if comparison.decision.because == "minimum" else ""
+    return f"{label.text} is {size} {more} with A ({test}).{alone}"
+
+
+def _power_sentences(comparison: Comparison) -> list[str]:
+    """Return the detectable difference and the number of scenarios needed."""
+    sensitivity, needed = comparison.sensitivity, comparison.decision.needed
+    if sensitivity is None:
+        return []
+    unit = _label(comparison.primary).unit
+    sentences = []
+    if sensitivity.detectable is not None:
+        least = number(sensitivity.detectable, unit) + suffix(unit, signed=True)
+        power = f"{100 * comparison.plan.power:.0f} %"
+        sentences.append(f"A difference of {least} would be detected in {power} of such comparisons.")
+    if needed is not None:
+        least = number(sensitivity.smallest, unit) + suffix(unit, signed=True)
+        sentences.append(f"{needed:,} scenarios are needed; the smallest difference that matters is {least}.")
+    return sentences
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """Return what a reader should know about the numbers."""
+    lines = []
+    for metric in (comparison.primary, *comparison.secondary):
+        if metric.undefined_a or metric.undefined_b:
+            counts = f"undefined for A in {metric.undefined_a:,}, for B in {metric.undefined_b:,} scenarios"
+            lines.append(f"{_label(metric).text}: {counts}")
+    unit = _label(comparison.primary).unit
+    for arm, name, seeds in zip("AB", comparison.names, comparison.seeds, strict=True):
+        if seeds is not None:
+            means = ", ".join(number(mean, unit) for mean in seeds.means)
+            middle = f"{number(seeds.interquartile.mean, unit)} ({bounds(seeds.interquartile, unit)})"
+            lines.append(f"{arm}, {name}: {len(seeds.means)} seeds: {means}; interquartile mean {middle}")
+    if any(comparison.seeds):
+        lines.append("seeds are averaged per scenario; intervals and the test hold for other seeds, too")
+    return lines
 
 
 def write_comparison(comparison: Comparison, out: Path, overwrite: bool = False) -> Path:
@@ -32,7 +210,7 @@ def write_comparison(comparison: Comparison, out: Path, overwrite: bool = False)
     names = f"{comparison.names[0]} against {comparison.names[1]}"
     label = f"{comparison.plan.name}: " if comparison.plan.name else ""
     sections = [_metrics(comparison), _plan(comparison), _origin(comparison)]
-    write_text(out, page(f"{label}{names}", _lead(comparison), sections, _STYLE))
+    write_text(out, page(f"{label}{names}", _lead(comparison), sections, asset("comparison.css")))
     return out
 
 
@@ -49,38 +227,37 @@ def _metrics(comparison: Comparison) -> str:
     items = "".join(f"<li>{escape(note)}</li>" for note in notes(comparison))
     a, b = comparison.names
     tables = "".join(f"{table.html()}<br>" for table in comparison_tables(comparison, (f"A: {a}", f"B: {b}")))
-    share = f"{100 * comparison.plan.confidence:.0f} %"
-    kind = "d_z, the mean of the differences over their standard deviation"
-    kind = kind if effect_name(comparison) == "d_z" else "d, with the pooled standard deviation"
-    level = f"{1 - comparison.plan.confidence:.2g}"
-    return (
-        f"<section><h2>Metrics</h2>{tables}{f'<ul>{items}</ul>' if items else ''}<p><small>Mean and {share} "
-        "interval; whole recordings are resampled. n: scenarios where the metric is defined. Effect size: Cohen's "
-        f"{kind}. A planner is called better where the two-sided p-value is below {level}; p-values of secondary "
-        "metrics are adjusted for their number by Holm's method.</small></p></section>"
+    share, level = (f"{100 * comparison.plan.confidence:.0f} %", f"{1 - comparison.plan.confidence:.2g}")
+    kind = "d, with the pooled standard deviation"
+    if effect_name(comparison) == "d_z":
+        kind = "d_z, the mean of the differences over their standard deviation"
+    note = (
+        f"Mean and {share} interval; whole recordings are resampled. n: scenarios where the metric is defined. Effect "
+        f"size: Cohen's {kind}. A planner is called better where the two-sided p-value is below {level}; p-values of "
+        "secondary metrics are adjusted for their number by Holm's method."
     )
+    return section("Metrics", tables, f"<ul>{items}</ul>" if items else "", note=note)
 
 
 def _plan(comparison: Comparison) -> str:
     plan = comparison.plan
-    return (
-        "<section><h2>The rule</h2><p>Nothing is decided with fewer than "
-        f"{plan.minimum_scenarios:,} scenarios. A p-value below {1 - plan.confidence:.2g} gives the better planner. "
-        "Otherwise there is no difference if the smallest difference that matters would have been detected with a "
-        f"power of {100 * plan.power:.0f} %, and if not, there are not enough scenarios.</p>"
-        f"<details><summary>the plan</summary><pre>{escape(settings.dump(plan))}</pre></details></section>"
+    return section(
+        "The rule",
+        f"<p>Nothing is decided with fewer than {plan.minimum_scenarios:,} scenarios. A p-value below "
+        f"{1 - plan.confidence:.2g} gives the better planner. Otherwise there is no difference if the smallest "
+        f"difference that matters would have been detected with a power of {100 * plan.power:.0f} %, and if not, "
+        "there are not enough scenarios.</p>"
+        f"<details><summary>the plan</summary><pre>{escape(settings.dump(plan))}</pre></details>",
     )
 
 
 def _origin(comparison: Comparison) -> str:
-    rows = [
-        (f"{arm}: {name}", [str(folder)])
-        for arm, name, folder in zip("AB", comparison.names, comparison.folders, strict=True)
-    ]
+    arms = zip("AB", comparison.names, comparison.folders, strict=True)
+    rows = [(f"{arm}: {name}", [str(folder)]) for arm, name, folder in arms]
     numbers = escape(json.dumps(comparison.as_dict(), indent=1, ensure_ascii=False))
-    return (
-        f"<section><h2>How this was made</h2>{facts_html(['', ''], rows)}"
-        f"<details><summary>all numbers</summary><pre>{numbers}</pre></details>"
-        f"<p><small>drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of both runs."
-        "</small></p></section>"
+    return section(
+        "How this was made",
+        facts_html(["", ""], rows),
+        f"<details><summary>all numbers</summary><pre>{numbers}</pre></details>",
+        note=f"drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of both runs.",
     )

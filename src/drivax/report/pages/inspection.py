@@ -7,29 +7,22 @@ from html import escape
 from pathlib import Path
 
 from drivax.files import check_output, write_text
-from drivax.report.charts.curves import series_legend
-from drivax.report.charts.distributions import histogram, short
-from drivax.report.inspection import QUANTITIES, Inspection, speeds
-from drivax.report.inspection_tables import Counts, content_table, of_all, true_findings
-from drivax.report.pages.page import page
+from drivax.report.charts import histogram, series_legend, short
+from drivax.report.inspection import (
+    QUANTITIES,
+    Counts,
+    Inspection,
+    content_table,
+    of_all,
+    speeds,
+    true_findings,
+)
+from drivax.report.pages.page import asset, definitions, page, section
 from drivax.report.pictures.palette import stroke
 from drivax.scenario.select.selection import FINDINGS
 
 #: Tags with more values than this (ids, dates) are left out of the page.
 _MOST_VALUES = 16
-_STYLE = """
-.chart rect { stroke: none; }
-.bars { display: grid; gap: 14px 28px; grid-template-columns: repeat(auto-fill, minmax(min(100%, 360px), 1fr)); }
-.bars h3 { margin-top: 10px; }
-.bars table td, .bars table th { border: 0; padding: 1px 6px; font-size: 13px; font-weight: 400; }
-.bars tr > :first-child { background: none; position: static; min-width: 0; width: 40%; max-width: none; }
-.bars td:last-child { text-align: right; width: 96px; white-space: nowrap; }
-.bars i { display: block; box-sizing: content-box; height: 10px; border: solid transparent; border-width: 4.75px 0;
-  background-clip: padding-box; }
-table.sets { width: auto; }
-table.sets td { min-width: 120px; }
-.chart figcaption small { display: block; font-weight: 400; }
-"""
 
 
 def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bool = False) -> Path:
@@ -39,10 +32,10 @@ def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bo
         UsageError: ``out`` exists.
     """
     check_output(out, overwrite)
-    names = ", ".join(inspection.name for inspection in inspections)
     sections = [_overview(inspections), _quantities(inspections), _shares(inspections), _meaning(inspections)]
-    title = f"Scenario sets: {names}" if len(inspections) > 1 else f"Scenario set: {names}"
-    write_text(out, page(title, f"<p class=lead>{_lead(inspections)}</p>", sections, _STYLE))
+    names = ", ".join(inspection.name for inspection in inspections)
+    title = f"Scenario set{'s' if len(inspections) > 1 else ''}: {names}"
+    write_text(out, page(title, f"<p class=lead>{_lead(inspections)}</p>", sections, asset("inspection.css")))
     return out
 
 
@@ -56,11 +49,11 @@ def _lead(inspections: Sequence[Inspection]) -> str:
 
 
 def _overview(inspections: Sequence[Inspection]) -> str:
-    return (
-        f"<section><h2>In numbers</h2>{content_table(inspections).html()}<p><small>Numbers of a scenario are means "
-        "over the scenarios that have them, counted in the source before cropping and capping. Windows of one "
-        "recording may overlap; the duration counts each in full.</small></p></section>"
+    note = (
+        "Numbers of a scenario are means over the scenarios that have them, counted in the source before cropping and "
+        "capping. Windows of one recording may overlap; the duration counts each in full."
     )
+    return section("In numbers", content_table(inspections).html(), note=note)
 
 
 def _quantities(inspections: Sequence[Inspection]) -> str:
@@ -82,9 +75,8 @@ def _quantities(inspections: Sequence[Inspection]) -> str:
         for sample, inspection in zip(sampled, inspections, strict=True)
         if sample.scenarios < len(inspection)
     ]
-    note = f"<p><small>Speeds: {escape('; '.join(counts))}, evenly spread.</small></p>" if counts else ""
-    drawn = f"<div class=charts>{charts}</div>"
-    return f"<section><h2>Histograms</h2>{_legend(inspections)}{drawn}{note}</section>"
+    note = f"Speeds: {escape('; '.join(counts))}, evenly spread." if counts else ""
+    return section("Histograms", _legend(inspections), f"<div class=charts>{charts}</div>", note=note)
 
 
 def _legend(inspections: Sequence[Inspection]) -> str:
@@ -95,15 +87,14 @@ def _shares(inspections: Sequence[Inspection]) -> str:
     """Return shares of scenarios by tag, flag and finding of the audit."""
     tagged = [inspection.tags() for inspection in inspections]
     sizes = [len(inspection) for inspection in inspections]
-    groups: dict[str, Counts] = {}
-    for name in dict.fromkeys(name for tags in tagged for name in tags):
-        counts = of_all([tags.get(name, {}) for tags in tagged], sizes)
-        if len(counts) <= _MOST_VALUES:
-            groups[name] = counts
+    groups = {
+        name: of_all([tags.get(name, {}) for tags in tagged], sizes)
+        for name in dict.fromkeys(name for tags in tagged for name in tags)
+    }
     flags = [inspection.words(lambda entry: entry["flags"]) for inspection in inspections]
-    bars = [_bars(name, counts) for name, counts in groups.items()]
+    bars = [_bars(name, counts) for name, counts in groups.items() if len(counts) <= _MOST_VALUES]
     bars += [_bars("flags", of_all(flags, sizes)), _bars("audit", true_findings(inspections))]
-    return f"<section><h2>Tags, flags, audit</h2>{_legend(inspections)}<div class=bars>{''.join(bars)}</div></section>"
+    return section("Tags, flags, audit", _legend(inspections), f"<div class=bars>{''.join(bars)}</div>")
 
 
 def _bars(title: str, counts: Counts) -> str:
@@ -121,9 +112,5 @@ def _bars(title: str, counts: Counts) -> str:
 
 def _meaning(inspections: Sequence[Inspection]) -> str:
     names = dict.fromkeys(name for inspection in inspections for name in inspection.findings())
-    items = "".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(FINDINGS[name].meaning)}</dd></div>"
-        for name in names
-        if name in FINDINGS
-    )
-    return f"<section><h2>What the audit checks</h2><dl class=metrics>{items}</dl></section>" if items else ""
+    items = [(name, FINDINGS[name].meaning) for name in names if name in FINDINGS]
+    return section("What the audit checks", definitions(items)) if items else ""

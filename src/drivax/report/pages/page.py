@@ -9,7 +9,7 @@ from importlib import metadata, resources
 from string import Template
 from typing import Any
 
-from drivax.report.charts.motion import COMMANDS, SIGNALS
+from drivax.report.charts import COMMANDS, SIGNALS
 from drivax.report.pictures.drawing import EVENT_WORDS, GOAL_M, LIGHTS, STOP_M, WIDTHS
 from drivax.report.pictures.palette import LEGEND, STROKES, THEMES
 from drivax.table import Cell, Column, Table
@@ -18,40 +18,15 @@ KEYS = (
     ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
     ("+ −", "zoom"), ("f", "follow or whole episode"), ("n p", "next and previous episode"),
 )  # fmt: skip
-_CONTROLS = """<div class=controls>
-<button type=button data-control=back aria-label="one step back" title="one step back (←)">◂</button>
-<button type=button data-control=play aria-label="play" title="play or pause (space)">▶</button>
-<button type=button data-control=forward aria-label="one step on" title="one step on (→)">▸</button>
-<div class=track><div class=ticks data-control=ticks></div>
-<input type=range min=0 max=90 value=0 step=1 data-control=scrub aria-label="time"></div>
-<span class=clock data-control=clock></span>
-<select data-control=speed aria-label="speed" title="speed ([ and ])">
-<option value=0.25>¼×</option><option value=0.5>½×</option><option value=1 selected>1×</option>
-<option value=2>2×</option><option value=4>4×</option></select>
-<button type=button data-control=follow aria-pressed=true title="follow the ego (f)">follow</button>
-<button type=button data-control=fit aria-pressed=false title="show the whole episode (f)">whole</button>
-<button type=button data-control=wider aria-label="zoom out" title="zoom out (−)">−</button>
-<button type=button data-control=closer aria-label="zoom in" title="zoom in (+)">+</button>
-</div>"""
 
 
 def page(
-    title: str,
-    lead: str,
-    sections: Iterable[str],
-    style: str = "",
-    data: Iterable[str] = (),
+    title: str, lead: str, sections: Iterable[str], style: str = "", data: Iterable[str] = (),
     scripts: Iterable[str] = (),
-) -> str:
-    """Return a whole page.
+) -> str:  # fmt: skip
+    """Return a whole page from a title (plain text), HTML below it and of its sections (empty ones are left out).
 
-    Args:
-        title: Its heading, as plain text.
-        lead: HTML below the heading.
-        sections: HTML of its parts; empty ones are left out.
-        style: CSS in addition to that of all pages.
-        data: Script elements that hold data.
-        scripts: Programs, in order.
+    ``style`` is further CSS, ``data`` are script elements that hold data, ``scripts`` are programs in order.
     """
     return Template(asset("report.html.template")).substitute(
         title=escape(title),
@@ -62,6 +37,14 @@ def page(
         data="\n".join(data),
         script="\n".join(scripts),
     )
+
+
+def section(title: str, *parts: str, note: str = "", attributes: str = "") -> str:
+    """Return a section with the HTML of its parts and small print below; empty where all parts are."""
+    if not any(parts):
+        return ""
+    small = f"<p><small>{note}</small></p>" if note else ""
+    return f"<section{attributes}><h2>{title}</h2>{''.join(parts)}{small}</section>"
 
 
 def data_element(value: Any, **attributes: str) -> str:
@@ -75,6 +58,12 @@ def facts_html(headings: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]
     """Return a table of texts: a label and the facts about it in each row."""
     columns = tuple(Column(heading, label=not place) for place, heading in enumerate(headings))
     return Table("facts", columns, tuple((Cell(label), *map(Cell, facts)) for label, facts in rows)).html()
+
+
+def definitions(items: Iterable[tuple[str, str]]) -> str:
+    """Return a list of terms with their explanations."""
+    rows = (f"<div><dt>{escape(term)}</dt><dd>{escape(text)}</dd></div>" for term, text in items)
+    return f"<dl class=metrics>{''.join(rows)}</dl>"
 
 
 def asset(name: str) -> str:
@@ -91,10 +80,14 @@ def _colours() -> str:
 
 def player_html() -> str:
     """Return stage, controls, legend, keys and plots."""
-    legend = "".join(_legend_item(name, words) for name, words in LEGEND)
+    legend = ""
+    for name, words in LEGEND:
+        fill = "" if name in ("log", "route", "mark", "goal") else f' style="background:var(--{name})"'
+        legend += f'<li><i class="k-{name}"{fill}>{"✕" if name == "mark" else ""}</i>{escape(words)}</li>'
+    controls = asset("controls.html").rstrip()
     keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
     return (
-        f"<div id=stage></div>{_CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
+        f"<div id=stage></div>{controls}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
         "<noscript><p>The player needs JavaScript, which this page carries with it.</p></noscript>"
         "<h3>Motion and commands</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the "
         "filters of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are "
@@ -124,9 +117,3 @@ def player_data(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
 def player_scripts() -> list[str]:
     """Return the programs of plots and player; the plots listen to the player, so they come first."""
     return [asset("plots.js"), asset("player.js")]
-
-
-def _legend_item(name: str, words: str) -> str:
-    sign = "✕" if name == "mark" else ""
-    fill = "" if name in ("log", "route", "mark", "goal") else f' style="background:var(--{name})"'
-    return f'<li><i class="k-{name}"{fill}>{sign}</i>{escape(words)}</li>'

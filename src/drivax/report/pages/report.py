@@ -12,29 +12,26 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
+from drivax.evaluation import tables
+from drivax.evaluation.episode_table import RATES, EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable, mismatch
-from drivax.evaluation.tables import (
-    COLLISION_KINDS,
-    CONFIDENCE,
-    collisions_table,
-    differences_table,
-    headline,
-    metric_label,
-    metric_names,
-    ordered,
-    planners_table,
-    summarise,
-)
 from drivax.files import check_output, write_text
-from drivax.report.charts.curves import curve_sections
-from drivax.report.charts.distributions import distribution_charts
-from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, rollouts_of
-from drivax.report.pages.episode_list import EPISODE_LIST, episode_data
-from drivax.report.pages.page import asset, facts_html, page, player_data, player_html, player_scripts
+from drivax.report.charts import curve_sections, distribution_charts
+from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, outcome, rollouts_of, worst_first
+from drivax.report.pages.page import (
+    asset,
+    data_element,
+    definitions,
+    facts_html,
+    page,
+    player_data,
+    player_html,
+    player_scripts,
+    section,
+)
 from drivax.report.pictures.player_data import pack_episode
 from drivax.report.runs import Training, read_runs
-from drivax.report.table_files import Tags, strata_tables, transfer_tables
+from drivax.report.table_files import strata_tables, transfer_tables
 from drivax.table import bounds, number, suffix
 
 EPISODES = 12
@@ -43,17 +40,13 @@ Packed = Sequence[tuple[EpisodeGroup, Mapping[str, Any]]]
 
 
 def write_report(
-    runs: Sequence[Path],
-    out: Path,
-    data: Path | None = None,
-    episodes: int = EPISODES,
-    overwrite: bool = False,
-) -> Path:
+    runs: Sequence[Path], out: Path, data: Path | None = None, episodes: int = EPISODES, overwrite: bool = False
+) -> Path:  # fmt: skip
     """Write a report of evaluation and training runs to the HTML file ``out``; the last evaluation is the policy.
 
     Args:
         runs: Run folders of ``drivax evaluate`` and ``drivax train``, in the order of the tables.
-        out: The file; it appears when it is complete.
+        out: The file.
         data: The scenario set of the evaluation, where it has moved.
         episodes: Number of playable episodes; 0 leaves out rollouts and tags and needs no scenario set.
         overwrite: Replace an existing file.
@@ -66,10 +59,7 @@ def write_report(
     if episodes < 0:
         raise UsageError(f"cannot show {episodes} episodes", cure="give 0 or more")
     evaluations, trainings = read_runs(runs)
-    packed: Packed = ()
-    tags: Tags = {}
-    if evaluations and episodes:
-        packed, tags = _from_set(evaluations, data, episodes)
+    packed, tags = _from_set(evaluations, data, episodes) if evaluations and episodes else ((), {})
     write_text(out, _page(evaluations, trainings, packed, tags))
     return out
 
@@ -97,9 +87,10 @@ def _page(runs: Sequence[EpisodeTable], trainings: Sequence[Training], packed: P
         data.append(episode_data(runs, tags, played))
         scripts += [*(player_scripts() if packed else ()), asset("episode_table.js")]
     if trainings:
-        sections.append(f"<section><h2>Learning curves</h2>{curve_sections(trainings)}</section>")
+        sections.append(section("Learning curves", curve_sections(trainings)))
     if runs:
-        sections.append(_meaning(runs))
+        meanings = explanations(tables.ordered(tables.metric_names(runs)), runs)
+        sections.append(section("What the metrics mean", meanings))
     sections.append(_origin([*runs, *trainings]))
     title = f"{runs[-1].name}: evaluation report" if runs else "training report"
     return page(title, _lead(runs), sections, data=data, scripts=scripts)
@@ -112,7 +103,7 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
     path = Path(str(policy.data.get("path", "its scenario set")))
     name, where = escape(policy.name), escape(str(policy.data.get("name") or path.name))
     for metric, words in (("success", "succeeds in"), ("accuracy", "drives without failure in")):
-        interval = summarise(policy, metric)
+        interval = tables.summarise(policy, metric)
         if interval.mean is not None:
             share = number(interval.mean, "rate") + suffix("rate")
             return (
@@ -123,28 +114,25 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
 
 
 def _results(runs: Sequence[EpisodeTable]) -> str:
-    names = metric_names(runs)
+    names = tables.metric_names(runs)
     first = _first(runs, names)
-    rest = [name for name in ordered(names) if name not in first]
-    more = (
-        f"<details><summary>{len(rest)} more metrics</summary>{planners_table(runs, rest).html()}</details>"
-        if rest
-        else ""
+    rest = [name for name in tables.ordered(names) if name not in first]
+    table = tables.planners_table(runs, first).html() if first else ""
+    more = f"<summary>{len(rest)} more metrics</summary>{tables.planners_table(runs, rest).html()}"
+    note = (
+        f"Mean, {tables.CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; "
+        "undefined episodes are left out. The best mean is underlined, whether or not it is clearly best. Click a "
+        "mean for its episodes. Intervals: Wilson's for rates (with the effective number of episodes where some share "
+        "a recording), a bootstrap over recordings otherwise."
     )
-    table = planners_table(runs, first).html() if first else ""
-    return (
-        f"<section><h2>Results</h2>{_warning(runs)}{table}{more}<p><small>Mean, {CONFIDENCE:.0%} interval, and n, the "
-        "number of episodes where the metric is defined; undefined episodes are left out. The best mean is "
-        "underlined, whether or not it is clearly best. Click a mean for its episodes. Intervals: Wilson's for rates "
-        "(with the effective number of episodes where some share a recording), a bootstrap over recordings "
-        "otherwise.</small></p></section>"
-    )
+    more = f"<details>{more}</details>" if rest else ""
+    return section("Results", _warning(runs), table, more, note=note)
 
 
 def _first(runs: Sequence[EpisodeTable], names: Sequence[str]) -> list[str]:
     """Return the metrics of the first table: the headline, after crashes where there were any."""
     crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
-    return [*(["crashed"] if crashed and "crashed" in names else []), *headline(names)]
+    return [*(["crashed"] if crashed and "crashed" in names else []), *tables.headline(names)]
 
 
 def _warning(runs: Sequence[EpisodeTable]) -> str:
@@ -164,86 +152,69 @@ def _warning(runs: Sequence[EpisodeTable]) -> str:
 
 def _differences(runs: Sequence[EpisodeTable]) -> str:
     policy, others = runs[-1], runs[:-1]
-    names = _first(runs, list(policy.metrics)) or ordered(list(policy.metrics))
+    names = _first(runs, list(policy.metrics)) or tables.ordered(list(policy.metrics))
     if not others or not names:
         return ""
-    table = differences_table(policy, others, names).html()
-    return (
-        f"<section><h2>{escape(policy.name)} against the others</h2>{table}<p><small>Mean of the differences, scenario "
-        f"by scenario, over those where both are defined (n pairs), with a {CONFIDENCE:.0%} bootstrap interval over "
-        "recordings. “Better” and “worse”: the interval excludes zero; it is not widened for the number of "
-        "comparisons. “All equal”: no pair differs from the next, so that a bootstrap has no width."
-        "</small></p></section>"
+    note = (
+        "Mean of the differences, scenario by scenario, over those where both are defined (n pairs), with a "
+        f"{tables.CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval excludes "
+        "zero; it is not widened for the number of comparisons. “All equal”: no pair differs from the next, so that a "
+        "bootstrap has no width."
     )
+    table = tables.differences_table(policy, others, names).html()
+    return section(f"{escape(policy.name)} against the others", table, note=note)
 
 
 def _transfer(runs: Sequence[EpisodeTable]) -> str:
     """Return the results by training and evaluation data; empty where all runs share one set."""
-    tables = "".join(
-        f"<h3>{escape(metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
+    parts = "".join(
+        f"<h3>{escape(tables.metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
         for table in transfer_tables(runs)
     )
-    return (
-        f"<section><h2>Transfer</h2>{tables}<p><small>Rows: planners and their training data (– where nothing was "
-        "trained, or the run does not say). Columns: evaluation data. Sets differ in difficulty: compare along a "
-        "column.</small></p></section>"
-        if tables
-        else ""
+    note = (
+        "Rows: planners and their training data (– where nothing was trained, or the run does not say). Columns: "
+        "evaluation data. Sets differ in difficulty: compare along a column."
     )
+    return section("Transfer", parts, note=note)
 
 
 def _collisions(runs: Sequence[EpisodeTable]) -> str:
     """Return the kinds of the first collision with their meanings; empty without collisions of a known kind."""
-    table = collisions_table(runs)
+    table = tables.collisions_table(runs)
     if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
         return ""
-    meanings = "".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(meaning[:1].upper() + meaning[1:])}.</dd></div>"
-        for name, meaning in COLLISION_KINDS.values()
-    )
-    total = ", ".join(
-        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {len(run)}"
-        for run in runs
-        if "collision_type" in run.metrics
-    )
-    return (
-        f"<section><h2>Kinds of collision</h2><p>Episodes with a collision: {total}.</p>{table.html()}"
-        f"<dl class=metrics>{meanings}</dl><p><small>{escape(table.caption)} (Wilson's).</small></p></section>"
-    )
+    kinds = tables.COLLISION_KINDS.values()
+    meanings = definitions((name, f"{meaning[:1].upper()}{meaning[1:]}.") for name, meaning in kinds)
+    counted = [(run, run.metrics["collision_type"] > 0) for run in runs if "collision_type" in run.metrics]
+    total = ", ".join(f"{escape(run.name)} {int(hit.sum())} of {len(run)}" for run, hit in counted)
+    parts = f"<p>Episodes with a collision: {total}.</p>", table.html(), meanings
+    return section("Kinds of collision", *parts, note=f"{escape(table.caption)} (Wilson's).")
 
 
 def _strata(runs: Sequence[EpisodeTable], tags: Tags) -> str:
     """Return the results by kind of scenario; empty without tags."""
-    tables = "".join(
+    parts = "".join(
         f"<details{'' if place else ' open'}><summary>{escape(table.name.replace('-', ' '))}</summary>"
         f"{table.html()}</details>"
         for place, table in enumerate(strata_tables(runs, tags))
     )
-    return (
-        f"<section><h2>By kind of scenario</h2>{tables}<p><small>Tags describe the log. Small strata have wide "
-        "intervals; of many cells, some stand out by chance.</small></p></section>"
-        if tables
-        else ""
-    )
+    note = "Tags describe the log. Small strata have wide intervals; of many cells, some stand out by chance."
+    return section("By kind of scenario", parts, note=note)
 
 
 def _distributions(runs: Sequence[EpisodeTable]) -> str:
-    charts = distribution_charts(runs)
-    return (
-        f"<section><h2>Distributions</h2>{charts}<p><small>The height of a line at a value is the share of episodes at "
-        "or below it; undefined ones are left out.</small></p></section>"
-        if charts
-        else ""
-    )
+    note = "The height of a line at a value is the share of episodes at or below it; undefined ones are left out."
+    return section("Distributions", distribution_charts(runs), note=note)
 
 
 def _episodes(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     note = "▶ marks those that play below." if packed else "Rollouts and tags were left out of this page."
-    return (
-        f"<section id=episodes><h2>Episodes</h2><p>All episodes, worst first: the gravest kind of failure, then the "
-        f"lowest score. Click a number in the tables above for its episodes. {note}</p>{EPISODE_LIST}"
-        f"{_player(runs, packed)}</section>"
+    words = (
+        "<p>All episodes, worst first: the gravest kind of failure, then the lowest score. Click a number in the "
+        f"tables above for its episodes. {note}</p>"
     )
+    listed = asset("episode_list.html").rstrip()
+    return section("Episodes", words, listed, _player(runs, packed), attributes=" id=episodes")
 
 
 def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
@@ -257,12 +228,8 @@ def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     )
     policy = escape(runs[-1].name)
     shown = [run for run in runs if comparable(run, runs[-1])]
-    caution = (
-        f"<p><b>Other agents are drawn as they moved around {policy};</b> around the others they reacted "
-        "differently.</p>"
-        if len(shown) > 1 and runs[-1].traffic != "log"
-        else ""
-    )
+    words = f"Other agents are drawn as they moved around {policy};</b> around the others they reacted differently."
+    caution = f"<p><b>{words}</p>" if len(shown) > 1 and runs[-1].traffic != "log" else ""
     return (
         f"<h3>Rollouts</h3><p>Selected by rule: failures of {policy} first, each kind in turn, then successes. All "
         f"planners start from the same state at the same time.</p>{caution}"
@@ -270,19 +237,10 @@ def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     )
 
 
-def _meaning(runs: Sequence[EpisodeTable]) -> str:
-    return (
-        f"<section><h2>What the metrics mean</h2>{explanations(ordered(metric_names(runs)), runs)}</section>"
-    )
-
-
 def explanations(metrics: Sequence[str], runs: Sequence[EpisodeTable]) -> str:
     """Return a list that explains each known metric in one line."""
-    labels = [label for metric in metrics if (label := metric_label(metric, runs)).explanation]
-    items = "".join(
-        f"<div><dt>{escape(label.heading)}</dt><dd>{escape(label.explanation)}</dd></div>" for label in labels
-    )
-    return f"<dl class=metrics>{items}</dl>"
+    labels = [label for metric in metrics if (label := tables.metric_label(metric, runs)).explanation]
+    return definitions((label.heading, label.explanation) for label in labels)
 
 
 def _origin(runs: Sequence[EpisodeTable | Training]) -> str:
@@ -301,9 +259,91 @@ def _origin(runs: Sequence[EpisodeTable | Training]) -> str:
         f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.info), indent=1, ensure_ascii=False))}</pre>"
         for run in runs
     )
-    return (
-        f"<section><h2>How this was made</h2>{facts_html(['run', 'command', 'data', 'versions'], rows)}"
-        f"<details><summary>all settings</summary>{settings}</details><p><small>drivax "
-        f"{escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of its run.</small></p>"
-        "</section>"
+    return section(
+        "How this was made",
+        facts_html(["run", "command", "data", "versions"], rows),
+        f"<details><summary>all settings</summary>{settings}</details>",
+        note=f"drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of its run.",
     )
+
+
+#: Tags with more values than this (ids, places) are not offered as a choice.
+MOST_VALUES = 24
+#: Columns of the list, as far as a run has them; all other metrics filter and sort it.
+_SHOWN = (
+    "vmax_score", "at_fault_collision", "collision", "offroad", "red_light", "progress_ratio", "min_ttc", "comfortable",
+)  # fmt: skip
+
+
+def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[ScenarioKey, int]) -> str:
+    """Return the data of the list as a script element; the policy is the last run, ``played`` has places in the player.
+
+    ``metrics`` says how each is shown and which value of a rate is a failure; ``runs[].values`` holds one column per
+    metric with four significant digits, null where undefined, rows worst first; ``runs[].errors`` by row the step and
+    the error of a crash; ``tags`` holds for each tag its values and for each scenario the index of its value, which is
+    ``unknown`` where it has none.
+    """
+    names = tables.ordered(tables.metric_names(runs))
+    names += [name for name in tables.metric_names(runs) if name in tables.CODES]
+    keys = list(dict.fromkeys(key for run in runs for key in run.scenarios))
+    place = {key: number for number, key in enumerate(keys)}
+    return data_element(
+        {
+            "scenarios": [key[1] for key in keys],
+            "tags": _tags([tags.get(key, {}) for key in keys]),
+            "played": {str(place[key]): number for key, number in played.items()},
+            "metrics": [_metric(name, runs) for name in names],
+            "shown": [names.index(name) for name in _SHOWN if name in names],
+            "runs": [_run(run, runs, names, place) for run in runs],
+        },
+        id="list",
+    )
+
+
+def _metric(name: str, runs: Sequence[EpisodeTable]) -> dict[str, Any]:
+    label = tables.metric_label(name, runs)
+    bad = {"high": 0, "low": 1, "-": None}[label.better] if name in RATES else None
+    return {"name": name, "label": label.text, "better": label.better, "unit": label.unit, "bad": bad}
+
+
+def _run(
+    run: EpisodeTable, runs: Sequence[EpisodeTable], names: Sequence[str], place: Mapping[ScenarioKey, int]
+) -> dict[str, Any]:
+    rows = worst_first(run, [other for other in runs if other is not run])
+    outcomes = [outcome(run, row) for row in rows]
+    distinct = list(dict.fromkeys(outcomes))
+    keys = run.scenarios
+    scenarios, crashes = [keys[row] for row in rows], run.crash_by_scenario
+    failed = ((str(row), key) for row, key in enumerate(scenarios))
+    return {
+        "name": run.name,
+        "playable": comparable(run, runs[-1]),
+        "scenario": [place[key] for key in scenarios],
+        "outcomes": distinct,
+        "outcome": [distinct.index(words) for words in outcomes],
+        "errors": {row: (crashes[key].step, crashes[key].error) for row, key in failed if key in crashes},
+        "values": [_column(run.metrics.get(name), rows) for name in names],
+    }
+
+
+def _column(values: Any, rows: Sequence[int]) -> list[float | None]:
+    if values is None:
+        return [None] * len(rows)
+    return [None if np.isnan(value) else _rounded(value) for value in np.asarray(values)[rows]]
+
+
+def _rounded(value: float) -> float:
+    """Return four significant digits; whole numbers as such, which are shorter."""
+    rounded = float(f"{value:.4g}")
+    return int(rounded) if rounded.is_integer() else rounded
+
+
+def _tags(tagged: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
+    columns = []
+    for name in dict.fromkeys(name for tags in tagged for name in tags):
+        values = [tags.get(name, tables.UNKNOWN) for tags in tagged]
+        distinct = sorted(set(values))
+        if 1 < len(distinct) <= MOST_VALUES:
+            number = {value: place for place, value in enumerate(distinct)}
+            columns.append({"name": name, "words": distinct, "of": [number[value] for value in values]})
+    return columns

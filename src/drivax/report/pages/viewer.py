@@ -12,7 +12,7 @@ import numpy as np
 from drivax.curation.scores import ScoreTable
 from drivax.errors import UsageError, did_you_mean
 from drivax.files import check_output, write_text
-from drivax.report.charts.curves import chart, series_legend
+from drivax.report.charts import chart, series_legend
 from drivax.report.episodes import logged_motion
 from drivax.report.pages.page import asset, page, player_data, player_html, player_scripts
 from drivax.report.pictures.drawing import Rollout
@@ -46,20 +46,10 @@ def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ())
 
 
 def write_player(
-    scenarios: Sequence[Scenario],
-    out: Path,
-    overwrite: bool = False,
-    title: str = "scenarios",
+    scenarios: Sequence[Scenario], out: Path, overwrite: bool = False, title: str = "scenarios",
     details: Sequence[str] = (),
-) -> Path:
-    """Write a page of logs to the HTML file ``out``.
-
-    Args:
-        scenarios: The scenarios; some tens of kB of page each.
-        out: The file; it appears when it is complete.
-        overwrite: Replace an existing file.
-        title: Heading of the page, as the name of the set.
-        details: HTML above the facts of each scenario.
+) -> Path:  # fmt: skip
+    """Write a page of logs (some tens of kB each) to the HTML file ``out``; ``details`` is HTML above each one's facts.
 
     Raises:
         UsageError: ``out`` exists or is a folder, or there is no scenario.
@@ -67,7 +57,14 @@ def write_player(
     check_output(out, overwrite)
     if not scenarios:
         raise UsageError("there is no scenario to show", cure="name at least one")
-    write_text(out, _page(scenarios, title, details or [""] * len(scenarios)))
+    packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
+    unclean = sum(bool(findings(scenario)) for scenario in scenarios)
+    audited = sum(bool(scenario.audit) for scenario in scenarios)
+    audit = f"the audit finds violations in {unclean} of {audited}" if audited else "not audited"
+    lead = f"<p class=lead><b>{len(scenarios)}</b> recorded scenarios; {audit}.</p>"
+    browser = _browser(scenarios, details or [""] * len(scenarios))
+    scripts = [*player_scripts(), asset("browser.js")]
+    write_text(out, page(title, lead, [browser], asset("browser.css"), player_data(packed), scripts))
     return out
 
 
@@ -84,30 +81,15 @@ def criticality_html(table: ScoreTable, row: int) -> str:
     valid = table.valid[row]
     time = np.flatnonzero(valid) * DT_S
     series = {"score": table.steps[row], **{name: part[row] for name, part in table.components.items()}}
-    lines = {
-        name.replace("_", " "): (stroke(place), np.column_stack([time, values[valid]]))
-        for place, (name, values) in enumerate(series.items())
+    points = {
+        name.replace("_", " "): np.column_stack([time, values[valid]]) for name, values in series.items()
     }
+    lines = {name: (stroke(place), line) for place, (name, line) in enumerate(points.items())}
     rank = int(np.flatnonzero(table.order == row)[0]) + 1
     words = f"score {table.scenarios[row]:.3f}, rank {rank:,} of {len(table.scenarios):,} by {table.method}"
     return (
         f"<h3>Criticality</h3><p>{escape(words)}</p>"
         f"{chart('criticality over time', lines, share=True, across='s')}{series_legend(list(lines))}"
-    )
-
-
-def _page(scenarios: Sequence[Scenario], title: str, details: Sequence[str]) -> str:
-    packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
-    unclean = sum(bool(findings(scenario)) for scenario in scenarios)
-    audited = sum(bool(scenario.audit) for scenario in scenarios)
-    audit = f"the audit finds violations in {unclean} of {audited}" if audited else "not audited"
-    return page(
-        title,
-        f"<p class=lead><b>{len(scenarios)}</b> recorded scenarios; {audit}.</p>",
-        [_browser(scenarios, details)],
-        asset("browser.css"),
-        player_data(packed),
-        [*player_scripts(), asset("browser.js")],
     )
 
 
@@ -144,12 +126,9 @@ def _details(scenario: Scenario, details: str) -> str:
     """Return tags, flags, audit and overflow as lists, visible while the scenario is selected."""
     source = scenario.source
     counts = {
-        "steps": int(scenario.steps),
-        "tracks": source.tracks,
-        "tracks now": source.tracks_valid_now,
-        "map points": source.map_points,
-        "lights": source.lights,
-    }
+        "steps": int(scenario.steps), "tracks": source.tracks, "tracks now": source.tracks_valid_now,
+        "map points": source.map_points, "lights": source.lights,
+    }  # fmt: skip
     # The step of an event that never happened is stored as -1.
     audit = {
         name: "never" if name.endswith("_step") and value == -1 else value
@@ -166,11 +145,8 @@ def _details(scenario: Scenario, details: str) -> str:
 
 
 def _facts(values: Mapping[str, Any]) -> str:
-    rows = (
-        f"<dt>{escape(name.replace('_', ' '))}</dt><dd>{escape(_text(value))}</dd>"
-        for name, value in values.items()
-    )
-    return f"<dl>{''.join(rows)}</dl>"
+    words = ((escape(name.replace("_", " ")), escape(_text(value))) for name, value in values.items())
+    return f"<dl>{''.join(f'<dt>{name}</dt><dd>{text}</dd>' for name, text in words)}</dl>"
 
 
 def _text(value: Any) -> str:

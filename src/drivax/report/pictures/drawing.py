@@ -42,11 +42,10 @@ class Rollout:
     """One planner's episode in a scenario.
 
     Attributes:
-        planner: Its name.
+        planner, outcome: Its name, and its outcome in words.
         ego: Position [m], heading [rad], speed [m/s] at every step, local frame; NaN where the agent is absent.
         start: Step at which the planner took over.
         events: Step of the first event by name, -1 for none.
-        outcome: Its outcome in words.
         action: The first two numbers of its actions, NaN where there are none; None for the log.
         others: Position [m] and heading [rad] of every agent in reactive traffic, NaN where absent; None for the log's.
     """
@@ -86,14 +85,9 @@ def surroundings(scenario: Scenario, rollouts: Sequence[Rollout]) -> Box:
 
 @dataclass(frozen=True)
 class Shape:
-    """Lines or polygons of one style, metres.
+    """Lines or polygons ``[n, 2]`` of one style, metres, with the colours of outline and inside (None for none).
 
-    Attributes:
-        lines: Points ``[n, 2]`` of each.
-        line: Colour of the outline, None for none.
-        fill: Colour of the inside, None for none.
-        dash: Lengths of dashes and gaps, pixels.
-        level: Drawing order.
+    ``dash`` has the lengths of dashes and gaps in pixels, ``level`` is the drawing order.
     """
 
     lines: Sequence[Array]
@@ -110,14 +104,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Boxes:
-    """Agents.
-
-    Attributes:
-        xy, heading: Pose at every step.
-        size: Length and width, metres.
-        colour: Name of the colour of each.
-        valid: Where they are present.
-    """
+    """Poses of agents at every step, their length and width in metres, names of colours, and where they are present."""
 
     xy: Float[Array, "step agent 2"]
     heading: Float[Array, "step agent"]
@@ -129,11 +116,8 @@ class Boxes:
         """Yield the agents at a step, one shape per colour."""
         rows: list[int] = np.flatnonzero(self.valid[step]).tolist()
         for colour in dict.fromkeys(self.colour[row] for row in rows):
-            outlines = [
-                _outline(self.xy[step, row], self.heading[step, row], self.size[row])
-                for row in rows
-                if self.colour[row] == colour
-            ]
+            same = [row for row in rows if self.colour[row] == colour]
+            outlines = [_outline(self.xy[step, row], self.heading[step, row], self.size[row]) for row in same]
             yield Shape(outlines, "outline", colour, level=4)
 
 
@@ -142,12 +126,10 @@ class Drawing:
     """A scenario as it is drawn, local frame, metres.
 
     Attributes:
-        layers: Polylines of the map by layer.
-        stops: Positions of stop signs.
-        route, goal: Points of the route to the goal; the goal, if it is near.
+        layers, stops: Polylines of the map by layer, and positions of stop signs.
+        route, goal: Points of the route, and the goal, if it is near.
         light_line, light_state: Stop line of each light, and its code (:data:`LIGHTS`) at every step, -1 unobserved.
-        agents, parked: All agents but ego.
-        log: The logged ego.
+        agents, parked, log: All agents but ego, and the logged ego.
     """
 
     layers: Mapping[str, Lines]
@@ -191,12 +173,9 @@ class Drawing:
         yield from self.agents.shapes(step)
 
     def ego(self, path: Float[Array, "step _"], step: int, logged: bool = True) -> Iterator[Shape]:
-        """Yield ego at a step: its path so far, the dashed box of the log, its box and its arrow.
+        """Yield ego at a step: its path so far, the dashed box of the log (``logged``), its box and its arrow.
 
-        Args:
-            path: Position and heading at every step, NaN where ego is absent.
-            step: The step.
-            logged: Whether to draw the log's box.
+        ``path`` has position and heading at every step, NaN where ego is absent.
         """
         path, size = path[: step + 1], self.log.size[0]
         yield Shape([path[np.isfinite(path).all(axis=1), :2]], "ego", level=4.5)
@@ -209,9 +188,8 @@ class Drawing:
             ahead = np.array((np.cos(heading), np.sin(heading)))
             left = np.array((-ahead[1], ahead[0]))
             tip, base, side = 0.38 * size[0] * ahead, 0.05 * size[0] * ahead, 0.32 * size[1] * left
-            yield Shape(
-                [np.array((x, y)) + np.array((tip, base + side, base - side))], fill="outline", level=7
-            )
+            arrow = np.array((x, y)) + np.array((tip, base + side, base - side))
+            yield Shape([arrow], fill="outline", level=7)
 
 
 def _outline(xy: Any, heading: Any, size: Any) -> Float[Array, "5 2"]:
@@ -232,13 +210,9 @@ def _within(xy: Array, box: Box) -> Bool[Array, "..."]:
 
 
 def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
-    """Return the polylines of every layer, joined again from the stored segments.
+    """Return the polylines of every layer, of segments with a midpoint in the box (low x, low y, high x, high y).
 
     Segments are stored by grid cell; within a feature they are ordered by arc length and chained where ends meet.
-
-    Args:
-        scenario: The scenario.
-        box: Keep segments with a midpoint in (low x, low y, high x, high y), metres, local frame.
     """
     used = int(scenario.segment_blocks[3])
     rows = np.lexsort((scenario.segment_start_m[:used], scenario.segment_feature[:used]))
@@ -290,9 +264,7 @@ def _agents(scenario: Scenario, box: Box) -> Boxes:
 
 def _parked(scenario: Scenario, box: Box) -> Boxes:
     steps = int(scenario.steps)
-    rows = np.flatnonzero(
-        scenario.parked_valid[:steps].any(axis=0) & _within(scenario.parked_xy, box)
-    )  # fmt: skip
+    rows = np.flatnonzero(scenario.parked_valid[:steps].any(axis=0) & _within(scenario.parked_xy, box))
     colours = [agent_colour(int(kind)) for kind in scenario.parked_kind[rows]]
     shape = (steps, len(rows))
     return Boxes(

@@ -15,10 +15,9 @@ from drivax.report.pictures.palette import LIGHT
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.features import COLUMNS, feature_names
+from drivax.tasks.features import COLUMNS, PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, feature_names
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
-from drivax.tasks.view import PIECE_M, POSITION_M, SIZE_M, SPEED_MPS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,21 +34,13 @@ _SLIMMEST = 0.66
 #: An agent of unknown size is a dot of this radius, m.
 _DOT_M = 0.9
 _SCALE = {
-    "position": POSITION_M,
-    "goal": POSITION_M,
-    "velocity": SPEED_MPS,
-    **dict.fromkeys(("length", "width"), SIZE_M),
-}
+    "position": POSITION_M, "goal": POSITION_M, "velocity": SPEED_MPS, "length": SIZE_M, "width": SIZE_M
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class ObservationGroups:
-    """An observation by group and feature: lengths in m, velocities in m/s, other values unchanged.
-
-    Attributes:
-        values: Group -> feature -> ``[..., columns]``, as configured.
-        masks: Group -> which rows are valid.
-    """
+    """An observation by group and feature ``[..., columns]`` in m and m/s, and the valid rows of each group."""
 
     values: Mapping[str, Mapping[str, Values]]
     masks: Mapping[str, Values]
@@ -90,7 +81,7 @@ def draw_observation(config: ObservationConfig, observation: Mapping[str, Any], 
     except ImportError as error:
         raise missing_package(error) or error from error
     groups = ObservationGroups.of(config, observation)
-    low, high = _extent(config, groups)
+    low, high = _extent(groups)
     width, height = high - low
     tall = 7.6
     wide = min(max(tall * width / height, 3.2), 10.0)
@@ -104,9 +95,8 @@ def draw_observation(config: ObservationConfig, observation: Mapping[str, Any], 
         side.set_color(LIGHT["lane"])
     _scale_bar(axes, low, high)
     _legend(figure, (wide + 0.4) / across, config, groups)
-    figure.text(
-        0.15 / across, 1 - 0.2 / up, title, fontsize=11, color=LIGHT["ink"], va="center", weight="bold"
-    )
+    style: dict[str, Any] = {"fontsize": 11, "color": LIGHT["ink"], "va": "center", "weight": "bold"}
+    figure.text(0.15 / across, 1 - 0.2 / up, title, **style)
     return figure
 
 
@@ -124,7 +114,7 @@ def _up(points: Values) -> Values:
     return np.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
-def _extent(config: ObservationConfig, groups: ObservationGroups) -> tuple[Values, Values]:
+def _extent(groups: ObservationGroups) -> tuple[Values, Values]:
     """Return the corners of the rectangle that holds everything within ``_FARTHEST_M``."""
     points = [np.zeros((1, 2)), np.array([[20.0, 12.0], [-8.0, -12.0]])]
     for group in ("agents", "road", "lights", "route", "ego"):
@@ -140,14 +130,10 @@ def _extent(config: ObservationConfig, groups: ObservationGroups) -> tuple[Value
 def _draw(axes: Axes, config: ObservationConfig, groups: ObservationGroups) -> None:
     if config.road:
         _draw_reach(axes, config)
-    if groups.has("road", "position"):
-        _draw_road(axes, groups)
-    if groups.has("route", "position"):
-        _draw_route(axes, groups)
-    if groups.has("lights", "position"):
-        _draw_lights(axes, groups)
-    if groups.has("agents", "position"):
-        _draw_agents(axes, groups)
+    drawn = (("road", _draw_road), ("route", _draw_route), ("lights", _draw_lights), ("agents", _draw_agents))
+    for group, draw in drawn:
+        if groups.has(group, "position"):
+            draw(axes, groups)
     _draw_ego(axes, groups)
 
 
@@ -156,12 +142,9 @@ def _draw_reach(axes: Axes, config: ObservationConfig) -> None:
     from matplotlib.patches import Rectangle
 
     side, behind, ahead = config.road_side_m, config.road_behind_m, config.road_ahead_m
-    axes.add_patch(
-        Rectangle(
-            (-side, -behind), 2 * side, ahead + behind, facecolor="white", edgecolor=LIGHT["lane"],
-            linestyle=(0, (6, 4)), linewidth=0.9, zorder=0,
-        )
-    )  # fmt: skip
+    box = Rectangle((-side, -behind), 2 * side, ahead + behind, facecolor="white", edgecolor=LIGHT["lane"])
+    box.set(linestyle=(0, (6, 4)), linewidth=0.9, zorder=0)
+    axes.add_patch(box)
 
 
 def _draw_road(axes: Axes, groups: ObservationGroups) -> None:
@@ -173,23 +156,17 @@ def _draw_road(axes: Axes, groups: ObservationGroups) -> None:
         axes.scatter(*_up(middle).T, s=5, color=LIGHT["edge"], zorder=1)
         return
     direction = groups["road", "direction"][mask]
-    length = (
-        groups["road", "length"][mask] if groups.has("road", "length") else np.full((len(middle), 1), 1.0)
-    )
+    length, kinds = np.ones((len(middle), 1)), np.eye(3)[np.zeros(len(middle), int)]
+    if groups.has("road", "length"):
+        length = groups["road", "length"][mask]
+    if groups.has("road", "type"):
+        kinds = groups["road", "type"][mask]
     half = direction * length / 2
     pieces = _up(np.stack([middle - half, middle + half], axis=1))
-    kinds = (
-        groups["road", "type"][mask] if groups.has("road", "type") else np.eye(3)[np.zeros(len(middle), int)]
-    )
     for number, (colour, width) in enumerate(_ROADS.values()):
         chosen = kinds[:, number] > 0
-        collection = LineCollection(
-            list(pieces[chosen]),
-            colors=LIGHT[colour],
-            linewidths=width,
-            capstyle="butt",
-            zorder=1.5 - number / 4,
-        )
+        style: dict[str, Any] = {"linewidths": width, "capstyle": "butt", "zorder": 1.5 - number / 4}
+        collection = LineCollection(list(pieces[chosen]), colors=LIGHT[colour], **style)
         if number == 2:
             collection.set(linestyles=[(0, (0.5, 0.5))], alpha=0.55)
         axes.add_collection(collection)
@@ -239,14 +216,8 @@ def _draw_agents(axes: Axes, groups: ObservationGroups) -> None:
 
 
 def _outline(
-    axes: Axes,
-    groups: ObservationGroups,
-    group: str,
-    at: tuple[Any, ...],
-    colour: str,
-    alpha: float,
-    zorder: float,
-) -> None:
+    axes: Axes, groups: ObservationGroups, group: str, at: tuple[Any, ...], colour: str, alpha: float, zorder: float
+) -> None:  # fmt: skip
     """Draw a box where heading and size are known, else a dot."""
     from matplotlib.patches import Circle, Polygon
 
@@ -261,9 +232,8 @@ def _outline(
         if alpha == 1.0:  # the windscreen shows the front
             front = _up(corners(np.array([*(place + 0.22 * size[0] * np.array([cos, sin])), cos, sin,
                                           0.16 * size[0], 0.72 * size[1]])))  # fmt: skip
-            axes.add_patch(
-                Polygon(front, closed=True, facecolor=LIGHT["ink"], alpha=0.65, zorder=zorder + 0.01)
-            )
+            front_style: dict[str, Any] = {"facecolor": LIGHT["ink"], "alpha": 0.65, "zorder": zorder + 0.01}
+            axes.add_patch(Polygon(front, closed=True, **front_style))
     else:
         axes.add_patch(Circle(tuple(_up(place)), _DOT_M, facecolor=colour, edgecolor=edge, **style))
 
@@ -293,11 +263,10 @@ def _draw_ego(axes: Axes, groups: ObservationGroups) -> None:
 
 
 def _scale_bar(axes: Axes, low: Values, high: Values) -> None:
-    x, y = low[0] + 0.04 * (high[0] - low[0]), low[1] + 0.025 * (high[1] - low[1])
+    width, height = high - low
+    x, y = low[0] + 0.04 * width, low[1] + 0.025 * height
     axes.plot((x, x + 10.0), (y, y), color=LIGHT["ink"], linewidth=2.5, solid_capstyle="butt", zorder=9)
-    axes.text(
-        x + 5.0, y + 0.008 * (high[1] - low[1]), "10 m", color=LIGHT["ink"], fontsize=9, ha="center", zorder=9
-    )
+    axes.text(x + 5.0, y + 0.008 * height, "10 m", color=LIGHT["ink"], fontsize=9, ha="center", zorder=9)
 
 
 def _legend(figure: Figure, left: float, config: ObservationConfig, groups: ObservationGroups) -> None:
@@ -313,12 +282,11 @@ def _legend(figure: Figure, left: float, config: ObservationConfig, groups: Obse
 
     handles: list[Any] = [Patch(facecolor=LIGHT["ego"], edgecolor=LIGHT["outline"], label="ego")]
     if groups.has("agents", "position"):
-        kinds = _KINDS if groups.has("agents", "type") else _KINDS[:1]
-        named = kinds if len(kinds) > 1 else ("agent",)
-        handles += [
-            Patch(facecolor=LIGHT[kind], edgecolor=LIGHT["outline"], label=name)
-            for kind, name in zip(kinds, named, strict=True)
-        ]
+        kinds = (
+            dict(zip(_KINDS, _KINDS, strict=True)) if groups.has("agents", "type") else {_KINDS[0]: "agent"}
+        )
+        edge = LIGHT["outline"]
+        handles += [Patch(facecolor=LIGHT[kind], edgecolor=edge, label=name) for kind, name in kinds.items()]
         if config.steps > 1:
             handles.append(Patch(facecolor=LIGHT["vehicle"], alpha=0.3, label="past steps, faded"))
     if groups.has("agents", "velocity") or groups.has("ego", "velocity"):
@@ -328,9 +296,8 @@ def _legend(figure: Figure, left: float, config: ObservationConfig, groups: Obse
         handles.append(line("lane", "reach of the road", linestyle="--", linewidth=0.9))
     if groups.has("lights", "position"):
         handles += [sign(colour, f"{name} light") for name, colour in _STATES.items()]
-        handles.append(
-            sign("ground", "light on the route", markeredgecolor=LIGHT["ink"], markeredgewidth=1.4)
-        )
+        marker: dict[str, Any] = {"markeredgecolor": LIGHT["ink"], "markeredgewidth": 1.4}
+        handles.append(sign("ground", "light on the route", **marker))
     if groups.has("route", "position"):
         handles.append(line("route", "route", marker="o", markersize=5, linewidth=1.4))
     if groups.has("route", "goal"):
@@ -341,9 +308,8 @@ def _legend(figure: Figure, left: float, config: ObservationConfig, groups: Obse
         labelcolor=LIGHT["ink"], borderaxespad=0, handlelength=1.8,
     )  # fmt: skip
     legend.set_in_layout(False)
-    figure.text(
-        left, 0.2 / up, "\n".join(_counts(config, groups)), fontsize=9, color=LIGHT["ink"], linespacing=1.5
-    )
+    counts = "\n".join(_counts(config, groups))
+    figure.text(left, 0.2 / up, counts, fontsize=9, color=LIGHT["ink"], linespacing=1.5)
 
 
 def _counts(config: ObservationConfig, groups: ObservationGroups) -> list[str]:
@@ -354,15 +320,11 @@ def _counts(config: ObservationConfig, groups: ObservationGroups) -> list[str]:
     if groups.has("ego_static", "last_action"):
         action = ", ".join(f"{number:.2f}" for number in groups["ego_static", "last_action"])
         lines.append(f"last action {action}")
-    for group, words in (
-        ("agents", "agents"),
-        ("road", "pieces of road"),
-        ("lights", "lights"),
-        ("route", "route points"),
-    ):
+    words = {"agents": "agents", "road": "pieces of road", "lights": "lights", "route": "route points"}
+    for group in words:
         if group in groups.masks:
             mask = groups.masks[group]
             valid = mask[:, -1] if mask.ndim > 1 else mask
-            lines.append(f"{words}: {int(valid.sum())} of {valid.size}")
+            lines.append(f"{words[group]}: {int(valid.sum())} of {valid.size}")
     lines += [f"{group.name}: not drawn" for group in config.own]
     return lines

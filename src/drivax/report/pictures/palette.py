@@ -20,12 +20,7 @@ SERIES = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
 
 @dataclass(frozen=True)
 class Stroke:
-    """Style of a line in a chart.
-
-    Attributes:
-        colour: Its colour.
-        dash: Lengths of dash and gap, as SVG has them; empty for a solid line.
-    """
+    """Style of a line in a chart; ``dash`` has the lengths of dash and gap as in SVG, empty for a solid line."""
 
     colour: str
     dash: str = ""
@@ -63,12 +58,9 @@ LIGHT = MappingProxyType(
     }
 )  # fmt: skip
 DARK = MappingProxyType(
-    {
+    LIGHT | {
         "ground": "#15191e", "ink": "#e8ecf0", "edge": "#aab4bf", "lane": "#3d4651", "line": "#56616d",
-        "bike": "#2c5c4e", "crosswalk": "#262d35", "outline": "#0b0d10", "ego": PURPLE, "route": PURPLE, "goal": PURPLE,
-        "log": "#9aa5b1", "vehicle": SKY, "pedestrian": YELLOW, "cyclist": ORANGE, "other": BLUE,
-        "parked": "#4a535d", "red": VERMILLION, "amber": ORANGE, "green": GREEN, "unknown": "#8b949e",
-        "stop": VERMILLION, "mark": VERMILLION,
+        "bike": "#2c5c4e", "crosswalk": "#262d35", "outline": "#0b0d10", "log": "#9aa5b1", "parked": "#4a535d",
     }
 )  # fmt: skip
 THEMES = MappingProxyType({"light": LIGHT, "dark": DARK})
@@ -84,7 +76,7 @@ LEGEND = (
 
 def rgb(colour: str) -> tuple[int, int, int]:
     """Return red, green and blue of a hex colour, 0 to 255."""
-    red, green, blue = (int(colour[at : at + 2], 16) for at in (1, 3, 5))
+    red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue
 
 

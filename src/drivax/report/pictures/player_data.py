@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from drivax.report.charts.motion import COMMANDED, COMMANDS, SIGNALS, Signal, signals
+from drivax.report.charts import COMMANDED, COMMANDS, SIGNALS, Signal, signals
 from drivax.report.pictures.drawing import (
     EVENT_WORDS,
     LAYERS,
@@ -67,9 +67,8 @@ def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) ->
     Arrays are little-endian int16 in base64, in C order. ``map`` holds per layer the number of points of each line
     and the points of all lines; ``agents.pose`` is ``[agent, step, 3]``; ``parked.seen`` the first and last step at
     which a parked agent was seen; ``lights.state`` ``[step, light]`` indexes ``LIGHTS`` and is -1 where unobserved;
-    ``rollouts[].pose`` is ``[step, 3]``, ``speed`` is in cm/s, and ``signals`` are ``motion.SIGNALS`` and
-    ``motion.COMMANDS`` in order, in units of their steps, ABSENT where missing. Other agents move as in the last of the
-    rollouts.
+    ``rollouts[].pose`` is ``[step, 3]``, ``speed`` is in cm/s, and ``signals`` are ``charts.SIGNALS`` and
+    ``charts.COMMANDS`` in order, in units of their steps, ABSENT where missing. Other agents move as in the last one.
     """
     scenario = with_traffic_of(rollouts[-1], scenario)
     box = surroundings(scenario, rollouts)
@@ -115,10 +114,8 @@ def _poses(scale: Scale, boxes: Boxes) -> Array:
 
 def _boxes(scale: Scale, boxes: Boxes, poses: Array) -> dict[str, Any]:
     return {
-        "kind": list(boxes.colour),
-        "size": _encoded(scale.lengths(boxes.size)),
-        "pose": _encoded(poses),
-    }
+        "kind": list(boxes.colour), "size": _encoded(scale.lengths(boxes.size)), "pose": _encoded(poses)
+    }  # fmt: skip
 
 
 def _parked(scale: Scale, parked: Boxes) -> dict[str, Any]:

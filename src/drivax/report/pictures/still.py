@@ -24,18 +24,13 @@ _POINTS = 0.9
 
 
 def draw_scenario(
-    scenario: Scenario,
-    step: int,
-    ego: Any = None,
-    reach_m: float = 60.0,
-    theme: str = "light",
-    legend: bool = True,
-) -> Figure:
+    scenario: Scenario, step: int, ego: Any = None, reach_m: float = 60.0, theme: str = "light", legend: bool = True
+) -> Figure:  # fmt: skip
     """Return a figure of map, agents, lights and route around the ego at one step.
 
     Args:
         scenario: The scenario.
-        step: Step to draw, 0 to ``scenario.steps - 1``.
+        step: Step to draw.
         ego: Path ``[step, 4]`` (x, y, heading, speed; local frame) to draw instead of the log's ego, which is then a
             dashed box; None draws the log.
         reach_m: Half the side of the square, metres.
@@ -78,14 +73,9 @@ def draw_pixels(scenario: Scenario, path: Any) -> np.ndarray[Any, Any]:
 
 
 def draw_on(
-    axes: Axes,
-    scenario: Scenario,
-    step: int,
-    centre: tuple[float, float],
-    reach_m: float,
-    path: Any = None,
+    axes: Axes, scenario: Scenario, step: int, centre: tuple[float, float], reach_m: float, path: Any = None,
     colours: Colours = LIGHT,
-) -> None:
+) -> None:  # fmt: skip
     """Draw a square of a scenario on given axes; the arguments are those of :func:`draw_scenario`."""
     from matplotlib.patches import Rectangle
 
@@ -93,8 +83,8 @@ def draw_on(
     drawing = Drawing.of(scenario, (x - around, y - around, x + around, y + around))
     logged = path is not None
     if path is None:
-        pose = np.column_stack((scenario.agent_xy[:, 0], scenario.agent_heading[:, 0])).astype(np.float64)
-        path = np.where(scenario.agent_valid[:, 0, None], pose, np.nan)
+        path = np.column_stack((scenario.agent_xy[:, 0], scenario.agent_heading[:, 0])).astype(np.float64)
+        path[~scenario.agent_valid[:, 0]] = np.nan
     for shape in (*drawing.ground(), *drawing.traffic(step), *drawing.ego(path, step, logged)):
         _draw(axes, colours, shape)
     axes.set(xlim=(x - reach_m, x + reach_m), ylim=(y - reach_m, y + reach_m))
@@ -109,12 +99,11 @@ def draw_on(
 def _draw(axes: Axes, colours: Colours, shape: Shape) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
-    width, line = _POINTS * shape.width, colours[shape.line] if shape.line else "none"
+    lines, width = list(shape.lines), _POINTS * shape.width
+    line = colours[shape.line] if shape.line else "none"
+    artist: Any = LineCollection(lines, colors=line, linewidths=width, capstyle="round")
     if shape.fill:
-        fill = colours[shape.fill]
-        artist: Any = PolyCollection(list(shape.lines), facecolor=fill, edgecolor=line, linewidth=width)
-    else:
-        artist = LineCollection(list(shape.lines), colors=line, linewidths=width, capstyle="round")
+        artist = PolyCollection(lines, facecolor=colours[shape.fill], edgecolor=line, linewidth=width)
     if shape.dash:
         artist.set_linestyle((0, tuple(length / shape.width for length in shape.dash)))
     artist.set_zorder(shape.level)

@@ -1,25 +1,41 @@
-"""Rollouts as mp4 files: one planner each, or all of them side by side."""
+"""Rollouts as mp4 files: one planner each, or all of them side by side.
+
+matplotlib's rasteriser draws frames directly: a figure with artists takes ten times as long.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from drivax.errors import UsageError, did_you_mean, missing_package
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import atomic_write, check_output
 from drivax.report.episodes import EpisodeGroup, EvaluatedSet, ranked, rollouts_of
-from drivax.report.pictures.drawing import Rollout, with_traffic_of
-from drivax.report.pictures.frames import Canvas, Picture, Scenery, draw_frame, legend_strip
-from drivax.report.pictures.palette import THEMES, rgb
+from drivax.report.pictures.drawing import (
+    EVENT_WORDS,
+    LIGHTS,
+    Drawing,
+    Rollout,
+    Shape,
+    ring,
+    surroundings,
+    with_traffic_of,
+)
+from drivax.report.pictures.palette import LEGEND, THEMES, rgb
 from drivax.report.runs import read_evaluations
 from drivax.scenario.schema import Scenario
+
+if TYPE_CHECKING:
+    from matplotlib.transforms import Affine2D
 
 #: Side of a picture in pixels: of one planner alone, of several side by side.
 ALONE, SIDE_BY_SIDE = 720, 480
@@ -28,20 +44,14 @@ _ACROSS = 3
 
 
 def write_videos(
-    runs: Sequence[Path],
-    out: Path,
-    which: str,
-    side_by_side: bool = False,
-    data: Path | None = None,
-    theme: str = "light",
-    overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Path]:
+    runs: Sequence[Path], out: Path, which: str, side_by_side: bool = False, data: Path | None = None,
+    theme: str = "light", overwrite: bool = False, progress: Callable[[int, int], None] | None = None,
+) -> list[Path]:  # fmt: skip
     """Write episodes of evaluation runs as mp4 files, in real time; returns the files, worst episode first.
 
     Args:
         runs: Run folders; the last evaluation is the policy, whose episodes are ranked and, alone, drawn.
-        out: Folder for the files; each appears when it is complete.
+        out: Folder for the files.
         which: ``worst:N``, ``all``, or the id of a scenario.
         side_by_side: Draw every run with an episode of the scenario in one picture.
         data: The scenario set of the evaluation, where it has moved.
@@ -78,9 +88,8 @@ def _selected(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
     if which.startswith("worst:"):
         count = which.removeprefix("worst:")
         if not count.isdecimal() or int(count) < 1:
-            raise UsageError(
-                f"{which!r} is not a selection", cure="write worst:N with N at least 1, as worst:20"
-            )
+            cure = "write worst:N with N at least 1, as worst:20"
+            raise UsageError(f"{which!r} is not a selection", cure=cure)
         return groups[: int(count)]
     if requested := [group for group in groups if group.scenario_id == which]:
         return requested
@@ -92,11 +101,10 @@ def _selected(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
 def _files(out: Path, groups: Sequence[EpisodeGroup], ranked: bool) -> list[Path]:
     """Return the names of the files: the scenario's id, after its rank in a ranking."""
     names = [re.sub(r"[^\w.+-]", "_", group.scenario_id) for group in groups]
-    digits = len(str(len(names)))
-    return [
-        out / (f"{place:0{digits}d}-{name}.mp4" if ranked else f"{name}.mp4")
-        for place, name in enumerate(names, start=1)
-    ]
+    if ranked:
+        digits = len(str(len(names)))
+        names = [f"{rank:0{digits}d}-{name}" for rank, name in enumerate(names, start=1)]
+    return [out / f"{name}.mp4" for name in names]
 
 
 def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light") -> Iterator[Picture]:
@@ -108,15 +116,12 @@ def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light"
         recorded if rollout.others is None else Scenery(canvas, with_traffic_of(rollout, scenario), rollouts)
         for rollout in rollouts
     ]
-    across = (
-        len(rollouts) if len(rollouts) <= _ACROSS else -(-len(rollouts) // (-(-len(rollouts) // _ACROSS)))
-    )
-    legend = legend_strip(across * side, theme)
+    rows = math.ceil(len(rollouts) / _ACROSS)
+    across = math.ceil(len(rollouts) / rows)
+    legend, dt_s = legend_strip(across * side, theme), float(scenario.dt_s)
     for step in range(min(rollout.start for rollout in rollouts), int(scenario.steps)):
-        panes = [
-            draw_frame(scenery, rollout, step, float(scenario.dt_s))
-            for scenery, rollout in zip(sceneries, rollouts, strict=True)
-        ]
+        drawn = zip(sceneries, rollouts, strict=True)
+        panes = [draw_frame(scenery, rollout, step, dt_s) for scenery, rollout in drawn]
         for pane in panes if across > 1 else ():
             pane[:, -1, :3] = rgb(THEMES[theme]["lane"])
         yield np.concatenate((_tiled(panes, across), legend))
@@ -131,12 +136,7 @@ def _tiled(panes: Sequence[Picture], across: int) -> Picture:
 
 
 def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
-    """Write pictures as H.264, which every browser plays; the file appears when it is complete.
-
-    Args:
-        file: The mp4 file.
-        pictures: At least one, all of one even width and height.
-        dt_s: Seconds between pictures.
+    """Write at least one picture, all of one even size, as H.264, which every browser plays, every ``dt_s`` seconds.
 
     Raises:
         UsageError: PyAV is not installed.
@@ -145,18 +145,204 @@ def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
         import av
     except ImportError as error:
         raise missing_package(error) or error from error
-    faststart = {"movflags": "+faststart"}
-    with (
-        atomic_write(file) as target,
-        av.open(target.name, "w", format="mp4", options=faststart) as container,
-    ):
+    options = {"movflags": "+faststart"}
+    with atomic_write(file) as target, av.open(target.name, "w", format="mp4", options=options) as container:
         stream: Any = None
         for picture in pictures:
             if stream is None:
-                rate = Fraction(1 / dt_s).limit_denominator(20)
-                options = {"preset": "veryfast", "crf": "23"}
+                rate, options = Fraction(1 / dt_s).limit_denominator(20), {"preset": "veryfast", "crf": "23"}
                 stream = container.add_stream("libx264", rate=rate, options=options)
                 stream.height, stream.width = picture.shape[:2]
                 stream.pix_fmt = "yuv420p"
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgba")))
         container.mux(stream.encode(None))
+
+
+Array = np.ndarray[Any, Any]
+#: Red, green, blue and an unused alpha: four bytes are copied faster than three.
+Picture = UInt8[Array, "_ _ 4"]
+#: Metres across the shorter edge of a picture.
+VIEW_M = 70.0
+_BAR, _LINE = 30, 22
+
+
+class Canvas:
+    """Pixels to draw on: shapes in metres under a camera, texts and bars in pixels from the upper left corner.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+    """
+
+    def __init__(self, width: int, height: int, theme: str) -> None:
+        try:
+            from matplotlib.backends.backend_agg import RendererAgg
+            from matplotlib.font_manager import FontProperties
+            from matplotlib.path import Path
+            from matplotlib.transforms import Affine2D
+        except ImportError as error:
+            raise missing_package(error) or error from error
+        # At 72 dots per inch a point of matplotlib is a pixel.
+        self._agg = RendererAgg(width, height, 72)
+        self._path, self._affine, self._font = Path, Affine2D, FontProperties
+        self.width, self.height, self.colours = width, height, THEMES[theme]
+        self._camera: Affine2D = Affine2D()
+
+    def clear(self) -> None:
+        """Paint everything in the colour of the ground."""
+        pixel = np.array([*rgb(self.colours["ground"]), 255], np.uint8)
+        np.asarray(self._agg.buffer_rgba()).view(np.uint32).fill(pixel.view(np.uint32)[0])
+
+    def look(self, x: float, y: float, scale: float) -> None:
+        """Move a point (metres) into the middle, at ``scale`` pixels per metre."""
+        camera = self._affine().translate(-x, -y).scale(scale)
+        self._camera = camera.translate(self.width / 2, self.height / 2)
+
+    def path(self, lines: Sequence[Array]) -> Any:
+        """Return lines as one path, which is drawn faster than its parts; None for no lines."""
+        paths = [self._path(line) for line in lines if len(line)]
+        return self._path.make_compound_path(*paths) if len(paths) > 1 else paths[0] if paths else None
+
+    def shape(self, shape: Shape) -> None:
+        """Draw a shape."""
+        self.draw(self.path(shape.lines), shape.line, shape.width, shape.fill, shape.dash)
+
+    def draw(
+        self, path: Any, line: str | None, width: float = 1.0, fill: str | None = None, dash: Sequence[float] = ()
+    ) -> None:  # fmt: skip
+        """Draw a path, metres, with an outline of ``width`` pixels; None draws nothing."""
+        if path is None:
+            return
+        pen = self._agg.new_gc()
+        pen.set_linewidth(width if line else 0.0)
+        pen.set_foreground(self.colours[line or fill or "ink"])
+        pen.set_capstyle("round")
+        pen.set_joinstyle("round")
+        if dash:
+            pen.set_dashes(0, dash)
+        red, green, blue = (value / 255 for value in rgb(self.colours[fill or "ink"]))
+        self._agg.draw_path(pen, path, self._camera, (red, green, blue) if fill else None)
+
+    def text(
+        self, x: float, y: float, words: str, size: float = 13.0, colour: str = "ink", right: bool = False
+    ) -> float:
+        """Write one line with its base at a place in pixels, to the right or left of it; returns its width."""
+        font, pen = self._font(size=size), self._agg.new_gc()
+        pen.set_foreground(self.colours[colour])
+        width = float(self._agg.get_text_width_height_descent(words, font, ismath=False)[0])
+        self._agg.draw_text(pen, x - width if right else x, y, words, font, 0)
+        return width
+
+    def ring(self, x: float, y: float, radius: float, line: str | None, fill: str | None = None) -> None:
+        """Draw a circle in pixels, 2 pixels wide or filled."""
+        self._flat(ring(np.array((x, y)), radius), line, 2.0, fill)
+
+    def bar(self, x: float, y: float, width: float, height: float, fill: str) -> None:
+        """Fill a rectangle in pixels with its upper left corner at (x, y)."""
+        edges = np.array([(x, y), (x + width, y), (x + width, y + height), (x, y + height)])
+        self._flat(edges, None, 0.0, fill)
+
+    def _flat(self, points: Array, line: str | None, width: float, fill: str | None) -> None:
+        camera, self._camera = self._camera, self._affine().scale(1, -1).translate(0, self.height)
+        self.draw(self._path(points), line, width, fill)
+        self._camera = camera
+
+    def pixels(self) -> Picture:
+        """Return a copy of the pixels."""
+        return np.asarray(self._agg.buffer_rgba()).copy()
+
+
+class Scenery:
+    """A scenario on a canvas, its map prepared once and cut to the surroundings of the rollouts."""
+
+    def __init__(self, canvas: Canvas, scenario: Scenario, rollouts: Sequence[Rollout]) -> None:
+        self.canvas, self.scenario = canvas, scenario
+        self.drawing = Drawing.of(scenario, surroundings(scenario, rollouts))
+        self._ground = [(canvas.path(shape.lines), shape) for shape in self.drawing.ground()]
+
+    def draw(self, rollout: Rollout, step: int) -> None:
+        """Draw everything at a step."""
+        for path, shape in self._ground:
+            self.canvas.draw(path, shape.line, shape.width, shape.fill, shape.dash)
+        for shape in (*self.drawing.traffic(step), *self.drawing.ego(rollout.ego, step)):
+            self.canvas.shape(shape)
+
+
+def draw_frame(scenery: Scenery, rollout: Rollout, step: int, dt_s: float) -> Picture:
+    """Return one planner's rollout at a step, with its name, speed, time and past events."""
+    canvas = scenery.canvas
+    canvas.clear()
+    scale = (min(canvas.width, canvas.height) - _BAR) / VIEW_M
+    x, y = _middle(scenery.scenario, rollout, step)
+    canvas.look(x, y + _BAR / 2 / scale, scale)
+    scenery.draw(rollout, step)
+    _mark_events(canvas, rollout, step, scale)
+    canvas.bar(0, 0, canvas.width, _BAR, "crosswalk")
+    width = canvas.text(10, 20, rollout.planner, 14)
+    canvas.text(20 + width, 20, rollout.outcome, 12, "mark" if rollout.outcome != "success" else "ink")
+    absent = not np.isfinite(rollout.ego[step]).all()
+    speed = "gone" if absent else f"{rollout.ego[step, 3]:.1f} m/s"
+    canvas.text(canvas.width - 10, 20, f"{speed}   {step * dt_s:.1f} s", 12, right=True)
+    past = [name for name, at in rollout.events.items() if 0 <= at <= step and name in EVENT_WORDS]
+    for line, name in enumerate(past):
+        words = f"✕ {EVENT_WORDS[name]} at {rollout.events[name] * dt_s:.1f} s"
+        canvas.text(10, _BAR + 18 + 16 * line, words, 12, "mark")
+    _scale_bar(canvas, scale)
+    return canvas.pixels()
+
+
+def legend_strip(width: int, theme: str) -> Picture:
+    """Return the legend as wide as a picture, its height an even number of pixels."""
+    entries, x, y = [], 10.0, 0
+    for name, words in LEGEND:
+        length = 34 + 7.0 * len(words)
+        if x + length > width - 10:
+            x, y = 10.0, y + _LINE
+        entries.append((x, y, name, words))
+        x += length
+    canvas = Canvas(width, (y + _LINE + 10) // 2 * 2, theme)
+    canvas.clear()
+    for x, y, name, words in entries:
+        middle = y + 5 + _LINE / 2
+        if name == "mark":
+            canvas.text(x + 3, middle + 5, "✕", 14, name)
+        elif name in ("route", "log"):
+            for dash in (0, 8):
+                canvas.bar(x + dash, middle - 1.5, 6, 3, name)
+        elif name == "stop":
+            canvas.ring(x + 8, middle, 5, None, fill=name)
+        elif name == "goal":
+            canvas.ring(x + 8, middle, 6, name)
+        elif name in LIGHTS:
+            canvas.bar(x + 5, middle - 7, 5, 14, name)
+        else:
+            canvas.bar(x, middle - 5, 16, 10, "outline")
+            canvas.bar(x + 1, middle - 4, 14, 8, name)
+        canvas.text(x + 21, middle + 4, words, 11)
+    return canvas.pixels()
+
+
+def _middle(scenario: Scenario, rollout: Rollout, step: int) -> tuple[float, float]:
+    """Return the position of ego, or its last one."""
+    known = np.flatnonzero(np.isfinite(rollout.ego[: step + 1]).all(axis=1))
+    point = rollout.ego[known[-1], :2] if known.size else scenario.agent_xy[step, 0]
+    return float(point[0]), float(point[1])
+
+
+def _mark_events(canvas: Canvas, rollout: Rollout, step: int, scale: float) -> None:
+    for at in rollout.events.values():
+        if 0 <= at <= step and np.isfinite(rollout.ego[at]).all():
+            for turn in (-1, 1):
+                arm = np.array((9.0, turn * 9.0)) / scale
+                path = canvas.path([np.array((rollout.ego[at, :2] - arm, rollout.ego[at, :2] + arm))])
+                for colour, width in (("ground", 7.0), ("mark", 3.5)):
+                    canvas.draw(path, colour, width)
+
+
+def _scale_bar(canvas: Canvas, scale: float) -> None:
+    length = next(nice for nice in (5, 10, 20, 50, 100) if nice * scale >= 45 or nice == 100)
+    base = canvas.height - 12
+    canvas.bar(6, base - 22, length * scale + 12, 28, "ground")
+    canvas.bar(12, base, length * scale, 2, "ink")
+    for x in (12.0, 10 + length * scale):
+        canvas.bar(x, base - 6, 2, 8, "ink")
+    canvas.text(18, base - 5, f"{length} m", 12)

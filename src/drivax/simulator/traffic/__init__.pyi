@@ -1,10 +1,10 @@
 from .bank_data import PreparedBank as PreparedBank
 from .bank_data import TrafficData as TrafficData
 from .bank_data import prepare_bank as prepare_bank
-from .catalogue import TRAFFIC as TRAFFIC
-from .catalogue import make_traffic as make_traffic
 from .log import LogTraffic as LogTraffic
 from .override import OverrideTraffic as OverrideTraffic
 from .override import motions_of_actions as motions_of_actions
 from .override import with_override as with_override
+from .reactive import TRAFFIC as TRAFFIC
 from .reactive import IdmTraffic as IdmTraffic
+from .reactive import make_traffic as make_traffic

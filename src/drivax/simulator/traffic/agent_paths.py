@@ -15,12 +15,11 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.boxes import overlap
 from drivax.geometry.polylines import Polylines, arc_lengths, point_to_segment
 from drivax.geometry.vectors import wrap
-from drivax.scenario.bank.columns import AgentColumn, LaneRow, SizeColumn
+from drivax.scenario.bank.columns import AgentColumn, LaneRow, LightRow, SizeColumn
 from drivax.scenario.bank.queries import LANE_CUTOFF_M, LEVEL_M
-from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
+from drivax.scenario.bank.scenario_bank import NEVER_M, WORD, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import AgentKind, Flag
-from drivax.simulator.traffic.agent_lights import light_arcs
 from drivax.simulator.traffic.bank_data import TrafficData, find_data, with_data
 
 #: Points of a path, equally far apart along it.
@@ -42,44 +41,41 @@ _BACKWARDS_M = 1.5
 CURVE_MPS2, CURVE_BRAKING_MPS2 = 2.5, 1.5
 #: Half the stretch over which a curvature is measured: at least this many metres, and this many seconds at peak speed.
 _CURVE_M, _CURVE_S = 2.5, 0.25
+#: Stop lines of a path that are kept, the first ones.
+STOPS = 4
+#: Stop lines that a path crosses this close to each other are one place to stop, m.
+_ONE_PLACE_M = 3.0
+#: Of the lights at one place that one counts whose lane ends closest to the path's heading this far beyond, m.
+_EVALUATED_AFTER_M = 20.0
+#: A line counts for paths that cross it within this angle of its lane's heading.
+_ASKEW_COS = 0.5
 Numbers = np.ndarray[Any, Any]
-_Tables = tuple[Numbers, ...]
 
 
 @record
 class AgentPaths(TrafficData):
-    """Paths of the R agents of a scenario that may react; rows without an agent have slot -1.
+    """Paths of the R agents of a scenario that may react; rows without an agent have slot -1."""
 
-    Attributes:
-        slot: Agent slot of each path.
-        points: x, y, cos, sin, evenly spaced.
-        profile: Height of the box centre, and speed limit from peak and curves (m/s), at the same points.
-        spacing: Arc length between two points, m.
-        log_arc: Arc length of the logged agent at each step, m; never decreases, holds while unobserved.
-        log_speed: Logged speed at each step, not negative, m/s.
-        appears: First step at or after each step at which the log has the agent; T for none.
-        stop_arc: Arc lengths of the stop lines that the path crosses, m; very large for none.
-        stop_light: Slot of the light of each of them.
-        overlaps: Up to two slots whose boxes the agent overlaps in the log, -1 for none.
-        kinds: Agent classes with paths.
-    """
-
-    slot: Int[Array, "N R"]
-    points: Float[Array, "N R M 4"]
+    slot: Int[Array, "N R"]  # Agent slot of each path
+    points: Float[Array, "N R M 4"]  # x, y, cos, sin, evenly spaced
+    # Height of the box centre, and speed limit from peak and curves (m/s), at the same points
     profile: Float[Array, "N R M 2"]
-    spacing: Float[Array, "N R"]
+    spacing: Float[Array, "N R"]  # Arc length between two points, m
+    # Arc length of the logged agent at each step, m; never decreases, holds while unobserved
     log_arc: Float[Array, "N T R"]
-    log_speed: Float[Array, "N T R"]
+    log_speed: Float[Array, "N T R"]  # Logged speed at each step, not negative, m/s
+    # First step at or after each step at which the log has the agent; T for none
     appears: Int[Array, "N T R"]
+    # Arc lengths of the stop lines that the path crosses, m; very large for none
     stop_arc: Float[Array, "N R 4"]
-    stop_light: Int[Array, "N R 4"]
-    overlaps: Int[Array, "N T R 2"]
-    kinds: tuple[int, ...] = static()
+    stop_light: Int[Array, "N R 4"]  # Slot of the light of each of them
+    overlaps: Int[Array, "N T R 2"]  # Up to two slots whose boxes the agent overlaps in the log, -1 for none
+    kinds: tuple[int, ...] = static()  # Agent classes with paths
 
 
 @dataclass(frozen=True)
 class _Logs:
-    """Logs of V agents, flattened over the scenarios of a bank: where each belongs, and its motion."""
+    """Logs of V agents, flattened over the scenarios of a bank."""
 
     scenario: Int[np.ndarray, " V"]
     slot: Int[np.ndarray, " V"]
@@ -94,14 +90,6 @@ class _Logs:
         return _Logs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
-@dataclass(frozen=True)
-class _Courses:
-    """The lines of V agents and where their logs are on them."""
-
-    lines: Polylines  # x, y, z, heading (unwrapped)
-    log_arc: Float[np.ndarray, "V T"]
-
-
 def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHICLE),)) -> ScenarioBank:
     """Return the bank with paths of all agents of ``kinds`` that drive forward more than 2 m in their log.
 
@@ -113,7 +101,7 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     if known is not None and known.kinds == kinds:
         return bank
     logs = _candidates(bank, kinds)
-    courses = _courses(bank, logs)
+    lines, log_arc = _lines(bank, logs)
     count = np.bincount(logs.scenario, minlength=len(bank))
     # A bank that keeps its padding shares programs with others of its capacity.
     rows = max(2, -(-int(count.max(initial=0)) // 2) * 2) if bank.trimmed else bank.agents.shape[2]
@@ -125,49 +113,43 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
         result[at] = values
         return jnp.asarray(result)
 
-    points, profile, spacing = _sampled(courses.lines, _peak(logs))
-    at_points = np.concatenate([points, profile], axis=-1)
-    stop_arc, stop_light = light_arcs(bank, logs.scenario, at_points, spacing)
-    return with_data(
-        bank,
-        AgentPaths(
-            slot=placed(logs.slot, -1, np.int16),
-            points=placed(points, 0.0, np.float32),
-            profile=placed(profile, 0.0, np.float32),
-            spacing=placed(spacing, 1.0, np.float32),
-            log_arc=jnp.swapaxes(placed(courses.log_arc, 0.0, np.float32), 1, 2),
-            log_speed=jnp.swapaxes(placed(np.maximum(logs.speed, 0.0), 0.0, np.float32), 1, 2),
-            appears=jnp.swapaxes(placed(_appears(logs.valid), bank.steps, np.int16), 1, 2),
-            stop_arc=placed(stop_arc, 1e6, np.float32),
-            stop_light=placed(stop_light, 0, np.int16),
-            overlaps=jnp.asarray(_logged_overlaps(bank, logs, row, rows)),
-            kinds=kinds,
-        ),
+    points, profile, spacing = _sampled(
+        lines, np.max(np.where(logs.valid, logs.speed, 0.0), axis=1, initial=0.0)
     )
+    at_points = np.concatenate([points, profile], axis=-1)
+    stop_arc, stop_light = _light_arcs(bank, logs.scenario, at_points, spacing)
+    paths = AgentPaths(
+        slot=placed(logs.slot, -1, np.int16),
+        points=placed(points, 0.0, np.float32),
+        profile=placed(profile, 0.0, np.float32),
+        spacing=placed(spacing, 1.0, np.float32),
+        log_arc=jnp.swapaxes(placed(log_arc, 0.0, np.float32), 1, 2),
+        log_speed=jnp.swapaxes(placed(np.maximum(logs.speed, 0.0), 0.0, np.float32), 1, 2),
+        appears=jnp.swapaxes(placed(_next_step(logs.valid), bank.steps, np.int16), 1, 2),
+        stop_arc=placed(stop_arc, 1e6, np.float32),
+        stop_light=placed(stop_light, 0, np.int16),
+        overlaps=jnp.asarray(_logged_overlaps(bank, logs, row, rows)),
+        kinds=kinds,
+    )
+    return with_data(bank, paths)
 
 
 def _candidates(bank: ScenarioBank, kinds: tuple[int, ...]) -> _Logs:
-    """Logs of the agents that may react: of these kinds, moving more than 2 m, never backwards."""
-    agents, kind = (
-        np.asarray(bank.agents, np.float64),
-        np.asarray(bank.agent_box[:, : bank.agents.shape[2], SizeColumn.KIND]),
-    )
+    """Return the logs of the agents that may react: of these kinds, moving more than 2 m, never backwards."""
+    agents = np.asarray(bank.agents, np.float64)
+    kind = np.asarray(bank.agent_box[:, : bank.agents.shape[2], SizeColumn.KIND])
     valid = agents[..., AgentColumn.VALID] > 0
     there = np.argwhere(np.isin(kind, kinds) & valid.any(axis=1))
     scenario, slot = there[:, 0], there[:, 1]
     rows = agents[scenario, :, slot]
     heading = np.arctan2(rows[..., AgentColumn.SIN], rows[..., AgentColumn.COS])
-    along = (
-        rows[..., AgentColumn.VX] * rows[..., AgentColumn.COS]
-        + rows[..., AgentColumn.VY] * rows[..., AgentColumn.SIN]
-    )
-    seen = valid[scenario, :, slot]
+    along = rows[..., AgentColumn.VX] * rows[..., AgentColumn.COS]
+    along += rows[..., AgentColumn.VY] * rows[..., AgentColumn.SIN]
+    xy, z, seen = rows[..., AgentColumn.XY], rows[..., AgentColumn.Z], valid[scenario, :, slot]
     extension = np.asarray(bank.extension, np.float64)[scenario, slot]
-    logs = _Logs(
-        scenario, slot, rows[..., AgentColumn.XY], rows[..., AgentColumn.Z], heading, along, seen, extension
-    )
+    logs = _Logs(scenario, slot, xy, z, heading, along, seen, extension)
     key = _keys(logs.xy, logs.valid)
-    last, _ = _neighbours(key)
+    last = _last_key(key)
     xy, turned = (np.take_along_axis(x, last[..., None], 1) for x in (logs.xy, logs.heading[..., None]))
     step = np.diff(xy, axis=1) * key[:, 1:, None] * (np.cumsum(key, axis=1)[:, 1:, None] > 1)
     moved = np.hypot(step[..., 0], step[..., 1])
@@ -178,7 +160,7 @@ def _candidates(bank: ScenarioBank, kinds: tuple[int, ...]) -> _Logs:
 
 
 def _keys(xy: Float[np.ndarray, "V T 2"], valid: Bool[np.ndarray, "V T"]) -> Bool[np.ndarray, "V T"]:
-    """Which steps shape a path: the first valid one, and each that is a metre away from the one before."""
+    """Mask of the steps that shape a path: the first valid one, and each that is a metre away from the one before."""
     key, last = np.zeros_like(valid), np.full_like(xy[:, 0], np.inf)
     for step in range(valid.shape[1]):
         away = xy[:, step] - last
@@ -187,24 +169,27 @@ def _keys(xy: Float[np.ndarray, "V T 2"], valid: Bool[np.ndarray, "V T"]) -> Boo
     return key
 
 
-def _neighbours(key: Bool[np.ndarray, "V T"]) -> tuple[Int[np.ndarray, "V T"], Int[np.ndarray, "V T"]]:
-    """The last key step at or before each step (the first one before it), and the first at or after (T for none)."""
-    steps = key.shape[1]
-    at = np.arange(steps)
-    last = np.maximum.accumulate(np.where(key, at, -1), axis=1)
-    following = np.minimum.accumulate(np.where(key, at, steps)[:, ::-1], axis=1)[:, ::-1]
-    return np.where(last < 0, np.argmax(key, axis=1)[:, None], last), following
+def _last_key(key: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
+    """Return the last key step at or before each step; the first one where there is none."""
+    last = np.maximum.accumulate(np.where(key, np.arange(key.shape[1]), -1), axis=1)
+    return np.where(last < 0, np.argmax(key, axis=1)[:, None], last)
 
 
-def _courses(bank: ScenarioBank, logs: _Logs) -> _Courses:
-    """The line of every agent, logged and extended, and where its log is on it."""
+def _next_step(valid: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
+    """Return the first valid step at or after each step; T where there is none."""
+    steps = valid.shape[1]
+    at = np.where(valid, np.arange(steps), steps)
+    return np.minimum.accumulate(at[:, ::-1], axis=1)[:, ::-1]
+
+
+def _lines(bank: ScenarioBank, logs: _Logs) -> tuple[Polylines, Float[np.ndarray, "V T"]]:
+    """Return the line of every agent (x, y, z, unwrapped heading), and the arc length of its log at each step."""
     count, steps = logs.valid.shape
     key = _keys(logs.xy, logs.valid)
-    last, following = _neighbours(key)
     rows = np.arange(count)
     end = steps - 1 - np.argmax(logs.valid[:, ::-1], axis=1)
     final, final_heading = logs.xy[rows, end], logs.heading[rows, end]
-    ahead = final - logs.xy[rows, last[:, -1]]
+    ahead = final - logs.xy[rows, _last_key(key)[:, -1]]
     # The last pose shapes the path too, unless a standing car's jitter put it behind.
     onward = ahead[:, 0] * np.cos(final_heading) + ahead[:, 1] * np.sin(final_heading) > 0.2
     points = max(1, min(int(EXTENSION_M / _EXTENSION_STEP_M), logs.extension.shape[1]))
@@ -212,23 +197,20 @@ def _courses(bank: ScenarioBank, logs: _Logs) -> _Courses:
     line = np.concatenate([logs.xy, final[:, None], beyond], axis=1)
     tangent = np.diff(np.concatenate([final[:, None], beyond, beyond[:, -1:]], axis=1), axis=1)
     tangent = tangent[:, :-1] + tangent[:, 1:]
-    heading = np.concatenate(
-        [logs.heading, final_heading[:, None], np.arctan2(tangent[..., 1], tangent[..., 0])], axis=1
-    )
+    turned = np.arctan2(tangent[..., 1], tangent[..., 0])
+    heading = np.concatenate([logs.heading, final_heading[:, None], turned], axis=1)
     height = np.concatenate([logs.z, logs.z[rows, end][:, None], _heights(bank, logs, beyond, end)], axis=1)
     shapes = np.concatenate([key, onward[:, None], np.ones((count, points), bool)], axis=1)
     flat = np.concatenate([line, height[..., None], heading[..., None]], axis=-1)[shapes]
-    # Turns over the whole row of agents: each is continuous, whatever it starts at.
+    # Unwrapped over all agents at once: each line is continuous, whatever heading it starts with.
     flat[:, 3] = np.unwrap(flat[:, 3]) if len(flat) else flat[:, 3]
     start = np.concatenate(([0], np.cumsum(shapes.sum(1))))
     lines = Polylines(flat, start, arc_lengths(flat, start))
-    return _Courses(lines, _log_arcs(logs, lines, key, last, following))
+    return lines, _log_arcs(logs, lines, key)
 
 
-def _log_arcs(
-    logs: _Logs, lines: Polylines, key: Numbers, last: Numbers, following: Numbers
-) -> Float[np.ndarray, "V T"]:
-    """Arc length of every logged step: between two shaping points by how far it has come towards the next."""
+def _log_arcs(logs: _Logs, lines: Polylines, key: Numbers) -> Float[np.ndarray, "V T"]:
+    """Return the arc length of every logged step; between two shaping points by its projection on their chord."""
     place = lines.start[:-1, None] + np.cumsum(key, axis=1) - 1
     place = np.maximum(place, lines.start[:-1, None])
     begin, then = lines.points[place], lines.points[np.minimum(place + 1, len(lines.points) - 1)]
@@ -240,7 +222,7 @@ def _log_arcs(
 
 
 def _heights(bank: ScenarioBank, logs: _Logs, beyond: Numbers, end: Numbers) -> Float[np.ndarray, "V X"]:
-    """Heights of the box centre beyond the log: of the lanes below, on one level with the point before."""
+    """Return heights of the box centre beyond the log, from the lanes below on the level of the point before."""
     flags, lanes = np.asarray(bank.flags), np.asarray(bank.lanes)
     half = np.asarray(bank.agent_box[:, :, SizeColumn.HEIGHT])[logs.scenario, logs.slot] / 2
     height = np.repeat(logs.z[np.arange(len(end)), end][:, None], beyond.shape[1], axis=1)
@@ -256,7 +238,7 @@ def _heights(bank: ScenarioBank, logs: _Logs, beyond: Numbers, end: Numbers) -> 
 
 
 def _ground(segments: Numbers, xy: Numbers, ground: Numbers) -> Float[np.ndarray, " V"]:
-    """Height of the nearest lane within 4 m of each point, on the level of ``ground``; that itself where none is."""
+    """Return the height of the nearest lane within 4 m of each point on the level of ``ground``, or ``ground``."""
     low, high = xy.min(axis=0) - LANE_CUTOFF_M, xy.max(axis=0) + LANE_CUTOFF_M
     middle = (segments[0:2] + segments[2:4]) / 2
     # Segments are at most 4 m long.
@@ -269,14 +251,10 @@ def _ground(segments: Numbers, xy: Numbers, ground: Numbers) -> Float[np.ndarray
     return np.where(far.min(axis=1) <= LANE_CUTOFF_M, z[far.argmin(axis=1)], ground)
 
 
-def _peak(logs: _Logs) -> Float[np.ndarray, " V"]:
-    return np.max(np.where(logs.valid, logs.speed, 0.0), axis=1, initial=0.0)
-
-
 def _sampled(
     lines: Polylines, peak: Numbers
 ) -> tuple[Float[np.ndarray, "V M 4"], Float[np.ndarray, "V M 2"], Float[np.ndarray, " V"]]:
-    """Paths at equally distant points, their heights and the speed that they allow, and the points' distance."""
+    """Return evenly spaced points of paths, their heights and speed limits, and the spacing."""
     row, spacing = np.arange(lines.count)[:, None], lines.length / (PATH_POINTS - 1)
     arc = spacing[:, None] * np.arange(PATH_POINTS)
     if not lines.count:
@@ -296,19 +274,13 @@ def _sampled(
     return placed, np.stack([points[..., 2], speed], axis=-1), spacing
 
 
-def _appears(valid: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
-    steps = valid.shape[1]
-    at = np.where(valid, np.arange(steps), steps)
-    return np.minimum.accumulate(at[:, ::-1], axis=1)[:, ::-1]
-
-
 def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -> Numbers:
-    """Frame slots whose box each agent's own overlaps in the log, step by step; the first two, -1 for none."""
+    """Return the first two frame slots that each agent overlaps at each step of the log, -1 for none."""
     overlaps = np.full((len(bank), bank.steps, rows, OVERLAPS), -1, np.int16)
-    tables = tuple(np.asarray(part) for part in (bank.agents, bank.agent_box, bank.parked, bank.parked_when))
+    tables = [np.asarray(table) for table in (bank.agents, bank.agent_box, bank.parked, bank.parked_when)]
     for scenario in np.unique(logs.scenario):
         mine = np.flatnonzero(logs.scenario == scenario)
-        boxes, z, valid = _logged_boxes(tables, int(scenario))
+        boxes, z, valid = _logged_boxes(*(table[scenario] for table in tables))
         own, slots = boxes[:, logs.slot[mine]], logs.slot[mine]
         reach = np.hypot(boxes[0, :, 4], boxes[0, :, 5]) / 2
         dx, dy = (own[:, :, None, i] - boxes[:, None, :, i] for i in (0, 1))
@@ -317,18 +289,18 @@ def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -
         near &= np.abs(z[:, slots][..., None] - z[:, None]) <= LEVEL_M
         step, agent, other = np.nonzero(near)
         meets = overlap(own[step, agent], boxes[step, other])
-        counted: dict[tuple[int, int], int] = {}
-        for t, a, o in zip(step[meets].tolist(), agent[meets].tolist(), other[meets].tolist(), strict=True):
-            place = counted.get((t, a), 0)
-            counted[t, a] = place + 1
-            if place < OVERLAPS:
-                overlaps[scenario, t, row[mine[a]], place] = o
+        step, agent, other = step[meets], agent[meets], other[meets]
+        pair = step * len(mine) + agent
+        place = np.arange(len(pair)) - np.searchsorted(pair, pair)
+        kept = place < OVERLAPS
+        overlaps[scenario, step[kept], row[mine[agent[kept]]], place[kept]] = other[kept]
     return overlaps
 
 
-def _logged_boxes(tables: _Tables, scenario: int) -> tuple[Numbers, Numbers, Numbers]:
-    """Boxes, heights and validity of all slots of a frame, at every logged step."""
-    agents, box, parked, when = (table[scenario] for table in tables)
+def _logged_boxes(
+    agents: Numbers, box: Numbers, parked: Numbers, when: Numbers
+) -> tuple[Numbers, Numbers, Numbers]:
+    """Return boxes, heights and validity of all slots of a scenario's frames, at every logged step."""
     step = np.arange(len(agents))
     there = (when[step // WORD] >> (step % WORD).astype(np.uint32)[:, None]) & 1 > 0
     rows = np.pad(agents, ((0, 0), (0, len(box) - agents.shape[1]), (0, 0)))
@@ -336,3 +308,58 @@ def _logged_boxes(tables: _Tables, scenario: int) -> tuple[Numbers, Numbers, Num
     size = np.broadcast_to(box[None, :, SizeColumn.FOOTPRINT], (len(rows), len(box), 2))
     boxes = np.concatenate([rows[..., AgentColumn.XY], rows[..., AgentColumn.HEADING], size], axis=-1)
     return boxes, rows[..., AgentColumn.Z], rows[..., AgentColumn.VALID] > 0
+
+
+def _light_arcs(
+    bank: ScenarioBank, scenario: Int[np.ndarray, " V"], points: Float[np.ndarray, "V M 6"],
+    spacing: Float[np.ndarray, " V"],
+) -> tuple[Float[np.ndarray, "V 4"], Int[np.ndarray, "V 4"]]:  # fmt: skip
+    """Return arc lengths of the first four stop lines that paths (points, profile) cross forwards, and their lights."""
+    arcs = np.full((len(scenario), STOPS), NEVER_M)
+    lights = np.zeros((len(scenario), STOPS), np.int64)
+    line, state = np.asarray(bank.light_line, np.float64), np.asarray(bank.light_state)
+    exits = np.arctan2(line[:, LightRow.EXIT_SIN], line[:, LightRow.EXIT_COS])
+    for row in np.unique(scenario):
+        seen = np.flatnonzero((state[row] >= 0).any(axis=0))
+        mine = np.flatnonzero(scenario == row)
+        if not len(seen):
+            continue
+        crossed = _crossings(line[row][:, seen], points[mine], spacing[mine])
+        for path, arc in zip(mine, crossed, strict=True):
+            heading = np.arctan2(points[path, :, 3], points[path, :, 2])
+            stops = _stops(arc, heading, spacing[path], exits[row, seen])
+            for number, (where, light) in enumerate(stops[:STOPS]):
+                arcs[path, number], lights[path, number] = where, seen[light]
+    return arcs, lights
+
+
+def _crossings(line: Numbers, points: Numbers, spacing: Numbers) -> Float[np.ndarray, "V L"]:
+    """Return the arc length at which each path first crosses each stop line forwards; infinite where it does not."""
+    cos, sin = line[LightRow.COS], line[LightRow.SIN]
+    dx, dy = (points[:, :, None, i] - line[at] for i, at in ((0, LightRow.X), (1, LightRow.Y)))
+    ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+    before, after = ahead[:, :-1], ahead[:, 1:]
+    share = -before / np.where(after > before, after - before, 1.0)
+    through = np.abs(left[:, :-1] + share * np.diff(left, axis=1)) <= line[LightRow.HALF]
+    facing = points[:, :-1, None, 2] * cos + points[:, :-1, None, 3] * sin > _ASKEW_COS
+    level = np.abs(points[:, :-1, None, 4] - line[LightRow.Z]) <= LEVEL_M
+    crosses = (before < 0.0) & (after >= 0.0) & through & facing & level
+    first = np.argmax(crosses, axis=1)
+    arc = (first + np.take_along_axis(share, first[:, None], axis=1)[:, 0]) * spacing[:, None]
+    return np.where(crosses.any(axis=1), arc, np.inf)
+
+
+def _stops(arc: Numbers, heading: Numbers, spacing: float, exits: Numbers) -> list[tuple[float, int]]:
+    """Return the places to stop in order: arc length, and the light that counts there."""
+    groups: list[list[int]] = []
+    for light in (int(light) for light in np.argsort(arc) if np.isfinite(arc[light])):
+        if groups and arc[light] - arc[groups[-1][0]] <= _ONE_PLACE_M:
+            groups[-1].append(light)
+        else:
+            groups.append([light])
+    stops = []
+    for group in groups:
+        later = min(round((arc[group[0]] + _EVALUATED_AFTER_M) / spacing), len(heading) - 1)
+        light = min(group, key=lambda light: abs(float(wrap(exits[light] - heading[later]))))
+        stops.append((float(arc[light]), light))
+    return stops

@@ -44,40 +44,25 @@ _SLOT_BITS, _PIECE_BITS = 10, 4
 
 @record
 class Movers:
-    """R vehicles on their paths.
+    """R vehicles on their paths."""
 
-    Attributes:
-        box: x, y, cos, sin, length, width.
-        z: Height of the box centre, m.
-        arc: Arc length along the path, m.
-        speed: m/s.
-        slot: Slot of the frame.
-        ignored: Slots of ignored agents, -1 for none.
-    """
-
-    box: Float[Array, "R 6"]
-    z: Float[Array, " R"]
-    arc: Float[Array, " R"]
-    speed: Float[Array, " R"]
-    slot: Int[Array, " R"]
-    ignored: Int[Array, "R 2"]
+    box: Float[Array, "R 6"]  # x, y, cos, sin, length, width
+    z: Float[Array, " R"]  # Height of the box centre, m
+    arc: Float[Array, " R"]  # Arc length along the path, m
+    speed: Float[Array, " R"]  # m/s
+    slot: Int[Array, " R"]  # Slot of the frame
+    ignored: Int[Array, "R 2"]  # Slots of ignored agents, -1 for none
 
 
 @record
 class Leaders:
-    """What is ahead of R vehicles.
+    """What is ahead of R vehicles."""
 
-    Attributes:
-        gap: Free path to the nearest agent in the corridor, bumper to bumper, m; 10 km if free.
-        speed: Speed of that agent along the path, m/s.
-        things: Slots of the closest agents around the corridor.
-        real: Mask of valid ``things``.
-    """
-
+    # Free path to the nearest agent in the corridor, bumper to bumper, m; 10 km if free
     gap: Float[Array, " R"]
-    speed: Float[Array, " R"]
-    things: Int[Array, "R C"]
-    real: Bool[Array, "R C"]
+    speed: Float[Array, " R"]  # Speed of that agent along the path, m/s
+    things: Int[Array, "R C"]  # Slots of the closest agents around the corridor
+    real: Bool[Array, "R C"]  # Mask of valid ``things``
 
 
 def path_poses(
@@ -161,12 +146,9 @@ def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any
 
 
 def _bulge(part: Any, way: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
-    """Offset of the path to the left of a straight piece, relative to its length: cubic with both tangents.
+    """Return the offset of the path to the left of a straight piece, relative to its length: cubic with both tangents.
 
-    Args:
-        part: Relative position on the piece.
-        way: Direction of the piece: cosine, sine.
-        tangents: Directions of the path at start and end: cosine, sine, cosine, sine.
+    ``part`` is the relative position on the piece, ``way`` its direction; ``tangents`` are those at start and end.
     """
     (ux, uy), slopes = way, []
     for cos, sin in (tangents[:2], tangents[2:]):
@@ -236,15 +218,10 @@ def reaching(
     box: Float[Array, "6 S"], nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any,
     rectangles: int,
 ) -> Bool[Array, "R S"]:  # fmt: skip
-    """Mask of boxes that reach into a rectangle along the chords of K points on a path.
+    """Mask of boxes (:func:`columns`) that reach into one of the rectangles along the chords of K points on a path.
 
-    Args:
-        box: Boxes, as :func:`columns`.
-        nodes: Points on the path.
-        half: Half the width of the corridor, m.
-        behind: Extension of the first rectangle backwards, m.
-        beyond: Extension of the last rectangle forwards, m.
-        rectangles: Number of rectangles; divides K - 1.
+    The corridor is ``half`` wide (m) on either side; the first rectangle extends ``behind``, the last ``beyond`` (m).
+    The number of rectangles divides K - 1.
     """
     around = _rectangles(nodes, half, behind, beyond, rectangles)
     deep, wide = box[LENGTH] / 2, box[WIDTH] / 2
@@ -255,16 +232,15 @@ def reaching(
         turn_sin = jnp.abs(box[SIN] * cos - box[COS] * sin)
         ahead = jnp.abs(box[X] * cos + (box[Y] * sin - (x * cos + y * sin)))
         left = jnp.abs(box[Y] * cos - (box[X] * sin + (y * cos - x * sin)))
-        reached |= (ahead < length + turn_cos * deep + turn_sin * wide) & (
-            left < width + turn_sin * deep + turn_cos * wide
-        )
+        inside = ahead < length + turn_cos * deep + turn_sin * wide
+        reached |= inside & (left < width + turn_sin * deep + turn_cos * wide)
     return reached
 
 
 def _rectangles(
     nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any, count: int
 ) -> tuple[Float[Array, "R Q"], ...]:
-    """Rectangles around stretches of paths: x, y, cosine, sine, half the length, half the width."""
+    """Return rectangles around stretches of paths: x, y, cosine, sine, half the length, half the width."""
     long = (nodes.shape[1] - 1) // count
     # All points but the last, by stretches; the end of each is (chord, 0) in its own frame.
     x, y = (nodes[:, :-1, axis].reshape(len(nodes), count, long) for axis in (X, Y))

@@ -1,4 +1,4 @@
-"""Agents that follow given motions (``override``): given trajectories, or given actions."""
+"""Traffic in which some agents follow given trajectories or actions (``override``)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_bank, with_data
-from drivax.simulator.traffic.log import LogTraffic, logged_history
+from drivax.simulator.traffic.log import LogTraffic, agent_rows, logged_history
 from drivax.simulator.types import AgentContext, Traffic
 
 #: Next motion for a motion, an action and a length in metres, such as ``Task.motion``.
@@ -25,19 +25,12 @@ Move = Callable[[Float[Array, " 4"], Float[Array, " D"], Any], Float[Array, " 4"
 
 @record
 class OverrideMotions(TrafficData):
-    """Motions of K agents of every scenario.
+    """Motions of K agents of every scenario."""
 
-    Attributes:
-        slot: Their slots, -1 for none.
-        motion: x, y, heading, speed.
-        z: Height of the box centre, m.
-        valid: Whether they are there.
-    """
-
-    slot: Int[Array, "N K"]
-    motion: Float[Array, "N T K 4"]
-    z: Float[Array, "N T K"]
-    valid: Bool[Array, "N T K"]
+    slot: Int[Array, "N K"]  # Their slots, -1 for none
+    motion: Float[Array, "N T K 4"]  # x, y, heading, speed
+    z: Float[Array, "N T K"]  # Height of the box centre, m
+    valid: Bool[Array, "N T K"]  # Whether they are there
 
 
 @dataclass(frozen=True)
@@ -51,54 +44,43 @@ class OverrideTraffic:
 
     @property
     def name(self) -> str:
-        """As printed in tables: ``override``, or ``override+idm``."""
+        """``override``, or ``override+idm``."""
         return "override" if self.base.name == "log" else f"override+{self.base.name}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """The bank with what ``base`` needs."""
+        """Return the bank with the data of ``base``."""
         return prepare_bank(self.base, bank)
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
-        """State of ``base``; the bank says the rest.
+        """Return the state of ``base``.
 
         Raises:
-            UsageError: If nothing is given in the bank.
+            UsageError: The bank has no motions.
         """
         data_of(bank, OverrideMotions, "use override.with_override")
         return self.base.start(bank, index, step)
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Any) -> Any:
-        """State of ``base`` one step later."""
+        """Return the state of ``base`` one step later."""
         return self.base.advance(bank, context, frame)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
-        """Rows of ``base``, with those of the overridden agents as given."""
+        """Return the rows of ``base`` with the overridden agents as given."""
         rows, given = self.base.agents(bank, context, back), data_of(bank, OverrideMotions)
         step = jnp.clip(context.step - back, 0, bank.steps - 1)
-        motion, valid = given.motion[context.index, step], given.valid[context.index, step]
-        cos, sin = jnp.cos(motion[:, 2]), jnp.sin(motion[:, 2])
-        parts = [motion[:, 0], motion[:, 1], given.z[context.index, step], cos, sin]
-        parts += [motion[:, 3] * cos, motion[:, 3] * sin, valid.astype(cos.dtype)]
-        slot = given.slot[context.index]
-        slot = jnp.where(slot >= 0, slot, rows.shape[0])
-        return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
+        at, slot = (context.index, step), given.slot[context.index]
+        overridden = agent_rows(given.motion[at], given.z[at], given.valid[at].astype(jnp.float32))
+        return rows.at[jnp.where(slot >= 0, slot, rows.shape[0])].set(overridden, mode="drop")
 
 
 def with_override(
-    bank: ScenarioBank,
-    slots: Int[Array, "N K"],
-    motion: Float[Array, "N T K 4"],
+    bank: ScenarioBank, slots: Int[Array, "N K"], motion: Float[Array, "N T K 4"],
     valid: Bool[Array, "N T K"] | None = None,
-) -> ScenarioBank:
-    """The bank with given trajectories; heights are those of the nearest lane, from the logged one on.
+) -> ScenarioBank:  # fmt: skip
+    """Return the bank with given trajectories; their heights follow the nearest lane, from the first logged one on.
 
-    Differentiable with respect to ``motion``.
-
-    Args:
-        bank: The scenarios.
-        slots: Moving agents of each scenario, -1 for none.
-        motion: x, y (m), heading (rad), speed (m/s) at every step of the log.
-        valid: Whether they are there; always by default.
+    Differentiable with respect to ``motion``: x, y (m), heading (rad), speed (m/s) at every step of the log, with the
+    mask ``valid`` (by default all). ``slots`` are moving agents of each scenario, -1 for none.
     """
     valid = jnp.ones(motion.shape[:3], bool) if valid is None else valid
     slots = jnp.asarray(slots, jnp.int32)
@@ -121,23 +103,15 @@ def with_override(
 
 
 def motions_of_actions(
-    bank: ScenarioBank,
-    slots: Int[Array, "N K"],
-    actions: Float[Array, "N steps K D"],
-    move: Move,
+    bank: ScenarioBank, slots: Int[Array, "N K"], actions: Float[Array, "N steps K D"], move: Move,
     begin: int = CURRENT_STEP,
-) -> Float[Array, "N T K 4"]:
-    """Trajectories of agents that carry out given actions from step ``begin`` on; as logged until then.
+) -> Float[Array, "N T K 4"]:  # fmt: skip
+    """Return the trajectories of agents that follow the log until step ``begin`` and then execute given actions.
 
-    Differentiable with respect to ``actions``. Agents that were not seen at step ``begin`` begin where they were seen
-    last, or first.
-
-    Args:
-        bank: The scenarios.
-        slots: Moving agents of each scenario, -1 for none.
-        actions: One per step from ``begin`` on; after the last one it is repeated.
-        move: The dynamics under the action space, such as ``Task().motion``.
-        begin: Step of the log at which they take over, at most 15 steps of whose past are kept.
+    Differentiable with respect to ``actions``. An agent that the log lacks at ``begin`` starts where it was last seen,
+    or first. ``slots`` are moving agents of each scenario, -1 for none. There is one action per step; the last one is
+    repeated. ``move`` is the dynamics of the action space, such as ``Task().motion``. At most 15 steps before ``begin``
+    are as logged.
     """
     steps = bank.steps - 1 - begin
     desired = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)

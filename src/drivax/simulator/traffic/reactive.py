@@ -1,31 +1,30 @@
-"""Reactive traffic (``idm``): vehicles follow their own logged paths by the Intelligent Driver Model."""
+"""Reactive traffic (``idm``): vehicles follow their logged paths by the Intelligent Driver Model; traffic by name."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
-from drivax.scenario.bank.columns import AgentColumn, SizeColumn
+from drivax.plugins import find_named, is_dotted
+from drivax.scenario.bank.columns import SizeColumn
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
-from drivax.scenario.schema import DT_S, AgentKind, LightState
+from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.idm import IdmParameters, idm_acceleration
-from drivax.simulator.traffic.agent_paths import (
-    PATH_POINTS,
-    PROFILE_SPEED,
-    PROFILE_Z,
-    TRAVELS_M,
-    AgentPaths,
-    with_paths,
-)
+from drivax.simulator.lights import is_red, is_yellow
+from drivax.simulator.traffic import agent_paths
+from drivax.simulator.traffic.agent_paths import PROFILE_SPEED, PROFILE_Z, AgentPaths
 from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.corridor import FREE_M, Leaders, Movers, columns, leaders, path_poses
-from drivax.simulator.types import AgentContext, Frame
+from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.types import AgentContext, Frame, Traffic
 
 #: Steps of recent motion kept for observations; older frames repeat the oldest.
 PAST = 10
@@ -39,24 +38,15 @@ _STANDS_MPS = 0.5
 
 @record
 class Reactive:
-    """State of the R vehicles of a scenario that may react; the last of the 10 rows is now.
+    """State of the R vehicles of a scenario that may react; the last of the 10 rows is now."""
 
-    Attributes:
-        begin: First step of the episode; until then all agents moved as logged.
-        phase: Replays (0), waits to appear (1), drives (2), has left (3).
-        entry: Step at which the vehicle appears in the log.
-        arc: Arc length along the path, m.
-        speed: m/s.
-        there: Whether the vehicle is on the road.
-        ignored: Slots of agents overlapped on appearing, until they separate; -1 for none.
-    """
-
-    begin: Int[Array, "*batch"]
-    phase: Int[Array, "*batch R"]
-    entry: Int[Array, "*batch R"]
-    arc: Float[Array, "*batch 10 R"]
-    speed: Float[Array, "*batch 10 R"]
-    there: Bool[Array, "*batch 10 R"]
+    begin: Int[Array, "*batch"]  # First step of the episode; until then all agents moved as logged
+    phase: Int[Array, "*batch R"]  # Replays (0), waits to appear (1), drives (2), has left (3)
+    entry: Int[Array, "*batch R"]  # Step at which the vehicle appears in the log
+    arc: Float[Array, "*batch 10 R"]  # Arc length along the path, m
+    speed: Float[Array, "*batch 10 R"]  # m/s
+    there: Bool[Array, "*batch 10 R"]  # Whether the vehicle is on the road
+    # Slots of agents overlapped on appearing, until they separate; -1 for none
     ignored: Int[Array, "*batch R 2"]
 
 
@@ -76,7 +66,7 @@ class IdmTraffic:
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
         """Return the bank with the paths of reacting vehicles; unchanged if it has them."""
-        return with_paths(bank, tuple(kind for kind, _ in self.drivers))
+        return agent_paths.with_paths(bank, tuple(kind for kind, _ in self.drivers))
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Reactive:
         """Return the logged traffic state at ``step``.
@@ -90,21 +80,14 @@ class IdmTraffic:
         entry = paths.appears[index, step].astype(jnp.int32)
         at = jnp.minimum(entry, bank.steps - 1)
         row = jnp.arange(slot.shape[0])
-        travels = paths.log_arc[index, -1] - paths.log_arc[index, step] > TRAVELS_M
+        travels = paths.log_arc[index, -1] - paths.log_arc[index, step] > agent_paths.TRAVELS_M
         reacts = (slot >= 0) & travels & (entry < bank.steps) & (self._class(bank, index, slot) >= 0)
         now = reacts & (entry <= step)
-        arc = paths.log_arc[index, at, row]
-        speed = paths.log_speed[index, at, row]
-        phase = jnp.where(reacts, jnp.where(now, DRIVES, WAITS), REPLAYS)
-        return Reactive(
-            begin=step,
-            phase=phase.astype(jnp.int8),
-            entry=entry.astype(jnp.int16),
-            arc=jnp.broadcast_to(arc, (PAST, *arc.shape)),
-            speed=jnp.broadcast_to(speed, (PAST, *speed.shape)),
-            there=jnp.broadcast_to(now, (PAST, *now.shape)),
-            ignored=paths.overlaps[index, at, row],
-        )
+        arc, speed = paths.log_arc[index, at, row], paths.log_speed[index, at, row]
+        phase = jnp.where(reacts, jnp.where(now, DRIVES, WAITS), REPLAYS).astype(jnp.int8)
+        arc, speed, there = (jnp.broadcast_to(rows, (PAST, *rows.shape)) for rows in (arc, speed, now))
+        ignored = paths.overlaps[index, at, row]
+        return Reactive(step, phase, entry.astype(jnp.int16), arc, speed, there, ignored)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Return rows of the moving slots ``back`` steps ago (at most 9): reacting agents simulated, others logged."""
@@ -114,10 +97,8 @@ class IdmTraffic:
         at = PAST - 1 - min(back, PAST - 1)
         (here, profile), speed = path_poses(paths, context.index, now.arc[at]), now.speed[at, :, None]
         direction, there = here[:, 2:], now.there[at, :, None].astype(jnp.float32)
-        height = profile[:, PROFILE_Z : PROFILE_Z + 1]
-        driven = jnp.concatenate(
-            [here[:, AgentColumn.XY], height, direction, direction * speed, there], axis=-1
-        )
+        parts = [here[:, :2], profile[:, PROFILE_Z, None], direction, direction * speed, there]
+        driven = jnp.concatenate(parts, axis=-1)
         slot = paths.slot[context.index].astype(jnp.int32)
         reacts = (now.phase != REPLAYS) & (step > now.begin)
         return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(driven, mode="drop")
@@ -125,28 +106,25 @@ class IdmTraffic:
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Reactive:
         """Advance all vehicles by one step of 0.1 s from the present frame."""
         paths, now = data_of(bank, AgentPaths), context.traffic
-        slot = paths.slot[context.index].astype(jnp.int32)
+        slot, drives, waits = (
+            paths.slot[context.index].astype(jnp.int32),
+            now.phase == DRIVES,
+            now.phase == WAITS,
+        )
         movers, most = _movers(bank, context, slot)
-        movers, ignored = _without_parted(movers, frame, now.phase == WAITS)
+        movers, ignored = _without_parted(movers, frame, waits)
         ahead = leaders(paths, context.index, movers, frame)
         driver = self._parameters(bank, context.index, slot)
         acceleration = _acceleration(bank, context, movers, most, ahead, driver)
         arc, speed = _driven(movers.arc, movers.speed, acceleration)
-        drives, waits = now.phase == DRIVES, now.phase == WAITS
         enters = waits & _may_enter(context, movers, ahead, frame)
-        arrived = arc >= paths.spacing[context.index] * (PATH_POINTS - 1)
+        arrived = arc >= paths.spacing[context.index] * (agent_paths.PATH_POINTS - 1)
         phase = jnp.where(enters, DRIVES, jnp.where(drives & arrived, LEFT, now.phase))
         arc = jnp.where(drives, arc, movers.arc)
         speed = jnp.where(drives, speed, jnp.where(enters, _entry_speed(movers, ahead, driver), movers.speed))
-        return Reactive(
-            begin=now.begin,
-            phase=phase.astype(jnp.int8),
-            entry=now.entry,
-            arc=jnp.concatenate([now.arc[1:], arc[None]]),
-            speed=jnp.concatenate([now.speed[1:], speed[None]]),
-            there=jnp.concatenate([now.there[1:], (phase == DRIVES)[None]]),
-            ignored=ignored,
-        )
+        steps = ((now.arc, arc), (now.speed, speed), (now.there, phase == DRIVES))
+        arc, speed, there = (jnp.concatenate([rows[1:], row[None]]) for rows, row in steps)
+        return Reactive(now.begin, phase.astype(jnp.int8), now.entry, arc, speed, there, ignored)
 
     def _class(self, bank: ScenarioBank, index: Any, slot: Int[Array, " R"]) -> Int[Array, " R"]:
         """Index of the driver parameters of each vehicle; -1 for none."""
@@ -188,12 +166,12 @@ def _without_parted(
     level = jnp.abs(frame.z[other] - movers.z[:, None]) <= LEVEL_M
     together = overlap(movers.box[:, None], frame.box[other]) & frame.valid[other] & level
     kept = jnp.where((movers.ignored >= 0) & (together | waits[:, None]), movers.ignored, -1)
-    return Movers(movers.box, movers.z, movers.arc, movers.speed, movers.slot, kept), kept.astype(jnp.int16)
+    return replace(movers, ignored=kept), kept.astype(jnp.int16)
 
 
 def _acceleration(
-    bank: ScenarioBank, context: AgentContext, movers: Movers,
-    most: Float[Array, " R"], ahead: Leaders, driver: IdmParameters
+    bank: ScenarioBank, context: AgentContext, movers: Movers, most: Float[Array, " R"], ahead: Leaders,
+    driver: IdmParameters,
 ) -> Float[Array, " R"]:  # fmt: skip
     """IDM acceleration behind the leader, and before a red light as behind a standing car on the stop line."""
     stop = _stop_gap(bank, context, movers, driver)
@@ -213,14 +191,11 @@ def _stop_gap(
     light = paths.stop_light[context.index].astype(jnp.int32)
     state = bank.light_state[context.index, jnp.clip(context.step, 0, bank.steps - 1)][light]
     line = paths.stop_arc[context.index] - movers.arc[:, None]
-    front = line - movers.box[:, LENGTH : LENGTH + 1] / 2
+    front = line - movers.box[:, LENGTH, None] / 2
     square = (movers.speed * movers.speed)[:, None]
-    hard, soft = (
-        jnp.reshape(driver.max_braking_mps2, (-1, 1)),
-        jnp.reshape(driver.comfortable_braking_mps2, (-1, 1)),
-    )
-    red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
-    yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
+    hard = jnp.reshape(driver.max_braking_mps2, (-1, 1))
+    soft = jnp.reshape(driver.comfortable_braking_mps2, (-1, 1))
+    red, yellow = is_red(state), is_yellow(state)
     over = (front <= 0.0) & (line > 0.0) & (movers.speed < _STANDS_MPS)[:, None]
     can = (front > 0.0) & ((red & (square <= 2 * hard * front)) | (yellow & (square <= 2 * soft * front)))
     return jnp.min(jnp.where(can | (red & over), jnp.maximum(front, 0.0), FREE_M), axis=1)
@@ -241,8 +216,7 @@ def _driven(
 def _may_enter(context: AgentContext, movers: Movers, ahead: Leaders, frame: Frame) -> Bool[Array, " R"]:
     """Mask of the waiting vehicles that appear in the next step: due, and with a free entry.
 
-    Of two that wait for the same space the one due first enters first; vehicles on time never exclude each other, since
-    the log has room for both.
+    Of two that wait for the same space the one due first enters first; two on time both enter, as in the log.
     """
     now = context.traffic
     size = jnp.asarray([0.0, 0.0, 0.0, 0.0, 2 * _ENTRY_END_M, 2 * _ENTRY_SIDE_M])
@@ -269,3 +243,24 @@ def _entry_speed(movers: Movers, ahead: Leaders, driver: IdmParameters) -> Float
     room = jnp.maximum(ahead.gap - driver.min_gap_m, 0.0)
     square = jnp.maximum(ahead.speed, 0.0) ** 2 + 2.0 * driver.comfortable_braking_mps2 * room
     return jnp.minimum(movers.speed, jnp.sqrt(jnp.maximum(square, 1e-6)))
+
+
+#: Traffic models by name.
+TRAFFIC: dict[str, Callable[[], Traffic]] = {"log": LogTraffic, "idm": IdmTraffic}
+
+
+def make_traffic(name: str) -> Traffic:
+    """Return the traffic model of a name in :data:`TRAFFIC`, or of ``package.module:name`` (a class or function).
+
+    Raises:
+        UsageError: Unknown name, or it makes no traffic model.
+    """
+    if name in TRAFFIC:
+        return TRAFFIC[name]()
+    if not is_dotted(name):
+        cure = f"use {', '.join(TRAFFIC)}, or package.module:name"
+        raise UsageError(f"there is no traffic {name!r}", cure=cure)
+    traffic = find_named(name)()
+    if not isinstance(traffic, Traffic):
+        raise UsageError(f"{name!r} makes no traffic", cure="see drivax.simulator.types.Traffic")
+    return traffic

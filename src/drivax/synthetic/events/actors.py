@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -13,12 +14,13 @@ from drivax.synthetic.roads import curves
 from drivax.synthetic.roads.curves import Curve
 from drivax.synthetic.traffic.roles import Motion, Scripted
 
+#: A number for each time; length, width and height, m.
+Times = Float64[np.ndarray, " time"]
+Size = tuple[float, float, float]
 CAR_M = (4.6, 1.85, 1.55)
 
 
-def speed_change(
-    first_mps: float, last_mps: float, rate_mps2: float, times_s: Float64[np.ndarray, " k"]
-) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
+def speed_change(first_mps: float, last_mps: float, rate_mps2: float, times_s: Times) -> tuple[Times, Times]:
     """Distance and speed of a change between constant speeds that starts at time 0 (distances before are negative)."""
     lasts = abs(last_mps - first_mps) / rate_mps2
     rate = math.copysign(rate_mps2, last_mps - first_mps)
@@ -37,18 +39,11 @@ def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
 
 
 def walk(
-    distance_m: float,
-    speed_mps: float,
-    rates_mps2: tuple[float, float],
-    times_s: Float64[np.ndarray, " k"],
-) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]] | None:
+    distance_m: float, speed_mps: float, rates_mps2: tuple[float, float], times_s: Times
+) -> tuple[Times, Times] | None:
     """Distance and speed of a walk from rest at time 0 to rest; None where it is too short to reach its speed.
 
-    Args:
-        distance_m: Length of the walk.
-        speed_mps: Speed in between.
-        rates_mps2: Acceleration and deceleration.
-        times_s: Times.
+    ``rates_mps2`` are acceleration and deceleration.
     """
     gain, loss = rates_mps2
     stopping = speed_mps**2 / (2 * loss)
@@ -60,18 +55,12 @@ def walk(
     return gone + more, np.where(times_s < slows, up, down)
 
 
-def smooth_step(times_s: Float64[np.ndarray, " k"], lasts_s: float) -> Float64[np.ndarray, " k"]:
-    """Quintic step from 0 to 1 within a duration; speed and acceleration vanish at both ends."""
-    return curves.smooth_step(times_s / lasts_s)
-
-
 def along_track(
     track: Track,
-    station: Float64[np.ndarray, " time"],
-    left_m: Float64[np.ndarray, " time"],
+    station: Times,
+    left_m: Times,
     kind: AgentKind,
-    size_m: tuple[float, float, float],
-    *,
+    size_m: Size,
     valid: Bool[np.ndarray, " time"],
 ) -> Scripted:
     """Actor at stations and lateral offsets of ego's path, headed along its motion."""
@@ -82,9 +71,9 @@ def along_track(
 
 def scripted_motion(
     xy: Float64[np.ndarray, "time 2"],
-    heading: Float64[np.ndarray, " time"],
+    heading: Times,
     kind: AgentKind,
-    size_m: tuple[float, float, float],
+    size_m: Size,
     valid: Bool[np.ndarray, " time"],
 ) -> Scripted:
     """Actor at positions, headed along its motion; at rest it keeps its last heading, or the given one."""
@@ -99,31 +88,29 @@ def scripted_motion(
     return Scripted(kind, size_m, xy, heading, speed, valid)
 
 
-def along_curve(
-    curve: Curve,
-    distance_m: Float64[np.ndarray, " time"],
-    kind: AgentKind,
-    size_m: tuple[float, float, float],
-) -> Scripted:
+def along_curve(curve: Curve, distance_m: Times, kind: AgentKind, size_m: Size) -> Scripted:
     """Actor that drives along a curve and is valid while it is on it."""
-    arc = curve.arc_m
-    xy = np.stack([np.interp(distance_m, arc, curve.xy[:, k]) for k in (0, 1)], axis=-1)
+    xy, heading = curve.at(distance_m)
     speed = np.maximum(np.gradient(distance_m, DT_S), 0.0)
-    valid = (distance_m >= size_m[0] / 2) & (distance_m <= arc[-1] - size_m[0] / 2)
-    return Scripted(kind, size_m, xy, np.interp(distance_m, arc, curve.heading), speed, valid)
+    valid = (distance_m >= size_m[0] / 2) & (distance_m <= curve.arc_m[-1] - size_m[0] / 2)
+    return Scripted(kind, size_m, xy, heading, speed, valid)
+
+
+def user_of(motion: Motion, row: int) -> Scripted:
+    """Trajectory of a user of the traffic."""
+    length, width, height = map(float, motion.size_m[row])
+    track = motion.xy[row], motion.heading[row], motion.speed[row], motion.valid[row].copy()
+    return Scripted(AgentKind(int(motion.kind[row])), (length, width, height), *track)
 
 
 def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
     """Vehicle of the traffic that brakes from a step to a halt on its path."""
-    xy, heading = motion.xy[row], np.unwrap(motion.heading[row])
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
-    times = DT_S * (np.arange(len(xy)) - step)
-    speed = float(motion.speed[row, step])
-    gone, slower = speed_change(speed, 0.0, braking_mps2, times)
+    user = user_of(motion, row)
+    arc = Curve(user.xy, user.heading).arc_m
+    times = DT_S * (np.arange(len(arc)) - step)
+    gone, slower = speed_change(float(user.speed[step]), 0.0, braking_mps2, times)
     at = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
     grows = np.concatenate([[True], np.diff(arc) > 1e-6])
-    moved = np.stack([np.interp(at, arc[grows], xy[grows, k]) for k in (0, 1)], axis=-1)
-    turned = np.interp(at, arc[grows], heading[grows])
-    speeds = np.where(times < 0, motion.speed[row], np.minimum(slower, motion.speed[row]))
-    size = (float(motion.size_m[row, 0]), float(motion.size_m[row, 1]), float(motion.size_m[row, 2]))
-    return Scripted(AgentKind(int(motion.kind[row])), size, moved, turned, speeds, motion.valid[row].copy())
+    heading = np.interp(at, arc[grows], np.unwrap(user.heading)[grows])
+    speed = np.where(times < 0, user.speed, np.minimum(slower, user.speed))
+    return replace(user, xy=curves.interpolate(at, arc[grows], user.xy[grows]), heading=heading, speed=speed)

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from drivax.geometry.boxes import overlap, time_to_overlap
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind
+from drivax.synthetic.events.actors import user_of
 from drivax.synthetic.events.ego_view import EgoView
 from drivax.synthetic.events.kinds import StagedEvent
 from drivax.synthetic.roads.curves import STEP_M
@@ -60,24 +62,28 @@ def waiting_room(speed_mps: float, deceleration_mps2: float, time_s: float) -> f
     return speed_mps**2 / (2 * deceleration_mps2)
 
 
-def boxes(actor: Scripted) -> Float64[np.ndarray, "time 6"]:
-    """Boxes of an actor in the layout of :mod:`drivax.geometry.boxes`."""
-    size = np.broadcast_to(np.array(actor.size_m[:2]), actor.xy.shape)
-    return np.column_stack([actor.xy, np.cos(actor.heading), np.sin(actor.heading), size])
+def boxes(
+    xy: Float64[np.ndarray, "*n 2"], heading: Float64[np.ndarray, "*n"], size_m: Any
+) -> Float64[np.ndarray, "*n 6"]:
+    """Boxes in the layout of :mod:`drivax.geometry.boxes`; sizes are broadcast."""
+    direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    return np.concatenate([xy, direction, np.broadcast_to(size_m, xy.shape)], axis=-1)
+
+
+def actor_boxes(actor: Scripted) -> Float64[np.ndarray, "time 6"]:
+    """Boxes of an actor at all steps."""
+    return boxes(actor.xy, actor.heading, actor.size_m[:2])
 
 
 def first_blocked(view: EgoView, adversary: Scripted, step: int) -> Float64[np.ndarray, " time"]:
     """First station ahead at which ego would touch the actor, for each step from ``step`` on, m (infinite: none)."""
     track, last = view.track, view.last_step
-    box = boxes(adversary)[step : last + 1]
+    box = actor_boxes(adversary)[step : last + 1]
     begin = int(track.at[step] / STEP_M)
-    station = STEP_M * np.arange(begin, len(track.xy), 1)
-    xy, heading = track.xy[begin:], track.heading[begin:]
-    size = view.ego_size_m
-    ego = np.column_stack(
-        [xy, np.cos(heading), np.sin(heading), np.broadcast_to(size[:2], xy.shape)],
-    )
-    reach = (math.hypot(size[0], size[1]) + math.hypot(*adversary.size_m[:2])) / 2
+    station, xy = STEP_M * np.arange(begin, len(track.xy)), track.xy[begin:]
+    size = view.ego_size_m[:2]
+    ego = boxes(xy, track.heading[begin:], size)
+    reach = (math.hypot(*size) + math.hypot(*adversary.size_m[:2])) / 2
     gap = (box[:, None, 0] - xy[:, 0]) ** 2 + (box[:, None, 1] - xy[:, 1]) ** 2
     time, place = np.nonzero((gap < reach**2) & adversary.valid[step : last + 1, None])
     hit = overlap(ego[place], box[time])
@@ -105,52 +111,35 @@ def required_by_samples(speed_mps: float, room_m: Float64[np.ndarray, " step"]) 
     return required_deceleration(speed_mps, np.maximum(room, 0.0), time)
 
 
-def least_ttc(view: EgoView, adversary: Scripted, hold_from: int, since: int) -> float:
-    """Least time to collision from ``since`` on, of an ego at constant speed from ``hold_from`` on, s (at most 5)."""
-    track, steps = view.track, np.arange(max(since, hold_from), view.last_step + 1)
-    speed = float(view.motion.speed[0, hold_from])
-    xy, heading = track.pose(track.at[hold_from] + speed * DT_S * (steps - hold_from))
-    time = _times_to_collision(view, (xy, heading, speed), boxes(adversary)[steps], adversary.speed[steps])
-    return float(np.min(np.where(adversary.valid[steps], time, 5.0), initial=5.0))
+def least_ttc(
+    view: EgoView, actor: Scripted, ego: tuple[float, float, float], hold_from: int, since: int
+) -> float:
+    """Least time to collision with an actor ahead from ``since`` on, s (at most 5).
+
+    ``ego`` is its station, lateral offset and speed at ``hold_from``; it keeps the latter two from then on.
+    """
+    station, left, speed = ego
+    steps = np.arange(max(since, hold_from), view.last_step + 1)
+    xy, heading = view.track.pose(station + speed * DT_S * (steps - hold_from), left)
+    own, other = boxes(xy, heading, view.ego_size_m[:2] - _SMALLER_M), actor_boxes(actor)[steps]
+    toward = own[:, 2:4]
+    time = time_to_overlap(own, speed * toward, other, actor.speed[steps, None] * other[:, 2:4], 5.0)
+    time = np.where(overlap(own, other), 0.0, time)
+    # Braking does not avoid actors from behind.
+    ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -view.ego_size_m[0] / 2
+    return float(np.min(np.where(ahead & actor.valid[steps], time, 5.0), initial=5.0))
 
 
 def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
     """Whether the simulated actor comes close to collision with an ego that keeps its speed from the event's start.
 
-    Rejects events that other agents disturbed, or for which ego became slower before.
-
-    Args:
-        view: The scenario without the event: ego's path.
-        motion: The simulated motion with the event.
-        staged: The event.
+    Rejects events that other agents disturbed, or for which ego became slower before. ``view`` is the scenario without
+    the event, ``motion`` the simulated motion with it.
     """
-    begin, actor = staged.first_step, staged.actors[0]
+    begin = staged.first_step
     (station,), (left,) = view.track.project(motion.xy[:1, begin])
-    steps = np.arange(begin, view.last_step + 1)
-    speed = float(motion.speed[0, begin])
-    xy, heading = view.track.pose(station + speed * DT_S * (steps - begin), left)
-    acts = slice(begin, view.last_step + 1)
-    turned, size = motion.heading[actor, acts], np.broadcast_to(motion.size_m[actor, :2], xy.shape)
-    other = np.column_stack([motion.xy[actor, acts], np.cos(turned), np.sin(turned), size])
-    time = _times_to_collision(view, (xy, heading, speed), other, motion.speed[actor, acts])
-    return bool(np.any(motion.valid[actor, acts] & (time < SURELY_S)))
-
-
-def _times_to_collision(
-    view: EgoView,
-    ego: tuple[Float64[np.ndarray, "time 2"], Float64[np.ndarray, " time"], float],
-    other: Float64[np.ndarray, "time 6"],
-    speed: Float64[np.ndarray, " time"],
-) -> Float64[np.ndarray, " time"]:
-    """Time to collision of ego (positions, headings, speed) with a box ahead, s (at most 5)."""
-    xy, heading, own = ego
-    toward = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    box = np.column_stack([xy, toward, np.broadcast_to(view.ego_size_m[:2] - _SMALLER_M, xy.shape)])
-    time = time_to_overlap(box, own * toward, other, speed[:, None] * other[:, 2:4], 5.0)
-    time = np.where(overlap(box, other), 0.0, time)
-    # Braking does not avoid actors from behind.
-    ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -view.ego_size_m[0] / 2
-    return np.where(ahead, time, 5.0)
+    ego = station, left, float(motion.speed[0, begin])
+    return least_ttc(view, user_of(motion, staged.actors[0]), ego, begin, begin) < SURELY_S
 
 
 def comes_close(view: EgoView, adversary: Scripted, step: int) -> bool:
@@ -159,10 +148,13 @@ def comes_close(view: EgoView, adversary: Scripted, step: int) -> bool:
     Where ego's speed changes in between (a turn, a queue) only the first counts.
     """
     current, speed = view.first_step + CURRENT_STEP, view.motion.speed[0]
-    if least_ttc(view, adversary, step, step) >= NEAR_S:
-        return False
+
+    def close(hold_from: int) -> bool:
+        ego = view.track.at[hold_from], 0.0, float(speed[hold_from])
+        return least_ttc(view, adversary, ego, hold_from, step) < NEAR_S
+
     steady = abs(speed[step] - speed[current]) < _STEADY * speed[current]
-    return not steady or least_ttc(view, adversary, current, step) < NEAR_S
+    return close(step) and (not steady or close(current))
 
 
 def vehicles_in_lane(view: EgoView, extra: Scripted, until: int) -> tuple[int, ...]:
@@ -185,38 +177,25 @@ def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
     crosses = np.abs(np.cos(turned - extra.heading[moves])) < 0.7
     row, step = np.nonzero(motion.valid[rows][:, moves] & crosses & (gap < _NEAR_M**2))
     size = motion.size_m[rows[row], :2] + _CROSSED_M
-    other = np.column_stack(
-        [motion.xy[rows[row], moves[step]], np.cos(turned[row, step]), np.sin(turned[row, step]), size]
-    )
-    hit = overlap(boxes(extra)[moves[step]], other)
+    other = boxes(motion.xy[rows[row], moves[step]], turned[row, step], size)
+    hit = overlap(actor_boxes(extra)[moves[step]], other)
     return tuple(np.unique(rows[row[hit]]).tolist())
 
 
-def enter_when_clear(
-    view: EgoView, extra: Scripted, until: int, removed: tuple[int, ...] = ()
-) -> Scripted | None:
+def enter_when_clear(view: EgoView, extra: Scripted, until: int, removed: tuple[int, ...]) -> Scripted | None:
     """Let a new actor appear when it has no collision ahead; None where it has, or where ego would see it appear.
 
-    Other agents see it and keep behind it: only agents ahead of it and pedestrians count.
-
-    Args:
-        view: The scenario without the actor.
-        extra: The actor.
-        until: The step at which ego may meet it.
-        removed: Rows of vehicles that are left out.
+    Other agents see it and keep behind it: only agents ahead of it and pedestrians count, until ego may meet it at step
+    ``until``; vehicles of the rows ``removed`` are left out.
     """
     motion, last = view.motion, until + 1
     along, across = _APART_M if extra.kind == AgentKind.VEHICLE else _APART_ON_FOOT_M
-    box = boxes(extra)[None, :last] + np.array([0, 0, 0, 0, 2 * along, 2 * across])
+    box = actor_boxes(extra)[None, :last] + np.array([0, 0, 0, 0, 2 * along, 2 * across])
     users = slice(1, None)
-    size = np.broadcast_to(motion.size_m[users, None, :2], motion.xy[users].shape)[:, :last]
-    turned = motion.heading[users, :last]
-    other = np.concatenate(
-        [motion.xy[users, :last], np.cos(turned)[..., None], np.sin(turned)[..., None], size], axis=-1
-    )
-    part = ~np.isin(np.arange(len(motion.kind)), removed)[users, None]
-    valid = motion.valid[users, :last] & extra.valid[:last] & part
-    near = np.sum((other[..., :2] - box[..., :2]) ** 2, axis=-1) < 15.0**2
+    other = boxes(motion.xy[users, :last], motion.heading[users, :last], motion.size_m[users, None, :2])
+    stays = ~np.isin(np.arange(len(motion.kind)), removed)[users, None]
+    valid = motion.valid[users, :last] & extra.valid[:last] & stays
+    near = np.sum((other[..., :2] - box[..., :2]) ** 2, axis=-1) < _NEAR_M**2
     user, step = np.nonzero(valid & near)
     forward = box[0, step, 2:4] * np.where(extra.speed[step] < 0, -1.0, 1.0)[:, None]
     ahead = np.sum((other[user, step, :2] - box[0, step, :2]) * forward, axis=-1) > 0

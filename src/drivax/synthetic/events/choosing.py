@@ -14,51 +14,35 @@ from drivax.synthetic.events.adversary import (
     vehicles_that_cross,
 )
 from drivax.synthetic.events.crossing import CrossTraffic
-from drivax.synthetic.events.destinations import Destination, open_road
+from drivax.synthetic.events.destinations import Destination
 from drivax.synthetic.events.ego_view import FULL_SWING, NOTICED, EgoView
-from drivax.synthetic.events.kinds import (
-    SEVERITY_MPS2,
-    DestinationScript,
-    EventKind,
-    EventScript,
-    Proposal,
-    StagedEvent,
-)
-from drivax.synthetic.events.leading import LeadBrakes, StalledVehicle
-from drivax.synthetic.events.merging import CutIn
+from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, EventScript, Proposal, StagedEvent
+from drivax.synthetic.events.leading import CutIn, LeadBrakes, StalledVehicle
 from drivax.synthetic.events.roadside import Jaywalker, LaneBlocked, ReversingCar, WrongWayCyclist
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Staging
 
 #: All scripts; a new event is a script here and a number in :class:`EventKind`.
 SCRIPTS: dict[EventKind, EventScript] = {
-    script.kind: script
-    for script in (
-        LeadBrakes(),
-        CutIn(),
-        StalledVehicle(),
-        CrossTraffic(),
-        Jaywalker(),
-        Jaywalker(hidden=True),
-        CutIn(late_merge=True),
-        WrongWayCyclist(),
-        CrossTraffic(turning=True),
-        LaneBlocked(),
-        ReversingCar(),
-        LeadBrakes(tailgater=True),
-    )
+    EventKind.LEAD_BRAKES: LeadBrakes(),
+    EventKind.CUT_IN: CutIn(),
+    EventKind.STALLED_VEHICLE: StalledVehicle(),
+    EventKind.RED_LIGHT_RUNNER: CrossTraffic(),
+    EventKind.JAYWALKER: Jaywalker(),
+    EventKind.FROM_BEHIND_PARKED: Jaywalker(hidden=True),
+    EventKind.LATE_MERGE: CutIn(late_merge=True),
+    EventKind.WRONG_WAY_CYCLIST: WrongWayCyclist(),
+    EventKind.TURN_CONFLICT: CrossTraffic(turning=True),
+    EventKind.LANE_BLOCKED: LaneBlocked(),
+    EventKind.REVERSING_CAR: ReversingCar(),
+    EventKind.TAILGATER: LeadBrakes(tailgater=True),
 }
 #: Proposals per event, how many of them with the requested severity, and how many with each other one.
 _DRAWS, _AS_REQUESTED, _PER_SEVERITY = 40, 20, 5
 #: Exponent of the uniform number behind a severity; below 1 hard events are more frequent.
 _HARD = 0.7
 #: Kinds that rarely succeed unless ego is sent to a suitable place.
-_PLACED = (
-    EventKind.RED_LIGHT_RUNNER,
-    EventKind.TURN_CONFLICT,
-    EventKind.LATE_MERGE,
-    EventKind.TAILGATER,
-)
+_PLACED = {EventKind.RED_LIGHT_RUNNER, EventKind.TURN_CONFLICT, EventKind.LATE_MERGE, EventKind.TAILGATER}
 #: Largest difference between a proposal's severity and the one that it really requires, m/s2.
 _NEAR_MPS2 = 0.6
 
@@ -71,15 +55,9 @@ def possible(kind: EventKind, network: RoadNetwork) -> bool:
 def destinations_for(kind: EventKind, network: RoadNetwork, again: bool = False) -> tuple[Destination, ...]:
     """Places of which ego should pass one, so that an event can be staged; empty: anywhere.
 
-    Args:
-        kind: The kind of event.
-        network: The roads.
-        again: Whether staging has failed before: then kinds that can happen anywhere get places too.
+    ``again`` after staging has failed: then kinds that can happen anywhere get places too.
     """
-    script = SCRIPTS[kind]
-    if not again and kind not in _PLACED:
-        return ()
-    return script.destinations(network) if isinstance(script, DestinationScript) else open_road(network)
+    return SCRIPTS[kind].destinations(network) if again or kind in _PLACED else ()
 
 
 def draw_severity(rng: np.random.Generator) -> float:
@@ -94,21 +72,16 @@ def draw_severity(rng: np.random.Generator) -> float:
 def stage(
     kind: EventKind, view: EgoView, severity_mps2: float, rng: np.random.Generator
 ) -> StagedEvent | None:
-    """Stage an event of a kind, or return None where no proposal passes.
+    """Stage an event of a kind in a scenario without it, or return None where no proposal passes.
 
-    Args:
-        kind: The kind.
-        view: The scenario without the event.
-        severity_mps2: Requested severity; other ones are drawn where it cannot be staged.
-        rng: Source of randomness.
+    Where the requested severity cannot be staged, others are drawn.
     """
-    script = SCRIPTS[kind]
     for draw in range(_DRAWS):
         if draw >= _AS_REQUESTED and draw % _PER_SEVERITY == 0:
             severity_mps2 = draw_severity(rng)
-        proposal = script.propose(view, severity_mps2, rng)
-        checked = None if proposal is None else _check(proposal.view or view, proposal)
-        if proposal is not None and checked is not None:
+        proposal = SCRIPTS[kind].propose(view, severity_mps2, rng)
+        checked = proposal and _check(proposal.view or view, proposal)
+        if proposal and checked:
             required, staging = checked
             actor = len(view.motion.kind) if proposal.vehicle is None else proposal.vehicle
             actors = (actor, *proposal.others)
@@ -125,18 +98,19 @@ def _check(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
         return None
     blocked = np.isfinite(first_blocked(view, adversary, begin))
     entered = begin + int(np.argmax(blocked))
-    if not blocked.any() or entered >= view.first_step + FULL_SWING:
-        return None
-    if not comes_close(view, adversary, begin):
+    if (
+        not blocked.any()
+        or entered >= view.first_step + FULL_SWING
+        or not comes_close(view, adversary, begin)
+    ):
         return None
     staging = proposal.staging
-    removed = sorted(
-        {*staging.removed, *(row for extra in staging.extras for row in vehicles_that_cross(view, extra))}
-    )
-    if set(removed) & set(proposal.others):
+    crossing = (row for extra in staging.extras for row in vehicles_that_cross(view, extra))
+    removed = tuple(sorted({*staging.removed, *crossing}))
+    if not set(removed).isdisjoint(proposal.others):
         return None
-    extras = tuple(enter_when_clear(view, extra, entered, tuple(removed)) for extra in staging.extras)
-    known = tuple(extra for extra in extras if extra is not None and extra.valid[begin])
-    if len(known) < len(extras):
+    entering = (enter_when_clear(view, extra, entered, removed) for extra in staging.extras)
+    extras = tuple(extra for extra in entering if extra is not None and extra.valid[begin])
+    if len(extras) < len(staging.extras):
         return None
-    return required, replace(staging, extras=known, removed=tuple(removed))
+    return required, replace(staging, extras=extras, removed=removed)

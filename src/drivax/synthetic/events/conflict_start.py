@@ -1,4 +1,4 @@
-"""Interactive moments of a simulation: the steps from index a driver that only follows its leader would collide.
+"""Interactive moments of a simulation: the steps from which a driver that only follows its leader would collide.
 
 Recorded data sets are mined for interactions, since most driving is on empty roads. Here a reference driver that
 follows its leader and stops at red lights, but ignores all other agents, is rolled out from several steps of the same
@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float64, Int8, Int64
 from drivax.geometry.boxes import overlap
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS
 from drivax.simulator.idm import IdmParameters, idm_acceleration
+from drivax.synthetic.events.adversary import boxes
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes, extents
@@ -30,44 +31,41 @@ _SIDE_M, _STOP_SHORT_M = 0.3, 1.0
 _NEAR_M = 12.0
 #: Simulate every second step.
 _STRIDE = 2
+#: Steps and numbers, one for each start of the driver.
+_Steps = Int64[np.ndarray, " start"]
+_Floats = Float64[np.ndarray, " start"]
 
 
 @dataclass(frozen=True)
 class _Others:
-    """Agents near ego's path at all steps: extents along and across it, m."""
+    """Agents near ego's path at all steps.
 
-    near_m: Float64[np.ndarray, "user time"]
-    far_m: Float64[np.ndarray, "user time"]
-    right_m: Float64[np.ndarray, "user time"]
-    left_m: Float64[np.ndarray, "user time"]
+    Attributes:
+        extent: Nearest and farthest point along the path, outermost points to the right and to the left of it, m.
+        speed: Speed along the path.
+    """
+
+    extent: Float64[np.ndarray, "4 user time"]
     speed: Float64[np.ndarray, "user time"]
     box: Float64[np.ndarray, "user time 6"]
 
 
 def critical_steps(
-    network: RoadNetwork,
-    motion: Motion,
-    colour: Int8[np.ndarray, "time lane"],
-    steps: Int64[np.ndarray, " start"],
+    network: RoadNetwork, motion: Motion, colour: Int8[np.ndarray, "time lane"], steps: _Steps
 ) -> Bool[np.ndarray, " start"]:
-    """Whether the reference driver collides in the recordings that begin at some steps.
+    """Whether the reference driver collides in the recordings that begin at some steps, which are even.
 
-    Args:
-        network: The roads.
-        motion: Motion of all agents; row 0 is ego.
-        colour: Colours of the lights at each time.
-        steps: First steps of recordings, even numbers; the driver takes over ``CURRENT_STEP`` later.
+    The driver takes over from row 0 of the motion ``CURRENT_STEP`` later.
     """
     path, motion = motion.paths[0], motion.every(_STRIDE)
-    others, colour = _project_others(path, motion), colour[::_STRIDE]
-    length, width = motion.size_m[0, :2]
+    others, colour, size_m = _project_others(path, motion), colour[::_STRIDE], motion.size_m[0, :2]
     now = (np.asarray(steps) + CURRENT_STEP) // _STRIDE
     at, speed = motion.distance_m[0, now], motion.speed[0, now]
     fastest = speed_profile(path, 1.0, _LATERAL_MPS2, _SLOWING_MPS2)
-    hit, behind = np.zeros(len(now), bool), np.zeros((len(others.near_m), len(now)), bool)
+    hit, behind = np.zeros(len(now), bool), np.zeros((len(others.box), len(now)), bool)
     for _ in range((STEPS - CURRENT_STEP - 1) // _STRIDE):
-        gap, leader = _leader(others, now, at, (float(length), float(width)))
-        line = _stop_line_m(network, path, colour[now], at + length / 2) + 2.0 - _STOP_SHORT_M
+        gap, leader = _leader(others, now, at, size_m)
+        line = _stop_line_m(network, path, colour[now], at + size_m[0] / 2) + 2.0 - _STOP_SHORT_M
         target_mps = fastest[np.minimum((at / path.step_m).astype(int), len(fastest) - 1)]
         a = idm_acceleration(
             np.stack([speed, speed]),
@@ -78,69 +76,53 @@ def critical_steps(
         ).min(axis=0)
         after = np.maximum(speed + a * _STRIDE * DT_S, 0.0)
         at, speed, now = at + (speed + after) / 2 * _STRIDE * DT_S, after, now + 1
-        hit |= _hits(others, now, path, at, (float(length), float(width)), behind)
+        hit |= _hits(others, now, path, at, size_m, behind)
     return hit
 
 
 def _project_others(path: Path, motion: Motion) -> _Others:
     """Extents of all other agents in the coordinates of ego's path."""
-    count, times = motion.valid.shape
-    flat = (count - 1) * times
-    boxes = Boxes(
-        motion.xy[1:].reshape(flat, 2),
-        motion.heading[1:].reshape(flat),
-        motion.speed[1:].reshape(flat),
-        np.repeat(motion.size_m[1:, :2], times, axis=0),
+    shape = motion.valid[1:].shape
+    every = Boxes(
+        motion.xy[1:].reshape(-1, 2),
+        motion.heading[1:].ravel(),
+        motion.speed[1:].ravel(),
+        np.repeat(motion.size_m[1:, :2], shape[1], axis=0),
     )
-    extent, index = extents(path, boxes, _NEAR_M)
-    valid = motion.valid[1:].reshape(flat)[index]
+    extent, index = extents(path, every, _NEAR_M)
+    valid = motion.valid[1:].ravel()[index]
     place = np.clip((extent.near_m + extent.far_m) / 2 / path.step_m, 0, len(path.curve.xy) - 1).astype(int)
-    along = boxes.speed[index] * np.cos(boxes.heading[index] - path.curve.heading[place])
+    along = every.speed[index] * np.cos(every.heading[index] - path.curve.heading[place])
 
     def table(values: Float64[np.ndarray, " k"], empty: float) -> Float64[np.ndarray, "user time"]:
-        result = np.full(flat, empty)
+        result = np.full(len(every.xy), empty)
         result[index] = np.where(valid, values, empty)
-        return result.reshape(count - 1, times)
+        return result.reshape(shape)
 
-    direction = np.stack([np.cos(boxes.heading), np.sin(boxes.heading)], axis=-1)
-    box = np.concatenate([boxes.xy, direction, boxes.size_m], axis=-1).reshape(count - 1, times, 6)
-    near = table(extent.near_m, np.inf)
-    rows = np.isfinite(near).any(axis=1)
-    return _Others(
-        near_m=near[rows],
-        far_m=table(extent.far_m, np.inf)[rows],
-        right_m=table(extent.right_m, np.inf)[rows],
-        left_m=table(extent.left_m, np.inf)[rows],
-        speed=table(along, 0.0)[rows],
-        box=box[rows],
-    )
+    sides = (extent.near_m, extent.far_m, extent.right_m, extent.left_m)
+    extent_m = np.stack([table(side, np.inf) for side in sides])
+    near = np.isfinite(extent_m[0]).any(axis=1)
+    box = boxes(every.xy, every.heading, every.size_m).reshape(*shape, 6)
+    return _Others(extent_m[:, near], table(along, 0.0)[near], box[near])
 
 
 def _leader(
-    others: _Others,
-    now: Int64[np.ndarray, " start"],
-    at: Float64[np.ndarray, " start"],
-    size_m: tuple[float, float],
-) -> tuple[Float64[np.ndarray, " start"], Float64[np.ndarray, " start"]]:
+    others: _Others, now: _Steps, at: _Floats, size_m: Float64[np.ndarray, " 2"]
+) -> tuple[_Floats, _Floats]:
     """Gap to the next agent ahead on the path, and its speed."""
-    if not len(others.near_m):
+    if not len(others.box):
         return np.full(len(at), np.inf), np.zeros(len(at))
-    near, far = others.near_m[:, now], others.far_m[:, now]
+    near, far, right, left = others.extent[..., now]
     side = size_m[1] / 2 + _SIDE_M
-    ahead = (near + far) / 2 > at
-    ahead &= (others.right_m[:, now] < side) & (others.left_m[:, now] > -side)
+    ahead = ((near + far) / 2 > at) & (right < side) & (left > -side)
     gap = np.where(ahead, near, np.inf) - at - size_m[0] / 2
-    first = gap.argmin(axis=0)
-    columns = np.arange(len(at))
-    return gap[first, columns], others.speed[:, now][first, columns]
+    first = gap.argmin(axis=0), np.arange(len(at))
+    return gap[first], others.speed[:, now][first]
 
 
 def _stop_line_m(
-    network: RoadNetwork,
-    path: Path,
-    colour: Int8[np.ndarray, "start lane"],
-    front: Float64[np.ndarray, " start"],
-) -> Float64[np.ndarray, " start"]:
+    network: RoadNetwork, path: Path, colour: Int8[np.ndarray, "start lane"], front: _Floats
+) -> _Floats:
     """Distance to the next stop line with a red or yellow light."""
     result = np.full(len(front), np.inf)
     for span in path.spans:
@@ -153,27 +135,20 @@ def _stop_line_m(
 
 def _hits(
     others: _Others,
-    now: Int64[np.ndarray, " start"],
+    now: _Steps,
     path: Path,
-    at: Float64[np.ndarray, " start"],
-    size_m: tuple[float, float],
+    at: _Floats,
+    size_m: Float64[np.ndarray, " 2"],
     behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:
     """Whether an agent overlaps ego and did not come from behind; adds agents that did to ``behind``."""
-    result = np.zeros(len(at), bool)
-    if not len(others.near_m):
-        return result
-    half = size_m[0] / 2
-    near, far = others.near_m[:, now], others.far_m[:, now]
-    maybe = (near < at + half) & (far > at - half)
-    maybe &= (others.right_m[:, now] < size_m[1] / 2) & (others.left_m[:, now] > -size_m[1] / 2)
+    half, side = size_m / 2
+    near, far, right, left = others.extent[..., now]
+    maybe = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
     behind |= maybe & ((near + far) / 2 <= at - half)
     user, start = np.nonzero(maybe & ~behind)
-    if len(user):
-        place = np.minimum((at[start] / path.step_m).astype(int), len(path.curve.xy) - 1)
-        heading = path.curve.heading[place]
-        ego = np.column_stack(
-            [path.curve.xy[place], np.cos(heading), np.sin(heading), np.tile(size_m, (len(user), 1))]
-        )
-        result[start[overlap(ego, others.box[user, now[start]])]] = True
+    place = np.minimum((at[start] / path.step_m).astype(int), len(path.curve.xy) - 1)
+    ego = boxes(path.curve.xy[place], path.curve.heading[place], size_m)
+    result = np.zeros(len(at), bool)
+    result[start[overlap(ego, others.box[user, now[start]])]] = True
     return result

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_curve
+from drivax.synthetic.events.actors import CAR_M, Times, along_curve
 from drivax.synthetic.events.adversary import (
     comes_close,
     first_blocked,
@@ -19,7 +17,7 @@ from drivax.synthetic.events.adversary import (
 )
 from drivax.synthetic.events.destinations import Destination
 from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, EgoView
-from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
+from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventScript, Proposal
 from drivax.synthetic.roads.curves import Curve, join_curves
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
@@ -47,29 +45,19 @@ class _ActorPath:
     def through(cls, view: EgoView, connector: int, rng: np.random.Generator) -> _ActorPath:
         """Draw a path through a connector."""
         lanes = view.roles.network.lanes
-        before, after = (
-            _chain(lanes, connector, -1, _FROM_M, rng),
-            _chain(lanes, connector, 1, _BEYOND_M, rng),
-        )
+        before = _chain(lanes, connector, -1, _FROM_M, rng)
+        after = _chain(lanes, connector, 1, _BEYOND_M, rng)
         ahead = [lanes[i].curve for i in reversed(before)]
         line = sum(float(curve.arc_m[-1]) for curve in ahead)
         curve = join_curves(*ahead, lanes[connector].curve, *(lanes[i].curve for i in after))
         limit = lanes[before[0]].limit_mps if before else lanes[connector].limit_mps
         return cls(curve, line, limit)
 
-    @cached_property
-    def arc_m(self) -> Float64[np.ndarray, " point"]:
-        """Distance along the curve at its samples."""
-        return self.curve.arc_m
-
-    def distances(
-        self, fastest_mps: float, times_s: Float64[np.ndarray, " time"]
-    ) -> Float64[np.ndarray, " time"]:
+    def distances(self, fastest_mps: float, times_s: Times) -> Times:
         """Distance along the path at times; the front reaches the line at time 0, and bends limit the speed."""
-        arc = self.arc_m
-        rate = np.abs(
-            np.gradient(self.curve.heading, np.maximum.accumulate(arc + 1e-9 * np.arange(len(arc))))
-        )
+        arc = self.curve.arc_m
+        rising = np.maximum.accumulate(arc + 1e-9 * np.arange(len(arc)))
+        rate = np.abs(np.gradient(self.curve.heading, rising))
         smooth = np.convolve(np.pad(rate, 4, mode="edge"), np.full(9, 1 / 9), mode="valid")
         cap = np.minimum(fastest_mps**2, _LATERAL_MPS2 / np.maximum(smooth, 1e-6))
         ramp = 2 * _SLOWING_MPS2 * arc
@@ -88,10 +76,7 @@ def _chain(
     """Draw successive lanes before (-1) or after (1) a lane up to a total length."""
     result: list[int] = []
     total, at = 0.0, first
-    while total < length_m:
-        links = lanes[at].successors if direction > 0 else lanes[at].predecessors
-        if not links:
-            break
+    while total < length_m and (links := lanes[at].successors if direction > 0 else lanes[at].predecessors):
         at = int(rng.choice(links))
         result.append(at)
         total += lanes[at].length_m
@@ -103,7 +88,7 @@ def _straight_on(lane: Lane) -> bool:
 
 
 @dataclass(frozen=True)
-class CrossTraffic:
+class CrossTraffic(EventScript):
     """A vehicle crosses ego's path in a junction although ego has right of way.
 
     Attributes:
@@ -116,17 +101,8 @@ class CrossTraffic:
     speed_share: tuple[float, float] = (0.7, 1.1)
     arrival_s: tuple[float, float] = (2.5, 5.5)
 
-    @property
-    def kind(self) -> EventKind:
-        """See :class:`EventScript`."""
-        return EventKind.TURN_CONFLICT if self.turning else EventKind.RED_LIGHT_RUNNER
-
-    def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`."""
-        return bool(self.destinations(network))
-
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """See :class:`DestinationScript`: stop lines of connectors that actors may cross."""
+        """See :class:`EventScript`: stop lines of connectors that actors may cross."""
         if network.signals is None and not self.turning:
             return ()
         return tuple(
@@ -137,8 +113,8 @@ class CrossTraffic:
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        connectors = self._crossing_connectors(view)
-        share = float(rng.uniform(*self.speed_share))
+        network, share = view.roles.network, float(rng.uniform(*self.speed_share))
+        connectors = sorted({other for mine in view.connectors for other in self._conflicting(network, mine)})
         if not connectors:
             return None
         lane = int(rng.choice(connectors))
@@ -153,18 +129,9 @@ class CrossTraffic:
         leaves = int(np.argmax(~np.isfinite(first_blocked(view, adversary, entry))[8:])) + 8 + entry
         # A queue at its light would block the actor.
         removed = vehicles_in_lane(view, adversary, entry + 5)
-        return Proposal(
-            Staging(extras=(adversary,), removed=removed),
-            required,
-            adversary,
-            entry - decides,
-            min(max(leaves, entry + 10), view.last_step),
-        )
-
-    def _crossing_connectors(self, view: EgoView) -> list[int]:
-        """Connectors of actors that cross a connector on ego's path."""
-        network = view.roles.network
-        return sorted({other for mine in view.connectors for other in self._conflicting(network, mine)})
+        last = min(max(leaves, entry + 10), view.last_step)
+        staging = Staging(extras=(adversary,), removed=removed)
+        return Proposal(staging, required, adversary, entry - decides, last)
 
     def _conflicting(self, network: RoadNetwork, mine: int) -> list[int]:
         """Connectors that cross a straight one and have to give way to it."""
@@ -188,7 +155,7 @@ class CrossTraffic:
         self, view: EgoView, lane: int, path: _ActorPath, pace: tuple[float, int], requested: float
     ) -> tuple[int, Scripted, float] | None:
         """The entry step of the actor at which it requires about this deceleration, its motion, and its severity."""
-        (fastest, decides), steps, track = pace, np.arange(view.steps), view.track
+        (fastest, decides), steps = pace, np.arange(view.steps)
         first = view.first_step + EARLIEST + decides
         last = min(view.first_step + LATEST + decides, view.last_step - 15)
 
@@ -205,7 +172,7 @@ class CrossTraffic:
             begin = entry - decides + NOTICED
             speed = float(view.motion.speed[0, begin])
             if speed > 4.0:
-                room = blocked[NOTICED:][: view.last_step + 1 - begin] - track.at[begin]
+                room = blocked[NOTICED:][: view.last_step + 1 - begin] - view.track.at[begin]
                 requires[entry] = required_by_samples(speed, room)
         low, high = SEVERITY_MPS2
         # The step at which the actor blocks ego's path, for each entry step.
@@ -224,6 +191,8 @@ class CrossTraffic:
         network = view.roles.network
         if network.signals is None:
             return self.turning
-        colour, _ = network.signals.colours(view.times_s, len(network.lanes))
-        seen = colour[entry - 12 : entry + 1, lane]
-        return bool(np.all(seen != Colour.RED)) if self.turning else bool(np.all(seen == Colour.RED))
+        # On the clock of the lights the recording begins at 0.
+        times = (np.arange(view.steps) - view.first_step) * DT_S
+        colour, _ = network.signals.colours(times, len(network.lanes))
+        red = colour[entry - 12 : entry + 1, lane] == Colour.RED
+        return not red.any() if self.turning else bool(red.all())

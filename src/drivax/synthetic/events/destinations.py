@@ -49,10 +49,7 @@ class Destination:
 class DestinationRoute:
     """A route past a destination, with the destination's ``alone`` and ``followed``.
 
-    Attributes:
-        start: Where ego is when the recording begins.
-        lanes: Lanes of the route; some lie behind ego.
-        place: Which of these the destination is on.
+    Some of its lanes lie behind ego's start, where the recording begins; the destination is on lane ``lanes[place]``.
     """
 
     start: Start
@@ -65,13 +62,7 @@ class DestinationRoute:
 def open_road(
     network: RoadNetwork, lowest_limit_mps: float = 0.0, has_neighbour: bool = False
 ) -> tuple[Destination, ...]:
-    """Places on ordinary lanes away from their ends.
-
-    Args:
-        network: The roads.
-        lowest_limit_mps: Lowest speed limit of the lanes.
-        has_neighbour: Whether a lane must have a neighbour.
-    """
+    """Places on ordinary lanes, with at least this speed limit and with neighbours if needed, away from their ends."""
     return tuple(
         Destination(index, (_BEFORE_M, lane.length_m - _AFTER_M), _MIDWAY_S, alone=False)
         for index, lane in enumerate(network.lanes)
@@ -86,23 +77,17 @@ def draw_route(
     network: RoadNetwork, destinations: Sequence[Destination], rng: np.random.Generator
 ) -> DestinationRoute | None:
     """Draw a route past one of several destinations; None where none can be reached."""
-    for place in rng.permutation(len(destinations)).tolist():
-        route = route_past(network, destinations[place], rng)
-        if route is not None:
-            return route
-    return None
+    order = rng.permutation(len(destinations)).tolist()
+    routes = (route_past(network, destinations[place], rng) for place in order)
+    return next((route for route in routes if route is not None), None)
 
 
 def route_past(
     network: RoadNetwork, destination: Destination, rng: np.random.Generator
 ) -> DestinationRoute | None:
     """Draw a route past a destination to the end of the map; None where a light or a sign before it delays ego."""
-    time, lane, at = (
-        float(rng.uniform(*destination.when_s)),
-        destination.lane,
-        float(rng.uniform(*destination.along_m)),
-    )
-    lanes = [lane]
+    time, at = float(rng.uniform(*destination.when_s)), float(rng.uniform(*destination.along_m))
+    lane, lanes = destination.lane, [destination.lane]
     while at < time * _pace(network, lane):
         time -= at / _pace(network, lane)
         before = _before(network, lanes)
@@ -131,13 +116,9 @@ def route_past(
 def rearrange(
     others: Placement, route: DestinationRoute, ego: tuple[int, float], rng: np.random.Generator
 ) -> Placement:
-    """Adapt the placement of other vehicles to a destination: empty lanes ahead of ego, a follower behind it.
+    """Adapt the placement of other vehicles to a route: empty lanes ahead of ego, a follower behind it.
 
-    Args:
-        others: Placement of other vehicles.
-        route: Route of ego.
-        ego: Lane on which ego begins, and distance along it.
-        rng: Source of randomness.
+    ``ego`` is the lane on which ego begins, and the distance along it.
     """
     places = list(zip(others.lane, others.along_m, strict=True))
     if route.alone:

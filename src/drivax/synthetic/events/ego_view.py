@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS
 from drivax.simulator.idm import idm_acceleration
-from drivax.synthetic.roads.curves import STEP_M
+from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate, normals
 from drivax.synthetic.traffic.roles import Motion, Roles
 
 #: Earliest and latest first step of an event, and the step before which its actor blocks ego's path.
@@ -27,12 +27,7 @@ _SLOWEST_MPS = 4.0
 
 @dataclass(frozen=True)
 class Track:
-    """Ego's trace and the rest of its path as samples half a metre apart; stations are distances along it.
-
-    Attributes:
-        xy, heading: The samples.
-        at: Station of ego at each step, m.
-    """
+    """Ego's trace and the rest of its path as samples half a metre apart, and its station (distance along it), m."""
 
     xy: Float64[np.ndarray, "point 2"]
     heading: Float64[np.ndarray, " point"]
@@ -52,8 +47,7 @@ class Track:
         share = place - index
         heading = self.heading[index] + share * (self.heading[index + 1] - self.heading[index])
         xy = self.xy[index] + share[..., None] * (self.xy[index + 1] - self.xy[index])
-        normal = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
-        return xy + np.asarray(left_m)[..., None] * normal, heading
+        return xy + np.asarray(left_m)[..., None] * normals(heading), heading
 
     def place(self, station: float) -> tuple[Float64[np.ndarray, " 2"], float]:
         """Position and heading at one station."""
@@ -74,7 +68,7 @@ class Track:
 def ego_track(motion: Motion) -> Track:
     """Return the track of row 0: its trace, the rest of its path, then straight on."""
     xy, heading = motion.xy[0], np.unwrap(motion.heading[0])
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    arc = Curve(xy, heading).arc_m
     moved = np.concatenate([[True], np.diff(arc) > 1e-3])
     # Rounding must not move an ego at rest.
     points, turned, along = xy[moved], heading[moved], arc[moved]
@@ -91,18 +85,12 @@ def ego_track(motion: Motion) -> Track:
     points = np.concatenate([points, [points[-1] + 300.0 * out]])
     turned, along = np.append(turned, turned[-1]), np.append(along, along[-1] + 300.0)
     station = np.arange(0.0, arc[-1] + _BEYOND_M, STEP_M)
-    sampled = np.stack([np.interp(station, along, points[:, k]) for k in (0, 1)], axis=-1)
-    return Track(sampled, np.interp(station, along, turned), arc)
+    return Track(interpolate(station, along, points), np.interp(station, along, turned), arc)
 
 
 @dataclass(frozen=True)
 class EgoView:
-    """The scenario without the event.
-
-    Attributes:
-        motion: Motion of all agents; row 0 is ego.
-        first_step: Step of ``motion`` at which the recording begins.
-    """
+    """The scenario without the event; the recording begins at ``first_step`` of the motion, whose row 0 is ego."""
 
     roles: Roles
     motion: Motion
@@ -124,14 +112,13 @@ class EgoView:
         return min(self.first_step + STEPS, self.steps) - 1
 
     @property
-    def times_s(self) -> Float64[np.ndarray, " time"]:
-        """Times on the clock of the lights: the recording begins at 0."""
-        return (np.arange(self.steps) - self.first_step) * DT_S
-
-    @property
     def ego_size_m(self) -> Float64[np.ndarray, " 3"]:
         """Ego's length, width, height."""
         return self.motion.size_m[0]
+
+    def at_step(self, step: int) -> tuple[float, float]:
+        """Station and speed of ego at a step."""
+        return float(self.track.at[step]), float(self.motion.speed[0, step])
 
     def draw_step(self, rng: np.random.Generator) -> int | None:
         """Draw a step at which an event may begin and ego is not slow; None without one."""
@@ -199,8 +186,7 @@ class EgoView:
 
     def plain_road(self, station: float) -> bool:
         """Whether a station is on an ordinary lane, away from junctions and crosswalks."""
-        lane = self.lane_at(station)
-        network = self.roles.network
+        lane, network = self.lane_at(station), self.roles.network
         if lane < 0 or network.lanes[lane].connector:
             return False
         xy, _ = self.track.place(station)
@@ -210,14 +196,15 @@ class EgoView:
     def connectors(self) -> list[int]:
         """Connectors on ego's path during the recording and right after it."""
         begin, end = self.track.at[self.first_step + EARLIEST], self.track.at[self.last_step] + 30.0
-        lanes = {self.lane_at(station) for station in np.arange(begin, end, 3.0).tolist()}
-        return sorted(i for i in lanes if i >= 0 and self.roles.network.lanes[i].connector)
+        return self._connectors_between(begin, end, 3.0)
 
     def meets_junction(self, low_m: float, high_m: float) -> bool:
         """Whether ego's path has a junction between two stations; scripted actors do not obey its rules."""
-        lanes = self.roles.network.lanes
-        passed = {self.lane_at(station) for station in np.arange(low_m, high_m + 4.0, 4.0).tolist()}
-        return any(lanes[lane].connector for lane in passed if lane >= 0)
+        return bool(self._connectors_between(low_m, high_m + 4.0, 4.0))
+
+    def _connectors_between(self, low_m: float, high_m: float, step_m: float) -> list[int]:
+        lanes = {self.lane_at(station) for station in np.arange(low_m, high_m, step_m).tolist()}
+        return sorted(i for i in lanes if i >= 0 and self.roles.network.lanes[i].connector)
 
     def on_path(self, step: int) -> tuple[Float64[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
         """Stations of all vehicles at a step, and whether they drive on ego's path (False for ego itself)."""
@@ -232,12 +219,8 @@ class EgoView:
     def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
         """The scenario with a new leader, its rear bumper at stations from a step on: IDM slows ego behind it."""
         drivers, at, speed = self.roles.drivers.idm, self.track.at, self.motion.speed[0]
-        law = replace(
-            drivers,
-            headway_s=drivers.headway_s[:1],
-            acceleration_mps2=drivers.acceleration_mps2[:1],
-            comfortable_braking_mps2=drivers.comfortable_braking_mps2[:1],
-        )
+        names = ("headway_s", "acceleration_mps2", "comfortable_braking_mps2")
+        law = replace(drivers, **{name: getattr(drivers, name)[:1] for name in names})
         ahead = np.gradient(rear_m, DT_S)
         where, how = at.copy(), speed.copy()
         for t in range(since, self.steps - 1):
@@ -250,14 +233,9 @@ class EgoView:
             where[t + 1] = min(where[t] + moved, at[t + 1])
             how[t + 1] = min(after, (where[t + 1] - where[t]) / DT_S if where[t + 1] == at[t + 1] else after)
         xy, heading = self.track.pose(where)
-        motion = self.motion
-        changed = replace(
-            motion,
-            xy=np.concatenate([xy[None], motion.xy[1:]]),
-            heading=np.concatenate([heading[None], motion.heading[1:]]),
-            speed=np.concatenate([how[None], motion.speed[1:]]),
-        )
-        result = replace(self, motion=changed)
+        ego = {"xy": xy, "heading": heading, "speed": how}
+        rows = {k: np.concatenate([own[None], getattr(self.motion, k)[1:]]) for k, own in ego.items()}
+        result = replace(self, motion=replace(self.motion, **rows))
         # Only ego's stations change.
         result.__dict__["track"] = replace(self.track, at=where)
         return result

@@ -1,14 +1,14 @@
-"""Records of events: kinds, staged events, proposals and the protocols of scripts."""
+"""Records of events: kinds, staged events, proposals and the base class of scripts."""
 
 from __future__ import annotations
 
 import enum
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from drivax.synthetic.events.destinations import Destination
+from drivax.synthetic.events.destinations import Destination, open_road
 from drivax.synthetic.events.ego_view import EgoView
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Scripted, Staging
@@ -57,10 +57,9 @@ class StagedEvent:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An event as a script proposes it, before the checks.
+    """An event of about this severity as a script proposes it, before the checks.
 
     Attributes:
-        severity_mps2: Intended severity.
         adversary: Undisturbed motion of the actor at all steps.
         vehicle: Row of the actor if it is a vehicle of the traffic; else it is the first of the extras.
         others: Rows of further actors.
@@ -77,28 +76,17 @@ class Proposal:
     view: EgoView | None = None
 
 
-@runtime_checkable
-class EventScript(Protocol):
+class EventScript(ABC):
     """Proposes events of one kind."""
 
-    @property
-    def kind(self) -> EventKind:
-        """Kind of event."""
-        ...
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
+        """Places of which ego should pass one; by default any open road."""
+        return open_road(network)
 
     def possible(self, network: RoadNetwork) -> bool:
         """Whether a network has what the event needs."""
-        ...
+        return bool(self.destinations(network))
 
+    @abstractmethod
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """Propose an event of about this severity, or None where this draw fails."""
-        ...
-
-
-@runtime_checkable
-class DestinationScript(EventScript, Protocol):
-    """Script that needs ego at certain places; all others may happen on any open road."""
-
-    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """Places of which ego should pass one."""
-        ...

@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_track, scripted_motion, smooth_step, travel_s, walk
+from drivax.synthetic.events.actors import CAR_M, Size, Times, along_track, scripted_motion, travel_s, walk
 from drivax.synthetic.events.adversary import waiting_room
 from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
-from drivax.synthetic.events.kinds import EventKind, Proposal
+from drivax.synthetic.events.kinds import EventScript, Proposal
+from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
@@ -25,23 +25,35 @@ _START_MPS2 = 3.0
 _ROLLING_MPS2 = 6.0
 
 
-def _has_streets(network: RoadNetwork) -> bool:
-    return any(lane.limit_mps <= _STREET_MPS for lane in network.lanes)
+class _StreetScript(EventScript):
+    def possible(self, network: RoadNetwork) -> bool:
+        """See :class:`EventScript`: on networks with streets."""
+        return any(lane.limit_mps <= _STREET_MPS for lane in network.lanes)
 
 
 def _is_open_street(view: EgoView, station: float) -> bool:
     """Whether a station is on an ordinary street, away from junctions and crosswalks."""
-    lane = view.lane_at(station)
-    return view.plain_road(station) and view.roles.network.lanes[lane].limit_mps <= _STREET_MPS
+    lanes = view.roles.network.lanes
+    return view.plain_road(station) and lanes[view.lane_at(station)].limit_mps <= _STREET_MPS
 
 
-def _crossing_actor(
-    view: EgoView,
-    station: float,
-    left_m: Float64[np.ndarray, " time"],
-    kind: AgentKind,
-    size: tuple[float, float, float],
-) -> Scripted:
+def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: float) -> tuple[float, float]:
+    """Station of a lasting obstacle that requires a deceleration, and the time until ego would reach it, s."""
+    own, speed = view.at_step(step)
+    room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
+    return own + room + (view.ego_size_m[0] + length_m) / 2, room / speed
+
+
+def _entry(
+    view: EgoView, step: int, distance_m: float, pace_mps: float, rates_mps2: tuple[float, float]
+) -> tuple[Times, Times] | None:
+    """Distance and speed of an obstacle that moves into ego's lane, braking harder where the distance is short."""
+    gain, loss = rates_mps2
+    times = DT_S * (np.arange(view.steps) - step)
+    return walk(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
+
+
+def _crossing_actor(view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size) -> Scripted:
     """Actor that moves at a right angle to ego's path at a station; at rest it faces the path."""
     xy, heading = view.track.pose(np.full(view.steps, station), left_m)
     toward = heading - math.copysign(math.pi / 2, float(left_m[0]))
@@ -49,25 +61,15 @@ def _crossing_actor(
 
 
 @dataclass(frozen=True)
-class Jaywalker:
-    """A pedestrian crosses the road away from crossings.
-
-    Attributes:
-        hidden: From behind a parked car; else from the kerb.
-        speed_mps: Walking speed, low and high.
-    """
+class Jaywalker(_StreetScript):
+    """A pedestrian crosses the road away from crossings: from behind a parked car (``hidden``), or from the kerb."""
 
     hidden: bool = False
     speed_mps: tuple[float, float] = (1.3, 3.0)
 
-    @property
-    def kind(self) -> EventKind:
-        """See :class:`EventScript`."""
-        return EventKind.FROM_BEHIND_PARKED if self.hidden else EventKind.JAYWALKER
-
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        return bool(network.bays) if self.hidden else _has_streets(network)
+        return bool(network.bays) if self.hidden else super().possible(network)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
@@ -85,12 +87,9 @@ class Jaywalker:
         gait = walk(over, pace, (_START_MPS2, 2.0), times)
         if gait is None:
             return None
-        left = offset + side * gait[0]
-        adversary = _crossing_actor(view, station, left, AgentKind.PEDESTRIAN, _PERSON_M)
-        last = step + round(travel_s(over, pace, _START_MPS2) / DT_S)
-        return Proposal(
-            Staging(extras=(adversary,)), severity_mps2, adversary, step, min(last, view.last_step)
-        )
+        adversary = _crossing_actor(view, station, offset + side * gait[0], AgentKind.PEDESTRIAN, _PERSON_M)
+        last = min(step + round(travel_s(over, pace, _START_MPS2) / DT_S), view.last_step)
+        return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
     def _required_room(
         self, view: EgoView, offset: float, speed: float, pace: float, requested: float
@@ -110,7 +109,7 @@ class Jaywalker:
         back = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
-        speed, own = float(view.motion.speed[0, step]), float(view.track.at[step])
+        own, speed = view.at_step(step)
         front = own + (view.ego_size_m[0] + _PERSON_M[1]) / 2
         station, offset = front + speed, 0.0
         # The distance of the kerb depends on the station, which depends on that distance: iterate twice.
@@ -129,8 +128,7 @@ class Jaywalker:
     ) -> tuple[int, float, float] | None:
         if not view.roles.parked:
             return None
-        centres = np.array([car.xy[0] for car in view.roles.parked])
-        station, left = view.track.project(centres)
+        station, left = view.track.project(np.array([car.xy[0] for car in view.roles.parked]))
         steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST)
         speed = view.motion.speed[0, steps]
         near = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > view.track.at[steps[0]] + 6.0)
@@ -139,11 +137,9 @@ class Jaywalker:
             line = float(station[car]) + view.roles.parked[car].size_m[0] / 2 + 0.55
             offset = float(left[car])
             front = view.track.at[steps] + (view.ego_size_m[0] + _PERSON_M[1]) / 2
-            needs = [
-                self._required_room(view, offset, float(v), pace, requested) if v > 4.0 else None
-                for v in speed
-            ]
-            off = np.array([math.inf if need is None else need for need in needs]) - (line - front)
+            rooms = [self._required_room(view, offset, float(v), pace, requested) for v in speed]
+            rooms = [math.inf if room is None else room for room in rooms]
+            off = np.where(speed > 4.0, rooms, math.inf) - (line - front)
             best = int(np.argmin(np.abs(off)))
             if abs(off[best]) < 0.08 * speed[best]:
                 return int(steps[best]), line, offset
@@ -151,15 +147,10 @@ class Jaywalker:
 
 
 @dataclass(frozen=True)
-class LaneBlocked:
-    """An object rolls from the roadside into ego's lane and stays there.
-
-    Attributes:
-        speed_mps: Speed of the object, low and high.
-    """
+class LaneBlocked(EventScript):
+    """An object rolls from the roadside into ego's lane and stays there."""
 
     speed_mps: tuple[float, float] = (2.5, 7.0)
-    kind: EventKind = EventKind.LANE_BLOCKED
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`: on all roads."""
@@ -172,19 +163,13 @@ class LaneBlocked:
         out = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
-        speed = float(view.motion.speed[0, step])
-        room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
-        station = float(view.track.at[step]) + room + (view.ego_size_m[0] + _THING_M[0]) / 2
+        station, arrival_s = _blocked_station(view, step, severity_mps2, _THING_M[0])
         offset = view.edge_m(station, side) + out
         half = (view.ego_size_m[1] + _THING_M[1]) / 2
         if not offset < 9.0 or not view.plain_road(station):
             return None
-        if travel_s(offset - half, pace, _ROLLING_MPS2) > room / speed - 0.05:
-            return None
-        times = DT_S * (np.arange(view.steps) - step)
-        length = offset - rest
-        gait = walk(length, pace, (_ROLLING_MPS2, max(3.0, pace**2 / length)), times)
-        if gait is None:
+        gait = _entry(view, step, offset - rest, pace, (_ROLLING_MPS2, 3.0))
+        if gait is None or travel_s(offset - half, pace, _ROLLING_MPS2) > arrival_s - 0.05:
             return None
         left = side * (offset - gait[0])
         adversary = _crossing_actor(view, station, left, AgentKind.OTHER, _THING_M)
@@ -192,21 +177,11 @@ class LaneBlocked:
 
 
 @dataclass(frozen=True)
-class ReversingCar:
-    """A car backs out of a driveway into ego's lane and stops there.
-
-    Attributes:
-        speed_mps: Speed in reverse, low and high.
-        gain_mps2: Acceleration.
-    """
+class ReversingCar(_StreetScript):
+    """A car backs out of a driveway into ego's lane and stops there."""
 
     speed_mps: tuple[float, float] = (2.0, 4.0)
     gain_mps2: float = 3.0
-    kind: EventKind = EventKind.REVERSING_CAR
-
-    def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`."""
-        return _has_streets(network)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
@@ -214,34 +189,26 @@ class ReversingCar:
         into, back = float(rng.uniform(0.2, 1.2)), float(rng.uniform(-0.6, 0.4))
         if step is None:
             return None
-        speed = float(view.motion.speed[0, step])
-        room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
-        station = float(view.track.at[step]) + room + (view.ego_size_m[0] + CAR_M[1]) / 2
+        station, arrival_s = _blocked_station(view, step, severity_mps2, CAR_M[1])
         # The rear bumper starts near the right kerb and ends beyond the middle of ego's path.
         rear = view.edge_m(station, -1) + back
         if not 1.3 < rear < 7.0 or not _is_open_street(view, station):
             return None
-        half = view.ego_size_m[1] / 2
-        if travel_s(rear - half, pace, self.gain_mps2) > room / speed - 0.05:
+        gait = _entry(view, step, rear + into, pace, (self.gain_mps2, 2.5))
+        clears = view.ego_size_m[1] / 2
+        if gait is None or travel_s(rear - clears, pace, self.gain_mps2) > arrival_s - 0.05:
             return None
-        times = DT_S * (np.arange(view.steps) - step)
-        length = rear + into
-        gait = walk(length, pace, (self.gain_mps2, max(2.5, pace**2 / length)), times)
-        if gait is None:
-            return None
-        left = gait[0] - (rear + CAR_M[0] / 2)
-        xy, heading = view.track.pose(np.full(view.steps, station), left)
-        turned = heading - math.pi / 2
-        adversary = Scripted(AgentKind.VEHICLE, CAR_M, xy, turned, -gait[1], np.ones(view.steps, bool))
+        xy, heading = view.track.pose(np.full(view.steps, station), gait[0] - (rear + CAR_M[0] / 2))
+        valid = np.ones(view.steps, bool)
+        adversary = Scripted(AgentKind.VEHICLE, CAR_M, xy, heading - math.pi / 2, -gait[1], valid)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, view.last_step)
 
 
 @dataclass(frozen=True)
-class WrongWayCyclist:
+class WrongWayCyclist(_StreetScript):
     """An oncoming cyclist at the edge of ego's side swings out into ego's lane for a while.
 
     Attributes:
-        speed_mps: Speed, low and high.
         out_s: Time in ego's lane, low and high.
         swing_s: Duration of each swing.
     """
@@ -249,11 +216,6 @@ class WrongWayCyclist:
     speed_mps: tuple[float, float] = (3.5, 6.5)
     out_s: tuple[float, float] = (2.0, 3.2)
     swing_s: float = 1.6
-    kind: EventKind = EventKind.WRONG_WAY_CYCLIST
-
-    def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`."""
-        return _has_streets(network)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
@@ -261,7 +223,7 @@ class WrongWayCyclist:
         clear, inner = float(rng.uniform(*self.out_s)), float(rng.uniform(-0.9, -0.1))
         if step is None:
             return None
-        speed, own = float(view.motion.speed[0, step]), float(view.track.at[step])
+        own, speed = view.at_step(step)
         room = speed * NOTICED_S + waiting_room(speed, severity_mps2, clear - NOTICED_S)
         start = own + (view.ego_size_m[0] + _BICYCLE_M[0]) / 2 + room + pace * clear
         if not _is_open_street(view, own + room) or not _is_open_street(view, start):
@@ -275,20 +237,17 @@ class WrongWayCyclist:
         # Share of the swing back after which ego's lane is clear.
         share = (half + outer) / (outer - inner) if outer < inner else 1.0
         begin_back = clear - _time_of_share(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
-        swing = smooth_step(times, self.swing_s) - smooth_step(times - begin_back, self.swing_s)
+        swing = smooth_step(times / self.swing_s) - smooth_step((times - begin_back) / self.swing_s)
         if begin_back < self.swing_s * 0.6:
             return None
         left = outer + (inner - outer) * swing
-        station = start - pace * times
         valid = np.ones(view.steps, bool)
-        adversary = along_track(view.track, station, left, AgentKind.CYCLIST, _BICYCLE_M, valid=valid)
-        last = step + round((begin_back + self.swing_s) / DT_S)
-        return Proposal(
-            Staging(extras=(adversary,)), severity_mps2, adversary, step, min(last, view.last_step)
-        )
+        adversary = along_track(view.track, start - pace * times, left, AgentKind.CYCLIST, _BICYCLE_M, valid)
+        last = min(step + round((begin_back + self.swing_s) / DT_S), view.last_step)
+        return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
 
 def _time_of_share(share: float) -> float:
     """Inverse of the smooth step: the share of its duration at which it reaches a share."""
     t = np.linspace(0.0, 1.0, 201)
-    return float(np.interp(share, smooth_step(t, 1.0), t))
+    return float(np.interp(share, smooth_step(t), t))

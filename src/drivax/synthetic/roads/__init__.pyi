@@ -1,10 +1,10 @@
 from .curves import Curve as Curve
 from .curves import Pose as Pose
-from .draft import Draft as Draft
 from .families import FAMILIES as FAMILIES
 from .families import RoadFamily as RoadFamily
 from .network import Control as Control
 from .network import Crossing as Crossing
+from .network import Draft as Draft
 from .network import Lane as Lane
 from .network import Line as Line
 from .network import RoadNetwork as RoadNetwork

@@ -29,15 +29,13 @@ class Pose:
 
     def ahead(self, metres: float) -> Pose:
         """Pose at a distance straight ahead."""
-        return Pose(
-            self.x + metres * math.cos(self.heading), self.y + metres * math.sin(self.heading), self.heading
-        )
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        return Pose(self.x + metres * cos, self.y + metres * sin, self.heading)
 
     def aside(self, left_m: float) -> Pose:
         """Pose at a distance to the left (negative: right)."""
-        return Pose(
-            self.x - left_m * math.sin(self.heading), self.y + left_m * math.cos(self.heading), self.heading
-        )
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        return Pose(self.x - left_m * sin, self.y + left_m * cos, self.heading)
 
     def turned(self) -> Pose:
         """Pose at the same place with the opposite heading."""
@@ -73,10 +71,15 @@ class Curve:
         """Pose at a sample."""
         return Pose(float(self.xy[sample, 0]), float(self.xy[sample, 1]), float(self.heading[sample]))
 
+    def at(
+        self, along_m: Float64[np.ndarray, " n"]
+    ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
+        """Positions and headings at distances along the curve, interpolated linearly."""
+        return interpolate(along_m, self.arc_m, self.xy), np.interp(along_m, self.arc_m, self.heading)
+
     def shifted(self, left_m: float) -> Curve:
         """Parallel curve at a distance to the left (negative: right)."""
-        normal = np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=-1)
-        return Curve(self.xy + left_m * normal, self.heading)
+        return Curve(self.xy + left_m * normals(self.heading), self.heading)
 
     def displaced(self, left_m: Float64[np.ndarray, " point"]) -> Curve:
         """Curve at a distance to the left that varies along it, with its own tangent headings.
@@ -85,8 +88,8 @@ class Curve:
         """
         stretch = 1.0 - left_m * np.gradient(self.heading, self.arc_m)
         slope = np.gradient(left_m, self.arc_m)
-        normal = np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=-1)
-        return Curve(self.xy + left_m[:, None] * normal, self.heading + np.arctan2(slope, stretch))
+        xy = self.xy + left_m[:, None] * normals(self.heading)
+        return Curve(xy, self.heading + np.arctan2(slope, stretch))
 
     def reversed(self) -> Curve:
         """Curve in the other direction."""
@@ -95,6 +98,20 @@ class Curve:
     def piece(self, first: int, last: int) -> Curve:
         """Samples ``first`` to ``last``, both included."""
         return Curve(self.xy[first : last + 1], self.heading[first : last + 1])
+
+
+def normals(heading: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n 2"]:
+    """Unit vectors to the left of headings."""
+    return np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+
+
+def interpolate(
+    along_m: Float64[np.ndarray, " n"],
+    arc_m: Float64[np.ndarray, " point"],
+    xy: Float64[np.ndarray, "point 2"],
+) -> Float64[np.ndarray, "n 2"]:
+    """Positions at distances along a polyline whose points lie at ``arc_m``."""
+    return np.stack([np.interp(along_m, arc_m, xy[:, k]) for k in (0, 1)], axis=-1)
 
 
 def smooth_step(share: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
@@ -134,21 +151,15 @@ def join_curves(*curves: Curve) -> Curve:
 
 def resample(curve: Curve, step_m: float) -> Curve:
     """Resample a curve at equal distances of about ``step_m`` along its chords; both ends are kept."""
-    arc = curve.arc_m
-    count = max(2, round(float(arc[-1]) / step_m) + 1)
-    at = np.linspace(0.0, arc[-1], count)
-    xy = np.stack([np.interp(at, arc, curve.xy[:, 0]), np.interp(at, arc, curve.xy[:, 1])], axis=-1)
-    return Curve(xy, np.interp(at, arc, curve.heading))
+    length = curve.arc_m[-1]
+    return Curve(*curve.at(np.linspace(0.0, length, max(2, round(float(length) / step_m) + 1))))
 
 
 def turn(start: Pose, angle: float, tangent_m: float, easing: float = 0.3) -> Curve:
-    """Bend of clothoid, arc and clothoid; it ends ``tangent_m`` beyond the corner in the new direction.
+    """Bend of clothoid, arc and clothoid by an angle (rad, positive to the left).
 
-    Args:
-        start: First pose.
-        angle: Change of heading, rad, positive to the left.
-        tangent_m: Distance from the start to the corner where the tangents of both ends meet, m.
-        easing: Share of the length in each of the two clothoids.
+    The tangents of both ends meet at the corner, ``tangent_m`` after the start and before the end; ``easing`` is the
+    share of the length in each of the two clothoids.
     """
 
     def shape(count: int, length_m: float, at: Pose) -> Curve:
@@ -183,6 +194,13 @@ def quintic(start: Pose, end: Pose) -> Curve:
     return resample(Curve(xy, heading), STEP_M)
 
 
+def tangent_lengths(start: Pose, end: Pose, sin: float) -> tuple[float, float]:
+    """Distances ahead of ``start`` and behind ``end`` of their tangents' intersection; ``sin`` of the angle between."""
+    dx, dy = end.x - start.x, end.y - start.y
+    before = (dx * math.sin(end.heading) - dy * math.cos(end.heading)) / sin
+    return before, (dy * math.cos(start.heading) - dx * math.sin(start.heading)) / sin
+
+
 def connect_poses(start: Pose, end: Pose) -> Curve:
     """Smooth curve between poses: a fillet of the two tangents, or a quintic for small changes of heading.
 
@@ -192,12 +210,10 @@ def connect_poses(start: Pose, end: Pose) -> Curve:
     angle = float(wrap(end.heading - start.heading))
     if abs(angle) < _FILLET_ANGLE:
         return quintic(start, end)
-    dx, dy = end.x - start.x, end.y - start.y
-    before = (dx * math.sin(end.heading) - dy * math.cos(end.heading)) / math.sin(angle)
-    after = (dy * math.cos(start.heading) - dx * math.sin(start.heading)) / math.sin(angle)
-    if min(before, after) < 1.0:
-        raise ValueError("no single bend connects the poses: their tangents do not meet between them")
+    before, after = tangent_lengths(start, end, math.sin(angle))
     tangent = min(before, after)
+    if tangent < 1.0:
+        raise ValueError("no single bend connects the poses: their tangents do not meet between them")
     parts = [turn(start.ahead(before - tangent), angle, tangent)]
     if before - tangent > _SHORTEST_M:
         parts.insert(0, straight(start, before - tangent))
@@ -211,12 +227,8 @@ def winding(
 ) -> Curve:
     """Draw a winding road: curvature is linear between random knots 35 to 90 m apart.
 
-    Args:
-        rng: Source of randomness.
-        length_m: Length, m.
-        max_curvature: Largest curvature, 1/m.
-        max_turn: Largest difference of two headings, rad; below pi the curve cannot intersect itself.
-        start: First pose.
+    Curvature is at most ``max_curvature`` (1/m). Headings differ by at most ``max_turn`` (rad): below pi the curve
+    cannot intersect itself.
     """
     knots, values = [0.0], [0.0]
     while knots[-1] < length_m:

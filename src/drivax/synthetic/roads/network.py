@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import combinations, permutations
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -84,11 +87,9 @@ class Start:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Place where pedestrians cross.
+    """Place where pedestrians cross, from kerb to kerb along an axis.
 
     Attributes:
-        axis: Two points, one on each kerb.
-        width_m: Width of the crosswalk.
         lanes: Crossed lanes, each with the distance along it of the axis, m.
         marked: Whether there is a crosswalk, where drivers yield to pedestrians.
     """
@@ -101,12 +102,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Bay:
-    """Parking space inside the road's edges: its middle, heading and length.
-
-    Attributes:
-        lane: The adjacent lane, on which cars may be double-parked.
-        along_m: Distance along that lane of the bay's middle.
-    """
+    """Parking space inside the road's edges: its middle and length, the adjacent lane and the distance along it, m."""
 
     pose: Pose
     length_m: float
@@ -119,9 +115,7 @@ class RoadNetwork:
     """A road map in its own frame (metres).
 
     Attributes:
-        family: Name of the family that built it.
         edges: Closed rings without the repeated point: the outer boundary counter-clockwise, islands clockwise.
-        starts: Possible starts of ego.
         walks: Sidewalks outside the edges.
         busy: Lanes with denser traffic.
     """
@@ -146,43 +140,92 @@ class RoadNetwork:
     @cached_property
     def shared_m(self) -> dict[tuple[int, int], float]:
         """For successors of the same lane: distance along the first one over which both share space, m."""
-        result: dict[tuple[int, int], float] = {}
-        for lane in self.lanes:
-            for a in lane.successors:
-                for b in lane.successors:
-                    if a != b:
-                        result[a, b] = _shared_length(self.lanes[a].curve, self.lanes[b].curve)
-        return result
+        pairs = (pair for lane in self.lanes for pair in permutations(lane.successors, 2))
+        return {(a, b): _shared_length(self.lanes[a].curve, self.lanes[b].curve) for a, b in pairs}
 
 
-def conflicting(lanes: tuple[Lane, ...]) -> Bool[np.ndarray, "lane lane"]:
+def conflicting(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
     """See :attr:`RoadNetwork.conflicts`."""
     result = np.zeros((len(lanes), len(lanes)), bool)
     connectors = [i for i, lane in enumerate(lanes) if lane.connector]
     low = np.array([lanes[i].curve.xy.min(axis=0) for i in connectors]).reshape(-1, 2)
     high = np.array([lanes[i].curve.xy.max(axis=0) for i in connectors]).reshape(-1, 2)
     # Bounding boxes exclude most pairs of a network with several junctions.
-    far = ((low[:, None] - high[None]).max(axis=-1) > CLEARANCE_M) | (
-        (low[None] - high[:, None]).max(axis=-1) > CLEARANCE_M
-    )
-    for place, a in enumerate(connectors):
-        for other, b in enumerate(connectors[place + 1 :], place + 1):
-            if far[place, other] or set(lanes[a].predecessors) & set(lanes[b].predecessors):
-                continue
-            near = _distance(lanes[a].curve.xy[::2], lanes[b].curve.xy[::2]) < CLEARANCE_M
-            result[a, b] = result[b, a] = near
+    apart = (low[:, None] - high).max(axis=-1) > CLEARANCE_M
+    for (i, a), (k, b) in combinations(enumerate(connectors), 2):
+        if not (apart[i, k] or apart[k, i] or set(lanes[a].predecessors) & set(lanes[b].predecessors)):
+            gaps = _distances(lanes[a].curve.xy[::2], lanes[b].curve.xy[::2])
+            result[a, b] = result[b, a] = gaps.min() < CLEARANCE_M
     return result
 
 
-def _distance(a: Float64[np.ndarray, "a 2"], b: Float64[np.ndarray, "b 2"]) -> float:
-    dx, dy = (np.subtract.outer(a[:, k], b[:, k]) for k in (0, 1))
-    return float(np.sqrt((dx * dx + dy * dy).min()))
-
-
 def _shared_length(a: Curve, b: Curve) -> float:
-    gap = np.sqrt(np.min(np.sum((a.xy[:, None] - b.xy[None]) ** 2, axis=-1), axis=1))
-    apart = gap > CLEARANCE_M
-    return float(a.arc_m[int(np.argmax(apart))] if apart.any() else a.arc_m[-1])
+    apart = _distances(a.xy, b.xy).min(axis=1) > CLEARANCE_M
+    return float(a.arc_m[int(np.argmax(apart)) if apart.any() else -1])
+
+
+def _distances(a: Float64[np.ndarray, "a 2"], b: Float64[np.ndarray, "b 2"]) -> Float64[np.ndarray, "a b"]:
+    dx, dy = (np.subtract.outer(a[:, k], b[:, k]) for k in (0, 1))
+    return np.sqrt(dx * dx + dy * dy)
+
+
+@dataclass
+class Draft:
+    """Features of a future :class:`RoadNetwork`: families add and link them, then freeze the draft."""
+
+    lanes: list[Lane] = field(default_factory=list)
+    edges: list[Line] = field(default_factory=list)
+    markings: list[Line] = field(default_factory=list)
+    crosswalks: list[Line] = field(default_factory=list)
+    crossings: list[Crossing] = field(default_factory=list)
+    walks: list[Curve] = field(default_factory=list)
+    bays: list[Bay] = field(default_factory=list)
+
+    def lane(self, curve: Curve, width_m: float, limit_mps: float, **more: Any) -> int:
+        """Add a lane with further attributes of :class:`Lane` and return its index."""
+        self.lanes.append(Lane(curve, width_m, limit_mps, **more))
+        return len(self.lanes) - 1
+
+    def change(self, lane: int, **attributes: Any) -> None:
+        """Change attributes of a lane, such as rules that depend on other lanes."""
+        self.lanes[lane] = replace(self.lanes[lane], **attributes)
+
+    def link(self, before: int, after: int) -> None:
+        """Make lane ``after`` a successor of lane ``before``."""
+        self.change(before, successors=(*self.lanes[before].successors, after))
+        self.change(after, predecessors=(*self.lanes[after].predecessors, before))
+
+    def link_neighbours(self, left: int, right: int) -> None:
+        """Make two lanes of the same direction neighbours."""
+        self.change(left, right=right)
+        self.change(right, left=left)
+
+    def mark(self, kind: RoadKind, curve: Curve) -> None:
+        """Add a marking along a curve, sampled at about 1 m."""
+        self.markings.append(Line(kind, curve.xy[::2]))
+
+    def crosswalk(self, *corners: Pose) -> None:
+        """Add the outline of a crosswalk."""
+        self.crosswalks.append(Line(RoadKind.CROSSWALK, points(*corners)))
+
+    def network(
+        self, family: str, starts: tuple[Start, ...], signals: SignalPlan | None = None
+    ) -> RoadNetwork:
+        """Return the finished network."""
+        features = {item.name: tuple(getattr(self, item.name)) for item in fields(self)}
+        return RoadNetwork(family, starts=starts, signals=signals, **features)
+
+
+def points(*poses: Pose) -> Float64[np.ndarray, "pose 2"]:
+    """Positions of poses."""
+    return np.array([[pose.x, pose.y] for pose in poses])
+
+
+def ring(*curves: Curve) -> Float64[np.ndarray, "point 2"]:
+    """Closed ring of successive curves, sampled at about 1 m without repeated points."""
+    xy = np.concatenate([np.concatenate([curve.xy[:-1:2], curve.xy[-1:]]) for curve in curves])
+    far = np.hypot(*(xy - np.roll(xy, 1, axis=0)).T) > 1e-6
+    return xy[far]
 
 
 def feature_id(lane: int) -> int:
@@ -193,38 +236,37 @@ def feature_id(lane: int) -> int:
 def map_features(network: RoadNetwork) -> tuple[MapFeature, ...]:
     """Convert a network to map features: lanes first (ids 1, 2, ...), then edges, markings, crosswalks, stop signs."""
     features = [_lane_feature(index, lane) for index, lane in enumerate(network.lanes)]
-    for line in network.edges:
-        features.append(_line_feature(len(features) + 1, line.kind, np.concatenate([line.xy, line.xy[:1]])))
-    for line in network.markings + network.crosswalks:
-        features.append(_line_feature(len(features) + 1, line.kind, line.xy))
-    for stop in _stop_signs(network):
-        features.append(replace(stop, feature_id=len(features) + 1))
+    closed = [Line(line.kind, np.concatenate([line.xy, line.xy[:1]])) for line in network.edges]
+    for line in (*closed, *network.markings, *network.crosswalks):
+        features.append(MapFeature(feature_id=len(features) + 1, kind=line.kind, points=_flat(line.xy)))
+    for before, connectors in _signed(network).items():
+        features.append(
+            MapFeature(
+                feature_id=len(features) + 1,
+                kind=RoadKind.STOP_SIGN,
+                points=_flat(network.lanes[before].curve.xy[-1:]),
+                lanes=tuple(map(feature_id, connectors)),
+            )
+        )
     return tuple(features)
 
 
-def _stop_signs(network: RoadNetwork) -> list[MapFeature]:
-    """Stop signs at the stop lines, one per lane before connectors with a stop."""
+def _signed(network: RoadNetwork) -> dict[int, list[int]]:
+    """Lanes that end at a stop sign, each with the connectors to which it applies."""
     signs: dict[int, list[int]] = {}
     for index, lane in enumerate(network.lanes):
         if lane.control in (Control.STOP, Control.ALL_WAY_STOP):
             for before in lane.predecessors:
                 signs.setdefault(before, []).append(index)
-    return [
-        MapFeature(
-            feature_id=0,
-            kind=RoadKind.STOP_SIGN,
-            points=_flat(network.lanes[before].curve.xy[-1:]),
-            lanes=tuple(map(feature_id, connectors)),
-        )
-        for before, connectors in signs.items()
-    ]
+    return signs
 
 
 def _lane_feature(index: int, lane: Lane) -> MapFeature:
+    xy = lane.curve.xy
     return MapFeature(
         feature_id=feature_id(index),
         kind=lane.kind,
-        points=_flat(_thinned(lane.curve.xy)),
+        points=_flat(xy if len(xy) < 3 else np.concatenate([xy[:-1:_STRIDE], xy[-1:]])),
         limit_mps=lane.limit_mps,
         width_m=lane.width_m,
         successors=tuple(map(feature_id, lane.successors)),
@@ -233,14 +275,6 @@ def _lane_feature(index: int, lane: Lane) -> MapFeature:
         right_neighbours=() if lane.right < 0 else (feature_id(lane.right),),
         interpolating=lane.connector,
     )
-
-
-def _line_feature(number: int, kind: RoadKind, xy: Float64[np.ndarray, "point 2"]) -> MapFeature:
-    return MapFeature(feature_id=number, kind=kind, points=_flat(xy))
-
-
-def _thinned(xy: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "kept 2"]:
-    return xy if len(xy) < 3 else np.concatenate([xy[:-1:_STRIDE], xy[-1:]])
 
 
 def _flat(xy: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "point 3"]:

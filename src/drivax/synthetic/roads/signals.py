@@ -6,7 +6,7 @@ import enum
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64, Int8, Int64
+from jaxtyping import Float64, Int8
 
 from drivax.scenario.schema import LightState
 
@@ -35,7 +35,6 @@ class SignalPlan:
     Attributes:
         phases: Indices of the groups that are green, per phase.
         green_s: Duration of green of each phase, s.
-        yellow_s, all_red_s: Duration of yellow and of the red after it, s.
         offset_s: Time at which phase 0 turns green, s.
         programs: Phases of each junction in order, each program on its own cycle; empty: one junction with all phases.
         lags_s: Time from ``offset_s`` until the first phase of each program turns green, s; empty: no lags.
@@ -89,10 +88,7 @@ class SignalPlan:
     def colours(
         self, times_s: Float64[np.ndarray, " time"], lanes: int
     ) -> tuple[Int8[np.ndarray, "time lane"], Float64[np.ndarray, "time lane"]]:
-        """Colour of each of ``lanes`` lanes at times (NONE without a light), and the seconds from yellow to red.
-
-        The seconds are 0 where the light is not yellow.
-        """
+        """Colour of each of ``lanes`` lanes (NONE without a light), and the seconds until a yellow light turns red."""
         colour = np.zeros((len(times_s), lanes), np.int8)
         left = np.zeros((len(times_s), lanes))
         for group in self.groups:
@@ -123,41 +119,28 @@ def yellow_time_s(limit_mps: float) -> float:
 
 
 def combine_plans(first: SignalPlan, second: SignalPlan, lag_s: float) -> SignalPlan:
-    """Combine the plans of two junctions, each with its own cycle.
+    """Combine the plans of two junctions, each with its own cycle; phase 0 of ``second`` turns green ``lag_s`` later.
 
-    Args:
-        first: Plan without programs; its yellow and all-red times hold for both junctions.
-        second: Plan of the other junction.
-        lag_s: Time from green of phase 0 of ``first`` to green of phase 0 of ``second``, s.
+    The yellow and all-red times of ``first`` hold for both.
     """
     groups, phases = len(first.groups), len(first.phases)
-    return SignalPlan(
+    return replace(
+        first,
         groups=first.groups + second.groups,
         phases=first.phases + tuple(tuple(groups + g for g in phase) for phase in second.phases),
         green_s=first.green_s + second.green_s,
-        yellow_s=first.yellow_s,
-        all_red_s=first.all_red_s,
-        offset_s=first.offset_s,
         programs=(tuple(range(phases)), tuple(range(phases, phases + len(second.phases)))),
         lags_s=(0.0, lag_s),
     )
 
 
-_ROUND = {
-    Colour.NONE: LightState.UNOBSERVED,
-    Colour.GREEN: LightState.GO,
-    Colour.YELLOW: LightState.CAUTION,
-    Colour.RED: LightState.STOP,
-}
-_ARROW = {
-    Colour.NONE: LightState.UNOBSERVED,
-    Colour.GREEN: LightState.ARROW_GO,
-    Colour.YELLOW: LightState.ARROW_CAUTION,
-    Colour.RED: LightState.ARROW_STOP,
-}
+#: Light states by colour: of round lights, and of arrows.
+_STATES = (
+    (LightState.UNOBSERVED, LightState.GO, LightState.CAUTION, LightState.STOP),
+    (LightState.UNOBSERVED, LightState.ARROW_GO, LightState.ARROW_CAUTION, LightState.ARROW_STOP),
+)
 
 
 def light_states(colour: Int8[np.ndarray, " time"], arrow: bool) -> Int8[np.ndarray, " time"]:
     """Convert colours to light states of the scenario schema."""
-    table: Int64[np.ndarray, " 4"] = np.array([(_ARROW if arrow else _ROUND)[c] for c in Colour])
-    return table[colour].astype(np.int8)
+    return np.array(_STATES[arrow], np.int8)[colour]

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+#: Lanes ahead (inward), lanes the other way (outward), and the share of that layout.
+Layouts = tuple[tuple[int, int, float], ...]
+
 
 @dataclass(frozen=True)
 class RoadStyle:
     """Statistics of a domain's roads.
 
     Attributes:
-        width_m: Width of lanes, low and high.
-        limits_mps: Speed limits of streets.
-        fast_limits_mps: Speed limits of highways.
-        shoulder_m: Drivable width beyond the outer lanes, low and high.
+        width_m, shoulder_m: Width of lanes, and drivable width beyond the outer ones, low and high.
+        limits_mps, fast_limits_mps: Speed limits of streets and of highways.
         curvature: Factor on the curvature of bends.
-        walk_share: Share of streets with sidewalks.
-        parking_share: Share of streets with bays, in families that have them.
+        walk_share, parking_share: Shares of streets with sidewalks, and of those of some families with bays.
     """
 
     width_m: tuple[float, float] = (3.35, 3.75)
@@ -40,3 +42,9 @@ RING = RoadStyle(
     walk_share=0.95,
     parking_share=0.7,
 )
+
+
+def draw_layout(rng: np.random.Generator, layouts: Layouts) -> tuple[int, int]:
+    """Draw the numbers of lanes of a street."""
+    ahead, back, _ = layouts[rng.choice(len(layouts), p=[share for *_, share in layouts])]
+    return ahead, back

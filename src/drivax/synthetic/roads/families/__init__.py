@@ -6,10 +6,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from drivax.synthetic.roads.families.corridor import Corridor
-from drivax.synthetic.roads.families.highway import Highway
 from drivax.synthetic.roads.families.junctions import (
     AllWayStop,
+    Corridor,
     SignalisedJunction,
     TJunction,
     UnprotectedLeft,
@@ -18,6 +17,7 @@ from drivax.synthetic.roads.families.roundabout import Roundabout
 from drivax.synthetic.roads.families.streets import (
     STRAIGHT_ROAD,
     CurvedRoad,
+    Highway,
     LaneDrop,
     MidblockCrosswalk,
     ParkedStreet,
@@ -55,20 +55,3 @@ FAMILIES: tuple[RoadFamily, ...] = (
     MidblockCrosswalk(),
     ParkedStreet(),
 )
-
-__all__ = [
-    "FAMILIES",
-    "STRAIGHT_ROAD",
-    "AllWayStop",
-    "Corridor",
-    "CurvedRoad",
-    "Highway",
-    "LaneDrop",
-    "MidblockCrosswalk",
-    "ParkedStreet",
-    "RoadFamily",
-    "Roundabout",
-    "SignalisedJunction",
-    "TJunction",
-    "UnprotectedLeft",
-]

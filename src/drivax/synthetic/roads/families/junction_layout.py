@@ -25,10 +25,10 @@ from drivax.synthetic.roads.curves import (
     join_curves,
     resample,
     straight,
+    tangent_lengths,
     winding,
 )
-from drivax.synthetic.roads.draft import Draft, points, ring
-from drivax.synthetic.roads.network import Crossing, Line, Start
+from drivax.synthetic.roads.network import Crossing, Draft, Line, Start, points, ring
 from drivax.synthetic.roads.style import RoadStyle
 
 #: Distances from the mouth of the crossing's two sides and of the stop line, with a crosswalk and without, m.
@@ -145,19 +145,18 @@ class Site:
 
 @dataclass(frozen=True)
 class Reach:
-    """Shape of arms beyond the stop line: straight first, then slightly bent.
-
-    Attributes:
-        arm_m: Length.
-        straight_m: Length of the straight part.
-        tightest_m: Radius of the tightest bend.
-        widest_turn: Largest difference of two headings, rad.
-    """
+    """Arms beyond the stop line: straight, then bent, with headings that differ by at most ``widest_turn`` (rad)."""
 
     arm_m: float = 230.0
     straight_m: float = 30.0
     tightest_m: float = 120.0
     widest_turn: float = math.radians(28.0)
+
+    def draw(self, rng: np.random.Generator, start: Pose) -> Curve:
+        """Draw the middle line of an arm."""
+        near, bends = straight(start, self.straight_m), self.arm_m - self.straight_m
+        shape = {"max_curvature": 1.0 / self.tightest_m, "max_turn": self.widest_turn}
+        return join_curves(near, winding(rng, bends, start=near.end, **shape))
 
 
 @dataclass(frozen=True)
@@ -165,11 +164,9 @@ class Geometry:
     """Geometry of a junction.
 
     Attributes:
-        skew: Largest deviation of an arm from its direction, rad.
-        offset_m: Largest lateral offset of an arm from the centre.
+        skew, offset_m: Largest deviation of an arm from its direction, rad, and from the centre.
         corner_m: Radius of the corners' kerbs, low and high.
         walk_m: Distance of sidewalks from the edge, low and high.
-        reach: Shape of the arms.
     """
 
     skew: float = math.radians(6.0)
@@ -186,8 +183,7 @@ class Geometry:
         for heading, street in zip(headings, streets, strict=True):
             at = Pose(0.0, 0.0, heading + float(rng.uniform(-self.skew, self.skew)))
             centred = (street.outward - street.inward) * street.width_m / 2
-            offset = float(rng.uniform(-self.offset_m, self.offset_m))
-            arms.append(Arm(at.aside(centred + offset), street))
+            arms.append(Arm(at.aside(centred + float(rng.uniform(-self.offset_m, self.offset_m))), street))
         return arms
 
     def mouths(self, rng: np.random.Generator, arms: Sequence[Arm]) -> list[float]:
@@ -219,85 +215,64 @@ def draw_street(
     return CrossSection(*lanes, width, float(rng.uniform(*style.shoulder_m)), limit_mps, marked)
 
 
-def draw_four_headings(rng: np.random.Generator, cross_skew: float) -> list[float]:
-    """Draw directions of the arms where two streets cross."""
-    first = float(rng.uniform(-math.pi, math.pi))
-    second = first + math.pi / 2 + float(rng.uniform(-cross_skew, cross_skew))
-    return [first, second, first + math.pi, second + math.pi]
-
-
 def _intersection(right: Arm, left: Arm) -> tuple[float, float]:
     """Distances along both middle lines of the intersection of an arm's left edge and the next arm's right edge."""
-    a, b = right.base, left.base
-    sin = math.sin(b.heading - a.heading)
-    start, end = a.aside(right.street.left_m), b.aside(-left.street.right_m)
-    dx, dy = end.x - start.x, end.y - start.y
-    along_a = (dx * math.sin(b.heading) - dy * math.cos(b.heading)) / sin
-    along_b = (dx * math.sin(a.heading) - dy * math.cos(a.heading)) / sin
-    return along_a, along_b
+    start, end = right.base.aside(right.street.left_m), left.base.aside(-left.street.right_m)
+    mine, behind = tangent_lengths(start, end, math.sin(end.heading - start.heading))
+    return mine, -behind
 
 
 def open_approach(rng: np.random.Generator, draft: Draft, arm: Arm, mouth_m: float, reach: Reach) -> Approach:
     """Add an arm that leads off the map."""
-    near = straight(arm.base.ahead(mouth_m + arm.street.stop_line_m), reach.straight_m)
-    far = winding(
-        rng,
-        reach.arm_m - reach.straight_m,
-        max_curvature=1.0 / reach.tightest_m,
-        max_turn=reach.widest_turn,
-        start=near.end,
-    )
-    middle = join_curves(near, far)
+    middle = reach.draw(rng, arm.base.ahead(mouth_m + arm.street.stop_line_m))
     side = join_curves(straight(arm.base.ahead(mouth_m), arm.street.stop_line_m), middle)
-    inward, outward = lay_lanes(draft, arm.street, middle)
-    return Approach(arm, mouth_m, middle, side, inward, outward)
+    return Approach(arm, mouth_m, middle, side, *lay_lanes(draft, arm.street, middle))
 
 
 def lay_lanes(draft: Draft, street: CrossSection, middle: Curve) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Add the lanes of a street, whose middle line leads outwards; return inward and outward lanes."""
-    inward, outward = (
-        [
-            draft.lane(
-                curve if side < 0 else curve.reversed(),
-                street.width_m,
-                street.limit_mps,
-            )
-            for j in range(count)
-            for curve in [middle.shifted(side * (street.gap_m / 2 + (j + 0.5) * street.width_m))]
-        ]
-        for side, count in ((1.0, street.inward), (-1.0, street.outward))
-    )
-    for lanes in (inward, outward):
-        for a, b in pairwise(lanes):
-            draft.link_neighbours(a, b)
-    return tuple(inward), tuple(outward)
+
+    def lay(count: int, side: float) -> tuple[int, ...]:
+        lanes = []
+        for j in range(count):
+            curve = middle.shifted(side * (street.gap_m / 2 + (j + 0.5) * street.width_m))
+            curve = curve if side < 0 else curve.reversed()
+            lanes.append(draft.lane(curve, street.width_m, street.limit_mps))
+        for pair in pairwise(lanes):
+            draft.link_neighbours(*pair)
+        return tuple(lanes)
+
+    return lay(street.inward, 1.0), lay(street.outward, -1.0)
 
 
-def open_site(rng: np.random.Generator, draft: Draft, arms: Sequence[Arm], geometry: Geometry) -> Site:
-    """Add all arms of a single junction, without connectors."""
-    mouths = geometry.mouths(rng, arms)
-    return Site(
-        tuple(
-            open_approach(rng, draft, arm, mouth, geometry.reach)
-            for arm, mouth in zip(arms, mouths, strict=True)
-        )
-    )
+def open_site(rng: np.random.Generator, arms: Sequence[Arm], geometry: Geometry) -> tuple[Draft, Site]:
+    """Begin a draft with all arms of a single junction, without connectors."""
+    draft, mouths = Draft(), geometry.mouths(rng, arms)
+    pairs = zip(arms, mouths, strict=True)
+    return draft, Site(tuple(open_approach(rng, draft, arm, mouth, geometry.reach) for arm, mouth in pairs))
+
+
+def open_crossroads(
+    rng: np.random.Generator, streets: Sequence[CrossSection], geometry: Geometry, skew: float
+) -> tuple[Draft, Site]:
+    """Begin a draft with the arms of two streets that cross at a right angle, give or take ``skew`` (rad)."""
+    first = float(rng.uniform(-math.pi, math.pi))
+    second = first + math.pi / 2 + float(rng.uniform(-skew, skew))
+    headings = [first, second, first + math.pi, second + math.pi]
+    return open_site(rng, geometry.arms(rng, headings, [*streets, *streets]), geometry)
 
 
 def connect(draft: Draft, site: Site, left_only: Sequence[bool]) -> Site:
     """Add the connectors.
 
     Left turns connect innermost lanes, right turns outermost ones, and straight connectors match lanes from the
-    outside. Where fewer lanes leave than arrive, the innermost one is for turning only.
-
-    Args:
-        draft: The draft.
-        site: The junction.
-        left_only: Whether the innermost of several lanes is for left turns only, per approach.
+    outside. Where fewer lanes leave than arrive, the innermost one is for turning only; with ``left_only`` of an
+    approach, the innermost of several lanes always is.
     """
     moves = []
     for i, approach in enumerate(site.approaches):
-        turns = {_turn(approach.arm, site.approaches[k].arm): k for k in _others(i, len(site.approaches))}
+        others = [(i + step) % len(site.approaches) for step in range(1, len(site.approaches))]
+        turns = {_turn(approach.arm, site.approaches[k].arm): k for k in others}
         lanes = approach.inward
         for turn, k in sorted(turns.items()):
             out = site.approaches[k].outward
@@ -310,10 +285,6 @@ def connect(draft: Draft, site: Site, left_only: Sequence[bool]) -> Site:
             ends = (approach.arm.street.stop_line_m, site.approaches[k].arm.street.stop_line_m)
             moves += [Move(_connector(draft, a, b, ends), i, k, turn) for a, b in pairs]
     return Site(site.approaches, tuple(moves))
-
-
-def _others(i: int, count: int) -> list[int]:
-    return [(i + step) % count for step in range(1, count)]
 
 
 def _turn(before: Arm, after: Arm) -> Turn:
@@ -339,9 +310,8 @@ def starts(draft: Draft, lanes: Sequence[int]) -> tuple[Start, ...]:
     """Starts on inward lanes; a repeated lane is drawn more often."""
     result = []
     for index in lanes:
-        lane = draft.lanes[index]
-        earliest = min(_EARLIEST_M, _EARLIEST_S * lane.limit_mps)
-        result.append(Start(index, lane.length_m - earliest, lane.length_m - _LATEST_M))
+        length, limit = draft.lanes[index].length_m, draft.lanes[index].limit_mps
+        result.append(Start(index, length - min(_EARLIEST_M, _EARLIEST_S * limit), length - _LATEST_M))
     return tuple(result)
 
 
@@ -349,14 +319,17 @@ def starts(draft: Draft, lanes: Sequence[int]) -> tuple[Start, ...]:
 Place = tuple[int, int]
 
 
-def outline(draft: Draft, sites: Sequence[Site], links: dict[Place, Place], walk_m: float | None) -> None:
-    """Add the boundary around all sites, counter-clockwise, and sidewalks along it.
+def finish_sites(
+    rng: np.random.Generator,
+    style: RoadStyle,
+    draft: Draft,
+    sites: Sequence[Site],
+    links: dict[Place, Place],
+    geometry: Geometry,
+) -> None:
+    """Add the boundary around all sites, counter-clockwise, sidewalks along it, markings and crossings.
 
-    Args:
-        draft: The draft.
-        sites: The junctions, linked as a tree.
-        links: Pairs of approaches at the two ends of a street, in both directions.
-        walk_m: Distance of the sidewalks from the edge; None: no sidewalks.
+    ``links`` pairs the approaches at the two ends of a street, in both directions; linked sites form a tree.
     """
     first = next((0, i) for i in range(len(sites[0].approaches)) if (0, i) not in links)
     kerbs, at = [], first
@@ -364,8 +337,14 @@ def outline(draft: Draft, sites: Sequence[Site], links: dict[Place, Place], walk
         kerb, at = _kerb_between_ends(sites, links, at)
         kerbs.append(kerb)
     draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*kerbs)))
-    if walk_m is not None:
+    walk_m = float(rng.uniform(*geometry.walk_m))
+    if rng.random() < style.walk_share:
         draft.walks += [kerb.shifted(-walk_m) for kerb in kerbs]
+    for number, site in enumerate(sites):
+        for i, approach in enumerate(site.approaches):
+            if links.get((number, i), (number, i)) >= (number, i):
+                _paint(draft, approach.arm.street, approach.middle)
+        _add_crossings(draft, site)
 
 
 def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: Place) -> tuple[Curve, Place]:
@@ -385,7 +364,7 @@ def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: 
         here = links[after]
 
 
-def paint(draft: Draft, street: CrossSection, middle: Curve) -> None:
+def _paint(draft: Draft, street: CrossSection, middle: Curve) -> None:
     """Add the markings of a street."""
     draft.mark(RoadKind.LINE_SOLID_DOUBLE_YELLOW, middle)
     for side, count in ((1.0, street.inward), (-1.0, street.outward)):
@@ -394,47 +373,20 @@ def paint(draft: Draft, street: CrossSection, middle: Curve) -> None:
             draft.mark(kind, middle.shifted(side * (street.gap_m / 2 + j * street.width_m)))
 
 
-def add_crossings(draft: Draft, site: Site) -> None:
+def _add_crossings(draft: Draft, site: Site) -> None:
     """Add a crossing at the mouth of each approach, with a crosswalk where it is marked."""
     for i, approach in enumerate(site.approaches):
         street = approach.arm.street
-        near, far = (approach.arm.base.ahead(approach.mouth_m + metres) for metres in street.crossing_m)
+        left, right, (begin, end) = street.left_m, -street.right_m, street.crossing_m
+        near, far = (approach.arm.base.ahead(approach.mouth_m + metres) for metres in (begin, end))
         if street.marked:
-            left, right = street.left_m, -street.right_m
             draft.crosswalk(near.aside(left), far.aside(left), far.aside(right), near.aside(right))
-        width = street.crossing_m[1] - street.crossing_m[0]
-        middle = near.ahead(width / 2)
-        axis = points(middle.aside(street.left_m), middle.aside(-street.right_m))
-        draft.crossings.append(Crossing(axis, width, _crossed(draft, site, i), street.marked))
-
-
-def _crossed(draft: Draft, site: Site, i: int) -> tuple[tuple[int, float], ...]:
-    """Connectors that an approach's crossing crosses, and the distance along each, m."""
-    street = site.approaches[i].arm.street
-    inside = street.stop_line_m - sum(street.crossing_m) / 2
-    entering = [(move.lane, inside) for move in site.moves if move.arm == i]
-    leaving = [(move.lane, draft.lanes[move.lane].length_m - inside) for move in site.moves if move.to == i]
-    return (*entering, *leaving)
-
-
-def draw_sidewalk_m(rng: np.random.Generator, style: RoadStyle, geometry: Geometry) -> float | None:
-    """Draw the distance of sidewalks from the edge; None: no sidewalks."""
-    distance = float(rng.uniform(*geometry.walk_m))
-    return distance if rng.random() < style.walk_share else None
-
-
-def finish_site(
-    rng: np.random.Generator,
-    style: RoadStyle,
-    draft: Draft,
-    site: Site,
-    left_only: Sequence[bool],
-    geometry: Geometry,
-) -> Site:
-    """Add connectors, edges, sidewalks, markings and crossings of a single junction."""
-    site = connect(draft, site, left_only)
-    outline(draft, (site,), {}, draw_sidewalk_m(rng, style, geometry))
-    for approach in site.approaches:
-        paint(draft, approach.arm.street, approach.middle)
-    add_crossings(draft, site)
-    return site
+        # Connectors begin and end at the stop line.
+        inside = street.stop_line_m - (begin + end) / 2
+        entering = [(move.lane, inside) for move in site.moves if move.arm == i]
+        leaving = [
+            (move.lane, draft.lanes[move.lane].length_m - inside) for move in site.moves if move.to == i
+        ]
+        middle = near.ahead((end - begin) / 2)
+        axis = points(middle.aside(left), middle.aside(right))
+        draft.crossings.append(Crossing(axis, end - begin, (*entering, *leaving), street.marked))

@@ -1,4 +1,4 @@
-"""Families of single junctions: with lights, T-junctions, all-way stops, and unprotected left turns.
+"""Families of junctions: with lights, T-junctions, all-way stops, unprotected left turns, and a corridor of two.
 
 Lights serve left turns in a phase of their own (protected, with arrows), together with oncoming traffic that has right
 of way (permissive), or serve one approach after the other (split phases). Other conflicting movements are never green
@@ -8,34 +8,126 @@ at the same time. Ego starts on any approach, 12 to 85 m (6 s) before the juncti
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Bool
 
-from drivax.synthetic.roads.draft import Draft
+from drivax.synthetic.roads.curves import Curve, Pose, join_curves, straight, winding
 from drivax.synthetic.roads.families.junction_layout import (
+    Approach,
+    Arm,
     CrossSection,
     Geometry,
-    draw_four_headings,
+    Move,
+    Reach,
+    Site,
+    Turn,
+    connect,
     draw_street,
-    finish_site,
+    finish_sites,
+    lay_lanes,
+    open_approach,
+    open_crossroads,
     open_site,
     starts,
 )
-from drivax.synthetic.roads.families.rules import LeftTurns, set_lights, set_priorities
-from drivax.synthetic.roads.network import Control, RoadNetwork
-from drivax.synthetic.roads.style import GRID, RoadStyle
+from drivax.synthetic.roads.network import Control, Draft, RoadNetwork, conflicting
+from drivax.synthetic.roads.signals import LightGroup, SignalPlan, combine_plans, yellow_time_s
+from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
-#: Lanes inward and outward of a street, with the share of each layout. An extra lane inward is for turning left.
-_SIGNAL_LAYOUTS = ((1, 1), (2, 1), (2, 2), (3, 2))
-_SIGNAL_SHARES = (0.35, 0.15, 0.38, 0.12)
-
-
-#: Lanes inward and outward of the main road, with the share of each layout; the left one is for turning left.
-_LEFT_LAYOUTS = ((2, 1), (2, 2), (3, 2))
-_LEFT_SHARES = (0.4, 0.3, 0.3)
+#: Layouts of streets at lights; an extra lane inward is for turning left.
+_SIGNAL_LAYOUTS: Layouts = ((1, 1, 0.35), (2, 1, 0.15), (2, 2, 0.38), (3, 2, 0.12))
+#: Layouts of the main road at unprotected left turns; the left lane is for turning left.
+_LEFT_LAYOUTS: Layouts = ((2, 1, 0.4), (2, 2, 0.3), (3, 2, 0.3))
 #: The left-turn lane is this many times as likely to be ego's as another one.
 _LEFT_WEIGHT = 4
+#: Kinds of junctions in a corridor and their shares.
+_LIGHTS, _SIDE_ROAD = "lights", "side_road"
+_KINDS = {_LIGHTS: 0.5, "two_stops": 0.25, _SIDE_ROAD: 0.25}
+#: Weight of a start on the main road relative to one on a side road.
+_MAIN_WEIGHT = 3
+#: Length of the straight ends of the road between the junctions, m.
+_STRAIGHT_M = 25.0
+#: Speed of platoons as a share of the limit.
+_PLATOON = 0.85
+#: Pairs of connectors in conflict.
+Conflicts = Bool[np.ndarray, "lane lane"]
+
+
+def set_priorities(draft: Draft, site: Site, major: Sequence[int], sign: Control) -> None:
+    """Set the rules of a priority road: other approaches have a sign, left turns yield to oncoming traffic."""
+    conflicts = conflicting(draft.lanes)
+    for move in site.moves:
+        yields_to = _yields_to(move, site.moves, conflicts, major)
+        unsigned = Control.YIELD if yields_to else Control.NONE
+        draft.change(move.lane, control=unsigned if move.arm in major else sign, yields_to=yields_to)
+
+
+@dataclass(frozen=True)
+class LeftTurns:
+    """Phases of the left turns of two opposing approaches.
+
+    Protected: in a phase of their own, with arrows, where possible. Permissive: together with oncoming traffic, to
+    which they yield. Neither: one approach at a time.
+    """
+
+    protected: bool
+    permissive: bool
+
+
+def set_lights(
+    rng: np.random.Generator, draft: Draft, site: Site, lefts: list[LeftTurns], green_s: tuple[float, float]
+) -> SignalPlan:
+    """Set the lights of a four-way junction: one or two phases for approaches 0 and 2, then for 1 and 3.
+
+    ``lefts`` has the left turns of both pairs of approaches, ``green_s`` the least and the largest green time.
+    """
+    green, conflicts = [float(g) for g in rng.uniform(*green_s, size=4)], conflicting(draft.lanes)
+    groups: list[LightGroup] = []
+    phases: list[tuple[int, ...]] = []
+
+    def phase(*approaches: list[Move], arrow: bool = False) -> None:
+        phases.append(tuple(range(len(groups), len(groups) + len(approaches))))
+        for approach in approaches:
+            groups.append(LightGroup(tuple(move.lane for move in approach), arrow))
+            for move in approach:
+                yields_to = _yields_to(move, [m for other in approaches for m in other], conflicts, ())
+                draft.change(move.lane, control=Control.SIGNAL, yields_to=yields_to)
+
+    for axis, turns in enumerate(lefts):
+        approaches = [[move for move in site.moves if move.arm == arm] for arm in (axis, axis + 2)]
+        left, other = (
+            [[m for m in approach if (m.turn == Turn.LEFT) is turning] for approach in approaches]
+            for turning in (True, False)
+        )
+        if turns.protected and _apart(left, conflicts) and _apart(other, conflicts):
+            phase(*left, arrow=True)
+            phase(*other)
+        elif turns.permissive and _apart(other, conflicts):
+            phase(*approaches)
+        else:
+            for approach in approaches:
+                phase(approach)
+    yellow = yellow_time_s(max(draft.lanes[move.lane].limit_mps for move in site.moves))
+    return SignalPlan(tuple(groups), tuple(phases), tuple(green[: len(phases)]), yellow_s=yellow)
+
+
+def _yields_to(
+    move: Move, others: Sequence[Move], conflicts: Conflicts, major: Sequence[int]
+) -> tuple[int, ...]:
+    """Conflicting moves with right of way: by priority road, then turn, then approach."""
+
+    def order(m: Move) -> tuple[bool, Turn, int]:
+        return m.arm not in major, m.turn, m.arm
+
+    return tuple(m.lane for m in others if conflicts[move.lane, m.lane] and order(m) < order(move))
+
+
+def _apart(approaches: list[list[Move]], conflicts: Conflicts) -> bool:
+    a, b = approaches
+    return not any(conflicts[x.lane, y.lane] for x in a for y in b)
 
 
 @dataclass(frozen=True)
@@ -47,7 +139,6 @@ class SignalisedJunction:
         left_lane_share: Share of left-turn lanes on streets with as many lanes inward as outward.
         protected_share: Share of streets with left-turn lanes whose left turns are protected.
         permissive_share: Share of the other streets whose left turns are permissive.
-        green_s: Green time of a phase, low and high.
     """
 
     geometry: Geometry = field(default_factory=Geometry)
@@ -60,30 +151,24 @@ class SignalisedJunction:
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draw a junction."""
-        streets = [_draw_street(rng, style) for _ in range(2)]
-        arms = self.geometry.arms(rng, draw_four_headings(rng, self.cross_skew), streets * 2)
-        draft = Draft()
-        site = open_site(rng, draft, arms, self.geometry)
-        left_only = [_has_left_lane(street, rng, self.left_lane_share) for street in streets]
-        site = finish_site(rng, style, draft, site, left_only * 2, self.geometry)
+        streets = []
+        for _ in range(2):
+            layout = draw_layout(rng, _SIGNAL_LAYOUTS)
+            streets.append(draw_street(rng, style, layout, float(rng.choice(style.limits_mps))))
+        draft, site = open_crossroads(rng, streets, self.geometry, self.cross_skew)
+        left_only = [
+            street.inward > street.outward
+            or (street.inward > 1 and bool(rng.random() < self.left_lane_share))
+            for street in streets
+        ]
+        site = connect(draft, site, left_only * 2)
+        finish_sites(rng, style, draft, (site,), {}, self.geometry)
         lefts = [
             LeftTurns(only and rng.random() < self.protected_share, rng.random() < self.permissive_share)
             for only in left_only
         ]
-        green = [float(g) for g in rng.uniform(*self.green_s, size=4)]
-        signals = set_lights(draft, site.moves, draft.conflicts(), (lefts[0], lefts[1]), green)
+        signals = set_lights(rng, draft, site, lefts, self.green_s)
         return draft.network(self.name, starts(draft, site.inward), signals)
-
-
-def _draw_street(rng: np.random.Generator, style: RoadStyle) -> CrossSection:
-    layout = _SIGNAL_LAYOUTS[rng.choice(len(_SIGNAL_LAYOUTS), p=_SIGNAL_SHARES)]
-    return draw_street(rng, style, layout, float(rng.choice(style.limits_mps)))
-
-
-def _has_left_lane(street: CrossSection, rng: np.random.Generator, share: float) -> bool:
-    if street.inward > street.outward:
-        return True
-    return street.inward > 1 and bool(rng.random() < share)
 
 
 @dataclass(frozen=True)
@@ -94,7 +179,6 @@ class TJunction:
         stem_skew: Largest deviation of the stem from a right angle, rad.
         two_lane_share: Share of priority roads with two lanes per direction; half of these have a left-turn lane.
         stem_lanes_share: Share of stems with separate lanes for left and right turns.
-        stop_share: Share of stems with a stop sign; the others have a yield sign.
         marked_share: Share of priority roads with crosswalks; the stem has one twice as often.
     """
 
@@ -120,11 +204,11 @@ class TJunction:
         first = float(rng.uniform(-math.pi, math.pi))
         across = first + math.pi / 2 + float(rng.uniform(-self.stem_skew, self.stem_skew))
         arms = self.geometry.arms(rng, (first, across, first + math.pi), (main, stem, main))
-        draft = Draft()
-        site = open_site(rng, draft, arms, self.geometry)
-        site = finish_site(rng, style, draft, site, [bool(rng.random() < 0.5)] * 3, self.geometry)
+        draft, site = open_site(rng, arms, self.geometry)
+        site = connect(draft, site, [bool(rng.random() < 0.5)] * 3)
+        finish_sites(rng, style, draft, (site,), {}, self.geometry)
         sign = Control.STOP if rng.random() < self.stop_share else Control.YIELD
-        set_priorities(draft, site.moves, draft.conflicts(), (0, 2), sign)
+        set_priorities(draft, site, (0, 2), sign)
         return draft.network(self.name, starts(draft, site.inward))
 
 
@@ -132,11 +216,7 @@ class TJunction:
 class AllWayStop:
     """Settings of the family ``all_way_stop``: two streets with stop signs on all approaches.
 
-    Attributes:
-        cross_skew: Largest deviation of the two streets from a right angle, rad.
-        two_lane_share: Share of streets with two lanes per direction.
-        fastest_mps: Highest limit of the streets, unless the domain has only higher ones.
-        marked_share: Share of junctions with crosswalks.
+    Limits are at most ``fastest_mps``, unless the domain has only higher ones.
     """
 
     geometry: Geometry = field(default_factory=lambda: Geometry(corner_m=(5.0, 9.0)))
@@ -154,10 +234,9 @@ class AllWayStop:
         for _ in range(2):
             lanes = 2 if rng.random() < self.two_lane_share else 1
             streets.append(draw_street(rng, style, (lanes, lanes), float(rng.choice(limits)), marked))
-        arms = self.geometry.arms(rng, draw_four_headings(rng, self.cross_skew), streets * 2)
-        draft = Draft()
-        site = open_site(rng, draft, arms, self.geometry)
-        site = finish_site(rng, style, draft, site, (False,) * 4, self.geometry)
+        draft, site = open_crossroads(rng, streets, self.geometry, self.cross_skew)
+        site = connect(draft, site, (False,) * 4)
+        finish_sites(rng, style, draft, (site,), {}, self.geometry)
         for move in site.moves:
             draft.change(move.lane, control=Control.ALL_WAY_STOP)
         return draft.network(self.name, starts(draft, site.inward))
@@ -167,12 +246,8 @@ class AllWayStop:
 class UnprotectedLeft:
     """Settings of the family ``unprotected_left``: left-turn lanes that yield to oncoming traffic.
 
-    Either the lights are green for both directions at the same time, or the road has priority over side streets.
-
-    Attributes:
-        cross_skew: Largest deviation of the two streets from a right angle, rad.
-        signal_share: Share of junctions with lights.
-        green_s: Green time of a phase, low and high; long enough to wait for a gap.
+    Either the lights are green for both directions at the same time, long enough to wait for a gap, or the road has
+    priority over side streets.
     """
 
     geometry: Geometry = field(
@@ -188,25 +263,163 @@ class UnprotectedLeft:
         lights = bool(rng.random() < self.signal_share)
         limit = float(rng.choice(style.limits_mps))
         slower = min(limit, float(rng.choice(style.limits_mps)))
-        layout = _LEFT_LAYOUTS[rng.choice(len(_LEFT_LAYOUTS), p=_LEFT_SHARES)]
-        main = draw_street(rng, style, layout, limit, lights)
+        main = draw_street(rng, style, draw_layout(rng, _LEFT_LAYOUTS), limit, lights)
         side = draw_street(rng, style, (1, 1), slower)
-        arms = self.geometry.arms(rng, draw_four_headings(rng, self.cross_skew), (main, side) * 2)
-        draft = Draft()
-        site = open_site(rng, draft, arms, self.geometry)
-        site = finish_site(rng, style, draft, site, (True, False) * 2, self.geometry)
-        signals = None
+        draft, site = open_crossroads(rng, (main, side), self.geometry, self.cross_skew)
+        site = connect(draft, site, (True, False) * 2)
+        finish_sites(rng, style, draft, (site,), {}, self.geometry)
+        signals, lefts = None, [LeftTurns(protected=False, permissive=True)] * 2
         if lights:
-            lefts = LeftTurns(protected=False, permissive=True)
-            green = [float(g) for g in rng.uniform(*self.green_s, size=4)]
-            signals = set_lights(draft, site.moves, draft.conflicts(), (lefts, lefts), green)
+            signals = set_lights(rng, draft, site, lefts, self.green_s)
         else:
-            set_priorities(draft, site.moves, draft.conflicts(), (0, 2), Control.STOP)
+            set_priorities(draft, site, (0, 2), Control.STOP)
+        inward = [site.approaches[i].inward for i in (0, 2)]
+        chosen = [lane for left, *others in inward for lane in [left] * _LEFT_WEIGHT + others]
+        oncoming = tuple(lane for lanes in inward for lane in lanes[1:])
+        return replace(draft.network(self.name, starts(draft, chosen), signals), busy=oncoming)
+
+
+@dataclass(frozen=True)
+class _Plot:
+    """A junction without lanes; arm 0 leads to the other junction."""
+
+    kind: str
+    arms: list[Arm]
+    mouths: list[float]
+    left_only: bool
+
+    @property
+    def main(self) -> tuple[int, ...]:
+        """Approaches of the main road."""
+        angles = [arm.base.heading - self.arms[0].base.heading for arm in self.arms]
+        return tuple(i for i, angle in enumerate(angles) if abs(math.sin(angle)) <= 0.5)
+
+    @property
+    def gate(self) -> Pose:
+        """Beginning of the road to the other junction, looking outwards."""
+        return self.arms[0].base.ahead(self.mouths[0] + self.arms[0].street.stop_line_m)
+
+    def moved(self, gate: Pose) -> _Plot:
+        """Move the junction so that its gate is at a pose."""
+        angle = gate.heading - self.gate.heading
+        cos, sin = math.cos(angle), math.sin(angle)
+        arms = []
+        for arm in self.arms:
+            dx, dy = arm.base.x - self.gate.x, arm.base.y - self.gate.y
+            base = Pose(gate.x + cos * dx - sin * dy, gate.y + sin * dx + cos * dy, arm.base.heading + angle)
+            arms.append(Arm(base, arm.street))
+        return replace(self, arms=arms)
+
+
+@dataclass(frozen=True)
+class Corridor:
+    """Settings of the family ``corridor``: a main road with two junctions, with lights, stop signs or a side road.
+
+    The junctions share the lanes between them. Two lights may be coordinated: the same cycle, and the second one turns
+    green when vehicles arrive that left the first one at the beginning of green.
+
+    Attributes:
+        side_reach: Shape of side roads: nearly straight, so that those of both junctions stay apart.
+        between_m: Length of the road between the stop lines of both junctions, low and high.
+        left_lane_share: Share of left-turn lanes at lights of two-lane roads.
+        protected_share: Share of protected left turns at lights with left-turn lanes.
+    """
+
+    geometry: Geometry = field(
+        default_factory=lambda: Geometry(
+            skew=math.radians(3.0), offset_m=0.4, corner_m=(5.0, 10.0), reach=Reach(arm_m=200.0)
+        )
+    )
+    side_reach: Reach = field(default_factory=lambda: Reach(arm_m=200.0, widest_turn=math.radians(6.0)))
+    between_m: tuple[float, float] = (70.0, 115.0)
+    two_lane_share: float = 0.5
+    left_lane_share: float = 0.6
+    protected_share: float = 0.5
+    coordinated_share: float = 0.5
+    green_s: tuple[float, float] = (8.0, 15.0)
+    name: str = "corridor"
+
+    def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
+        """Draw a network; ego starts before either junction, most often on the main road."""
+        lanes = 2 if rng.random() < self.two_lane_share else 1
+        main = draw_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
+        first = self._plot(rng, style, main).moved(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
+        middle = self._between(rng, first.gate)
+        second = self._plot(rng, style, main).moved(middle.end.turned())
+        draft = Draft()
+        sites = self._sites(rng, draft, (first, second), middle)
+        finish_sites(rng, style, draft, sites, {(0, 0): (1, 0), (1, 0): (0, 0)}, self.geometry)
+        pairs = list(zip((first, second), sites, strict=True))
+        plans = [self._rules(rng, draft, *pair) for pair in pairs]
         chosen = [
             lane
-            for i in (0, 2)
-            for j, lane in enumerate(site.approaches[i].inward)
-            for _ in range(1 if j else _LEFT_WEIGHT)
+            for plot, site in pairs
+            for i, approach in enumerate(site.approaches[1:], 1)
+            for lane in approach.inward * (_MAIN_WEIGHT if i in plot.main else 1)
         ]
-        oncoming = tuple(lane for i in (0, 2) for lane in site.approaches[i].inward[1:])
-        return replace(draft.network(self.name, starts(draft, chosen), signals), busy=oncoming)
+        travel = (float(middle.arc_m[-1]) + first.mouths[0] + second.mouths[0]) / (_PLATOON * main.limit_mps)
+        return draft.network(self.name, starts(draft, chosen), self._signals(rng, plans, travel))
+
+    def _plot(self, rng: np.random.Generator, style: RoadStyle, main: CrossSection) -> _Plot:
+        kind = list(_KINDS)[rng.choice(len(_KINDS), p=list(_KINDS.values()))]
+        marked = kind == _LIGHTS or bool(rng.random() < 0.4)
+        slower = min(main.limit_mps, float(rng.choice(style.limits_mps)))
+        side = draw_street(rng, style, (1, 1), slower, kind == _LIGHTS or bool(rng.random() < 0.6))
+        main = replace(main, marked=marked)
+        streets, headings = [main, side, main, side], [k * math.pi / 2 for k in range(4)]
+        if kind == _SIDE_ROAD:
+            closed = int(rng.choice([1, 3]))
+            del streets[closed], headings[closed]
+        arms = self.geometry.arms(rng, headings, streets)
+        left_only = kind == _LIGHTS and main.inward > 1 and bool(rng.random() < self.left_lane_share)
+        return _Plot(kind, arms, self.geometry.mouths(rng, arms), left_only)
+
+    def _between(self, rng: np.random.Generator, gate: Pose) -> Curve:
+        near, length = straight(gate, _STRAIGHT_M), float(rng.uniform(*self.between_m)) - 2 * _STRAIGHT_M
+        shape = {"max_curvature": 1.0 / self.geometry.reach.tightest_m, "max_turn": math.radians(8.0)}
+        bent = winding(rng, length, start=near.end, **shape)
+        return join_curves(near, bent, straight(bent.end, _STRAIGHT_M))
+
+    def _sites(
+        self, rng: np.random.Generator, draft: Draft, plots: tuple[_Plot, _Plot], middle: Curve
+    ) -> list[Site]:
+        """Add the shared road, then the other arms and the connectors of both junctions."""
+        near, far = plots
+        side = join_curves(
+            straight(near.arms[0].base.ahead(near.mouths[0]), near.arms[0].street.stop_line_m),
+            middle,
+            straight(middle.end, far.arms[0].street.stop_line_m),
+        )
+        there, back = lay_lanes(draft, near.arms[0].street, middle)[::-1]
+        shared = (
+            Approach(near.arms[0], near.mouths[0], middle, side, back, there),
+            Approach(far.arms[0], far.mouths[0], middle.reversed(), side.reversed(), there, back),
+        )
+        sites = []
+        for plot, first in zip(plots, shared, strict=True):
+            approaches = [first]
+            for i in range(1, len(plot.arms)):
+                reach = self.geometry.reach if i in plot.main else self.side_reach
+                approaches.append(open_approach(rng, draft, plot.arms[i], plot.mouths[i], reach))
+            left_only = [plot.left_only and i in plot.main for i in range(len(plot.arms))]
+            sites.append(connect(draft, Site(tuple(approaches)), left_only))
+        return sites
+
+    def _rules(self, rng: np.random.Generator, draft: Draft, plot: _Plot, site: Site) -> SignalPlan | None:
+        if plot.kind != _LIGHTS:
+            set_priorities(draft, site, plot.main, Control.STOP)
+            return None
+        protected = plot.left_only and bool(rng.random() < self.protected_share)
+        lefts = [LeftTurns(protected, permissive=True), LeftTurns(protected=False, permissive=True)]
+        return set_lights(rng, draft, site, lefts, self.green_s)
+
+    def _signals(
+        self, rng: np.random.Generator, plans: Sequence[SignalPlan | None], travel_s: float
+    ) -> SignalPlan | None:
+        first, second = plans
+        if first is None or second is None:
+            return first or second
+        cycle = max(first.cycle_s, second.cycle_s)
+        if rng.random() < self.coordinated_share:
+            return combine_plans(first.stretched(cycle), second.stretched(cycle), travel_s)
+        return combine_plans(first, second, float(rng.uniform(0.0, cycle)))

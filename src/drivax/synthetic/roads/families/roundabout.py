@@ -22,12 +22,20 @@ from drivax.synthetic.roads.curves import (
     from_curvature,
     join_curves,
     smooth_step,
-    straight,
-    winding,
 )
-from drivax.synthetic.roads.draft import Draft, points, ring
+from drivax.synthetic.roads.families.junction_layout import Reach
 from drivax.synthetic.roads.families.street_layout import CROSSWALK_M
-from drivax.synthetic.roads.network import Control, Crossing, Line, RoadNetwork, Start
+from drivax.synthetic.roads.network import (
+    Control,
+    Crossing,
+    Draft,
+    Line,
+    RoadNetwork,
+    Start,
+    conflicting,
+    points,
+    ring,
+)
 from drivax.synthetic.roads.style import GRID, RoadStyle
 
 #: Least radius of the fillets of entries and exits, m.
@@ -49,8 +57,7 @@ class _Plan:
     Attributes:
         radius_m: Radii of the circle's lane centres, inner first.
         join: Angle from an arm to the entry and the exit of each circle, rad.
-        gap_m: Gap between the directions at the yield lines.
-        yield_m: Distance of the yield lines from the centre.
+        gap_m, yield_m: Gap between the directions at the yield lines, and distance of these from the centre.
         circle_m, width_m: Width of lanes in the circle and on the arms.
     """
 
@@ -62,10 +69,6 @@ class _Plan:
     width_m: float
     shoulder_m: float
     limit_mps: float
-
-    def aside_m(self, j: int) -> float:
-        """Distance from an arm's middle line to the centre of its lane ``j`` at the yield line."""
-        return self.gap_m / 2 + (j + 0.5) * self.width_m
 
     def spread_m(self, middle: Curve) -> Float64[np.ndarray, " point"]:
         """Half of the gap between the directions along an arm."""
@@ -90,13 +93,9 @@ class Roundabout:
     Attributes:
         arm_m: Length of arms beyond the yield line.
         radius_m: Radius of the outer circle's lane centre with one lane and with two, low and high.
-        two_lane_share: Share of roundabouts with two lanes.
-        three_arm_share: Share of roundabouts with three arms.
         gap_m: Gap between the directions at the yield lines, low and high.
         skew: Largest deviation of an arm from an even division, rad, where room permits.
-        limit_mps: Highest limit of the arms.
-        circle_mps: Limit in the circle.
-        marked_share: Share of roundabouts with crosswalks.
+        limit_mps, circle_mps: Highest limit of the arms, and the limit in the circle.
     """
 
     arm_m: float = 230.0
@@ -117,23 +116,16 @@ class Roundabout:
         arms = [self._arm(rng, draft, plan, heading) for heading in self._headings(rng, plan)]
         chains = _go_round(draft, plan, arms, self.circle_mps)
         _set_priorities(draft)
-        _edges(
-            draft,
-            plan,
-            arms,
-            chains,
-            float(rng.uniform(1.2, 2.0)) if rng.random() < style.walk_share else None,
-        )
+        walk_m = float(rng.uniform(1.2, 2.0)) if rng.random() < style.walk_share else None
+        _add_boundary(draft, plan, chains, walk_m)
+        _add_islands(draft, plan, arms)
         marked = bool(rng.random() < self.marked_share)
         for arm in arms:
             _paint(draft, plan, arm)
             _cross(draft, plan, arm, marked)
-        starts = [
-            Start(lane, draft.lanes[lane].length_m - 85.0, draft.lanes[lane].length_m - 12.0)
-            for arm in arms
-            for lane in arm.inward
-        ]
-        return draft.network(self.name, tuple(starts))
+        lengths = {lane: draft.lanes[lane].length_m for arm in arms for lane in arm.inward}
+        starts = tuple(Start(lane, length - 85.0, length - 12.0) for lane, length in lengths.items())
+        return draft.network(self.name, starts)
 
     def _plan(self, rng: np.random.Generator, style: RoadStyle) -> _Plan:
         lanes = 2 if rng.random() < self.two_lane_share else 1
@@ -165,11 +157,8 @@ class Roundabout:
 
     def _arm(self, rng: np.random.Generator, draft: Draft, plan: _Plan, heading: float) -> _Arm:
         """Add the lanes of an arm: straight near the circle, then slightly bent."""
-        near = straight(Pose(0.0, 0.0, heading).ahead(plan.yield_m), 50.0)
-        far = winding(
-            rng, self.arm_m - 50.0, max_curvature=1 / 110, max_turn=math.radians(24.0), start=near.end
-        )
-        middle = join_curves(near, far)
+        reach = Reach(self.arm_m, straight_m=50.0, tightest_m=110.0, widest_turn=math.radians(24.0))
+        middle = reach.draw(rng, Pose(0.0, 0.0, heading).ahead(plan.yield_m))
         spread = plan.spread_m(middle)
         inward, outward = [], []
         for j in range(len(plan.radius_m)):
@@ -201,45 +190,44 @@ def _on_circle(radius: float, angle: float) -> Pose:
 
 
 def _arc(radius: float, begin: float, end: float) -> Curve:
-    length = radius * (end - begin)
-    count = max(4, math.ceil(length / STEP_M) + 1)
-    chord = 2 * radius * math.sin((end - begin) / (count - 1) / 2)
+    count = max(4, math.ceil(radius * (end - begin) / STEP_M) + 1)
+    step = (end - begin) / (count - 1)
     # Steps are chords: the samples lie on the circle.
-    curvature = np.full(count, (end - begin) / (count - 1) / chord)
-    return from_curvature(curvature, chord, _on_circle(radius, begin))
+    chord = 2 * radius * math.sin(step / 2)
+    return from_curvature(np.full(count, step / chord), chord, _on_circle(radius, begin))
 
 
 def _go_round(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> list[list[Curve]]:
     """Add entries, exits and circles; return the outermost curves from each arm to the next one."""
     chains: list[list[Curve]] = []
     for j, (radius, join) in enumerate(zip(plan.radius_m, plan.join, strict=True)):
-        entries, exits, passes = [], [], []
+        # Entry, exit, and the connector that passes the arm.
+        junctions: list[list[int]] = []
         for arm in arms:
-            a, b = draft.lanes[arm.inward[j]].curve, draft.lanes[arm.outward[j]].curve
-            entry = connect_poses(a.end, _on_circle(radius, arm.heading + join))
-            leave = connect_poses(_on_circle(radius, arm.heading - join), b.start)
-            around = _arc(radius, arm.heading - join, arm.heading + join)
-            for lanes, curve, width in ((entries, entry, plan.width_m), (exits, leave, plan.width_m),
-                                        (passes, around, plan.circle_m)):  # fmt: skip
-                lanes.append(draft.lane(curve, width, limit, connector=True))
-            draft.link(arm.inward[j], entries[-1])
-            draft.link(exits[-1], arm.outward[j])
+            low, high = arm.heading - join, arm.heading + join
+            entry = connect_poses(draft.lanes[arm.inward[j]].curve.end, _on_circle(radius, high))
+            leave = connect_poses(_on_circle(radius, low), draft.lanes[arm.outward[j]].curve.start)
+            curves = ((entry, plan.width_m), (leave, plan.width_m), (_arc(radius, low, high), plan.circle_m))
+            junctions.append([draft.lane(curve, width, limit, connector=True) for curve, width in curves])
+            draft.link(arm.inward[j], junctions[-1][0])
+            draft.link(junctions[-1][1], arm.outward[j])
         for i, arm in enumerate(arms):
             k = (i + 1) % len(arms)
             ahead = (arms[k].heading - arm.heading) % (2 * math.pi)
             curve = _arc(radius, arm.heading + join, arm.heading + ahead - join)
             arc = draft.lane(curve, plan.circle_m, limit)
-            for before, after in ((entries[i], arc), (passes[i], arc), (arc, exits[k]), (arc, passes[k])):
-                draft.link(before, after)
+            (entry, _, before), (_, leave, after) = junctions[i], junctions[k]
+            for pair in ((entry, arc), (before, arc), (arc, leave), (arc, after)):
+                draft.link(*pair)
             if j == len(plan.radius_m) - 1:
-                lanes = (arm.inward[j], entries[i], arc, exits[k], arms[k].outward[j])
+                lanes = (arm.inward[j], entry, arc, leave, arms[k].outward[j])
                 chains.append([draft.lanes[lane].curve for lane in lanes])
     return chains
 
 
 def _set_priorities(draft: Draft) -> None:
     """Give circulating traffic right of way over entries, and over exits across the outer circle."""
-    lanes, conflicts = draft.lanes, draft.conflicts()
+    lanes, conflicts = draft.lanes, conflicting(draft.lanes)
     arcs = {i for i, lane in enumerate(lanes) if len(lane.predecessors) == 2}
     passes = {i for i, lane in enumerate(lanes) if {*lane.predecessors, *lane.successors} <= arcs}
     for i in range(len(lanes)):
@@ -248,10 +236,8 @@ def _set_priorities(draft: Draft) -> None:
             draft.change(i, control=Control.YIELD, yields_to=yields_to)
 
 
-def _edges(
-    draft: Draft, plan: _Plan, arms: list[_Arm], chains: list[list[Curve]], walk_m: float | None
-) -> None:
-    """Add the outer boundary, the central island, the splitter islands, and the sidewalks."""
+def _add_boundary(draft: Draft, plan: _Plan, chains: list[list[Curve]], walk_m: float | None) -> None:
+    """Add the outer boundary and the sidewalks."""
     sides = []
     for chain in chains:
         line = join_curves(*chain)
@@ -263,18 +249,19 @@ def _edges(
         if walk_m is not None:
             draft.walks.append(line.displaced(-reach - walk_m))
     draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*sides)))
-    island = plan.radius_m[0] - plan.circle_m / 2 - _KERB_M
-    angles = np.arange(0.0, 2 * math.pi, 1.0 / island)
-    draft.edges.append(
-        Line(RoadKind.EDGE_MEDIAN, island * np.stack([np.cos(angles), -np.sin(angles)], axis=-1))
-    )
+
+
+def _add_islands(draft: Draft, plan: _Plan, arms: list[_Arm]) -> None:
+    """Add the central island, and the splitter island of each arm."""
+    radius = plan.radius_m[0] - plan.circle_m / 2 - _KERB_M
+    angles = np.arange(0.0, 2 * math.pi, 1.0 / radius)
+    islands = [radius * np.stack([np.cos(angles), -np.sin(angles)], axis=-1)]
     for arm in arms:
         half = plan.spread_m(arm.middle) - _KERB_M
         here = arm.middle.piece(0, int(np.argmax(half < 0.15)) - 1)
         half = half[: len(here.xy)]
-        draft.edges.append(
-            Line(RoadKind.EDGE_MEDIAN, ring(here.displaced(half), here.displaced(-half).reversed()))
-        )
+        islands.append(ring(here.displaced(half), here.displaced(-half).reversed()))
+    draft.edges += [Line(RoadKind.EDGE_MEDIAN, island) for island in islands]
 
 
 def _paint(draft: Draft, plan: _Plan, arm: _Arm) -> None:

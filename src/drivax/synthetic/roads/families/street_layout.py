@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import RoadKind
 from drivax.synthetic.roads.curves import STEP_M, Curve, Pose, smooth_step, winding
-from drivax.synthetic.roads.draft import Draft, ring
-from drivax.synthetic.roads.network import Bay, Crossing, Line, Start
+from drivax.synthetic.roads.network import Bay, Crossing, Draft, Line, RoadNetwork, Start, points, ring
 
-#: Lanes of a street by the place of their strip and their section.
-Laid = dict[tuple[int, int], int]
 #: Width of a crosswalk, m.
 CROSSWALK_M = 3.2
 #: Distance from a median's kerb to the adjacent lane, m.
@@ -55,7 +51,7 @@ def strips(ahead: int, back: int, sections: int) -> tuple[Strip, ...]:
 
 @dataclass(frozen=True)
 class Street:
-    """A cross-section along a reference line.
+    """A street along a reference line, and the draft to which it is added.
 
     Attributes:
         middle: The reference line: between the directions, or anywhere in a one-way road.
@@ -63,6 +59,7 @@ class Street:
         median_m: Width of the raised median along the middle line, 0 without one.
         rows_m: Width of the parking rows beyond the lanes, right and left of the middle line.
         taper_m: Length over which the edge moves in beyond a strip that ends.
+        lanes: Lanes of the draft by the place of their strip and their section.
     """
 
     middle: Curve
@@ -75,6 +72,8 @@ class Street:
     rows_m: tuple[float, float] = (0.0, 0.0)
     taper_m: float = 45.0
     kind: RoadKind = RoadKind.LANE_SURFACE
+    draft: Draft = field(default_factory=Draft)
+    lanes: dict[tuple[int, int], int] = field(default_factory=dict)
 
     def offset_m(self, place: int) -> float:
         """Offset of a strip's centre from the middle line, m, positive to the left."""
@@ -108,22 +107,25 @@ class Street:
             present = np.where(beyond > 0, 1.0 - smooth_step(beyond), present)
         return present
 
-    def start_draft(self) -> tuple[Draft, Laid]:
-        """Return a draft with the street's lanes, edges and markings, and its lanes."""
-        draft = Draft()
-        laid = self.lay(draft)
-        self.bound(draft)
-        self.paint(draft)
-        return draft, laid
+    def build(self) -> None:
+        """Add the lanes, the edges and the markings."""
+        self.lay()
+        right, left = self.edge_m
+        outer = ring(self.middle.displaced(-right), self.middle.displaced(left).reversed())
+        self.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, outer))
+        self.divide()
+        for side, reach in zip((-1.0, 1.0), self.reach_m, strict=True):
+            if reach[0] > self.median_m / 2:
+                self.draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, self.middle.displaced(side * reach))
+        self.paint_inside()
 
-    def lay(self, draft: Draft) -> Laid:
+    def lay(self) -> None:
         """Add all lanes with their links."""
-        laid: Laid = {}
         for strip in self.strips:
             line = self.middle.shifted(self.offset_m(strip.place))
             for k in range(strip.first, strip.last):
                 piece = line.piece(self.cuts[k], self.cuts[k + 1])
-                laid[strip.place, k] = draft.lane(
+                self.lanes[strip.place, k] = self.draft.lane(
                     piece if strip.forward else piece.reversed(),
                     self.width_m,
                     self.limit_mps,
@@ -132,155 +134,134 @@ class Street:
                     kind=self.kind,
                 )
             for k in range(strip.first, strip.last - 1):
-                a, b = laid[strip.place, k], laid[strip.place, k + 1]
-                draft.link(*((a, b) if strip.forward else (b, a)))
+                pair = self.lanes[strip.place, k], self.lanes[strip.place, k + 1]
+                self.draft.link(*(pair if strip.forward else pair[::-1]))
         for strip in self.strips:
-            self._link_neighbours(draft, strip, laid)
+            self._link_neighbours(strip)
             if strip.fork:
-                laid[strip.place, strip.first - 1] = self._fork(draft, strip, laid)
-        return laid
+                self._fork(strip)
 
-    def starts(self, draft: Draft, laid: Laid) -> tuple[Start, ...]:
-        """Starts in the second half of the second section of all lanes ahead."""
-        lanes = [laid[s.place, 1] for s in self.strips if s.forward and (s.place, 1) in laid]
-        lengths = [draft.lanes[lane].length_m for lane in lanes]
-        return tuple(Start(k, 0.5 * m, 0.94 * m) for k, m in zip(lanes, lengths, strict=True))
+    def network(self, name: str) -> RoadNetwork:
+        """Return the network; ego starts in the second half of the second section of any lane ahead."""
+        lanes = [self.lanes[s.place, 1] for s in self.strips if s.forward and (s.place, 1) in self.lanes]
+        lengths = [self.draft.lanes[lane].length_m for lane in lanes]
+        starts = (Start(k, 0.5 * m, 0.94 * m) for k, m in zip(lanes, lengths, strict=True))
+        return self.draft.network(name, tuple(starts))
 
-    def _link_neighbours(self, draft: Draft, strip: Strip, laid: Laid) -> None:
+    def _link_neighbours(self, strip: Strip) -> None:
         """Link a strip with the one to its right as seen along the middle line."""
         place = strip.place - 1 or -1
         right = next((s for s in self.strips if s.place == place and s.forward == strip.forward), None)
         if right is None or (self.median_m and place * strip.place < 0):
             return
         for k in range(max(strip.first, right.first), min(strip.last, right.last)):
-            pair = laid[strip.place, k], laid[place, k]
-            draft.link_neighbours(*(pair if strip.forward else pair[::-1]))
+            pair = self.lanes[strip.place, k], self.lanes[place, k]
+            self.draft.link_neighbours(*(pair if strip.forward else pair[::-1]))
 
-    def _fork(self, draft: Draft, strip: Strip, laid: Laid) -> int:
+    def _fork(self, strip: Strip) -> None:
         """Add the lane by which a strip branches off from its neighbour nearer to the middle line."""
         inner = strip.place - int(np.sign(strip.place))
         k, offset = strip.first - 1, self.offset_m(inner)
         piece = self.middle.piece(self.cuts[k], self.cuts[k + 1])
         share = smooth_step(np.linspace(0.0, 1.0, len(piece.xy)))
         curve = piece.displaced(offset + share * (self.offset_m(strip.place) - offset))
-        lane = draft.lane(curve, self.width_m, self.limit_mps, exit_only=strip.exit_only, kind=self.kind)
-        draft.link(laid[inner, k - 1], lane)
-        draft.link(lane, laid[strip.place, strip.first])
-        return lane
+        lane = self.draft.lane(curve, self.width_m, self.limit_mps, exit_only=strip.exit_only, kind=self.kind)
+        self.draft.link(self.lanes[inner, k - 1], lane)
+        self.draft.link(lane, self.lanes[strip.place, strip.first])
+        self.lanes[strip.place, k] = lane
 
-    def bound(self, draft: Draft) -> None:
-        """Add the road's boundary and the median."""
-        right, left = self.edge_m
-        outer = ring(self.middle.displaced(-right), self.middle.displaced(left).reversed())
-        draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, outer))
-        self.divide(draft)
-
-    def divide(self, draft: Draft) -> None:
+    def divide(self) -> None:
         """Add the median, if any; traffic may pass around its ends."""
         if self.median_m:
             half, end = self.median_m / 2 - _KERB_M, round(2 / STEP_M)
             inner = self.middle.piece(end, len(self.middle.xy) - 1 - end)
             island = ring(inner.shifted(half), inner.shifted(-half).reversed())
-            draft.edges.append(Line(RoadKind.EDGE_MEDIAN, island))
+            self.draft.edges.append(Line(RoadKind.EDGE_MEDIAN, island))
 
-    def paint(self, draft: Draft) -> None:
-        """Add the markings: white along and between lanes of one direction, yellow between directions."""
-        for side, reach in zip((-1.0, 1.0), self.reach_m, strict=True):
-            if reach[0] > self.median_m / 2:
-                draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, self.middle.displaced(side * reach))
-        self.paint_inside(draft)
-
-    def paint_inside(self, draft: Draft) -> None:
-        """Add the markings between lanes and between directions."""
+    def paint_inside(self) -> None:
+        """Add the markings: white between lanes of one direction, yellow between directions."""
         for strip in self.strips:
             inner = strip.place - int(np.sign(strip.place))
             if inner:
-                first, last = self.cuts[strip.first], self.cuts[strip.last]
                 aside = self.offset_m(strip.place) + (0.5 if inner < 0 else -0.5) * self.width_m
-                line = self.middle.piece(first, last).shifted(aside)
-                draft.mark(RoadKind.LINE_BROKEN_SINGLE_WHITE, line)
-        self._paint_middle(draft)
+                line = self.middle.piece(self.cuts[strip.first], self.cuts[strip.last]).shifted(aside)
+                self.draft.mark(RoadKind.LINE_BROKEN_SINGLE_WHITE, line)
+        self._paint_middle()
 
-    def _paint_middle(self, draft: Draft) -> None:
+    def _paint_middle(self) -> None:
         one_way = len({strip.forward for strip in self.strips}) == 1
         left = [strip for strip in self.strips if strip.place > 0]
+        kind, lines = RoadKind.LINE_SOLID_SINGLE_YELLOW, [self.middle]
         if one_way and left:
+            kind = RoadKind.LINE_BROKEN_SINGLE_WHITE
             first, last = max(s.first for s in left), max(s.last for s in left)
-            middle = self.middle.piece(self.cuts[first], self.cuts[last])
-            draft.mark(RoadKind.LINE_BROKEN_SINGLE_WHITE, middle)
-        elif one_way:
-            draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, self.middle)
-        elif self.median_m:
-            draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, self.middle.shifted(-self.median_m / 2))
-            draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, self.middle.shifted(self.median_m / 2))
-        elif len(self.strips) == 2:
-            draft.mark(RoadKind.LINE_BROKEN_SINGLE_YELLOW, self.middle)
-        else:
-            draft.mark(RoadKind.LINE_SOLID_DOUBLE_YELLOW, self.middle)
+            lines = [self.middle.piece(self.cuts[first], self.cuts[last])]
+        elif self.median_m and not one_way:
+            lines = [self.middle.shifted(side * self.median_m / 2) for side in (-1, 1)]
+        elif not one_way:
+            broken = len(self.strips) == 2
+            kind = RoadKind.LINE_BROKEN_SINGLE_YELLOW if broken else RoadKind.LINE_SOLID_DOUBLE_YELLOW
+        for line in lines:
+            self.draft.mark(kind, line)
 
-    def walk(self, draft: Draft, rng: np.random.Generator) -> None:
+    def walk(self, rng: np.random.Generator) -> None:
         """Add a sidewalk on both sides, 1.2 to 2.5 m outside the edges."""
         right, left = self.edge_m
         away = float(rng.uniform(1.2, 2.5))
-        draft.walks += [self.middle.displaced(-right - away), self.middle.displaced(left + away)]
+        self.draft.walks += [self.middle.displaced(-right - away), self.middle.displaced(left + away)]
 
-    def cross(self, draft: Draft, laid: Laid, at: int, marked: bool) -> None:
+    def cross(self, at: int, marked: bool) -> None:
         """Add a crossing at a sample of the middle line, with a crosswalk where it is marked."""
-        right, left = self.edge_m
-        here = self.middle.pose(at)
-        axis = np.array([[p.x, p.y] for p in (here.aside(-right[at]), here.aside(left[at]))])
-        lanes = []
-        for (place, k), lane in laid.items():
-            first, last = self.cuts[k], self.cuts[k + 1]
-            if first < at <= last:
-                lanes.append((lane, self._along(draft, place, k, lane, at)))
-        draft.crossings.append(Crossing(axis, CROSSWALK_M, tuple(lanes), marked))
+        here, right, left = self.middle.pose(at), -self.edge_m[0][at], self.edge_m[1][at]
+        section = self._section(at)
+        lanes = tuple(self._on_lane(place, k, at) for place, k in self.lanes if k == section)
+        axis = points(here.aside(right), here.aside(left))
+        self.draft.crossings.append(Crossing(axis, CROSSWALK_M, lanes, marked))
         if marked:
             near, far = (here.ahead(CROSSWALK_M / 2 * sign) for sign in (-1.0, 1.0))
-            draft.crosswalk(
-                near.aside(-right[at]), near.aside(left[at]), far.aside(left[at]), far.aside(-right[at])
-            )
+            self.draft.crosswalk(near.aside(right), near.aside(left), far.aside(left), far.aside(right))
 
-    def _along(self, draft: Draft, place: int, section: int, lane: int, at: int) -> float:
-        """Distance along a lane of a section at sample ``at`` of the middle line, m."""
-        forward = next(s.forward for s in self.strips if s.place == place)
-        index = at - self.cuts[section] if forward else self.cuts[section + 1] - at
-        return float(draft.lanes[lane].curve.arc_m[index])
+    def _on_lane(self, place: int, section: int, at: int) -> tuple[int, float]:
+        """Lane of a section, and the distance along it at sample ``at`` of the middle line, m."""
+        lane = self.lanes[place, section]
+        index = at - self.cuts[section] if self._forward(place) else self.cuts[section + 1] - at
+        return lane, float(self.draft.lanes[lane].curve.arc_m[index])
 
-    def park(
-        self, draft: Draft, laid: Laid, between_m: tuple[float, float], rng: np.random.Generator
-    ) -> None:
-        """Add bays in the parking rows, with gaps for driveways and at crossings."""
+    def _section(self, at: int) -> int:
+        return next(k for k, last in enumerate(self.cuts[1:]) if at <= last)
+
+    def _forward(self, place: int) -> bool:
+        return next(strip.forward for strip in self.strips if strip.place == place)
+
+    def park(self, margin_m: float, rng: np.random.Generator) -> None:
+        """Add bays in the parking rows, away from the road's ends, with gaps for driveways and at crossings."""
+        end_m = STEP_M * self.cuts[-1] - margin_m
         for side, row in zip((-1, 1), self.rows_m, strict=True):
             places = [strip.place for strip in self.strips if strip.place * side > 0]
             if not row:
                 continue
             outer = max(places, key=abs) if places else -side
             aside = side * (self.median_m / 2 + len(places) * self.width_m + row / 2)
-            at, pitch = between_m[0] + float(rng.uniform(0.0, 8.0)), float(rng.uniform(5.8, 6.6))
+            at, pitch = margin_m + float(rng.uniform(0.0, 8.0)), float(rng.uniform(5.8, 6.6))
             # In bends the inner row is shorter than the middle line.
             stretch = 1.0 - aside * np.gradient(self.middle.heading, STEP_M)
-            while at + 1.5 * pitch < between_m[1]:
+            while at + 1.5 * pitch < end_m:
                 if rng.random() < 0.08:
                     at += float(rng.uniform(4.0, 9.0))
                     continue
                 room = pitch / float(stretch[round((at + pitch / 2) / STEP_M)])
-                self._bay(draft, laid, outer, aside, at + room / 2, pitch)
+                self._bay(outer, aside, at + room / 2, pitch)
                 at += room
 
-    def _bay(self, draft: Draft, laid: Laid, place: int, aside: float, at_m: float, length_m: float) -> None:
+    def _bay(self, place: int, aside: float, at_m: float, length_m: float) -> None:
         at = round(at_m / STEP_M)
-        section = next(k for k, (_, last) in enumerate(pairwise(self.cuts)) if at <= last)
         pose = self.middle.pose(at).aside(aside)
         # Bays do not hide crossings.
         along = np.array([np.cos(pose.heading), np.sin(pose.heading)])
-        to = [crossing.axis.mean(axis=0) - [pose.x, pose.y] for crossing in draft.crossings]
-        if any(np.hypot(*d) < 30.0 and abs(d @ along) < _BAY_CLEAR_M for d in to):
-            return
-        forward = next(s.forward for s in self.strips if s.place == place)
-        pose = pose if forward else pose.turned()
-        lane = laid[place, section]
-        draft.bays.append(Bay(pose, length_m, lane, self._along(draft, place, section, lane, at)))
+        to = [crossing.axis.mean(axis=0) - [pose.x, pose.y] for crossing in self.draft.crossings]
+        if not any(np.hypot(*d) < 30.0 and abs(d @ along) < _BAY_CLEAR_M for d in to):
+            pose = pose if self._forward(place) else pose.turned()
+            self.draft.bays.append(Bay(pose, length_m, *self._on_lane(place, self._section(at), at)))
 
 
 @dataclass(frozen=True)

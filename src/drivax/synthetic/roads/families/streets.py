@@ -1,4 +1,4 @@
-"""Families of streets without junctions: curved and straight roads, lane drops, crosswalks, parked cars."""
+"""Families of roads without junctions: curved and straight roads, lane drops, crosswalks, parked cars, highways."""
 
 from __future__ import annotations
 
@@ -6,22 +6,21 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float64
 
-from drivax.synthetic.roads.curves import STEP_M
+from drivax.scenario.schema import RoadKind
+from drivax.synthetic.roads.curves import STEP_M, Curve, from_curvature
 from drivax.synthetic.roads.families.street_layout import Street, StreetFamily, Strip, strips
-from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.roads.style import GRID, RoadStyle
+from drivax.synthetic.roads.network import Line, RoadNetwork, Start, ring
+from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
-#: Lanes ahead, lanes the other way, and the share of that layout.
-_Layouts = tuple[tuple[int, int, float], ...]
 #: Highest limit of curved roads with bays, m/s, and of streets with crosswalks, m/s.
 _PARKING_LIMIT_MPS, _CROSSING_LIMIT_MPS = 14.0, 17.0
-_CROSSWALK_LAYOUTS: _Layouts = ((1, 1, 0.45), (2, 2, 0.25), (2, 1, 0.1), (2, 0, 0.1), (1, 0, 0.1))
-
-
-def _draw_layout(rng: np.random.Generator, layouts: _Layouts) -> tuple[int, int]:
-    ahead, back, _ = layouts[rng.choice(len(layouts), p=[share for *_, share in layouts])]
-    return ahead, back
+_CROSSWALK_LAYOUTS: Layouts = ((1, 1, 0.45), (2, 2, 0.25), (2, 1, 0.1), (2, 0, 0.1), (1, 0, 0.1))
+#: Length over which a ramp's curvature rises and falls, m.
+_EASING_M = 40.0
+#: Drivable width left of a ramp's lane, m.
+_RAMP_SHOULDER_M = 0.7
 
 
 @dataclass(frozen=True)
@@ -35,20 +34,13 @@ class CurvedRoad(StreetFamily):
 
     tightest_m: tuple[float, float] = (30.0, 140.0)
     widest_turn: float = math.radians(150.0)
-    layouts: _Layouts = (
-        (1, 1, 0.28),
-        (2, 0, 0.16),
-        (2, 1, 0.12),
-        (2, 2, 0.24),
-        (3, 0, 0.1),
-        (3, 1, 0.1),
-    )
+    layouts: Layouts = ((1, 1, 0.28), (2, 0, 0.16), (2, 1, 0.12), (2, 2, 0.24), (3, 0, 0.1), (3, 1, 0.1))
     median_share: float = 0.3
     name: str = "curved_road"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draw a road; ego starts in the second section of any lane ahead."""
-        ahead, back = _draw_layout(rng, self.layouts)
+        ahead, back = draw_layout(rng, self.layouts)
         middle = self.draw_middle(rng, style.curvature)
         limit = float(rng.choice(style.limits_mps))
         parking = limit < _PARKING_LIMIT_MPS and rng.random() < style.parking_share
@@ -63,11 +55,11 @@ class CurvedRoad(StreetFamily):
             median_m=float(rng.uniform(1.5, 3.0)) if back and rng.random() < self.median_share else 0.0,
             rows_m=(row, row if back else 0.0),
         )
-        draft, laid = street.start_draft()
+        street.build()
         if rng.random() < style.walk_share:
-            street.walk(draft, rng)
-        street.park(draft, laid, (20.0, self.length_m - 20.0), rng)
-        return draft.network(self.name, street.starts(draft, laid))
+            street.walk(rng)
+        street.park(20.0, rng)
+        return street.network(self.name)
 
 
 #: The family ``straight_road``: up to four lanes, slight bends.
@@ -84,7 +76,6 @@ class LaneDrop(StreetFamily):
     """Settings of the family ``lane_drop``: a road that loses a lane, right or left, or gains one.
 
     Attributes:
-        two_way_share: Share of two-way roads.
         left_share: Share of one-way roads on which the left lane ends.
         gain_share: Share of roads that gain a lane instead of losing one.
         taper_m: Length over which the road narrows beyond the lane's end, low and high.
@@ -108,10 +99,10 @@ class LaneDrop(StreetFamily):
             shoulder_m=float(rng.uniform(*style.shoulder_m)),
             taper_m=float(rng.uniform(*self.taper_m)),
         )
-        draft, laid = street.start_draft()
+        street.build()
         if rng.random() < style.walk_share:
-            street.walk(draft, rng)
-        return draft.network(self.name, street.starts(draft, laid))
+            street.walk(rng)
+        return street.network(self.name)
 
     def _strips(self, rng: np.random.Generator, sections: int) -> tuple[Strip, ...]:
         """Draw the lanes; the rightmost one, or the one left of the middle line, changes."""
@@ -132,9 +123,7 @@ class MidblockCrosswalk(StreetFamily):
     Attributes:
         crossing_m: Station of the first crossing, low and high; ego starts at 120 to 155 m.
         apart_m: Distance to a second crossing, low and high.
-        marked_share: Share of crossings with a crosswalk.
-        second_share: Share of streets with two crossings.
-        median_share: Share of two-way streets with a raised median.
+        marked_share, second_share: Shares of crossings with a crosswalk, and of streets with two crossings.
     """
 
     length_m: float = 560.0
@@ -148,7 +137,7 @@ class MidblockCrosswalk(StreetFamily):
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draw a street with sidewalks on both sides and one or two crossings."""
-        ahead, back = _draw_layout(rng, _CROSSWALK_LAYOUTS)
+        ahead, back = draw_layout(rng, _CROSSWALK_LAYOUTS)
         middle = self.draw_middle(rng, style.curvature)
         row = float(rng.uniform(2.1, 2.4)) if rng.random() < style.parking_share else 0.0
         street = Street(
@@ -161,25 +150,21 @@ class MidblockCrosswalk(StreetFamily):
             median_m=float(rng.uniform(1.8, 3.0)) if back and rng.random() < self.median_share else 0.0,
             rows_m=(row, row if back else 0.0),
         )
-        draft, laid = street.start_draft()
-        street.walk(draft, rng)
+        street.build()
+        street.walk(rng)
         at = float(rng.uniform(*self.crossing_m))
         stations = [at, at + float(rng.uniform(*self.apart_m))] if rng.random() < self.second_share else [at]
         for station in stations:
-            street.cross(draft, laid, round(station / STEP_M), marked=bool(rng.random() < self.marked_share))
-        street.park(draft, laid, (20.0, self.length_m - 20.0), rng)
-        return draft.network(self.name, street.starts(draft, laid))
+            street.cross(round(station / STEP_M), marked=bool(rng.random() < self.marked_share))
+        street.park(20.0, rng)
+        return street.network(self.name)
 
 
 @dataclass(frozen=True)
 class ParkedStreet(StreetFamily):
     """Settings of the family ``parked_street``: a narrow street with parked cars along one or both sides.
 
-    Attributes:
-        one_way_share: Share of one-way streets.
-        both_sides_share: Share of streets with bays on both sides.
-        crossing_share: Share of streets with a crossing, half of them marked.
-        row_m: Width of a row of bays, low and high.
+    A share of the streets (``crossing_share``) has a crossing, half of these a crosswalk.
     """
 
     length_m: float = 480.0
@@ -206,10 +191,179 @@ class ParkedStreet(StreetFamily):
             shoulder_m=float(rng.uniform(0.1, 0.4)),
             rows_m=(row * sides[0], row * sides[1]),
         )
-        draft, laid = street.start_draft()
-        street.walk(draft, rng)
+        street.build()
+        street.walk(rng)
         if rng.random() < self.crossing_share:
             at = round(float(rng.uniform(170.0, 250.0)) / STEP_M)
-            street.cross(draft, laid, at, marked=bool(rng.random() < 0.5))
-        street.park(draft, laid, (15.0, self.length_m - 15.0), rng)
-        return draft.network(self.name, street.starts(draft, laid))
+            street.cross(at, marked=bool(rng.random() < 0.5))
+        street.park(15.0, rng)
+        return street.network(self.name)
+
+
+@dataclass(frozen=True)
+class _Ramp:
+    """A ramp, its edges, and the nose, where its left edge meets the highway's right edge.
+
+    Attributes:
+        left, right: Edges in the direction of traffic; the left one ends at the nose.
+        nose: Sample of the highway's middle line next to the nose.
+    """
+
+    lane: int
+    left: Curve
+    right: Curve
+    nose: int
+
+
+@dataclass(frozen=True)
+class Highway(StreetFamily):
+    """Settings of the family ``highway``.
+
+    Attributes:
+        shares: Shares of highways with an on-ramp, with an off-ramp and with both.
+        two_way_share: Share of highways of two or three lanes with the other direction beyond a median (``median_m``).
+        ramp_m: Length of an on-ramp and of an off-ramp.
+        ramp_radius_m, ramp_turn: Radius and angle (rad) of a ramp's bend, low and high.
+        ramp_limit: Limit on ramps as a share of the highway's, low and high.
+    """
+
+    length_m: float = 720.0
+    section_m: float = 90.0
+    tightest_m: tuple[float, float] = (600.0, 3000.0)
+    widest_turn: float = math.radians(30.0)
+    shares: tuple[float, float, float] = (0.5, 0.25, 0.25)
+    two_way_share: float = 0.5
+    median_m: tuple[float, float] = (3.0, 8.0)
+    shoulder_m: tuple[float, float] = (1.5, 3.0)
+    ramp_m: tuple[float, float] = (235.0, 180.0)
+    ramp_radius_m: tuple[float, float] = (180.0, 350.0)
+    ramp_turn: tuple[float, float] = (math.radians(10.0), math.radians(24.0))
+    ramp_limit: tuple[float, float] = (0.62, 0.75)
+    name: str = "highway"
+
+    def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
+        """Draw a highway; ego starts 25 to 70 m before the section with a ramp, or on the on-ramp."""
+        middle = self.draw_middle(rng)
+        lanes = int(rng.integers(2, 5))
+        # At most five lanes in total fit the map of a stored scenario.
+        back = int(rng.integers(2, 6 - lanes)) if lanes < 4 and rng.random() < self.two_way_share else 0
+        extra = self._extra(rng, lanes)
+        street = Street(
+            middle=middle,
+            cuts=self.cuts,
+            strips=(*strips(lanes, back, len(self.cuts) - 1), extra),
+            width_m=max(3.4, float(rng.uniform(*style.width_m))),
+            limit_mps=float(rng.choice(style.fast_limits_mps)),
+            shoulder_m=float(rng.uniform(*self.shoulder_m)),
+            median_m=float(rng.uniform(*self.median_m)) if back else 0.0,
+            taper_m=float(rng.uniform(50.0, 90.0)),
+            kind=RoadKind.LANE_FREEWAY,
+        )
+        street.lay()
+        on = None if extra.fork else self._ramp(rng, street, extra, away=-1)
+        off = self._ramp(rng, street, extra, away=1) if extra.exit_only else None
+        _edges(street, extra, on, off)
+        _paint(street, extra, on, off)
+        starts = [Start(street.lanes[-j - 1, 2], 20.0, 65.0) for j in range(lanes)]
+        if on is not None:
+            starts += [Start(on.lane, self.ramp_m[0] - 110.0, self.ramp_m[0] - 30.0)] * 2
+        return street.draft.network(self.name, tuple(starts))
+
+    def _extra(self, rng: np.random.Generator, lanes: int) -> Strip:
+        """Draw the auxiliary lane: for entering, for leaving, or for both."""
+        purpose = rng.choice(3, p=self.shares)
+        place, length = -lanes - 1, int(rng.integers(2, 4))
+        if purpose == 0:
+            return Strip(place, True, 3, 3 + length, ends=True)
+        if purpose == 1:
+            return Strip(place, True, 4, 3 + length, fork=True, exit_only=True)
+        return Strip(place, True, 3, 3 + length, exit_only=True)
+
+    def _ramp(self, rng: np.random.Generator, street: Street, extra: Strip, away: int) -> _Ramp:
+        """Add a ramp at the beginning of the auxiliary lane (``away`` -1) or at its end (1)."""
+        auxiliary = street.lanes[extra.place, extra.first if away < 0 else extra.last - 1]
+        at = street.cuts[extra.first if away < 0 else extra.last]
+        length = self.ramp_m[0 if away < 0 else 1]
+        line = street.draft.lanes[auxiliary].curve
+        gore = line.start.turned() if away < 0 else line.end
+        # Seen from the highway, an on-ramp bends to the left and an off-ramp to the right.
+        side = np.gradient(street.middle.heading, STEP_M)[at::away][: round(length / STEP_M) + 1] * away
+        bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
+        outward = from_curvature(side - away * bend, STEP_M, gore)
+        curve = outward if away > 0 else outward.reversed()
+        limit = street.limit_mps * float(rng.uniform(*self.ramp_limit))
+        lane = street.draft.lane(curve, street.width_m, limit, kind=street.kind, exit_only=away > 0)
+        street.draft.link(*((lane, auxiliary) if away < 0 else (auxiliary, lane)))
+        half = street.width_m / 2
+        left, right = curve.shifted(half + _RAMP_SHOULDER_M), curve.shifted(-half - street.shoulder_m)
+        nose, sample = _nose(street, extra, left if away > 0 else left.reversed())
+        last = len(left.xy) - 1
+        left = left.piece(nose, last) if away > 0 else left.piece(0, last - nose)
+        return _Ramp(lane, left, right, sample)
+
+
+def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray, " point"]:
+    """Curvature that rises to 1 / radius, holds, and falls, and integrates to an angle."""
+    hold = max(0.0, angle * radius_m - _EASING_M)
+    knots = np.cumsum([0.0, _EASING_M, hold, _EASING_M])
+    at = STEP_M * np.arange(round(length_m / STEP_M) + 1)
+    peak = angle / (hold + _EASING_M)
+    return np.interp(at, knots, [0.0, peak, peak, 0.0])
+
+
+def _main_edge(street: Street, extra: Strip) -> Curve:
+    """Right edge of the highway without its auxiliary lane."""
+    reach = street.reach_m[0] - street.width_m * street.presence(extra) + street.shoulder_m
+    return street.middle.displaced(-reach)
+
+
+def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
+    """First sample of a ramp's left edge beyond the highway's edge, and the nearest sample of that edge."""
+    edge = _main_edge(street, extra)
+    # The nose lies within 150 m of the beginning of the ramp.
+    span = round(150.0 / STEP_M)
+    gore = int(np.argmin(np.sum((edge.xy - left.xy[0]) ** 2, axis=-1)))
+    first, points = max(0, gore - span), left.xy[:span]
+    window = edge.xy[first : gore + span]
+    near = first + np.argmin(np.sum((points[:, None] - window[None]) ** 2, axis=-1), axis=1)
+    to = points - edge.xy[near]
+    aside = -to[:, 0] * np.sin(edge.heading[near]) + to[:, 1] * np.cos(edge.heading[near])
+    sample = int(np.argmax(aside < -0.05))
+    return sample, int(near[sample])
+
+
+def _edges(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) -> None:
+    """Add the boundary, counter-clockwise: along the right edge with the ramps, and back along the left edge."""
+    right, left = street.edge_m
+    main, full, last = _main_edge(street, extra), street.middle.displaced(-right), len(right) - 1
+    parts, begin = [], 0
+    if on is not None:
+        begin = street.cuts[extra.first]
+        parts += [main.piece(0, on.nose - 2), on.left.reversed(), on.right]
+    end = last if off is None else street.cuts[extra.last]
+    parts.append(full.piece(begin, end))
+    if off is not None:
+        parts += [off.right, off.left.reversed(), main.piece(off.nose + 2, last)]
+    parts.append(street.middle.displaced(left).reversed())
+    street.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*parts)))
+    street.divide()
+
+
+def _paint(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) -> None:
+    street.paint_inside()
+    inset = replace(street, shoulder_m=0.1)
+    right, left = inset.edge_m
+    main, last = _main_edge(inset, extra), len(right) - 1
+    begin = 0 if on is None else street.cuts[extra.first]
+    end = last if off is None else street.cuts[extra.last]
+    lines = [] if on is None else [main.piece(0, on.nose)]
+    lines.append(street.middle.displaced(-right).piece(begin, end))
+    if off is not None:
+        lines.append(main.piece(off.nose, last))
+    if any(strip.place > 0 for strip in street.strips):
+        lines.append(street.middle.displaced(left))
+    for ramp in (on, off):
+        if ramp is not None:
+            lines += [ramp.left.shifted(-_RAMP_SHOULDER_M), ramp.right.shifted(street.shoulder_m)]
+    for line in lines:
+        street.draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, line)

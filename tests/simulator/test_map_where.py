@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.simulator.sparse import AT_ONCE, map_where
+from drivax.simulator.simulator import AT_ONCE, map_where
 
 ROWS = 3 * AT_ONCE + 1
 

@@ -1,6 +1,7 @@
-"""Advantages, temporal-difference targets, and the losses of PPO and SAC: arrays in, arrays out.
+"""Equations of reinforcement learning: advantages, temporal-difference targets, and the losses of all algorithms.
 
-Time is the leading axis; ``_t`` and ``_tp1`` mark steps t and t + 1. Losses are per sample; callers average them.
+Arrays in, arrays out. Time is the leading axis; ``_t`` and ``_tp1`` mark steps t and t + 1. Losses are per sample;
+callers average them.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ def generalised_advantages(
     ``delta_t = r_t + gamma (1 - terminated_t) V(s_{t+1}) - V(s_t)`` and
     ``A_t = delta_t + gamma lambda (1 - terminated_t) (1 - truncated_t) A_{t+1}``, zero beyond the end. A truncated
     step bootstraps ``value_tp1``, the value of its final state, and no reward of the next episode reaches it.
-    ``lambda_`` 0 gives one-step TD errors, 1 Monte Carlo returns.
 
     Returns:
         Advantages, and value targets ``A_t + V(s_t)``.
@@ -66,8 +66,7 @@ def td_target(
 ) -> Float[Array, "*batch"]:
     """One-step target ``r_t + gamma (1 - terminated_t) V(s_{t+1})`` (Sutton 1988).
 
-    A terminated step has its reward alone as target; a truncated step bootstraps the value of its final state. No
-    gradient flows into the targets.
+    A truncated step bootstraps the value of its final state. No gradient flows into the targets.
     """
     # Selected, not multiplied by zero: a value that overflowed must not reach a terminated step.
     return jax.lax.stop_gradient(reward_t + gamma * jnp.where(terminated_t, 0.0, value_tp1))
@@ -76,10 +75,9 @@ def td_target(
 def soft_value(
     q: Float[Array, "critic *batch"], log_prob: Float[Array, "*batch"], temperature: Float[Array, ""]
 ) -> Float[Array, "*batch"]:
-    """``min_i Q_i(s, a) - alpha log pi(a|s)`` of an action that the policy sampled.
+    """Soft state value ``min_i Q_i(s, a) - alpha log pi(a|s)`` of a sampled action (arXiv 1812.05905, eq. 3).
 
-    Soft state value (Haarnoja et al. 2018, arXiv 1812.05905, eq. 3) with the minimum over critics against
-    overestimation (clipped double Q, Fujimoto et al. 2018, arXiv 1802.09477, eq. 10).
+    The minimum over critics counters overestimation (clipped double Q, arXiv 1802.09477, eq. 10).
     """
     return jnp.min(q, axis=0) - temperature * log_prob
 
@@ -99,8 +97,8 @@ def temperature_loss(
 ) -> Float[Array, "*batch"]:
     """``-alpha (log pi(a|s) + H)`` per sample, with ``alpha = exp(log_temperature)`` (arXiv 1812.05905, eq. 18).
 
-    Its gradient lowers the temperature where the policy's entropy ``-E log pi`` is above the target ``H`` and raises it
-    where it is below. No gradient reaches the policy.
+    The temperature falls while the policy's entropy ``-E log pi`` is above the target ``H``. No gradient reaches the
+    policy.
     """
     return -jnp.exp(log_temperature) * jax.lax.stop_gradient(log_prob + target_entropy)
 
@@ -108,3 +106,68 @@ def temperature_loss(
 def polyak(target: Any, online: Any, tau: float) -> Any:
     """``(1 - tau) target + tau online``, leaf by leaf; tau 1 copies, tau 0 keeps (Polyak and Juditsky 1992)."""
     return jax.tree.map(lambda old, new: (1.0 - tau) * old + tau * new, target, online)
+
+
+def log_mass(
+    q: Float[Array, "action *batch"], log_density: Float[Array, "action *batch"], temperature: float = 1.0
+) -> Float[Array, "*batch"]:
+    """``tau log int exp(Q(s, a) / tau) da``, a soft maximum over all actions, from K sampled ones.
+
+    By importance sampling: ``tau log 1/K sum_k exp(Q(s, a_k) / tau) / p(a_k)`` (Kumar et al. 2020, arXiv 2006.04779,
+    appendix F). ``log_density`` is that of the distribution that each action was drawn from; zeros give the mean of
+    ``exp(Q / tau)``. A ``temperature`` near 0 gives the maximum.
+    """
+    return temperature * (jax.nn.logsumexp(q / temperature - log_density, axis=0) - jnp.log(len(q)))
+
+
+def conservative_penalty(
+    q: Float[Array, "action *batch"],
+    log_density: Float[Array, "action *batch"],
+    q_data: Float[Array, "*batch"],
+    temperature: float = 1.0,
+) -> Float[Array, "*batch"]:
+    """``log_mass(Q(s, .)) - Q(s, a)`` with the logged action ``a``: the regulariser CQL(H) (arXiv 2006.04779, eq. 4).
+
+    A tabular critic that also minimises half the squared error of ``r + gamma V`` ends at
+    ``r + gamma V - alpha (softmax(Q) / pi_beta - 1)``, with ``pi_beta`` the policy of the data.
+    """
+    return log_mass(q, log_density, temperature) - q_data
+
+
+def penalty_weight_loss(
+    log_weight: Float[Array, ""], penalty: Float[Array, "*batch"], gap: float
+) -> Float[Array, "*batch"]:
+    """``-alpha (penalty - gap)`` with ``alpha = exp(log_weight)``: CQL's Lagrange multiplier (its eq. 30).
+
+    The weight rises while the penalty is above the gap. No gradient reaches the critics.
+    """
+    return -jnp.exp(log_weight) * jax.lax.stop_gradient(penalty - gap)
+
+
+def expectile_loss(error: Float[Array, "*batch"], expectile: float) -> Float[Array, "*batch"]:
+    """``|tau - 1(u < 0)| u^2`` of ``u = target - value`` (Kostrikov et al. 2021, arXiv 2110.06169, eq. 5)."""
+    return jnp.where(error < 0.0, 1.0 - expectile, expectile) * error**2
+
+
+def advantage_weights(
+    advantage: Float[Array, "*batch"], inverse_temperature: float, largest: float
+) -> Float[Array, "*batch"]:
+    """``min(exp(beta A), largest)`` without gradient: advantage-weighted regression (arXiv 2110.06169, eq. 7)."""
+    # Clipping the exponent avoids overflow.
+    exponent = jnp.minimum(inverse_temperature * advantage, jnp.log(largest))
+    return jax.lax.stop_gradient(jnp.exp(exponent))
+
+
+def scaled_policy_loss(loss: Float[Array, "*batch"], q: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """``loss / mean |Q|`` over the batch, independent of the scale of rewards (Fujimoto and Gu 2021, arXiv 2106.06860).
+
+    No gradient reaches the divisor.
+    """
+    return loss / jnp.maximum(jax.lax.stop_gradient(jnp.mean(jnp.abs(q))), 1e-6)
+
+
+def smoothed_action(
+    action: Float[Array, "*batch D"], noise: Float[Array, "*batch D"], bound: float
+) -> Float[Array, "*batch D"]:
+    """``clip(a + clip(noise, -c, c), -1, 1)``: target policy smoothing (arXiv 1802.09477, eq. 14)."""
+    return jnp.clip(action + jnp.clip(noise, -bound, bound), -1.0, 1.0)

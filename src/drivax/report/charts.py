@@ -1,0 +1,325 @@
+"""Charts as inline SVG: learning curves, distributions, histograms, their axes, and the signals of the player."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from drivax.evaluation.episode_table import SHARES, EpisodeTable
+from drivax.evaluation.tables import metric_label
+from drivax.geometry.vectors import wrap
+from drivax.metrics import comfort
+from drivax.metrics.comfort import WINDOW, savgol_matrix
+from drivax.report.pictures.palette import Stroke, stroke
+from drivax.report.runs import Training
+from drivax.scenario.schema import DT_S
+
+WIDTH, HEIGHT = 380, 210
+_RIGHT, _TOP, _BOTTOM = 12, 10, 34
+Points = Float[np.ndarray[Any, Any], "point 2"]
+#: A longer line is averaged into this many bins.
+_MOST_POINTS = 150
+#: Groups of quantities that are shown; the others are folded away.
+_FIRST = ("validation", "evaluation", "rollout")
+
+
+def curve_sections(runs: Sequence[Training]) -> str:
+    """Return all learning curves: the policy's results visible, losses and the rest folded away."""
+    names = list(dict.fromkeys(name for run in runs for name in run.curves))
+    drawable = [name for name in names if any(len(run.curves.get(name, ())) > 1 for run in runs)]
+    if not drawable:
+        return "<p>No quantity was logged more than once.</p>"
+    first = [name for group in _FIRST for name in drawable if name.split("/")[0] == group] or drawable[:6]
+    rest = [name for name in drawable if name not in first]
+    more = f"<details><summary>{len(rest)} more curves</summary>{_charts(rest, runs)}</details>"
+    return series_legend([run.name for run in runs]) + _charts(first, runs) + (more if rest else "")
+
+
+def chart(
+    title: str, lines: Mapping[str, tuple[Stroke, Points]], share: bool = False, across: str = ""
+) -> str:
+    """Return one chart as HTML, with a title above and words (``across``) below.
+
+    ``lines`` has the stroke and the points (horizontal, vertical) of each run; with ``share``, the vertical axis is
+    from 0 to 1 where all values fit.
+    """
+    drawn = {name: (style, _thinned(points)) for name, (style, points) in lines.items() if len(points)}
+    values = np.concatenate([points for _, points in drawn.values()])
+    x_ticks = ticks(min(0.0, float(values[:, 0].min())), float(values[:, 0].max()), 5)
+    low, high = float(values[:, 1].min()), float(values[:, 1].max())
+    y_ticks = [0.0, 0.25, 0.5, 0.75, 1.0] if share and low >= 0 and high <= 1 else ticks(low, high, 5)
+    last = max(float(values[:, 0].max()), x_ticks[0] + 1e-9)
+    axes = Axes(x_ticks[0], last, y_ticks[0], y_ticks[-1], left=52)
+    shapes = [axes.horizontal(value, compact(value)) for value in y_ticks]
+    shapes += [axes.mark(value) for value in x_ticks if value <= axes.x1 + 1e-9]
+    shapes += [
+        f'<polyline {style.svg} points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
+        for name, (style, points) in drawn.items()
+    ]
+    return axes.figure(title, shapes, across)
+
+
+def _thinned(points: Points) -> Float[np.ndarray[Any, Any], "bin 2"]:
+    """Return points in order of their step, averaged into bins where there are too many."""
+    points = points[np.argsort(points[:, 0], kind="stable")]
+    if len(points) <= _MOST_POINTS:
+        return points
+    return np.stack([part.mean(axis=0) for part in np.array_split(points, _MOST_POINTS)])
+
+
+def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
+    drawn, styled = [], list(enumerate(runs))
+    for name in names:
+        lines = {run.name: (stroke(at), run.curves[name]) for at, run in styled if name in run.curves}
+        share = name.split("/")[-1] in (*SHARES, "progress_ratio")
+        drawn.append(chart(name, lines, share, across="environment steps"))
+    return f"<div class=charts>{''.join(drawn)}</div>"
+
+
+class Axes:
+    """Maps data to the drawing; ``left`` is the margin of the vertical axis, pixels."""
+
+    def __init__(self, x0: float, x1: float, y0: float, y1: float, left: int) -> None:
+        self.x0, self.x1, self.y0, self.y1, self.left = x0, x1, y0, y1, left
+
+    def x(self, value: Any) -> Any:
+        """Return the horizontal place of a value, pixels."""
+        return self.left + (value - self.x0) / (self.x1 - self.x0) * (WIDTH - self.left - _RIGHT)
+
+    def y(self, value: Any) -> Any:
+        """Return the vertical place of a value, pixels."""
+        return HEIGHT - _BOTTOM - (value - self.y0) / (self.y1 - self.y0) * (HEIGHT - _BOTTOM - _TOP)
+
+    def path(self, points: Any) -> str:
+        """Return points ``[n, 2]`` as an SVG path."""
+        return " ".join(f"{self.x(x):.1f},{self.y(y):.1f}" for x, y in points)
+
+    def horizontal(self, value: float, text: str) -> str:
+        """Return a grid line with its label."""
+        y = self.y(value)
+        return (
+            f'<line class="grid" x1="{self.left}" x2="{WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f'<text x="{self.left - 6}" y="{y + 4:.1f}" text-anchor="end">{text}</text>'
+        )
+
+    def mark(self, value: float) -> str:
+        """Return a label of the horizontal axis."""
+        y = HEIGHT - _BOTTOM + 15
+        return f'<text x="{self.x(value):.1f}" y="{y}" text-anchor="middle">{compact(value)}</text>'
+
+    def figure(self, title: str, shapes: Iterable[str], across: str, facts: str = "") -> str:
+        """Return the chart: a caption (``facts`` is HTML), shapes, and words below the horizontal axis."""
+        middle = (self.left + WIDTH - _RIGHT) / 2
+        return (
+            f"<figure class=chart><figcaption>{escape(title)}{facts}</figcaption>"
+            f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">{"".join(shapes)}'
+            f'<text x="{middle:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(across)}</text></svg></figure>'
+        )
+
+
+def ticks(low: float, high: float, most: int) -> list[float]:
+    """Return evenly spaced round numbers that enclose ``[low, high]``: steps of 1, 2 or 5 times a power of ten."""
+    if high - low < 1e-12 * max(1.0, abs(low), abs(high)):
+        pad = max(0.5 * abs(low), 0.5)
+        low, high = low - pad, high + pad
+    rough = (high - low) / most
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * (1 - 1e-9))
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    return [step * place for place in range(first, last + 1)]
+
+
+def compact(value: float) -> str:
+    """Return a number in few letters: ``1.5M``, ``20k``, ``0.25``."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:.4g}{letter}".replace("-", "−")
+    return "0" if abs(value) < 1e-12 else f"{value:.4g}".replace("-", "−")
+
+
+def series_legend(names: Sequence[str]) -> str:
+    """Return the legend of charts: names in the order of their strokes."""
+    styled = [(stroke(place).key, escape(name)) for place, name in enumerate(names)]
+    items = "".join(f'<li><i style="background:{style}"></i>{name}</li>' for style, name in styled)
+    return f"<ul class=series>{items}</ul>"
+
+
+Values = Float[np.ndarray[Any, Any], "_"]
+#: Metrics with a chart, in order.
+SPREAD = (
+    "vmax_score", "progress_ratio", "min_ttc", "average_ttc", "max_jerk", "max_lateral_acceleration", "comfort",
+    "speeding_max", "route_deviation_max", "ade", "goal_distance", "distance",
+)  # fmt: skip
+#: Steps of a drawn line at most, so that a chart does not average its corners.
+_LEVELS = 75
+#: Bins of a histogram at most.
+BINS = 24
+
+
+def distribution_charts(runs: Sequence[EpisodeTable]) -> str:
+    """Return a chart for each metric of :data:`SPREAD` that differs between episodes; empty without any."""
+    styles = {run.name: stroke(place) for place, run in enumerate(runs)}
+    charts = []
+    for name in SPREAD:
+        lines = {run.name: distribution(run.metrics[name]) for run in runs if name in run.metrics}
+        values = np.concatenate([line[:, 0] for line in lines.values()]) if lines else np.zeros(0)
+        if values.size and values.min() < values.max():
+            drawn = {run: (styles[run], line) for run, line in lines.items()}
+            charts.append(chart(metric_label(name, runs).text, drawn, share=True))
+    return f"{series_legend(list(styles))}<div class=charts>{''.join(charts)}</div>" if charts else ""
+
+
+def distribution(values: Any) -> Float[np.ndarray[Any, Any], "point 2"]:
+    """Return the corners of the empirical distribution function: value, share of the defined values up to it.
+
+    More than 75 values are thinned evenly, so that no corner moves by more than 1 / 75.
+    """
+    known = np.sort(np.asarray(values, np.float64))
+    known = known[~np.isnan(known)]
+    if not known.size:
+        return np.zeros((0, 2))
+    share = np.arange(1, known.size + 1) / known.size
+    if known.size > _LEVELS:
+        rows = np.unique(np.ceil(np.linspace(1, known.size, _LEVELS)).astype(int)) - 1
+        known, share = known[rows], share[rows]
+    return np.column_stack((np.repeat(known, 2), np.concatenate(([0.0], np.repeat(share, 2)[:-1]))))
+
+
+def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenario") -> str:
+    """Return one histogram as HTML: the share of each series in common bins; the unit is written below."""
+    values = np.concatenate(list(series.values()))
+    edges = bins(values)
+    shares = {name: _shares(numbers, edges) for name, numbers in series.items()}
+    levels = ticks(0.0, max(float(share.max()) for share in shares.values()), 4)
+    low, high = float(edges[0]), float(edges[-1])
+    axes = Axes(low, high, 0.0, levels[-1], left=44)
+    shapes = [axes.horizontal(value, f"{compact(100 * value)} %") for value in levels]
+    whole = bool((values == np.round(values)).all())
+    marks = [value for value in ticks(low, high, 5) if low <= value <= high]
+    shapes += [axes.mark(value) for value in marks if not whole or value == round(value)]
+    draw = _bars if len(shares) == 1 else _steps
+    shapes += [draw(axes, edges, share, stroke(place)) for place, share in enumerate(shares.values())]
+    names = {name: escape(f"{name}: ") if len(series) > 1 else "" for name in series}
+    facts = "".join(f"<small>{names[name]}{_facts(numbers)}</small>" for name, numbers in series.items())
+    return axes.figure(title, shapes, unit, facts)
+
+
+def bins(values: Values, most: int = BINS) -> Values:
+    """Return the edges of at most ``most`` equal bins of a round width that hold all values.
+
+    Whole numbers get bins that are centred on them while each number has its own.
+    """
+    low, high = float(values.min()), float(values.max())
+    whole = bool((values == np.round(values)).all())
+    if low == high:
+        return low + np.array([-1.5, -0.5, 0.5, 1.5])
+    if whole and high - low < most:
+        return np.arange(low - 0.5, high + 1.0)
+    edges = ticks(min(low, 0.0) if low < 0.5 * high else low, high, most - 1)
+    width = edges[1] - edges[0]
+    if whole and width < 1.0:
+        return np.arange(math.floor(low), math.ceil(high) + 1.5)
+    return np.append(edges, edges[-1] + width) if edges[-1] <= high else np.array(edges)
+
+
+def short(value: Any) -> str:
+    """Return a number with about three figures."""
+    value = float(value)
+    digits = 0 if abs(value) >= 100 or value == round(value) else 1 if abs(value) >= 10 else 2
+    return f"{value:,.{digits}f}"
+
+
+def _shares(values: Values, edges: Values) -> Values:
+    counts, _ = np.histogram(values, edges)
+    return counts / max(len(values), 1)
+
+
+def _facts(values: Values) -> str:
+    if not len(values):
+        return "n 0"
+    return f"median {short(np.median(values))}, most {short(values.max())}, n {len(values):,}"
+
+
+def _bars(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
+    return "".join(
+        f'<rect x="{axes.x(a) + 0.5:.1f}" y="{axes.y(share):.1f}" width="{axes.x(b) - axes.x(a) - 1:.1f}" '
+        f'height="{axes.y(0) - axes.y(share):.1f}" fill="{style.colour}">'
+        f"<title>{compact(a)} to {compact(b)}: {100 * share:.3g} %</title></rect>"
+        for a, b, share in zip(edges[:-1], edges[1:], shares, strict=True)
+        if share > 0
+    )
+
+
+def _steps(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
+    corners = np.column_stack((np.repeat(edges, 2), np.concatenate(([0.0], np.repeat(shares, 2), [0.0]))))
+    return f'<polyline {style.svg} points="{axes.path(corners)}"/>'
+
+
+Array = np.ndarray[Any, Any]
+#: Below this speed a path has no curvature: headings jitter more than the car moves.
+_CURVED_MPS = 0.5
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One plot: title, unit, resolution of the packed values (``step``), and comfort limits, low and high, if any."""
+
+    name: str
+    title: str
+    unit: str
+    step: float
+    limits: tuple[float, ...] = ()
+
+
+SIGNALS = (
+    Signal("speed", "speed", "m/s", 0.01),
+    Signal("acceleration", "acceleration along the road", "m/s²", 0.01, comfort.LONGITUDINAL_MPS2),
+    Signal("jerk", "jerk along the road", "m/s³", 0.01, (-comfort.JERK_MPS3, comfort.JERK_MPS3)),
+    Signal("curvature", "curvature", "1/m", 0.0001),
+    Signal("yaw_rate", "yaw rate", "rad/s", 0.001, (-comfort.YAW_RATE_RPS, comfort.YAW_RATE_RPS)),
+    Signal("lateral", "lateral acceleration", "m/s²", 0.01, (-comfort.LATERAL_MPS2, comfort.LATERAL_MPS2)),
+)
+#: Commands: the first two numbers of an action.
+COMMANDS = (
+    Signal("lengthwise", "command lengthwise", "1 is the most", 0.001),
+    Signal("sideways", "command sideways", "1 is the most", 0.001),
+)
+COMMANDED = len(COMMANDS)
+
+
+def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
+    """Return the signals of a path by name, differentiated and filtered like the comfort metrics.
+
+    The path has position [m], heading [rad] and speed [m/s]; NaN where the agent is absent. Savitzky-Golay windows of
+    nuPlan: accelerations 8/2, jerk 15/2 of them, yaw rate 5/2 (``metrics.comfort``). Curvature is yaw rate over speed. The 7
+    steps at either end have values of the first or last window's polynomial. Values are NaN outside of the last
+    unbroken stretch of the path, at its first step, and, except for speed, throughout if it has fewer than 16 steps.
+    """
+    present = np.asarray(np.isfinite(ego).all(axis=1))
+    values = {signal.name: np.full(len(ego), np.nan) for signal in SIGNALS}
+    values["speed"][present] = ego[present, 3]
+    if not present.any():
+        return values
+    end = int(np.flatnonzero(present)[-1]) + 1
+    gaps = np.flatnonzero(~present[:end])
+    first = int(gaps[-1]) + 1 if gaps.size else 0
+    if end - first <= WINDOW:
+        return values
+    path, at = np.asarray(ego[first:end], np.float64), slice(first + 1, end)
+    turned = np.asarray(wrap(np.diff(path[:, 2])))
+    along, middle = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
+    samples = end - first - 1
+    smooth = savgol_matrix(samples, *comfort.SMOOTH)
+    rate = savgol_matrix(samples, *comfort.YAW_RATE) @ np.cumsum(turned) / DT_S
+    values["acceleration"][at] = smooth @ along
+    values["lateral"][at] = smooth @ (middle * turned / DT_S)
+    values["jerk"][at] = savgol_matrix(samples, *comfort.JERK) @ smooth @ along / DT_S
+    values["yaw_rate"][at] = rate
+    values["curvature"][at] = np.where(middle >= _CURVED_MPS, rate / np.maximum(middle, _CURVED_MPS), np.nan)
+    return values
