@@ -354,6 +354,12 @@ def _total(part: Part, bank: ScenarioBank, state: SimState) -> Array:
 
 def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimState) -> float:
     """Return the microseconds per environment and step of a part."""
+    program = _repeated(config, part)
+    return _median(lambda: program(bank, states, None), config.repeats) / config.steps / config.batch * 1e6
+
+
+def _repeated(config: BenchConfig, part: Part) -> Any:
+    """Return a program that computes a part ``config.steps`` times, and returns the shift of the last time."""
 
     def repeated(bank: ScenarioBank, states: SimState, _: Any) -> Array:
         def iteration(shift: Array, _: None) -> tuple[Array, None]:
@@ -363,8 +369,7 @@ def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimS
 
         return jax.lax.scan(iteration, jnp.zeros(states.start.shape), None, config.steps)[0]
 
-    program = _shared(repeated)
-    return _median(lambda: program(bank, states, None), config.repeats) / config.steps / config.batch * 1e6
+    return _shared(repeated)
 
 
 def _shifted(state: SimState, by: Array) -> SimState:
