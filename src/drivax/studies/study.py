@@ -23,7 +23,7 @@ from drivax.curation.subset import top_rows
 from drivax.curation.weights import draw_statistics
 from drivax.errors import UsageError
 from drivax.evaluation.episode_table import EpisodeTable
-from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
+from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.files import write_json
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
