@@ -13,7 +13,7 @@ from jaxtyping import Float
 from drivax.curation.scores import ScoreTable
 from drivax.files import write_text
 from drivax.metrics.catalogue import METRICS
-from drivax.report.charts.distributions import histogram
+from drivax.report.charts import histogram
 from drivax.report.pages.page import page
 from drivax.studies.definition import Stratum, StudyDefinition
 from drivax.studies.verdicts import RELATED, UNRELATED
