@@ -243,8 +243,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("no episode is running; call reset() first")
-        worlds = self._worlds
-        command = worlds.commands(action, ())
+        worlds, command = self._worlds, self._worlds.commands(action, ())
         state, observation, ending = _step(worlds.simulator, worlds.bank, self._state, command)
         self._state = state
         if self.render_mode is not None:

@@ -65,19 +65,16 @@ def train(
 
     Args:
         config: Settings of the training.
-        data: Scenarios to train on, all held on the device. Offline algorithms draw logged steps by weight from a
-            :class:`WeightedSet`, otherwise uniformly.
+        data: Scenarios to train on, all held on the device; offline algorithms draw steps of a weighted set by weight.
         out: Run folder.
         validation: Scenarios that rank checkpoints.
         resume: Continue the run in ``out`` from its newest checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder.
-        seeds: Number of seeds to train in one program, from ``config.seed`` on; several have run folders
-            ``out/seed-0``, ``out/seed-1``, ...
+        seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-0``, ...
         log: Called with lines about memory, pretrained networks, and seeds that stop early.
 
     Raises:
-        UsageError: ``out`` exists and neither ``resume`` nor ``overwrite`` is given, a resumed run was trained on other
-            data or with other weights, weights do not fit the data or the algorithm, or memory is too small.
+        UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
         DataError: The run to fine-tune is no training run, or its networks do not fit.
         Preempted: SIGTERM stopped it, after a checkpoint.
     """

@@ -106,11 +106,8 @@ class IdmTraffic:
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Reactive:
         """Advance all vehicles by one step of 0.1 s from the present frame."""
         paths, now = data_of(bank, AgentPaths), context.traffic
-        slot, drives, waits = (
-            paths.slot[context.index].astype(jnp.int32),
-            now.phase == DRIVES,
-            now.phase == WAITS,
-        )
+        drives, waits = now.phase == DRIVES, now.phase == WAITS
+        slot = paths.slot[context.index].astype(jnp.int32)
         movers, most = _movers(bank, context, slot)
         movers, ignored = _without_parted(movers, frame, waits)
         ahead = leaders(paths, context.index, movers, frame)
