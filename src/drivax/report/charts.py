@@ -297,8 +297,8 @@ def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
     """Return the signals of a path by name, differentiated and filtered like the comfort metrics.
 
     The path has position [m], heading [rad] and speed [m/s]; NaN where the agent is absent. Savitzky-Golay windows of
-    nuPlan: accelerations 8/2, jerk 15/2 of them, yaw rate 5/2 (``metrics.comfort``). Curvature is yaw rate over speed. The 7
-    steps at either end have values of the first or last window's polynomial. Values are NaN outside of the last
+    nuPlan: accelerations 8/2, jerk 15/2 of them, yaw rate 5/2 (``metrics.comfort``). Curvature is yaw rate over speed.
+    The steps at either end have values of the first or last window's polynomial. Values are NaN outside of the last
     unbroken stretch of the path, at its first step, and, except for speed, throughout if it has fewer than 16 steps.
     """
     present = np.asarray(np.isfinite(ego).all(axis=1))
