@@ -9,7 +9,6 @@ its configuration, which ``run`` gets as a second argument.
 from __future__ import annotations
 
 import importlib
-import inspect
 import os
 import shutil
 import sys
@@ -18,6 +17,7 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from importlib import metadata
+from inspect import getdoc
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -167,7 +167,7 @@ def _run(name: str, command: Command, arguments: list[str]) -> int:
     module = importlib.import_module(command.module)
     config = getattr(module, command.config)
     args, overrides = tyro.cli(
-        config, prog=f"drivax {name}", args=arguments, description=_wrapped(inspect.getdoc(config) or ""),
+        config, prog=f"drivax {name}", args=arguments, description=_wrapped(getdoc(config) or ""),
         config=(tyro.conf.FlagCreatePairsOff,), return_unknown_args=True,
     )  # fmt: skip
     if command.overrides:
