@@ -5,8 +5,14 @@ import pytest
 from drivax.cli.generate import Generate, run
 from drivax.errors import UsageError
 from drivax.scenario.store import ScenarioSet
-from drivax.synthetic.benchmark import BENCHMARK_VERSION, SPLITS, generate_benchmark, sizes
-from drivax.synthetic.generate import RESERVED_SEED, Generation
+from drivax.synthetic.generate import (
+    BENCHMARK_VERSION,
+    RESERVED_SEED,
+    SPLITS,
+    Generation,
+    generate_benchmark,
+    sizes,
+)
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig
 
 TRAIN = 8

@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.expert.reservations import (
+from drivax.synthetic.expert.candidates import (
     HARD_M,
     NEAR_M,
     NEAR_PEOPLE_M,
+    SPACING_M,
+    Shift,
     arrivals,
     find_conflicts,
+    shifted_path,
     stop_lines,
 )
-from drivax.synthetic.expert.trajectories import SPACING_M, Shift, shifted_path
 from drivax.synthetic.expert.violations import user_boxes
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.roads.network import Control

@@ -8,13 +8,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.expert.comfort import discomfort
 from drivax.synthetic.expert.plan import plan_ego
-from drivax.synthetic.expert.violations import Violation, find_violation, is_staged, last_stop
+from drivax.synthetic.expert.violations import Violation, discomfort, find_violation, is_staged, last_stop
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import LaneChange, Path, Sway, lane_path, random_lanes
-from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, Staging
+from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Staging
 
 #: Experts that brake harder than this are rejected, m/s2: comfort (-4.05) in common driving, the end of the
 #: common law's range where an event leaves no choice.

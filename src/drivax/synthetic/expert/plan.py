@@ -10,16 +10,20 @@ from jaxtyping import Bool, Float64
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.expert.reservations import Conflicts, StopLine, arrivals, find_conflicts, stop_lines
-from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smoothed
-from drivax.synthetic.expert.speed_search import TOUCH, Occupancy, SpeedPlan, search
-from drivax.synthetic.expert.trajectories import (
+from drivax.synthetic.expert.candidates import (
     SPACING_M,
     CandidatePath,
+    Conflicts,
     Shift,
+    StopLine,
+    arrivals,
     candidate_corners,
+    find_conflicts,
     shifted_path,
+    stop_lines,
 )
+from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smoothed
+from drivax.synthetic.expert.speed_search import TOUCH, Occupancy, SpeedPlan, search
 from drivax.synthetic.expert.violations import against_traffic, inside, user_boxes
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.traffic.lateral import located

@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float64, Int64
 from drivax.scenario.schema import RoadKind
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.obstacles import Boxes
 from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.roles import Drivers
 
 #: MOBIL: threshold and safe braking, m/s2; the latter grows to the second value as the own lane runs out.
 _THRESHOLD_MPS2 = 0.25

@@ -328,12 +328,7 @@ def followed(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np.ndarra
     return result
 
 
-def change_onto(
-    target: Path,
-    present: Path,
-    at_m: float,
-    length_m: float,
-) -> tuple[Path, float]:
+def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tuple[Path, float]:
     """A path that leaves another where a vehicle is and swings onto a third, as a lane change does.
 
     Args:

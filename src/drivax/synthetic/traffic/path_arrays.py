@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import SLOTS, Path
+from drivax.synthetic.traffic.roles import Drivers
 
 
 def speed_profile(

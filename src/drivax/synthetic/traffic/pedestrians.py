@@ -68,9 +68,7 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
     across = axes[:, 1] - axes[:, 0]
     length = np.hypot(*across.T)
     # People walk in the middle of the crosswalk: who stands on its rim does not block it.
-    strip = np.column_stack(
-        [axes.mean(axis=1), across / length[:, None], length, np.ones(len(axes))],
-    )
+    strip = np.column_stack([axes.mean(axis=1), across / length[:, None], length, np.ones(len(axes))])
     return _CrossingConflicts(
         xy=np.array(xy).reshape(-1, 2),
         heading=np.array(heading, float),
@@ -146,11 +144,7 @@ class Walkers:
         self._released, self._into = np.zeros((2, len(curves)), bool)
 
     def step(
-        self,
-        t: int,
-        vehicles: Boxes,
-        active: Bool[np.ndarray, " v"],
-        colour_row: Int8[np.ndarray, " lane"],
+        self, t: int, vehicles: Boxes, active: Bool[np.ndarray, " v"], colour_row: Int8[np.ndarray, " lane"]
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
         """Return all walkers at step ``t``, then advance them.
 
@@ -185,11 +179,7 @@ class Walkers:
         occupied[self._crossing[some]] = True
 
     def _release(
-        self,
-        t: int,
-        vehicles: Boxes,
-        active: Bool[np.ndarray, " v"],
-        colour_row: Int8[np.ndarray, " lane"],
+        self, t: int, vehicles: Boxes, active: Bool[np.ndarray, " v"], colour_row: Int8[np.ndarray, " lane"]
     ) -> None:
         """Release walkers at the kerb of a crossing that is safe for long enough."""
         before = self._kerb - self._at
@@ -207,9 +197,7 @@ class Walkers:
         red = ~(conflicts.red & (colour_row != Colour.RED)).any(axis=1)
         yielded = conflicts.marked | conflicts.red.any(axis=1)
         gap = np.where(
-            yielded[crossing],
-            hard_s[crossing] > needed + _MARGIN_S,
-            any_s[crossing] > needed + _GAP_MARGIN_S,
+            yielded[crossing], hard_s[crossing] > needed + _MARGIN_S, any_s[crossing] > needed + _GAP_MARGIN_S
         )
         lasting = self._red_left_s[t, crossing] >= needed
         self._released[asks] = gap & free[crossing] & red[crossing] & lasting

@@ -12,9 +12,8 @@ from jaxtyping import Float64
 from drivax.scenario.schema import AgentKind, RoadKind
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.roads.network import Bay, Lane, RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import Path, Sway, lane_path
-from drivax.synthetic.traffic.roles import Scripted
+from drivax.synthetic.traffic.roles import Drivers, Scripted
 
 #: Who passes a double-parked car without leaving the road needs this width, m.
 _PASSAGE_M = 2.3

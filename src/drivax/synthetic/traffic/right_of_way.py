@@ -17,8 +17,8 @@ from drivax.scenario.schema import DT_S
 from drivax.synthetic.roads.curves import resample
 from drivax.synthetic.roads.network import CLEARANCE_M, Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.roles import Drivers
 
 #: A driver asks for the way when it would brake this gently for the line, m/s2, with this much time and room to spare.
 _ASK_MPS2, _ASK_S, _ASK_M = 2.0, 0.7, 3.5

@@ -21,18 +21,11 @@ from drivax.synthetic.events.destinations import (
 from drivax.synthetic.expert import driver as expert
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import SignalPlan
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Path, random_lanes
 from drivax.synthetic.traffic.pedestrians import place_walkers
-from drivax.synthetic.traffic.population import (
-    draw_drivers,
-    driven_path,
-    join_drivers,
-    parked_cars,
-    placed,
-)
-from drivax.synthetic.traffic.roles import Roles
+from drivax.synthetic.traffic.population import draw_drivers, driven_path, join_drivers, parked_cars, placed
+from drivax.synthetic.traffic.roles import Drivers, Roles
 
 #: Lanes that lead to a meeting are followed back for this long, m.
 _BACK_M = 160.0

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float64, Int64
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.lane_changes import HELP_MPS2, Change, Helped, LaneChanges, Situation
 from drivax.synthetic.traffic.lateral import (
     DETOUR_MARGIN_M,
@@ -31,7 +30,7 @@ from drivax.synthetic.traffic.path_arrays import PathTables
 from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, onward
 from drivax.synthetic.traffic.pedestrians import Walkers
 from drivax.synthetic.traffic.right_of_way import RightOfWay, TrafficState
-from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, Scripted, Staging
+from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Scripted, Staging
 
 
 def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
