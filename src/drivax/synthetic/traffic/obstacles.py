@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask
 from drivax.synthetic.traffic.paths import Path
 
 #: Room that a driver keeps on both sides, m.
@@ -135,7 +135,7 @@ class Standing:
         width_m: Widths of the vehicles.
     """
 
-    def __init__(self, boxes: Boxes, tables: PathTables, width_m: Float64[np.ndarray, " v"]) -> None:
+    def __init__(self, boxes: Boxes, tables: PathTables, width_m: PerVehicle) -> None:
         self.boxes, self._half = boxes, width_m / 2
         self.near_m = np.full((len(width_m), 1), np.inf)
         self._seen: list[tuple[Extents, Int64[np.ndarray, " k"]]] = []
@@ -171,19 +171,15 @@ class Standing:
         block &= (seen.near_m > front_m - 0.5) & (seen.near_m < front_m + within_m)
         return bool(block.any())
 
-    def gap(self, front_m: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
+    def gap(self, front_m: PerVehicle) -> PerVehicle:
         """Distance from the front bumper to the next thing in the way (infinite: none)."""
         gap = self.near_m - front_m[:, None]
         return np.where(gap > -1.0, gap, np.inf).min(axis=1)
 
 
 def nearest_obstacles(
-    tables: PathTables,
-    vehicles: Boxes,
-    at_m: Float64[np.ndarray, " v"],
-    active: Bool[np.ndarray, " v"],
-    others: Boxes,
-) -> tuple[Float64[np.ndarray, " v"], Float64[np.ndarray, " v"]]:
+    tables: PathTables, vehicles: Boxes, at_m: PerVehicle, active: VehicleMask, others: Boxes
+) -> tuple[PerVehicle, PerVehicle]:
     """Gap from each front bumper to the nearest thing in the corridor of the own path, and its speed along it.
 
     Args:
@@ -227,7 +223,7 @@ def nearest_obstacles(
 
 
 def _close(
-    vehicles: Boxes, things: Boxes, active: Bool[np.ndarray, " v"]
+    vehicles: Boxes, things: Boxes, active: VehicleMask
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
     """Pairs of a vehicle and what is ahead of it and near enough to matter, roughly; vehicles come first in things."""
     count = len(vehicles)
@@ -256,10 +252,7 @@ _LOOKS_M = np.arange(0.0, _AHEAD_M + 6.0, _EVERY_M)
 
 
 def _nearest(
-    tables: PathTables,
-    at_m: Float64[np.ndarray, " v"],
-    viewer: Int64[np.ndarray, " k"],
-    xy: Float64[np.ndarray, "k 2"],
+    tables: PathTables, at_m: PerVehicle, viewer: Int64[np.ndarray, " k"], xy: Float64[np.ndarray, "k 2"]
 ) -> tuple[Float64[np.ndarray, "k 4"], Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
     """The sample ahead on the path of a vehicle that is nearest to a point, where it is, and the squared distance."""
     step = tables.step_m[viewer]

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.paths import SLOTS, Path
 from drivax.synthetic.traffic.roles import Drivers
+
+#: A number, a flag and an index per vehicle.
+PerVehicle = Float64[np.ndarray, " v"]
+VehicleMask = Bool[np.ndarray, " v"]
+VehicleRows = Int64[np.ndarray, " v"]
 
 
 def speed_profile(
@@ -127,9 +132,7 @@ class PathTables:
             setattr(result, name, value.copy() if isinstance(value, np.ndarray | list) else value)
         return result
 
-    def at(
-        self, position_m: Float64[np.ndarray, " v"], rows: Int64[np.ndarray, " v"]
-    ) -> Float64[np.ndarray, "v 4"]:
+    def at(self, position_m: PerVehicle, rows: VehicleRows) -> Float64[np.ndarray, "v 4"]:
         """x, y, heading and fastest speed at positions on the paths of some vehicles."""
         place = position_m / self.step_m[rows]
         index = np.minimum(np.maximum(place.astype(int), 0), self.last[rows] - 1)
@@ -139,7 +142,7 @@ class PathTables:
         return low + share * (flat.take(index + 1, axis=0) - low)
 
     def on(
-        self, position_m: Float64[np.ndarray, " v"], rows: Int64[np.ndarray, " v"]
+        self, position_m: PerVehicle, rows: VehicleRows
     ) -> tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]]:
         """The lanes taken up at positions on the paths (-1: no more), and where on them, m."""
         step = self.step_m[rows]

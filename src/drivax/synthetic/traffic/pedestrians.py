@@ -15,6 +15,7 @@ from drivax.synthetic.roads.curves import STEP_M, Curve, resample
 from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes
+from drivax.synthetic.traffic.path_arrays import PerVehicle, VehicleMask
 from drivax.synthetic.traffic.roles import Walker
 
 #: Where people wait, m before the kerb, how near to it they occupy the crossing, and from where on they look.
@@ -144,7 +145,7 @@ class Walkers:
         self._released, self._into = np.zeros((2, len(curves)), bool)
 
     def step(
-        self, t: int, vehicles: Boxes, active: Bool[np.ndarray, " v"], colour_row: Int8[np.ndarray, " lane"]
+        self, t: int, vehicles: Boxes, active: VehicleMask, colour_row: Int8[np.ndarray, " lane"]
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
         """Return all walkers at step ``t``, then advance them.
 
@@ -179,7 +180,7 @@ class Walkers:
         occupied[self._crossing[some]] = True
 
     def _release(
-        self, t: int, vehicles: Boxes, active: Bool[np.ndarray, " v"], colour_row: Int8[np.ndarray, " lane"]
+        self, t: int, vehicles: Boxes, active: VehicleMask, colour_row: Int8[np.ndarray, " lane"]
     ) -> None:
         """Release walkers at the kerb of a crossing that is safe for long enough."""
         before = self._kerb - self._at
@@ -238,7 +239,7 @@ def _red_left(
 
 
 def _arrivals(
-    conflicts: _CrossingConflicts, boxes: Float64[np.ndarray, "v 6"], speed: Float64[np.ndarray, " v"]
+    conflicts: _CrossingConflicts, boxes: Float64[np.ndarray, "v 6"], speed: PerVehicle
 ) -> tuple[Float64[np.ndarray, " crossing"], Float64[np.ndarray, " crossing"]]:
     """When the next vehicle reaches each crossing, s: any that moves, and any that cannot stop with ease."""
     any_s, hard_s = np.full(len(conflicts.marked), math.inf), np.full(len(conflicts.marked), math.inf)
@@ -262,7 +263,7 @@ def _arrivals(
 
 
 def _walks_into(
-    pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: Bool[np.ndarray, " v"]
+    pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask
 ) -> Bool[np.ndarray, " w"]:
     """Mask of walkers about to come too near to a vehicle, and not near one already."""
     x, y, angle = pose.T
@@ -273,10 +274,7 @@ def _walks_into(
 
 
 def _within(
-    x: Float64[np.ndarray, " w"],
-    y: Float64[np.ndarray, " w"],
-    vehicles: Boxes,
-    active: Bool[np.ndarray, " v"],
+    x: Float64[np.ndarray, " w"], y: Float64[np.ndarray, " w"], vehicles: Boxes, active: VehicleMask
 ) -> Bool[np.ndarray, " w"]:
     """Which points lie in any vehicle grown by the berth that people give it."""
     cos, sin = vehicles.direction

@@ -17,7 +17,7 @@ from drivax.scenario.schema import DT_S
 from drivax.synthetic.roads.curves import resample
 from drivax.synthetic.roads.network import CLEARANCE_M, Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
-from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows
 from drivax.synthetic.traffic.roles import Drivers
 
 #: A driver asks for the way when it would brake this gently for the line, m/s2, with this much time and room to spare.
@@ -56,14 +56,14 @@ class TrafficState:
     step: int
     colour: Int8[np.ndarray, " lane"]
     to_red: Float64[np.ndarray, " lane"]
-    front_m: Float64[np.ndarray, " v"]
-    rear_m: Float64[np.ndarray, " v"]
-    speed: Float64[np.ndarray, " v"]
-    active: Bool[np.ndarray, " v"]
-    room_m: Float64[np.ndarray, " v"]
-    leader: Int64[np.ndarray, " v"]
-    leader_speed: Float64[np.ndarray, " v"]
-    promised: Int64[np.ndarray, " v"]
+    front_m: PerVehicle
+    rear_m: PerVehicle
+    speed: PerVehicle
+    active: VehicleMask
+    room_m: PerVehicle
+    leader: VehicleRows
+    leader_speed: PerVehicle
+    promised: VehicleRows
     promises: bool
 
 
@@ -106,7 +106,7 @@ def time_to_cover(
     return np.where(distance < ramp, early, late)
 
 
-def _number(mask: Bool[np.ndarray, "v k"]) -> Int64[np.ndarray, " v"]:
+def _number(mask: Bool[np.ndarray, "v k"]) -> VehicleRows:
     """How many of each row are true."""
     return np.add.reduce(mask, axis=1, dtype=np.int64)
 
@@ -146,7 +146,7 @@ class RightOfWay:
         self._granted[row] = int(np.sum(tables.connector_begin[row] < front_m))
         self._stood[row], self._asked[row] = np.inf, -1
 
-    def lines(self, state: TrafficState, tables: PathTables) -> Float64[np.ndarray, " v"]:
+    def lines(self, state: TrafficState, tables: PathTables) -> PerVehicle:
         """Distance from the front bumper to the next line at which to stop (infinite: none)."""
         connectors = tables.connector.shape[1]
         entered = _number(tables.connector_begin < state.front_m[:, None])
@@ -171,9 +171,7 @@ class RightOfWay:
             self._decide(state, tables, asking, place, stop)
         return stop
 
-    def _lights(
-        self, state: TrafficState, tables: PathTables
-    ) -> tuple[Float64[np.ndarray, " v"], Int64[np.ndarray, " v"]]:
+    def _lights(self, state: TrafficState, tables: PathTables) -> tuple[PerVehicle, VehicleRows]:
         """Distance to the nearest line held by a light, and which connector it is (none: their number)."""
         begin, count = tables.connector_begin, tables.connector.shape[1]
         if not np.count_nonzero(state.colour):
@@ -198,8 +196,8 @@ class RightOfWay:
         state: TrafficState,
         tables: PathTables,
         asking: Int64[np.ndarray, " asking"],
-        place: Int64[np.ndarray, " v"],
-        stop: Float64[np.ndarray, " v"],
+        place: VehicleRows,
+        stop: PerVehicle,
     ) -> None:
         """Grant or deny what drivers ask for, nearest in time first, at all-way stops in the order of standing."""
         index = np.arange(tables.connector.shape[1])
@@ -246,7 +244,7 @@ class RightOfWay:
         state: TrafficState,
         tables: PathTables,
         asking: Int64[np.ndarray, " asking"],
-        place: Int64[np.ndarray, " v"],
+        place: VehicleRows,
     ) -> list[int]:
         connectors = tables.connector[asking, place[asking]]
         arrival = (tables.connector_begin[asking, place[asking]] - state.front_m[asking]) / np.maximum(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.idm import idm_acceleration
@@ -26,7 +26,7 @@ from drivax.synthetic.traffic.lateral import (
     followed,
 )
 from drivax.synthetic.traffic.obstacles import Boxes, Standing, nearest_obstacles
-from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows
 from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, onward
 from drivax.synthetic.traffic.pedestrians import Walkers
 from drivax.synthetic.traffic.right_of_way import RightOfWay, TrafficState
@@ -117,8 +117,8 @@ class Leaders:
         self._nearest = np.full(len(width_m), np.inf), np.zeros(len(width_m), int)
 
     def ahead(
-        self, tables: PathTables, at_m: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
-    ) -> tuple[Float64[np.ndarray, " v"], Int64[np.ndarray, " v"]]:
+        self, tables: PathTables, at_m: PerVehicle, active: VehicleMask
+    ) -> tuple[PerVehicle, VehicleRows]:
         """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and that vehicle.
 
         Args:
@@ -297,9 +297,7 @@ class _Run:
         self._at[0], self._speed[0] = self._plan_at[k], self._ego.speed[k]
         return True
 
-    def _walk(
-        self, t: int, active: Bool[np.ndarray, " v"], walked: Float64[np.ndarray, "walker time 4"]
-    ) -> None:
+    def _walk(self, t: int, active: VehicleMask, walked: Float64[np.ndarray, "walker time 4"]) -> None:
         """Advance the walkers and gather scripted users."""
         self._people = _NO_BOXES
         if self._walkers is not None:
@@ -313,12 +311,8 @@ class _Run:
             self._people = self._people.joined(boxes_at(there, t))
 
     def _preferred_acceleration(
-        self,
-        t: int,
-        fastest: Float64[np.ndarray, " v"],
-        ahead: Float64[np.ndarray, " v"],
-        active: Bool[np.ndarray, " v"],
-    ) -> Float64[np.ndarray, " v"]:
+        self, t: int, fastest: PerVehicle, ahead: PerVehicle, active: VehicleMask
+    ) -> PerVehicle:
         """The acceleration that each driver would like: the least that leaders, lines, things and speed allow.
 
         The fastest speed that each driver likes is given for here, and for where it will be a little later.
@@ -347,9 +341,7 @@ class _Run:
         preferred = np.minimum(preferred, (ahead - self._speed) / _SPEED_TIME_S)
         return self._helping(preferred, fastest)
 
-    def _helping(
-        self, preferred: Float64[np.ndarray, " v"], fastest: Float64[np.ndarray, " v"]
-    ) -> Float64[np.ndarray, " v"]:
+    def _helping(self, preferred: PerVehicle, fastest: PerVehicle) -> PerVehicle:
         """Open gaps for mandatory lane changes on both lanes."""
         h = self._helped
         if len(h.behind):
@@ -362,9 +354,7 @@ class _Run:
             np.minimum.at(preferred, h.behind, helpful)
         return preferred
 
-    def _stops(
-        self, t: int, active: Bool[np.ndarray, " v"], leader: Int64[np.ndarray, " v"]
-    ) -> Float64[np.ndarray, " v"]:
+    def _stops(self, t: int, active: VehicleMask, leader: VehicleRows) -> PerVehicle:
         """Room as the law counts it (2 m are kept) to where to stop: lines, crossings, things, the lane's end."""
         p, front = self._tables, self._at + self._half_m
         promised = self._promised
@@ -394,7 +384,7 @@ class _Run:
             room = np.minimum(room, self._standing.gap(front) + 2.0 - _KEEP_M)
         return room
 
-    def _crossings(self, front: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
+    def _crossings(self, front: PerVehicle) -> PerVehicle:
         """Distance to the next occupied crossing at which a vehicle can stop comfortably."""
         away = self._tables.crossing_m - front[:, None]
         needed = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
@@ -404,7 +394,7 @@ class _Run:
         self._halting = halt & (needed < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
         return np.where(self._halting, away, np.inf).min(axis=1)
 
-    def _acted(self, t: int, preferred: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
+    def _acted(self, t: int, preferred: PerVehicle) -> PerVehicle:
         """Return applied accelerations: the preferred ones a reaction time ago, bounded by overrides."""
         depth = len(self._memory)
         if t == 0:
@@ -417,9 +407,7 @@ class _Run:
                 result[vehicles_ahead] = min(result[vehicles_ahead], override.acceleration_mps2)
         return result
 
-    def _advance(
-        self, preferred: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
-    ) -> Float64[np.ndarray, " v"]:
+    def _advance(self, preferred: PerVehicle, active: VehicleMask) -> PerVehicle:
         """Advance by one step and return accelerations; speeds stay non-negative."""
         jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
         a = np.clip(preferred, self._last - jerk, self._last + self._drivers.jerk_mps3 * DT_S)
@@ -434,13 +422,7 @@ class _Run:
         self._speed = np.where(active, np.maximum(after, 0.0), 0.0)
         return a
 
-    def _decide(
-        self,
-        t: int,
-        preferred: Float64[np.ndarray, " v"],
-        fastest: Float64[np.ndarray, " v"],
-        active: Bool[np.ndarray, " v"],
-    ) -> None:
+    def _decide(self, t: int, preferred: PerVehicle, fastest: PerVehicle, active: VehicleMask) -> None:
         """Start lane changes and detours."""
         calm = (self._at > self._busy_m) & (self._rest <= t) & active
         calm &= ~self._staged(t)
@@ -455,7 +437,7 @@ class _Run:
             calm[0] = False
         self._pass(t, calm)
 
-    def _staged(self, t: int) -> Bool[np.ndarray, " v"]:
+    def _staged(self, t: int) -> VehicleMask:
         """Mask of vehicles under an override."""
         result = np.zeros(len(self._rows), bool)
         for override in self._staging.overrides:
@@ -478,7 +460,7 @@ class _Run:
         self._swap(row, path, at)
         self._busy_m[row], self._rest[row] = at + change.length_m, t + round(_REST_S / DT_S)
 
-    def _pass(self, t: int, calm: Bool[np.ndarray, " v"]) -> None:
+    def _pass(self, t: int, calm: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
         halted = self._people.chosen(np.abs(self._people.speed) < 0.05)
         stuck = np.zeros(len(self._rows), bool)
@@ -502,7 +484,7 @@ class _Run:
             if any_halted or self._standing.meets(row, front, half + DETOUR_MARGIN_M, LOOK_M):
                 self._pass_by(t, row, standing, stuck)
 
-    def _pass_by(self, t: int, row: int, standing: Boxes, stuck: Bool[np.ndarray, " v"]) -> None:
+    def _pass_by(self, t: int, row: int, standing: Boxes, stuck: VehicleMask) -> None:
         """Start a detour around an obstacle ahead, if there is one."""
         others = self._vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
         moving = others.joined(self._people.chosen(np.abs(self._people.speed) >= 0.05))
