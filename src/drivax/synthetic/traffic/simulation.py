@@ -249,7 +249,6 @@ class _Run:
         self._leaders = Leaders(self._network, self._drivers)
         # Of leaders, lines and things: the gaps to them, and how fast they are.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
-        self._promised = np.full(count, -1)
         self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
         self._people = self._vehicles = _NO_BOXES
 
@@ -357,11 +356,12 @@ class _Run:
     def _stops(self, t: int, active: VehicleMask, leader: VehicleRows) -> PerVehicle:
         """Room as the law counts it (2 m are kept) to where to stop: lines, crossings, things, the lane's end."""
         p, front = self._tables, self._at + self._half_m
-        promised = self._promised
+        committed = -1
         if self._ego is not None and t >= self._ego.first_step:
             then = min(t - self._ego.first_step + _FORESEEN, len(self._plan_at) - 1)
-            promised[0] = np.sum(p.connector_begin[0] < self._plan_at[then] + self._half_m[0])
+            committed = int(np.sum(p.connector_begin[0] < self._plan_at[then] + self._half_m[0]))
         now = TrafficState(
+            tables=p,
             step=t,
             colour=self._fixed.colour[t],
             to_red=self._fixed.to_red[t],
@@ -372,11 +372,10 @@ class _Run:
             room_m=self._gaps[0],
             leader=leader,
             leader_speed=self._leads[0],
-            promised=promised,
-            promises=bool(promised[0] >= 0),
+            committed=committed,
         )
         # Drivers stop closer to a line than to a bumper.
-        room = self._right_of_way.lines(now, p) + 2.0 - _STOP_SHORT_M
+        room = self._right_of_way.lines(now) + 2.0 - _STOP_SHORT_M
         if np.count_nonzero(self._occupied_crossings):
             room = np.minimum(room, self._crossings(front) + 2.0 - _STOP_SHORT_M)
         room = np.minimum(room, p.stop_m - front - _END_M)
