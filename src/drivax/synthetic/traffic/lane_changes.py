@@ -38,7 +38,9 @@ _HALF_OBSTACLE_M = 2.4
 HELP_MPS2 = 1.8
 
 #: A number, a flag and an index per candidate.
-_Values, _Mask, _Indices = Float64[np.ndarray, " k"], Bool[np.ndarray, " k"], Int64[np.ndarray, " k"]
+_Values = Float64[np.ndarray, " k"]
+_Mask = Bool[np.ndarray, " k"]
+_Indices = Int64[np.ndarray, " k"]
 #: Chain of lanes and position along it, per candidate, and for all lanes that the vehicles occupy.
 _Place = tuple[_Indices, _Values]
 _Occupied = tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]]
