@@ -195,6 +195,14 @@ def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[Lan
     return Path(curve, step, smoothed_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 
 
+def interpolated(
+    curve: Curve, arc_m: Float64[np.ndarray, " point"], at_m: Float64[np.ndarray, " n"]
+) -> Curve:
+    """Interpolate a curve, whose samples lie at ``arc_m``, linearly at positions."""
+    xy = np.stack([np.interp(at_m, arc_m, curve.xy[:, k]) for k in (0, 1)], axis=-1)
+    return Curve(xy, np.interp(at_m, arc_m, curve.heading))
+
+
 def smoothed_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]:
     """Curvature of an equally sampled curve, 1/m, averaged over 3 m."""
     window = max(1, round(_CURVATURE_WINDOW_M / step_m))
