@@ -125,13 +125,6 @@ class PathTables:
             self.lane = np.pad(self.lane, pad, constant_values=-1)
             self.lane_m = np.pad(self.lane_m, pad)
 
-    def copy(self) -> PathTables:
-        """A copy whose rows can be replaced without changing this one."""
-        result = object.__new__(PathTables)
-        for name, value in vars(self).items():
-            setattr(result, name, value.copy() if isinstance(value, np.ndarray | list) else value)
-        return result
-
     def at(self, position_m: PerVehicle, rows: VehicleRows) -> Float64[np.ndarray, "v 4"]:
         """x, y, heading and fastest speed at positions on the paths of some vehicles."""
         place = position_m / self.step_m[rows]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -184,6 +185,17 @@ class Traffic:
         return _Run(self, staging or Staging(), ego).finish()
 
 
+_Tables = TypeVar("_Tables", PathTables, Standing)
+
+
+def _copied(tables: _Tables) -> _Tables:
+    """Copy tables with their arrays and lists."""
+    result = copy.copy(tables)
+    for name, value in vars(tables).items():
+        setattr(result, name, copy.copy(value) if isinstance(value, np.ndarray | list) else value)
+    return result
+
+
 class _Run:
     """State of one run."""
 
@@ -197,10 +209,10 @@ class _Run:
         count = len(roles.paths)
         self._rows = np.arange(count)
         self._idm = self._drivers.idm
-        self._tables = traffic.tables.copy()
+        self._tables = _copied(traffic.tables)
         static, self._movers = standing_and_moving(staging.extras)
         boxes = traffic.parked.joined(boxes_at(static, 0))
-        self._standing = Standing(boxes, self._tables, self._width_m) if static else traffic.standing.copy()
+        self._standing = Standing(boxes, self._tables, self._width_m) if static else _copied(traffic.standing)
         self._right_of_way = traffic.right_of_way
         self._right_of_way.reset()
         self._changes = LaneChanges(self._network, roles.drivers, boxes)
