@@ -15,12 +15,37 @@ from drivax.synthetic.roads.network import Bay, Lane, RoadNetwork
 from drivax.synthetic.traffic.paths import Path, Sway, lane_path
 from drivax.synthetic.traffic.roles import Drivers, Scripted
 
-#: Who passes a double-parked car without leaving the road needs this width, m.
+#: Width left next to a double-parked car where it can be passed within the lane, m.
 _PASSAGE_M = 2.3
-#: Room that is left in a bay before and behind the car, m.
+#: Free length in an occupied bay, m.
 _MANOEUVRE_M = 0.6
-#: Double-parked cars keep so far from the ends of lanes, m.
+#: Distance of double-parked cars from the ends of lanes, m.
 _FROM_ENDS_M = 15.0
+#: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time gap added to it, s.
+_GAP_M, _GAP_S = 5.0, 0.9
+#: Free gaps on busy lanes as a share of those elsewhere.
+_BUSY = 0.4
+#: No cyclists where the speed limit is higher, m/s; their distance from the lane's right side, m.
+_CYCLED_MPS, _KERB_M = 16.0, 0.55
+#: No vehicle is placed within this time of a lane's end, s.
+_MERGE_S = 5.0
+#: No vehicle is placed this far before and behind an obstacle in its lane, m; the widest vehicle, m.
+_BEFORE_M, _BEHIND_M, _WIDEST_M = 30.0, 14.0, 2.55
+#: Distance between centres of vehicles on different lanes that share space, m.
+_APART_M = 15.0
+_CAR, _VAN, _TRUCK, _BUS, _CYCLIST = range(5)
+#: Smallest and largest length, width and height of each type, m.
+_SIZES = np.array(
+    [
+        [[3.9, 1.7, 1.35], [5.3, 2.05, 1.85]],
+        [[5.0, 1.95, 2.0], [6.4, 2.1, 2.7]],
+        [[7.0, 2.3, 2.8], [9.5, 2.5, 3.6]],
+        [[10.5, 2.5, 2.9], [12.0, 2.55, 3.3]],
+        [[1.7, 0.6, 1.65], [1.9, 0.7, 1.85]],
+    ]
+)
+#: Length and width of the largest vehicle, m.
+LONGEST_M: tuple[float, float] = (float(_SIZES[_BUS, 1, 0]), float(_SIZES[_BUS, 1, 1]))
 
 
 def parked_cars(
@@ -30,15 +55,15 @@ def parked_cars(
 
     Args:
         network: The roads.
-        share: Share of bays that are taken.
-        double_share: Chance of a double-parked car next to a bay, where others can pass: on a lane of the
-            same direction, on the oncoming lane, or because 2.3 m are left.
-        rng: Source of chance.
-        steps: Length of the result, time steps.
+        share: Share of occupied bays.
+        double_share: Probability of a double-parked car next to a bay where others can pass: on an adjacent or
+            oncoming lane, or within the lane.
+        rng: Source of randomness.
+        steps: Number of time steps.
     """
     result = []
     for bay in network.bays:
-        # All values are drawn for every bay: the share must not change other cars.
+        # All values are drawn for every bay, so that the share does not change other cars.
         size = _size(rng, bay.length_m)
         along, aside = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
         turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
@@ -58,10 +83,9 @@ def parked_cars(
 
 
 def _size(rng: np.random.Generator, room_m: float) -> tuple[float, float, float]:
-    """A car or, in one case of eight, a van, that fits the bay."""
+    """Draw the size of a car or, in one case of eight, a van that fits a bay."""
     length = float(np.clip(rng.normal(4.5, 0.35), 3.6, 5.2))
-    van = rng.random() < 0.125 and room_m > 6.2
-    if van:
+    if rng.random() < 0.125 and room_m > 6.2:
         return min(length + 0.8, room_m - _MANOEUVRE_M), 2.0, 2.3
     return min(length, room_m - _MANOEUVRE_M), float(np.clip(rng.normal(1.82, 0.06), 1.65, 1.95)), 1.55
 
@@ -72,7 +96,7 @@ def _moved(pose: Pose, ahead_m: float, left_m: float) -> Pose:
 
 
 def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> Pose:
-    """Return the pose in the lane next to a bay, as near to it as the lane's border allows."""
+    """Return the pose in the lane next to a bay, at the lane's border."""
     lane = network.lanes[bay.lane]
     centre = _pose_at(lane, bay.along_m)
     dx, dy = bay.pose.x - centre.x, bay.pose.y - centre.y
@@ -90,7 +114,7 @@ def _passable(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> b
 
 
 def _oncoming(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
-    """Whether a lane of the other direction is adjacent here."""
+    """Whether a lane of the other direction is adjacent."""
     here = _pose_at(lane, along_m)
     for other in network.lanes:
         gap = np.hypot(other.curve.xy[:, 0] - here.x, other.curve.xy[:, 1] - here.y)
@@ -107,45 +131,16 @@ def _pose_at(lane: Lane, along_m: float) -> Pose:
     return Pose(x, y, float(np.interp(along_m, arc, lane.curve.heading)))
 
 
-#: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time added per m/s.
-_GAP_M, _GAP_S = 5.0, 0.9
-#: Free gaps on busy lanes as a share of those elsewhere.
-_BUSY = 0.4
-#: No cyclists where the speed limit is higher, m/s.
-_CYCLED_MPS = 16.0
-#: How far from the lane's right side cyclists ride, m.
-_KERB_M = 0.55
-#: No vehicle is placed within this time of a lane's end, s.
-_MERGE_S = 5.0
-#: No vehicle is placed this far before and behind an obstacle in its lane, m; the widest vehicle, m.
-_BEFORE_M, _BEHIND_M, _WIDEST_M = 30.0, 14.0, 2.55
-#: Vehicles on different lanes that take up the same strip are this far apart, centre to centre, m.
-_APART_M = 15.0
-_CAR, _VAN, _TRUCK, _BUS, _CYCLIST = range(5)
-#: Smallest and largest length, width and height of each type, m.
-_SIZES = np.array(
-    [
-        [[3.9, 1.7, 1.35], [5.3, 2.05, 1.85]],
-        [[5.0, 1.95, 2.0], [6.4, 2.1, 2.7]],
-        [[7.0, 2.3, 2.8], [9.5, 2.5, 3.6]],
-        [[10.5, 2.5, 2.9], [12.0, 2.55, 3.3]],
-        [[1.7, 0.6, 1.65], [1.9, 0.7, 1.85]],
-    ]
-)
-#: Length and width of the largest vehicle, m.
-LONGEST_M: tuple[float, float] = (float(_SIZES[_BUS, 1, 0]), float(_SIZES[_BUS, 1, 1]))
-
-
 @dataclass(frozen=True)
 class Density:
-    """How full the roads are.
+    """Density and composition of traffic.
 
     Attributes:
         spacing_m: Mean free gap between vehicles of a lane, drawn per scenario, low and high.
-        vehicles: Most vehicles besides ego; the nearest to ego are kept.
-        van_share, truck_share, bus_share: Shares of these among all; the rest are cars.
-        cyclist_share: Share of cyclists among those who are placed on streets.
-        leader_share: Share of scenarios in which a vehicle is placed right ahead of ego.
+        vehicles: Largest number of vehicles without ego; the nearest to ego are kept.
+        van_share, truck_share, bus_share: Shares of vehicle types; the rest are cars.
+        cyclist_share: Share of cyclists on streets.
+        leader_share: Share of scenarios with a vehicle right ahead of ego.
     """
 
     spacing_m: tuple[float, float] = (25.0, 90.0)
@@ -174,16 +169,16 @@ def placed(
     parked: tuple[Scripted, ...] = (),
     busy: Collection[int] = (),
 ) -> Placement:
-    """Draw initial positions: none on a connector, none too close to ego or another vehicle.
+    """Draw initial positions: none on a connector, none too close to ego, another vehicle or a parked car.
 
     Args:
         network: The roads.
         ego_lane: Lane on which ego begins.
         ego_along_m: Distance of ego along that lane, m.
-        density: How full the roads are.
-        rng: Source of chance.
-        parked: Parked cars; no vehicle begins in or right behind one.
-        busy: Lanes that are as full as the network's busy ones.
+        density: Density of traffic.
+        rng: Source of randomness.
+        parked: Parked cars.
+        busy: Lanes that are as dense as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
     vehicles: list[tuple[int, float]] = []
@@ -216,7 +211,7 @@ def placed(
 def _apart_in_space(
     network: RoadNetwork, vehicles: list[tuple[int, float]], ego: tuple[int, float]
 ) -> list[tuple[int, float]]:
-    """Drop who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
+    """Drop vehicles that share space with an earlier one on another lane, as where lanes fork or merge."""
     kept: list[tuple[float, float]] = []
     result = []
     for place in [ego, *vehicles]:
@@ -235,7 +230,7 @@ def _apart_in_space(
 
 
 def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
-    """Whether a parked car is in the lane here or too near ahead to be passed."""
+    """Whether a parked car is in the lane at or close to a position."""
     curve = network.lanes[lane].curve
     place = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
     cos, sin = np.cos(curve.heading[place]), np.sin(curve.heading[place])
@@ -250,14 +245,12 @@ def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Script
 def _apart_at_joints(
     network: RoadNetwork, vehicles: list[tuple[int, float]], ego_lane: int, ego_along_m: float
 ) -> list[tuple[int, float]]:
-    """Drop who stands too close behind the first vehicle of a following lane."""
+    """Drop vehicles that are too close behind the first vehicle of the next lane."""
     kept = []
     first: dict[int, float] = {}
+    last: dict[int, float] = {}
     for lane, along in [*vehicles, (ego_lane, ego_along_m)]:
-        first[lane] = min(along, first.get(lane, np.inf))
-    last: dict[int, float] = {ego_lane: ego_along_m}
-    for lane, along in vehicles:
-        last[lane] = max(along, last.get(lane, 0.0))
+        first[lane], last[lane] = min(along, first.get(lane, np.inf)), max(along, last.get(lane, 0.0))
     for lane, along in vehicles:
         this = network.lanes[lane]
         least = 10.0 + _GAP_M + _GAP_S * this.limit_mps
@@ -281,9 +274,9 @@ def draw_drivers(
     """Draw vehicles and drivers.
 
     Args:
-        count: How many.
+        count: Number of vehicles.
         density: Shares of the types.
-        rng: Source of chance.
+        rng: Source of randomness.
         lanes: First lane of each: no cyclists on fast roads, only cyclists on bicycle lanes.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
@@ -294,8 +287,7 @@ def draw_drivers(
         fast = np.array([lane.limit_mps > _CYCLED_MPS for lane in lanes], bool)
         kind[(kind == _CYCLIST) & fast] = _CAR
         kind[np.array([lane.kind == RoadKind.LANE_BIKE for lane in lanes], bool)] = _CYCLIST
-    low, high = _SIZES[kind, 0], _SIZES[kind, 1]
-    size = rng.uniform(low, high)
+    size = rng.uniform(_SIZES[kind, 0], _SIZES[kind, 1])
     heavy, cyclist = (kind == _TRUCK) | (kind == _BUS), kind == _CYCLIST
     slower = np.where(heavy, 0.85, 1.0)
     return Drivers(
