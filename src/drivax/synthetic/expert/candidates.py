@@ -15,26 +15,38 @@ from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.lateral import located, quintic_step
 from drivax.synthetic.traffic.path_arrays import speed_profile
-from drivax.synthetic.traffic.paths import LaneSpan, Path, smoothed_curvature
+from drivax.synthetic.traffic.paths import Path, interpolated, smoothed_curvature
 from drivax.synthetic.traffic.roles import Drivers
 
-#: Distance between the samples of a path, m.
+#: Distance between the samples of a candidate, m.
 SPACING_M = 0.5
-#: Lateral acceleration and yaw rate beyond which no plan goes: nuPlan's limits of comfort with a reserve.
+#: Largest lateral acceleration and yaw rate of a plan: nuPlan's comfort limits with a reserve.
 _LATERAL_MPS2, _YAW_RATE_RPS = 4.2, 0.8
-#: A difference from the path at the beginning is driven off over this distance, m.
+#: Distance over which ego returns to its path, m.
 _RETURN_M = 30.0
+#: Hard margin at ego's bumpers and sides, m; the final check uses 0.1 m.
+HARD_M = (0.35, 0.2)
+#: Preferred margin, m, for vehicles and for pedestrians and cyclists.
+NEAR_M, NEAR_PEOPLE_M = (1.2, 0.5), (2.0, 1.2)
+#: Stride of the coarse pass over path samples.
+_STRIDE = 4
+#: Ego avoids passing a light that turns red sooner than this, s.
+_LATE_YELLOW_S = 1.0
+#: Smallest time gap to users with priority where ego gives way, s.
+_YIELD_S = 2.0
+#: Distance to a stop line at standstill, m.
+_SHORT_M = 0.5
+
+#: A number and a flag per time step, and a number per sample of a path.
+_Series = Float64[np.ndarray, " time"]
+_Steps = Bool[np.ndarray, " time"]
+_Points = Float64[np.ndarray, " point"]
+_Boxes = Float64[np.ndarray, "user time 6"]
 
 
 @dataclass(frozen=True)
 class Shift:
-    """Lateral offset with quintic transitions.
-
-    Attributes:
-        aside_m: How far to the left (right where negative).
-        begin_m, there_m: From where to where the way out takes, m ahead of ego.
-        back_m, end_m: The same of the way back.
-    """
+    """Lateral offset to the left with quintic transitions, from begin to there and from back to end, m ahead of ego."""
 
     aside_m: float = 0.0
     begin_m: float = 0.0
@@ -45,83 +57,65 @@ class Shift:
 
 @dataclass(frozen=True)
 class CandidatePath:
-    """A curve that begins at ego's centre.
+    """A curve that begins at ego's centre, sampled every ``SPACING_M``.
 
     Attributes:
-        xy, heading: Samples every ``SPACING_M``.
         base_m: Position of each sample along the original path, m ahead of ego.
-        preferred_mps: The speed that the driver likes.
-        limit_mps: The speed that bends allow at most.
+        preferred_mps: Preferred speed of the driver.
+        limit_mps: Largest speed in bends.
     """
 
     xy: Float64[np.ndarray, "point 2"]
-    heading: Float64[np.ndarray, " point"]
-    base_m: Float64[np.ndarray, " point"]
-    preferred_mps: Float64[np.ndarray, " point"]
-    limit_mps: Float64[np.ndarray, " point"]
+    heading: _Points
+    base_m: _Points
+    preferred_mps: _Points
+    limit_mps: _Points
     shift: Shift = Shift()
-
-    @property
-    def length_m(self) -> float:
-        """Length, m."""
-        return SPACING_M * (len(self.xy) - 1)
-
-    @property
-    def arc_m(self) -> Float64[np.ndarray, " point"]:
-        """Distance of each sample from ego, m."""
-        return SPACING_M * np.arange(len(self.xy))
 
     def pose(
         self, at_m: Float64[np.ndarray, " n"]
     ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
         """Position and heading at distances from ego."""
-        arc = self.arc_m
-        xy = np.stack([np.interp(at_m, arc, self.xy[:, k]) for k in (0, 1)], axis=-1)
-        return xy, np.interp(at_m, arc, self.heading)
+        arc = SPACING_M * np.arange(len(self.xy))
+        curve = interpolated(Curve(self.xy, self.heading), arc, at_m)
+        return curve.xy, curve.heading
 
 
 def shifted_path(
     path: Path, drivers: Drivers, pose: Pose, span_m: tuple[float, float], shift: Shift
 ) -> CandidatePath:
-    """Return a path that leaves the original one and returns to it.
+    """Return ego's path with a shift, or without; it starts at ego and ends where the path does, or earlier.
 
     Args:
         path: Ego's path.
         drivers: Row 0 is ego's driver.
-        pose: Where ego is now.
-        span_m: About where on the path ego is, and how far the path reaches, m; it ends where the path does.
-        shift: How it leaves the path.
+        pose: Ego's pose.
+        span_m: Approximate position of ego on the path, and reach of the result, m.
+        shift: The lateral shift.
     """
     begin, left, direction = located(path, np.array([pose.x, pose.y]), span_m[0])
     ahead = np.arange(0.0, min(span_m[1], path.length_m - begin - 1e-6), SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
-    base = np.stack([np.interp(begin + ahead, grid, path.curve.xy[:, k]) for k in (0, 1)], axis=-1)
-    heading = np.interp(begin + ahead, grid, path.curve.heading)
+    base = interpolated(path.curve, grid, begin + ahead)
     aside = quintic_step(ahead, (0.0, left, math.tan(wrap(pose.heading - direction))), _RETURN_M)
     there, back = shift.there_m - shift.begin_m, shift.end_m - shift.back_m
     aside += shift.aside_m * quintic_step(ahead, (shift.back_m, 1.0, 0.0), back)
     aside -= shift.aside_m * quintic_step(ahead, (shift.begin_m, 1.0, 0.0), there)
-    normal = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+    normal = np.stack([-np.sin(base.heading), np.cos(base.heading)], axis=-1)
     stretch = np.maximum(1.0 - aside * np.interp(begin + ahead, grid, path.curvature), 0.2)
-    curve = Curve(
-        base + aside[:, None] * normal, heading + np.arctan2(np.gradient(aside, SPACING_M), stretch)
-    )
+    turned = np.arctan2(np.gradient(aside, SPACING_M), stretch)
+    curve = Curve(base.xy + aside[:, None] * normal, base.heading + turned)
     arc = curve.arc_m
     at = np.arange(0.0, float(arc[-1]), SPACING_M)
-    xy = np.stack([np.interp(at, arc, curve.xy[:, k]) for k in (0, 1)], axis=-1)
-    driven = Curve(xy, np.interp(at, arc, curve.heading))
-    base_m = np.interp(at, arc, ahead)
-    return _with_speeds(path, drivers, driven, (begin, base_m), shift)
+    return _with_speeds(
+        path, drivers, interpolated(curve, arc, at), (begin, np.interp(at, arc, ahead)), shift
+    )
 
 
 def _with_speeds(
-    path: Path,
-    drivers: Drivers,
-    curve: Curve,
-    base_m: tuple[float, Float64[np.ndarray, " point"]],
-    shift: Shift,
+    path: Path, drivers: Drivers, curve: Curve, base_m: tuple[float, _Points], shift: Shift
 ) -> CandidatePath:
-    """Add the speeds that limits and bends allow."""
+    """Add the speeds; ``base_m`` is ego's position and the samples' distances along the path."""
     curvature = smoothed_curvature(curve, SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
     limit = np.interp(base_m[0] + base_m[1], grid, path.limit_mps)
@@ -135,107 +129,76 @@ def _with_speeds(
 
 
 def candidate_boxes(
-    candidate: CandidatePath, size_m: Float64[np.ndarray, " 3"], every: int = 1
+    candidate: CandidatePath, size_m: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, "point 6"]:
     """Return ego's box at the samples of a path."""
-    heading = candidate.heading[::every]
+    heading = candidate.heading[:, None]
     size = np.broadcast_to(size_m[:2], (len(heading), 2))
-    return np.concatenate(
-        [candidate.xy[::every], np.cos(heading)[:, None], np.sin(heading)[:, None], size], axis=-1
-    )
+    return np.concatenate([candidate.xy, np.cos(heading), np.sin(heading), size], axis=-1)
 
 
 def candidate_corners(
     candidate: CandidatePath, size_m: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, "corner 2"]:
-    """Return corners of ego's box every metre where a candidate leaves the original path."""
-    away = (candidate.base_m >= candidate.shift.begin_m - 2.0) & (
-        candidate.base_m <= candidate.shift.end_m + 2.0
-    )
+    """Return corners of ego's box every metre of the stretch where a candidate leaves the original path."""
+    base, shift = candidate.base_m, candidate.shift
+    away = (base >= shift.begin_m - 2.0) & (base <= shift.end_m + 2.0)
     return corners(candidate_boxes(candidate, size_m)[away][::2]).reshape(-1, 2)
-
-
-#: Hard margin at ego's bumpers and sides, m; the final check uses 0.1 m.
-HARD_M = (0.35, 0.2)
-#: Preferred margin, m, for vehicles and for pedestrians and cyclists.
-NEAR_M, NEAR_PEOPLE_M = (1.2, 0.5), (2.0, 1.2)
-#: Stride of the coarse pass over path samples.
-_STRIDE = 4
-#: Ego avoids passing a light that turns red sooner than this, s.
-_LATE_YELLOW_S = 1.0
-#: Smallest time gap to users with priority where ego gives way, s.
-_YIELD_S = 2.0
-#: Where ego rests before a line, m from it.
-_SHORT_M = 0.5
 
 
 @dataclass(frozen=True)
 class Conflicts:
-    """Overlaps of ego's box along its path with other users, one entry per (user, step, path sample).
+    """Overlaps of ego's box along its path with other users; ``hard`` where they touch, else they are only close."""
 
-    Attributes:
-        hard: True where they would touch, else they would only be close.
-    """
+    user: Int64[np.ndarray, " conflict"]
+    step: Int64[np.ndarray, " conflict"]
+    point: Int64[np.ndarray, " conflict"]
+    hard: Bool[np.ndarray, " conflict"]
 
-    user: Int64[np.ndarray, " meeting"]
-    step: Int64[np.ndarray, " meeting"]
-    point: Int64[np.ndarray, " meeting"]
-    hard: Bool[np.ndarray, " meeting"]
-
-    def only(self, keep: Bool[np.ndarray, " meeting"]) -> Conflicts:
+    def only(self, keep: Bool[np.ndarray, " conflict"]) -> Conflicts:
         """Return a subset."""
         return Conflicts(self.user[keep], self.step[keep], self.point[keep], self.hard[keep])
 
 
 @dataclass(frozen=True)
 class StopLine:
-    """A line that ego's centre must not pass at some steps.
+    """A line that ego's centre must not pass at some steps (closed) and should not at others (late).
 
-    Attributes:
-        base_m: Where it is, m ahead of ego along the path.
-        closed: When it must not be passed.
-        late: When it should not be passed.
+    ``base_m`` is its distance ahead of ego along the path.
     """
 
     base_m: float
-    closed: Bool[np.ndarray, " time"]
-    late: Bool[np.ndarray, " time"]
+    closed: _Steps
+    late: _Steps
 
 
 def find_conflicts(
     candidate: CandidatePath,
     size_m: Float64[np.ndarray, " 3"],
-    others: Float64[np.ndarray, "user time 6"],
+    others: _Boxes,
     valid: Bool[np.ndarray, "user time"],
     people: Bool[np.ndarray, " user"],
 ) -> Conflicts:
-    """Find conflicts of ego's box along a path with other boxes.
-
-    Args:
-        candidate: Ego's path.
-        size_m: Ego's length, width, height.
-        others: Boxes of the others.
-        valid: When they exist.
-        people: Who is on foot or on a bicycle.
-    """
-    liked = np.where(people[:, None], NEAR_PEOPLE_M, NEAR_M)
+    """Find conflicts of ego's box along a path with boxes of others, of which ``people`` walk or cycle."""
+    margin = np.where(people[:, None], NEAR_PEOPLE_M, NEAR_M)
     still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
     ego = candidate_boxes(candidate, size_m)
-    moving = _box_conflicts(ego, others, valid & ~still[:, None], liked)
+    moving = _box_conflicts(ego, others, valid & ~still[:, None], margin)
     # Static users are tested at one step only.
-    once = _box_conflicts(ego, others[:, :1], still[:, None], liked)
+    once = _box_conflicts(ego, others[:, :1], still[:, None], margin)
     steps = others.shape[1]
+    user, point, hard = (np.repeat(values, steps) for values in (once.user, once.point, once.hard))
     return Conflicts(
-        user=np.concatenate([moving.user, np.repeat(once.user, steps)]),
+        user=np.concatenate([moving.user, user]),
         step=np.concatenate([moving.step, np.tile(np.arange(steps), len(once.step))]),
-        point=np.concatenate([moving.point, np.repeat(once.point, steps)]),
-        hard=np.concatenate([moving.hard, np.repeat(once.hard, steps)]),
+        point=np.concatenate([moving.point, point]),
+        hard=np.concatenate([moving.hard, hard]),
     )
 
 
 def _box_conflicts(
     ego: Float64[np.ndarray, "point 6"],
-    others: Float64[np.ndarray, "user time 6"],
+    others: _Boxes,
     valid: Bool[np.ndarray, "user time"],
     margin_m: Float64[np.ndarray, "user 2"],
 ) -> Conflicts:
@@ -265,9 +228,7 @@ def _wider(box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]) -
 
 
 def _around(
-    others: Float64[np.ndarray, "user time 6"],
-    ego: Float64[np.ndarray, "point 6"],
-    reach: Float64[np.ndarray, " user"],
+    others: _Boxes, ego: Float64[np.ndarray, "point 6"], reach: Float64[np.ndarray, " user"]
 ) -> Bool[np.ndarray, "user time"]:
     """Mask of users near the bounding rectangle of the path."""
     low, high = ego[:, :2].min(axis=0), ego[:, :2].max(axis=0)
@@ -279,19 +240,19 @@ def stop_lines(
     network: RoadNetwork,
     path: Path,
     ego_m: tuple[float, float],
-    times_s: Float64[np.ndarray, " time"],
-    passed: Float64[np.ndarray, " time"],
-    arrivals: dict[int, Bool[np.ndarray, " time"]],
+    times_s: _Series,
+    passed: _Series,
+    arrivals: dict[int, _Steps],
 ) -> list[StopLine]:
     """Return the stop lines ahead.
 
     Args:
         network: The roads.
         path: Ego's path.
-        ego_m: Where on it ego's centre is now, and half of ego's length.
+        ego_m: Path position of ego's centre, and half of ego's length.
         times_s: Times, on the clock of the lights.
-        passed: Where on the path ego's centre was at these times in the last run: it tells when its turn came.
-        arrivals: Per connector, when a user with priority is on it or about to be.
+        passed: Path position of ego's centre at these times in the last run.
+        arrivals: Result of :func:`arrivals`.
     """
     from_m, half_m = ego_m
     result = []
@@ -323,22 +284,17 @@ def arrivals(
     distance_m: Float64[np.ndarray, "vehicle time"],
     valid: Bool[np.ndarray, "vehicle time"],
     half_m: Float64[np.ndarray, " vehicle"],
-) -> dict[int, Bool[np.ndarray, " time"]]:
-    """For each connector to which another yields: when a vehicle (ego left out) is on it or nearly so."""
+) -> dict[int, _Steps]:
+    """Steps at which a vehicle other than ego is on, or about to enter, each connector to which another yields."""
     watched = {first for lane in network.lanes for first in lane.yields_to}
-    result: dict[int, Bool[np.ndarray, " time"]] = {}
+    result: dict[int, _Steps] = {}
     for vehicle in range(1, len(paths)):
         for span in paths[vehicle].spans:
             if span.lane in watched:
-                here = _on(network, span, distance_m[vehicle], half_m[vehicle]) & valid[vehicle]
+                at, half = distance_m[vehicle], half_m[vehicle]
+                end = span.begin_m + span.scale * network.lanes[span.lane].length_m
+                here = (at + half > span.begin_m) & (at - half < end) & valid[vehicle]
                 early = round(_YIELD_S / 0.1)
                 coming = np.convolve(here[::-1], np.ones(early + 1), mode="full")[: len(here)][::-1] > 0
                 result[span.lane] = result.get(span.lane, np.zeros(len(here), bool)) | coming
     return result
-
-
-def _on(
-    network: RoadNetwork, span: LaneSpan, at_m: Float64[np.ndarray, " time"], half_m: float
-) -> Bool[np.ndarray, " time"]:
-    length = span.scale * network.lanes[span.lane].length_m
-    return (at_m + half_m > span.begin_m) & (at_m - half_m < span.begin_m + length)
