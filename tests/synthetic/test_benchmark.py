@@ -35,7 +35,7 @@ def test_sizes_follow_the_table_or_scale():
 
 
 @pytest.mark.slow
-def test_four_sets_that_share_no_map(small):
+def test_benchmark_sets_share_no_map(small):
     path, made, progress = small
     assert sorted(made) == sorted(SPLITS) == sorted(child.name for child in path.iterdir())
     total = sum(sizes(TRAIN).values())
@@ -70,7 +70,9 @@ def test_command_names_benchmark_and_world(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert printed.startswith(f"benchmark {BENCHMARK_VERSION} of world {WORLD_VERSION}, domain grid\n")
     assert all(f"{out / name}: 1 scenarios" in printed for name in SPLITS)
-    with pytest.raises(UsageError, match="the same for everybody; leave out --rare-rate and --config"):
+    with pytest.raises(
+        UsageError, match="the benchmark has a fixed world; leave out --rare-rate and --config"
+    ):
         run(Generate(out, benchmark=True, workers=1, rare_rate=0.5))
     with pytest.raises(UsageError, match="world is fixed but for its domain"):
         generate_benchmark(tmp_path / "other", Generation(world=WorldConfig(rare_rate=0.5)), train=1)
