@@ -80,6 +80,12 @@ class NoiseConfig:
                 raise UsageError(f"noise.{name} is {value}", cure="use a number from 0 to below 1")
 
 
+_Boxes = Float64[np.ndarray, "user time 6"]
+_Visible = Bool[np.ndarray, "user time"]
+_Looks = Int64[np.ndarray, " look"]
+_Pairs = Int64[np.ndarray, " pair"]
+
+
 def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "track time"]:
     """Return the visibility mask of tracks (:func:`visible`); vehicles occlude other users."""
     order = np.concatenate(([ego], np.delete(np.arange(len(tracks.kind)), ego)))
@@ -94,22 +100,18 @@ def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "t
 
 
 def visible(
-    box: Float64[np.ndarray, "user time 6"],
+    box: _Boxes,
     height_m: Float64[np.ndarray, " user"],
-    valid: Bool[np.ndarray, "user time"],
+    valid: _Visible,
     blocks: Bool[np.ndarray, " user"],
     config: SensorConfig,
-) -> Bool[np.ndarray, "user time"]:
+) -> _Visible:
     """Mask of users in the sensor's range whose centre or a corner is in free view; ego sees itself.
 
     A ray from the sensor to half the height of the other's box is blocked by every box that it does not pass above.
 
-    Args:
-        box: Boxes of all users (:mod:`drivax.geometry.boxes`); row 0 is ego.
-        height_m: Heights of the boxes, all on level ground.
-        valid: Mask of existing users.
-        blocks: Mask of users that occlude others.
-        config: The sensor.
+    ``box`` holds the boxes of all users (:mod:`drivax.geometry.boxes`), ego first; ``blocks`` is a mask of those that
+    occlude others.
     """
     offset = box[..., :2] - box[:1, :, :2]
     distance = np.hypot(offset[..., 0], offset[..., 1])
@@ -131,12 +133,7 @@ def visible(
     return seen
 
 
-def _occluders(
-    box: Float64[np.ndarray, "user time 6"],
-    blocking: Bool[np.ndarray, "user time"],
-    target: Int64[np.ndarray, " look"],
-    step: Int64[np.ndarray, " look"],
-) -> tuple[Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]]:
+def _occluders(box: _Boxes, blocking: _Visible, target: _Looks, step: _Looks) -> tuple[_Pairs, _Pairs]:
     """Pairs of a line of sight and a user whose circumscribed circle it intersects."""
     offset = box[..., :2] - box[:1, :, :2]
     x, y = (np.ascontiguousarray(offset[..., k]) for k in (0, 1))

@@ -42,6 +42,9 @@ _Series = Float64[np.ndarray, " time"]
 _Steps = Bool[np.ndarray, " time"]
 _Points = Float64[np.ndarray, " point"]
 _Boxes = Float64[np.ndarray, "user time 6"]
+_PathBoxes = Float64[np.ndarray, "point 6"]
+_Exists = Bool[np.ndarray, "user time"]
+_Size = Float64[np.ndarray, " 3"]
 
 
 @dataclass(frozen=True)
@@ -57,12 +60,9 @@ class Shift:
 
 @dataclass(frozen=True)
 class CandidatePath:
-    """A curve that begins at ego's centre, sampled every ``SPACING_M``.
+    """A curve that begins at ego's centre, sampled every ``SPACING_M``, with preferred and largest speeds.
 
-    Attributes:
-        base_m: Position of each sample along the original path, m ahead of ego.
-        preferred_mps: Preferred speed of the driver.
-        limit_mps: Largest speed in bends.
+    ``base_m`` is the position of each sample along the original path, m ahead of ego.
     """
 
     xy: Float64[np.ndarray, "point 2"]
@@ -86,12 +86,7 @@ def shifted_path(
 ) -> CandidatePath:
     """Return ego's path with a shift, or without; it starts at ego and ends where the path does, or earlier.
 
-    Args:
-        path: Ego's path.
-        drivers: Row 0 is ego's driver.
-        pose: Ego's pose.
-        span_m: Approximate position of ego on the path, and reach of the result, m.
-        shift: The lateral shift.
+    ``span_m`` is the approximate position of ego on the path, and the reach of the result, m.
     """
     begin, left, direction = located(path, np.array([pose.x, pose.y]), span_m[0])
     ahead = np.arange(0.0, min(span_m[1], path.length_m - begin - 1e-6), SPACING_M)
@@ -128,18 +123,14 @@ def _with_speeds(
     return CandidatePath(curve.xy, curve.heading, base_m[1], fastest, bound, shift)
 
 
-def candidate_boxes(
-    candidate: CandidatePath, size_m: Float64[np.ndarray, " 3"]
-) -> Float64[np.ndarray, "point 6"]:
+def candidate_boxes(candidate: CandidatePath, size_m: _Size) -> _PathBoxes:
     """Return ego's box at the samples of a path."""
     heading = candidate.heading[:, None]
     size = np.broadcast_to(size_m[:2], (len(heading), 2))
     return np.concatenate([candidate.xy, np.cos(heading), np.sin(heading), size], axis=-1)
 
 
-def candidate_corners(
-    candidate: CandidatePath, size_m: Float64[np.ndarray, " 3"]
-) -> Float64[np.ndarray, "corner 2"]:
+def candidate_corners(candidate: CandidatePath, size_m: _Size) -> Float64[np.ndarray, "corner 2"]:
     """Return corners of ego's box every metre of the stretch where a candidate leaves the original path."""
     base, shift = candidate.base_m, candidate.shift
     away = (base >= shift.begin_m - 2.0) & (base <= shift.end_m + 2.0)
@@ -173,11 +164,7 @@ class StopLine:
 
 
 def find_conflicts(
-    candidate: CandidatePath,
-    size_m: Float64[np.ndarray, " 3"],
-    others: _Boxes,
-    valid: Bool[np.ndarray, "user time"],
-    people: Bool[np.ndarray, " user"],
+    candidate: CandidatePath, size_m: _Size, others: _Boxes, valid: _Exists, people: Bool[np.ndarray, " user"]
 ) -> Conflicts:
     """Find conflicts of ego's box along a path with boxes of others, of which ``people`` walk or cycle."""
     margin = np.where(people[:, None], NEAR_PEOPLE_M, NEAR_M)
@@ -197,10 +184,7 @@ def find_conflicts(
 
 
 def _box_conflicts(
-    ego: Float64[np.ndarray, "point 6"],
-    others: _Boxes,
-    valid: Bool[np.ndarray, "user time"],
-    margin_m: Float64[np.ndarray, "user 2"],
+    ego: _PathBoxes, others: _Boxes, valid: _Exists, margin_m: Float64[np.ndarray, "user 2"]
 ) -> Conflicts:
     """Find conflicts of boxes: circles at every fourth sample first, then exact overlap."""
     reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + margin_m).T)
@@ -227,9 +211,7 @@ def _wider(box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]) -
     return np.concatenate([box[:, :4], size], axis=1)
 
 
-def _around(
-    others: _Boxes, ego: Float64[np.ndarray, "point 6"], reach: Float64[np.ndarray, " user"]
-) -> Bool[np.ndarray, "user time"]:
+def _around(others: _Boxes, ego: _PathBoxes, reach: Float64[np.ndarray, " user"]) -> _Exists:
     """Mask of users near the bounding rectangle of the path."""
     low, high = ego[:, :2].min(axis=0), ego[:, :2].max(axis=0)
     outside = np.maximum(low - others[..., :2], others[..., :2] - high).max(axis=-1)
@@ -244,15 +226,9 @@ def stop_lines(
     passed: _Series,
     arrivals: dict[int, _Steps],
 ) -> list[StopLine]:
-    """Return the stop lines ahead.
+    """Return the stop lines ahead of ego (path position of its centre, half length).
 
-    Args:
-        network: The roads.
-        path: Ego's path.
-        ego_m: Path position of ego's centre, and half of ego's length.
-        times_s: Times, on the clock of the lights.
-        passed: Path position of ego's centre at these times in the last run.
-        arrivals: Result of :func:`arrivals`.
+    ``passed`` is the path position of ego's centre at each time (on the clock of the lights) in the last run.
     """
     from_m, half_m = ego_m
     result = []

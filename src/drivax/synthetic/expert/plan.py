@@ -52,6 +52,7 @@ _FURTHEST_M = 4.5
 _TOLERANCE = 0.03
 
 _Series = Float64[np.ndarray, " time"]
+_Hit = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -105,14 +106,9 @@ class _Option:
 def plan_ego(
     roles: Roles, motion: Motion, times_s: _Series, first_step: int, unreactive: frozenset[int] = frozenset()
 ) -> EgoPlan:
-    """Plan ego's motion.
+    """Plan ego's motion from a step on, given all users' motion in the last run.
 
-    Args:
-        roles: All users.
-        motion: Their motion in the last run; row 0 is ego.
-        times_s: Times of the motion's steps, on the clock of the lights.
-        first_step: First step of the plan.
-        unreactive: Users that hit ego in an earlier run and are not expected to react.
+    ``unreactive`` users hit ego in an earlier run and are not expected to react; ``times_s`` are on the lights' clock.
     """
     scene = _scene(roles, motion, times_s, first_step, unreactive)
     candidate, drive = _best_candidate(scene)
@@ -296,7 +292,7 @@ def _passing_options(scene: _Scene, candidate: CandidatePath, conflicts: Conflic
     return result
 
 
-def _first_hit(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> tuple[int, int, int] | None:
+def _first_hit(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> _Hit | None:
     """Return user, step and path sample of the first collision at the preferred speeds."""
     at, speed, places = 0.0, scene.speed, []
     for _ in range(scene.others.shape[1]):
@@ -316,7 +312,7 @@ def _shift(
     scene: _Scene,
     candidate: CandidatePath,
     conflicts: Conflicts,
-    hit: tuple[int, int, int],
+    hit: _Hit,
     side: float,
     room_m: float,
     step_mps2: float,
@@ -351,9 +347,7 @@ def _stands(scene: _Scene, user: int) -> bool:
     return bool(np.ptp(xy, axis=0).max() < 0.5)
 
 
-def _extent(
-    scene: _Scene, candidate: CandidatePath, hit: tuple[int, int, int], side: float
-) -> tuple[float, float, float]:
+def _extent(scene: _Scene, candidate: CandidatePath, hit: _Hit, side: float) -> tuple[float, float, float]:
     """Return a user's longitudinal range and its lateral extent on one side of the path at the conflict."""
     user, step, point = hit
     box = scene.others[user, step]

@@ -76,13 +76,9 @@ def _times(rows: _Matrix, values: _Knots) -> _Rows:
 
 
 def smoothed(at_m: _Series, speed: _Series, acceleration_mps2: float, bounds: Bounds) -> SpeedProfile:
-    """Return the smoothest speed profile near a coarse plan.
+    """Return the smoothest speed profile near a coarse plan (distances from 0, speeds; the first speed is kept).
 
-    Args:
-        at_m: Distances of the plan; the first is 0.
-        speed: Its speeds; the first is kept.
-        acceleration_mps2: Acceleration just before the first step.
-        bounds: Bounds of the result.
+    ``acceleration_mps2`` is the acceleration just before the first step.
     """
     steps = len(at_m) - 1
     rows, base = _matrices(steps)

@@ -45,6 +45,8 @@ LIMITS: dict[str, tuple[float, float]] = {
 #: A number and a flag per time step.
 _Series = Float64[np.ndarray, " time"]
 _Steps = Bool[np.ndarray, " step"]
+_UserPairs = Bool[np.ndarray, "user user"]
+_LaneSteps = Bool[np.ndarray, "step lane"]
 _Points = Float64[np.ndarray, "time 2"]
 
 
@@ -69,13 +71,7 @@ def find_violation(
 ) -> Violation:
     """Find the first violation of a motion from a step on; a staged event excuses driving against traffic.
 
-    Args:
-        roles: All users.
-        motion: Their motion.
-        times_s: Times of its steps, on the clock of the lights.
-        first_step: First step of the recording.
-        staging: The staged event.
-        hardest_mps2: Largest braking of ego.
+    ``times_s`` are on the clock of the lights.
     """
     now = slice(first_step, None)
     speed = motion.speed[0, now]
@@ -106,7 +102,7 @@ def is_staged(staging: Staging) -> bool:
     return any(vars(staging).values())
 
 
-def _tested(motion: Motion) -> Bool[np.ndarray, "user user"]:
+def _tested(motion: Motion) -> _UserPairs:
     """Mask of pairs that must not overlap: not two pedestrians, not two static users."""
     person = motion.kind == AgentKind.PEDESTRIAN
     moves = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
@@ -114,9 +110,7 @@ def _tested(motion: Motion) -> Bool[np.ndarray, "user user"]:
 
 
 def touching(
-    box: Float64[np.ndarray, "user time 6"],
-    valid: Bool[np.ndarray, "user time"],
-    tested: Bool[np.ndarray, "user user"],
+    box: Float64[np.ndarray, "user time 6"], valid: Bool[np.ndarray, "user time"], tested: _UserPairs
 ) -> Int64[np.ndarray, "user user"]:
     """Return the step at which tested pairs first overlap (the number of steps: never); ego has a margin of 10 cm."""
     box = box.copy()
@@ -199,12 +193,7 @@ def _rules_broken(roles: Roles, motion: Motion, times_s: _Series, first_step: in
 
 
 def _passes_red_off_route(
-    network: RoadNetwork,
-    path: Path,
-    xy: _Points,
-    front: _Points,
-    heading: _Series,
-    red_steps: Bool[np.ndarray, "step lane"],
+    network: RoadNetwork, path: Path, xy: _Points, front: _Points, heading: _Series, red_steps: _LaneSteps
 ) -> bool:
     """Whether ego, off its route, passes the line of another lane at red, as the metric does."""
     own = {span.lane for span in path.spans}

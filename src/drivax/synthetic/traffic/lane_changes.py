@@ -39,6 +39,7 @@ HELP_MPS2 = 1.8
 
 #: A number, a flag and an index per candidate.
 _Values = Float64[np.ndarray, " k"]
+_Stack = Float64[np.ndarray, "*k"]
 _Mask = Bool[np.ndarray, " k"]
 _Indices = Int64[np.ndarray, " k"]
 #: Chain of lanes and position along it, per candidate, and for all lanes that the vehicles occupy.
@@ -102,11 +103,9 @@ class Change:
 
 @dataclass(frozen=True)
 class Helped:
-    """Pairs of vehicles on adjacent lanes between which a gap is opened for a mandatory change.
+    """Pairs of vehicles on adjacent lanes of which the one behind opens a gap for a mandatory change.
 
-    Attributes:
-        behind, ahead: Rows of the vehicles; the one behind adjusts.
-        gap_m: Bumper-to-bumper gap along the lane less the difference of path positions, which is constant.
+    ``gap_m`` is the bumper-to-bumper gap along the lane less the difference of path positions, which is constant.
     """
 
     behind: Int64[np.ndarray, " pair"]
@@ -119,12 +118,9 @@ NO_HELP = Helped(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 
 @dataclass(frozen=True)
 class Situation:
-    """State of all vehicles when lane changes are decided.
+    """State of all vehicles, with the fastest speed and the preferred acceleration on the own path.
 
-    Attributes:
-        free: Mask of vehicles that may change (not ego, cyclists, or vehicles that are changing).
-        fastest: Fastest speed on the own path here.
-        acceleration: Preferred acceleration on the own path.
+    ``free`` is a mask of vehicles that may change (neither ego nor vehicles that are changing).
     """
 
     at_m: PerVehicle
@@ -160,13 +156,7 @@ class _Options:
 
 
 class LaneChanges:
-    """Decides the lane changes of all vehicles.
-
-    Args:
-        network: The roads.
-        drivers: All drivers.
-        standing: Obstacles that stand in lanes.
-    """
+    """Decides the lane changes of all vehicles."""
 
     def __init__(self, network: RoadNetwork, drivers: Drivers, standing: Boxes) -> None:
         self.chains, self._drivers, self._idm = LaneChains(network), drivers, drivers.idm
@@ -252,13 +242,8 @@ class LaneChanges:
         return near, far
 
     def _follow(
-        self,
-        rows: _Indices,
-        speed: _Values,
-        preferred: _Values,
-        gap: Float64[np.ndarray, "*k"],
-        leader_speed: Float64[np.ndarray, "*k"],
-    ) -> Float64[np.ndarray, "*k"]:
+        self, rows: _Indices, speed: _Values, preferred: _Values, gap: _Stack, leader_speed: _Stack
+    ) -> _Stack:
         names = ("headway_s", "acceleration_mps2", "comfortable_braking_mps2")
         idm = replace(self._idm, **{name: getattr(self._idm, name)[rows] for name in names})
         return idm_acceleration(speed, preferred, gap, leader_speed, idm)

@@ -30,19 +30,15 @@ _LEFT_SHARE = 0.75
 #: Lateral offset from which on a vehicle occupies the adjacent lane, m.
 _INTRUDES_M = 0.7
 
+_Samples = Float64[np.ndarray, " point"]
+_Point = Float64[np.ndarray, " 2"]
 
-def displaced(
-    path: Path, aside_m: Float64[np.ndarray, " point"], occupied: tuple[LaneSpan, ...] = ()
-) -> tuple[Path, Float64[np.ndarray, " point"]]:
-    """Displace a path laterally.
 
-    Args:
-        path: The path.
-        aside_m: Offset to the left at each of its samples; smooth.
-        occupied: Further lanes that the vehicle occupies, in positions of the old path.
+def displaced(path: Path, aside_m: _Samples, occupied: tuple[LaneSpan, ...] = ()) -> tuple[Path, _Samples]:
+    """Displace a path to the left by a smooth offset at each sample.
 
-    Returns:
-        The new path, and the position on it of each sample of the old one, m.
+    ``occupied`` are further lanes that the vehicle occupies, in positions of the old path. Returns the new path, and
+    the position on it of each sample of the old one, m.
     """
     curve, step = path.curve, path.step_m
     normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
@@ -66,10 +62,7 @@ def displaced(
 
 
 def _moved_spans(
-    path: Path,
-    occupied: tuple[LaneSpan, ...],
-    old: Float64[np.ndarray, " point"],
-    new: Float64[np.ndarray, " point"],
+    path: Path, occupied: tuple[LaneSpan, ...], old: _Samples, new: _Samples
 ) -> tuple[LaneSpan, ...]:
     """Lane spans of a displaced path, whose samples moved from the old to the new positions."""
 
@@ -93,10 +86,7 @@ def _moved_spans(
 
 
 def _occupy(
-    span: LaneSpan,
-    at: Float64[np.ndarray, " point"],
-    lane: np.ndarray,
-    lane_m: Float64[np.ndarray, "point slot"],
+    span: LaneSpan, at: _Samples, lane: np.ndarray, lane_m: Float64[np.ndarray, "point slot"]
 ) -> None:
     """Enter a lane into the first free slot of the samples on which it is occupied."""
     here = (at >= span.from_m) & (at <= span.until_m) & ~(lane == span.lane).any(axis=1)
@@ -107,15 +97,10 @@ def _occupy(
         here &= ~free
 
 
-def quintic_step(
-    at: Float64[np.ndarray, " point"], begin: tuple[float, float, float], length_m: float
-) -> Float64[np.ndarray, " point"]:
-    """Offset that fades from a value and slope to zero, with zero slope and curvature at the end.
+def quintic_step(at: _Samples, begin: tuple[float, float, float], length_m: float) -> _Samples:
+    """Offset that fades to zero, with zero slope and curvature at the end, over a length.
 
-    Args:
-        at: Path positions, m.
-        begin: Position of the begin, and offset (m) and slope (m/m) there; the second derivative there is zero.
-        length_m: Length of the transition, m.
+    ``begin`` is the first position with the offset (m) and slope (m/m) there; the second derivative is zero.
     """
     place, offset, slope = begin
     u = np.clip((at - place) / length_m, 0.0, 1.0)
@@ -127,9 +112,7 @@ def quintic_step(
     return np.where(at < place, offset + slope * before, offset * value + rate * tangent)
 
 
-def located(
-    path: Path, xy: Float64[np.ndarray, " 2"], near_m: float | None = None
-) -> tuple[float, float, float]:
+def located(path: Path, xy: _Point, near_m: float | None = None) -> tuple[float, float, float]:
     """Project a point onto a path, if given only within 30 m of a position.
 
     Returns:
@@ -159,14 +142,7 @@ def followed(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np.ndarra
 def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tuple[Path, float]:
     """A lane change: the path from a position on the present path onto a parallel one.
 
-    Args:
-        target: The path to change to.
-        present: The vehicle's path.
-        at_m: The vehicle's position on it, m.
-        length_m: Distance along the target over which to change, m.
-
-    Returns:
-        The path, and the vehicle's position on it. The old lanes stay occupied for most of the change.
+    Returns the path, and the vehicle's position on it. The old lanes stay occupied for most of the change.
     """
     place = min(max(at_m / present.step_m, 0.0), len(present.curve.xy) - 1.001)
     index, share = int(place), place - int(place)
@@ -192,13 +168,9 @@ def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tu
 def around(
     path: Path, at_m: tuple[float, float, float, float], aside_m: float, adjacent: tuple[LaneSpan, ...] = ()
 ) -> Path:
-    """A detour: out between the first two positions, back between the last two.
+    """A detour to the left by ``aside_m``: out between the first two positions, back between the last two.
 
-    Args:
-        path: The path.
-        at_m: The four positions, rising.
-        aside_m: Offset in between, positive to the left.
-        adjacent: Lanes that the detour may enter.
+    ``adjacent`` are the lanes that the detour may enter.
     """
     old = path.step_m * np.arange(len(path.curve.xy))
     out = 1.0 - quintic_step(old, (at_m[0], 1.0, 0.0), at_m[1] - at_m[0])
@@ -237,11 +209,7 @@ _Positions = tuple[float, float, float, float]
 
 
 class Detours:
-    """Finds detours around standing obstacles.
-
-    Args:
-        network: The roads.
-    """
+    """Finds detours around standing obstacles."""
 
     def __init__(self, network: RoadNetwork) -> None:
         xy = np.concatenate([np.zeros((0, 2)), *(_dense(edge.xy) for edge in network.edges)])

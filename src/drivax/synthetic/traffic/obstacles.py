@@ -120,13 +120,7 @@ def _reach(size_m: Float64[np.ndarray, "k 2"], turned: _Values) -> tuple[_Values
 
 
 class Standing:
-    """Static obstacles, in the coordinates of every vehicle's path.
-
-    Args:
-        boxes: The obstacles.
-        tables: All paths.
-        width_m: Widths of the vehicles.
-    """
+    """Static obstacles, in the coordinates of every vehicle's path."""
 
     def __init__(self, boxes: Boxes, tables: PathTables, width_m: PerVehicle) -> None:
         self.boxes, self._half = boxes, width_m / 2
@@ -165,15 +159,7 @@ class Standing:
 def nearest_obstacles(
     tables: PathTables, vehicles: Boxes, at_m: PerVehicle, active: VehicleMask, others: Boxes
 ) -> tuple[PerVehicle, PerVehicle]:
-    """Gap from each front bumper to the nearest obstacle in the corridor of the own path, and its speed along it.
-
-    Args:
-        tables: All paths.
-        vehicles: The vehicles, which are obstacles for each other.
-        at_m: Their path positions.
-        active: Mask of the vehicles on the map.
-        others: Other users that move or have halted.
-    """
+    """Gap from each front bumper to the nearest obstacle in the corridor of the own path, and its speed along it."""
     count, users = len(vehicles), vehicles.joined(others)
     gap, speed = np.full(count, np.inf), np.zeros(count)
     viewer, user = _close(vehicles, users, active)

@@ -72,12 +72,9 @@ class Path:
 
 @dataclass(frozen=True)
 class LaneChange:
-    """A planned change to an adjacent lane.
+    """A planned change from a lane (its index in the lane sequence) to the next one, which is adjacent.
 
-    Attributes:
-        section: Index of the old lane in the lane sequence; the next one in the sequence is the new lane.
-        begin_m: Position on the old lane at which the change begins, m.
-        length_m: Length of the manoeuvre, m.
+    It begins at a position on the old lane and has a length.
     """
 
     section: int

@@ -40,15 +40,12 @@ _NEAR_JUNCTION_M = 25.0
 #: A number and a flag per walker.
 _Values = Float64[np.ndarray, " w"]
 _Mask = Bool[np.ndarray, " w"]
+_Point = Float64[np.ndarray, " 2"]
 
 
 @dataclass(frozen=True)
 class _CrossingConflicts:
-    """Intersections of crossings and lanes, and the lights that protect the crossings.
-
-    Attributes:
-        red: Connectors whose light must be red while people cross: all but turns into the crossed road, which yield.
-    """
+    """Intersections of crossings and lanes, and a mask of the connectors whose light must be red while people cross."""
 
     xy: Float64[np.ndarray, "conflict 2"]
     heading: Float64[np.ndarray, " conflict"]
@@ -84,7 +81,7 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
 
 
 def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, " lane"]:
-    """See :attr:`_CrossingConflicts.red`."""
+    """Mask of connectors with lights over a crossing, but for turns into the crossed road, which yield."""
     result = np.zeros(len(network.lanes), bool)
     if network.signals is None:
         return result
@@ -107,13 +104,7 @@ def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, "
 
 
 class Walkers:
-    """Pedestrians, moved step by step.
-
-    Args:
-        network: The roads.
-        walkers: All walkers.
-        times_s: Times of all steps, on the clock of the signals.
-    """
+    """Pedestrians, moved step by step."""
 
     def __init__(
         self, network: RoadNetwork, walkers: tuple[Walker, ...], times_s: Float64[np.ndarray, " time"]
@@ -147,15 +138,8 @@ class Walkers:
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
         """Return all walkers at step ``t``, then advance them; steps come in order.
 
-        Args:
-            t: The step.
-            vehicles: All vehicles.
-            active: Mask of the vehicles on the map.
-            colour: Colour of every lane's light.
-
-        Returns:
-            The walkers, and a mask of the crossings that drivers must keep free: a walker is on it or, where drivers
-            must yield, about to step on it.
+        Also return a mask of the crossings that drivers must keep free: a walker is on it or, where drivers must yield,
+        about to step on it.
         """
         place = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
         index = np.minimum(place.astype(int), self._last - 1)
@@ -281,13 +265,9 @@ def _within(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Ma
 def place_walkers(
     network: RoadNetwork, per_100m: float, rng: np.random.Generator, times_s: Float64[np.ndarray, " time"]
 ) -> tuple[Walker, ...]:
-    """Draw walkers: along the sidewalks in both directions, and over the crossings.
+    """Draw walkers along the sidewalks in both directions, and half as many at each crossing as per 100 m.
 
-    Args:
-        network: The roads.
-        per_100m: Mean number of people per 100 m of sidewalk; half as many at each crossing.
-        rng: Source of randomness.
-        times_s: Times of all steps; people reach their kerbs between 4 s before and 8 s after time 0.
+    They reach the kerbs between 4 s before and 8 s after time 0.
     """
     people = []
     for walk in network.walks:
@@ -327,10 +307,7 @@ def _crosser(
 
 
 def _along_walk(
-    network: RoadNetwork,
-    kerb: Float64[np.ndarray, " 2"],
-    out: Float64[np.ndarray, " 2"],
-    rng: np.random.Generator,
+    network: RoadNetwork, kerb: _Point, out: _Point, rng: np.random.Generator
 ) -> Float64[np.ndarray, "point 2"]:
     """Continue from a kerb: along a nearby sidewalk, in either direction, or straight off the road."""
     best: tuple[float, Curve, int] | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -53,13 +53,8 @@ def parked_cars(
 ) -> tuple[Scripted, ...]:
     """Draw parked cars in bays, and sometimes a double-parked one.
 
-    Args:
-        network: The roads.
-        share: Share of occupied bays.
-        double_share: Probability of a double-parked car next to a bay where others can pass: on an adjacent or
-            oncoming lane, or within the lane.
-        rng: Source of randomness.
-        steps: Number of time steps.
+    ``share`` bays are occupied. With probability ``double_share`` a car is double-parked next to a bay where others can
+    pass: on an adjacent or oncoming lane, or within the lane.
     """
     result = []
     for bay in network.bays:
@@ -70,8 +65,8 @@ def parked_cars(
         occupied = rng.random() < share
         if occupied and size[0] < bay.length_m:
             play = (bay.length_m - size[0]) / 2
-            pose = _moved(bay.pose, float(np.clip(along, -play, play)), float(np.clip(aside, -0.15, 0.15)))
-            pose = Pose(pose.x, pose.y, pose.heading + turn)
+            pose = bay.pose.ahead(float(np.clip(along, -play, play)))
+            pose = replace(pose.aside(float(np.clip(aside, -0.15, 0.15))), heading=pose.heading + turn)
             result.append(Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
     doubled, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
     for place in rng.permutation(len(network.bays)).tolist() if doubled else ():
@@ -90,18 +85,13 @@ def _size(rng: np.random.Generator, room_m: float) -> tuple[float, float, float]
     return min(length, room_m - _MANOEUVRE_M), float(np.clip(rng.normal(1.82, 0.06), 1.65, 1.95)), 1.55
 
 
-def _moved(pose: Pose, ahead_m: float, left_m: float) -> Pose:
-    cos, sin = math.cos(pose.heading), math.sin(pose.heading)
-    return Pose(pose.x + ahead_m * cos - left_m * sin, pose.y + ahead_m * sin + left_m * cos, pose.heading)
-
-
 def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> Pose:
     """Return the pose in the lane next to a bay, at the lane's border."""
     lane = network.lanes[bay.lane]
     centre = _pose_at(lane, bay.along_m)
     dx, dy = bay.pose.x - centre.x, bay.pose.y - centre.y
     side = math.copysign(1.0, dy * math.cos(centre.heading) - dx * math.sin(centre.heading))
-    return _moved(centre, 0.0, side * ((lane.width_m - width_m) / 2 - gap_m))
+    return centre.aside(side * ((lane.width_m - width_m) / 2 - gap_m))
 
 
 def _passable(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
@@ -171,14 +161,7 @@ def placed(
 ) -> Placement:
     """Draw initial positions: none on a connector, none too close to ego, another vehicle or a parked car.
 
-    Args:
-        network: The roads.
-        ego_lane: Lane on which ego begins.
-        ego_along_m: Distance of ego along that lane, m.
-        density: Density of traffic.
-        rng: Source of randomness.
-        parked: Parked cars.
-        busy: Lanes that are as dense as the network's busy ones.
+    ``busy`` are lanes that are as dense as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
     vehicles: list[tuple[int, float]] = []
@@ -273,11 +256,7 @@ def draw_drivers(
 ) -> Drivers:
     """Draw vehicles and drivers.
 
-    Args:
-        count: Number of vehicles.
-        density: Shares of the types.
-        rng: Source of randomness.
-        lanes: First lane of each: no cyclists on fast roads, only cyclists on bicycle lanes.
+    With the first lane of each, there are no cyclists on fast roads, and only cyclists on bicycle lanes.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
     drawn = np.searchsorted(shares, rng.random(count), side="right")

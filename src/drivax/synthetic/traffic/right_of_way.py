@@ -52,7 +52,6 @@ class TrafficState:
     """State of all vehicles when drivers decide.
 
     Attributes:
-        tables: All paths.
         colour, to_red: Colour of each lane's light, and time until it turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
@@ -114,12 +113,7 @@ def time_to_cover(
 
 @dataclass(frozen=True)
 class _Request:
-    """A vehicle's request for the next connector on its path.
-
-    Attributes:
-        place: Index of the connector on the path.
-        line_m, distance_m: Path position of its stop line, and distance from the front bumper.
-    """
+    """A vehicle's request for the connector at an index (``place``) of its path, and the distance to its stop line."""
 
     row: int
     connector: int
@@ -130,7 +124,6 @@ class _Request:
 
     @classmethod
     def at(cls, state: TrafficState, row: int, place: int) -> _Request:
-        """Return the request of a vehicle for a connector on its path."""
         line = float(state.tables.connector_begin[row, place])
         connector, distance = int(state.tables.connector[row, place]), float(line - state.front_m[row])
         return cls(row, connector, place, line, distance, float(state.speed[row]))
@@ -142,12 +135,7 @@ class _Request:
 
 
 class RightOfWay:
-    """Grants connectors to drivers.
-
-    Args:
-        network: The roads.
-        drivers: All drivers.
-    """
+    """Grants connectors to drivers."""
 
     def __init__(self, network: RoadNetwork, drivers: Drivers) -> None:
         self._lanes, self._drivers = network.lanes, drivers

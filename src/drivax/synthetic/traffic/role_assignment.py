@@ -37,6 +37,7 @@ _LEAST_M = 12.0
 _ROUTES = 4
 #: Shares of what the light does for ego: green on arrival, turning green, turning red.
 SignalTiming = tuple[float, float, float]
+_Values = Float64[np.ndarray, " n"]
 
 
 def giving_way(network: RoadNetwork) -> tuple[Destination, ...]:
@@ -77,7 +78,7 @@ def with_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
 def assign_roles(
     network: RoadNetwork,
     domain: Domain,
-    times_s: Float64[np.ndarray, " time"],
+    times_s: _Values,
     lane_change_share: float,
     timing: SignalTiming,
     rng: np.random.Generator,
@@ -88,7 +89,7 @@ def assign_roles(
 
     Args:
         network: The roads.
-        domain: Traffic density and composition.
+        domain: Density and composition of traffic.
         times_s: Times of all steps; the warm-up of traffic ends at time 0.
         lane_change_share: Share of scenarios, of those with room, in which ego plans a lane change.
         timing: Shares of what the light does for ego.
@@ -183,12 +184,8 @@ def _timed(plan: SignalPlan, lane: int, timing: SignalTiming, rng: np.random.Gen
 
 
 def _first_speeds(
-    network: RoadNetwork,
-    paths: list[Path],
-    drivers: Drivers,
-    distance: Float64[np.ndarray, " vehicle"],
-    rng: np.random.Generator,
-) -> Float64[np.ndarray, " vehicle"]:
+    network: RoadNetwork, paths: list[Path], drivers: Drivers, distance: _Values, rng: np.random.Generator
+) -> _Values:
     """Draw speeds from which each vehicle can stop at its next stop line."""
     speeds = []
     for i, path in enumerate(paths):

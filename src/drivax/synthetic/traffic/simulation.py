@@ -109,12 +109,7 @@ class _Log:
 
 
 class Leaders:
-    """Finds the leader of every vehicle.
-
-    Args:
-        network: The roads.
-        drivers: All drivers.
-    """
+    """Finds the leader of every vehicle."""
 
     def __init__(self, network: RoadNetwork, drivers: Drivers) -> None:
         self._half_m, width_m = drivers.size_m[:, 0] / 2, drivers.size_m[:, 1]
@@ -155,12 +150,7 @@ class Leaders:
 
 
 class Traffic:
-    """Traffic of all users, advanced step by step.
-
-    Args:
-        roles: All users.
-        times_s: Times of all steps, on the clock of the signals.
-    """
+    """Traffic of all users, advanced step by step."""
 
     def __init__(self, roles: Roles, times_s: Float64[np.ndarray, " time"]) -> None:
         self.roles, self.times_s = roles, times_s
