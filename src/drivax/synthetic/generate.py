@@ -222,17 +222,13 @@ def write_set(
             counts.add(draw)
             batch.append(draw.scenario)
             if len(batch) == _BATCH or done == scenarios:
-                _write(writer, batch, audit)
+                findings = [{} for _ in batch] if audit is None else audit(batch)
+                for scenario, finding in zip(batch, findings, strict=True):
+                    writer.add(dataclasses.replace(scenario, audit={**scenario.audit, **finding}))
                 batch = []
             if progress is not None:
                 progress(done, scenarios)
     return GeneratedSet(Path(out), scenarios, time.monotonic() - begin, counts.families())
-
-
-def _write(writer: ScenarioWriter, batch: list[Scenario], audit: Audit | None) -> None:
-    findings = [{} for _ in batch] if audit is None else audit(batch)
-    for scenario, finding in zip(batch, findings, strict=True):
-        writer.add(dataclasses.replace(scenario, audit={**scenario.audit, **finding}))
 
 
 def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:

@@ -56,8 +56,8 @@ _Hit = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
-class _Scene:
-    """Planning input that all candidates share, from the first step of the plan on.
+class _State:
+    """State at the first step of the plan and what follows, as all candidates share them.
 
     Attributes:
         pose, from_m: Ego's pose and path position.
@@ -82,15 +82,11 @@ class _Scene:
     people: Bool[np.ndarray, " user"]
     unreactive: Bool[np.ndarray, " user"]
 
-    @property
-    def reach_m(self) -> float:
-        """Largest distance that ego can travel."""
-        top = max(self.speed, 1.05 * float(np.max(self.path.limit_mps)))
-        return top * DT_S * self.others.shape[1] + 15.0
-
     def candidate(self, shift: Shift) -> CandidatePath:
-        """Return ego's path with a lateral shift."""
-        return shifted_path(self.path, self.roles.drivers, self.pose, (self.from_m, self.reach_m), shift)
+        """Return ego's path with a lateral shift, as far as ego can travel."""
+        top = max(self.speed, 1.05 * float(np.max(self.path.limit_mps)))
+        reach_m = top * DT_S * self.others.shape[1] + 15.0
+        return shifted_path(self.path, self.roles.drivers, self.pose, (self.from_m, reach_m), shift)
 
 
 @dataclass(frozen=True)
@@ -110,28 +106,28 @@ def plan_ego(
 
     ``unreactive`` users hit ego in an earlier run and are not expected to react; ``times_s`` are on the lights' clock.
     """
-    scene = _scene(roles, motion, times_s, first_step, unreactive)
-    candidate, drive = _best_candidate(scene)
+    state = _state(roles, motion, times_s, first_step, unreactive)
+    candidate, drive = _best_candidate(state)
     steps = motion.xy.shape[1] - first_step
     xy, heading = candidate.pose(drive.at_m[:steps])
     # The path starts within millimetres of ego; the difference fades over the first metres.
     fade = np.clip(1.0 - drive.at_m[:steps] / _FADE_M, 0.0, 1.0)
     xy += fade[:, None] * (motion.xy[0, first_step] - xy[0])
-    heading += fade * wrap(scene.pose.heading - heading[0])
+    heading += fade * wrap(state.pose.heading - heading[0])
     heading = heading[0] + np.concatenate([[0.0], np.cumsum(wrap(np.diff(heading)))])
     return EgoPlan(first_step, xy, heading, drive.speed[:steps])
 
 
-def _scene(
+def _state(
     roles: Roles, motion: Motion, times_s: _Series, first_step: int, unreactive: frozenset[int]
-) -> _Scene:
+) -> _State:
     x, y = motion.xy[0, first_step]
     pose = Pose(float(x), float(y), float(motion.heading[0, first_step]))
     paths = motion.paths or roles.paths
     from_m = located(paths[0], motion.xy[0, first_step], float(motion.distance_m[0, first_step]))[0]
     boxes, valid = _continued(motion, first_step)
     rows = np.arange(1, len(motion.kind))
-    scene = _Scene(
+    state = _State(
         roles=roles,
         path=paths[0],
         pose=pose,
@@ -146,11 +142,11 @@ def _scene(
         people=np.isin(motion.kind[1:], (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)),
         unreactive=(rows >= motion.vehicles) | np.isin(rows, sorted(unreactive)),
     )
-    candidate = scene.candidate(Shift())
+    candidate = state.candidate(Shift())
     gap = candidate.xy[:, None] - motion.xy[0, first_step:]
     passed_m = candidate.base_m[np.argmin(np.sum(gap**2, axis=-1), axis=0)]
-    scene = replace(scene, passed_m=_longer(passed_m))
-    return replace(scene, lines=_lines(motion, times_s[first_step:], scene))
+    state = replace(state, passed_m=_longer(passed_m))
+    return replace(state, lines=_lines(motion, times_s[first_step:], state))
 
 
 def _longer(values: np.ndarray) -> np.ndarray:
@@ -170,31 +166,31 @@ def _continued(
     return np.concatenate([box, longer], axis=1), np.concatenate([valid, more], axis=1)
 
 
-def _lines(motion: Motion, times_s: _Series, scene: _Scene) -> list[StopLine]:
+def _lines(motion: Motion, times_s: _Series, state: _State) -> list[StopLine]:
     """Stop lines ahead, during the plan and after it."""
     steps, half = len(times_s), motion.size_m[: motion.vehicles, 0] / 2
-    roles = scene.roles
+    roles = state.roles
     distance, valid = motion.distance_m[:, -steps:], motion.valid[: motion.vehicles, -steps:]
     coming = arrivals(roles.network, motion.paths or roles.paths, distance, valid, half)
     first = {lane: _longer(taken) for lane, taken in coming.items()}
     longer = np.append(times_s, times_s[-1] + DT_S * np.arange(1, _BEYOND_STEPS + 1))
-    ego, passed = (scene.from_m, float(half[0])), scene.from_m + scene.passed_m
-    return stop_lines(roles.network, scene.path, ego, longer, passed, first)
+    ego, passed = (state.from_m, float(half[0])), state.from_m + state.passed_m
+    return stop_lines(roles.network, state.path, ego, longer, passed, first)
 
 
-def _best_candidate(scene: _Scene) -> tuple[CandidatePath, SpeedProfile]:
+def _best_candidate(state: _State) -> tuple[CandidatePath, SpeedProfile]:
     """Return the cheapest feasible candidate, else the one that violates its bounds least."""
-    candidate = scene.candidate(Shift())
-    conflicts = _conflicts(scene, candidate)
-    options = [_option(scene, candidate, conflicts)]
+    candidate = state.candidate(Shift())
+    conflicts = _conflicts(state, candidate)
+    options = [_option(state, candidate, conflicts)]
     drives: list[tuple[float, CandidatePath, SpeedProfile]] = []
     if options[0].cost < _CHEAP:
-        drive = _smooth(scene, options[0])
+        drive = _smooth(state, options[0])
         if drive.excess <= _TOLERANCE:
             return candidate, drive
-    options += _passing_options(scene, candidate, conflicts)
+    options += _passing_options(state, candidate, conflicts)
     for option in sorted(options, key=lambda option: option.cost):
-        drive = _smooth(scene, option)
+        drive = _smooth(state, option)
         if drive.excess <= _TOLERANCE and not option.speeds.touches:
             return option.candidate, drive
         drives.append((drive.excess + 100.0 * option.speeds.touches, option.candidate, drive))
@@ -202,53 +198,53 @@ def _best_candidate(scene: _Scene) -> tuple[CandidatePath, SpeedProfile]:
     return candidate, drive
 
 
-def _conflicts(scene: _Scene, candidate: CandidatePath) -> Conflicts:
+def _conflicts(state: _State, candidate: CandidatePath) -> Conflicts:
     """Return conflicts along a candidate, without those of vehicles that follow ego and will react."""
-    conflicts = find_conflicts(candidate, scene.size_m, scene.others, scene.valid, scene.people)
-    follows = np.zeros(len(scene.others), bool)
+    conflicts = find_conflicts(candidate, state.size_m, state.others, state.valid, state.people)
+    follows = np.zeros(len(state.others), bool)
     order = np.lexsort((-conflicts.point, conflicts.step, conflicts.user))
     users, first = np.unique(conflicts.user[order], return_index=True)
     step, point = conflicts.step[order][first], conflicts.point[order][first]
-    box = scene.others[users, step]
+    box = state.others[users, step]
     along = box[:, 2] * np.cos(candidate.heading[point]) + box[:, 3] * np.sin(candidate.heading[point])
-    behind = candidate.base_m[point] < scene.passed_m[step]
-    follows[users] = behind & (along > 0.7) & ~scene.unreactive[users]
+    behind = candidate.base_m[point] < state.passed_m[step]
+    follows[users] = behind & (along > 0.7) & ~state.unreactive[users]
     return conflicts.only(~follows[conflicts.user])
 
 
-def _option(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> _Option:
-    occupancy = _occupancy(scene, candidate, conflicts)
-    speeds = search(occupancy, candidate.preferred_mps, candidate.limit_mps, scene.speed)
+def _option(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Option:
+    occupancy = _occupancy(state, candidate, conflicts)
+    speeds = search(occupancy, candidate.preferred_mps, candidate.limit_mps, state.speed)
     cost = speeds.cost
     if candidate.shift.aside_m:
-        wrong = against_traffic(scene.roles.network, candidate.xy[::4], candidate.heading[::4])
+        wrong = against_traffic(state.roles.network, candidate.xy[::4], candidate.heading[::4])
         wrong_m, aside = float(wrong.sum() * 4 * SPACING_M), abs(candidate.shift.aside_m)
-        cost += _LEAVING + _ASIDE * aside + _AGAINST * wrong_m / max(scene.speed, 4.0)
+        cost += _LEAVING + _ASIDE * aside + _AGAINST * wrong_m / max(state.speed, 4.0)
     return _Option(candidate, occupancy, speeds, cost)
 
 
-def _occupancy(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> Occupancy:
+def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> Occupancy:
     """Return the occupancy of a candidate by others, stop lines, and the end of the map."""
-    shape = (scene.others.shape[1], len(candidate.xy))
+    shape = (state.others.shape[1], len(candidate.xy))
     hard, near = np.zeros(shape, bool), np.zeros(shape)
-    weight = np.where(scene.people[conflicts.user], _PEOPLE, 1.0)
+    weight = np.where(state.people[conflicts.user], _PEOPLE, 1.0)
     np.maximum.at(near, (conflicts.step, conflicts.point), weight)
     hard[conflicts.step[conflicts.hard], conflicts.point[conflicts.hard]] = True
-    thick = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + scene.speed) + 0.5) / SPACING_M))
-    for line in scene.lines:
+    thick = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + state.speed) + 0.5) / SPACING_M))
+    for line in state.lines:
         if line.base_m < candidate.base_m[-1]:
             place = int(np.searchsorted(candidate.base_m, line.base_m))
             hard[line.closed, place : place + thick] = True
             near[line.late, place : place + thick] = _LATE
-    room = scene.path.length_m - scene.from_m - scene.size_m[0] / 2 - 0.5
+    room = state.path.length_m - state.from_m - state.size_m[0] / 2 - 0.5
     hard[:, candidate.base_m > room] = True
     return Occupancy(SPACING_M, hard, near)
 
 
-def _smooth(scene: _Scene, option: _Option) -> SpeedProfile:
+def _smooth(state: _State, option: _Option) -> SpeedProfile:
     """Smooth an option's speeds within the tightest feasible bounds."""
-    at, speed = option.speeds.fine(scene.others.shape[1])
-    speed[0] = scene.speed
+    at, speed = option.speeds.fine(state.others.shape[1])
+    speed[0] = state.speed
     hard = option.occupancy.hard[1:]
     place = np.arange(hard.shape[1])
     own = np.clip(np.rint(at[1:] / SPACING_M).astype(int), 0, len(place) - 1)
@@ -263,45 +259,45 @@ def _smooth(scene: _Scene, option: _Option) -> SpeedProfile:
     drive = None
     for acceleration, jerk in _BOUNDS:
         bounds = Bounds(low, np.maximum(high, low), top, acceleration, jerk)
-        drive = smoothed(at, speed, scene.acceleration, bounds)
+        drive = smoothed(at, speed, state.acceleration, bounds)
         if drive.excess <= _TOLERANCE:
             break
     assert drive is not None
     return drive
 
 
-def _passing_options(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> list[_Option]:
+def _passing_options(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> list[_Option]:
     """Return options that pass the first obstacle, if there is one."""
-    hit = _first_hit(scene, candidate, conflicts)
+    hit = _first_hit(state, candidate, conflicts)
     if hit is None:
         return []
-    rings = tuple(edge.xy for edge in scene.roles.network.edges)
+    rings = tuple(edge.xy for edge in state.roles.network.edges)
     result = []
     for side in (1.0, -1.0):
-        for room, step_mps2 in zip(_ROOM_M, _STEP_MPS2, strict=True):
-            shift = _shift(scene, candidate, conflicts, hit, side, room, step_mps2)
+        for margins in zip(_ROOM_M, _STEP_MPS2, strict=True):
+            shift = _shift(state, candidate, conflicts, hit, side, margins)
             if shift is None:
                 continue
-            shifted = scene.candidate(shift)
-            if not bool(inside(candidate_corners(shifted, scene.size_m + 0.2), rings).all()):
+            shifted = state.candidate(shift)
+            if not bool(inside(candidate_corners(shifted, state.size_m + 0.2), rings).all()):
                 continue
-            option = _option(scene, shifted, _conflicts(scene, shifted))
+            option = _option(state, shifted, _conflicts(state, shifted))
             result.append(option)
             if option.cost < TOUCH:
                 break
     return result
 
 
-def _first_hit(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> _Hit | None:
+def _first_hit(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Hit | None:
     """Return user, step and path sample of the first collision at the preferred speeds."""
-    at, speed, places = 0.0, scene.speed, []
-    for _ in range(scene.others.shape[1]):
+    at, speed, places = 0.0, state.speed, []
+    for _ in range(state.others.shape[1]):
         places.append(at)
         index = min(int(at / SPACING_M), len(candidate.xy) - 1)
         speed = min(speed + 1.5 * DT_S, max(float(candidate.preferred_mps[index]), speed - 2.0 * DT_S))
         at += speed * DT_S
     apart = np.abs(conflicts.point * SPACING_M - np.array(places)[conflicts.step])
-    touch = conflicts.hard & (apart < 0.3 + 0.05 * scene.speed)
+    touch = conflicts.hard & (apart < 0.3 + 0.05 * state.speed)
     if not touch.any():
         return None
     first = int(np.flatnonzero(touch)[np.argmin(conflicts.step[touch])])
@@ -309,30 +305,34 @@ def _first_hit(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) ->
 
 
 def _shift(
-    scene: _Scene,
+    state: _State,
     candidate: CandidatePath,
     conflicts: Conflicts,
     hit: _Hit,
     side: float,
-    room_m: float,
-    step_mps2: float,
+    margins: tuple[float, float],
 ) -> Shift | None:
     """Return the shift that passes a user, and standing users close behind it, on one side (1: left, -1: right)."""
-    begin, end, edge = _extent(scene, candidate, hit, side)
-    half_l, half_w = scene.size_m[0] / 2 + 1.0, scene.size_m[1] / 2
+    room_m, step_mps2 = margins
+    begin, end, edge = _extent(state, candidate, hit, side)
+    half_l, half_w = state.size_m[0] / 2 + 1.0, state.size_m[1] / 2
     seen = {hit[0]}
-    standing = [int(u) for u in np.unique(conflicts.user[conflicts.hard]) if _stands(scene, int(u))]
+    standing = [
+        user
+        for user in np.unique(conflicts.user[conflicts.hard]).tolist()
+        if np.ptp(state.others[user, state.valid[user], :2], axis=0).max() < 0.5
+    ]
     for user in sorted(standing, key=lambda u: int(conflicts.point[conflicts.user == u].min())):
         mine = conflicts.hard & (conflicts.user == user)
         place = int(conflicts.point[mine].min())
         if user not in seen and begin < place * SPACING_M < end + 20.0:
-            more = _extent(scene, candidate, (user, int(conflicts.step[mine].min()), place), side)
+            more = _extent(state, candidate, (user, int(conflicts.step[mine].min()), place), side)
             end, edge = max(end, more[1]), max(edge, more[2])
             seen.add(user)
     aside = edge + half_w + room_m
     if not 0.15 < aside < _FURTHEST_M:
         return None
-    speed = max(scene.speed, float(candidate.preferred_mps[hit[2]]) * 0.7)
+    speed = max(state.speed, float(candidate.preferred_mps[hit[2]]) * 0.7)
     length = max(speed * float(np.sqrt(5.77 * aside / step_mps2)), 3.0 * aside, 8.0)
     gentle = max(length, speed * float(np.sqrt(5.77 * aside / _STEP_MPS2[0])))
     out = max(0.0, begin - half_l - length)
@@ -341,22 +341,16 @@ def _shift(
     return Shift(side * aside, out, there, back, back + gentle)
 
 
-def _stands(scene: _Scene, user: int) -> bool:
-    """Whether a user stays within half a metre."""
-    xy = scene.others[user, scene.valid[user], :2]
-    return bool(np.ptp(xy, axis=0).max() < 0.5)
-
-
-def _extent(scene: _Scene, candidate: CandidatePath, hit: _Hit, side: float) -> tuple[float, float, float]:
+def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> tuple[float, float, float]:
     """Return a user's longitudinal range and its lateral extent on one side of the path at the conflict."""
     user, step, point = hit
-    box = scene.others[user, step]
+    box = state.others[user, step]
     c, s = float(np.cos(candidate.heading[point])), float(np.sin(candidate.heading[point]))
     offset = corners(box) - candidate.xy[point]
     along, left = offset @ np.array([c, s]), offset @ np.array([-s, c])
     # Moving users are passed over a longer stretch.
-    later = min(step + 10, len(scene.others[user]) - 1)
-    moved = (scene.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
+    later = min(step + 10, len(state.others[user]) - 1)
+    moved = (state.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
     at = point * SPACING_M
     ahead, behind = max(3.0 * moved, 0.7 * -moved, 0.0), max(0.7 * abs(moved), 0.0)
     return at + float(along.min()) - behind, at + float(along.max()) + ahead, float((side * left).max())

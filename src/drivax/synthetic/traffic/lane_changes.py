@@ -136,10 +136,9 @@ class _Options:
     """Candidate changes, one entry each: those to the left first, each side in order of vehicles.
 
     Attributes:
-        vehicles, target: The vehicle and its new lane.
+        target, limit_mps: The new lane and the preferred speed there.
         length_m: Length of the manoeuvre.
         possible, mandatory: Whether the lanes allow the change, and whether it must be made.
-        limit_mps: Preferred speed on the new lane.
         left_m: Distance to the end of the own chain.
         there, here: Place on the new and on the own chain.
     """

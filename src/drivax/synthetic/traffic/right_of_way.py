@@ -216,7 +216,12 @@ class RightOfWay:
         holders = list(zip(row.tolist(), tables.connector[row, slot].tolist(), strict=True))
         requests = [_Request.at(state, i, int(place[i])) for i in rows.tolist()]
         for request in requests:
-            self._note_stop(state, request)
+            i = request.row
+            if self._requested[i] != request.connector:
+                self._requested[i], self._stood[i] = request.connector, np.inf
+            stands = request.speed < _STANDS_MPS and request.distance_m < _STANDS_M
+            if stands and not np.isfinite(self._stood[i]):
+                self._stood[i] = state.step * DT_S
         waiting: list[int] = []  # connectors of vehicles that stand at an all-way stop and must still wait
         for k in self._order(requests):
             request = requests[k]
@@ -235,14 +240,6 @@ class RightOfWay:
                 stop[i] = min(stop[i], request.distance_m)
                 if self._control[connector] == _ALL_WAY_STOP and np.isfinite(self._stood[i]):
                     waiting.append(connector)
-
-    def _note_stop(self, state: TrafficState, request: _Request) -> None:
-        i = request.row
-        if self._requested[i] != request.connector:
-            self._requested[i], self._stood[i] = request.connector, np.inf
-        stands = request.speed < _STANDS_MPS and request.distance_m < _STANDS_M
-        if stands and not np.isfinite(self._stood[i]):
-            self._stood[i] = state.step * DT_S
 
     def _order(self, requests: list[_Request]) -> list[int]:
         """Order in which requests are decided."""

@@ -160,19 +160,14 @@ def _lights(
     aimed: DestinationRoute | None,
     rng: np.random.Generator,
 ) -> SignalPlan | None:
-    """Set the clock of the lights for the first one on ego's route, or beyond its destination."""
+    """Set the clock so that ego's next light is green, turns green or turns yellow when the recording begins."""
     plan, ahead = network.signals, lanes if aimed is None else lanes[aimed.place :]
     lit = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
     if plan is None or not lit:
         return plan
     if aimed is not None and aimed.alone:
         return green_on_arrival(plan, lit[0])
-    return _timed(plan, lit[0], timing, rng)
-
-
-def _timed(plan: SignalPlan, lane: int, timing: SignalTiming, rng: np.random.Generator) -> SignalPlan:
-    """Set the plan's clock so that a light is green at time 0, or turns green or yellow after it."""
-    phase = plan.phase_of(lane)
+    phase = plan.phase_of(lit[0])
     case = int(rng.choice(3, p=timing))
     if case == 0:
         green_at = -rng.uniform(0.0, 3.0)

@@ -114,6 +114,11 @@ class Scripted:
         xy = np.tile([pose.x, pose.y], (steps, 1))
         return cls(kind, size_m, xy, np.full(steps, pose.heading), np.zeros(steps), np.ones(steps, bool))
 
+    @property
+    def is_static(self) -> bool:
+        """Whether the user exists and stands still at all steps."""
+        return bool(self.valid.all() and not self.speed.any() and not np.ptp(self.xy, axis=0).any())
+
 
 @dataclass(frozen=True)
 class Roles:

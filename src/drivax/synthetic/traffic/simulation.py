@@ -66,15 +66,6 @@ def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
     )
 
 
-def standing_and_moving(extras: tuple[Scripted, ...]) -> tuple[tuple[Scripted, ...], tuple[Scripted, ...]]:
-    """Split scripted users into static and moving ones."""
-    static, moving = [], []
-    for user in extras:
-        still = user.valid.all() and not user.speed.any() and not np.ptp(user.xy, axis=0).any()
-        (static if still else moving).append(user)
-    return tuple(static), tuple(moving)
-
-
 @dataclass(frozen=True)
 class _Log:
     """What a run records of its vehicles (x, y, heading) and walkers (x, y, heading, speed)."""
@@ -200,7 +191,8 @@ class _Run:
         self._rows = np.arange(count)
         self._idm = self._drivers.idm
         self._tables = _copied(traffic.tables)
-        static, self._movers = standing_and_moving(staging.extras)
+        static = tuple(user for user in staging.extras if user.is_static)
+        self._movers = tuple(user for user in staging.extras if not user.is_static)
         boxes = traffic.parked.joined(boxes_at(static, 0))
         self._standing = Standing(boxes, self._tables, self._width_m) if static else _copied(traffic.standing)
         self._right_of_way = traffic.right_of_way
