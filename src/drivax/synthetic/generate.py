@@ -195,7 +195,7 @@ def generate(
     if scenarios < 1:
         raise UsageError(f"scenarios is {scenarios}", cure="use 1 or more")
     if not 0 <= seed < RESERVED_SEED:
-        raise UsageError(f"seed is {seed}", cure=f"use 0 to {RESERVED_SEED - 1:,}".replace(",", ""))
+        raise UsageError(f"seed is {seed}", cure=f"use 0 to {RESERVED_SEED - 1}")
     return write_set(out, scenarios, seed, options, {}, progress, audit)
 
 
@@ -233,12 +233,9 @@ def write_set(
 
 def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:
     """Draw scenarios ``first`` to ``last - 1`` (in a worker)."""
-    capacity, result = CAPACITIES[options.capacity], []
-    for index in range(first, last):
-        draw = generate_one(seed, index, options.world)
-        scenario = assemble(draw.recording, capacity)
-        result.append(_Draw(scenario, draw.family, draw.rejected))
-    return result
+    draws = [generate_one(seed, index, options.world) for index in range(first, last)]
+    capacity = CAPACITIES[options.capacity]
+    return [_Draw(assemble(draw.recording, capacity), draw.family, draw.rejected) for draw in draws]
 
 
 def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, None, None]:

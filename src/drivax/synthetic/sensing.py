@@ -81,6 +81,7 @@ class NoiseConfig:
 
 
 _Boxes = Float64[np.ndarray, "user time 6"]
+_PerUser = Float64[np.ndarray, " user"]
 _Visible = Bool[np.ndarray, "user time"]
 _Looks = Int64[np.ndarray, " look"]
 _Pairs = Int64[np.ndarray, " pair"]
@@ -100,11 +101,7 @@ def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "t
 
 
 def visible(
-    box: _Boxes,
-    height_m: Float64[np.ndarray, " user"],
-    valid: _Visible,
-    blocks: Bool[np.ndarray, " user"],
-    config: SensorConfig,
+    box: _Boxes, height_m: _PerUser, valid: _Visible, blocks: Bool[np.ndarray, " user"], config: SensorConfig
 ) -> _Visible:
     """Mask of users in the sensor's range whose centre or a corner is in free view; ego sees itself.
 

@@ -241,8 +241,8 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
 def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
     """Add perception noise and the visibility mask."""
     tracks, ego = recording.tracks, recording.ego
-    visible = sight(tracks, ego, config.sensor)
-    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=visible)
+    seen = sight(tracks, ego, config.sensor)
+    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=seen)
 
 
 def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:

@@ -57,7 +57,7 @@ _Hit = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class _State:
-    """State at the first step of the plan and what follows, as all candidates share them.
+    """Planning input that all candidates share, from the first step of the plan on.
 
     Attributes:
         pose, from_m: Ego's pose and path position.

@@ -60,11 +60,10 @@ class SpeedPlan:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Speeds, places and accelerations, and the state from which each (acceleration, speed, place) is reached."""
+    """Speeds, places, the state from which each (acceleration, speed, place) is reached, and costs of acceleration."""
 
     speed: Float32[np.ndarray, " speed"]
     place: Float64[np.ndarray, " place"]
-    change: Int64[np.ndarray, " change"]
     source: Int64[np.ndarray, "change speed place"]
     effort: Float32[np.ndarray, " change"]
 
@@ -86,10 +85,8 @@ def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]
     source = np.where(possible, before[..., None] * places + source, speeds * places)
     a = change * unit
     effort = _ACCELERATION * a**2 + _HARD_BRAKING * np.maximum(_COMFORT_MPS2 - a, 0.0) ** 2
-    grid = _Grid(
-        (v * step).astype(np.float32), s * spacing, change, source, (effort * _STEP_S).astype(np.float32)
-    )
-    return grid, index
+    effort = (effort * _STEP_S).astype(np.float32)
+    return _Grid((v * step).astype(np.float32), s * spacing, source, effort), index
 
 
 def search(
@@ -141,7 +138,7 @@ class _Taken:
     """Costs of occupied states (speed, place), which keep their speed within half a coarse step."""
 
     def __init__(self, occupancy: Occupancy, grid: _Grid) -> None:
-        self._occupancy, self._grid = occupancy, grid
+        self._occupancy = occupancy
         half = COARSE // 2
         places = occupancy.hard.shape[1]
         moved = grid.place + (DT_S * np.arange(-half, half + 1))[:, None, None] * grid.speed[:, None]

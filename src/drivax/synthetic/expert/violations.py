@@ -91,8 +91,8 @@ def find_violation(
     cause = _rules_broken(roles, motion, times_s, first_step)
     if cause:
         return Violation(cause)
-    excused = bool(roles.parked) or is_staged(staging)
-    if not excused and goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, now]):
+    against = goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, now])
+    if against and not roles.parked and not is_staged(staging):
         return Violation("ego_wrong_way")
     return Violation("others_collide" if (pairs < box.shape[1]).any() else "")
 

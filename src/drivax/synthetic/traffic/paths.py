@@ -72,10 +72,7 @@ class Path:
 
 @dataclass(frozen=True)
 class LaneChange:
-    """A planned change from a lane (its index in the lane sequence) to the next one, which is adjacent.
-
-    It begins at a position on the old lane and has a length.
-    """
+    """A planned change between adjacent lanes: index of the old one in the lane sequence, position on it, length."""
 
     section: int
     begin_m: float
@@ -124,8 +121,7 @@ def lane_path(
             spans.append(LaneSpan(lane, at, 1.0, end_m=at + length))
         pieces.append(curve)
         at += length
-    middle = join_curves(*pieces) if len(pieces) > 1 else pieces[0]
-    return _finished(network, resample(sway.applied(middle), STEP_M), at, spans)
+    return _finished(network, resample(sway.applied(join_curves(*pieces)), STEP_M), at, spans)
 
 
 def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:

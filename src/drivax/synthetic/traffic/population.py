@@ -47,6 +47,10 @@ _SIZES = np.array(
 #: Length and width of the largest vehicle, m.
 LONGEST_M: tuple[float, float] = (float(_SIZES[_BUS, 1, 0]), float(_SIZES[_BUS, 1, 1]))
 
+#: Lane and distance along it, m.
+_Place = tuple[int, float]
+_Places = list[_Place]
+
 
 def parked_cars(
     network: RoadNetwork, share: float, double_share: float, rng: np.random.Generator, steps: int
@@ -164,7 +168,7 @@ def placed(
     ``busy`` are lanes that are as dense as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
-    vehicles: list[tuple[int, float]] = []
+    vehicles: _Places = []
     if rng.random() < density.leader_share:
         ahead = ego_along_m + rng.uniform(18.0, 45.0)
         if ahead < network.lanes[ego_lane].length_m - 6.0:
@@ -183,7 +187,7 @@ def placed(
                 occupied.append(float(at))
             at += least + rng.exponential(mean)
     vehicles = [place for place in vehicles if not _blocked(network, *place, parked)]
-    vehicles = _apart_at_joints(network, vehicles, ego_lane, ego_along_m)
+    vehicles = _apart_at_joints(network, vehicles, (ego_lane, ego_along_m))
     here = network.lanes[ego_lane].curve
     ego_xy = here.xy[np.searchsorted(here.arc_m, ego_along_m).clip(max=len(here.xy) - 1)]
     vehicles.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
@@ -191,9 +195,7 @@ def placed(
     return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
 
 
-def _apart_in_space(
-    network: RoadNetwork, vehicles: list[tuple[int, float]], ego: tuple[int, float]
-) -> list[tuple[int, float]]:
+def _apart_in_space(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
     """Drop vehicles that share space with an earlier one on another lane, as where lanes fork or merge."""
     kept: list[tuple[float, float]] = []
     result = []
@@ -225,22 +227,20 @@ def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Script
     return False
 
 
-def _apart_at_joints(
-    network: RoadNetwork, vehicles: list[tuple[int, float]], ego_lane: int, ego_along_m: float
-) -> list[tuple[int, float]]:
+def _apart_at_joints(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
     """Drop vehicles that are too close behind the first vehicle of the next lane."""
     kept = []
     first: dict[int, float] = {}
     last: dict[int, float] = {}
-    for lane, along in [*vehicles, (ego_lane, ego_along_m)]:
+    for lane, along in [*vehicles, ego]:
         first[lane], last[lane] = min(along, first.get(lane, np.inf)), max(along, last.get(lane, 0.0))
     for lane, along in vehicles:
         this = network.lanes[lane]
         least = 10.0 + _GAP_M + _GAP_S * this.limit_mps
         after = min((first.get(b, np.inf) for b in this.successors), default=np.inf)
         # Only the last vehicle of a lane can be too close to the next lane's first one. Ego always stays.
-        behind_ego = ego_lane in this.predecessors
-        gap_to_ego = network.lanes[ego_lane].length_m - ego_along_m + along if behind_ego else np.inf
+        before_ego = network.lanes[ego[0]].length_m - ego[1] + along
+        gap_to_ego = before_ego if ego[0] in this.predecessors else np.inf
         if (along < last[lane] or this.length_m - along + after > least) and gap_to_ego > least:
             kept.append((lane, along))
     return kept

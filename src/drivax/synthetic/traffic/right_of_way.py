@@ -40,7 +40,6 @@ _IMPATIENT_S = 30.0
 _NONE, _STOP, _ALL_WAY_STOP = int(Control.NONE), int(Control.STOP), int(Control.ALL_WAY_STOP)
 _RED, _YELLOW = int(Colour.RED), int(Colour.YELLOW)
 
-
 #: Rows of the vehicles that request a connector.
 _Requests = Int64[np.ndarray, " request"]
 #: Row and connector of each vehicle that holds one.

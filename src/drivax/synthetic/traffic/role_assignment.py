@@ -99,17 +99,12 @@ def assign_roles(
     """
     driver = expert.draw_expert(rng)
     aimed = draw_route(network, giving_way(network) if critical else destinations, rng)
-    first_s = float(times_s[0])
-    lanes, path, at = _draw_route(network, driver, first_s, lane_change_share, rng, aimed)
-    for _ in range(_ROUTES if critical and aimed is None else 0):
-        if conflicts_on(network, path):
-            break
-        lanes, path, at = _draw_route(network, driver, first_s, lane_change_share, rng, None)
+    first_s, tries = float(times_s[0]), _ROUTES if critical and aimed is None else 0
+    lanes, path, at = _draw_route(network, driver, first_s, lane_change_share, rng, aimed, tries)
     rivals = with_feeders(network, conflicts_on(network, path)) if critical else frozenset()
     network = replace(network, signals=_lights(network, lanes, timing, aimed, rng))
     here = max((span for span in path.spans if span.begin_m <= at), key=lambda span: span.begin_m)
-    density = domain.density
-    share = float(rng.uniform(*domain.parked_share))
+    density, share = domain.density, float(rng.uniform(*domain.parked_share))
     parked = parked_cars(network, share, domain.double_share, rng, len(times_s))
     others = placed(network, here.lane, at - here.begin_m, density, rng, parked, rivals)
     if aimed is not None:
@@ -139,8 +134,9 @@ def _draw_route(
     lane_change_share: float,
     rng: np.random.Generator,
     aimed: DestinationRoute | None,
+    tries: int = 0,
 ) -> tuple[tuple[int, ...], Path, float]:
-    """Draw ego's lanes, path and position, so far back that the warm-up brings it to the start of the recording."""
+    """Draw ego's lanes, path and position before the warm-up; draw again, up to ``tries`` times, without conflicts."""
     if aimed is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
         lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
@@ -150,6 +146,8 @@ def _draw_route(
     cruise = 0.9 * float(driver.speed_factor[0]) * network.lanes[start.lane].limit_mps
     first = next(span for span in path.spans if span.lane == start.lane)
     at = max(_LEAST_M, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + first_s * cruise))
+    if tries and not conflicts_on(network, path):
+        return _draw_route(network, driver, first_s, lane_change_share, rng, aimed, tries - 1)
     return lanes, path, at
 
 

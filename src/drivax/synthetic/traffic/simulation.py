@@ -128,8 +128,7 @@ class Leaders:
         position = tables.scale.take(taken, axis=1)
         position *= along.ravel().take(used)
         position = begin.take(taken, axis=1) + position
-        seen = position > own
-        seen &= vehicles_ahead != self._rows[:, None]
+        seen = (position > own) & (vehicles_ahead != self._rows[:, None])
         if self._any_cyclist:
             # Where the lane is wide enough, cyclists are overtaken within it.
             seen &= ~(self._cyclist[vehicles_ahead] & self._passes.take(taken, axis=1))
@@ -265,11 +264,9 @@ class _Run:
 
     def _walk(self, t: int, active: VehicleMask) -> None:
         """Advance the walkers and gather scripted users."""
-        people = boxes_at((), 0)
+        people, colour = boxes_at((), 0), self._fixed.colour[t]
         if self._walkers is not None:
-            people, self._occupied_crossings = self._walkers.step(
-                t, self._vehicles, active, self._fixed.colour[t]
-            )
+            people, self._occupied_crossings = self._walkers.step(t, self._vehicles, active, colour)
             self._log.walked[:, t] = np.column_stack([people.xy, people.heading, people.speed])
         self._people = people.joined(boxes_at(tuple(user for user in self._movers if user.valid[t]), t))
 
