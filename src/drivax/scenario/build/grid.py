@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -124,17 +125,17 @@ def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity
     if keep.sum() > capacity.segments:
         inside = np.flatnonzero(keep)
         keep[inside[np.argsort(far[inside], kind="stable")[capacity.segments :]]] = False
-    overflow = {"segments": int((~keep).sum())}
+    overflow = Counter(segments=int((~keep).sum()))
     block = segments.block
-    for name, number, cap in (
-        ("edge_run", EDGE_BLOCK, capacity.edge_run),
-        ("lane_run", LANE_BLOCK, capacity.lane_run),
-    ):
+    for name, number in (("edge_run", EDGE_BLOCK), ("lane_run", LANE_BLOCK)):
         rows = np.flatnonzero(keep & (block == number))
-        drop = rows[grid.crowded(grid.cell(middle[rows]), far[rows], cap)]
+        drop = rows[grid.crowded(grid.cell(middle[rows]), far[rows], getattr(capacity, name))]
         keep[drop] = False
         overflow[name] = len(drop)
-    _refuse_unsafe(~keep & (block == EDGE_BLOCK), far, capacity)
+    if lost := int((~keep & (block == EDGE_BLOCK) & (far < UNSAFE_M)).sum()):
+        near = f"{lost} road-edge segments within {UNSAFE_M:.0f} m of the ego's log"
+        problem = f"{near} do not fit capacity {capacity.name!r}"
+        raise DataError(problem, cure="convert with a larger capacity")
     rows = np.flatnonzero(keep)
     cell = grid.cell(middle[rows])
     sort_key = block[rows] * grid.side**2 + np.where(block[rows] == REST_BLOCK, 0, cell)
@@ -147,21 +148,8 @@ def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity
         blocks=ends,
         edge_start=grid.starts(cell[: ends[1]], 0),
         lane_start=grid.starts(cell[ends[1] : ends[2]], int(ends[1])),
-        overflow={name: count for name, count in overflow.items() if count},
+        overflow=+overflow,
     )
-
-
-def _refuse_unsafe(
-    dropped: Bool[Array, " segment"], far: Float[Array, " segment"], capacity: Capacity
-) -> None:
-    """Refuse a scenario if an edge next to the log of the ego did not fit."""
-    lost = int((dropped & (far < UNSAFE_M)).sum())
-    if lost:
-        raise DataError(
-            f"{lost} road-edge segments within {UNSAFE_M:.0f} m of the ego's log do not fit capacity"
-            f" {capacity.name!r}",
-            cure="convert with a larger capacity",
-        )
 
 
 def cell_sides(
@@ -169,15 +157,9 @@ def cell_sides(
 ) -> Int32[Array, " cell"]:
     """Sides of the 3 x 3 side cells of every grid cell, packed by :func:`packed`.
 
-    The edge nearest to the centre of a side cell decides: its left is drivable; the side beyond the end of an open edge
-    is unknown. Side cells with a lane centre are never off the road. Cells out of reach of all edges get a side only if
-    every road edge is a closed ring.
-
-    Args:
-        grid: The grid.
-        edges: All road-edge segments, also those outside the crop.
-        lanes: Points of lane centres.
-        rings_closed: Whether every road edge is a closed ring.
+    The nearest of ``edges`` (all of the source, also those outside the crop) decides: its left is drivable; beyond the
+    end of an open edge the side is unknown. Side cells with a lane centre (``lanes``) are never off the road. Cells out
+    of reach of all edges get a side only if every road edge is a closed ring.
     """
     fine = Grid(grid.origin, grid.cell_m / SPLIT, grid.side * SPLIT)
     if not len(edges):

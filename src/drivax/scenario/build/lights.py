@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -70,7 +71,7 @@ def place_lights(
         else np.full(len(lights), HALF_WIDTH_M)  # fmt: skip
     directed = np.flatnonzero(~np.isnan(heading))
     rows = directed[np.argsort(path_distance(stop[directed, :2], path), kind="stable")]
-    overflow = {"lights": max(len(rows) - most, 0), "lights_without_lane": len(lights) - len(directed)}
+    overflow = +Counter(lights=len(rows) - most, lights_without_lane=len(lights) - len(directed))
     rows = rows[:most]
     left = half[rows, None] * np.stack((-np.sin(heading[rows]), np.cos(heading[rows])), axis=-1)
     states = [np.asarray(lights[i].states, dtype=np.int8) for i in rows]
@@ -81,7 +82,7 @@ def place_lights(
         heading=heading[rows],
         exit_heading=exit_heading[rows],
         state=np.stack(states) if states else np.zeros((0, steps), dtype=np.int8),
-        overflow={name: count for name, count in overflow.items() if count},
+        overflow=overflow,
     )
 
 
@@ -136,5 +137,4 @@ def place_stops(
         lane[i, : min(len(known), LANES_PER_STOP)] = known[:LANES_PER_STOP]
         lost += max(len(known) - LANES_PER_STOP, 0)
     rows = np.argsort(path_distance(xy, path), kind="stable")
-    overflow = {"stops": max(len(rows) - most, 0), "stop_lanes": lost}
-    return Stops(xy[rows[:most]], lane[rows[:most]], {name: n for name, n in overflow.items() if n})
+    return Stops(xy[rows[:most]], lane[rows[:most]], +Counter(stops=len(rows) - most, stop_lanes=lost))

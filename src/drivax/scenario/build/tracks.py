@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -145,26 +146,18 @@ def place(tracks: LocalTracks, marked: Sequence[int], agents: int, parked: int) 
     rank = _rank(tracks, np.where(tracks.valid, away, 0.0).max(axis=1), marked)
     order = np.argsort(rank, kind="stable")
     moving, standing = order[(seen & ~parks)[order]], order[parks[order]]
-    overflow = {"agents": max(len(moving) - agents, 0), "parked": max(len(standing) - parked, 0)}
-    return Placement(
-        moving[:agents], standing[:parked], pose, {name: count for name, count in overflow.items() if count}
-    )
+    overflow = +Counter(agents=len(moving) - agents, parked=len(standing) - parked)
+    return Placement(moving[:agents], standing[:parked], pose, overflow)
 
 
 def median_pose(tracks: LocalTracks) -> Float[Array, "track 4"]:
     """Median x, y, z and heading over the valid steps; the heading relative to its circular mean."""
-    xyz = masked_median(
-        np.swapaxes(tracks.xyz, 1, 2), np.broadcast_to(tracks.valid[:, None], _swapped(tracks))
-    )
+    by_axis = np.swapaxes(tracks.xyz, 1, 2)
+    xyz = masked_median(by_axis, np.broadcast_to(tracks.valid[:, None], by_axis.shape))
     weight = tracks.valid.astype(np.float64)
     mean = np.arctan2((np.sin(tracks.heading) * weight).sum(1), (np.cos(tracks.heading) * weight).sum(1))
     turn = masked_median(wrap(tracks.heading - mean[:, None]), tracks.valid)
     return np.concatenate((xyz, wrap(mean + turn)[:, None]), axis=1)
-
-
-def _swapped(tracks: LocalTracks) -> tuple[int, int, int]:
-    rows, steps, width = tracks.xyz.shape
-    return rows, width, steps
 
 
 def _rank(

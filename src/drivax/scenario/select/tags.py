@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 
 from drivax.geometry.polylines import arc_lengths
 from drivax.geometry.vectors import wrap
-from drivax.scenario.build.filling import Parts
 from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph
-from drivax.scenario.build.routes import STEP_M, Route
+from drivax.scenario.build.lights import Lights
+from drivax.scenario.build.routes import STEP_M, RouteSet
 from drivax.scenario.build.tracks import LocalTracks
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import DT_S, AgentKind, Flag, among
@@ -71,8 +71,8 @@ class Driven:
     lane: Int[Array, " metre"]
 
     @classmethod
-    def of(cls, tracks: LocalTracks, log: Route) -> Driven:
-        """Build from the track of the ego and the route of its log."""
+    def of(cls, tracks: LocalTracks, routes: RouteSet) -> Driven:
+        """Build from the track of the ego and the route of its log, which is left out where only one is stored."""
         valid = tracks.valid[tracks.ego]
         xy, heading = tracks.xyz[tracks.ego, valid, :2], tracks.heading[tracks.ego, valid]
         keep = [0]
@@ -80,42 +80,32 @@ class Driven:
             if np.hypot(*(xy[i] - xy[keep[-1]])) >= STEP_M:
                 keep.append(i)
         arc = arc_lengths(xy[keep])
-        return cls(arc, np.unwrap(heading[keep]), log.lane[: int(arc[-1]) + 1])
+        lane = routes.routes[1].lane if len(routes.routes) > 1 else np.zeros(0, dtype=np.int64)
+        return cls(arc, np.unwrap(heading[keep]), lane[: int(arc[-1]) + 1])
 
 
-def scenario_tags(recording: Recording, parts: Parts, flags: Flag, routes: str) -> dict[str, str]:
-    """Return all tags of a scenario; ``routes`` names the source of its candidate routes."""
-    driven = Driven.of(parts.tracks, parts.routes.routes[1] if len(parts.routes.routes) > 1 else _nowhere())
-    kind = type_of(driven, parts.graph)
-    density = density_of(parts.tracks, recording.current_step)
+def scenario_tags(
+    recording: Recording, tracks: LocalTracks, graph: LaneGraph, routes: RouteSet, lights: Lights,
+    flags: Flag, style: str,
+) -> dict[str, str]:  # fmt: skip
+    """Return all tags of a scenario; ``style`` names the source of its candidate routes."""
+    driven = Driven.of(tracks, routes)
+    kind = type_of(driven, graph)
+    density = density_of(tracks, recording.current_step)
+    limits = "measured" if Flag.SPEED_LIMITS in flags else "none"
+    links = "chained" if Flag.CHAINED_GRAPH in flags else "given"
     return {
         **recording.tags,
         "dataset": recording.dataset,
         "type": kind,
-        "difficulty": difficulty_of(parts.tracks, kind, density),
+        "difficulty": difficulty_of(tracks, kind, density),
         "density": density,
         "moves": "yes" if driven.arc[-1] >= MOVES_M else "no",
-        "lights": "yes" if len(parts.lights.z) else "no",
-        "limits": _limits(flags),
-        "lane_graph": _lane_graph(flags),
-        "routes": routes,
+        "lights": "yes" if len(lights.z) else "no",
+        "limits": "default" if Flag.DEFAULT_LIMITS in flags else limits,
+        "lane_graph": links if Flag.LANE_GRAPH in flags else "none",
+        "routes": style,
     }
-
-
-def _nowhere() -> Route:
-    return Route(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64))
-
-
-def _limits(flags: Flag) -> str:
-    if Flag.DEFAULT_LIMITS in flags:
-        return "default"
-    return "measured" if Flag.SPEED_LIMITS in flags else "none"
-
-
-def _lane_graph(flags: Flag) -> str:
-    if Flag.LANE_GRAPH not in flags:
-        return "none"
-    return "chained" if Flag.CHAINED_GRAPH in flags else "given"
 
 
 def type_of(driven: Driven, graph: LaneGraph) -> str:
