@@ -14,9 +14,17 @@ from drivax.errors import DataError
 from drivax.scenario.build.grid import GridSegments, arrange, cell_sides
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments, lane_graph, lane_of_feature, select
 from drivax.scenario.build.lights import Lights, Stops, place_lights, place_stops
-from drivax.scenario.build.roads import RoadRows, road_rows
 from drivax.scenario.build.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
-from drivax.scenario.build.segments import RoadLines, cut, inside_box, path_distance, road_lines, thin_path
+from drivax.scenario.build.segments import (
+    RoadLines,
+    RoadRows,
+    cut,
+    inside_box,
+    path_distance,
+    road_lines,
+    road_rows,
+    thin_path,
+)
 from drivax.scenario.build.tracks import (
     EGO_BIT,
     INTEREST_BIT,

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from drivax.errors import DataError
 from drivax.geometry.polylines import Polylines, point_to_segment
 from drivax.geometry.vectors import wrap
-from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box
+from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box, known_limit
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among
 
@@ -27,8 +27,8 @@ CHAIN_HEADING_RAD = np.deg2rad(20.0)
 SAME_WAY_RAD = np.deg2rad(45.0)
 #: Lane widths believed when measured from the spacing of neighbours, metres.
 WIDTHS_M = (2.2, 5.5)
-#: Widths and limits that a source gives are believed up to here.
-MOST_WIDTH_M, MOST_LIMIT_MPS = 50.0, 100.0
+#: Larger widths of a source are not believed.
+MOST_WIDTH_M = 50.0
 LEVEL_M = 3.0
 #: Headings at lane ends are measured over this chord: the last source points lie close together.
 END_SPAN_M = 2.0
@@ -129,9 +129,8 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     right, right_shift, right_gap = _adjacent(lanes, index, samples, lines.length, "right_neighbours")
     gap = np.fmin(left_gap, right_gap)
     measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
-    given = np.array(
-        [lane.width_m if _within(lane.width_m, MOST_WIDTH_M) else np.nan for lane in lanes], dtype=np.float64
-    )
+    given = np.array([lane.width_m for lane in lanes], dtype=np.float64)
+    given[~((given > 0.0) & (given <= MOST_WIDTH_M))] = np.nan
     return LaneGraph(
         lines=lines,
         feature=np.array(rows, dtype=np.int64),
@@ -158,16 +157,6 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
 def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], names: Sequence[str]) -> int:
     """Number of links of these kinds to missing lanes."""
     return sum(other not in index for lane in lanes for name in names for other in getattr(lane, name))
-
-
-def known_limit(feature: MapFeature) -> float:
-    """Plausible speed limit of a lane in m/s, else -1."""
-    limit = feature.limit_mps if feature.kind in LANE_KINDS else None
-    return limit if limit is not None and _within(limit, MOST_LIMIT_MPS) else -1.0
-
-
-def _within(value: float | None, most: float) -> bool:
-    return value is not None and 0.0 < value <= most
 
 
 def _has_length(points: Array) -> bool:

@@ -1,7 +1,8 @@
-"""Map features as polylines and as short straight segments for map queries."""
+"""Map features as polylines, as segments of at most 4 m for queries, and as ranked pieces to observe."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from drivax.geometry.polylines import Polylines, arc_lengths, cut_counts, simplify
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import MapFeature
-from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, POLYGON_KINDS, RoadKind, among
+from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, RoadKind, among
 
 Array = np.ndarray[Any, Any]
 
@@ -22,6 +24,13 @@ TOLERANCE_M = 0.05
 Z_WEIGHT = 0.25
 #: Largest gap between the first and last point of a closed ring.
 CLOSED_M = 0.05
+#: Larger speed limits of a source are not believed.
+MOST_LIMIT_MPS = 100.0
+PIECE_M = 10.0
+#: A closed ring is cut into at least this many pieces, so that each has a direction.
+RING_PIECES = 4
+#: Pieces rank by rings of this width around the log of the ego.
+RING_M = 50.0
 
 
 @dataclass(frozen=True)
@@ -171,3 +180,97 @@ def inside_box(
     """Return whether points lie in the axis-aligned box of a trajectory, widened by a margin."""
     low, high = path.min(axis=0) - margin_m, path.max(axis=0) + margin_m
     return np.all((xy >= low) & (xy <= high), axis=1)
+
+
+def known_limit(feature: MapFeature) -> float:
+    """Plausible speed limit of a lane in m/s, else -1."""
+    limit = feature.limit_mps if feature.kind in LANE_KINDS else None
+    return limit if limit is not None and 0.0 < limit <= MOST_LIMIT_MPS else -1.0
+
+
+@dataclass(frozen=True)
+class RoadRows:
+    """Pieces of road in the local frame, in order of rank.
+
+    Attributes:
+        xy: Midpoint by arc length.
+        direction: Unit vector from the first to the last point.
+        length: Arc length, metres.
+        limit: Speed limit in m/s, -1 unknown or no lane.
+        curvature: Heading change per metre, 1/m, left positive.
+        overflow: Rows that did not fit, by name.
+    """
+
+    xy: Float[Array, "row 2"]
+    direction: Float[Array, "row 2"]
+    length: Float[Array, " row"]
+    kind: Int[Array, " row"]
+    limit: Float[Array, " row"]
+    curvature: Float[Array, " row"]
+    overflow: dict[str, int]
+
+
+def road_rows(
+    roads: RoadLines, features: Sequence[MapFeature], path: Float[Array, "step 2"], margin_m: float, most: int
+) -> RoadRows:
+    """Cut lanes, road edges and crosswalks into pieces and keep the ``most`` highest ranks.
+
+    Pieces whose midpoint lies more than ``margin_m`` outside the box of ``path``, the log of the ego, are left out.
+    """
+    line = np.flatnonzero(np.isin(roads.kind, (*LANE_KINDS, *EDGE_KINDS, RoadKind.CROSSWALK)))
+    length = roads.lines.length[line]
+    pieces = np.maximum(cut_counts(length, PIECE_M), np.where(roads.closed[line], RING_PIECES, 1))
+    owner = np.repeat(line, pieces)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    span = np.repeat(length / pieces, pieces)
+    begin = number * span
+    middle = roads.lines.at(owner, begin + span / 2)[..., :2]
+    near = np.flatnonzero(inside_box(middle, path, margin_m)) if len(owner) else np.zeros(0, dtype=np.int64)
+    owner, begin, span, middle = owner[near], begin[near], span[near], middle[near]
+    kind = roads.kind[owner]
+    group = np.where(among(kind, LANE_KINDS), 0, np.where(among(kind, EDGE_KINDS), 1, 2))
+    order = rank(group, path_distance(middle, path))[:most]
+    overflow = +Counter(road_rows=len(owner) - len(order))
+    owner, begin, span, middle, kind = owner[order], begin[order], span[order], middle[order], kind[order]
+    angle = _angle(roads, owner, begin, begin + span)
+    first, last = _angle(roads, owner, begin, begin + span / 3), begin + span * 2 / 3
+    turn = wrap(_angle(roads, owner, last, begin + span) - first)
+    limits = np.array([known_limit(feature) for feature in features], dtype=np.float64)
+    return RoadRows(
+        xy=middle,
+        direction=np.stack((np.cos(angle), np.sin(angle)), axis=-1),
+        length=span,
+        kind=kind,
+        limit=limits[roads.feature[owner]] if len(owner) else np.zeros(0),
+        # Rounded: the last bits of angles depend on the processor.
+        curvature=np.round(turn / (span * 2 / 3), 6) + 0.0,
+        overflow=overflow,
+    )
+
+
+def _angle(roads: RoadLines, line: Array, begin: Array, end: Array) -> Float[Array, " row"]:
+    """Angle of the chord between two arc lengths of each polyline."""
+    chord = roads.lines.at(line, end) - roads.lines.at(line, begin)
+    return np.arctan2(chord[..., 1], chord[..., 0])
+
+
+def rank(group: Int[Array, " row"], far: Float[Array, " row"]) -> Int[Array, " row"]:
+    """Order pieces so that every prefix spreads evenly over each group, nearer rings first.
+
+    Within a ring of 50 m around the log, the rows of a group (in order along the map) are taken in bit-reversed
+    order (van der Corput's sequence), and the groups are interleaved in proportion to their sizes.
+    """
+    ring = np.floor(far / RING_M).astype(np.int64)
+    label, place = ring * 3 + group, np.zeros(len(group))
+    for number in np.unique(label):
+        members = np.flatnonzero(label == number)
+        place[members] = (_bit_reversed_place(len(members)) + 0.5) / len(members)
+    return np.lexsort((np.arange(len(group)), place, ring))
+
+
+def _bit_reversed_place(count: int) -> Int[Array, " count"]:
+    """Rank of each of ``count`` items in the order of their bit-reversed indices."""
+    bits = max(int(count - 1).bit_length(), 1)
+    index = np.arange(count)
+    reverse = sum(((index >> bit) & 1) << (bits - 1 - bit) for bit in range(bits))
+    return np.argsort(np.argsort(reverse))
