@@ -12,12 +12,12 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, wrap
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.scenario.bank.passages import lane_passage
 from drivax.scenario.bank.queries import (
     OFFROAD_TOLERANCE_M,
     LaneHits,
     around_lanes,
     is_mapped,
+    lane_passage,
     left_the_map,
     offroad_distance,
     project_on_route,

@@ -200,13 +200,13 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
 
 @reward_term("lane_changed")
 def lane_change(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 at the step that enters a neighbouring lane of the same direction (``scenario.bank.passages``)."""
+    """1 at the step that enters a neighbouring lane of the same direction (``scenario.bank.lane_passage``)."""
     return _event(now.lane_changed)
 
 
 @reward_term("merged")
 def merge(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 at the step that leaves a lane that ends within 100 m, or joins another (``scenario.bank.passages``)."""
+    """1 at the step that leaves a lane that ends within 100 m, or joins another (``scenario.bank.lane_passage``)."""
     return _event(now.merged)
 
 

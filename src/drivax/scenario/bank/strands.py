@@ -2,7 +2,7 @@
 
 A strand is a sequence of lanes that continue each other. Where several lanes begin or end, the lane with the smallest
 change of course continues the strand; the others belong to other strands. Passing to an adjacent strand is a lane
-change (``scenario.bank.passages``).
+change (``scenario.bank.queries.lane_passage``).
 """
 
 from __future__ import annotations
