@@ -154,7 +154,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     whole = lane_graph(recording.features, origin)
     on = LaneSegments.of(segments, whole)
     intent, unknown = _intent(recording, whole)
-    routes = find_routes(whole, on, log, intent, style, capacity.routes, capacity.route_points)
+    routes = find_routes(on, log, intent, style, capacity.routes, capacity.route_points)
     marked = (*recording.to_predict, *recording.of_interest)
     placement = place(tracks, marked, capacity.agents, capacity.parked)
     on_route = _lanes_of(routes)
@@ -171,7 +171,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     parts = Parts(
         tracks=tracks,
         placement=placement,
-        extension=extend(tracks, placement.moving, whole, on, capacity.extension),
+        extension=extend(tracks, placement.moving, on, capacity.extension),
         graph=graph,
         routes=_renumber(routes, keep, whole.count),
         grid=grid,
@@ -179,7 +179,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
         roads=roads,
         polylines=polylines,
         rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),
-        lights=place_lights(recording.lights, graph, stored_on, origin, path, capacity.lights),
+        lights=place_lights(recording.lights, stored_on, origin, path, capacity.lights),
         stops=place_stops(recording.features, graph, origin, path, capacity.stops),
     )
     overflow = _overflow(parts, recording, capacity, {"lanes": lost_lanes, "features": lost_features})

@@ -42,12 +42,9 @@ class LaneGraph:
     """Lanes with dense indices and their links; everything in the local frame, float64.
 
     Attributes:
-        lines: Centre lines, one per lane.
-        feature: Row of the source feature.
-        lane_id: Feature id in the source.
-        kind: Road kind.
-        width: Metres, -1 unknown.
-        limit: Speed limit in m/s, -1 unknown.
+        lines: Centre lines.
+        feature, lane_id: Row and id of the source feature.
+        width, limit: Metres and m/s, -1 unknown.
         interpolating: Turn paths inside junctions (WOMD).
         successor, predecessor: Dense indices, -1 padded, the straightest first.
         left, right: Neighbours in the same direction, -1 none.
@@ -80,20 +77,15 @@ class LaneGraph:
         return len(self.lane_id)
 
     @property
-    def linked(self) -> bool:
-        """Whether any lane has a successor."""
-        return bool((self.successor >= 0).any())
-
-    @property
     def flags(self) -> Flag:
         """Flags that the graph justifies."""
-        flags = Flag.LANE_GRAPH if self.linked else Flag.NONE
-        if self.linked and self.chained:
-            flags |= Flag.CHAINED_GRAPH
-        return flags | (Flag.SPEED_LIMITS if (self.limit > 0).any() else Flag.NONE)
+        flags = Flag.SPEED_LIMITS if (self.limit > 0).any() else Flag.NONE
+        if not (self.successor >= 0).any():
+            return flags
+        return flags | Flag.LANE_GRAPH | (Flag.CHAINED_GRAPH if self.chained else Flag.NONE)
 
     def index(self) -> dict[int, int]:
-        """Dense index of every source id."""
+        """Return the dense index of every source id."""
         return {int(lane): i for i, lane in enumerate(self.lane_id)}
 
     def neighbours(self, lane: int) -> list[tuple[int, float]]:
@@ -116,7 +108,7 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
         raise DataError(f"two lanes have the id {twice}", cure="give every map feature its own id")
     index = {lane_id: i for i, lane_id in enumerate(ids)}
     lines = Polylines.of([np.asarray(lane.points, dtype=np.float64) - origin for lane in lanes])
-    begin, end = _end_headings(lines)
+    begin, end = end_headings(lines)
     kind = np.array([lane.kind for lane in lanes], dtype=np.int64)
     pairs = _linked_pairs(lanes, index)
     has_links = any(f.successors or f.predecessors for f in lanes)
@@ -163,8 +155,8 @@ def _has_length(points: Array) -> bool:
     return len(points) >= 2 and bool(np.any(np.abs(points[:, :2] - points[0, :2]) > 1e-3))
 
 
-def _end_headings(lines: Polylines) -> tuple[Float[Array, " lane"], Float[Array, " lane"]]:
-    """Headings at the first and at the last point of every lane."""
+def end_headings(lines: Polylines) -> tuple[Float[Array, " lane"], Float[Array, " lane"]]:
+    """Return the headings at the first and at the last point of every lane."""
     row = np.arange(lines.count)
     return lines.heading(row, np.zeros(lines.count), END_SPAN_M), lines.heading(row, lines.length, END_SPAN_M)
 
@@ -173,12 +165,8 @@ def _linked_pairs(lanes: Sequence[MapFeature], index: Mapping[int, int]) -> list
     """(lane, successor) pairs named by either side; dangling and self links dropped, order kept."""
     pairs: dict[tuple[int, int], None] = {}
     for i, lane in enumerate(lanes):
-        for other in lane.successors:
-            if index.get(other, i) != i:
-                pairs[i, index[other]] = None
-        for other in lane.predecessors:
-            if index.get(other, i) != i:
-                pairs[index[other], i] = None
+        pairs |= dict.fromkeys((i, index[j]) for j in lane.successors if index.get(j, i) != i)
+        pairs |= dict.fromkeys((index[j], i) for j in lane.predecessors if index.get(j, i) != i)
     return list(pairs)
 
 
@@ -272,7 +260,7 @@ def select(graph: LaneGraph, rows: Int[Array, " kept"]) -> LaneGraph:
     """Return the graph of these lanes with new dense indices; links to other lanes are dropped."""
     new = np.full(graph.count + 1, -1)
     new[rows] = np.arange(len(rows))
-    lines = [graph.lines.points[graph.lines.start[i] : graph.lines.start[i + 1]] for i in rows]
+    lines = [graph.lines.line(i) for i in rows]
     per_lane = ("feature", "lane_id", "kind", "width", "limit", "interpolating", "left_shift", "right_shift")
     return replace(
         graph,
@@ -292,44 +280,38 @@ def _compact(links: Int[Array, "lane 4"]) -> Int[Array, "lane 4"]:
 
 @dataclass(frozen=True)
 class LaneSegments:
-    """Segments of lanes, to look up the lanes under a pose.
+    """Car-lane segments of a lane graph, to look up the lanes under a pose.
 
     Attributes:
-        segments: Segments of car lanes.
-        lane: Dense lane index of each.
-        heading: Direction of each, radians.
+        lane: Dense lane index of each segment.
+        heading: Direction of each segment, radians.
     """
 
+    graph: LaneGraph
     segments: Segments
     lane: Int[Array, " segment"]
     heading: Float[Array, " segment"]
 
     @classmethod
     def of(cls, segments: Segments, graph: LaneGraph) -> LaneSegments:
-        """Car-lane segments among ``segments``, keyed by the graph's dense indices."""
+        """Select the segments of the car lanes of a graph."""
         rows = np.flatnonzero(among(segments.kind, CAR_LANE_KINDS))
         lane = lane_of_feature(graph, segments.feature[rows])
-        rows, lane = rows[lane >= 0], lane[lane >= 0]
-        kept = segments.take(rows)
+        kept = segments.take(rows[lane >= 0])
         step = kept.b - kept.a
-        return cls(kept, lane, np.arctan2(step[:, 1], step[:, 0]))
+        return cls(graph, kept, lane[lane >= 0], np.arctan2(step[:, 1], step[:, 0]))
 
     def nearest(
         self, xyz: Float[Array, "pose 3"], heading: Float[Array, " pose"], reach_m: float, turn_rad: float
     ) -> tuple[Int[Array, " pose"], Float[Array, " pose"], Float[Array, " pose"]]:
-        """Nearest lane of each pose within reach, heading difference and level.
-
-        Returns:
-            Dense lane index (-1 none), arc length on it, distance from it in metres.
-        """
+        """Nearest lane of each pose within reach, turn and level (-1 none), arc length on it, and distance from it."""
         near = self._near(xyz[:, :2], reach_m)
         if not len(near.lane):
             return np.full(len(xyz), -1), np.zeros(len(xyz)), np.full(len(xyz), np.inf)
         distance, s = near._measure(xyz, heading, turn_rad)
         best = distance.argmin(axis=1)
-        rows = np.arange(len(xyz))
-        reached = distance[rows, best] <= reach_m
-        return np.where(reached, near.lane[best], -1), s[rows, best], distance[rows, best]
+        here = np.arange(len(xyz)), best
+        return np.where(distance[here] <= reach_m, near.lane[best], -1), s[here], distance[here]
 
     def around(
         self, xyz: Float[Array, " 3"], heading: float, reach_m: float, turn_rad: float
@@ -347,10 +329,10 @@ class LaneSegments:
 
     def _near(self, xy: Float[Array, "pose 2"], reach_m: float) -> LaneSegments:
         """Segments in the box of the poses, widened by the reach."""
-        if len(xy) == 0 or len(self.segments) == 0:
-            return LaneSegments(self.segments.take(np.zeros(0, int)), self.lane[:0], self.heading[:0])
-        rows = np.flatnonzero(inside_box(self.segments.a[:, :2], xy, reach_m + LONGEST_M))
-        return LaneSegments(self.segments.take(rows), self.lane[rows], self.heading[rows])
+        rows = np.zeros(0, int)
+        if len(xy) and len(self.segments):
+            rows = np.flatnonzero(inside_box(self.segments.a[:, :2], xy, reach_m + LONGEST_M))
+        return LaneSegments(self.graph, self.segments.take(rows), self.lane[rows], self.heading[rows])
 
     def _measure(self, xyz: Array, heading: Array, turn_rad: float) -> tuple[Array, Array]:
         """Distance (infinite where gated) and arc length of every pose on every segment."""
@@ -363,7 +345,7 @@ class LaneSegments:
 
 
 def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:
-    """Dense lane index of source features, -1 for those that are no lane of the graph."""
+    """Return the dense lane index of source features, -1 for those that are no lane of the graph."""
     size = max(int(graph.feature.max(initial=-1)), int(feature.max(initial=-1))) + 2
     table = np.full(size, -1)
     table[graph.feature] = np.arange(graph.count)

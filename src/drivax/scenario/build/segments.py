@@ -174,6 +174,15 @@ def thin_path(xy: Float[Array, "step 2"], spacing_m: float = 5.0) -> Float[Array
     return xy[keep]
 
 
+def spaced(xy: Float[Array, "step 2"], least_m: float) -> list[int]:
+    """Return the first position and those at least ``least_m`` from the one kept before."""
+    keep = [0]
+    for i in range(1, len(xy)):
+        if np.hypot(*(xy[i] - xy[keep[-1]])) >= least_m:
+            keep.append(i)
+    return keep
+
+
 def inside_box(
     xy: Float[Array, "point 2"], path: Float[Array, "step 2"], margin_m: float
 ) -> Bool[Array, " point"]:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from drivax.geometry.polylines import left_normals
 from drivax.geometry.vectors import wrap
 from drivax.scenario.build.lane_paths import walk
-from drivax.scenario.build.lanes import LaneGraph, LaneSegments
+from drivax.scenario.build.lanes import LaneSegments
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind, among
 
@@ -44,12 +45,9 @@ MOST_SIZE_M = 100.0
 
 @dataclass(frozen=True)
 class LocalTracks:
-    """Tracks in the local frame, float64, cleaned: zeros where not valid, headings wrapped.
+    """Tracks in the local frame, float64: box centres, headings in [-pi, pi), m/s; zeros where not valid.
 
     Attributes:
-        xyz: Box centres, metres.
-        heading: Radians in [-pi, pi).
-        velocity: m/s.
         size: Median length, width and height over the valid steps, metres.
         ego: Row of the ego.
         defaulted: Number of tracks with a default size.
@@ -173,7 +171,7 @@ def _rank(
 
 
 def extend(
-    tracks: LocalTracks, rows: Int[Array, " slot"], graph: LaneGraph, on: LaneSegments, count: int
+    tracks: LocalTracks, rows: Int[Array, " slot"], on: LaneSegments, count: int
 ) -> Float[Array, "slot count 2"]:
     """Extend tracks by ``count`` points 4 m apart beyond their last valid pose: along their lane, else straight on.
 
@@ -190,14 +188,10 @@ def extend(
     follows = np.flatnonzero((lane >= 0) & drives)
     if len(follows) == 0:
         return points
-    foot = graph.lines.at(lane[follows], s[follows])[..., :2]
-    normal = _left_normal(graph.lines.heading(lane[follows], s[follows]))
-    lateral = np.einsum("ai,ai->a", xyz[follows, :2] - foot, normal)
-    ahead, lane_heading = walk(graph, lane[follows], s[follows], EXTENSION_STEP_M, count)
+    lines, lane, s = on.graph.lines, lane[follows], s[follows]
+    offset = xyz[follows, :2] - lines.at(lane, s)[..., :2]
+    lateral = np.einsum("ai,ai->a", offset, left_normals(lines.heading(lane, s)))
+    ahead, lane_heading = walk(on.graph, lane, s, EXTENSION_STEP_M, count)
     fade = np.maximum(1.0 - distance / FADE_M, 0.0)
-    points[follows] = ahead + (lateral[:, None] * fade)[..., None] * _left_normal(lane_heading)
+    points[follows] = ahead + (lateral[:, None] * fade)[..., None] * left_normals(lane_heading)
     return points
-
-
-def _left_normal(heading: Float[Array, "*pose"]) -> Float[Array, "*pose 2"]:
-    return np.stack((-np.sin(heading), np.cos(heading)), axis=-1)

@@ -15,9 +15,10 @@ from jaxtyping import Bool, Float, Int
 
 from drivax.geometry.polylines import arc_lengths
 from drivax.geometry.vectors import wrap
-from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph
+from drivax.scenario.build.lanes import LaneGraph, end_headings
 from drivax.scenario.build.lights import Lights
 from drivax.scenario.build.routes import STEP_M, RouteSet
+from drivax.scenario.build.segments import spaced
 from drivax.scenario.build.tracks import LocalTracks
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import DT_S, AgentKind, Flag, among
@@ -75,10 +76,7 @@ class Driven:
         """Build from the track of the ego and the route of its log, which is left out where only one is stored."""
         valid = tracks.valid[tracks.ego]
         xy, heading = tracks.xyz[tracks.ego, valid, :2], tracks.heading[tracks.ego, valid]
-        keep = [0]
-        for i in range(1, len(xy)):
-            if np.hypot(*(xy[i] - xy[keep[-1]])) >= STEP_M:
-                keep.append(i)
+        keep = spaced(xy, STEP_M)
         arc = arc_lengths(xy[keep])
         lane = routes.routes[1].lane if len(routes.routes) > 1 else np.zeros(0, dtype=np.int64)
         return cls(arc, np.unwrap(heading[keep]), lane[: int(arc[-1]) + 1])
@@ -148,10 +146,7 @@ def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
     result = graph.interpolating.copy()
     if graph.count == 0:
         return result
-    row = np.arange(graph.count)
-    begin, end = (
-        graph.lines.heading(row, s, END_SPAN_M) for s in (np.zeros(graph.count), graph.lines.length)
-    )
+    begin, end = end_headings(graph.lines)
     for links, heading in ((graph.successor, end), (graph.predecessor, begin)):
         angle = wrap(heading[links][:, :, None] - heading[links][:, None])
         both = (links >= 0)[:, :, None] & (links >= 0)[:, None]
