@@ -56,7 +56,7 @@ class Polylines:
             return np.zeros(0)
         return np.where(np.diff(self.start) > 0, self.arc[np.maximum(self.start[1:] - 1, 0)], 0.0)
 
-    def line(self, row: int | np.integer[Any]) -> Float[Array, "_ dim"]:
+    def line(self, row: Any) -> Float[Array, "_ dim"]:
         """Points of a polyline."""
         return self.points[self.start[row] : self.start[row + 1]]
 

@@ -8,6 +8,7 @@ grid; ``tests/scenario/test_queries.py`` compares with brute force. Segments mor
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
