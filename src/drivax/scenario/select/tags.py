@@ -59,12 +59,9 @@ BRAKING_MPS = 2.0
 
 @dataclass(frozen=True)
 class Driven:
-    """Log of the ego as poses at least half a metre apart.
+    """Log of the ego as poses at least half a metre apart: distance driven, unwrapped headings.
 
-    Attributes:
-        arc: Distance driven, metres.
-        heading: Unwrapped, radians.
-        lane: Dense lane index under every metre of the log, -1 without a lane.
+    ``lane`` is the dense index of the lane under every metre of the log, -1 without one.
     """
 
     arc: Float[Array, " pose"]
@@ -73,7 +70,7 @@ class Driven:
 
     @classmethod
     def of(cls, tracks: LocalTracks, routes: RouteSet) -> Driven:
-        """Build from the track of the ego and the route of its log, which is left out where only one is stored."""
+        """Build from the track of the ego and the route of its log (row 1, if stored)."""
         valid = tracks.valid[tracks.ego]
         xy, heading = tracks.xyz[tracks.ego, valid, :2], tracks.heading[tracks.ego, valid]
         keep = spaced(xy, STEP_M)
@@ -158,27 +155,17 @@ def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
 def _merges(lane: Int[Array, " metre"], graph: LaneGraph, junction: Bool[Array, " lane"]) -> bool:
     """Return whether the log continues on a lane that another lane enters, neither in a junction."""
     changes = np.flatnonzero(lane[1:] != lane[:-1])
-    for a, b in zip(lane[changes], lane[changes + 1], strict=True):
-        into = graph.predecessor[b]
-        into = into[into >= 0]
-        if a in into and len(into) > 1 and not junction[into].any():
-            return True
-    return False
+    entries = ((a, graph.predecessor[b]) for a, b in zip(lane[changes], lane[changes + 1], strict=True))
+    entries = ((a, into[into >= 0]) for a, into in entries)
+    return any(a in into and len(into) > 1 and not junction[into].any() for a, into in entries)
 
 
 def density_of(tracks: LocalTracks, current_step: int) -> str:
     """Return the density of road users within 50 m at the current step: below 5, 5 to 19, 20 or more."""
-    here = tracks.valid[:, current_step] & _is_road_user(tracks)
-    apart = np.hypot(*(tracks.xyz[:, current_step, :2] - tracks.xyz[tracks.ego, current_step, :2]).T)
-    count = int((here & (apart <= NEAR_M)).sum())
-    return TAGS["density"][int(np.searchsorted(DENSITY, count, side="right"))]
-
-
-def _is_road_user(tracks: LocalTracks) -> Bool[Array, " track"]:
-    """Mask of vehicles, pedestrians and cyclists other than the ego."""
     users = among(tracks.kind, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST))
     users[tracks.ego] = False
-    return users
+    apart = _apart(tracks, np.flatnonzero(users))[:, current_step]
+    return TAGS["density"][int(np.searchsorted(DENSITY, (apart <= NEAR_M).sum(), side="right"))]
 
 
 def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
@@ -188,10 +175,11 @@ def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
     within 15 m; a vehicle at 1 m/s or more within 20 m that crosses ego's heading at 45 to 135 degrees; and the log's
     ego losing 2 m/s of speed within a second. Distances are between centres at the same step, at any step of the log.
     """
+    vulnerable = np.flatnonzero(among(tracks.kind, (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)))
     demands = (
         kind not in ("straight", "lane_follow"),
         density == "high",
-        _meets_vulnerable(tracks),
+        bool((_apart(tracks, vulnerable) <= VULNERABLE_M).any()),
         _meets_crossing(tracks),
         _brakes(tracks),
     )
@@ -203,11 +191,6 @@ def _apart(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array, "row t
     offset = tracks.xyz[rows, :, :2] - tracks.xyz[tracks.ego, :, :2]
     both = tracks.valid[rows] & tracks.valid[tracks.ego]
     return np.where(both, np.hypot(offset[..., 0], offset[..., 1]), np.inf)
-
-
-def _meets_vulnerable(tracks: LocalTracks) -> bool:
-    rows = np.flatnonzero(among(tracks.kind, (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)))
-    return bool((_apart(tracks, rows) <= VULNERABLE_M).any())
 
 
 def _meets_crossing(tracks: LocalTracks) -> bool:
