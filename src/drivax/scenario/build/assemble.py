@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from drivax.errors import DataError
-from drivax.scenario.build.grid import GridSegments, arrange, cell_sides
+from drivax.scenario.build.grid import EDGE_BLOCK, LANE_BLOCK, GridSegments, arrange, cell_sides
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments, lane_graph, lane_of_feature, select
 from drivax.scenario.build.lights import Lights, Stops, place_lights, place_stops
 from drivax.scenario.build.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
@@ -125,12 +125,10 @@ def count_source(recording: Recording) -> SourceCounts:
 def assemble(
     recording: Recording, capacity: Capacity = CAPACITIES["default"], routes: RouteStyle = "graph"
 ) -> Scenario:
-    """Assemble a scenario from a recording.
+    """Assemble a scenario from a recording of at most ``capacity.steps`` steps (cut longer ones with ``windows``).
 
-    Args:
-        recording: At most ``capacity.steps`` steps; cut longer recordings with ``windows``.
-        capacity: Padded sizes; the farthest items from the ego's log that do not fit are counted in ``overflow``.
-        routes: Source of candidate routes (``scenario.build.routes``).
+    Items that do not fit the capacity, those farthest from the ego's log, are left out and counted in ``overflow``.
+    ``routes`` is the source of candidate routes (``scenario.build.routes``).
 
     Raises:
         DataError: The recording is invalid.
@@ -151,23 +149,22 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     roads = road_lines(recording.features, origin, recording.split_gap_m)
     _refuse_endless(roads)
     segments = cut(roads)
+    block = segments.block
     whole = lane_graph(recording.features, origin)
     on = LaneSegments.of(segments, whole)
     intent, unknown = _intent(recording, whole)
     routes = find_routes(on, log, intent, style, capacity.routes, capacity.route_points)
-    marked = (*recording.to_predict, *recording.of_interest)
-    placement = place(tracks, marked, capacity.agents, capacity.parked)
-    on_route = _lanes_of(routes)
+    on_route = np.unique(np.concatenate([route.lane for route in routes.routes]))
+    on_route = on_route[on_route >= 0]
     inside = inside_box(segments.middle, path, MARGIN_M)
     inside |= np.isin(segments.feature, whole.feature[on_route])
     grid = arrange(segments.take(inside), path, capacity)
     keep, lost_lanes = _kept_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
     graph = select(whole, keep)
     polylines, lost_features = _kept_polylines(roads, grid, path, capacity.features)
-    is_lane = among(segments.kind, CAR_LANE_KINDS)
-    is_edge, is_ring = among(segments.kind, EDGE_KINDS), roads.closed[among(roads.kind, EDGE_KINDS)]
-    rings = len(is_ring) > 0 and bool(is_ring.all())
-    stored_on = LaneSegments.of(segments, graph)
+    marked = (*recording.to_predict, *recording.of_interest)
+    placement = place(tracks, marked, capacity.agents, capacity.parked)
+    edges, lanes = segments.take(block == EDGE_BLOCK), segments.take(block == LANE_BLOCK)
     parts = Parts(
         tracks=tracks,
         placement=placement,
@@ -175,15 +172,17 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
         graph=graph,
         routes=_renumber(routes, keep, whole.count),
         grid=grid,
-        sides=cell_sides(grid.grid, segments.take(is_edge), segments.take(is_lane).middle, rings),
+        sides=cell_sides(grid.grid, edges, lanes.middle, roads.rings_closed),
         roads=roads,
         polylines=polylines,
         rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),
-        lights=place_lights(recording.lights, stored_on, origin, path, capacity.lights),
+        lights=place_lights(
+            recording.lights, LaneSegments.of(segments, graph), origin, path, capacity.lights
+        ),
         stops=place_stops(recording.features, graph, origin, path, capacity.stops),
     )
     overflow = _overflow(parts, recording, capacity, {"lanes": lost_lanes, "features": lost_features})
-    flags = _flags(recording, parts, rings, capacity)
+    flags = _flags(recording, parts, capacity)
     flags |= Flag.OVERFLOW if overflow else Flag.NONE
     return Scenario(
         record=fill(parts, recording, capacity, origin, flags),
@@ -222,12 +221,6 @@ def ego_log(tracks: LocalTracks, current_step: int) -> EgoLog:
     row = tracks.ego
     speed = np.hypot(*tracks.velocity[row].T)
     return EgoLog(tracks.xyz[row], tracks.heading[row], speed, tracks.valid[row], current_step)
-
-
-def _lanes_of(routes: RouteSet) -> Int[Array, " lane"]:
-    """Return the dense indices of all lanes under routes."""
-    lanes = np.unique(np.concatenate([route.lane for route in routes.routes]))
-    return lanes[lanes >= 0]
 
 
 def _kept_lanes(
@@ -279,14 +272,14 @@ def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict
     return dict(+Counter(counts))
 
 
-def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) -> Flag:
+def _flags(recording: Recording, parts: Parts, capacity: Capacity) -> Flag:
     """Flags of the reader, with those that are measured here."""
     heights = parts.roads.lines.points[:, 2]
     facts = (
         (Flag.LIGHTS, len(parts.lights.z) > 0),
         (Flag.NO_FUTURE, len(recording.timestamps_s) < capacity.steps),
         (Flag.DEFAULT_SIZES, parts.tracks.defaulted > 0),
-        (Flag.CLOSED_EDGES, rings),
+        (Flag.CLOSED_EDGES, parts.roads.rings_closed),
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
         (Flag.ROUTE, parts.routes.on_lanes),
         (Flag.DEFAULT_LIMITS, ((parts.graph.limit <= 0) & among(parts.graph.kind, _LIMITED_KINDS)).any()),

@@ -37,11 +37,8 @@ RING_M = 50.0
 class RoadLines:
     """All drawn map features as polylines in the local frame: split at clipping gaps, polygons closed.
 
-    Attributes:
-        lines: The polylines; ``lines.arc`` is measured per polyline.
-        feature: Row of the source feature.
-        closed: Mask of closed rings.
-        arc: Arc length of every point along its source feature (gaps included), metres.
+    ``feature`` is the row of the source feature, ``closed`` the mask of closed rings. ``arc`` is the arc length of every
+    point along its source feature, gaps included (``lines.arc`` that along its polyline), metres.
     """
 
     lines: Polylines
@@ -50,17 +47,18 @@ class RoadLines:
     closed: Bool[Array, " polyline"]
     arc: Float[Array, " point"]
 
+    @property
+    def rings_closed(self) -> bool:
+        """Whether there are road edges, and all of them are closed rings."""
+        rings = self.closed[among(self.kind, EDGE_KINDS)]
+        return len(rings) > 0 and bool(rings.all())
+
 
 @dataclass(frozen=True)
 class Segments:
-    """Straight pieces of at most 4 m, in the local frame, float64.
+    """Straight pieces of at most 4 m from ``a`` to ``b``, in the local frame, float64.
 
-    Attributes:
-        a, b: Start and end points.
-        polyline: Row of the polyline.
-        feature: Row of the source feature.
-        start_m: Arc length at ``a`` along the source feature.
-        span_m: Arc length between ``a`` and ``b`` along the source feature.
+    ``start_m`` is the arc length at ``a``, and ``span_m`` that from ``a`` to ``b``, both along the source feature.
     """
 
     a: Float[Array, "segment 3"]
@@ -94,7 +92,7 @@ class Segments:
 def road_lines(
     features: Sequence[MapFeature], origin: Float[Array, " 3"], split_gap_m: float | None
 ) -> RoadLines:
-    """Features of two or more points as polylines in the local frame; stop signs are left out.
+    """Draw features of two or more points, other than stop signs, as polylines in the local frame.
 
     Polylines other than polygons are split where neighbouring points are more than ``split_gap_m`` apart.
     """
@@ -107,9 +105,8 @@ def road_lines(
     if split_gap_m is not None and len(points):
         step = np.hypot(*np.diff(points[:, :2], axis=0, prepend=points[:1, :2]).T)
         breaks |= (step > split_gap_m) & ~among(kind, POLYGON_KINDS)[whole.row]
-    source = whole.row
     lines, keep = _long_enough(points, np.flatnonzero(breaks))
-    row = source[keep][lines.start[:-1]]
+    row = whole.row[keep][lines.start[:-1]]
     first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
     closed = (np.hypot(*(last - first)[:, :2].T) <= CLOSED_M) & (np.diff(lines.start) >= 4)
     lines.points[lines.start[1:][closed] - 1] = first[closed]
@@ -126,13 +123,12 @@ def _outline(feature: MapFeature) -> Array:
 
 def _long_enough(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " point"]]:
     """Polylines that begin at these points, and the mask of their points; those without length are left out."""
-    start = np.concatenate((begin, [len(points)])).astype(np.int64)
+    start = np.append(begin, len(points))
     counts = np.diff(start)
     arc = arc_lengths(points, start)
     long = (counts >= 2) & (arc[start[1:] - 1] > 1e-3) if len(points) else counts >= 2
     keep = np.repeat(long, counts)
-    kept_start = np.concatenate(([0], np.cumsum(counts[long]))).astype(np.int64)
-    return Polylines(points[keep], kept_start, arc[keep]), keep
+    return Polylines(points[keep], np.concatenate(([0], np.cumsum(counts[long]))), arc[keep]), keep
 
 
 def cut(roads: RoadLines) -> Segments:
@@ -201,13 +197,8 @@ def known_limit(feature: MapFeature) -> float:
 class RoadRows:
     """Pieces of road in the local frame, in order of rank.
 
-    Attributes:
-        xy: Midpoint by arc length.
-        direction: Unit vector from the first to the last point.
-        length: Arc length, metres.
-        limit: Speed limit in m/s, -1 unknown or no lane.
-        curvature: Heading change per metre, 1/m, left positive.
-        overflow: Rows that did not fit, by name.
+    Each has its midpoint by arc length, unit vector from its first to its last point, arc length (m), speed limit (m/s,
+    -1 unknown or no lane), and curvature (1/m, left positive).
     """
 
     xy: Float[Array, "row 2"]
@@ -234,7 +225,7 @@ def road_rows(
     span = np.repeat(length / pieces, pieces)
     begin = number * span
     middle = roads.lines.at(owner, begin + span / 2)[..., :2]
-    near = np.flatnonzero(inside_box(middle, path, margin_m)) if len(owner) else np.zeros(0, dtype=np.int64)
+    near = np.flatnonzero(inside_box(middle, path, margin_m))
     owner, begin, span, middle = owner[near], begin[near], span[near], middle[near]
     kind = roads.kind[owner]
     group = np.where(among(kind, LANE_KINDS), 0, np.where(among(kind, EDGE_KINDS), 1, 2))
