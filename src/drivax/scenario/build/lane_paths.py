@@ -42,17 +42,15 @@ EAGERNESS = 0.1
 
 @dataclass(frozen=True)
 class LanePath:
-    """A sequence of lanes, each a successor or neighbour of the previous one.
+    """A sequence of lanes, each a successor or neighbour of the previous one; metres.
 
     Attributes:
         lanes: Dense indices, from the lane of the ego on.
-        s: Arc length of the ego on the first lane.
-        ahead: Distance from the ego to the beginning of the last lane, metres.
+        s, lateral: Arc length of the ego on the first lane, and its distance from it.
+        ahead: Distance from the ego to the beginning of the last lane.
         entry: Arc length on the last lane at which it is entered.
-        penalty: Cost of lane changes, turns and lateral distance, metres.
-        changes: Number of lane changes.
-        until: Distance from the ego to the goal, metres; infinite without one.
-        lateral: Distance of the ego from the first lane, metres.
+        penalty: Cost of lane changes, turns and lateral distance.
+        until: Distance from the ego to the goal; infinite without one.
     """
 
     lanes: tuple[int, ...]
@@ -94,10 +92,7 @@ class LaneSearch:
         cls, on: LaneSegments, xyz: Float[Array, "3"], heading: float, need_m: float,
         corridor: Collection[int] = (),
     ) -> LaneSearch:  # fmt: skip
-        """Start a search at the lanes within 4 m and 60 degrees of a pose.
-
-        ``corridor`` holds the lanes that the intended route may use; empty means any.
-        """
+        """Start at the lanes within 4 m and 60 degrees of a pose; ``corridor`` holds the intended lanes, if known."""
         graph, outside = on.graph, np.zeros(on.graph.count)
         if corridor:
             outside[~np.isin(np.arange(graph.count), list(corridor))] = OUTSIDE_COST_M
@@ -218,11 +213,7 @@ def is_change(graph: LaneGraph, lane: int, following: int) -> bool:
 
 
 def change_room(graph: LaneGraph, lane: int, following: int, entry_m: float) -> tuple[float, float, float]:
-    """Stretch of a lane, from ``entry_m`` on, along which its neighbour runs.
-
-    Returns:
-        Begin and end in arc length of the lane, and the offset to arc length of the neighbour.
-    """
+    """Stretch of a lane, from ``entry_m`` on, along which its neighbour runs, and the shift to its arc length."""
     on_left = graph.left[lane] == following
     shift = float(graph.left_shift[lane] if on_left else graph.right_shift[lane])
     low = max(entry_m, -shift)
@@ -302,10 +293,7 @@ def _blend(graph: LaneGraph, lane: int, following: int, leave: float, length: fl
 
 
 def follow(graph: LaneGraph, lanes: Sequence[int], ahead_m: float, need_m: float) -> tuple[int, ...]:
-    """Continue a sequence of lanes along the straightest successors, from ``ahead_m`` to ``need_m`` ahead of the ego.
-
-    The sequence ends earlier where lanes end or repeat.
-    """
+    """Continue lanes along the straightest successors from ``ahead_m`` to ``need_m``, or until they end or repeat."""
     result = list(lanes)
     while ahead_m < need_m:
         following = int(graph.successor[result[-1], 0])
@@ -319,10 +307,9 @@ def follow(graph: LaneGraph, lanes: Sequence[int], ahead_m: float, need_m: float
 def walk(
     graph: LaneGraph, lane: Int[Array, " start"], s: Float[Array, " start"], step_m: float, count: int
 ) -> tuple[Float[Array, "start count 2"], Float[Array, "start count"]]:
-    """Points ahead along lanes and their straightest successors; straight on where lanes end.
+    """Points and headings along lanes and their straightest successors; straight on where lanes end.
 
-    The first of ``count`` points lies ``step_m`` ahead of arc length ``s`` on each start lane. Returns points and
-    headings.
+    The first of ``count`` points lies ``step_m`` ahead of arc length ``s`` on each start lane.
     """
     distance = step_m * np.arange(1, count + 1)
     chain, begin = [lane], [-s]
@@ -346,12 +333,8 @@ def walk(
 def precede(
     graph: LaneGraph, lane: int, need_m: float, driven: Float[Array, "step 2"]
 ) -> tuple[tuple[int, ...], float]:
-    """Predecessors of a lane along the ego's past positions ``driven``, and their total length.
-
-    They are ``need_m`` long, or less where lanes begin.
-    """
-    result: list[int] = []
-    total = 0.0
+    """Predecessors of a lane along the driven positions, ``need_m`` long where there are as many, and their length."""
+    result, total = list[int](), 0.0
     while total < need_m:
         first = result[0] if result else lane
         options = [int(p) for p in graph.predecessor[first] if p >= 0 and p != lane and p not in result]

@@ -32,6 +32,11 @@ MOST_WIDTH_M = 50.0
 LEVEL_M = 3.0
 #: Headings at lane ends are measured over this chord: the last source points lie close together.
 END_SPAN_M = 2.0
+#: Kinds of links whose loss is counted.
+_DANGLING = {
+    "dangling_links": ("successors", "predecessors"),
+    "dangling_neighbours": ("left_neighbours", "right_neighbours"),
+}
 _SAMPLES = 33
 _PROBES = (0.1, 0.3, 0.5, 0.7, 0.9)
 _CHUNK = 512
@@ -95,12 +100,11 @@ class LaneGraph:
 
 
 def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> LaneGraph:
-    """Build the lane graph of all lanes of two or more points; dangling links are dropped and counted.
-
-    Raises:
-        DataError: Two lanes share an id.
-    """
-    rows = [i for i, f in enumerate(features) if f.kind in LANE_KINDS and _has_length(f.points)]
+    """Build the graph of all lanes of two or more points; dangling links are dropped and counted."""
+    rows = [
+        i for i, feature in enumerate(features)
+        if feature.kind in LANE_KINDS and (np.abs(feature.points - feature.points[0])[:, :2] > 1e-3).any()
+    ]  # fmt: skip
     lanes = [features[i] for i in rows]
     ids = [lane.feature_id for lane in lanes]
     if len(set(ids)) < len(ids):
@@ -119,40 +123,31 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     samples = _samples(lines)
     left, left_shift, left_gap = _adjacent(lanes, index, samples, lines.length, "left_neighbours")
     right, right_shift, right_gap = _adjacent(lanes, index, samples, lines.length, "right_neighbours")
-    gap = np.fmin(left_gap, right_gap)
-    measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
-    given = np.array([lane.width_m for lane in lanes], dtype=np.float64)
-    given[~((given > 0.0) & (given <= MOST_WIDTH_M))] = np.nan
+    dangling = {name: _dangling(lanes, index, *links) for name, links in _DANGLING.items()}
     return LaneGraph(
         lines=lines,
         feature=np.array(rows, dtype=np.int64),
         lane_id=np.array(ids, dtype=np.int64),
         kind=kind,
-        width=np.where(np.isnan(given), measured, given),
+        width=_widths(lanes, np.fmin(left_gap, right_gap)),
         limit=np.array([known_limit(lane) for lane in lanes], dtype=np.float64),
         interpolating=np.array([lane.interpolating for lane in lanes], dtype=bool),
-        successor=successor,
-        predecessor=predecessor,
-        left=left,
-        right=right,
-        left_shift=left_shift,
-        right_shift=right_shift,
-        chained=not has_links,
-        dropped_links=lost + lost_back,
-        lost={
-            "dangling_links": _dangling(lanes, index, ("successors", "predecessors")),
-            "dangling_neighbours": _dangling(lanes, index, ("left_neighbours", "right_neighbours")),
-        },
-    )
+        successor=successor, predecessor=predecessor, left=left, right=right,
+        left_shift=left_shift, right_shift=right_shift,
+        chained=not has_links, dropped_links=lost + lost_back, lost=dangling,
+    )  # fmt: skip
 
 
-def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], names: Sequence[str]) -> int:
+def _widths(lanes: Sequence[MapFeature], gap: Float[Array, " lane"]) -> Float[Array, " lane"]:
+    """Width of every lane: that of the source, else the gap to a neighbour, else -1."""
+    width = np.array([lane.width_m for lane in lanes], dtype=np.float64)
+    measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
+    return np.where((width > 0.0) & (width <= MOST_WIDTH_M), width, measured)
+
+
+def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], *names: str) -> int:
     """Number of links of these kinds to missing lanes."""
     return sum(other not in index for lane in lanes for name in names for other in getattr(lane, name))
-
-
-def _has_length(points: Array) -> bool:
-    return len(points) >= 2 and bool(np.any(np.abs(points[:, :2] - points[0, :2]) > 1e-3))
 
 
 def end_headings(lines: Polylines) -> tuple[Float[Array, " lane"], Float[Array, " lane"]]:
@@ -172,8 +167,6 @@ def _linked_pairs(lanes: Sequence[MapFeature], index: Mapping[int, int]) -> list
 
 def _chained_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) -> list[tuple[int, int]]:
     """Pairs of lanes where the end of the first meets the beginning of the second, in place and heading."""
-    if lines.count == 0:
-        return []
     first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
     bike = kind == RoadKind.LANE_BIKE
     pairs: list[tuple[int, int]] = []
@@ -193,9 +186,7 @@ def _link_table(
     """Up to four links per lane, the straightest first, and the number of links that did not fit."""
     table = np.full((len(out_heading), LINKS), -1, dtype=np.int64)
     used = np.zeros(len(out_heading), dtype=np.int64)
-    if not pairs:
-        return table, 0
-    a, b = np.array(pairs).T
+    a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     bend = np.abs(wrap(in_heading[b] - out_heading[a]))
     for i in np.lexsort((np.arange(len(a)), np.round(bend, 3), a)):
         if used[a[i]] < LINKS:
@@ -318,13 +309,12 @@ class LaneSegments:
     ) -> list[tuple[int, float, float]]:
         """Lanes within reach of a pose as (lane, arc length on it, distance), the nearest first."""
         near = self._near(xyz[None, :2], reach_m)
-        distance, s = near._measure(xyz[None], np.array([heading]), turn_rad)
+        (distance,), (s,) = near._measure(xyz[None], np.array([heading]), turn_rad)
         lanes: dict[int, tuple[int, float, float]] = {}
-        for i in np.argsort(distance[0], kind="stable"):
-            if distance[0, i] > reach_m:
-                break
+        for i in np.argsort(distance, kind="stable"):
             lane = int(near.lane[i])
-            lanes.setdefault(lane, (lane, float(s[0, i]), float(distance[0, i])))
+            if distance[i] <= reach_m:
+                lanes.setdefault(lane, (lane, float(s[i]), float(distance[i])))
         return list(lanes.values())
 
     def _near(self, xy: Float[Array, "pose 2"], reach_m: float) -> LaneSegments:

@@ -37,7 +37,7 @@ RING_M = 50.0
 class RoadLines:
     """All drawn map features as polylines in the local frame: split at clipping gaps, polygons closed.
 
-    ``feature`` is the row of the source feature, ``closed`` the mask of closed rings. ``arc`` is the arc length of every
+    ``feature`` is the row of the source feature, ``closed`` the mask of closed rings. ``arc`` is the arc length of each
     point along its source feature, gaps included (``lines.arc`` that along its polyline), metres.
     """
 

@@ -31,13 +31,9 @@ MOVER_M = 2.0
 EGO_BIT, PREDICT_BIT, INTEREST_BIT = 1, 2, 4
 #: Length, width and height where a source has none, metres (medians of Argoverse 2 sensor logs by class).
 DEFAULT_SIZES = {
-    AgentKind.NONE: (1.0, 1.0, 1.0),
-    AgentKind.VEHICLE: (4.1, 1.9, 1.6),
-    AgentKind.PEDESTRIAN: (0.7, 0.7, 1.8),
-    AgentKind.CYCLIST: (1.8, 0.6, 1.7),
-    AgentKind.OTHER: (1.0, 1.0, 1.0),
-    AgentKind.STATIC: (0.5, 0.5, 1.0),
-}
+    AgentKind.NONE: (1.0, 1.0, 1.0), AgentKind.VEHICLE: (4.1, 1.9, 1.6), AgentKind.PEDESTRIAN: (0.7, 0.7, 1.8),
+    AgentKind.CYCLIST: (1.8, 0.6, 1.7), AgentKind.OTHER: (1.0, 1.0, 1.0), AgentKind.STATIC: (0.5, 0.5, 1.0),
+}  # fmt: skip
 DEFAULT_EGO_SIZE = (4.9, 2.0, 1.5)
 #: Larger measured sizes are ignored.
 MOST_SIZE_M = 100.0
@@ -70,21 +66,12 @@ def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTr
     The size is the median of valid measurements between 0 and 100 m, since sizes of one object vary by metres in public
     data; without any it is the default of the class.
     """
-    valid = tracks.valid.astype(bool)
-    mask = valid[..., None]
-    xyz = np.concatenate((tracks.xy, tracks.z[..., None]), axis=-1) - origin
+    valid, mask = tracks.valid, tracks.valid[..., None]
+    xyz = np.where(mask, np.concatenate((tracks.xy, tracks.z[..., None]), axis=-1) - origin, 0.0)
+    heading, velocity = np.where(valid, wrap(tracks.heading), 0.0), np.where(mask, tracks.velocity, 0.0)
     size, defaulted = _sizes(tracks, ego)
-    return LocalTracks(
-        xyz=np.where(mask, xyz, 0.0),
-        heading=np.where(valid, wrap(tracks.heading), 0.0),
-        velocity=np.where(mask, tracks.velocity, 0.0),
-        size=size,
-        valid=valid,
-        kind=tracks.kind.astype(np.int64),
-        track_id=tracks.track_id.astype(np.int64),
-        ego=ego,
-        defaulted=defaulted,
-    )
+    kind, track_id = tracks.kind.astype(np.int64), tracks.track_id.astype(np.int64)
+    return LocalTracks(xyz, heading, velocity, size, valid, kind, track_id, ego, defaulted)
 
 
 def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], int]:
@@ -102,23 +89,19 @@ def masked_median(values: Float[Array, "*row time"], valid: Bool[Array, "*row ti
     """Median over the valid entries of the last axis; 0 where none is valid."""
     ordered = np.sort(np.where(valid, values, np.inf), axis=-1)
     count = valid.sum(axis=-1)
-    low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[..., None], axis=-1)[..., 0]
-    high = np.take_along_axis(
-        ordered, np.maximum(count // 2, 0).clip(max=values.shape[-1] - 1)[..., None], -1
+    middle = np.stack(
+        (np.maximum((count - 1) // 2, 0), np.minimum(count // 2, values.shape[-1] - 1)), axis=-1
     )
+    low, high = np.moveaxis(np.take_along_axis(ordered, middle, axis=-1), -1, 0)
     with np.errstate(invalid="ignore"):
-        return np.where(count > 0, (low + high[..., 0]) / 2, 0.0)
+        return np.where(count > 0, (low + high) / 2, 0.0)
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Slots of tracks.
+    """Tracks of the moving block (the ego first) and of the parked block, in slot order.
 
-    Attributes:
-        moving: Tracks of the moving block in slot order; the ego first.
-        parked: Tracks of the parked block in slot order.
-        pose: Median x, y, z and heading of every track.
-        overflow: Numbers of tracks that did not fit, by name.
+    ``pose`` is the median x, y, z and heading of every track.
     """
 
     moving: Int[Array, " slot"]
@@ -158,10 +141,8 @@ def median_pose(tracks: LocalTracks) -> Float[Array, "track 4"]:
     return np.concatenate((xyz, wrap(mean + turn)[:, None]), axis=1)
 
 
-def _rank(
-    tracks: LocalTracks, moved: Float[Array, " track"], marked: Sequence[int]
-) -> Float[Array, " track"]:
-    """Sort key of every track, smaller is more relevant."""
+def _rank(tracks: LocalTracks, moved: Array, marked: Sequence[int]) -> Float[Array, " track"]:
+    """Sort key of every track, smaller is more relevant; ``moved`` is its largest distance from its median pose."""
     both = tracks.valid & tracks.valid[tracks.ego]
     apart = np.hypot(*np.moveaxis((tracks.xyz - tracks.xyz[tracks.ego])[..., :2], -1, 0))
     rank = np.where(both, apart, 1e6).min(axis=1) - MOVER_BONUS_M * (moved > MOVER_M)
