@@ -1,4 +1,4 @@
-"""Candidate paths of ego: its own path or a detour, its conflicts with other users, and its stop lines."""
+"""Candidate paths of ego, their conflicts with other users, and their stop lines."""
 
 from __future__ import annotations
 

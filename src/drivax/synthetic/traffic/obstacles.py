@@ -37,16 +37,16 @@ _Indices = Int64[np.ndarray, " k"]
 class Boxes:
     """Boxes at one moment: centres, headings, signed speeds along them, lengths and widths."""
 
-    xy: Float64[np.ndarray, "thing 2"]
-    heading: Float64[np.ndarray, " thing"]
-    speed: Float64[np.ndarray, " thing"]
-    size_m: Float64[np.ndarray, "thing 2"]
+    xy: Float64[np.ndarray, "box 2"]
+    heading: Float64[np.ndarray, " box"]
+    speed: Float64[np.ndarray, " box"]
+    size_m: Float64[np.ndarray, "box 2"]
 
     def __len__(self) -> int:
         return len(self.speed)
 
     @cached_property
-    def direction(self) -> tuple[Float64[np.ndarray, " thing"], Float64[np.ndarray, " thing"]]:
+    def direction(self) -> tuple[Float64[np.ndarray, " box"], Float64[np.ndarray, " box"]]:
         """Cosine and sine of the headings."""
         return np.cos(self.heading), np.sin(self.heading)
 
@@ -66,13 +66,13 @@ class Boxes:
 class Extents:
     """Longitudinal and lateral extent of boxes in the coordinates of a path, m."""
 
-    near_m: Float64[np.ndarray, " thing"]
-    far_m: Float64[np.ndarray, " thing"]
-    right_m: Float64[np.ndarray, " thing"]
-    left_m: Float64[np.ndarray, " thing"]
+    near_m: Float64[np.ndarray, " box"]
+    far_m: Float64[np.ndarray, " box"]
+    right_m: Float64[np.ndarray, " box"]
+    left_m: Float64[np.ndarray, " box"]
 
 
-def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, Int64[np.ndarray, " thing"]]:
+def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, Int64[np.ndarray, " box"]]:
     """Extents of the boxes near a path, which counts as straight over the length of a box, and their rows."""
     coarse = path.curve.xy[::8]
     around = (boxes.xy > coarse.min(axis=0) - within_m) & (boxes.xy < coarse.max(axis=0) + within_m)
