@@ -19,12 +19,9 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Polylines:
-    """Concatenated polylines.
+    """Concatenated polylines: points, the index of the first point of each (and the number of points), arc lengths.
 
-    Attributes:
-        points: Points of all polylines, one after the other, metres.
-        start: Index of the first point of each polyline, and the number of points at the end.
-        arc: Arc length of every point from the start of its own polyline, metres.
+    Arc lengths are measured from the start of each polyline, metres.
     """
 
     points: Float[Array, "point dim"]
@@ -71,10 +68,9 @@ class Polylines:
         return self.arc + self._base[self.row]
 
     def locate(self, row: Array, s: Array) -> tuple[Int[Array, "*query"], Float[Array, "*query"]]:
-        """Point index and fraction of the segment that holds arc length ``s`` of polyline ``row``.
+        """Point index and fraction of the segment that holds arc length ``s`` of polyline ``row`` (two points or more).
 
-        Every polyline needs two points. Arc lengths beyond an end give fractions outside [0, 1] of the first or
-        the last segment: evaluation there continues straight on.
+        Beyond an end the fraction of the first or last segment is outside [0, 1]: evaluation continues straight on.
         """
         key = np.clip(s, 0.0, self.length[row]) + self._base[row]
         index = np.searchsorted(self._key, key, side="right") - 1
@@ -120,10 +116,7 @@ def arc_lengths(
 def point_to_segment(
     point: Float[Array, "*#batch dim"], a: Float[Array, "*#batch dim"], b: Float[Array, "*#batch dim"]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Distance from points to segments, and the fraction in [0, 1] of the nearest point; broadcasts.
-
-    All need at least one leading axis; the last one holds the coordinates (any number of them).
-    """
+    """Distance from points to segments, and the fraction in [0, 1] of the nearest point; broadcasts leading axes."""
     axes = range(a.shape[-1])
     return _to_chords([point[..., i] - a[..., i] for i in axes], [b[..., i] - a[..., i] for i in axes])
 
@@ -199,9 +192,8 @@ def left_normals(heading: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
 def headings(points: Float[Array, "point dim"]) -> Float[Array, " point"]:
     """Heading at every point of a polyline by central differences, one-sided at the ends, radians."""
     xy = points[:, :2]
-    ahead = np.concatenate((xy[1:], xy[-1:]))
-    behind = np.concatenate((xy[:1], xy[:-1]))
-    return np.arctan2(*(ahead - behind).T[::-1])
+    chord = np.concatenate((xy[1:], xy[-1:])) - np.concatenate((xy[:1], xy[:-1]))
+    return np.arctan2(*chord.T[::-1])
 
 
 def project(
@@ -229,9 +221,8 @@ def project_monotone(
     position is searched in ``[0, first_window_m]``, and ``window[0]`` is not used. The polyline needs two points.
     """
     line, arc = points[:, :2], arc_lengths(points)
-    step = np.diff(line, axis=0)
+    step, span = np.diff(line, axis=0), np.diff(arc)
     square = np.maximum((step * step).sum(axis=1), 1e-12)
-    span = np.diff(arc)
     result = np.zeros(len(xy))
     low, high = 0.0, min(first_window_m, arc[-1])
     for k in range(len(xy)):
