@@ -72,7 +72,7 @@ def repository() -> Path:
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder of real recordings beside the checkout; their licences keep them out of it."""
+    """The folder of real recordings next to the checkout; their licences keep them out of it."""
     folder = REPOSITORY.parent / "shared" / "data"
     if not folder.is_dir():
         pytest.skip("no real recordings at ../shared/data")

@@ -27,7 +27,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Logged(Pendulum):
-    """An environment that is only told of; its observations are three numbers."""
+    """An environment that is only described by its steps; its observations are three numbers."""
 
     def expert_steps(self, data: Table) -> ExpertSteps:
         fields = {

@@ -17,7 +17,6 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 _YAML = yaml.safe_load((REPOSITORY / "tests" / "wording.yaml").read_text())
 TABLE: list[dict[str, Any]] = _YAML["rows"]
 #: Files that are still to be rewritten.
-PENDING: tuple[str, ...] = tuple(_YAML["pending"])
 #: Records of the past keep the words of their day.
 HISTORY = ("docs/log/", "docs/decisions/")
 SUFFIXES = {".py", ".pyi", ".md", ".js", ".css", ".html", ".template"}
@@ -29,7 +28,7 @@ def _files() -> list[Path]:
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode != 0:
         pytest.skip("not a git checkout")
-    names = [name for name in result.stdout.splitlines() if not name.startswith((*HISTORY, *PENDING))]
+    names = [name for name in result.stdout.splitlines() if not name.startswith(HISTORY)]
     files = [REPOSITORY / name for name in names]
     return [
         file for file in files if file.suffix in SUFFIXES and file.is_file() and "wording" not in file.name
@@ -73,10 +72,6 @@ def violations(row: dict[str, Any], file: Path, text: str) -> list[str]:
         )
         hits = [(number, match[0]) for number, match in found if match]
     return [f"{place}:{number}: {word!r}, write: {row['write']}" for number, word in hits]
-
-
-def test_pending_files_exist():
-    assert [name for name in PENDING if not (REPOSITORY / name).exists()] == []
 
 
 def test_words_of_the_table_are_not_used():

@@ -10,7 +10,7 @@ from scipy.stats import beta
 
 from drivax.geometry.boxes import overlap, time_to_overlap
 from drivax.scenario.schema import DT_S, AgentKind, Scenario
-from drivax.synthetic.expert.comfort import broken_limits
+from drivax.synthetic.expert.violations import broken_limits
 from drivax.synthetic.sensing import NoiseConfig, largest_shift_m
 
 Array = np.ndarray[Any, Any]

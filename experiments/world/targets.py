@@ -34,7 +34,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.events import EventKind
 from drivax.synthetic.events.kinds import SEVERITY_MPS2
-from drivax.synthetic.expert.comfort import LIMITS
+from drivax.synthetic.expert.violations import LIMITS
 from drivax.synthetic.generate import Generation, generate
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig
 from drivax.tracking.run_folder import versions

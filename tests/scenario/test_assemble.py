@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.build.assemble import assemble, count_source
-from drivax.scenario.build.filling import MISSING, blank
+from drivax.scenario.build.assemble import MISSING, assemble, blank, count_source
 from drivax.scenario.recording import Event, MapFeature, windows, with_ego
 from drivax.scenario.schema import CAPACITIES, AgentKind, Capacity, Flag, LightState, RoadKind, record_dtype
 

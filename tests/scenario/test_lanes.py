@@ -82,8 +82,7 @@ def test_lanes_without_any_links_are_chained_by_geometry():
     assert graph.successor[:, 0].tolist() == [1, -1, -1, -1, -1, -1]
     assert graph.flags == Flag.LANE_GRAPH | Flag.CHAINED_GRAPH
     linked = graph_of(lane(1, line((0, 0), (20, 0)), successors=(77,)), lane(2, line((20, 0), (40, 0))))
-    assert not linked.linked  # a source with links is taken at its word
-    assert linked.flags == Flag.NONE
+    assert linked.flags == Flag.NONE  # a source with links is taken at its word
 
 
 def test_chaining_is_the_same_whatever_the_number_of_lanes():

@@ -18,7 +18,7 @@ PATH = np.array([[0.0, 0.0]])
 def placed(features, lights, most=8):
     graph = lane_graph(features, ZERO)
     on = LaneSegments.of(cut(road_lines(features, ZERO, None)), graph)
-    return place_lights(lights, graph, on, ZERO, PATH, most)
+    return place_lights(lights, on, ZERO, PATH, most)
 
 
 def test_a_stop_line_lies_across_its_lane_from_left_to_right():

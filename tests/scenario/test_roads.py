@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivax.scenario.build.roads import rank, road_rows
-from drivax.scenario.build.segments import road_lines
+from drivax.scenario.build.segments import rank, road_lines, road_rows
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
 

@@ -39,7 +39,7 @@ def routes_of(features, path, most_routes=12, style: RouteStyle = "graph", **mor
     ego = ego_log(tracks, 10)
     index = graph.index()
     intent = Intent(tuple(index[i] for i in given), tuple(index[i] for i in corridor))
-    return find_routes(graph, on, ego, intent, style, most_routes, 400), ego, graph
+    return find_routes(on, ego, intent, style, most_routes, 400), ego, graph
 
 
 def check_smooth(route: Route, kink=0.2):
@@ -326,7 +326,7 @@ def search_of(features, need=200.0, corridor=(), xy=(0.0, 0.0), heading=0.0):
     graph = lane_graph(features, ZERO)
     on = LaneSegments.of(cut(road_lines(features, ZERO, None)), graph)
     index = graph.index()
-    return LaneSearch.start(graph, on, np.array([*xy, 0.0]), heading, need, [index[i] for i in corridor])
+    return LaneSearch.start(on, np.array([*xy, 0.0]), heading, need, [index[i] for i in corridor])
 
 
 def test_candidates_are_as_long_as_speed_and_map_ask_and_at_most_ten():

@@ -126,7 +126,7 @@ def test_agents_go_on_along_their_lane_else_straight():
     valid = np.ones((3, 91), dtype=bool)
     valid[2, 40:] = False
     tracks = local_tracks(make_tracks(paths, kind=kinds, valid=valid), 0, ZERO)
-    points = extend(tracks, np.arange(3), graph, on, 16)
+    points = extend(tracks, np.arange(3), on, 16)
     s = 4.0 * np.arange(1, 17)  # the car ends at (0, 1)
     fade = np.maximum(1 - s / 20, 0)
     angle = np.maximum(s - 10, 0) / 40

@@ -12,9 +12,8 @@ from drivax.synthetic.events import EventKind
 from drivax.synthetic.roads.curves import Pose, straight, turn
 from drivax.synthetic.roads.network import Control, Draft, Line, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.roles import Motion, Roles, Scripted
+from drivax.synthetic.traffic.roles import Drivers, Motion, Roles, Scripted
 
 FIRST, STEPS = 60, 151
 CURRENT = FIRST + 10

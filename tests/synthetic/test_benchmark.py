@@ -5,8 +5,14 @@ import pytest
 from drivax.cli.generate import Generate, run
 from drivax.errors import UsageError
 from drivax.scenario.store import ScenarioSet
-from drivax.synthetic.benchmark import BENCHMARK_VERSION, SPLITS, generate_benchmark, sizes
-from drivax.synthetic.generate import RESERVED_SEED, Generation
+from drivax.synthetic.generate import (
+    BENCHMARK_VERSION,
+    RESERVED_SEED,
+    SPLITS,
+    Generation,
+    generate_benchmark,
+    sizes,
+)
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig
 
 TRAIN = 8
@@ -29,7 +35,7 @@ def test_sizes_follow_the_table_or_scale():
 
 
 @pytest.mark.slow
-def test_four_sets_that_share_no_map(small):
+def test_benchmark_sets_share_no_map(small):
     path, made, progress = small
     assert sorted(made) == sorted(SPLITS) == sorted(child.name for child in path.iterdir())
     total = sum(sizes(TRAIN).values())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from drivax.synthetic.expert.comfort import LIMITS, broken_limits, discomfort, quantities, smoother
+from drivax.synthetic.expert.violations import LIMITS, broken_limits, discomfort, quantities, smoother
 
 
 @pytest.mark.parametrize(("window", "order", "derivative"), [(8, 2, 0), (15, 2, 1), (15, 3, 2), (7, 3, 1)])

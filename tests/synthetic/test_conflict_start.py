@@ -16,7 +16,7 @@ SPEED = 10.0
 
 
 def moved(at, speeds=(SPEED, SPEED), ways=(EAST, NORTH)):
-    """Vehicles that keep their speeds all the time, whatever happens; the first one is ego."""
+    """Vehicles at constant speeds; the first one is ego."""
     network = crossroads()
     seconds = 2 * STEPS / 10
     motion = run(network, ways, twins(len(at)), at, speeds, seconds)

@@ -1,4 +1,4 @@
-"""Ego's way past a place at a time."""
+"""Routes on which ego arrives at a destination at a given time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LIMIT = 10.0
 
 
 def chain(lengths, control=Control.NONE):
-    """Lanes one after the other along +x; the second one from the end is a connector with a rule."""
+    """Consecutive lanes along +x; the second to last is a connector with a rule."""
     draft, at = Draft(), 0.0
     for k, length in enumerate(lengths):
         cross = k == len(lengths) - 2

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.expert.comfort import discomfort
 from drivax.synthetic.expert.plan import plan_ego
-from drivax.synthetic.expert.violations import find_violation
+from drivax.synthetic.expert.violations import discomfort, find_violation
 from drivax.synthetic.roads.curves import Pose, join_curves, resample, straight, turn
 from drivax.synthetic.roads.network import Control
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan

@@ -52,7 +52,7 @@ def test_worker_count_does_not_change_the_bytes(one_worker, tmp_path):
 
 
 def test_processors_without_newer_instructions_write_the_same_bytes(tmp_path):
-    """NumPy takes other routines there, whose last bits differ, and OpenBLAS other kernels."""
+    """NumPy and OpenBLAS use other routines there, whose last bits differ."""
     newer = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
     if not newer:
         pytest.skip("this processor has none of the newer instructions that NumPy knows")
@@ -69,7 +69,7 @@ def test_processors_without_newer_instructions_write_the_same_bytes(tmp_path):
 
 
 def test_workers_compute_as_the_oldest_processor_does(tmp_path, monkeypatch):
-    """Sines of a million angles, and solutions of equations, in processes with and without what this processor has."""
+    """Compare sines and solutions of equations in processes with and without newer instructions."""
     script = tmp_path / "computes.py"
     script.write_text(
         "import hashlib, numpy as np\n"
@@ -105,7 +105,7 @@ def test_workers_inherit_disabled_features(monkeypatch):
     assert os.environ["NPY_DISABLE_CPU_FEATURES"] == "B"
 
 
-def test_counts_and_progress(one_worker):
+def test_counts_and_progress_cover_all_scenarios(one_worker):
     _, result, progress = one_worker
     assert progress == [(done, SCENARIOS) for done in range(1, SCENARIOS + 1)]
     assert result.scenarios == SCENARIOS == sum(count.kept for count in result.families.values())
@@ -220,7 +220,7 @@ def test_command_prints_rate_and_rejections(tmp_path, capsys):
     assert len(ScenarioSet.open(out)) == 1
 
 
-def test_summary_by_hand(tmp_path):
+def test_summary_matches_counts_by_hand(tmp_path):
     counts = {"curved_road": FamilyCount(30, {"ego_collides": 2}), "x": FamilyCount(10, {}, 1200)}
     text = summary(GeneratedSet(tmp_path, 40, 4.0, counts))
     assert text.splitlines() == [

@@ -19,7 +19,7 @@ NOTHING = Boxes(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 2)))
 
 
 def decisions(ways, at, speed, politeness=0.0, network=None, movers=(1,)):
-    """What MOBIL decides for some rows, on two lanes 600 m long."""
+    """Lane changes of some vehicles on two lanes 600 m long."""
     network = network or road(lanes=2)[0]
     table = drivers(len(at), speed_factor=1.0, politeness=politeness, headway_s=1.5)
     table = dataclasses.replace(
@@ -32,15 +32,15 @@ def decisions(ways, at, speed, politeness=0.0, network=None, movers=(1,)):
     tables = PathTables(network, paths, table)
     at, speed = np.array(at, float), np.array(speed, float)
     fastest = tables.at(at, np.arange(len(at)))[:, 3]
-    wanted = np.full(len(at), np.nan)
+    preferred = np.full(len(at), np.nan)
     for i, way in enumerate(ways):
         ahead = [j for j in range(len(at)) if j != i and ways[j] == way and at[j] > at[i]]
         j = min(ahead, key=lambda j: at[j], default=None)
         gap = np.inf if j is None else at[j] - at[i] - 5.0
-        wanted[i] = law(speed[i], gap, 0.0 if j is None else speed[j])
+        preferred[i] = law(speed[i], gap, 0.0 if j is None else speed[j])
     free = np.isin(np.arange(len(at)), movers)
     changes = LaneChanges(network, table, NOTHING)
-    now = Situation(at, speed, np.ones(len(at), bool), free, fastest, wanted)
+    now = Situation(at, speed, np.ones(len(at), bool), free, fastest, preferred)
     return changes.decide(now, tables)
 
 
@@ -51,7 +51,7 @@ def law(speed, gap, leader_speed):
 
 
 def by_hand(gap_ahead_new, gap_behind_new, politeness, gap_ahead_old=20.0):
-    """The published rule for row 1 at 12 m/s behind a leader at 8 m/s; the new follower drives 14 m/s, alone."""
+    """MOBIL by hand for row 1 at 12 m/s behind a leader at 8 m/s; the new follower drives 14 m/s, alone."""
     own, new = law(12.0, gap_ahead_old, 8.0), law(12.0, gap_ahead_new, 15.0)
     follower, follower_then = (
         law(14.0, gap_ahead_new + gap_behind_new + 5.0, 15.0),
@@ -64,7 +64,7 @@ def by_hand(gap_ahead_new, gap_behind_new, politeness, gap_ahead_old=20.0):
 @pytest.mark.parametrize("behind", [6.0, 12.0, 20.0, 30.0, 60.0])
 @pytest.mark.parametrize("ahead", [8.0, 15.0, 60.0])
 @pytest.mark.parametrize("politeness", [0.0, 1.0])
-def test_lane_changes_are_those_of_the_published_rule(behind, ahead, politeness):
+def test_lane_changes_follow_mobil(behind, ahead, politeness):
     # Rows: ego far away, the candidate, its leader; on the left lane the new leader and the new follower.
     at = [20.0, 300.0, 325.0, 305.0 + ahead, 295.0 - behind]
     ways = [(1,), (1,), (1,), (0,), (0,)]

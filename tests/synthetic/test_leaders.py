@@ -34,7 +34,7 @@ def test_leader_is_the_nearest_vehicle_ahead_on_the_path(seed):
         if not ahead:
             assert gap[i] == np.inf
             continue
-        # Who is nearest by its rear: lengths differ.
+        # The nearest by its rear: lengths differ.
         room = {j: at[j] - at[i] - (table.size_m[j, 0] + table.size_m[i, 0]) / 2 for j in ahead}
         nearest = min(room, key=lambda j: room[j])
         assert gap[i] == pytest.approx(room[nearest], abs=1e-6)

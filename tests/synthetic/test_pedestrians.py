@@ -38,7 +38,7 @@ def street(marked=True, green_s=None):
 
 
 def over(speed=1.4, before=6.0):
-    """From 10 m south of the road straight over it; the kerb is 6 m along, the other one 14 m."""
+    """A walker from 10 m south of the road straight over it, with kerbs at 6 m and 14 m."""
     return Walker(straight(Pose(50.0, -10.0, math.pi / 2), 20.0), 6.0 - before, speed, 0, 6.0, 14.0)
 
 
@@ -70,7 +70,7 @@ def test_pedestrians_cross_a_free_road_at_their_speed():
     on = (xy[:, 0, 1] > -4.0) & (xy[:, 0, 1] < 4.0)
     near = (xy[:, 0, 1] > -5.0) & (xy[:, 0, 1] < 4.0)
     assert np.all(claims[on, 0]) and not np.any(claims[~near, 0])
-    # The end of the way is where people stop; they do not run through it.
+    # Walkers stop at the end of their path.
     assert xy[-1, 0, 1] <= 10.0 and speed[-1, 0] < 0.2
 
 
@@ -123,7 +123,7 @@ def test_no_walker_enters_a_standing_queue():
     standing = lambda t: (np.array([[50.0, -1.75]]), np.zeros(1), np.zeros(1))  # noqa: E731
     xy, _, speed, _ = play(street(), (over(),), standing)
     assert xy[:, 0, 1].max() < -4.0 and speed[-1, 0] == pytest.approx(0.0, abs=0.05)
-    # Off crossings too.
+    # Nor off crossings.
     along = Walker(straight(Pose(50.0, -10.0, math.pi / 2), 20.0), 0.0, 1.4)
     xy = play(street(), (along,), standing)[0]
     assert xy[:, 0, 1].max() < -1.75 - 0.95

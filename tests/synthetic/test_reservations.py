@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.expert.reservations import (
+from drivax.synthetic.expert.candidates import (
     HARD_M,
     NEAR_M,
     NEAR_PEOPLE_M,
+    SPACING_M,
+    Shift,
     arrivals,
     find_conflicts,
+    shifted_path,
     stop_lines,
 )
-from drivax.synthetic.expert.trajectories import SPACING_M, Shift, shifted_path
 from drivax.synthetic.expert.violations import user_boxes
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.roads.network import Control
@@ -105,7 +107,7 @@ def test_stop_signs_open_after_stopping_and_yield_signs_after_traffic():
     network = type(network)(
         **{**{k: v for k, v in vars(network).items() if k != "busy"}, "lanes": tuple(lanes)}
     )
-    # Somebody on the same path is on lane 2 (from 120 m on) from 4.77 s on; it is announced 2 s earlier.
+    # Another vehicle on the same path is on lane 2 (from 120 m on) from 4.77 s on; it is announced 2 s earlier.
     first = arrivals(
         network, [roles.paths[0]] * 2, np.stack([0 * TIMES, 70.0 + 10.0 * TIMES]),
         np.ones((2, 91), bool), np.full(2, 2.3),

@@ -53,7 +53,7 @@ def test_yielding_vehicle_accepts_an_eight_second_gap_and_rejects_three():
     assert theirs < 40 and mine > theirs
     mine, theirs, motion = yielding(8.0)
     assert mine < 30 and mine < theirs
-    # And the one with priority was not hindered.
+    # The vehicle with priority is not hindered.
     assert motion.acceleration[0].min() > -1.0
 
 
@@ -79,7 +79,7 @@ def test_all_vehicles_stand_at_a_stop_sign():
 def test_all_way_stop_serves_in_order_of_arrival(order):
     network = crossroads(4, control=[Control.ALL_WAY_STOP] * 4)
     table = twins(4, speed_factor=0.6)
-    # Each comes 12 m (more than a second) behind the one before.
+    # Each vehicle is 12 m (more than a second) behind the previous one.
     at = [80.0 - 12.0 * order[row] for row in range(4)]
     motion = run(network, WAYS, table, at, [6.0] * 4, 40.0)
     lines = [entered(motion, row, 100.0, table.size_m[row, 0]) for row in range(4)]
@@ -95,14 +95,14 @@ def test_right_hand_vehicle_goes_first_on_simultaneous_arrival():
     half = table.size_m[:, 0] / 2
     motion = run(network, WAYS[:2], table, 60.0 - half, [6.0] * 2, 25.0)
     lines = [entered(motion, row, 100.0, table.size_m[row, 0]) for row in range(2)]
-    # Row 1 goes north and so comes from the right of row 0, who goes east.
+    # Row 1 goes north and so comes from the right of row 0, which goes east.
     assert lines[1] < lines[0] < 250
 
 
 def test_no_vehicle_enters_a_junction_that_cannot_be_cleared():
     network = crossroads(2, control=[Control.YIELD, Control.NONE], yields_to=[(4,), ()])
     table = drivers(3, speed_factor=0.7)
-    # Row 0 stands right behind the junction on row 1's way (both go east); row 2 goes north later.
+    # Row 0 stands right behind the junction on row 1's path (both go east); row 2 goes north later.
     standing = EgoPlan(0, np.tile([124.0, -2.0], (200, 1)), np.zeros(200), np.zeros(200))
     motion = run(
         network, (WAYS[0], WAYS[0], WAYS[1]), table, [124.0, 60.0, 20.0], [0.0, 8.0, 8.0], 20.0, ego=standing

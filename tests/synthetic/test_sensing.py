@@ -39,7 +39,7 @@ def test_vans_occlude_pedestrians_and_pedestrians_occlude_no_agent():
     assert look([EGO, van, (15.0, 3.0, 0.0, 0.6, 0.6)], [1.5, 2.4, 1.75]) == [True, True, True]
 
 
-def test_view_over_a_low_roof_by_hand():
+def test_low_roofs_do_not_occlude():
     """The eye is 1.7 m up; the ray to half a truck's height (1.75 m) rises, so a roof of 1.5 m is below it."""
     car, truck = (10.0, 0.0, 0.0, 4.6, 1.9), (40.0, 0.0, 0.0, 8.0, 1.9)
     assert look([EGO, car, truck], [1.5, 1.5, 3.5]) == [True, True, True]
@@ -61,7 +61,7 @@ def test_range_is_to_the_centre_and_invalid_users_are_not_visible():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_against_shapely_in_crowds(seed):
+def test_visibility_agrees_with_shapely_in_crowds(seed):
     """Brute force with shapely; every blocker is a wall here, so that heights do not matter."""
     rng = np.random.default_rng(seed)
     users, steps = 25, 4
@@ -164,7 +164,7 @@ def test_reversing_users_still_reverse():
 
 
 class Extreme(np.random.Generator):
-    """Every error is as large as can be; only the signs are drawn."""
+    """Draws errors of the largest size with random signs."""
 
     def __init__(self, seed):
         super().__init__(np.random.PCG64(seed))
@@ -179,7 +179,7 @@ LARGEST = ((12.0, 2.55), (5.3, 2.05), (0.7, 0.7))
 
 @pytest.mark.parametrize(("length", "width"), LARGEST)
 def test_no_corner_moves_farther_than_the_bound(length, width):
-    """Against the corners of boxes with the largest errors, of all signs."""
+    """Compare with the corners of boxes with the largest errors of all signs."""
     plain = tracks(300)
     plain.size[:] = (length, width, 1.5)
     moved = noisy(plain, 0, Extreme(0), NoiseConfig())

@@ -43,7 +43,7 @@ def run(network, table, at, speed, seconds, overrides=()):
     return traffic_scenes.run(network, ways, table, at, speed, seconds, Staging(overrides=overrides))
 
 
-def test_speed_profile_by_hand():
+def test_speed_profile_equals_brute_force():
     network = CurvedRoad().build(np.random.default_rng(3))
     path = lane_path(network, random_lanes(network, 0, np.random.default_rng(0)), Sway())
     got = speed_profile(path, 0.9, 2.0, 1.4)
@@ -160,8 +160,8 @@ def test_platoon_reaches_the_equilibrium_gap():
             - motion.distance_m[k, -1]
             - (table.size_m[k - 1, 0] + table.size_m[k, 0]) / 2
         )
-        wanted = (2.0 + speed * table.headway_s[k]) / math.sqrt(1 - (speed / (0.9 * 15.0)) ** 4)
-        assert gap == pytest.approx(wanted, rel=0.02)
+        expected = (2.0 + speed * table.headway_s[k]) / math.sqrt(1 - (speed / (0.9 * 15.0)) ** 4)
+        assert gap == pytest.approx(expected, rel=0.02)
 
 
 def test_drivers_apply_decisions_after_their_reaction_time():
@@ -225,13 +225,13 @@ def test_cars_stop_for_walkers_on_a_crossing():
     assert motion.xy[2, -1, 1] > 2.0
     crossing = np.abs(motion.xy[2, :, 1]) < 2.5
     front = motion.xy[0, :, 0] + table.size_m[0, 0] / 2
-    # While somebody is on the lane, nobody is on the crosswalk, or has just passed it before.
+    # While a walker is on the lane, the car is before the crosswalk or beyond it.
     rear = motion.xy[0, :, 0] - table.size_m[0, 0] / 2
     assert np.all((front[crossing] < 198.5) | (rear[crossing] > 201.5))
     assert motion.xy[0, -1, 0] > 230.0 and motion.acceleration.min() > -5.0
 
 
-def test_order_of_users_and_repeated_runs():
+def test_repeated_runs_are_equal_and_users_keep_their_order():
     network, _ = road(400.0)
     steps = 50
     stands = Scripted.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
@@ -282,7 +282,7 @@ def test_dense_traffic_has_no_overlaps(family, seed):
         for a, b in np.argwhere(np.triu(near, 1)):
             boxes = [box_corners(xy[k], motion.heading[k, t], *table.size_m[k, :2]) for k in (a, b)]
             assert shared_area(*boxes) < 1e-6, (t, a, b)
-    # It flows, and everybody's speed is that of the places.
+    # Traffic flows, and speeds match the positions.
     assert np.ptp(motion.distance_m, axis=1).mean() > 25.0
     moved = np.hypot(*np.moveaxis(np.diff(motion.xy, axis=1), -1, 0))
     there = motion.valid[:, 1:]

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.synthetic.expert.trajectories import (
+from drivax.synthetic.expert.candidates import (
     SPACING_M,
     Shift,
     candidate_boxes,

@@ -35,7 +35,7 @@ def drawn(index, config=EXACT):
 
 
 def fields_of(recording):
-    """Everything in a recording as one flat list of comparable values."""
+    """Flat list of all values of a recording."""
     tracks = [getattr(recording.tracks, f.name).tobytes() for f in dataclasses.fields(recording.tracks)]
     lights = [
         (light.lane_id, light.stop_point.tobytes(), light.states.tobytes()) for light in recording.lights
@@ -280,7 +280,7 @@ def test_another_kind_replaces_an_event_that_cannot_be_staged(monkeypatch):
 
 @pytest.mark.slow
 def test_critical_recording_is_a_window_of_the_traffic(monkeypatch):
-    """Lights, poses and the begin are those of the traffic from the step on that was found critical."""
+    """Lights and poses are those of the traffic from the critical step on."""
     kept = {}
 
     def run(traffic, *args, **more):

@@ -1,4 +1,4 @@
-"""Small roads and casts for tests of traffic."""
+"""Small roads and vehicles for tests of traffic."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ CARS = Density(van_share=0.0, truck_share=0.0, bus_share=0.0, cyclist_share=0.0)
 
 
 def drivers(count, seed=0, **values):
-    """Cars whose drivers act at once; some of their values set for all."""
+    """Cars whose drivers react immediately, with some values equal for all."""
     table = draw_drivers(count, CARS, np.random.default_rng(seed))
     values = {"reaction_s": 0.0, **values}
     return dataclasses.replace(table, **{k: np.full(count, v) for k, v in values.items()})
 
 
 def twins(count, **values):
-    """The same driver several times."""
+    """Copies of one driver."""
     return drivers(1, **values).chosen(np.zeros(count, int))
 
 
@@ -69,7 +69,7 @@ def crossroads(arms=2, limit=15.0, **rules):
     for k in range(arms):
         heading = k * math.pi / 2
         begin = Pose(110.0 - 110.0 * math.cos(heading), -110.0 * math.sin(heading), heading)
-        # Everybody keeps to the right of the middle.
+        # Vehicles keep to the right of the middle.
         begin = Pose(begin.x + 2.0 * math.sin(heading), begin.y - 2.0 * math.cos(heading), heading)
         parts = [
             draft.lane(straight(begin.ahead(at), length), 3.5, limit, connector=at == 100.0)

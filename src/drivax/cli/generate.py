@@ -17,9 +17,15 @@ from drivax.scenario.schema import CAPACITIES
 from drivax.scenario.select.splits import parse_shares, write_splits
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import load
-from drivax.synthetic.benchmark import BENCHMARK_VERSION, generate_benchmark
 from drivax.synthetic.domains import DOMAINS
-from drivax.synthetic.generate import FamilyCount, GeneratedSet, Generation, generate
+from drivax.synthetic.generate import (
+    BENCHMARK_VERSION,
+    FamilyCount,
+    GeneratedSet,
+    Generation,
+    generate,
+    generate_benchmark,
+)
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig
 from drivax.tracking.progress import Progress
 

@@ -23,9 +23,8 @@ def corners(box: Any) -> Any:
     points = []
     for ahead, left in _CORNERS:
         dx, dy = ahead * half_length, left * half_width
-        points.append(
-            xp.stack([box[..., X] + dx * cos - dy * sin, box[..., Y] + dx * sin + dy * cos], axis=-1)
-        )
+        x, y = box[..., X] + dx * cos - dy * sin, box[..., Y] + dx * sin + dy * cos
+        points.append(xp.stack([x, y], axis=-1))
     return xp.stack(points, axis=-2)
 
 
@@ -33,8 +32,7 @@ def _axis_terms(a: Any, b: Any) -> tuple[tuple[Any, Any, Any], ...]:
     """The four separating axes of two boxes: (axis x, axis y, sum of the half extents along it)."""
     ca, sa, cb, sb = a[..., COS], a[..., SIN], b[..., COS], b[..., SIN]
     la, wa, lb, wb = a[..., LENGTH] / 2, a[..., WIDTH] / 2, b[..., LENGTH] / 2, b[..., WIDTH] / 2
-    cos = abs(ca * cb + sa * sb)
-    sin = abs(ca * sb - sa * cb)
+    cos, sin = abs(ca * cb + sa * sb), abs(ca * sb - sa * cb)
     return (
         (ca, sa, la + lb * cos + wb * sin),
         (-sa, ca, wa + lb * sin + wb * cos),
@@ -78,10 +76,7 @@ def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
 
 
 def gap(a: Any, b: Any) -> Any:
-    """Smallest distance between boxes, m; 0 where they overlap.
-
-    Between disjoint convex polygons the smallest distance is attained at a corner.
-    """
+    """Smallest distance between boxes, m: that at a corner, or 0 where they overlap."""
     xp = a.__array_namespace__()
     nearest = xp.minimum(_nearest_corner(a, b), _nearest_corner(b, a))
     return root(xp.where(overlap(a, b), xp.zeros_like(nearest), nearest))
@@ -102,27 +97,22 @@ def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s:
     """First time at which two boxes overlap at constant velocities and fixed headings, in closed form.
 
     On each separating axis the centre distance is linear in time, so the boxes overlap on that axis during one
-    interval; they overlap in the plane during the intersection of the four (swept separating axis theorem).
-
-    Velocities ``[..., 2]`` are those of the centres, m/s.
-
-    Returns:
-        Seconds ``[...]``: 0 for boxes that overlap now, ``horizon_s`` for those that do not within the horizon.
+    interval; they overlap in the plane during the intersection of the four (swept separating axis theorem). Velocities
+    ``[..., 2]`` are those of the centres, m/s. The time is 0 for boxes that overlap now, and ``horizon_s`` for those
+    that do not within the horizon.
     """
     xp = a.__array_namespace__()
     dx, dy = b[..., X] - a[..., X], b[..., Y] - a[..., Y]
-    vx = velocity_b[..., 0] - velocity_a[..., 0]
-    vy = velocity_b[..., 1] - velocity_a[..., 1]
-    begin, end = xp.zeros_like(dx), xp.full_like(dx, horizon_s)
+    vx, vy = velocity_b[..., 0] - velocity_a[..., 0], velocity_b[..., 1] - velocity_a[..., 1]
+    never = xp.full_like(dx, horizon_s)
+    begin, end = xp.zeros_like(dx), never
     for axis_x, axis_y, reach in _axis_terms(a, b):
-        distance = dx * axis_x + dy * axis_y
-        speed = vx * axis_x + vy * axis_y
+        distance, speed = dx * axis_x + dy * axis_y, vx * axis_x + vy * axis_y
         moving = abs(speed) > 1e-9
         inverse = 1.0 / xp.where(moving, speed, xp.ones_like(speed))
         first, second = (-reach - distance) * inverse, (reach - distance) * inverse
         inside = abs(distance) < reach
-        never = xp.full_like(dx, horizon_s)
         enter = xp.where(moving, xp.minimum(first, second), xp.where(inside, xp.zeros_like(dx), never))
         leave = xp.where(moving, xp.maximum(first, second), never)
         begin, end = xp.maximum(begin, enter), xp.minimum(end, leave)
-    return xp.where(begin < end, begin, xp.full_like(dx, horizon_s))
+    return xp.where(begin < end, begin, never)

@@ -19,12 +19,9 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Polylines:
-    """Concatenated polylines.
+    """Concatenated polylines: points, the index of the first point of each (and the number of points), arc lengths.
 
-    Attributes:
-        points: Points of all polylines, one after the other, metres.
-        start: Index of the first point of each polyline, and the number of points at the end.
-        arc: Arc length of every point from the start of its own polyline, metres.
+    Arc lengths are measured from the start of each polyline, metres.
     """
 
     points: Float[Array, "point dim"]
@@ -56,6 +53,10 @@ class Polylines:
             return np.zeros(0)
         return np.where(np.diff(self.start) > 0, self.arc[np.maximum(self.start[1:] - 1, 0)], 0.0)
 
+    def line(self, row: Any) -> Float[Array, "_ dim"]:
+        """Points of a polyline."""
+        return self.points[self.start[row] : self.start[row + 1]]
+
     @cached_property
     def _base(self) -> Float[Array, " polyline_plus_1"]:
         """Offset of every polyline on one axis that holds all of them, one metre apart."""
@@ -67,10 +68,9 @@ class Polylines:
         return self.arc + self._base[self.row]
 
     def locate(self, row: Array, s: Array) -> tuple[Int[Array, "*query"], Float[Array, "*query"]]:
-        """Point index and fraction of the segment that holds arc length ``s`` of polyline ``row``.
+        """Point index and fraction of the segment that holds arc length ``s`` of polyline ``row`` (two points or more).
 
-        Every polyline needs two points. Arc lengths beyond an end give fractions outside [0, 1] of the first or
-        the last segment: evaluation there continues straight on.
+        Beyond an end the fraction of the first or last segment is outside [0, 1]: evaluation continues straight on.
         """
         key = np.clip(s, 0.0, self.length[row]) + self._base[row]
         index = np.searchsorted(self._key, key, side="right") - 1
@@ -101,9 +101,7 @@ def arc_lengths(
 ) -> Float[Array, " point"]:
     """Arc length in the plane of every point from the first point of its polyline, metres.
 
-    Args:
-        points: Points of one polyline, or of several one after the other.
-        start: First point of each polyline and the number of points; None for a single polyline.
+    ``start`` holds the first point of each polyline and the number of points; None stands for a single polyline.
     """
     if len(points) == 0:
         return np.zeros(0)
@@ -118,19 +116,17 @@ def arc_lengths(
 def point_to_segment(
     point: Float[Array, "*#batch dim"], a: Float[Array, "*#batch dim"], b: Float[Array, "*#batch dim"]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Distance from points to segments, and the fraction in [0, 1] of the nearest point; broadcasts.
-
-    All need at least one leading axis; the last one holds the coordinates (any number of them).
-    """
-    # Coordinate by coordinate, which is faster.
+    """Distance from points to segments, and the fraction in [0, 1] of the nearest point; broadcasts leading axes."""
     axes = range(a.shape[-1])
-    along = [b[..., i] - a[..., i] for i in axes]
-    to_point = [point[..., i] - a[..., i] for i in axes]
+    return _to_chords([point[..., i] - a[..., i] for i in axes], [b[..., i] - a[..., i] for i in axes])
+
+
+def _to_chords(offset: Sequence[Array], along: Sequence[Array]) -> tuple[Array, Array]:
+    """Distance to chords and fraction along them, from their beginnings; coordinate by coordinate, which is faster."""
     square = sum(u * u for u in along)
-    dot = sum(w * u for w, u in zip(to_point, along, strict=True))
+    dot = sum(w * u for w, u in zip(offset, along, strict=True))
     fraction = np.minimum(np.maximum(dot / np.where(square > 0.0, square, 1.0), 0.0), 1.0)
-    squared = sum((w - fraction * u) ** 2 for w, u in zip(to_point, along, strict=True))
-    return np.sqrt(squared), fraction
+    return np.sqrt(sum((w - fraction * u) ** 2 for w, u in zip(offset, along, strict=True))), fraction
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
@@ -140,10 +136,7 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
     between kept points whose farthest point exceeds the tolerance is split there. Distance is to the chord as a
     segment, so closed rings (first point = last point) work.
 
-    Args:
-        lines: The polylines.
-        tolerance_m: Largest distance, metres.
-        z_weight: Weight of the third coordinate in the distance; 0 ignores it.
+    ``z_weight`` is the weight of the third coordinate in the distance; 0 ignores it.
     """
     axes = [np.ascontiguousarray(lines.points[:, i]) for i in (0, 1)]
     if z_weight > 0.0 and lines.points.shape[1] > 2:
@@ -156,29 +149,17 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
     while len(inside):
         kept = np.flatnonzero(keep)
         interval = np.searchsorted(kept, inside)
-        distance = _chord_distance(axes, inside, kept[interval - 1], kept[interval])
+        begin, end = kept[interval - 1], kept[interval]
+        distance, _ = _to_chords([x[inside] - x[begin] for x in axes], [x[end] - x[begin] for x in axes])
         first = np.flatnonzero(np.diff(interval, prepend=-1))
-        farthest = np.maximum.reduceat(distance, first)
-        count = np.diff(first, append=len(inside))
-        split = farthest > tolerance_m
-        active = np.repeat(split, count)
-        at_peak = active & (distance == np.repeat(farthest, count))
-        peak = np.flatnonzero(at_peak)
+        farthest = np.repeat(np.maximum.reduceat(distance, first), np.diff(first, append=len(inside)))
+        active = farthest > tolerance_m
+        peak = np.flatnonzero(active & (distance == farthest))
         _, earliest = np.unique(interval[peak], return_index=True)
         keep[inside[peak[earliest]]] = True
         inside = inside[active]
         inside = inside[~keep[inside]]
     return keep
-
-
-def _chord_distance(axes: Sequence[Array], point: Array, a: Array, b: Array) -> Float[Array, " point"]:
-    """Distance of points to the segments a-b, all given as indices; coordinate by coordinate, which is faster."""
-    along = [axis[b] - axis[a] for axis in axes]
-    offset = [axis[point] - axis[a] for axis in axes]
-    square = sum(u * u for u in along)
-    fraction = sum(u * w for u, w in zip(along, offset, strict=True)) / np.where(square > 0.0, square, 1.0)
-    fraction = np.minimum(np.maximum(fraction, 0.0), 1.0)
-    return np.sqrt(sum((w - fraction * u) ** 2 for u, w in zip(along, offset, strict=True)))
 
 
 def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array, " segment"]:
@@ -189,15 +170,10 @@ def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array,
 def resample(
     points: Float[Array, "point dim"], spacing_m: float, most: int | None = None
 ) -> tuple[Float[Array, "sample dim"], Int[Array, " sample"]]:
-    """Points every ``spacing_m`` of arc length from the first point on; the rest at the end is dropped.
-
-    Args:
-        points: A polyline of at least two points.
-        spacing_m: Distance along the polyline, metres.
-        most: At most this many samples.
+    """Resample a polyline of at least two points every ``spacing_m`` of arc length; the rest at the end is dropped.
 
     Returns:
-        The samples, and for each the index of the point at or before it.
+        The first ``most`` samples, and for each the index of the point at or before it.
     """
     arc = arc_lengths(points)
     count = int(np.floor(arc[-1] / spacing_m + 1e-6)) + 1
@@ -208,12 +184,16 @@ def resample(
     return points[index] + fraction[:, None] * (points[index + 1] - points[index]), index
 
 
+def left_normals(heading: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
+    """Unit vectors to the left of headings."""
+    return np.stack((-np.sin(heading), np.cos(heading)), axis=-1)
+
+
 def headings(points: Float[Array, "point dim"]) -> Float[Array, " point"]:
     """Heading at every point of a polyline by central differences, one-sided at the ends, radians."""
     xy = points[:, :2]
-    ahead = np.concatenate((xy[1:], xy[-1:]))
-    behind = np.concatenate((xy[:1], xy[:-1]))
-    return np.arctan2(*(ahead - behind).T[::-1])
+    chord = np.concatenate((xy[1:], xy[-1:])) - np.concatenate((xy[:1], xy[:-1]))
+    return np.arctan2(*chord.T[::-1])
 
 
 def project(
@@ -238,18 +218,11 @@ def project_monotone(
     """Non-decreasing arc lengths of successive positions along a polyline, without jumps to another branch.
 
     ``s[k]`` is the arc length in ``[s[k-1], s[k-1] + window[k]]`` whose point is nearest to ``xy[k]``; the first
-    position is searched in ``[0, first_window_m]``.
-
-    Args:
-        points: Polyline of at least two points.
-        xy: Positions in order of time.
-        window_m: How far ahead each position may be of the one before, metres; the first entry is not used.
-        first_window_m: How far along the polyline the first position may be, metres.
+    position is searched in ``[0, first_window_m]``, and ``window[0]`` is not used. The polyline needs two points.
     """
     line, arc = points[:, :2], arc_lengths(points)
-    step = np.diff(line, axis=0)
+    step, span = np.diff(line, axis=0), np.diff(arc)
     square = np.maximum((step * step).sum(axis=1), 1e-12)
-    span = np.diff(arc)
     result = np.zeros(len(xy))
     low, high = 0.0, min(first_window_m, arc[-1])
     for k in range(len(xy)):

@@ -26,9 +26,8 @@ def root(squared: Any) -> Any:
     """
     xp = squared.__array_namespace__()
     positive = squared > 0
-    return xp.where(
-        positive, xp.sqrt(xp.where(positive, squared, xp.ones_like(squared))), xp.zeros_like(squared)
-    )
+    safe = xp.sqrt(xp.where(positive, squared, xp.ones_like(squared)))
+    return xp.where(positive, safe, xp.zeros_like(squared))
 
 
 def norm(vector: Any) -> Any:

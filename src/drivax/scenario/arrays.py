@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int8
 
 from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
@@ -28,15 +29,10 @@ _COLOURS = {"red": LightState.STOP, "yellow": LightState.CAUTION, "green": Light
 
 
 def recording_from_arrays(
-    scenario_id: str,
-    agents: Mapping[str, Any],
-    roads: Mapping[str, Any],
-    lights: Sequence[Mapping[str, Any]] = (),
-    route: Sequence[int] = (),
-    ego: int = 0,
-    dt_s: float = DT_S,
-    dataset: str = "own",
-) -> Recording:
+    scenario_id: str, agents: Mapping[str, Any], roads: Mapping[str, Any],
+    lights: Sequence[Mapping[str, Any]] = (), route: Sequence[int] = (), ego: int = 0,
+    dt_s: float = DT_S, dataset: str = "own",
+) -> Recording:  # fmt: skip
     """Return a recording of any length from plain arrays in one map frame: metres, radians anticlockwise from +x, m/s.
 
     Args:
@@ -62,14 +58,16 @@ def recording_from_arrays(
     Raises:
         UsageError: An argument is missing, misspelt, or has another shape.
     """
-    _check_step(dt_s)
+    if abs(dt_s - DT_S) > 1e-3:
+        cure = f"call drivax.scenario.resample(agents, {dt_s}) first, and leave dt_s out"
+        raise UsageError(f"dt_s is {dt_s}, scenarios have steps of {DT_S} s", cure=cure)
     _check_keys(agents, _AGENT_KEYS, "agents")
     _check_keys(roads, _ROAD_KEYS, "roads")
     features = tuple(_features(roads))
-    high = any(np.ptp(feature.points[:, 2]) > 0 for feature in features)
-    tracks = _tracks(agents, ego, needs_height=high)
+    uneven = any(np.ptp(feature.points[:, 2]) > 0 for feature in features)
+    tracks = _tracks(agents, ego, needs_height=uneven)
     steps = tracks.valid.shape[1]
-    lanes = len(roads.get("lanes", ()))
+    lanes = features[: len(roads.get("lanes", ()))]
     return Recording(
         scenario_id=scenario_id,
         dataset=dataset,
@@ -79,43 +77,27 @@ def recording_from_arrays(
         ego=ego,
         tracks=tracks,
         features=features,
-        lights=tuple(
-            _light(light, f"lights[{i}]", features[:lanes], steps) for i, light in enumerate(lights)
-        ),
-        route_lanes=_lane_indices(route, lanes, "route"),
+        lights=tuple(_light(light, f"lights[{i}]", lanes, steps) for i, light in enumerate(lights)),
+        route_lanes=_lane_indices(route, len(lanes), "route"),
         flags=Flag.NONE if "velocity" in agents else Flag.DIFFERENTIATED_VELOCITY,
         tags={"source_format": "arrays"},
     )
 
 
 def scenario_from_arrays(
-    scenario_id: str,
-    agents: Mapping[str, Any],
-    roads: Mapping[str, Any],
-    lights: Sequence[Mapping[str, Any]] = (),
-    route: Sequence[int] = (),
-    ego: int = 0,
-    dt_s: float = DT_S,
-    dataset: str = "own",
-) -> Scenario:
+    scenario_id: str, agents: Mapping[str, Any], roads: Mapping[str, Any],
+    lights: Sequence[Mapping[str, Any]] = (), route: Sequence[int] = (), ego: int = 0,
+    dt_s: float = DT_S, dataset: str = "own",
+) -> Scenario:  # fmt: skip
     """Return a scenario from plain arrays of at most 91 steps; step 10 is the current one.
 
-    Takes the arguments of :func:`recording_from_arrays`; cut longer recordings with
+    Arguments and errors are those of :func:`recording_from_arrays`; cut longer recordings with
     :func:`drivax.scenario.recording.windows`.
 
     Raises:
-        UsageError: An argument is missing, misspelt, or has another shape.
-        DataError: The data make no scenario (the ego is not valid at the current step, a number is not finite).
+        DataError: The recording is invalid (the ego is not valid at the current step, a number is not finite).
     """
     return assemble(recording_from_arrays(scenario_id, agents, roads, lights, route, ego, dt_s, dataset))
-
-
-def _check_step(dt_s: float) -> None:
-    if abs(dt_s - DT_S) > 1e-3:
-        raise UsageError(
-            f"dt_s is {dt_s}, scenarios have steps of {DT_S} s",
-            cure=f"call drivax.scenario.resample(agents, {dt_s}) first, and leave dt_s out",
-        )
 
 
 def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
@@ -149,11 +131,11 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
         step = (step + np.pi) % (2 * np.pi) - np.pi if name == "heading" else step
         return values[:, before] + share.reshape(-1, *[1] * len(columns)) * step
 
-    result = {name: agents[name] for name in ("kind", "id", "size") if name in agents}
-    if "size" in result and np.ndim(result["size"]) == 3:
-        result["size"] = between("size", (3,))
-    result |= {"xy": between("xy", (2,)), "heading": between("heading", ()), "valid": seen}
-    return result | ({"z": between("z", ())} if "z" in agents else {})
+    widths: dict[str, tuple[int, ...]] = {"xy": (2,), "heading": ()}
+    widths |= {"z": ()} if "z" in agents else {}
+    widths |= {"size": (3,)} if np.ndim(agents.get("size", ())) == 3 else {}
+    result = {name: agents[name] for name in ("kind", "id", "size") if name in agents} | {"valid": seen}
+    return result | {name: between(name, columns) for name, columns in widths.items()}
 
 
 def differentiate(
@@ -195,13 +177,11 @@ def _array(given: Mapping[str, Any], name: str, kind: type, shape: tuple[int | N
         values = np.array(given[name], dtype=kind)
     except (TypeError, ValueError) as error:
         raise UsageError(f'agents["{name}"] is no array of numbers', cure="give one row per agent") from error
-    if len(values.shape) != len(shape) or any(
-        w not in (None, n) for w, n in zip(shape, values.shape, strict=True)
+    if values.ndim != len(shape) or any(
+        size not in (None, given_size) for size, given_size in zip(shape, values.shape, strict=True)
     ):
-        expected = tuple("any" if size is None else size for size in shape)
-        raise UsageError(
-            f'agents["{name}"] has shape {values.shape}, not {expected}', cure="see recording_from_arrays"
-        )
+        problem = f"has shape {values.shape}, not {tuple('any' if size is None else size for size in shape)}"
+        raise UsageError(f'agents["{name}"] {problem}', cure="see recording_from_arrays")
     return values
 
 
@@ -216,7 +196,7 @@ def _tracks(agents: Mapping[str, Any], ego: int, needs_height: bool) -> Tracks:
     xy = _where(_array(agents, "xy", float, (count, steps, 2)), valid)
     if not 0 <= ego < count:
         raise UsageError(f"ego is {ego}, there are {count} agents", cure="give its row in agents")
-    kind = np.array(_kinds(agents, count), np.int8)
+    kind = _kinds(agents, count)
     size = _where(_sizes(agents, count, steps), valid)
     if "velocity" in agents:
         velocity = _where(_array(agents, "velocity", float, (count, steps, 2)), valid)
@@ -229,23 +209,17 @@ def _tracks(agents: Mapping[str, Any], ego: int, needs_height: bool) -> Tracks:
     else:
         default = np.array([DEFAULT_SIZES[AgentKind(code)][2] for code in kind])[:, None]
         z = _where(np.where(size[..., 2] > 0, size[..., 2], default) / 2, valid)
-    return Tracks(
-        xy=xy,
-        z=z,
-        heading=_where(_array(agents, "heading", float, (count, steps)), valid),
-        velocity=velocity,
-        size=size,
-        valid=valid,
-        kind=kind,
-        track_id=_array(agents, "id", np.int64, (count,)) if "id" in agents else np.arange(count),
-    )
+    heading = _where(_array(agents, "heading", float, (count, steps)), valid)
+    track_id = _array(agents, "id", np.int64, (count,)) if "id" in agents else np.arange(count)
+    return Tracks(xy, z, heading, velocity, size, valid, kind, track_id)
 
 
-def _kinds(agents: Mapping[str, Any], count: int) -> list[AgentKind]:
+def _kinds(agents: Mapping[str, Any], count: int) -> Int8[np.ndarray, " agent"]:
     given = agents.get("kind", ["vehicle"] * count)
     if isinstance(given, str) or len(given) != count:
         raise UsageError(f'agents["kind"] has {len(given)} entries, not {count}', cure="give one per agent")
-    return [_named(kind, _KINDS, AgentKind, f'agents["kind"][{row}]') for row, kind in enumerate(given)]
+    kinds = [_named(kind, _KINDS, AgentKind, f'agents["kind"][{row}]') for row, kind in enumerate(given)]
+    return np.array(kinds, np.int8)
 
 
 def _sizes(agents: Mapping[str, Any], count: int, steps: int) -> Array:
@@ -268,17 +242,18 @@ def _named(value: Any, names: Mapping[Any, Any], kinds: type[Any], what: str) ->
 
 def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
     """Lanes, edges, crosswalks and stop signs, numbered in this order."""
-    lanes = roads.get("lanes", ())
-    number = 0
-    for name, read in (
-        ("lanes", _lane),
-        ("edges", _edge),
-        ("crosswalks", _crosswalk),
-        ("stop_signs", _stop_sign),
-    ):
+    lanes, number = len(roads.get("lanes", ())), itertools.count()
+    for row, given in enumerate(roads.get("lanes", ())):
+        yield _lane(next(number), given, f'roads["lanes"][{row}]', lanes)
+    for name, kind, least in (("edges", RoadKind.EDGE_BOUNDARY, 2), ("crosswalks", RoadKind.CROSSWALK, 3)):
         for row, given in enumerate(roads.get(name, ())):
-            yield read(number, given, f'roads["{name}"][{row}]', len(lanes))
-            number += 1
+            yield MapFeature(next(number), kind, _points(given, f'roads["{name}"][{row}]', least))
+    for row, given in enumerate(roads.get("stop_signs", ())):
+        what = f'roads["stop_signs"][{row}]'
+        _check_keys(given, ("point", "lanes"), what)
+        point = _points([given.get("point")], f'{what}["point"]', 1)
+        controlled = _lane_indices(given.get("lanes", ()), lanes, what)
+        yield MapFeature(next(number), RoadKind.STOP_SIGN, point, lanes=controlled)
 
 
 def _points(given: Any, what: str, least: int) -> Array:
@@ -286,13 +261,11 @@ def _points(given: Any, what: str, least: int) -> Array:
     try:
         points = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise UsageError(
-            f"{what} is no array of points", cure="give (x, y) or (x, y, z) per point"
-        ) from error
+        cure = "give (x, y) or (x, y, z) per point"
+        raise UsageError(f"{what} is no array of points", cure=cure) from error
     if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) < least:
-        raise UsageError(
-            f"{what} has shape {points.shape}", cure=f"give at least {least} rows of x, y or x, y, z"
-        )
+        cure = f"give at least {least} rows of x, y or x, y, z"
+        raise UsageError(f"{what} has shape {points.shape}", cure=cure)
     if not np.isfinite(points).all():
         raise UsageError(f"{what} has a point that is not finite", cure="leave it out")
     return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
@@ -310,22 +283,6 @@ def _lane(number: int, given: Any, what: str, lanes: int) -> MapFeature:
         successors=_lane_indices(given.get("successors", ()), lanes, f'{what}["successors"]'),
         left_neighbours=_lane_indices(given.get("left", ()), lanes, f'{what}["left"]'),
         right_neighbours=_lane_indices(given.get("right", ()), lanes, f'{what}["right"]'),
-    )
-
-
-def _edge(number: int, given: Any, what: str, lanes: int) -> MapFeature:
-    return MapFeature(number, RoadKind.EDGE_BOUNDARY, _points(given, what, 2))
-
-
-def _crosswalk(number: int, given: Any, what: str, lanes: int) -> MapFeature:
-    return MapFeature(number, RoadKind.CROSSWALK, _points(given, what, 3))
-
-
-def _stop_sign(number: int, given: Any, what: str, lanes: int) -> MapFeature:
-    _check_keys(given, ("point", "lanes"), what)
-    point = _points([given.get("point")], f'{what}["point"]', 1)
-    return MapFeature(
-        number, RoadKind.STOP_SIGN, point, lanes=_lane_indices(given.get("lanes", ()), lanes, what)
     )
 
 

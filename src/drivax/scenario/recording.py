@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ EXTENT_M, SPEED_MPS = 100_000.0, 500.0
 #: Steps between the starts of two windows.
 STRIDE = 40
 _UNITS = "repair it, or convert it to metres in the reader"
+#: Fields of tracks with a value per step, and the shape of that value.
+_WIDTHS = {"xy": (2,), "z": (), "heading": (), "velocity": (2,), "size": (3,), "valid": ()}
 Finding = tuple[str, str] | None
 
 
@@ -122,9 +125,9 @@ class Recording:
 def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
     """Cut a recording into windows of 91 steps that share its segment.
 
-    Window ``k`` begins at step ``k * stride``; steps at the end that fill no window are left out (110 steps make one
-    window, 199 make three). Windows without a valid ego at the current step are left out and counted in ``lost`` of the
-    others as ``windows_without_ego``. A recording of at most 91 steps is its own window.
+    Window ``k`` starts at step ``k * stride``; a rest that fills no window is left out (110 steps make one window, 199
+    make three). Windows without a valid ego at the current step are left out, and counted in ``lost`` of the others as
+    ``windows_without_ego``. A recording of at most 91 steps is its own window.
 
     Raises:
         UsageError: The stride is not positive.
@@ -139,37 +142,30 @@ def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
     starts = range(0, steps - STEPS + 1, stride)
     usable = [start for start in starts if recording.tracks.valid[recording.ego, start + CURRENT_STEP]]
     if not usable:
-        raise DataError(
-            f"the ego is not valid at the current step of any of {len(starts)} windows",
-            record=recording.scenario_id,
-            cure="skip the recording",
-        )
-    lost = dict(recording.lost)
-    if len(usable) < len(starts):
-        lost["windows_without_ego"] = len(starts) - len(usable)
+        problem = f"the ego is not valid at the current step of any of {len(starts)} windows"
+        raise DataError(problem, record=recording.scenario_id, cure="skip the recording")
+    left_out = {"windows_without_ego": len(starts) - len(usable)} if len(usable) < len(starts) else {}
     for start in usable:
-        yield replace(_window(recording, start), lost=lost)
+        yield _window(replace(recording, lost={**recording.lost, **left_out}), start)
 
 
 def _window(recording: Recording, start: int) -> Recording:
     """The 91 steps from ``start`` on."""
     part = slice(start, start + STEPS)
-    tracks = recording.tracks
-    time_fields = ("xy", "z", "heading", "velocity", "size", "valid")
-    events = (replace(e, start=e.start - start, end=e.end - start) for e in recording.events)
+    timed = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
+    events = (
+        replace(event, start=max(event.start - start, 0), end=min(event.end - start, STEPS - 1))
+        for event in recording.events
+    )
     return replace(
         recording,
         scenario_id=f"{recording.scenario_id}@{start}",
         timestamps_s=recording.timestamps_s[part],
         current_step=CURRENT_STEP,
-        tracks=replace(tracks, **{name: getattr(tracks, name)[:, part] for name in time_fields}),
+        tracks=replace(recording.tracks, **timed),
         seen=None if recording.seen is None else recording.seen[:, part],
         lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
-        events=tuple(
-            replace(e, start=max(e.start, 0), end=min(e.end, STEPS - 1))
-            for e in events
-            if e.end >= 0 and e.start < STEPS
-        ),
+        events=tuple(event for event in events if event.end >= event.start),
     )
 
 
@@ -180,44 +176,24 @@ def with_ego(recording: Recording, row: int) -> Recording:
         UsageError: The row is no vehicle that is valid at the current step.
     """
     tracks = recording.tracks
-    good = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
-    if not good or not tracks.valid[row, recording.current_step]:
-        raise UsageError(
-            f"track row {row} is no vehicle that is valid at step {recording.current_step}",
-            record=recording.scenario_id,
-            cure="choose a vehicle that is valid at the current step",
-        )
+    is_vehicle = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
+    if not is_vehicle or not tracks.valid[row, recording.current_step]:
+        problem = f"track row {row} is no vehicle that is valid at step {recording.current_step}"
+        cure = "choose a vehicle that is valid at the current step"
+        raise UsageError(problem, record=recording.scenario_id, cure=cure)
     if row == recording.ego:
         return recording
-    return replace(
-        recording,
-        scenario_id=f"{recording.scenario_id}#{int(tracks.track_id[row])}",
-        ego=row,
-        seen=None,
-        route_lanes=(),
-        route_corridor=(),
-    )
+    name = f"{recording.scenario_id}#{int(tracks.track_id[row])}"
+    return replace(recording, scenario_id=name, ego=row, seen=None, route_lanes=(), route_corridor=())
 
 
 def check(recording: Recording, capacity: Capacity) -> None:
-    """Refuse an invalid recording.
-
-    Raises:
-        DataError: The recording is invalid.
-    """
-    for test in (
-        _check_names,
-        _check_time,
-        _check_shapes,
-        _check_tracks,
-        _check_ego,
-        _check_extent,
-        _check_map,
-        _check_lights,
-    ):
-        problem = test(recording, capacity)
-        if problem is not None:
-            raise DataError(problem[0], record=recording.scenario_id, cure=problem[1])
+    """Raise DataError if a recording is invalid."""
+    problem = _check_names(recording) or _check_time(recording, capacity.steps) or _check_shapes(recording)
+    problem = problem or _check_tracks(recording) or _check_extent(recording)
+    problem = problem or _check_map(recording) or _check_lights(recording)
+    if problem is not None:
+        raise DataError(problem[0], record=recording.scenario_id, cure=problem[1])
 
 
 def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
@@ -229,7 +205,7 @@ def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
     return median, float(np.abs(steps - median).max())
 
 
-def _check_names(recording: Recording, capacity: Capacity) -> Finding:
+def _check_names(recording: Recording) -> Finding:
     for name, size in TEXT_BYTES.items():
         text = getattr(recording, name)
         if not text or len(text.encode()) > size or "\0" in text:
@@ -237,13 +213,13 @@ def _check_names(recording: Recording, capacity: Capacity) -> Finding:
     return None
 
 
-def _check_time(recording: Recording, capacity: Capacity) -> Finding:
+def _check_time(recording: Recording, most_steps: int) -> Finding:
     times = np.asarray(recording.timestamps_s)
     steps = len(times)
     if steps == 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         return "timestamps do not increase", "repair the time base in the reader"
-    if steps > capacity.steps:
-        return f"{steps} steps, more than {capacity.steps}", "cut it with windows()"
+    if steps > most_steps:
+        return f"{steps} steps, more than {most_steps}", "cut it with windows()"
     if not 0 <= recording.current_step < steps:
         return f"current step {recording.current_step} of {steps} steps", "name a step that exists"
     median, _ = step_seconds(times)
@@ -252,27 +228,22 @@ def _check_time(recording: Recording, capacity: Capacity) -> Finding:
     return None
 
 
-def _check_shapes(recording: Recording, capacity: Capacity) -> Finding:
+def _check_shapes(recording: Recording) -> Finding:
     tracks, steps = recording.tracks, len(recording.timestamps_s)
     count = len(tracks.track_id)
-    widths = {"xy": (2,), "z": (), "heading": (), "velocity": (2,), "size": (3,), "valid": ()}
-    expected = {name: (count, steps, *width) for name, width in widths.items()} | {"kind": (count,)}
-    for name, shape in expected.items():
-        given = np.shape(getattr(tracks, name))
+    shapes = {f"tracks.{name}": (count, steps, *width) for name, width in _WIDTHS.items()}
+    shapes |= {"tracks.kind": (count,)} | ({} if recording.seen is None else {"seen": (count, steps)})
+    for name, shape in shapes.items():
+        given = np.shape(attrgetter(name)(recording))
         if given != shape:
-            return f"tracks.{name} has shape {given}, not {shape}", "give every track every step"
-    if recording.seen is not None and np.shape(recording.seen) != (count, steps):
-        return (
-            f"seen has shape {np.shape(recording.seen)}, not {(count, steps)}",
-            "give every track every step",
-        )
+            return f"{name} has shape {given}, not {shape}", "give every track every step"
     rows = (recording.ego, *recording.to_predict, *recording.of_interest)
     if any(not 0 <= row < count for row in rows):
         return f"a track row out of {count} is named in {rows}", "name rows of the track table"
     return None
 
 
-def _check_tracks(recording: Recording, capacity: Capacity) -> Finding:
+def _check_tracks(recording: Recording) -> Finding:
     tracks = recording.tracks
     for name in ("xy", "z", "heading", "velocity"):
         values = getattr(tracks, name)
@@ -287,11 +258,7 @@ def _check_tracks(recording: Recording, capacity: Capacity) -> Finding:
     ids = tracks.track_id
     if len(ids) and (ids.min() < 0 or ids.max() >= 2**31):
         return "track ids do not fit into 31 bits", "number the tracks in the reader"
-    return None
-
-
-def _check_ego(recording: Recording, capacity: Capacity) -> Finding:
-    if not recording.tracks.valid[recording.ego, recording.current_step]:
+    if not tracks.valid[recording.ego, recording.current_step]:
         return f"the ego is not valid at the current step {recording.current_step}", "skip the recording"
     return None
 
@@ -302,7 +269,7 @@ def _here(recording: Recording) -> Float[Array, "3"]:
     return np.append(recording.tracks.xy[now], recording.tracks.z[now])
 
 
-def _check_extent(recording: Recording, capacity: Capacity) -> Finding:
+def _check_extent(recording: Recording) -> Finding:
     """Positions and speeds of any size would not fit into memory or float32."""
     tracks, here = recording.tracks, _here(recording)
     places = np.concatenate((tracks.xy[tracks.valid], tracks.z[tracks.valid][:, None]), axis=1)
@@ -316,7 +283,7 @@ def _check_extent(recording: Recording, capacity: Capacity) -> Finding:
     return None
 
 
-def _check_map(recording: Recording, capacity: Capacity) -> Finding:
+def _check_map(recording: Recording) -> Finding:
     for feature in recording.features:
         shape = np.shape(feature.points)
         if len(shape) != 2 or shape[1] != 3 or not shape[0]:
@@ -327,19 +294,19 @@ def _check_map(recording: Recording, capacity: Capacity) -> Finding:
             return f"feature {feature.feature_id} is of unknown kind {feature.kind}", "use a RoadKind"
     if not recording.features:
         return None
-    counts = [len(feature.points) for feature in recording.features]
     points = np.concatenate([feature.points for feature in recording.features])
-    far = ~(np.abs(points - _here(recording)).max(axis=1) <= EXTENT_M)
-    if not far.any():
+    far = np.flatnonzero(~(np.abs(points - _here(recording)).max(axis=1) <= EXTENT_M))
+    if not len(far):
         return None
-    row = int(np.searchsorted(np.cumsum(counts), np.argmax(far), side="right"))
-    place = f"feature {recording.features[row].feature_id} has a point"
-    if not np.isfinite(points[np.argmax(far)]).all():
-        return f"{place} that is not finite", "repair it or drop it"
-    return f"{place} more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
+    ends = np.cumsum([len(feature.points) for feature in recording.features])
+    feature = recording.features[int(np.searchsorted(ends, far[0], side="right"))]
+    if not np.isfinite(points[far[0]]).all():
+        return f"feature {feature.feature_id} has a point that is not finite", "repair it or drop it"
+    where = f"more than {EXTENT_M / 1000:.0f} km away from the ego"
+    return f"feature {feature.feature_id} has a point {where}", _UNITS
 
 
-def _check_lights(recording: Recording, capacity: Capacity) -> Finding:
+def _check_lights(recording: Recording) -> Finding:
     steps = len(recording.timestamps_s)
     for light in recording.lights:
         states = np.asarray(light.states)

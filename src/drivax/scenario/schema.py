@@ -69,12 +69,12 @@ POLYGON_KINDS = (RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, RoadKind.DRIVEWAY)
 
 def among(kind: Int[np.ndarray, "*n"], group: tuple[int, ...]) -> Bool[np.ndarray, "*n"]:
     """Mask of kinds (-1 or more) in a group: ``np.isin`` by a table, which is several times faster."""
-    table = _member(group)
+    table = _members(group)
     return table[np.minimum(kind, len(table) - 1)]
 
 
 @cache
-def _member(group: tuple[int, ...]) -> Bool[np.ndarray, " kind"]:
+def _members(group: tuple[int, ...]) -> Bool[np.ndarray, " kind"]:
     """Mask of the numbers in a group; the last entry stands for larger numbers and -1."""
     result = np.zeros(max(group) + 2, dtype=bool)
     result[list(group)] = True
@@ -158,114 +158,67 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
     k, r, o, lt, st = c.routes, c.route_points, c.road_rows, c.lights, c.stops
     cells = c.grid * c.grid
     return {
-        "scenario_id": ("S64", ()),
-        "dataset": ("S16", ()),
-        "segment": ("S64", ()),
-        "origin": ("f8", (3,)),
-        "dt_s": ("f4", ()),
-        "current_step": ("i2", ()),
-        "steps": ("i2", ()),
-        "flags": ("u4", ()),
+        "scenario_id": ("S64", ()), "dataset": ("S16", ()), "segment": ("S64", ()), "origin": ("f8", (3,)),
+        "dt_s": ("f4", ()), "current_step": ("i2", ()), "steps": ("i2", ()), "flags": ("u4", ()),
         # Agents that move (slot 0 is ego), local frame, time-major; zeros where not valid.
-        "agent_xy": ("f4", (t, a, 2)),
-        "agent_z": ("f4", (t, a)),
-        "agent_heading": ("f4", (t, a)),
-        "agent_velocity": ("f4", (t, a, 2)),
-        "agent_valid": ("?", (t, a)),
+        "agent_xy": ("f4", (t, a, 2)), "agent_z": ("f4", (t, a)), "agent_heading": ("f4", (t, a)),
+        "agent_velocity": ("f4", (t, a, 2)), "agent_valid": ("?", (t, a)),
         "agent_seen": ("?", (t, a)),  # of the valid ones, those that ego's sensors would see
-        "agent_size": ("f4", (a, 3)),
-        "agent_kind": ("i1", (a,)),
-        "agent_id": ("i4", (a,)),
+        "agent_size": ("f4", (a, 3)), "agent_kind": ("i1", (a,)), "agent_id": ("i4", (a,)),
         "agent_flags": ("u1", (a,)),  # 1 ego, 2 to predict, 4 of interest
         "agent_extension": ("f4", (a, c.extension, 2)),  # 4 m apart, beyond the last logged pose, along lanes
         # Agents that stay where they are: one pose, and when they were seen.
-        "parked_xy": ("f4", (p, 2)),
-        "parked_z": ("f4", (p,)),
-        "parked_heading": ("f4", (p,)),
-        "parked_size": ("f4", (p, 3)),
-        "parked_kind": ("i1", (p,)),
-        "parked_id": ("i4", (p,)),
-        "parked_valid": ("?", (t, p)),
-        "parked_seen": ("?", (t, p)),
+        "parked_xy": ("f4", (p, 2)), "parked_z": ("f4", (p,)), "parked_heading": ("f4", (p,)),
+        "parked_size": ("f4", (p, 3)), "parked_kind": ("i1", (p,)), "parked_id": ("i4", (p,)),
+        "parked_valid": ("?", (t, p)), "parked_seen": ("?", (t, p)),
         # Lights and stop signs.
         "light_line": ("f4", (lt, 4)),  # stop line from left to right of the lane: x, y, x, y
-        "light_z": ("f4", (lt,)),
-        "light_lane": ("i2", (lt,)),
-        "light_heading": ("f4", (lt,)),
+        "light_z": ("f4", (lt,)), "light_lane": ("i2", (lt,)), "light_heading": ("f4", (lt,)),
         "light_exit_heading": ("f4", (lt,)),  # heading where the controlled lane ends
-        "light_state": ("i1", (t, lt)),
-        "stop_xy": ("f4", (st, 2)),
-        "stop_lane": ("i2", (st, 4)),
+        "light_state": ("i1", (t, lt)), "stop_xy": ("f4", (st, 2)), "stop_lane": ("i2", (st, 4)),
         # Map segments of at most 4 m: [edges by cell | car lanes by cell | the rest], -1 where a link is missing.
-        "segment_a": ("f4", (s, 3)),
-        "segment_b": ("f4", (s, 3)),
-        "segment_kind": ("i1", (s,)),
-        "segment_feature": ("i2", (s,)),
-        "segment_lane": ("i2", (s,)),
-        "segment_start_m": ("f4", (s,)),
+        "segment_a": ("f4", (s, 3)), "segment_b": ("f4", (s, 3)), "segment_kind": ("i1", (s,)),
+        "segment_feature": ("i2", (s,)), "segment_lane": ("i2", (s,)), "segment_start_m": ("f4", (s,)),
         "segment_blocks": ("i4", (4,)),  # 0, end of edges, end of lanes, end of the rest
-        "feature_id": ("i8", (m,)),
-        "feature_kind": ("i1", (m,)),
-        "feature_closed": ("?", (m,)),
+        "feature_id": ("i8", (m,)), "feature_kind": ("i1", (m,)), "feature_closed": ("?", (m,)),
         # Lane graph with dense indices; -1 none or unknown.
-        "lane_id": ("i8", (n,)),
-        "lane_kind": ("i1", (n,)),
-        "lane_length": ("f4", (n,)),
-        "lane_width": ("f4", (n,)),
-        "lane_limit": ("f4", (n,)),
-        "lane_interpolating": ("?", (n,)),
-        "lane_successor": ("i2", (n, 4)),
-        "lane_predecessor": ("i2", (n, 4)),
+        "lane_id": ("i8", (n,)), "lane_kind": ("i1", (n,)), "lane_length": ("f4", (n,)),
+        "lane_width": ("f4", (n,)), "lane_limit": ("f4", (n,)), "lane_interpolating": ("?", (n,)),
+        "lane_successor": ("i2", (n, 4)), "lane_predecessor": ("i2", (n, 4)),
         "lane_left": ("i2", (n,)),  # same direction only
-        "lane_right": ("i2", (n,)),
-        "lane_light": ("i2", (n,)),
-        "lane_stop": ("?", (n,)),
+        "lane_right": ("i2", (n,)), "lane_light": ("i2", (n,)), "lane_stop": ("?", (n,)),
         # Routes at 1 m: row 0 to the goal, row 1 the log's own (privileged), then the other candidates.
-        "route_xy": ("f4", (k, r, 2)),
-        "route_z": ("f4", (k, r)),
-        "route_heading": ("f4", (k, r)),
-        "route_lane": ("i2", (k, r)),
-        "route_limit": ("f4", (k, r)),
-        "route_points": ("i2", (k,)),
+        "route_xy": ("f4", (k, r, 2)), "route_z": ("f4", (k, r)), "route_heading": ("f4", (k, r)),
+        "route_lane": ("i2", (k, r)), "route_limit": ("f4", (k, r)), "route_points": ("i2", (k,)),
         "goal_xy": ("f4", (2,)),
         "log_progress": ("f4", (t,)),  # arc length of the logged ego along route 0
         # Uniform grid over the square [grid_origin, +cell * grid).
-        "grid_origin": ("f4", (2,)),
-        "grid_edge": ("i2", (cells + 1,)),
-        "grid_lane": ("i2", (cells + 1,)),
-        "grid_side": ("i4", (cells,)),  # drivable or not, 3 x 3 side cells per cell (scenario.sides.packed)
+        "grid_origin": ("f4", (2,)), "grid_edge": ("i2", (cells + 1,)), "grid_lane": ("i2", (cells + 1,)),
+        "grid_side": ("i4", (cells,)),  # drivable or not, 3 x 3 side cells per cell (scenario.build.grid.packed)
         # Observation polylines: pieces of at most 10 m, in order of rank.
-        "road_xy": ("f4", (o, 2)),
-        "road_direction": ("f4", (o, 2)),
-        "road_length": ("f4", (o,)),
-        "road_kind": ("i1", (o,)),
-        "road_limit": ("f4", (o,)),
-        "road_curvature": ("f4", (o,)),
+        "road_xy": ("f4", (o, 2)), "road_direction": ("f4", (o, 2)), "road_length": ("f4", (o,)),
+        "road_kind": ("i1", (o,)), "road_limit": ("f4", (o,)), "road_curvature": ("f4", (o,)),
         "road_rows": ("i2", ()),
         # Labels of the built-in world.
-        "event_kind": ("i1", (c.events,)),
-        "event_start": ("i2", (c.events,)),
-        "event_end": ("i2", (c.events,)),
-        "event_actor": ("i4", (c.events, 4)),
+        "event_kind": ("i1", (c.events,)), "event_start": ("i2", (c.events,)),
+        "event_end": ("i2", (c.events,)), "event_actor": ("i4", (c.events, 4)),
     }  # fmt: skip
 
 
 def record_dtype(capacity: Capacity) -> np.dtype[Any]:
     """Return the dtype of a stored scenario: 64-byte aligned fields, item size a multiple of 4096."""
-    names, formats, offsets, end = [], [], [], 0
-    for name, (kind, shape) in scenario_fields(capacity).items():
-        formats.append((kind, shape))
-        names.append(name)
+    fields = scenario_fields(capacity)
+    offsets, end = [], 0
+    for form in fields.values():
         offsets.append(-(-end // 64) * 64)
-        end = offsets[-1] + np.dtype((kind, shape)).itemsize
-    return np.dtype(
-        {"names": names, "formats": formats, "offsets": offsets, "itemsize": -(-end // 4096) * 4096}
-    )
+        end = offsets[-1] + np.dtype(form).itemsize
+    layout = {"names": list(fields), "formats": list(fields.values()), "offsets": offsets}
+    return np.dtype(layout | {"itemsize": -(-end // 4096) * 4096})
 
 
 @dataclass(frozen=True)
 class SourceCounts:
-    """Counts of the source before capping and cropping, as shown by ``drivax inspect``."""
+    """Counts of the source before capping and cropping; ``drivax inspect`` shows them."""
 
     steps: int
     tracks: int
@@ -287,8 +240,6 @@ class Scenario:
 
     Attributes:
         record: A zero-dimensional structured array of ``record_dtype(capacity)``.
-        capacity: The padded sizes.
-        source: Counts of the source before capping.
         overflow: Nonzero numbers of agents, segments, ... that did not fit, by name.
         audit: Findings of the audit, by name (``evaluation.audit``).
         tags: Words for filters and strata.

@@ -8,8 +8,8 @@ A set is a folder::
     splits/              lists for training, validation and test (``scenario.select.splits``)
     scores.npz           criticality scores by which the scenarios were selected (``curation.subset``)
 
-Any tool reads a shard with ``numpy.load(path, mmap_mode="r")``; record ``i`` lies at a fixed offset, so one
-scenario is one range read. A set appears under its name only when it is complete. This module needs no JAX.
+``numpy.load(path, mmap_mode="r")`` reads a shard; a record lies at a fixed offset, so a scenario is one range read. A
+set appears under its name only when it is complete. This module needs no JAX.
 """
 
 from __future__ import annotations
@@ -22,28 +22,22 @@ import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import metadata
+from operator import itemgetter
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any, Self
 
 import numpy as np
 
 from drivax.errors import DataError, UsageError
 from drivax.files import PartialFolder, check_output, sync_and_close, write_json
-from drivax.scenario.schema import (
-    SCHEMA_VERSION,
-    Capacity,
-    Scenario,
-    SourceCounts,
-    record_dtype,
-    scenario_fields,
-)
+from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
 from drivax.scenario.select.splits import Shares, write_splits
 
 MANIFEST = "manifest.json"
 #: The cure for a set that cannot be repaired.
 AGAIN = "convert or generate the set again"
 _HEADER_LIMIT = 100_000
+_Bytes = np.ndarray[Any, Any]
 
 
 class ScenarioWriter:
@@ -52,13 +46,13 @@ class ScenarioWriter:
     Args:
         path: Folder to create.
         capacity: Padded sizes of all scenarios.
-        source: Origin of the scenarios, as JSON values; may be completed until the block ends.
+        source: Origin of the scenarios, as JSON values; callers may add to :attr:`source` until the block ends.
         shard_size: Records per shard.
         overwrite: Replace an existing scenario set; other folders are never replaced.
         shares: Percentages of train, validation and test for the files of ``splits/``; None writes no files.
         identity: What is written, for a set that can be resumed: closed shards survive an exception or a kill, and the
             next writer with the same identity continues after them (:attr:`notes`).
-        further: Called with the complete folder before it is published, to write additional files.
+        further: Writes additional files into the complete folder before it is published.
 
     Raises:
         UsageError: ``path`` exists, another process writes it, or a scenario has another capacity.
@@ -78,9 +72,7 @@ class ScenarioWriter:
     ) -> None:
         if shard_size < 1:
             raise UsageError(f"shard_size is {shard_size}", cure="use 1 or more")
-        self.path = Path(path)
-        self.capacity = capacity
-        self.overwrite = overwrite
+        self.path, self.capacity, self.overwrite = Path(path), capacity, overwrite
         self._refuse_existing()
         self.source: dict[str, Any] = plain(dict(source or {}))
         #: Notes given to :meth:`add` with the last scenario of every shard that an earlier writer closed.
@@ -130,21 +122,14 @@ class ScenarioWriter:
     def add(self, scenario: Scenario, note: Any = None) -> None:
         """Append a scenario; a later writer finds ``note`` in :attr:`notes` if the scenario fills its shard."""
         if scenario.capacity != self.capacity:
-            raise UsageError(
-                f"capacity is {scenario.capacity.name!r}, the set's is {self.capacity.name!r}",
-                file=self.path,
-                record=scenario.id,
-                cure="assemble it with the capacity of the set",
-            )
+            problem = f"capacity is {scenario.capacity.name!r}, the set's is {self.capacity.name!r}"
+            cure = "assemble it with the capacity of the set"
+            raise UsageError(problem, file=self.path, record=scenario.id, cure=cure)
         entry = manifest_entry(scenario)
         key = _key(entry)
         if key in self._known:
-            raise DataError(
-                f"a scenario {key[1]!r} of {key[0]!r} is in the set already",
-                file=self.path,
-                record=len(self._entries),
-                cure="give each file once",
-            )
+            problem = f"a scenario {key[1]!r} of {key[0]!r} is in the set already"
+            raise DataError(problem, file=self.path, record=len(self), cure="give each file once")
         self._write_record(scenario)
         self._known.add(key)
         self._entries.append(entry)
@@ -176,15 +161,12 @@ class ScenarioWriter:
         with (folder / name).open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         shard = {"file": name, "count": count, "sha256": digest}
-        self._partial.note(
-            len(self._shards), {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
-        )
+        finished = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
+        self._partial.note(len(self._shards), finished)
         self._shards.append(shard)
         self._crcs = []
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             if kind is None:
                 self._finish()
@@ -217,11 +199,9 @@ class ScenarioWriter:
 
     def _refuse_existing(self) -> None:
         path = self.path
-        if not path.exists() and not path.is_symlink():
-            return
         if path.is_dir() and not any(path.iterdir()):
             return
-        if not (path / MANIFEST).is_file():
+        if (path.exists() or path.is_symlink()) and not (path / MANIFEST).is_file():
             raise UsageError("exists and is not a scenario set", file=path, cure="choose another name")
         check_output(path, self.overwrite, folder=True)
 
@@ -254,12 +234,9 @@ class ScenarioSet(Sequence[Scenario]):
                 out differently.
         """
         opened = cls(path, read_manifest(Path(path)), verify)
-        if len(opened.entries) != int(opened._starts[-1]):
-            raise DataError(
-                f"lists {len(opened.entries)} scenarios but its shards hold {opened._starts[-1]}",
-                file=opened.path / MANIFEST,
-                cure=AGAIN,
-            )
+        if len(opened) != int(opened._starts[-1]):
+            problem = f"lists {len(opened)} scenarios but its shards hold {opened._starts[-1]}"
+            raise DataError(problem, file=opened.path / MANIFEST, cure=AGAIN)
         for shard in opened._shards:
             shard.check_files()
         return opened
@@ -271,17 +248,15 @@ class ScenarioSet(Sequence[Scenario]):
         """Return a scenario (a view of the file), or a list for a slice."""
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        shard, row = self._locate(int(index))
-        entry = self.entries[self._starts[shard] + row]
-        record = self._shards[shard].record(row, self.verify)
-        return Scenario(
-            record=record.view(self._dtype).reshape(()),
-            capacity=self.capacity,
-            source=SourceCounts(**entry["source"]),
-            overflow=dict(entry["overflow"]),
-            audit=dict(entry["audit"]),
-            tags=dict(entry["tags"]),
-        )
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"scenario {index} of {len(self)}")
+        number = int(index) % len(self)
+        entry = self.entries[number]
+        shard = int(np.searchsorted(self._starts, number, side="right")) - 1
+        record = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
+        findings = {name: dict(entry[name]) for name in ("overflow", "audit", "tags")}
+        stored = record.view(self._dtype).reshape(())
+        return Scenario(stored, self.capacity, SourceCounts(**entry["source"]), **findings)
 
     def __iter__(self) -> Iterator[Scenario]:
         return (self[index] for index in range(len(self)))
@@ -295,12 +270,12 @@ class ScenarioSet(Sequence[Scenario]):
         digests = "".join(shard["sha256"] for shard in self.manifest["shards"])
         return hashlib.sha256(digests.encode()).hexdigest()
 
-    def records(self, indices: Any, out: np.ndarray[Any, Any] | None = None) -> np.ndarray[Any, Any]:
+    def records(self, indices: Any, out: _Bytes | None = None) -> _Bytes:
         """Copy records into a structured array ``[n]``, in the order of ``indices``.
 
         Args:
             indices: Negative ones count from the end.
-            out: Result of an earlier call with as many indices, to be filled again; twice as fast as new memory.
+            out: Result of an earlier call with as many indices, to fill again; twice as fast as new memory.
 
         Raises:
             IndexError: An index is out of range.
@@ -314,9 +289,8 @@ class ScenarioSet(Sequence[Scenario]):
         if out is None:
             out = np.empty(index.size, self._dtype)
         if out.shape != index.shape or out.dtype != self._dtype or not out.flags.c_contiguous:
-            raise UsageError(
-                "out does not have the size and type of the records", file=self.path, cure="leave it out"
-            )
+            problem = "out does not have the size and type of the records"
+            raise UsageError(problem, file=self.path, cure="leave it out")
         data = out.view(np.uint8).reshape(index.size, self._dtype.itemsize)
         shards = np.searchsorted(self._starts, index, side="right") - 1
         # A contiguous copy right after the test that brought the record into the cache; take() is slower.
@@ -325,22 +299,11 @@ class ScenarioSet(Sequence[Scenario]):
         return out
 
     def check(self) -> None:
-        """Test the CRC of every record and the SHA-256 of every shard.
-
-        Raises:
-            DataError: A record or shard is damaged.
-        """
+        """Test the CRC of every record and the SHA-256 of every shard; raise DataError where one differs."""
         for shard in self._shards:
             for row in range(shard.count):
                 shard.record(row, verify=True)
             shard.check_digest()
-
-    def _locate(self, index: int) -> tuple[int, int]:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"scenario {index} of {len(self)}")
-        index %= len(self)
-        shard = int(np.searchsorted(self._starts, index, side="right")) - 1
-        return shard, index - int(self._starts[shard])
 
 
 class Shard:
@@ -352,7 +315,7 @@ class Shard:
         self.count = int(entry["count"])
         self._sha256 = entry["sha256"]
         self._dtype = dtype
-        self._data: np.ndarray[Any, Any] | None = None
+        self._data: _Bytes | None = None
         self._crcs = np.zeros(0, np.uint32)
         self._intact = np.zeros(self.count, bool)
 
@@ -369,19 +332,17 @@ class Shard:
         size = self.path.stat().st_size
         if size != offset + self.count * self._dtype.itemsize:
             whole = max(0, size - offset) // self._dtype.itemsize
-            raise DataError(
-                f"shard is truncated or has trailing bytes: {whole} whole records of {self.count}",
-                file=self.path,
-                record=min(whole, self.count),
-                cure=f"copy the file again or {AGAIN}",
-            )
+            problem = f"shard is truncated or has trailing bytes: {whole} whole records of {self.count}"
+            raise self._damage(problem, min(whole, self.count))
         return offset
 
-    def record(self, row: int, verify: bool) -> np.ndarray[Any, Any]:
+    def record(self, row: int, verify: bool) -> _Bytes:
         """Return a view of the bytes of a record; with ``verify``, test its checksum at first use."""
         data = self._map() if self._data is None else self._data
         if verify and not self._intact[row]:
-            self._test(data, row)
+            if zlib.crc32(data[row].data) != int(self._crcs[row]):
+                raise self._damage("checksum mismatch, the record is damaged", row)
+            self._intact[row] = True
         return data[row]
 
     def check_digest(self) -> None:
@@ -390,7 +351,7 @@ class Shard:
             if hashlib.file_digest(file, "sha256").hexdigest() != self._sha256:
                 raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
 
-    def _map(self) -> np.ndarray[Any, Any]:
+    def _map(self) -> _Bytes:
         offset = self.check_files()
         shape = (self.count, self._dtype.itemsize)
         # A plain view: indexing a memmap costs Python time.
@@ -403,15 +364,8 @@ class Shard:
         self._crcs = np.frombuffer(crcs, np.uint32)
         return self._data
 
-    def _test(self, data: np.ndarray[Any, Any], row: int) -> None:
-        if zlib.crc32(data[row].data) != int(self._crcs[row]):
-            raise DataError(
-                "checksum mismatch, the record is damaged",
-                file=self.path,
-                record=row,
-                cure=f"copy the file again or {AGAIN}",
-            )
-        self._intact[row] = True
+    def _damage(self, problem: str, record: int) -> DataError:
+        return DataError(problem, file=self.path, record=record, cure=f"copy the file again or {AGAIN}")
 
 
 def _key(entry: Mapping[str, Any]) -> tuple[str, str]:
@@ -435,10 +389,9 @@ def manifest_entry(scenario: Scenario) -> dict[str, Any]:
 
 def field_table(capacity: Capacity) -> list[dict[str, Any]]:
     """Return name, dtype, shape and byte offset of every field of a record."""
-    offsets = {name: entry[1] for name, entry in (record_dtype(capacity).fields or {}).items()}
     return [
-        {"name": name, "dtype": np.dtype(kind).str, "shape": list(shape), "offset": offsets[name]}
-        for name, (kind, shape) in scenario_fields(capacity).items()
+        {"name": name, "dtype": field[0].base.str, "shape": list(field[0].shape), "offset": field[1]}
+        for name, field in (record_dtype(capacity).fields or {}).items()
     ]
 
 
@@ -453,11 +406,8 @@ def read_manifest(path: Path) -> dict[str, Any]:
         problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"
         raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
     if not file.is_file():
-        raise DataError(
-            "no manifest.json, so this is no complete scenario set",
-            file=path,
-            cure=f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}",
-        )
+        cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
+        raise DataError("no manifest.json, so this is no complete scenario set", file=path, cure=cure)
     try:
         manifest = json.loads(file.read_bytes())
         version = manifest["schema_version"]
@@ -465,11 +415,8 @@ def read_manifest(path: Path) -> dict[str, Any]:
         raise DataError(f"manifest is damaged ({error})", file=file, cure=AGAIN) from error
     if version != SCHEMA_VERSION:
         newer = isinstance(version, int) and version > SCHEMA_VERSION
-        raise DataError(
-            f"schema version {version}, this drivax reads {SCHEMA_VERSION}",
-            file=file,
-            cure="upgrade drivax" if newer else AGAIN,
-        )
+        problem = f"schema version {version}, this drivax reads {SCHEMA_VERSION}"
+        raise DataError(problem, file=file, cure="upgrade drivax" if newer else AGAIN)
     _check_manifest(manifest, file)
     return manifest
 
@@ -477,23 +424,15 @@ def read_manifest(path: Path) -> dict[str, Any]:
 def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
     try:
         fields_agree = manifest["fields"] == field_table(Capacity(**manifest["capacity"]))
-        _need(manifest["shards"], ("file", "count", "sha256"))
-        _need(
-            manifest["scenarios"], ("scenario_id", "dataset", "segment", "flags", "overflow", "audit", "tags")
-        )
+        for shard in manifest["shards"]:
+            itemgetter("file", "count", "sha256")(shard)
         for entry in manifest["scenarios"]:
+            itemgetter("scenario_id", "dataset", "segment", "flags", "overflow", "audit", "tags")(entry)
             SourceCounts(**entry["source"])
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"manifest is damaged ({error!r})", file=file, cure=AGAIN) from error
     if not fields_agree:
         raise DataError("field table is not this version's", file=file, cure=AGAIN)
-
-
-def _need(rows: list[dict[str, Any]], keys: tuple[str, ...]) -> None:
-    for row in rows:
-        for key in keys:
-            if key not in row:
-                raise KeyError(key)
 
 
 def shard_name(number: int) -> str:
@@ -514,11 +453,7 @@ def write_header(file: IO[bytes], dtype: np.dtype[Any], count: int) -> None:
 
 
 def read_header(file: IO[bytes], path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Read shape and dtype of a ``.npy`` file; leaves ``file`` at the first byte of data.
-
-    Raises:
-        DataError: The header is damaged.
-    """
+    """Read shape and dtype of a ``.npy`` file, up to the first byte of data."""
     try:
         np.lib.format.read_magic(file)
         shape, _, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=_HEADER_LIMIT)

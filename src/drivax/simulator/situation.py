@@ -13,7 +13,6 @@ from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, wrap
 from drivax.scenario.bank import queries
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.scenario.bank.passages import lane_passage
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator import contact
@@ -176,8 +175,8 @@ def _requested(
             # An agent that changes lanes at the start comes from its pose 15 steps ago.
             x, y, psi = context.history[-_ENTRY_STEPS, : MOTION_HEADING + 1]
             heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
-            strand = lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
-        passage = lane_passage(bank, context.index, me[:2], me[2:4], ground, strand)
+            strand = queries.lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
+        passage = queries.lane_passage(bank, context.index, me[:2], me[2:4], ground, strand)
         facts |= {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
     return facts
 

@@ -79,7 +79,7 @@ class Facts:
 
     The last five are measured only on request (``ON_REQUEST``): ``gap_m`` to the nearest agent, at most 50 m; ``lag_m``
     behind the log along the agent's heading (negative: ahead of it); the lane ``strand`` of the agent
-    (``scenario.bank.passages``), and whether it changed lanes or merged in this step.
+    (``scenario.bank.queries.lane_passage``), and whether it changed lanes or merged in this step.
     """
 
     collision: Bool[Array, "*batch"]

@@ -45,42 +45,28 @@ class Domain:
         return families[rng.choice(len(families), p=[share for _, share in families])][0]
 
 
-#: Wide lanes, lights, higher speeds; roundabouts are rare.
-GRID_DOMAIN = Domain(
-    name="grid",
-    style=GRID,
-    shares=(
-        ("straight_road", 0.05),
-        ("curved_road", 0.15),
-        ("lane_drop", 0.07),
-        ("highway", 0.1),
-        ("signalised_junction", 0.16),
-        ("t_junction", 0.09),
-        ("all_way_stop", 0.07),
-        ("roundabout", 0.04),
-        ("unprotected_left", 0.09),
-        ("midblock_crosswalk", 0.06),
-        ("parked_street", 0.05),
-        ("corridor", 0.07),
-    ),
+#: Road family, and its relative frequency in the grid and in the ring.
+_SHARES = (
+    ("straight_road", 0.05, 0.05),
+    ("curved_road", 0.15, 0.1),
+    ("lane_drop", 0.07, 0.04),
+    ("highway", 0.1, 0.0),
+    ("signalised_junction", 0.16, 0.05),
+    ("t_junction", 0.09, 0.13),
+    ("all_way_stop", 0.07, 0.1),
+    ("roundabout", 0.04, 0.2),
+    ("unprotected_left", 0.09, 0.05),
+    ("midblock_crosswalk", 0.06, 0.1),
+    ("parked_street", 0.05, 0.13),
+    ("corridor", 0.07, 0.05),
 )
+#: Wide lanes, lights, higher speeds; roundabouts are rare.
+GRID_DOMAIN = Domain("grid", GRID, tuple((family, share) for family, share, _ in _SHARES))
 #: Narrow streets, roundabouts and signs instead of lights, dense traffic, cyclists, no highways.
 RING_DOMAIN = Domain(
     name="ring",
     style=RING,
-    shares=(
-        ("straight_road", 0.05),
-        ("curved_road", 0.1),
-        ("lane_drop", 0.04),
-        ("signalised_junction", 0.05),
-        ("t_junction", 0.13),
-        ("all_way_stop", 0.1),
-        ("roundabout", 0.2),
-        ("unprotected_left", 0.05),
-        ("midblock_crosswalk", 0.1),
-        ("parked_street", 0.13),
-        ("corridor", 0.05),
-    ),
+    shares=tuple((family, share) for family, _, share in _SHARES if share),
     density=Density(spacing_m=(14.0, 60.0), vehicles=40, cyclist_share=0.14),
     walkers=(0.5, 3.0),
     parked_share=(0.6, 1.0),

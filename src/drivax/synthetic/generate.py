@@ -1,8 +1,10 @@
-"""Scenario sets of the built-in world: drawn and assembled in worker processes, written in order by one.
+"""Scenario sets of the built-in world, drawn in worker processes and written in order, and the benchmark's splits.
 
-The bytes of a set depend on the seed and the number of scenarios only, neither on the number of workers nor, if they
-draw, on the processor (``portable``). Nothing here imports JAX, so that workers start in a fraction of a second; an
-audit that needs it is handed in.
+The bytes of a set depend only on the seed and the number of scenarios: not on the number of workers nor, with workers,
+on the processor. Nothing here imports JAX, so that workers start quickly; an audit that needs it is an argument.
+
+A map is drawn from (seed, number of the map), so sets of different seeds share no map. The seeds of the benchmark's
+splits are refused to users: training on its maps by accident is impossible.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from drivax.errors import DrivaxError, UsageError
@@ -27,16 +30,29 @@ from drivax.scenario.store import ScenarioWriter
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
 from drivax.tracking.workers import await_interrupt, worker_pool
 
-#: What NumPy was built for beyond the oldest processor, and what of it this one has.
+#: CPU features beyond the baseline that NumPy can use, and the variable that disables them.
 _umath = importlib.import_module("numpy._core._multiarray_umath")
-#: Tells NumPy which of them to leave alone.
 _FEATURES = "NPY_DISABLE_CPU_FEATURES"
+#: Scenarios per audited batch, and per task of a worker.
+_BATCH, _CHUNK = 64, 4
+#: Finished tasks per worker that may wait: enough to keep workers busy while the audit compiles.
+_AHEAD = 12
+_EVENT = "event"
+#: First seed of the benchmark's splits.
+RESERVED_SEED = 1_000_000_000
+#: Raised when a split changes while the world's version stays.
+BENCHMARK_VERSION = 3
+
+#: Called with (scenarios done, scenarios).
+Progress = Callable[[int, int], None]
+#: Returns the audit of scenarios: one dictionary each.
+Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
 
 
 @contextmanager
 def portable_workers() -> Iterator[None]:
-    """Start worker processes within that compute the same bits on any x86-64 processor."""
-    # Features disabled in this process are missing here, but workers would use them.
+    """Context in which started worker processes compute the same bits on any x86-64 processor."""
+    # Features disabled in this process are missing from the table, but workers would use them.
     disabled = os.environ.get(_FEATURES, "").split()
     newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in disabled]
     settings = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
@@ -52,31 +68,16 @@ def portable_workers() -> Iterator[None]:
                 os.environ[name] = value
 
 
-#: Scenarios that are audited together, and that a worker draws at a time.
-_BATCH, _CHUNK = 64, 4
-#: Finished chunks per worker that may wait: enough to keep workers busy while the audit compiles.
-_AHEAD = 12
-_EVENT = "event"
-
-#: Seeds from here on belong to the fixed splits of ``synthetic.benchmark``.
-RESERVED_SEED = 1_000_000_000
-
-#: Called with (scenarios done, scenarios).
-Progress = Callable[[int, int], None]
-#: Fills the audit of scenarios: one dictionary each.
-Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
-
-
 @dataclass(frozen=True)
 class Generation:
-    """How to generate.
+    """Options of a generation.
 
     Attributes:
-        workers: Processes that draw. With 0 this one does, without waiting for others to start, and whose NumPy follows
-            the processor in its last bits: only workers write the same bytes everywhere.
+        workers: Number of worker processes. With 0 this process draws, whose NumPy depends on the processor in its last
+            bits: only workers write the same bytes everywhere.
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
         overwrite: Replace an existing scenario set.
-        world: What the world is like.
+        world: Settings of the world.
     """
 
     workers: int = 0
@@ -88,7 +89,7 @@ class Generation:
         """Check the options.
 
         Raises:
-            UsageError: The first of them.
+            UsageError: The first wrong option.
         """
         if self.workers < 0:
             raise UsageError(f"workers is {self.workers}", cure="use 0 or more")
@@ -104,10 +105,10 @@ class FamilyCount:
     """Counts of one road family.
 
     Attributes:
-        kept: Scenarios.
-        rejected: Draws that were thrown away because of what ego or others did, by cause.
-        unsuited: Draws in which the requested event could not happen.
-        events: How many of the scenarios have which labelled event.
+        kept: Number of scenarios.
+        rejected: Number of rejected draws by cause.
+        unsuited: Number of draws in which the requested event could not happen.
+        events: Number of scenarios with each labelled event.
     """
 
     kept: int
@@ -117,14 +118,14 @@ class FamilyCount:
 
     @property
     def rejection_rate(self) -> float:
-        """Share of the draws that were driven to the end and thrown away."""
+        """Share of rejected draws among those that could have the requested event."""
         thrown = sum(self.rejected.values())
         return thrown / max(thrown + self.kept, 1)
 
 
 @dataclass(frozen=True)
 class GeneratedSet:
-    """What a generation did: the set, its size, the wall time in seconds, and the counts per family."""
+    """A generated set: its path, size, wall time in seconds, and counts per family."""
 
     path: Path
     scenarios: int
@@ -159,7 +160,7 @@ class _Counts:
             self._events[draw.family][draw.scenario.tags[_EVENT]] += 1
 
     def families(self) -> dict[str, FamilyCount]:
-        """Sorted by name; also those of which no draw was kept."""
+        """Counts sorted by family, families without a kept draw included."""
         return {
             name: FamilyCount(
                 self._kept[name], dict(self._rejected[name]), self._unsuited[name], dict(self._events[name])
@@ -180,21 +181,21 @@ def generate(
 
     Args:
         out: The scenario set to write; it appears when it is complete.
-        scenarios: How many.
+        scenarios: Number of scenarios.
         seed: Scenario ``i`` of a seed is the same in every set; sets of different seeds have no map in common.
-        options: How.
+        options: Options.
         progress: Called after every scenario.
-        audit: Called in this process with batches of scenarios; what it returns is stored with them.
+        audit: Called in this process with batches of scenarios; its results are stored with them.
 
     Raises:
-        UsageError: Options that cannot be meant, or ``out`` exists.
+        UsageError: Wrong options, or ``out`` exists.
     """
     options = options or Generation()
     options.check()
     if scenarios < 1:
         raise UsageError(f"scenarios is {scenarios}", cure="use 1 or more")
     if not 0 <= seed < RESERVED_SEED:
-        raise UsageError(f"seed is {seed}", cure=f"use 0 to {RESERVED_SEED - 1:,}".replace(",", ""))
+        raise UsageError(f"seed is {seed}", cure=f"use 0 to {RESERVED_SEED - 1}")
     return write_set(out, scenarios, seed, options, {}, progress, audit)
 
 
@@ -207,7 +208,7 @@ def write_set(
     progress: Progress | None,
     audit: Audit | None,
 ) -> GeneratedSet:
-    """:func:`generate` without looking at the arguments; ``notes`` go into the manifest's source."""
+    """:func:`generate` without checks; ``notes`` go into the manifest's source."""
     begin = time.monotonic()
     source = {"command": "generate", "world": WORLD_VERSION, "seed": seed, "scenarios": scenarios, **notes}
     source["config"] = dataclasses.asdict(options.world)
@@ -221,31 +222,24 @@ def write_set(
             counts.add(draw)
             batch.append(draw.scenario)
             if len(batch) == _BATCH or done == scenarios:
-                _write(writer, batch, audit)
+                findings = [{} for _ in batch] if audit is None else audit(batch)
+                for scenario, finding in zip(batch, findings, strict=True):
+                    writer.add(dataclasses.replace(scenario, audit={**scenario.audit, **finding}))
                 batch = []
             if progress is not None:
                 progress(done, scenarios)
     return GeneratedSet(Path(out), scenarios, time.monotonic() - begin, counts.families())
 
 
-def _write(writer: ScenarioWriter, batch: list[Scenario], audit: Audit | None) -> None:
-    findings = [{} for _ in batch] if audit is None else audit(batch)
-    for scenario, finding in zip(batch, findings, strict=True):
-        writer.add(dataclasses.replace(scenario, audit={**scenario.audit, **finding}))
-
-
 def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:
-    """Scenarios ``first`` to ``last - 1``; runs in workers."""
-    capacity, result = CAPACITIES[options.capacity], []
-    for index in range(first, last):
-        draw = generate_one(seed, index, options.world)
-        scenario = assemble(draw.recording, capacity)
-        result.append(_Draw(scenario, draw.family, draw.rejected))
-    return result
+    """Draw scenarios ``first`` to ``last - 1`` (in a worker)."""
+    draws = [generate_one(seed, index, options.world) for index in range(first, last)]
+    capacity = CAPACITIES[options.capacity]
+    return [_Draw(assemble(draw.recording, capacity), draw.family, draw.rejected) for draw in draws]
 
 
 def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, None, None]:
-    """All scenarios in order."""
+    """Draw all scenarios in order."""
     spans = [(at, min(at + _CHUNK, scenarios)) for at in range(0, scenarios, _CHUNK)]
     if options.workers == 0:
         for first, last in spans:
@@ -266,3 +260,78 @@ def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, N
         raise DrivaxError("a worker process was killed", cure="try fewer --workers") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class Split:
+    """One of the benchmark's sets; without a ``rare_rate`` it has the configuration's share of events."""
+
+    scenarios: int
+    seed: int
+    rare_rate: float | None = None
+
+
+SPLITS: Mapping[str, Split] = MappingProxyType(
+    {
+        "train": Split(4096, RESERVED_SEED),
+        "validation": Split(512, RESERVED_SEED + 1),
+        "test": Split(1024, RESERVED_SEED + 2),
+        "test-rare": Split(512, RESERVED_SEED + 3, rare_rate=1.0),
+    }
+)
+
+
+def sizes(train: int | None = None) -> dict[str, int]:
+    """Sizes of the splits, scaled to a size of the training set if it is given.
+
+    Raises:
+        UsageError: ``train`` is not positive.
+    """
+    full = SPLITS["train"].scenarios
+    train = full if train is None else train
+    if train < 1:
+        raise UsageError(f"scenarios is {train}", cure="use 1 or more")
+    return {name: max(round(split.scenarios * train / full), 1) for name, split in SPLITS.items()}
+
+
+def generate_benchmark(
+    out: str | Path,
+    options: Generation | None = None,
+    train: int | None = None,
+    progress: Progress | None = None,
+    audit: Audit | None = None,
+) -> dict[str, GeneratedSet]:
+    """Write ``OUT/train``, ``OUT/validation``, ``OUT/test`` and ``OUT/test-rare``.
+
+    Args:
+        out: A folder.
+        options: Options; of the world only the domain may differ from the default.
+        train: Size of the training set, for tests and trials; the other sets are scaled with it. Smaller sets are
+            prefixes of the full ones.
+        progress: Called after every scenario, with counts over all splits.
+        audit: See :func:`generate`.
+
+    Raises:
+        UsageError: Wrong options, or one of the sets exists.
+    """
+    options = options or Generation()
+    options.check()
+    if options.world != WorldConfig(domain=options.world.domain):
+        raise UsageError(
+            "the benchmark's world is fixed but for its domain", cure="use generate for other settings"
+        )
+    counts, sets = sizes(train), dict[str, GeneratedSet]()
+    for name, split in SPLITS.items():
+        world = options.world
+        if split.rare_rate is not None:
+            world = dataclasses.replace(world, rare_rate=split.rare_rate)
+        notes = {"benchmark": BENCHMARK_VERSION, "split": name}
+        done = sum(counts[earlier] for earlier in sets)
+
+        def report(here: int, _: int, done: int = done) -> None:
+            if progress is not None:
+                progress(done + here, sum(counts.values()))
+
+        own = dataclasses.replace(options, world=world)
+        sets[name] = write_set(Path(out) / name, counts[name], split.seed, own, notes, report, audit)
+    return sets

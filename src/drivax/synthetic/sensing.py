@@ -16,7 +16,7 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind
 
-#: Noise falls below this speed, m/s, to this share at standstill.
+#: Below this speed, m/s, noise decreases to a share at standstill.
 _FULL_NOISE_MPS, _STANDING_SHARE = 2.0, 0.25
 #: Errors are clipped at this many standard deviations: noise must not make users overlap.
 _MOST_SIGMA = 3.0
@@ -35,19 +35,15 @@ class SensorConfig:
     """A sensor on the middle of ego's roof that looks in all directions.
 
     Attributes:
-        range_m: How far it sees, to the centre of a box.
-        above_roof_m: How high over the roof it sits.
+        range_m: Largest distance to the centre of a visible box.
+        above_roof_m: Height above the roof.
     """
 
     range_m: float = 80.0
     above_roof_m: float = 0.2
 
     def check(self) -> None:
-        """Check the settings.
-
-        Raises:
-            UsageError: The first wrong setting.
-        """
+        """Raise a UsageError for the first wrong setting."""
         _refuse_negative("sensor", self)
 
 
@@ -77,25 +73,22 @@ class NoiseConfig:
     speed_correlation: float = 0.0
 
     def check(self) -> None:
-        """Check the settings.
-
-        Raises:
-            UsageError: The first wrong setting.
-        """
+        """Raise a UsageError for the first wrong setting."""
         _refuse_negative("noise", self)
         for name, value in vars(self).items():
             if name.endswith("_correlation") and value >= 1.0:
                 raise UsageError(f"noise.{name} is {value}", cure="use a number from 0 to below 1")
 
 
-def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "track time"]:
-    """Return the visibility mask of tracks (:func:`visible`); vehicles occlude what is behind them.
+_Boxes = Float64[np.ndarray, "user time 6"]
+_PerUser = Float64[np.ndarray, " user"]
+_Visible = Bool[np.ndarray, "user time"]
+_Looks = Int64[np.ndarray, " look"]
+_Pairs = Int64[np.ndarray, " pair"]
 
-    Args:
-        tracks: The truth.
-        ego: Row of ego.
-        config: The sensor.
-    """
+
+def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "track time"]:
+    """Return the visibility mask of tracks (:func:`visible`); vehicles occlude other users."""
     order = np.concatenate(([ego], np.delete(np.arange(len(tracks.kind)), ego)))
     heading, size = tracks.heading[order], tracks.size[order]
     box = np.concatenate(
@@ -108,26 +101,14 @@ def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "t
 
 
 def visible(
-    box: Float64[np.ndarray, "user time 6"],
-    height_m: Float64[np.ndarray, " user"],
-    valid: Bool[np.ndarray, "user time"],
-    blocks: Bool[np.ndarray, " user"],
-    config: SensorConfig,
-) -> Bool[np.ndarray, "user time"]:
-    """Return which users ego's sensor sees: in range, with a corner or the centre in free view.
+    box: _Boxes, height_m: _PerUser, valid: _Visible, blocks: Bool[np.ndarray, " user"], config: SensorConfig
+) -> _Visible:
+    """Mask of users in the sensor's range whose centre or a corner is in free view; ego sees itself.
 
-    Rays run in space, from the sensor to half the height of the other's box. Another user's box hides what is behind
-    it where the ray passes below its roof.
+    A ray from the sensor to half the height of the other's box is blocked by every box that it does not pass above.
 
-    Args:
-        box: ``geometry.boxes`` of all users; row 0 is ego.
-        height_m: Of the boxes, all standing on level ground.
-        valid: Which users are there.
-        blocks: Users that can occlude others: vehicles only.
-        config: The sensor.
-
-    Returns:
-        False where not valid; ego sees itself.
+    ``box`` holds the boxes of all users (:mod:`drivax.geometry.boxes`), ego first; ``blocks`` is a mask of those that
+    occlude others.
     """
     offset = box[..., :2] - box[:1, :, :2]
     distance = np.hypot(offset[..., 0], offset[..., 1])
@@ -142,25 +123,15 @@ def visible(
     hidden = np.zeros(points.shape[:2], bool)
     row, other = _occluders(box, valid & blocks[:, None], target, step)
     eye = height_m[0] + config.above_roof_m
-    cut = _cuts(
-        box[0, step[row], :2],
-        points[row],
-        (eye, height_m[target[row]] / 2),
-        box[other, step[row]],
-        height_m[other],
-    )
+    heights, when = (eye, height_m[target[row]] / 2), step[row]
+    cut = _cuts(box[0, when, :2], points[row], heights, box[other, when], height_m[other])
     np.logical_or.at(hidden, row, cut)
     seen[target, step] = ~hidden.all(axis=1)
     return seen
 
 
-def _occluders(
-    box: Float64[np.ndarray, "user time 6"],
-    blocking: Bool[np.ndarray, "user time"],
-    target: Int64[np.ndarray, " look"],
-    step: Int64[np.ndarray, " look"],
-) -> tuple[Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]]:
-    """Pairs of a line of sight and a user whose circumscribed circle meets it."""
+def _occluders(box: _Boxes, blocking: _Visible, target: _Looks, step: _Looks) -> tuple[_Pairs, _Pairs]:
+    """Pairs of a line of sight and a user whose circumscribed circle it intersects."""
     offset = box[..., :2] - box[:1, :, :2]
     x, y = (np.ascontiguousarray(offset[..., k]) for k in (0, 1))
     ray_x, ray_y = x[target, step], y[target, step]
@@ -209,13 +180,7 @@ def _cuts(
 
 
 def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
-    """Return how far :func:`noisy` can move a corner of a box at most, m.
-
-    Args:
-        config: How large the errors are.
-        length_m: Of the box.
-        width_m: Of the box.
-    """
+    """Return the largest distance by which :func:`noisy` can move a corner of a box, m."""
     most = _MOST_SIGMA * config.level
     turn = most * config.heading_rad
     along = most * config.along_m + turn * width_m / 2
@@ -223,20 +188,13 @@ def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> flo
 
 
 def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfig) -> Tracks:
-    """Tracks as a perception system would have recorded them; ego's own row is exact.
+    """Add perception noise to tracks, ego's excepted.
 
     Errors are zero-mean AR(1) processes, clipped at three standard deviations. Standing users keep speed 0 and jitter
     by a few millimetres. Sizes are exact.
-
-    Args:
-        tracks: The truth.
-        ego: Row of ego.
-        rng: Source of all errors.
-        config: How large they are.
     """
-    speed = tracks.velocity[..., 0] * np.cos(tracks.heading) + tracks.velocity[..., 1] * np.sin(
-        tracks.heading
-    )
+    cos, sin = np.cos(tracks.heading), np.sin(tracks.heading)
+    speed = tracks.velocity[..., 0] * cos + tracks.velocity[..., 1] * sin
     share = np.clip(np.abs(speed) / _FULL_NOISE_MPS, 0.0, 1.0)
     share = (_STANDING_SHARE + (1.0 - _STANDING_SHARE) * share) * tracks.valid
     share[ego] = 0.0
@@ -246,7 +204,6 @@ def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfi
         config.level * sigma * share * _jitter(tracks.valid.shape, correlation, rng)
         for sigma, correlation in zip(deviations, correlations, strict=True)
     )
-    cos, sin = np.cos(tracks.heading), np.sin(tracks.heading)
     heading = np.where(tracks.valid, wrap(tracks.heading + turn), 0.0)
     # Noise neither moves standing users nor reverses moving ones.
     speed = np.sign(speed) * np.maximum(np.abs(speed) + np.where(np.abs(speed) > 0.0, faster, 0.0), 0.0)

@@ -1,13 +1,12 @@
 """The built-in traffic world: one recording per seed and index, whose expert neither collides nor leaves the road.
 
 Everything is drawn from ``numpy.random.default_rng`` seeded with (seed, index, attempt), the roads with (seed, number
-of the map), so a recording depends on nothing else: not on the number of workers, nor on what was generated before.
+of the map): a recording depends neither on the number of workers nor on other recordings.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -42,20 +41,20 @@ from drivax.synthetic.traffic.role_assignment import SignalTiming, assign_roles,
 from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 from drivax.synthetic.traffic.simulation import Traffic
 
-#: Raised whenever the same seed gives another world; part of every scenario id.
+#: Raised when the same seed gives another world; part of every scenario id.
 WORLD_VERSION = 2
 #: Traffic runs this long before the recording begins, s.
 _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
 #: Candidate first steps of a critical recording: earliest, latest delay, stride.
 _EARLIEST, _LATER, _EVERY = 28, 16, 4
-#: Ego may act on an event this many steps before it begins.
+#: Ego may react to an event this many steps before it begins.
 _FORESEEN = 8
-#: Lights of a next junction are recorded within this distance of ego's log: a scenario's map ends a little further on.
+#: Lights are recorded within this distance of ego's log, m: a scenario's map reaches a little further.
 _LIGHTS_M = 95.0
-#: Draws before a scenario is given up, draws on one map, and draws before a kind of event is given up.
+#: Most draws of a scenario, on one map, and with one kind of event.
 _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
-#: Causes that are no driving violation: the requested event cannot happen, or has no effect.
+#: Causes of rejection that are no violation: the requested event cannot happen, or has no effect.
 UNSUITED = ("no_occasion", "no_threat")
 #: Events that are tried with the same roles.
 _STAGINGS = 3
@@ -70,13 +69,13 @@ class WorldConfig:
     Attributes:
         domain: Name of the domain (``grid`` or ``ring``), a tag of every scenario.
         rare_rate: Share of scenarios in which a rare event is staged.
-        critical_share: Share of the others in which ego's route leads where it must give way, if the roads allow it;
-            the recording begins when another user approaches.
-        lane_change_share: Share of scenarios with room for it in which ego plans a lane change.
+        critical_share: Share of the others in which ego must give way, if the roads allow it; the recording begins when
+            another user approaches.
+        lane_change_share: Share of scenarios, of those with room, in which ego plans a lane change.
         signal_timing: Shares of what the light does for ego: green on arrival, turning green, turning red.
-        scenarios_per_map: How many scenarios, one after the other, take place on the same roads; they share a segment.
-        noise: How exactly the others are recorded.
-        sensor: What is within ego's sight.
+        scenarios_per_map: Number of consecutive scenarios on the same roads; they share a segment.
+        noise: Perception noise of the others' tracks.
+        sensor: Ego's sensor.
     """
 
     domain: str = "grid"
@@ -117,14 +116,7 @@ class WorldConfig:
 
 @dataclass(frozen=True)
 class Generated:
-    """A recording with its origin.
-
-    Attributes:
-        recording: The log.
-        family: Its family of roads.
-        domain: Its domain.
-        rejected: How many attempts were thrown away before this one, by their family and cause.
-    """
+    """A recording with its road family and domain, and the numbers of rejected draws by family and cause."""
 
     recording: Recording
     family: str
@@ -133,24 +125,18 @@ class Generated:
 
 
 def generate_recording(seed: int, index: int, config: WorldConfig | None = None) -> Recording:
-    """Generate the recording of a seed and index.
-
-    Args:
-        seed: Seed of the set, not negative.
-        index: Number of the scenario in the set, not negative.
-        config: What the world is like.
-    """
+    """Generate the recording of a seed and index (both not negative) in a world with some settings."""
     return generate_one(seed, index, config or WorldConfig()).recording
 
 
 def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
     """Generate a recording with its family and rejected attempts.
 
-    Whether a scenario is rare, and the kind of its event, are drawn first, so that no kind is rarer because its draws
-    fail more often. A rare scenario has roads of its own, and others where those give no occasion for its event.
+    The kind of event is drawn first, so that kinds whose draws fail more often are not rarer. A rare scenario has roads
+    of its own, and is redrawn on other roads if these give no occasion for its event.
 
     Raises:
-        UsageError: When seed or index are negative, or no attempt gives a clean expert.
+        UsageError: Seed or index are negative, or no draw gives a clean expert.
     """
     if seed < 0 or index < 0:
         raise UsageError(f"seed {seed} and index {index} must not be negative", cure="choose 0 or more")
@@ -175,18 +161,15 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
             tags={"family": family.name, "domain": config.domain, **result.tags},
         )
         return Generated(recording, family.name, config.domain, dict(rejected))
+    causes = ", ".join(f"{cause} in {family} {n}" for (family, cause), n in sorted(rejected.items()))
     raise UsageError(
-        f"no clean expert in {_ATTEMPTS} attempts for seed {seed}, index {index}: {_causes(rejected)}",
+        f"no clean expert in {_ATTEMPTS} attempts for seed {seed}, index {index}: {causes}",
         cure="choose another seed",
     )
 
 
-def _causes(rejected: Mapping[tuple[str, str], int]) -> str:
-    return ", ".join(f"{cause} in {family} {times}" for (family, cause), times in sorted(rejected.items()))
-
-
 def _drawn_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[EventKind], float]:
-    """The kind of event (another one where that fails too often), or none, and what it should require of ego, m/s2."""
+    """Draw the order in which kinds of event are tried (or none), and the deceleration the event demands of ego."""
     kinds = [kind for kind in EventKind if kind]
     rare, order = rng.random() < config.rare_rate, rng.permutation(len(kinds)).tolist()
     return ([kinds[k] for k in order] if rare else [EventKind.NONE]), draw_severity(rng)
@@ -194,7 +177,7 @@ def _drawn_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[E
 
 @lru_cache(maxsize=1)
 def _drawn_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[RoadFamily, RoadNetwork]:
-    """Roads of a domain, again and again until they have what the event needs; built once for draws in a row."""
+    """Draw roads of a domain until they suit the event; cached for consecutive draws."""
     domain, rng = DOMAINS[name], np.random.default_rng(seed)
     for _ in range(_ATTEMPTS):
         family = domain.draw_family(rng)
@@ -209,7 +192,7 @@ def _drawn_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[Ro
 
 @dataclass(frozen=True)
 class _Draw:
-    """Roads, places of which ego should pass one, and the event (or none) with what it should require of ego, m/s2."""
+    """Roads, destinations of which ego passes one, and the event (or none) with the deceleration it demands of ego."""
 
     network: RoadNetwork
     destinations: tuple[Destination, ...]
@@ -247,7 +230,6 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
         staged = stage(draw.event, view, draw.severity_mps2, rng)
         if staged is None:
             break
-        # Ego may foresee an event a little: an attentive driver sees it coming.
         aware = staged.first_step - _FORESEEN
         motion, cause = expert.drive_ego(roles, times, staged.staging, _WARM_UP, traffic.run, aware)
         if not cause and endangers_ego(view, motion, staged):
@@ -259,12 +241,12 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
 def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
     """Add perception noise and the visibility mask."""
     tracks, ego = recording.tracks, recording.ego
-    visible = sight(tracks, ego, config.sensor)
-    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=visible)
+    seen = sight(tracks, ego, config.sensor)
+    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=seen)
 
 
 def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:
-    """Draw the first step of a recording in which ego has to give way, if there is one."""
+    """Draw the first step of a recording in which ego must give way, if there is one."""
     network = traffic.roles.network
     if not conflicts_on(network, motion.paths[0]):
         return None
@@ -274,30 +256,14 @@ def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -
 
 
 def _recorded(roles: Roles, motion: Motion, first: int, staged: StagedEvent | None) -> Recording:
-    """The log from a step on, without names."""
+    """Return the recording from a step on, without id and segment."""
     network, motion = roles.network, motion.since(first)
     times = np.arange(STEPS) * DT_S
-    lights: tuple[Light, ...] = ()
-    if network.signals is not None:
-        begin_s = (first - _WARM_UP) * DT_S
-        colour, _ = network.signals.colours(begin_s + times, len(network.lanes))
-        low, high = motion.xy[0].min(axis=0) - _LIGHTS_M, motion.xy[0].max(axis=0) + _LIGHTS_M
-        lights = tuple(
-            Light(
-                lane_id=feature_id(lane),
-                stop_point=np.array([*stop, 0.0]),
-                states=light_states(colour[:, lane], group.arrow),
-            )
-            for group in network.signals.groups
-            for lane in group.lanes
-            for stop in [network.lanes[lane].curve.xy[0]]
-            if np.all((low <= stop) & (stop <= high))
-        )
     events, tags = (), {}
     if staged is not None:
         tags = {"event": staged.kind.name.lower(), "severity_mps2": f"{staged.severity_mps2:.1f}"}
         begin, last = staged.first_step - first, staged.last_step - first
-        actors = tuple(map(_track_id, staged.actors))
+        actors = tuple(user + 1 for user in staged.actors)
         events = (Event(int(staged.kind), begin, min(last, STEPS - 1), actors),)
     return Recording(
         scenario_id="",
@@ -308,42 +274,49 @@ def _recorded(roles: Roles, motion: Motion, first: int, staged: StagedEvent | No
         ego=0,
         tracks=_tracks(motion, () if staged is None else staged.actors),
         features=map_features(network),
-        lights=lights,
-        route_lanes=tuple(map(feature_id, _route(motion))),
+        lights=_lights(network, motion, (first - _WARM_UP) * DT_S + times),
+        route_lanes=tuple(map(feature_id, dict.fromkeys(span.lane for span in motion.paths[0].spans))),
         events=events,
         tags=tags,
-        # The world knows where there are no lights, so a road without them has its red-light metric defined.
+        # Lights are known to be complete, so the red-light metric is defined on roads without lights.
         flags=Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.CLOSED_EDGES | Flag.LIGHTS,
     )
 
 
-def _route(motion: Motion) -> tuple[int, ...]:
-    """Return the lanes of ego's path, each once."""
-    return tuple(dict.fromkeys(span.lane for span in motion.paths[0].spans))
-
-
-def _track_id(user: int) -> int:
-    return user + 1
+def _lights(network: RoadNetwork, motion: Motion, times_s: Float64[np.ndarray, " time"]) -> tuple[Light, ...]:
+    """Return the lights near ego's trajectory."""
+    if network.signals is None:
+        return ()
+    colour, _ = network.signals.colours(times_s, len(network.lanes))
+    low, high = motion.xy[0].min(axis=0) - _LIGHTS_M, motion.xy[0].max(axis=0) + _LIGHTS_M
+    lights = []
+    for group in network.signals.groups:
+        for lane in group.lanes:
+            stop = network.lanes[lane].curve.xy[0]
+            if np.all((low <= stop) & (stop <= high)):
+                states = light_states(colour[:, lane], group.arrow)
+                lights.append(Light(feature_id(lane), np.array([*stop, 0.0]), states))
+    return tuple(lights)
 
 
 def _tracks(motion: Motion, actors: tuple[int, ...]) -> Tracks:
-    """Return tracks of ego, an event's actors and the nearest others; zeros where invalid."""
+    """Return tracks of ego, an event's actors and the nearest others, with zeros where invalid."""
     valid = motion.valid
     apart = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
     nearest = np.where(valid, apart, np.inf).min(axis=1)
     nearest[[0, *actors]] = -1.0
-    nearest_rows = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
-    nearest_rows = nearest_rows[np.isfinite(nearest[nearest_rows])]
-    valid = valid[nearest_rows]
-    heading = np.where(valid, wrap(motion.heading[nearest_rows]), 0.0)
-    speed: Float64[np.ndarray, "v t"] = np.where(valid, motion.speed[nearest_rows], 0.0)
+    rows = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
+    rows = rows[np.isfinite(nearest[rows])]
+    valid = valid[rows]
+    heading = np.where(valid, wrap(motion.heading[rows]), 0.0)
+    speed: Float64[np.ndarray, "v t"] = np.where(valid, motion.speed[rows], 0.0)
     return Tracks(
-        xy=np.where(valid[..., None], motion.xy[nearest_rows], 0.0),
+        xy=np.where(valid[..., None], motion.xy[rows], 0.0),
         z=np.zeros(valid.shape),
         heading=heading,
         velocity=speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1),
-        size=np.where(valid[..., None], motion.size_m[nearest_rows, None], 0.0),
+        size=np.where(valid[..., None], motion.size_m[rows, None], 0.0),
         valid=valid,
-        kind=motion.kind[nearest_rows],
-        track_id=(nearest_rows + 1).astype(np.int64),
+        kind=motion.kind[rows],
+        track_id=(rows + 1).astype(np.int64),
     )

@@ -186,7 +186,7 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 
 
 # 1 at the step that enters a neighbouring lane of the same direction; at the step that leaves a lane that ends within
-# 100 m, or joins another (``scenario.bank.passages``).
+# 100 m, or joins another (``scenario.bank.lane_passage``).
 _event_term("lane_change", "lane_changed")
 _event_term("merge", "merged")
 

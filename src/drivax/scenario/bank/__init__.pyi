@@ -7,13 +7,13 @@ from .columns import RoadLayer as RoadLayer
 from .columns import RouteColumn as RouteColumn
 from .columns import SizeColumn as SizeColumn
 from .columns import StrandColumn as StrandColumn
-from .passages import Passage as Passage
-from .passages import lane_passage as lane_passage
 from .queries import LaneHits as LaneHits
+from .queries import Passage as Passage
 from .queries import RouteHit as RouteHit
 from .queries import around_lanes as around_lanes
 from .queries import lane_course as lane_course
 from .queries import lane_distance as lane_distance
+from .queries import lane_passage as lane_passage
 from .queries import left_of_edges as left_of_edges
 from .queries import left_the_map as left_the_map
 from .queries import light_crossing as light_crossing

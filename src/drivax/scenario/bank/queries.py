@@ -8,13 +8,14 @@ grid; ``tests/scenario/test_queries.py`` compares with brute force. Segments mor
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.vectors import root
-from drivax.scenario.bank.columns import EdgeRow, LaneRow, LightRow, RouteColumn
+from drivax.geometry.vectors import norm, root
+from drivax.scenario.bank.columns import EdgeRow, LaneRow, LightRow, RouteColumn, StrandColumn
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.build.grid import NOT_DRIVABLE, SPLIT
@@ -29,6 +30,12 @@ OFFROAD_TOLERANCE_M = 0.3
 LANE_MARGIN_M = 0.2
 #: Largest distance to the centre of a followed lane, m.
 _FOLLOWED_M = 2.5
+#: A passage to another lane counts from this far beyond the line between the two lanes, m.
+BEYOND_M = 0.3
+#: Least distance between the centres of parallel lanes, m; nearer lanes fork or join.
+SIDE_BY_SIDE_M = 2.0
+#: Largest distance to the end of a lane at which leaving it is a merge, m.
+MERGE_M = 100.0
 _FAR = 1e9
 _WINDOW = 40
 _WINDOW_BEHIND = 6
@@ -37,13 +44,10 @@ _WINDOW_BEHIND = 6
 def left_of_edges(
     bank: ScenarioBank, index: Integer, centre: Vector, points: Float[Array, "P 2"], z: Scalar
 ) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:
-    """Signed distance of points to the nearest road edge: positive on its drivable (left) side, in metres.
+    """Signed distance of points to the nearest road edge, m (left, the drivable side, positive), and whether it counts.
 
-    At a vertex two segments are equally near; the segment whose line is further away decides. Points must lie within 5
-    m of ``centre``, whose cells are read.
-
-    Returns:
-        Signed distances, and whether an edge of this level lies within the cut-off (the distance is valid only then).
+    It counts if an edge of this level lies within the cut-off. At a vertex two segments are equally near; the segment
+    whose line is further away decides. Points must lie within 5 m of ``centre``, whose cells are read.
     """
     rows, inside = edges_around(bank, index, centre)
     squared, side = to_segments(rows, points)
@@ -106,12 +110,10 @@ def to_segments(
 
 
 def _level(height: Float[Array, " K"], z: Scalar) -> Bool[Array, " K"]:
-    """Whether segments lie on the level of a height."""
     return jnp.abs(height - z) <= LEVEL_M
 
 
 def _chord(rows: Float[Array, "F K"]) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
-    """Components of the vectors from the beginnings to the ends of segments."""
     return rows[LaneRow.X_B] - rows[LaneRow.X_A], rows[LaneRow.Y_B] - rows[LaneRow.Y_A]
 
 
@@ -126,15 +128,14 @@ class LaneHits:
     """Lanes around a box; values at its centre unless stated otherwise.
 
     Attributes:
-        near: A lane centre lies within the cut-off.
-        points_near: The same for each corner.
+        near, points_near: A lane centre lies within the cut-off; the same for each corner.
         on_corridor: Inside a lane of the corridor of the route.
         wrong_way: Inside a lane against its direction (more than 135 deg), and no other lane is nearer.
         straddling: Some corner is outside all lanes in the direction of the ego.
         leaving_lane: Some corner is outside the lane of the centre (nuPlan's multiple lanes, for fault).
         limit: Speed limit of the lane, m/s; -1 unknown.
-        lane: Nearest lane in the direction of the ego, -1 without one.
-        offset: Signed distance to its centre line, left positive, m.
+        lane, offset: Nearest lane in the direction of the ego (-1 without one), and the signed distance to its centre
+            line, left positive, m.
         z: Height of the nearest lane, or of the query without one.
     """
 
@@ -193,23 +194,6 @@ def around_lanes(
     )
 
 
-def aligned_lanes(
-    bank: ScenarioBank, index: Integer, xy: Vector, heading: Vector, z: Scalar
-) -> tuple[Int[Array, " K"], Float[Array, " K"], Float[Array, " K"]]:
-    """Lane segments around a point in its direction: lane, squared distance, signed distance to the line (left +).
-
-    Others have lane -1 and a very large distance.
-    """
-    rows, inside = lanes_around(bank, index, xy)
-    squared, side = to_segments(rows, xy[None])
-    counts = inside & _runs_along(rows, heading) & _level(rows[LaneRow.Z], z)
-    return (
-        jnp.where(counts, rows[LaneRow.LANE], -1.0).astype(jnp.int32),
-        jnp.where(counts, squared[0], _FAR),
-        side[0],
-    )
-
-
 def lane_distance(bank: ScenarioBank, index: Integer, xy: Vector, z: Scalar) -> Scalar:
     """Distance to the nearest lane centre in any direction, m; infinite beyond the cut-off."""
     rows, inside = lanes_around(bank, index, xy)
@@ -226,10 +210,8 @@ def vertex_distances(
     The measure of tools that keep maps as points: segments get a vertex every ``spacing_m`` from their beginning, and
     one at their end. Exact within the cut-offs; beyond them it may be too large.
     """
-    return (
-        _nearest_vertex(*edges_around(bank, index, xy), xy, spacing_m),
-        _nearest_vertex(*lanes_around(bank, index, xy), xy, spacing_m),
-    )
+    edges, lanes = edges_around(bank, index, xy), lanes_around(bank, index, xy)
+    return _nearest_vertex(*edges, xy, spacing_m), _nearest_vertex(*lanes, xy, spacing_m)
 
 
 def _nearest_vertex(
@@ -256,7 +238,7 @@ def _outside_lanes(
 def _corner_lanes(
     bank: ScenarioBank, index: Integer, point: Vector, heading: Vector, z: Scalar
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether a lane is near to a corner of a long box, and whether the corner is outside all lanes."""
+    """Whether a lane is near a corner of a long box, and whether the corner is outside all lanes."""
     rows, inside = lanes_around(bank, index, point)
     squared = to_segments(rows, point[None])[0]
     squared = jnp.where(inside & _level(rows[LaneRow.Z], z), squared, _FAR)
@@ -270,8 +252,8 @@ def offroad_distance(
 ) -> Float[Array, " P"]:  # fmt: skip
     """Signed distance of points beyond the nearest road edge, m: positive off the road, negative on it.
 
-    Without an edge within the cut-off the stored side of the side cell decides, and if that is unknown, whether a lane
-    centre is near; the distance is then plus or minus the cut-off.
+    Without an edge within the cut-off the stored side decides, and if that is unknown, whether a lane centre is near;
+    the distance is then plus or minus the cut-off.
     """
     if bank.long_ego:
         look = jax.vmap(lambda p: left_of_edges(bank, index, p, p[None], z))
@@ -315,22 +297,13 @@ class RouteHit:
 
 
 def project_on_route(
-    bank: ScenarioBank,
-    index: Integer,
-    xy: Vector,
-    near_m: Scalar,
-    ahead_m: float | Scalar = 33.0,
-    route: int = 0,
-) -> RouteHit:
-    """Project a point on a route within a window from 6 m behind to ``ahead_m`` ahead of ``near_m``.
+    bank: ScenarioBank, index: Integer, xy: Vector, near_m: Scalar,
+    ahead_m: float | Scalar = 33.0, route: int = 0,
+) -> RouteHit:  # fmt: skip
+    """Project a point on a route from 6 m behind to ``ahead_m`` ahead of its last known arc length ``near_m``.
 
-    Args:
-        bank: The scenarios.
-        index: Row of the bank.
-        xy: The point, m.
-        near_m: Last known arc length.
-        ahead_m: End of the window; it keeps a car off the other leg of a hairpin.
-        route: 0 the route to the goal, 1 the log's own.
+    ``ahead_m`` keeps a car off the other leg of a hairpin; ``route`` is 0 for the route to the goal, 1 for the log's
+    own.
     """
     count = bank.routes.shape[2]
     first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
@@ -394,13 +367,10 @@ def light_crossing(
 def lane_course(
     bank: ScenarioBank, index: Integer, xy: Vector, heading: Vector, z: Scalar
 ) -> tuple[Vector, Scalar, Bool[Array, ""]]:
-    """Direction of the lane that a car at a pose follows.
+    """Lane that a car at a pose follows: direction, distance of the car from it (left positive, m), whether it exists.
 
     It is the best lane within 2.5 m and 60 degrees, where a metre weighs as much as 15 degrees: a car that has started
     to turn follows the turn.
-
-    Returns:
-        Direction, signed distance of the point from the lane (left positive, m), and whether there is such a lane.
     """
     rows, inside = lanes_around(bank, index, xy)
     squared, side = to_segments(rows, xy[None])
@@ -412,3 +382,48 @@ def lane_course(
     best = first_smallest(jnp.where(fits, squared[0] + (4.0 * sin) ** 2, _FAR))
     direction = jnp.stack([ux[best], uy[best]]) / length[best]
     return direction, side[0, best], fits[best]
+
+
+@record
+class Passage:
+    """Strand of a car (-1 without a near lane in its direction), and whether it changed lanes or merged at this step.
+
+    It changed lanes if the previous strand is parallel to this one, and merged if that strand ends, or joins this one,
+    within 100 m.
+    """
+
+    strand: Integer
+    changed: Bool[Array, ""]
+    merged: Bool[Array, ""]
+
+
+def lane_passage(
+    bank: ScenarioBank, index: Integer, xy: Vector, heading: Vector, z: Scalar, before: Any
+) -> Passage:
+    """Return the passage of a car from the strand ``before`` (-1 without one); ``z`` is the height of the ground.
+
+    A car stays on a strand of lanes (``scenario.bank.strands``) until its centre is 0.3 m beyond the line between the
+    strand and another, so that a car that drives along the line does not change lanes at every step.
+    """
+    rows, inside = lanes_around(bank, index, xy)
+    to_line, side = to_segments(rows, xy[None])
+    counts = inside & _runs_along(rows, heading) & _level(rows[LaneRow.Z], z)
+    lane = jnp.where(counts, rows[LaneRow.LANE], -1.0).astype(jnp.int32)
+    squared, side = jnp.where(counts, to_line[0], _FAR), side[0]
+    codes = bank.lane_strands[index]
+    strand = jnp.where(lane >= 0, codes[lane, StrandColumn.STRAND], -1.0).astype(jnp.int32)
+    best = first_smallest(squared)
+    own = jnp.where((strand == before) & (strand >= 0), squared, _FAR)
+    held = first_smallest(own)
+    near, kept = squared[best] <= LANE_CUTOFF_M**2, own[held] <= LANE_CUTOFF_M**2
+    stays = kept & (root(own[held]) - root(squared[best]) <= 2 * BEYOND_M)
+    now = jnp.where(stays, before, jnp.where(near, strand[best], -1))
+    old, new = codes[lane[held]], codes[lane[best]]
+    adjacent = (new[StrandColumn.LEFT] == before) | (new[StrandColumn.RIGHT] == before)
+    adjacent = (adjacent | (old[StrandColumn.LEFT] == now) | (old[StrandColumn.RIGHT] == now)) & kept
+    passed = (before >= 0) & (now >= 0) & (now != before)
+    changed = passed & adjacent & (jnp.abs(side[held] - side[best]) >= SIDE_BY_SIDE_M)
+    left = codes[before]
+    ending = norm(xy - left[StrandColumn.END]) <= MERGE_M
+    merged = passed & ending & (changed | (left[StrandColumn.ONTO] == now))
+    return Passage(now.astype(jnp.int16), changed, merged)

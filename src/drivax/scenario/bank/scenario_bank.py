@@ -54,12 +54,10 @@ class Sizes:
     """Sizes of the arrays of a bank; banks of the same sizes run the same compiled programs.
 
     Attributes:
-        agents: Moving agents.
-        slots: Slots of a frame: moving and parked agents.
-        edges, lanes: Segments of road edges and of car lanes.
+        agents, slots: Moving agents; slots of a frame for moving and parked agents.
+        edges, lanes, road: Segments of road edges and of car lanes, and pieces of road to observe.
         edge_run, lane_run: Longest run of a row of three grid cells.
         graphs: Lanes of the graph.
-        road: Pieces of road to observe.
         long_ego: Whether some ego is too long for a single grid query.
     """
 
@@ -77,19 +75,14 @@ class Sizes:
     @classmethod
     def whole(cls, capacity: Capacity) -> Sizes:
         """Return the sizes of a capacity."""
-        c = capacity
-        return cls(
-            agents=c.agents, slots=c.agents + c.parked, lights=c.lights, edges=c.segments, lanes=c.segments,
-            edge_run=c.edge_run, lane_run=c.lane_run, graphs=c.lanes, road=c.road_rows, long_ego=False,
-        )  # fmt: skip
+        own = {name: getattr(capacity, name) for name in ("agents", "lights", "edge_run", "lane_run")}
+        own |= {"edges": capacity.segments, "lanes": capacity.segments, "graphs": capacity.lanes}
+        slots = capacity.agents + capacity.parked
+        return cls(**own, slots=slots, road=capacity.road_rows, long_ego=False)
 
     @classmethod
     def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
-        """Return the sizes that scenarios of one capacity use.
-
-        Raises:
-            DrivaxError: There are no scenarios.
-        """
+        """Return the sizes that one or more scenarios of one capacity use."""
         needed = [_needed(scenario) for scenario in scenarios]
         if not needed:
             raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
@@ -133,10 +126,8 @@ def _rounded(count: int, most: int) -> int:
 
 def _longest_run(start: np.ndarray[Any, Any], grid: int) -> int:
     """Longest run over three neighbouring cells of a grid row, rounded up to a multiple of 8."""
-    begin = start[:-1].reshape(grid, grid).astype(np.int64)
-    end = start[1:].reshape(grid, grid).astype(np.int64)
-    longest = max(int((end[:, 2:] - begin[:, :-2]).max()), 1)
-    return -(-longest // _MULTIPLE) * _MULTIPLE
+    begin, end = (part.reshape(grid, grid).astype(np.int64) for part in (start[:-1], start[1:]))
+    return -(-max(int((end[:, 2:] - begin[:, :-2]).max()), 1) // _MULTIPLE) * _MULTIPLE
 
 
 @record
@@ -152,18 +143,16 @@ class ScenarioBank:
         parked: Parked agents in their slots, :class:`AgentColumn`.
         parked_when: Steps at which parked agents are observed: bit ``t % 32`` of word ``t // 32``.
         light_line: Stop lines, :class:`LightRow`.
-        edges: Road-edge segments (drivable side on the left) sorted by grid cell, :class:`EdgeRow`.
-        lanes: Car-lane segments sorted by grid cell, :class:`LaneRow`.
+        edges, lanes: Segments of road edges (drivable side on the left) and of car lanes, sorted by grid cell,
+            :class:`EdgeRow` and :class:`LaneRow`.
         lane_strands: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
         grid_edge, grid_lane: Start of the run of each cell in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
         routes: Points 1 m apart, :class:`RouteColumn`; route 0 leads to the goal, route 1 is the log's own.
-        log_progress: Arc length of the logged ego along route 0.
-        log_ahead: Distance that the logged ego still drives, m.
+        log_progress, log_ahead: Arc length of the logged ego along route 0; distance that it still drives, m.
         road: Pieces of road to observe, in order of rank, :class:`RoadColumn`.
-        road_at: x, y and layer of the same pieces.
-        road_curvature: Curvature of each piece, left positive, 1/m.
+        road_at, road_curvature: x, y and layer of the same pieces; their curvature, left positive, 1/m.
         flags: ``scenario.schema.Flag`` bits.
         identity: Seeds of the random numbers of a scenario (:func:`identities`).
         extension: Points 4 m apart beyond the last logged pose of moving agents, along their lane: x, y.
@@ -234,11 +223,8 @@ class ScenarioBank:
     ) -> ScenarioBank:
         """Stack scenarios of one capacity.
 
-        Args:
-            scenarios: Scenarios of one capacity.
-            trim: Cut unused padding, or cut to given sizes. Banks of the same sizes share compiled programs; smaller
-                banks are faster.
-            allow_no_future: Accept scenarios of test splits.
+        ``trim`` cuts unused padding, or cuts to given sizes: banks of the same sizes share compiled programs, smaller
+        banks are faster. ``allow_no_future`` accepts scenarios of test splits.
 
         Raises:
             DrivaxError: There are no scenarios, their capacities differ, or one has no logged future.
@@ -248,36 +234,30 @@ class ScenarioBank:
             if Flag.NO_FUTURE in scenario.has and not allow_no_future:
                 problem = "has no logged future (a test split)"
                 raise DataError(problem, record=scenario.id, cure="leave it out (flag!=NO_FUTURE)")
-        for scenario in kept:
             if scenario.capacity != kept[0].capacity:
-                raise DataError(
-                    f"has capacity {scenario.capacity.name!r}, others {kept[0].capacity.name!r}",
-                    record=scenario.id,
-                    cure="convert all sets with one --capacity",
-                )
+                problem = f"has capacity {scenario.capacity.name!r}, others {kept[0].capacity.name!r}"
+                raise DataError(problem, record=scenario.id, cure="convert all sets with one --capacity")
         own = Sizes.used(kept)
         sizes = trim if isinstance(trim, Sizes) else own if trim else Sizes.whole(kept[0].capacity)
+        arrays = _stack_agents(kept, sizes) | _stack_routes(kept) | _stack_lights(kept, sizes)
+        arrays |= _stack_road(kept, sizes) | _stack_maps(kept, sizes)
         return cls(
-            **{name: jnp.asarray(value) for name, value in _stack(kept, sizes).items()},
-            cell_m=kept[0].capacity.cell_m,
-            edge_run=sizes.edge_run,
-            lane_run=sizes.lane_run,
-            long_ego=own.long_ego or sizes.long_ego,
-            trimmed=trim is True,
-        )
+            **{name: jnp.asarray(value) for name, value in arrays.items()},
+            cell_m=kept[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
+            long_ego=own.long_ego or sizes.long_ego, trimmed=trim is True,
+        )  # fmt: skip
 
 
 def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
     """Return a number per scenario from its data set and id, independent of set, order and batch.
 
-    It is the first four bytes of BLAKE2b over data set, id and the number of earlier scenarios of the same name, so
-    that copies of a scenario differ.
+    It is a four-byte BLAKE2b digest of data set, id and the number of earlier scenarios of that name: copies differ.
     """
     seen: Counter[tuple[str, str]] = Counter()
     numbers = []
     for name in names:
-        text = "\0".join((*name, str(seen[name])))
-        numbers.append(int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "little"))
+        digest = hashlib.blake2b("\0".join((*name, str(seen[name]))).encode(), digest_size=4).digest()
+        numbers.append(int.from_bytes(digest, "little"))
         seen[name] += 1
     return np.array(numbers, np.uint32)
 
@@ -299,20 +279,14 @@ def _join(*parts: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.concatenate([p if p.ndim == rank else p[..., None] for p in parts], -1, dtype=np.float32)
 
 
-def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
-    arrays = _stack_agents(scenarios, sizes) | _stack_routes(scenarios) | _stack_lights(scenarios, sizes)
-    return arrays | _stack_road(scenarios, sizes) | _stack_maps(scenarios, sizes)
-
-
 def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     names = ("xy", "z", "heading", "velocity", "valid", "size", "kind")
     xy, z, heading, velocity, valid, size, kind = _columns(scenarios, "agent", *names)
-    count = sizes.agents
-    agents = _join(xy, z, np.cos(heading), np.sin(heading), velocity, valid)[:, :, :count]
-    box = _join(size, kind)[:, :count]
+    agents, box = _join(xy, z, np.cos(heading), np.sin(heading), velocity, valid), _join(size, kind)
+    box = box[:, : sizes.agents]
     return {
-        "agents": agents,
-        "extension": _column(scenarios, "agent_extension")[:, :count],
+        "agents": agents[:, :, : sizes.agents],
+        "extension": _column(scenarios, "agent_extension")[:, : sizes.agents],
         "flags": _column(scenarios, "flags"),
         "identity": identities([(scenario.text("dataset"), scenario.id) for scenario in scenarios]),
         **_stack_parked(scenarios, sizes.slots, last_used(valid.any(1)), box),
@@ -426,12 +400,11 @@ def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
 
 
 def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
-    rows = _column(scenarios, "road_rows").astype(np.int32)
-    used = sizes.road
     names = ("xy", "direction", "length", "kind", "limit", "curvature")
-    xy, direction, length, kind, limit, curvature = (c[:, :used] for c in _columns(scenarios, "road", *names))
+    columns = (column[:, : sizes.road] for column in _columns(scenarios, "road", *names))
+    xy, direction, length, kind, limit, curvature = columns
     layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
-    there = np.arange(used) < rows[:, None]
+    there = np.arange(sizes.road) < _column(scenarios, "road_rows")[:, None]
     layer = np.where(there & layers.any(-1), np.argmax(layers, axis=-1), RoadLayer.NONE)
     return {
         "road": _join(xy, direction, length, layer, limit),
@@ -449,6 +422,5 @@ def _lane_rows(scenario: Scenario, rows: slice) -> np.ndarray[Any, Any]:
     for kind, fallback in CLASS_LIMIT_MPS.items():
         limit = np.where((limit <= 0) & (scenario.lane_kind[lane] == kind), fallback, limit)
     number = lane + 0.5 * corridor_lanes(scenario)[lane]
-    return np.stack(
-        [a[:, 0], a[:, 1], b[:, 0], b[:, 1], (a[:, 2] + b[:, 2]) / 2, half, limit, number]
-    ).astype(np.float32)
+    columns = [a[:, 0], a[:, 1], b[:, 0], b[:, 1], (a[:, 2] + b[:, 2]) / 2, half, limit, number]
+    return np.stack(columns).astype(np.float32)

@@ -2,7 +2,7 @@
 
 A strand is a sequence of lanes that continue each other. Where several lanes begin or end, the lane with the smallest
 change of course continues the strand; the others belong to other strands. Passing to an adjacent strand is a lane
-change (``scenario.bank.passages``).
+change (``scenario.bank.queries.lane_passage``).
 """
 
 from __future__ import annotations
@@ -48,9 +48,8 @@ def lane_strands(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
     if not count:
         return table
     row = np.arange(count)
-    successor, predecessor = (
-        getattr(scenario, name)[:count].astype(np.int64) for name in ("lane_successor", "lane_predecessor")
-    )
+    successor = scenario.lane_successor[:count].astype(np.int64)
+    predecessor = scenario.lane_predecessor[:count].astype(np.int64)
     courses, each = _Courses.of(scenario, count), np.repeat(row[:, None], 4, axis=1)
     ahead = _straightest(successor, courses.turn(each, successor))
     behind = _straightest(predecessor, courses.turn(predecessor, each))
@@ -61,13 +60,13 @@ def lane_strands(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
     onto = np.where(comes_in, strand[ahead], -1)
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
     stops = (successor < 0).all(axis=1) & _known(scenario, stop)
-    for side in ("lane_right", "lane_left"):
-        adjacent = getattr(scenario, side)[:count].astype(np.int64)
+    sides = (StrandColumn.RIGHT, scenario.lane_right), (StrandColumn.LEFT, scenario.lane_left)
+    for column, neighbour in sides:
+        adjacent = neighbour[:count].astype(np.int64)
         further = ((stop[last[adjacent]] - stop) * course).sum(axis=1)
         # Lanes that are not stored lie beyond the crop.
         goes_on = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | ~(further <= _ON_M))
         onto = np.where(stops & goes_on, strand[adjacent], onto)
-        column = StrandColumn.LEFT if side == "lane_left" else StrandColumn.RIGHT
         table[:count, column] = np.where(adjacent >= 0, strand[adjacent], -1)
     onto = np.where(follows[last] < 0, onto[last], -1)
     table[:count, StrandColumn.STRAND], table[:count, StrandColumn.ONTO] = strand, onto
@@ -79,11 +78,8 @@ def lane_strands(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
 class _Courses:
     """Courses of lanes at their ends; NaN where that stretch is not stored.
 
-    Attributes:
-        begin, end: Headings, rad.
-        early, late: Mean curvature over the first and over the last 20 m, 1/m.
-        before: Heading 20 m before the end, rad.
-        stop: The last point, m.
+    Headings (rad) at the beginning, at the end and 20 m ``before`` the end; mean curvature (1/m) over the first and the
+    last 20 m; and the last point (m).
     """
 
     begin: Float[Array, " lane"]

@@ -1,23 +1,40 @@
-"""Assembly of scenarios from recordings: checks, local frame, padding, map index and routes."""
+"""Assembly of scenarios from recordings: checks, local frame, map index, routes, and the padded record."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from drivax.errors import DataError
-from drivax.scenario.build.filling import EVENT_ACTORS, Parts, fill
-from drivax.scenario.build.grid import GridSegments, arrange, cell_sides
-from drivax.scenario.build.lanes import LaneGraph, LaneSegments, lane_graph, select
-from drivax.scenario.build.lights import place_lights, place_stops
-from drivax.scenario.build.roads import road_rows
+from drivax.scenario.build.grid import EDGE_BLOCK, LANE_BLOCK, GridSegments, arrange, cell_sides
+from drivax.scenario.build.lanes import LaneGraph, LaneSegments, lane_graph, lane_of_feature, select
+from drivax.scenario.build.lights import Lights, Stops, place_lights, place_stops
 from drivax.scenario.build.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
-from drivax.scenario.build.segments import RoadLines, cut, inside_box, path_distance, road_lines, thin_path
-from drivax.scenario.build.tracks import LocalTracks, extend, local_tracks, place
+from drivax.scenario.build.segments import (
+    RoadLines,
+    RoadRows,
+    cut,
+    inside_box,
+    path_distance,
+    road_lines,
+    road_rows,
+    thin_path,
+)
+from drivax.scenario.build.tracks import (
+    EGO_BIT,
+    INTEREST_BIT,
+    PREDICT_BIT,
+    LocalTracks,
+    Placement,
+    extend,
+    local_tracks,
+    place,
+)
 from drivax.scenario.recording import Recording, check, step_seconds
 from drivax.scenario.schema import (
     CAPACITIES,
@@ -31,10 +48,12 @@ from drivax.scenario.schema import (
     Scenario,
     SourceCounts,
     among,
+    record_dtype,
 )
 from drivax.scenario.select.tags import scenario_tags
 
 Array = np.ndarray[Any, Any]
+Record = np.ndarray[Any, Any]
 
 #: Margin of the map around the box of the ego's log.
 MARGIN_M = 100.0
@@ -47,15 +66,17 @@ FLAT_M = 0.01
 #: Flags that are measured here and override those of the reader. ``LIGHTS`` is not among them: a source may know that
 #: there are no lights.
 MEASURED = (
-    Flag.LANE_GRAPH
-    | Flag.DEFAULT_LIMITS
-    | Flag.SPEED_LIMITS
-    | Flag.CHAINED_GRAPH
-    | Flag.CLOSED_EDGES
-    | Flag.OVERFLOW
-    | Flag.ROUTE
-    | Flag.ELEVATION
-)
+    Flag.LANE_GRAPH | Flag.DEFAULT_LIMITS | Flag.SPEED_LIMITS | Flag.CHAINED_GRAPH
+    | Flag.CLOSED_EDGES | Flag.OVERFLOW | Flag.ROUTE | Flag.ELEVATION
+)  # fmt: skip
+EVENT_ACTORS = 4
+#: Fields in which unused slots and unknown values are -1; they are 0 in all others.
+MISSING = (
+    "agent_id", "parked_id", "light_lane", "light_state", "stop_lane", "segment_kind", "segment_feature",
+    "segment_lane", "feature_id", "feature_kind", "lane_id", "lane_kind", "lane_width", "lane_limit",
+    "lane_successor", "lane_predecessor", "lane_left", "lane_right", "lane_light", "route_lane", "route_limit",
+    "road_kind", "road_limit", "event_kind", "event_start", "event_end", "event_actor",
+)  # fmt: skip
 #: Lanes whose class has a limit (``scenario.bank.scenario_bank.CLASS_LIMIT_MPS``).
 _LIMITED_KINDS = (RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE)
 _COUNTED = {
@@ -67,6 +88,24 @@ _COUNTED = {
     "stop_sign": (RoadKind.STOP_SIGN,),
     "driveway": (RoadKind.DRIVEWAY,),
 }
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Parts of a scenario in the local frame; ``polylines`` are the rows of ``roads`` that are stored as features."""
+
+    tracks: LocalTracks
+    placement: Placement
+    extension: Float[Array, "slot point 2"]
+    graph: LaneGraph
+    routes: RouteSet
+    grid: GridSegments
+    sides: Int[Array, " cell"]
+    roads: RoadLines
+    polylines: Int[Array, " polyline"]
+    rows: RoadRows
+    lights: Lights
+    stops: Stops
 
 
 def count_source(recording: Recording) -> SourceCounts:
@@ -86,12 +125,10 @@ def count_source(recording: Recording) -> SourceCounts:
 def assemble(
     recording: Recording, capacity: Capacity = CAPACITIES["default"], routes: RouteStyle = "graph"
 ) -> Scenario:
-    """Assemble a scenario from a recording.
+    """Assemble a scenario from a recording of at most ``capacity.steps`` steps (cut longer ones with ``windows``).
 
-    Args:
-        recording: At most ``capacity.steps`` steps; cut longer recordings with ``windows``.
-        capacity: Padded sizes; the farthest items from the ego's log that do not fit are counted in ``overflow``.
-        routes: Source of candidate routes (``scenario.build.routes``).
+    Items that do not fit the capacity, those farthest from the ego's log, are left out and counted in ``overflow``.
+    ``routes`` is the source of candidate routes (``scenario.build.routes``).
 
     Raises:
         DataError: The recording is invalid.
@@ -112,46 +149,47 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     roads = road_lines(recording.features, origin, recording.split_gap_m)
     _refuse_endless(roads)
     segments = cut(roads)
+    block = segments.block
     whole = lane_graph(recording.features, origin)
     on = LaneSegments.of(segments, whole)
     intent, unknown = _intent(recording, whole)
-    routes = find_routes(whole, on, log, intent, style, capacity.routes, capacity.route_points)
-    marked = (*recording.to_predict, *recording.of_interest)
-    placement = place(tracks, marked, capacity.agents, capacity.parked)
-    on_route = _lanes_of(routes)
+    routes = find_routes(on, log, intent, style, capacity.routes, capacity.route_points)
+    on_route = np.unique(np.concatenate([route.lane for route in routes.routes]))
+    on_route = on_route[on_route >= 0]
     inside = inside_box(segments.middle, path, MARGIN_M)
     inside |= np.isin(segments.feature, whole.feature[on_route])
     grid = arrange(segments.take(inside), path, capacity)
     keep, lost_lanes = _kept_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
     graph = select(whole, keep)
     polylines, lost_features = _kept_polylines(roads, grid, path, capacity.features)
-    is_lane = among(segments.kind, CAR_LANE_KINDS)
-    is_edge, is_ring = among(segments.kind, EDGE_KINDS), roads.closed[among(roads.kind, EDGE_KINDS)]
-    rings = len(is_ring) > 0 and bool(is_ring.all())
-    stored_on = LaneSegments.of(segments, graph)
+    marked = (*recording.to_predict, *recording.of_interest)
+    placement = place(tracks, marked, capacity.agents, capacity.parked)
+    edges, lanes = segments.take(block == EDGE_BLOCK), segments.take(block == LANE_BLOCK)
     parts = Parts(
         tracks=tracks,
         placement=placement,
-        extension=extend(tracks, placement.moving, whole, on, capacity.extension),
+        extension=extend(tracks, placement.moving, on, capacity.extension),
         graph=graph,
         routes=_renumber(routes, keep, whole.count),
         grid=grid,
-        sides=cell_sides(grid.grid, segments.take(is_edge), segments.take(is_lane).middle, rings),
+        sides=cell_sides(grid.grid, edges, lanes.middle, roads.rings_closed),
         roads=roads,
         polylines=polylines,
         rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),
-        lights=place_lights(recording.lights, graph, stored_on, origin, path, capacity.lights),
+        lights=place_lights(
+            recording.lights, LaneSegments.of(segments, graph), origin, path, capacity.lights
+        ),
         stops=place_stops(recording.features, graph, origin, path, capacity.stops),
     )
     overflow = _overflow(parts, recording, capacity, {"lanes": lost_lanes, "features": lost_features})
-    flags = _flags(recording, parts, rings, capacity)
+    flags = _flags(recording, parts, capacity)
     flags |= Flag.OVERFLOW if overflow else Flag.NONE
     return Scenario(
         record=fill(parts, recording, capacity, origin, flags),
         capacity=capacity,
         source=replace(count_source(recording), lost=_lost(recording, {**whole.lost, **unknown})),
         overflow=overflow,
-        tags=scenario_tags(recording, parts, flags, style),
+        tags=scenario_tags(recording, tracks, graph, parts.routes, parts.lights, flags, style),
     )
 
 
@@ -172,7 +210,6 @@ def _lost(recording: Recording, lost: Mapping[str, int]) -> dict[str, int]:
 
 
 def _refuse_endless(roads: RoadLines) -> None:
-    """Refuse maps that are too long for one place."""
     length = float(roads.lines.length.sum())
     if length > MAP_M:
         problem = f"the map's lines are {length / 1000:.0f} km long together, more than {MAP_M / 1000:.0f} km"
@@ -184,12 +221,6 @@ def ego_log(tracks: LocalTracks, current_step: int) -> EgoLog:
     row = tracks.ego
     speed = np.hypot(*tracks.velocity[row].T)
     return EgoLog(tracks.xyz[row], tracks.heading[row], speed, tracks.valid[row], current_step)
-
-
-def _lanes_of(routes: RouteSet) -> Int[Array, " lane"]:
-    """Return the dense indices of all lanes under routes."""
-    lanes = np.unique(np.concatenate([route.lane for route in routes.routes]))
-    return lanes[lanes >= 0]
 
 
 def _kept_lanes(
@@ -232,29 +263,23 @@ def _renumber(routes: RouteSet, keep: Int[Array, " lane"], count: int) -> RouteS
 
 def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict[str, int]) -> dict[str, int]:
     """Nonzero numbers of items that did not fit, by name."""
-    actors = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in recording.events)
-    counts = {
-        **parts.placement.overflow,
-        **lost,
-        **parts.grid.overflow,
-        **parts.lights.overflow,
-        **parts.stops.overflow,
-        **parts.rows.overflow,
-        "lane_links": parts.graph.dropped_links,
-        "events": max(len(recording.events) - capacity.events, 0),
-        "event_actors": actors,
-    }
-    return {name: count for name, count in counts.items() if count}
+    counts = parts.placement.overflow | lost
+    for part in (parts.grid, parts.lights, parts.stops, parts.rows):
+        counts |= part.overflow
+    counts["lane_links"] = parts.graph.dropped_links
+    counts["events"] = len(recording.events) - capacity.events
+    counts["event_actors"] = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in recording.events)
+    return dict(+Counter(counts))
 
 
-def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) -> Flag:
+def _flags(recording: Recording, parts: Parts, capacity: Capacity) -> Flag:
     """Flags of the reader, with those that are measured here."""
     heights = parts.roads.lines.points[:, 2]
-    facts: Sequence[tuple[Flag, Any]] = (
+    facts = (
         (Flag.LIGHTS, len(parts.lights.z) > 0),
         (Flag.NO_FUTURE, len(recording.timestamps_s) < capacity.steps),
         (Flag.DEFAULT_SIZES, parts.tracks.defaulted > 0),
-        (Flag.CLOSED_EDGES, rings),
+        (Flag.CLOSED_EDGES, parts.roads.rings_closed),
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
         (Flag.ROUTE, parts.routes.on_lanes),
         (Flag.DEFAULT_LIMITS, ((parts.graph.limit <= 0) & among(parts.graph.kind, _LIMITED_KINDS)).any()),
@@ -264,3 +289,127 @@ def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) 
     for flag, holds in facts:
         flags |= flag if holds else Flag.NONE
     return flags
+
+
+def fill(
+    parts: Parts, recording: Recording, capacity: Capacity, origin: Float[Array, "3"], flags: Flag
+) -> Record:
+    """Return the record of a scenario: a zero-dimensional structured array of ``record_dtype(capacity)``."""
+    record = blank(capacity)
+    for name in ("scenario_id", "dataset", "segment"):
+        record[name] = getattr(recording, name).encode()
+    # Rounded to a micrometre: the last bits of generated recordings depend on the processor.
+    record["origin"] = np.round(origin, 6) + 0.0
+    record["dt_s"] = step_seconds(recording.timestamps_s)[0]
+    record["current_step"] = recording.current_step
+    record["steps"] = len(recording.timestamps_s)
+    record["flags"] = int(flags)
+    _fill_agents(record, parts, recording)
+    _fill_map(record, parts, recording)
+    _fill_lanes(record, parts)
+    _fill_routes(record, parts)
+    for i, event in enumerate(recording.events[: capacity.events]):
+        for name in ("kind", "start", "end"):
+            record[f"event_{name}"][i] = getattr(event, name)
+        actors = event.actors[:EVENT_ACTORS]
+        record["event_actor"][i, : len(actors)] = actors
+    return record
+
+
+def blank(capacity: Capacity) -> Record:
+    """Return a record without valid entries: zeros, and -1 for missing indices and values."""
+    record = np.zeros((), record_dtype(capacity))
+    for name in MISSING:
+        record[name] = -1
+    return record
+
+
+def _put(record: Record, **values: Array) -> None:
+    """Write arrays into the beginning of the leading axis of fields."""
+    for name, value in values.items():
+        record[name][: len(value)] = value
+
+
+def _copy(record: Record, prefix: str, part: Any, *names: str) -> None:
+    """Write the named arrays of a part into the fields ``prefix_name``."""
+    _put(record, **{f"{prefix}_{name}": getattr(part, name) for name in names})
+
+
+def _fill_agents(record: Record, parts: Parts, recording: Recording) -> None:
+    tracks, moving, parked = parts.tracks, parts.placement.moving, parts.placement.parked
+    seen = tracks.valid if recording.seen is None else tracks.valid & recording.seen
+    timed = {
+        "xy": tracks.xyz[moving, :, :2],
+        "z": tracks.xyz[moving, :, 2],
+        "heading": tracks.heading[moving],
+        "velocity": tracks.velocity[moving],
+    }
+    steps = tracks.valid.shape[1]
+    for name, value in timed.items():
+        record[f"agent_{name}"][:steps, : len(moving)] = np.swapaxes(value, 0, 1)
+    for block, rows in (("agent", moving), ("parked", parked)):
+        record[f"{block}_valid"][:steps, : len(rows)] = tracks.valid[rows].T
+        record[f"{block}_seen"][:steps, : len(rows)] = seen[rows].T
+        values = {"size": tracks.size[rows], "kind": tracks.kind[rows], "id": tracks.track_id[rows]}
+        _put(record, **{f"{block}_{name}": value for name, value in values.items()})
+    flags = np.zeros(len(tracks.kind), dtype=np.uint8)
+    flags[tracks.ego] |= EGO_BIT
+    flags[list(recording.to_predict)] |= PREDICT_BIT
+    flags[list(recording.of_interest)] |= INTEREST_BIT
+    pose = parts.placement.pose[parked]
+    _put(record, agent_flags=flags[moving], agent_extension=parts.extension)
+    _put(record, parked_xy=pose[:, :2], parked_z=pose[:, 2], parked_heading=pose[:, 3])
+
+
+def _fill_map(record: Record, parts: Parts, recording: Recording) -> None:
+    grid, roads, kept, lights = parts.grid, parts.roads, parts.polylines, parts.lights
+    row_of = np.full(roads.lines.count + 1, -1)
+    row_of[kept] = np.arange(len(kept))
+    source_ids = np.array([feature.feature_id for feature in recording.features], dtype=np.int64)
+    _copy(record, "segment", grid.segments, "a", "b", "kind", "start_m")
+    _put(
+        record,
+        segment_feature=row_of[grid.segments.polyline],
+        segment_lane=lane_of_feature(parts.graph, grid.segments.feature),
+        segment_blocks=grid.blocks,
+        feature_id=source_ids[roads.feature[kept]],
+        feature_kind=roads.kind[kept],
+        feature_closed=roads.closed[kept],
+        grid_edge=grid.edge_start,
+        grid_lane=grid.lane_start,
+        grid_side=parts.sides,
+        grid_origin=grid.grid.origin,
+    )
+    steps, count = lights.state.shape[1], len(lights.z)
+    record["light_state"][:steps, :count] = lights.state.T
+    _copy(record, "light", lights, "line", "z", "lane", "heading", "exit_heading")
+    _copy(record, "stop", parts.stops, "xy", "lane")
+    _copy(record, "road", parts.rows, "xy", "direction", "length", "kind", "limit", "curvature")
+    record["road_rows"] = len(parts.rows.kind)
+
+
+def _fill_lanes(record: Record, parts: Parts) -> None:
+    graph = parts.graph
+    light_of, stops_at = np.full(graph.count, -1), np.zeros(graph.count, dtype=bool)
+    for i in reversed(np.flatnonzero(parts.lights.lane >= 0)):
+        light_of[parts.lights.lane[i]] = i
+    stops_at[parts.stops.lane[parts.stops.lane >= 0]] = True
+    _copy(record, "lane", graph, "kind", "width", "limit", "interpolating")
+    _copy(record, "lane", graph, "successor", "predecessor", "left", "right")
+    _put(
+        record, lane_id=graph.lane_id, lane_length=graph.lines.length, lane_light=light_of, lane_stop=stops_at
+    )
+
+
+def _fill_routes(record: Record, parts: Parts) -> None:
+    limits = np.append(parts.graph.limit, -1.0)
+    for k, route in enumerate(parts.routes.routes):
+        count = len(route.xyz)
+        record["route_xy"][k, :count] = route.xyz[:, :2]
+        record["route_z"][k, :count] = route.xyz[:, 2]
+        record["route_heading"][k, :count] = route.heading
+        record["route_lane"][k, :count] = route.lane
+        record["route_limit"][k, :count] = limits[route.lane]
+        record["route_points"][k] = count
+    record["goal_xy"] = parts.routes.goal
+    _put(record, log_progress=parts.routes.progress)

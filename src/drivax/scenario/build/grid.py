@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,7 +44,7 @@ class Grid:
 
     @classmethod
     def around(cls, xy: Float[Array, "point 2"], path: Float[Array, "step 2"], capacity: Capacity) -> Grid:
-        """Return the grid centred on points, or on the log of the ego if the points do not fit."""
+        """Return the grid centred on points, or on ``path``, the log of the ego, if they do not fit."""
         size = capacity.grid * capacity.cell_m
         points = xy if len(xy) and np.all(np.ptp(xy, axis=0) < size) else path
         centre = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -91,14 +92,9 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridSegments:
-    """Segments in storage order with their grid.
+    """Segments in storage order (edges by cell, car lanes by cell, the rest in order of the source) with their grid.
 
-    Attributes:
-        segments: Sorted: edges by cell, car lanes by cell, the rest in order of the source.
-        blocks: 0, end of the edges, end of the lanes, end of the rest.
-        edge_start: CSR starts of the edges, absolute segment indices.
-        lane_start: CSR starts of the car lanes, absolute segment indices.
-        overflow: What did not fit, by name.
+    ``blocks`` holds 0 and the ends of the edges, the lanes and the rest; the CSR starts are absolute segment indices.
     """
 
     grid: Grid
@@ -124,17 +120,17 @@ def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity
     if keep.sum() > capacity.segments:
         inside = np.flatnonzero(keep)
         keep[inside[np.argsort(far[inside], kind="stable")[capacity.segments :]]] = False
-    overflow = {"segments": int((~keep).sum())}
+    overflow = Counter(segments=int((~keep).sum()))
     block = segments.block
-    for name, number, cap in (
-        ("edge_run", EDGE_BLOCK, capacity.edge_run),
-        ("lane_run", LANE_BLOCK, capacity.lane_run),
-    ):
+    for name, number in (("edge_run", EDGE_BLOCK), ("lane_run", LANE_BLOCK)):
         rows = np.flatnonzero(keep & (block == number))
-        drop = rows[grid.crowded(grid.cell(middle[rows]), far[rows], cap)]
+        drop = rows[grid.crowded(grid.cell(middle[rows]), far[rows], getattr(capacity, name))]
         keep[drop] = False
         overflow[name] = len(drop)
-    _refuse_unsafe(~keep & (block == EDGE_BLOCK), far, capacity)
+    if lost := int((~keep & (block == EDGE_BLOCK) & (far < UNSAFE_M)).sum()):
+        near = f"{lost} road-edge segments within {UNSAFE_M:.0f} m of the ego's log"
+        problem = f"{near} do not fit capacity {capacity.name!r}"
+        raise DataError(problem, cure="convert with a larger capacity")
     rows = np.flatnonzero(keep)
     cell = grid.cell(middle[rows])
     sort_key = block[rows] * grid.side**2 + np.where(block[rows] == REST_BLOCK, 0, cell)
@@ -147,21 +143,8 @@ def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity
         blocks=ends,
         edge_start=grid.starts(cell[: ends[1]], 0),
         lane_start=grid.starts(cell[ends[1] : ends[2]], int(ends[1])),
-        overflow={name: count for name, count in overflow.items() if count},
+        overflow=+overflow,
     )
-
-
-def _refuse_unsafe(
-    dropped: Bool[Array, " segment"], far: Float[Array, " segment"], capacity: Capacity
-) -> None:
-    """Refuse a scenario if an edge next to the log of the ego did not fit."""
-    lost = int((dropped & (far < UNSAFE_M)).sum())
-    if lost:
-        raise DataError(
-            f"{lost} road-edge segments within {UNSAFE_M:.0f} m of the ego's log do not fit capacity"
-            f" {capacity.name!r}",
-            cure="convert with a larger capacity",
-        )
 
 
 def cell_sides(
@@ -169,20 +152,17 @@ def cell_sides(
 ) -> Int32[Array, " cell"]:
     """Sides of the 3 x 3 side cells of every grid cell, packed by :func:`packed`.
 
-    The edge nearest to the centre of a side cell decides: its left is drivable; the side beyond the end of an open edge
-    is unknown. Side cells with a lane centre are never off the road. Cells out of reach of all edges get a side only if
-    every road edge is a closed ring.
-
-    Args:
-        grid: The grid.
-        edges: All road-edge segments, also those outside the crop.
-        lanes: Points of lane centres.
-        rings_closed: Whether every road edge is a closed ring.
+    The nearest of ``edges`` (all of the source, also those outside the crop) decides: its left is drivable; beyond the
+    end of an open edge the side is unknown. Side cells with a lane centre (``lanes``) are never off the road. Cells out
+    of reach of all edges get a side only if every road edge is a closed ring.
     """
     fine = Grid(grid.origin, grid.cell_m / SPLIT, grid.side * SPLIT)
     if not len(edges):
         return np.zeros(grid.side**2, dtype=np.int32)
-    side, distance = _nearest_sides(fine, edges.take(_in_reach(grid, edges)))
+    reach = _REACH_M + grid.cell_m
+    middle = (edges.a[:, :2] + edges.b[:, :2]) / 2 - grid.origin
+    near = np.all((middle >= -reach) & (middle <= grid.side * grid.cell_m + reach), axis=1)
+    side, distance = _nearest_sides(fine, edges.take(near))
     lane_cells = fine.cell(lanes[fine.contains(lanes)])
     contradicted = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
     side[contradicted] = 0
@@ -204,13 +184,6 @@ def packed(side: Int[Array, "row column"]) -> Int32[Array, " cell"]:
     return np.bitwise_or.reduce(codes << np.arange(0, 2 * SPLIT * SPLIT, 2, dtype=np.int32), axis=1)
 
 
-def _in_reach(grid: Grid, edges: Segments) -> Bool[Array, " segment"]:
-    """Mask of edges in reach of the grid."""
-    reach = _REACH_M + grid.cell_m
-    middle = (edges.a[:, :2] + edges.b[:, :2]) / 2 - grid.origin
-    return np.all((middle >= -reach) & (middle <= grid.side * grid.cell_m + reach), axis=1)
-
-
 def _nearest_sides(fine: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Float[Array, " cell"]]:
     """Side of the nearest edge at every cell centre (0: out of reach, or beyond its open end), and its distance."""
     size, width = fine.side, fine.cell_m
@@ -221,8 +194,7 @@ def _nearest_sides(fine: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Fl
     base = np.floor((a + b) / (2 * width)).astype(np.int64)
     column, row = base[:, :1] + dx, base[:, 1:] + dy
     inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
-    # Cells outside the grid share the last index.
-    cell = np.where(inside, row * size + column, size * size)
+    cell = np.where(inside, row * size + column, size * size)  # cells outside the grid share the last index
     x, y = (column + 0.5) * width, (row + 0.5) * width
     squared = _squared_distances(x, y, a, b)
     nearest = np.full(size * size + 1, np.inf)
@@ -245,11 +217,8 @@ def _nearest_sides(fine: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Fl
     return np.where(cut | (distance > _REACH_M), 0, sign), distance
 
 
-def _squared_distances(
-    x: Float[Array, "segment near"], y: Float[Array, "segment near"], a: Float[Array, "segment 2"],
-    b: Float[Array, "segment 2"],
-) -> Float[Array, "segment near"]:  # fmt: skip
-    """Squared distances from each segment to points near it."""
+def _squared_distances(x: Array, y: Array, a: Array, b: Array) -> Float[Array, "segment near"]:
+    """Squared distances from each segment ``[segment, 2]`` to points ``[segment, near]``."""
     u = b - a
     squared = np.maximum((u * u).sum(axis=1), 1e-12)[:, None]
     x, y = x - a[:, :1], y - a[:, 1:]
@@ -266,9 +235,8 @@ def _squared_distances(
 
 def _open_ends(a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> tuple[Array, Array]:
     """Masks of segments that begin at an open end, and that end at one."""
-    both = np.round(np.concatenate((a, b)) / _JOINED_M).astype(np.int64)
-    name = both[:, 0] * 2**32 + both[:, 1]
-    first, last = name[: len(a)], name[len(a) :]
+    ends = (np.round(end / _JOINED_M).astype(np.int64) for end in (a, b))
+    first, last = (end[:, 0] * 2**32 + end[:, 1] for end in ends)
     return ~np.isin(first, last), ~np.isin(last, first)
 
 
@@ -282,10 +250,9 @@ def _sides_within_rings(grid: Grid, edges: Segments) -> Int8[Array, " cell"]:
     """
     side = np.zeros(grid.side**2, dtype=np.int8)
     winding = _winding_at_centres(grid, edges)
-    low, high = min(winding.min(), 0), max(winding.max(), 0)
-    if low < 0 < high:
+    if winding.min() < 0 < winding.max():
         return side  # Rings contradict each other.
-    drivable = winding > 0 if high > 0 else winding == 0
+    drivable = winding > 0 if winding.max() > 0 else winding == 0
     corner = np.concatenate((edges.a[:, :2], edges.b[:, :2]))
     centre = grid.origin + (np.arange(grid.side)[:, None] + 0.5) * grid.cell_m
     within = (centre >= corner.min(axis=0)) & (centre <= corner.max(axis=0))
@@ -313,10 +280,10 @@ def _winding_at_centres(grid: Grid, edges: Segments) -> Int[Array, "row column"]
 
 def _near_edge(grid: Grid, edges: Segments) -> Bool[Array, "row column"]:
     """Mask of cells whose 3 x 3 block holds the midpoint of an edge segment."""
-    cell = grid.column_row(edges.middle) + 1
-    padded = np.zeros((grid.side + 2, grid.side + 2), dtype=bool)
-    near_square = np.all((cell >= 0) & (cell < grid.side + 2), axis=1)
-    padded[cell[near_square, 1], cell[near_square, 0]] = True
     size = grid.side
+    cell = grid.column_row(edges.middle) + 1
+    padded = np.zeros((size + 2, size + 2), dtype=bool)
+    column, row = cell[np.all((cell >= 0) & (cell < size + 2), axis=1)].T
+    padded[row, column] = True
     shifts = [padded[dy : dy + size, dx : dx + size] for dy in range(3) for dx in range(3)]
     return np.logical_or.reduce(shifts)

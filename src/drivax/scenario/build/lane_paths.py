@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.geometry.polylines import project
+from drivax.geometry.polylines import arc_lengths, project
 from drivax.geometry.vectors import wrap
-from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph, LaneSegments
+from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph, LaneSegments, end_headings
 from drivax.scenario.schema import CAR_LANE_KINDS
 
 Array = np.ndarray[Any, Any]
@@ -42,17 +42,15 @@ EAGERNESS = 0.1
 
 @dataclass(frozen=True)
 class LanePath:
-    """A sequence of lanes, each a successor or neighbour of the previous one.
+    """A sequence of lanes, each a successor or neighbour of the previous one; metres.
 
     Attributes:
         lanes: Dense indices, from the lane of the ego on.
-        s: Arc length of the ego on the first lane.
-        ahead: Distance from the ego to the beginning of the last lane, metres.
+        s, lateral: Arc length of the ego on the first lane, and its distance from it.
+        ahead: Distance from the ego to the beginning of the last lane.
         entry: Arc length on the last lane at which it is entered.
-        penalty: Cost of lane changes, turns and lateral distance, metres.
-        changes: Number of lane changes.
-        until: Distance from the ego to the goal, metres; infinite without one.
-        lateral: Distance of the ego from the first lane, metres.
+        penalty: Cost of lane changes, turns and lateral distance.
+        until: Distance from the ego to the goal; infinite without one.
     """
 
     lanes: tuple[int, ...]
@@ -70,8 +68,6 @@ class LaneSearch:
     """Best-first search from the lanes under the ego.
 
     Attributes:
-        graph: The lane graph.
-        on: Lane segments of the same graph.
         starts: Paths of one lane under the ego, the best fitting first.
         need_m: Length of a complete path ahead of the ego.
         bend: Heading change along every lane, radians.
@@ -79,7 +75,6 @@ class LaneSearch:
         outside: Cost of entering a lane outside the intended corridor, metres.
     """
 
-    graph: LaneGraph
     on: LaneSegments
     starts: tuple[LanePath, ...]
     need_m: float
@@ -87,46 +82,29 @@ class LaneSearch:
     drivable: tuple[bool, ...]
     outside: tuple[float, ...]
 
+    @property
+    def graph(self) -> LaneGraph:
+        """The lane graph."""
+        return self.on.graph
+
     @classmethod
     def start(
-        cls,
-        graph: LaneGraph,
-        on: LaneSegments,
-        xyz: Float[Array, "3"],
-        heading: float,
-        need_m: float,
+        cls, on: LaneSegments, xyz: Float[Array, "3"], heading: float, need_m: float,
         corridor: Collection[int] = (),
-    ) -> LaneSearch:
-        """Start a search at the lanes within 4 m and 60 degrees of a pose.
-
-        ``corridor`` holds the lanes that the intended route may use; empty means any.
-        """
-        row = np.arange(graph.count)
-        lines = graph.lines
-        begin, end = lines.heading(row, 0.0 * row, END_SPAN_M), lines.heading(row, lines.length, END_SPAN_M)
-        near = on.around(xyz, heading, REACH_M, TURN_RAD)
-        outside = np.zeros(graph.count)
+    ) -> LaneSearch:  # fmt: skip
+        """Start at the lanes within 4 m and 60 degrees of a pose; ``corridor`` holds the intended lanes, if known."""
+        graph, outside = on.graph, np.zeros(on.graph.count)
         if corridor:
-            outside[~np.isin(row, list(corridor))] = OUTSIDE_COST_M
-        lane, arc = (np.array(values) for values in ([x[0] for x in near], [x[1] for x in near]))
-        askew = np.abs(wrap(lines.heading(lane, arc) - heading)) if near else np.zeros(0)
-        lane_paths = [
-            LanePath(
-                lanes=(lane,),
-                s=s,
-                ahead=-s,
-                entry=s,
-                penalty=LATERAL_COST * far + ASKEW_COST_M * float(turn) + float(outside[lane]),
-                changes=0,
-                lateral=far,
-            )
-            for (lane, s, far), turn in zip(near, askew, strict=True)
-        ]
-        drivable = tuple(bool(kind) for kind in np.isin(graph.kind, CAR_LANE_KINDS))
-        lane_paths.sort(key=lambda lane_path: lane_path.penalty)
-        return cls(
-            graph, on, tuple(lane_paths), need_m, np.abs(wrap(end - begin)), drivable, tuple(outside.tolist())
-        )
+            outside[~np.isin(np.arange(graph.count), list(corridor))] = OUTSIDE_COST_M
+        starts = []
+        for lane, s, far in on.around(xyz, heading, REACH_M, TURN_RAD):
+            turn = float(np.abs(wrap(graph.lines.heading(np.array([lane]), np.array([s])) - heading))[0])
+            penalty = LATERAL_COST * far + ASKEW_COST_M * turn + float(outside[lane])
+            starts.append(LanePath((lane,), s, -s, s, penalty, changes=0, lateral=far))
+        starts.sort(key=lambda lane_path: lane_path.penalty)
+        begin, end = end_headings(graph.lines)
+        drivable = tuple(np.isin(graph.kind, CAR_LANE_KINDS).tolist())
+        return cls(on, tuple(starts), need_m, np.abs(wrap(end - begin)), drivable, tuple(outside.tolist()))
 
     def alternatives(self, most: int) -> list[LanePath]:
         """Complete paths with different lanes at a third, two thirds and all of their length; the cheapest first."""
@@ -139,9 +117,7 @@ class LaneSearch:
                 break
             lane_path = heapq.heappop(heap)[2]
             following = [] if self.reach(lane_path) >= self.need_m else self.following(lane_path)
-            if not any(
-                not is_change(self.graph, lane_path.lanes[-1], child.lanes[-1]) for child in following
-            ):
+            if not self.goes_on(following):
                 complete.setdefault(self._signature(lane_path), lane_path)
             for child in following:
                 heapq.heappush(heap, (self._urgency(child), next(serial), child))
@@ -170,12 +146,10 @@ class LaneSearch:
 
     def along(self, lanes: Sequence[int], xyz: Float[Array, "3"], heading: float) -> LanePath:
         """Path along given lanes to a goal, from the lane that fits the ego best (the first where none does)."""
+        first = next((start for start in self.starts if start.lanes[0] in lanes), None)
         lane_path = LanePath(tuple(lanes), 0.0, 0.0, 0.0, 0.0, 0)
-        for start in self.starts:
-            if start.lanes[0] in lanes:
-                rest = tuple(lanes[list(lanes).index(start.lanes[0]) :])
-                lane_path = replace(start, lanes=rest)
-                break
+        if first is not None:
+            lane_path = replace(first, lanes=tuple(lanes[list(lanes).index(first.lanes[0]) :]))
         goals, ahead, until = self._goals(xyz, heading), lane_path.ahead, np.inf
         for lane, following in zip(lane_path.lanes, (*lane_path.lanes[1:], -1), strict=True):
             until = ahead + goals[lane] if lane in goals else until
@@ -187,8 +161,7 @@ class LaneSearch:
 
     def _goals(self, xyz: Float[Array, "3"], heading: float) -> dict[int, float]:
         """Lanes under the goal, with its arc length on each."""
-        near = self.on.around(xyz, heading, REACH_M, TURN_RAD)[:MOST_GOAL_LANES]
-        return {lane: s for lane, s, _ in near}
+        return {lane: s for lane, s, _ in self.on.around(xyz, heading, REACH_M, TURN_RAD)[:MOST_GOAL_LANES]}
 
     def reach(self, lane_path: LanePath) -> float:
         """Distance from the ego to the end of a path, metres."""
@@ -199,30 +172,27 @@ class LaneSearch:
 
     def following(self, lane_path: LanePath) -> list[LanePath]:
         """Paths with one more lane: successors, and neighbours where there is room for a lane change."""
-        graph, lane = self.graph, lane_path.lanes[-1]
+        graph, lane, lanes = self.graph, lane_path.lanes[-1], lane_path.lanes
         result = []
         for other in (int(x) for x in graph.successor[lane] if x >= 0):
-            if self.drivable[other] and other not in lane_path.lanes:
+            if self.drivable[other] and other not in lanes:
                 penalty = lane_path.penalty + TURN_COST_M * float(self.bend[other]) + self.outside[other]
-                lanes = (*lane_path.lanes, other)
-                result.append(
-                    replace(lane_path, lanes=lanes, ahead=self.reach(lane_path), entry=0.0, penalty=penalty)
-                )
+                longer = replace(lane_path, lanes=(*lanes, other), ahead=self.reach(lane_path))
+                result.append(replace(longer, entry=0.0, penalty=penalty))
         if lane_path.changes >= MOST_CHANGES:
             return result
         for other, shift in graph.neighbours(lane):
             low, high, _ = change_room(graph, lane, other, lane_path.entry)
-            if self.drivable[other] and other not in lane_path.lanes and high - low >= CHANGE_M:
-                changed = replace(
-                    lane_path,
-                    lanes=(*lane_path.lanes, other),
-                    ahead=lane_path.ahead - shift,
-                    entry=low + shift + CHANGE_M,
-                    penalty=lane_path.penalty + CHANGE_COST_M + self.outside[other],
-                    changes=lane_path.changes + 1,
-                )
-                result.append(changed)
+            if self.drivable[other] and other not in lanes and high - low >= CHANGE_M:
+                penalty = lane_path.penalty + CHANGE_COST_M + self.outside[other]
+                longer = replace(lane_path, lanes=(*lanes, other), ahead=lane_path.ahead - shift)
+                changed = replace(longer, entry=low + shift + CHANGE_M, changes=lane_path.changes + 1)
+                result.append(replace(changed, penalty=penalty))
         return result
+
+    def goes_on(self, following: Sequence[LanePath]) -> bool:
+        """Return whether any of these paths goes on without a lane change at its last step."""
+        return any(not is_change(self.graph, *lane_path.lanes[-2:]) for lane_path in following)
 
     def _signature(self, lane_path: LanePath) -> tuple[int, ...]:
         """Lanes at a third, two thirds and all of the required length; a lane left by a change is its neighbour."""
@@ -243,11 +213,7 @@ def is_change(graph: LaneGraph, lane: int, following: int) -> bool:
 
 
 def change_room(graph: LaneGraph, lane: int, following: int, entry_m: float) -> tuple[float, float, float]:
-    """Stretch of a lane, from ``entry_m`` on, along which its neighbour runs.
-
-    Returns:
-        Begin and end in arc length of the lane, and the offset to arc length of the neighbour.
-    """
+    """Stretch of a lane, from ``entry_m`` on, along which its neighbour runs, and the shift to its arc length."""
     on_left = graph.left[lane] == following
     shift = float(graph.left_shift[lane] if on_left else graph.right_shift[lane])
     low = max(entry_m, -shift)
@@ -255,19 +221,14 @@ def change_room(graph: LaneGraph, lane: int, following: int, entry_m: float) -> 
 
 
 def trace(
-    graph: LaneGraph,
-    lanes: Sequence[int],
-    begin_m: float,
-    ahead_m: float,
-    window_m: tuple[float, float],
-    place: float,
-    change_m: float = CHANGE_M,
-) -> Line:
-    """Draw the line along a sequence of lanes.
+    graph: LaneGraph, lanes: Sequence[int], begin_m: float, ahead_m: float, window_m: tuple[float, float],
+    place: float, change_m: float = CHANGE_M,
+) -> Line:  # fmt: skip
+    """Draw the line along a sequence of lanes, each a successor or neighbour of the previous one.
 
     Args:
         graph: The lane graph.
-        lanes: Dense indices; each is a successor or neighbour of the previous one.
+        lanes: Dense indices.
         begin_m: Arc length on the first lane where the line begins.
         ahead_m: Distance from the ego to the start of the first lane (negative: behind), metres.
         window_m: Range ahead of the ego for lane changes, where there is room.
@@ -300,10 +261,9 @@ def trace(
 
 def _stretch(graph: LaneGraph, lane: int, begin: float, end: float) -> Line:
     """Points of a lane between two arc lengths, ends included."""
-    part = slice(graph.lines.start[lane], graph.lines.start[lane + 1])
-    arc = graph.lines.arc[part]
+    arc = graph.lines.arc[graph.lines.start[lane] : graph.lines.start[lane + 1]]
     ends = graph.lines.at(np.array([lane, lane]), np.array([begin, end]))
-    inner = graph.lines.points[part][(arc > begin + 0.01) & (arc < end - 0.01)]
+    inner = graph.lines.line(lane)[(arc > begin + 0.01) & (arc < end - 0.01)]
     xyz = np.concatenate((ends[:1], inner, ends[1:]))
     return xyz, np.full(len(xyz), lane)
 
@@ -312,13 +272,11 @@ def _close_gap(parts: Sequence[Line], line: Line) -> Line:
     """Shift the beginning of a line onto the end of the previous one; the shift fades out."""
     if not parts:
         return line
-    gap = parts[-1][0][-1] - line[0][0]
-    width = float(np.hypot(gap[0], gap[1]))
-    if not GAP_M[0] < width < GAP_M[1]:
+    xyz, label = line
+    gap = parts[-1][0][-1] - xyz[0]
+    if not GAP_M[0] < float(np.hypot(gap[0], gap[1])) < GAP_M[1]:
         return line
-    xyz = line[0]
-    along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))))
-    return xyz + np.maximum(1.0 - along / FADE_M, 0.0)[:, None] * gap, line[1]
+    return xyz + np.maximum(1.0 - arc_lengths(xyz) / FADE_M, 0.0)[:, None] * gap, label
 
 
 def _blend(graph: LaneGraph, lane: int, following: int, leave: float, length: float) -> tuple[Line, float]:
@@ -326,20 +284,16 @@ def _blend(graph: LaneGraph, lane: int, following: int, leave: float, length: fl
 
     Lateral motion by the quintic 10 t^3 - 15 t^4 + 6 t^5: no jump in heading or curvature at the ends.
     """
-    part = slice(graph.lines.start[following], graph.lines.start[following + 1])
     t = np.linspace(0.0, 1.0, int(np.ceil(length)) + 1)
     origin = graph.lines.at(np.full(len(t), lane), leave + t * length)
-    s, _ = project(graph.lines.points[part], origin[[0, -1], :2])
+    s, _ = project(graph.lines.line(following), origin[[0, -1], :2])
     target = graph.lines.at(np.full(len(t), following), s[0] + t * (s[1] - s[0]))
     weight = (t**3 * (10.0 - 15.0 * t + 6.0 * t**2))[:, None]
     return ((1.0 - weight) * origin + weight * target, np.where(t < 0.5, lane, following)), float(s[1])
 
 
 def follow(graph: LaneGraph, lanes: Sequence[int], ahead_m: float, need_m: float) -> tuple[int, ...]:
-    """Continue a sequence of lanes along the straightest successors, from ``ahead_m`` to ``need_m`` ahead of the ego.
-
-    The sequence ends earlier where lanes end or repeat.
-    """
+    """Continue lanes along the straightest successors from ``ahead_m`` to ``need_m``, or until they end or repeat."""
     result = list(lanes)
     while ahead_m < need_m:
         following = int(graph.successor[result[-1], 0])
@@ -353,10 +307,9 @@ def follow(graph: LaneGraph, lanes: Sequence[int], ahead_m: float, need_m: float
 def walk(
     graph: LaneGraph, lane: Int[Array, " start"], s: Float[Array, " start"], step_m: float, count: int
 ) -> tuple[Float[Array, "start count 2"], Float[Array, "start count"]]:
-    """Points ahead along lanes and their straightest successors; straight on where lanes end.
+    """Points and headings along lanes and their straightest successors; straight on where lanes end.
 
-    The first of ``count`` points lies ``step_m`` ahead of arc length ``s`` on each start lane. Returns points and
-    headings.
+    The first of ``count`` points lies ``step_m`` ahead of arc length ``s`` on each start lane.
     """
     distance = step_m * np.arange(1, count + 1)
     chain, begin = [lane], [-s]
@@ -380,27 +333,18 @@ def walk(
 def precede(
     graph: LaneGraph, lane: int, need_m: float, driven: Float[Array, "step 2"]
 ) -> tuple[tuple[int, ...], float]:
-    """Predecessors of a lane along the ego's past positions ``driven``, and their total length.
-
-    They are ``need_m`` long, or less where lanes begin.
-    """
-    result: list[int] = []
-    total = 0.0
+    """Predecessors of a lane along the driven positions, ``need_m`` long where there are as many, and their length."""
+    result, total = list[int](), 0.0
     while total < need_m:
         first = result[0] if result else lane
         options = [int(p) for p in graph.predecessor[first] if p >= 0 and p != lane and p not in result]
         if not options:
             break
-        apart = [_mean_distance(graph, option, driven) for option in options]
-        best = min(range(len(options)), key=lambda i: (round(apart[i]), i))
-        result.insert(0, options[best])
-        total += float(graph.lines.length[options[best]])
+        apart = [project(graph.lines.line(option), driven)[1].mean() for option in options]
+        best = options[int(np.argmin([round(float(metres)) for metres in apart]))]
+        result.insert(0, best)
+        total += float(graph.lines.length[best])
     return tuple(result), total
-
-
-def _mean_distance(graph: LaneGraph, lane: int, driven: Float[Array, "step 2"]) -> float:
-    part = slice(graph.lines.start[lane], graph.lines.start[lane + 1])
-    return float(project(graph.lines.points[part], driven)[1].mean())
 
 
 def continue_straight(line: Line, behind_m: float, ahead_m: float) -> Line:

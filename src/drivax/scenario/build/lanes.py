@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from drivax.errors import DataError
 from drivax.geometry.polylines import Polylines, point_to_segment
 from drivax.geometry.vectors import wrap
-from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box
+from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box, known_limit
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among
 
@@ -27,11 +27,16 @@ CHAIN_HEADING_RAD = np.deg2rad(20.0)
 SAME_WAY_RAD = np.deg2rad(45.0)
 #: Lane widths believed when measured from the spacing of neighbours, metres.
 WIDTHS_M = (2.2, 5.5)
-#: Widths and limits that a source gives are believed up to here.
-MOST_WIDTH_M, MOST_LIMIT_MPS = 50.0, 100.0
+#: Larger widths of a source are not believed.
+MOST_WIDTH_M = 50.0
 LEVEL_M = 3.0
 #: Headings at lane ends are measured over this chord: the last source points lie close together.
 END_SPAN_M = 2.0
+#: Kinds of links whose loss is counted.
+_DANGLING = {
+    "dangling_links": ("successors", "predecessors"),
+    "dangling_neighbours": ("left_neighbours", "right_neighbours"),
+}
 _SAMPLES = 33
 _PROBES = (0.1, 0.3, 0.5, 0.7, 0.9)
 _CHUNK = 512
@@ -42,12 +47,9 @@ class LaneGraph:
     """Lanes with dense indices and their links; everything in the local frame, float64.
 
     Attributes:
-        lines: Centre lines, one per lane.
-        feature: Row of the source feature.
-        lane_id: Feature id in the source.
-        kind: Road kind.
-        width: Metres, -1 unknown.
-        limit: Speed limit in m/s, -1 unknown.
+        lines: Centre lines.
+        feature, lane_id: Row and id of the source feature.
+        width, limit: Metres and m/s, -1 unknown.
         interpolating: Turn paths inside junctions (WOMD).
         successor, predecessor: Dense indices, -1 padded, the straightest first.
         left, right: Neighbours in the same direction, -1 none.
@@ -80,20 +82,15 @@ class LaneGraph:
         return len(self.lane_id)
 
     @property
-    def linked(self) -> bool:
-        """Whether any lane has a successor."""
-        return bool((self.successor >= 0).any())
-
-    @property
     def flags(self) -> Flag:
         """Flags that the graph justifies."""
-        flags = Flag.LANE_GRAPH if self.linked else Flag.NONE
-        if self.linked and self.chained:
-            flags |= Flag.CHAINED_GRAPH
-        return flags | (Flag.SPEED_LIMITS if (self.limit > 0).any() else Flag.NONE)
+        flags = Flag.SPEED_LIMITS if (self.limit > 0).any() else Flag.NONE
+        if not (self.successor >= 0).any():
+            return flags
+        return flags | Flag.LANE_GRAPH | (Flag.CHAINED_GRAPH if self.chained else Flag.NONE)
 
     def index(self) -> dict[int, int]:
-        """Dense index of every source id."""
+        """Return the dense index of every source id."""
         return {int(lane): i for i, lane in enumerate(self.lane_id)}
 
     def neighbours(self, lane: int) -> list[tuple[int, float]]:
@@ -103,12 +100,11 @@ class LaneGraph:
 
 
 def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> LaneGraph:
-    """Build the lane graph of all lanes of two or more points; dangling links are dropped and counted.
-
-    Raises:
-        DataError: Two lanes share an id.
-    """
-    rows = [i for i, f in enumerate(features) if f.kind in LANE_KINDS and _has_length(f.points)]
+    """Build the graph of all lanes of two or more points; dangling links are dropped and counted."""
+    rows = [
+        i for i, feature in enumerate(features)
+        if feature.kind in LANE_KINDS and (np.abs(feature.points - feature.points[0])[:, :2] > 1e-3).any()
+    ]  # fmt: skip
     lanes = [features[i] for i in rows]
     ids = [lane.feature_id for lane in lanes]
     if len(set(ids)) < len(ids):
@@ -116,7 +112,7 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
         raise DataError(f"two lanes have the id {twice}", cure="give every map feature its own id")
     index = {lane_id: i for i, lane_id in enumerate(ids)}
     lines = Polylines.of([np.asarray(lane.points, dtype=np.float64) - origin for lane in lanes])
-    begin, end = _end_headings(lines)
+    begin, end = end_headings(lines)
     kind = np.array([lane.kind for lane in lanes], dtype=np.int64)
     pairs = _linked_pairs(lanes, index)
     has_links = any(f.successors or f.predecessors for f in lanes)
@@ -127,55 +123,35 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     samples = _samples(lines)
     left, left_shift, left_gap = _adjacent(lanes, index, samples, lines.length, "left_neighbours")
     right, right_shift, right_gap = _adjacent(lanes, index, samples, lines.length, "right_neighbours")
-    gap = np.fmin(left_gap, right_gap)
-    measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
-    given = np.array(
-        [lane.width_m if _within(lane.width_m, MOST_WIDTH_M) else np.nan for lane in lanes], dtype=np.float64
-    )
+    dangling = {name: _dangling(lanes, index, *links) for name, links in _DANGLING.items()}
     return LaneGraph(
         lines=lines,
         feature=np.array(rows, dtype=np.int64),
         lane_id=np.array(ids, dtype=np.int64),
         kind=kind,
-        width=np.where(np.isnan(given), measured, given),
+        width=_widths(lanes, np.fmin(left_gap, right_gap)),
         limit=np.array([known_limit(lane) for lane in lanes], dtype=np.float64),
         interpolating=np.array([lane.interpolating for lane in lanes], dtype=bool),
-        successor=successor,
-        predecessor=predecessor,
-        left=left,
-        right=right,
-        left_shift=left_shift,
-        right_shift=right_shift,
-        chained=not has_links,
-        dropped_links=lost + lost_back,
-        lost={
-            "dangling_links": _dangling(lanes, index, ("successors", "predecessors")),
-            "dangling_neighbours": _dangling(lanes, index, ("left_neighbours", "right_neighbours")),
-        },
-    )
+        successor=successor, predecessor=predecessor, left=left, right=right,
+        left_shift=left_shift, right_shift=right_shift,
+        chained=not has_links, dropped_links=lost + lost_back, lost=dangling,
+    )  # fmt: skip
 
 
-def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], names: Sequence[str]) -> int:
+def _widths(lanes: Sequence[MapFeature], gap: Float[Array, " lane"]) -> Float[Array, " lane"]:
+    """Width of every lane: that of the source, else the gap to a neighbour, else -1."""
+    width = np.array([lane.width_m for lane in lanes], dtype=np.float64)
+    measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
+    return np.where((width > 0.0) & (width <= MOST_WIDTH_M), width, measured)
+
+
+def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], *names: str) -> int:
     """Number of links of these kinds to missing lanes."""
     return sum(other not in index for lane in lanes for name in names for other in getattr(lane, name))
 
 
-def known_limit(feature: MapFeature) -> float:
-    """Plausible speed limit of a lane in m/s, else -1."""
-    limit = feature.limit_mps if feature.kind in LANE_KINDS else None
-    return limit if limit is not None and _within(limit, MOST_LIMIT_MPS) else -1.0
-
-
-def _within(value: float | None, most: float) -> bool:
-    return value is not None and 0.0 < value <= most
-
-
-def _has_length(points: Array) -> bool:
-    return len(points) >= 2 and bool(np.any(np.abs(points[:, :2] - points[0, :2]) > 1e-3))
-
-
-def _end_headings(lines: Polylines) -> tuple[Float[Array, " lane"], Float[Array, " lane"]]:
-    """Headings at the first and at the last point of every lane."""
+def end_headings(lines: Polylines) -> tuple[Float[Array, " lane"], Float[Array, " lane"]]:
+    """Return the headings at the first and at the last point of every lane."""
     row = np.arange(lines.count)
     return lines.heading(row, np.zeros(lines.count), END_SPAN_M), lines.heading(row, lines.length, END_SPAN_M)
 
@@ -184,19 +160,13 @@ def _linked_pairs(lanes: Sequence[MapFeature], index: Mapping[int, int]) -> list
     """(lane, successor) pairs named by either side; dangling and self links dropped, order kept."""
     pairs: dict[tuple[int, int], None] = {}
     for i, lane in enumerate(lanes):
-        for other in lane.successors:
-            if index.get(other, i) != i:
-                pairs[i, index[other]] = None
-        for other in lane.predecessors:
-            if index.get(other, i) != i:
-                pairs[index[other], i] = None
+        pairs |= dict.fromkeys((i, index[j]) for j in lane.successors if index.get(j, i) != i)
+        pairs |= dict.fromkeys((index[j], i) for j in lane.predecessors if index.get(j, i) != i)
     return list(pairs)
 
 
 def _chained_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) -> list[tuple[int, int]]:
     """Pairs of lanes where the end of the first meets the beginning of the second, in place and heading."""
-    if lines.count == 0:
-        return []
     first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
     bike = kind == RoadKind.LANE_BIKE
     pairs: list[tuple[int, int]] = []
@@ -216,9 +186,7 @@ def _link_table(
     """Up to four links per lane, the straightest first, and the number of links that did not fit."""
     table = np.full((len(out_heading), LINKS), -1, dtype=np.int64)
     used = np.zeros(len(out_heading), dtype=np.int64)
-    if not pairs:
-        return table, 0
-    a, b = np.array(pairs).T
+    a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     bend = np.abs(wrap(in_heading[b] - out_heading[a]))
     for i in np.lexsort((np.arange(len(a)), np.round(bend, 3), a)):
         if used[a[i]] < LINKS:
@@ -283,7 +251,7 @@ def select(graph: LaneGraph, rows: Int[Array, " kept"]) -> LaneGraph:
     """Return the graph of these lanes with new dense indices; links to other lanes are dropped."""
     new = np.full(graph.count + 1, -1)
     new[rows] = np.arange(len(rows))
-    lines = [graph.lines.points[graph.lines.start[i] : graph.lines.start[i + 1]] for i in rows]
+    lines = [graph.lines.line(i) for i in rows]
     per_lane = ("feature", "lane_id", "kind", "width", "limit", "interpolating", "left_shift", "right_shift")
     return replace(
         graph,
@@ -303,65 +271,58 @@ def _compact(links: Int[Array, "lane 4"]) -> Int[Array, "lane 4"]:
 
 @dataclass(frozen=True)
 class LaneSegments:
-    """Segments of lanes, to look up the lanes under a pose.
+    """Car-lane segments of a lane graph, to look up the lanes under a pose.
 
     Attributes:
-        segments: Segments of car lanes.
-        lane: Dense lane index of each.
-        heading: Direction of each, radians.
+        lane: Dense lane index of each segment.
+        heading: Direction of each segment, radians.
     """
 
+    graph: LaneGraph
     segments: Segments
     lane: Int[Array, " segment"]
     heading: Float[Array, " segment"]
 
     @classmethod
     def of(cls, segments: Segments, graph: LaneGraph) -> LaneSegments:
-        """Car-lane segments among ``segments``, keyed by the graph's dense indices."""
+        """Select the segments of the car lanes of a graph."""
         rows = np.flatnonzero(among(segments.kind, CAR_LANE_KINDS))
         lane = lane_of_feature(graph, segments.feature[rows])
-        rows, lane = rows[lane >= 0], lane[lane >= 0]
-        kept = segments.take(rows)
+        kept = segments.take(rows[lane >= 0])
         step = kept.b - kept.a
-        return cls(kept, lane, np.arctan2(step[:, 1], step[:, 0]))
+        return cls(graph, kept, lane[lane >= 0], np.arctan2(step[:, 1], step[:, 0]))
 
     def nearest(
         self, xyz: Float[Array, "pose 3"], heading: Float[Array, " pose"], reach_m: float, turn_rad: float
     ) -> tuple[Int[Array, " pose"], Float[Array, " pose"], Float[Array, " pose"]]:
-        """Nearest lane of each pose within reach, heading difference and level.
-
-        Returns:
-            Dense lane index (-1 none), arc length on it, distance from it in metres.
-        """
+        """Nearest lane of each pose within reach, turn and level (-1 none), arc length on it, and distance from it."""
         near = self._near(xyz[:, :2], reach_m)
         if not len(near.lane):
             return np.full(len(xyz), -1), np.zeros(len(xyz)), np.full(len(xyz), np.inf)
         distance, s = near._measure(xyz, heading, turn_rad)
         best = distance.argmin(axis=1)
-        rows = np.arange(len(xyz))
-        reached = distance[rows, best] <= reach_m
-        return np.where(reached, near.lane[best], -1), s[rows, best], distance[rows, best]
+        here = np.arange(len(xyz)), best
+        return np.where(distance[here] <= reach_m, near.lane[best], -1), s[here], distance[here]
 
     def around(
         self, xyz: Float[Array, " 3"], heading: float, reach_m: float, turn_rad: float
     ) -> list[tuple[int, float, float]]:
         """Lanes within reach of a pose as (lane, arc length on it, distance), the nearest first."""
         near = self._near(xyz[None, :2], reach_m)
-        distance, s = near._measure(xyz[None], np.array([heading]), turn_rad)
+        (distance,), (s,) = near._measure(xyz[None], np.array([heading]), turn_rad)
         lanes: dict[int, tuple[int, float, float]] = {}
-        for i in np.argsort(distance[0], kind="stable"):
-            if distance[0, i] > reach_m:
-                break
+        for i in np.argsort(distance, kind="stable"):
             lane = int(near.lane[i])
-            lanes.setdefault(lane, (lane, float(s[0, i]), float(distance[0, i])))
+            if distance[i] <= reach_m:
+                lanes.setdefault(lane, (lane, float(s[i]), float(distance[i])))
         return list(lanes.values())
 
     def _near(self, xy: Float[Array, "pose 2"], reach_m: float) -> LaneSegments:
         """Segments in the box of the poses, widened by the reach."""
-        if len(xy) == 0 or len(self.segments) == 0:
-            return LaneSegments(self.segments.take(np.zeros(0, int)), self.lane[:0], self.heading[:0])
-        rows = np.flatnonzero(inside_box(self.segments.a[:, :2], xy, reach_m + LONGEST_M))
-        return LaneSegments(self.segments.take(rows), self.lane[rows], self.heading[rows])
+        rows = np.zeros(0, int)
+        if len(xy) and len(self.segments):
+            rows = np.flatnonzero(inside_box(self.segments.a[:, :2], xy, reach_m + LONGEST_M))
+        return LaneSegments(self.graph, self.segments.take(rows), self.lane[rows], self.heading[rows])
 
     def _measure(self, xyz: Array, heading: Array, turn_rad: float) -> tuple[Array, Array]:
         """Distance (infinite where gated) and arc length of every pose on every segment."""
@@ -374,7 +335,7 @@ class LaneSegments:
 
 
 def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:
-    """Dense lane index of source features, -1 for those that are no lane of the graph."""
+    """Return the dense lane index of source features, -1 for those that are no lane of the graph."""
     size = max(int(graph.feature.max(initial=-1)), int(feature.max(initial=-1))) + 2
     table = np.full(size, -1)
     table[graph.feature] = np.arange(graph.count)

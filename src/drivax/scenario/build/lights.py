@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Int8
 
-from drivax.geometry.polylines import point_to_segment
+from drivax.geometry.polylines import left_normals, point_to_segment
 from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph, LaneSegments
 from drivax.scenario.build.segments import path_distance
 from drivax.scenario.recording import Light, MapFeature
@@ -30,7 +31,6 @@ class Lights:
 
     Attributes:
         line: Stop lines from left to right of the lane: x, y, x, y.
-        z: Heights of the stop points.
         lane: Dense lane index, -1 if the lane is missing in the map.
         heading, exit_heading: Headings of the lane at the stop point and at its end.
         state: States over time, -1 unobserved.
@@ -48,14 +48,13 @@ class Lights:
 
 def place_lights(
     lights: Sequence[Light],
-    graph: LaneGraph,
     on: LaneSegments,
     origin: Float[Array, "3"],
     path: Float[Array, "step 2"],
     most: int,
 ) -> Lights:
     """Place stop lines across the lanes at the stop points; keep the ``most`` lights nearest to ``path``."""
-    steps = len(lights[0].states) if lights else 0
+    graph, steps = on.graph, len(lights[0].states) if lights else 0
     stop = np.array([light.stop_point for light in lights], dtype=np.float64).reshape(-1, 3) - origin
     index = graph.index()
     lane = np.array([index.get(light.lane_id, -1) for light in lights], dtype=np.int64)
@@ -66,13 +65,13 @@ def place_lights(
     exit_heading[known] = graph.lines.heading(lane[known], graph.lines.length[lane[known]], END_SPAN_M)
     for i in np.flatnonzero(lane < 0):
         heading[i] = exit_heading[i] = _heading_near(on, stop[i])
-    half = np.where((lane >= 0) & (graph.width[lane] > 0), graph.width[lane] / 2, HALF_WIDTH_M) if graph.count \
-        else np.full(len(lights), HALF_WIDTH_M)  # fmt: skip
+    width = np.append(graph.width, -1.0)[lane]
+    half = np.where(width > 0, width / 2, HALF_WIDTH_M)
     directed = np.flatnonzero(~np.isnan(heading))
     rows = directed[np.argsort(path_distance(stop[directed, :2], path), kind="stable")]
-    overflow = {"lights": max(len(rows) - most, 0), "lights_without_lane": len(lights) - len(directed)}
+    overflow = +Counter(lights=len(rows) - most, lights_without_lane=len(lights) - len(directed))
     rows = rows[:most]
-    left = half[rows, None] * np.stack((-np.sin(heading[rows]), np.cos(heading[rows])), axis=-1)
+    left = half[rows, None] * left_normals(heading[rows])
     states = [np.asarray(lights[i].states, dtype=np.int8) for i in rows]
     return Lights(
         line=np.concatenate((stop[rows, :2] + left, stop[rows, :2] - left), axis=1),
@@ -81,7 +80,7 @@ def place_lights(
         heading=heading[rows],
         exit_heading=exit_heading[rows],
         state=np.stack(states) if states else np.zeros((0, steps), dtype=np.int8),
-        overflow={name: count for name, count in overflow.items() if count},
+        overflow=overflow,
     )
 
 
@@ -90,10 +89,8 @@ def _arc_at(
 ) -> Float[Array, " light"]:
     """Arc length on each lane of the point nearest to its stop point."""
     result = np.zeros(len(lane))
-    lines = graph.lines
     for i, (row, point) in enumerate(zip(lane, xy, strict=True)):
-        part = slice(lines.start[row], lines.start[row + 1])
-        line, arc = lines.points[part, :2], lines.arc[part]
+        line, arc = graph.lines.line(row)[:, :2], graph.lines.arc[graph.lines.start[row] :]
         distance, along = point_to_segment(point, line[:-1], line[1:])
         best = distance.argmin()
         result[i] = arc[best] + along[best] * (arc[best + 1] - arc[best])
@@ -119,12 +116,9 @@ class Stops:
 
 
 def place_stops(
-    features: Sequence[MapFeature],
-    graph: LaneGraph,
-    origin: Float[Array, "3"],
-    path: Float[Array, "step 2"],
+    features: Sequence[MapFeature], graph: LaneGraph, origin: Float[Array, "3"], path: Float[Array, "step 2"],
     most: int,
-) -> Stops:
+) -> Stops:  # fmt: skip
     """Place stop signs with the lanes that they control; keep the ``most`` signs nearest to ``path``."""
     signs = [f for f in features if f.kind == RoadKind.STOP_SIGN and len(f.points)]
     xy = np.array([f.points[0] for f in signs], dtype=np.float64).reshape(-1, 3)[:, :2] - origin[:2]
@@ -136,5 +130,4 @@ def place_stops(
         lane[i, : min(len(known), LANES_PER_STOP)] = known[:LANES_PER_STOP]
         lost += max(len(known) - LANES_PER_STOP, 0)
     rows = np.argsort(path_distance(xy, path), kind="stable")
-    overflow = {"stops": max(len(rows) - most, 0), "stop_lanes": lost}
-    return Stops(xy[rows[:most]], lane[rows[:most]], {name: n for name, n in overflow.items() if n})
+    return Stops(xy[rows[:most]], lane[rows[:most]], +Counter(stops=len(rows) - most, stop_lanes=lost))

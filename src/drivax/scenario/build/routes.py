@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from drivax.geometry.polylines import arc_lengths, headings, project, project_monotone, resample
+from drivax.geometry.polylines import arc_lengths, headings, left_normals, project, project_monotone, resample
 from drivax.scenario.build.lane_paths import (
     CHANGE_M,
     REACH_M,
@@ -31,7 +31,7 @@ from drivax.scenario.build.lane_paths import (
     walk,
 )
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments
-from drivax.scenario.build.segments import thin_path
+from drivax.scenario.build.segments import spaced, thin_path
 
 #: A route may run this far from the driven path; a larger offset is taken back.
 OFFSET_M = 1.0
@@ -76,13 +76,7 @@ LABEL_EVERY = 4
 
 @dataclass(frozen=True)
 class Route:
-    """Points 1 m apart along a lane path.
-
-    Attributes:
-        xyz: Points in the local frame, metres.
-        heading: Radians.
-        lane: Dense lane index under each point, -1 where there is none.
-    """
+    """Points 1 m apart along a lane path, with the dense index of the lane under each (-1 without one)."""
 
     xyz: Float[Array, "point 3"]
     heading: Float[Array, " point"]
@@ -97,15 +91,7 @@ class Route:
 
 @dataclass(frozen=True)
 class EgoLog:
-    """The logged ego in the local frame.
-
-    Attributes:
-        xyz: Positions, zeros where not valid.
-        heading: Radians.
-        speed: m/s.
-        valid: Whether a step was observed.
-        current: The current step, which is valid.
-    """
+    """The logged ego in the local frame, zeros where not valid; the current step is valid."""
 
     xyz: Float[Array, "time 3"]
     heading: Float[Array, " time"]
@@ -155,18 +141,14 @@ class Intent:
 
 
 def find_routes(
-    graph: LaneGraph,
-    on: LaneSegments,
-    ego: EgoLog,
-    intent: Intent,
-    style: RouteStyle,
-    most_routes: int,
-    most_points: int,
+    on: LaneSegments, ego: EgoLog, intent: Intent, style: RouteStyle, most_routes: int, most_points: int
 ) -> RouteSet:
     """Find all routes of a scenario; ``published`` candidates ignore the intended route."""
-    log = log_route(graph, on, ego, most_points)
-    draft = _published if style == "published" else _searched
-    best, others = draft(graph, on, ego, intent, (most_routes, most_points))
+    log = log_route(on, ego, most_points)
+    if style == "published":
+        best, others = _published(on, ego, most_points)
+    else:
+        best, others = _searched(on, ego, intent, most_routes - 1, most_points)
     first = log if best is None else best
     rest = [route for route in others if not _same(route, first)]
     progress = log_progress(first, ego)
@@ -176,27 +158,25 @@ def find_routes(
 
 
 def _searched(
-    graph: LaneGraph, on: LaneSegments, ego: EgoLog, intent: Intent, most: tuple[int, int]
+    on: LaneSegments, ego: EgoLog, intent: Intent, most_routes: int, most_points: int
 ) -> tuple[Route | None, list[Route]]:
     """Route to the goal, if any, and alternatives, by best-first search from the current step."""
     pose = ego.xyz[ego.current], float(ego.heading[ego.current])
     need = max(AHEAD_M, float(ego.speed[ego.current]) * AHEAD_S)
-    search = LaneSearch.start(graph, on, *pose, need, intent.corridor)
-    drawer = _Drawer(graph, ego, most[1])
-    others = [drawer.draw(lane_path, 0.0) for lane_path in search.alternatives(most[0] - 1)]
+    search = LaneSearch.start(on, *pose, need, intent.corridor)
+    drawer = _Drawer(on.graph, ego, most_points)
+    others = [drawer.draw(lane_path, 0.0) for lane_path in search.alternatives(most_routes)]
     end = ego.xyz[ego.last], float(ego.heading[ego.last])
     if intent.lanes:
         return _best(ego, drawer.variants([search.along(intent.lanes, *end)]), np.inf), others
     return _best(ego, [*drawer.variants(search.to_goal(*end)), *others], GOAL_M), others
 
 
-def _published(
-    graph: LaneGraph, on: LaneSegments, ego: EgoLog, intent: Intent, most: tuple[int, int]
-) -> tuple[Route | None, list[Route]]:
+def _published(on: LaneSegments, ego: EgoLog, most_points: int) -> tuple[Route | None, list[Route]]:
     """Published candidate that leads to the goal, if any, and all candidates, the best score first."""
     ego = replace(ego, current=int(np.argmax(ego.valid)))
-    search = LaneSearch.start(graph, on, ego.xyz[ego.current], float(ego.heading[ego.current]), LEAST_M)
-    drawer = _Drawer(graph, ego, most[1], plain=True)
+    search = LaneSearch.start(on, ego.xyz[ego.current], float(ego.heading[ego.current]), LEAST_M)
+    drawer = _Drawer(on.graph, ego, most_points, plain=True)
     others = [drawer.draw(lane_path, 0.0) for lane_path in published_paths(search)]
     return _best(ego, others, GOAL_M), others
 
@@ -210,8 +190,7 @@ def published_paths(search: LaneSearch) -> list[LanePath]:
     The search begins at the first logged pose, on lanes within 2.5 m.
     """
     queue = deque(lane_path for lane_path in search.starts if lane_path.lateral <= PUBLISHED_REACH_M)
-    complete: list[LanePath] = []
-    ended: list[LanePath] = []
+    complete, ended = list[LanePath](), list[LanePath]()
     for _ in range(MOST_EXPANSIONS):
         if not queue or len(complete) >= MOST_PATHS:
             break
@@ -220,7 +199,7 @@ def published_paths(search: LaneSearch) -> list[LanePath]:
             complete.append(lane_path)
             continue
         following = search.following(lane_path)
-        if not any(not is_change(search.graph, lane_path.lanes[-1], child.lanes[-1]) for child in following):
+        if not search.goes_on(following):
             ended.append(lane_path)
         queue.extend(following)
     return sorted([*complete, *ended][:MOST_PATHS], key=lambda lane_path: -score(search, lane_path))
@@ -252,10 +231,8 @@ def _best(ego: EgoLog, routes: Sequence[Route], reach_m: float) -> Route | None:
     if not routes:
         return None
     path = thin_path(ego.seen[:, :2])
-    keys = []
-    for i, route in enumerate(routes):
-        _, distance = project(route.xyz, path)
-        keys.append((np.floor(distance[-1]), round(float(distance.mean()), 1), i))
+    distances = [project(route.xyz, path)[1] for route in routes]
+    keys = [(np.floor(away[-1]), round(float(away.mean()), 1), i) for i, away in enumerate(distances)]
     goal_distance, _, best = min(keys)
     return routes[best] if goal_distance < reach_m else None
 
@@ -292,16 +269,8 @@ class _Drawer:
         ends = float(graph.lines.length[list(lane_path.lanes)].sum()) - lane_path.s
         lanes = (*prefix, *follow(graph, lane_path.lanes, ends, self.most * SPACING_M))
         speed = float(ego.speed[ego.current])
-        change_m = max(CHANGE_M, CHANGE_S * speed)
-        line = trace(
-            graph,
-            lanes,
-            max(begin, 0.0),
-            -lane_path.s - length,
-            (REACTION_S * speed, lane_path.until),
-            place,
-            change_m,
-        )
+        change_m, window_m = max(CHANGE_M, CHANGE_S * speed), (REACTION_S * speed, lane_path.until)
+        line = trace(graph, lanes, max(begin, 0.0), -lane_path.s - length, window_m, place, change_m)
         line = continue_straight(line, max(-begin, 0.0), PAST_GOAL_M)
         arc, _ = project(line[0], ego.seen[-1:, :2])
         missing = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
@@ -315,14 +284,9 @@ def join(
 ) -> Float[Array, "point 3"]:
     """Bend a line so that it passes within a metre of the driven path.
 
-    At each driven pose the line is shifted across by what its distance exceeds a metre; between the poses the shift
-    is interpolated along the line, and ahead of the last of them it fades out by a cubic polynomial that goes on in the
-    ego's direction (Hermite: its shift and slope at the ego, zero and zero at the end).
-
-    Args:
-        xyz: Points of the line, about 1 m apart.
-        driven: Positions of the ego up to now, in order.
-        ahead_m: How far ahead of the ego the line is on its lane again.
+    At each driven pose the line is shifted sideways by the excess of its distance over a metre. The shift is
+    interpolated between the poses and fades out ahead of the last one by a cubic polynomial that continues in the ego's
+    direction (Hermite: shift and slope at the ego, zero both ``ahead_m`` ahead). Points of ``xyz`` are about 1 m apart.
     """
     first = int(arc_lengths(driven)[-1] + 2 * _BEHIND_M) + 2
     s, shift = _shifts(xyz[: max(first, 2)], driven)
@@ -336,7 +300,7 @@ def join(
     across[back] = _fade(s[0] - arc[back], shift[0], -slope[0], _BEHIND_M)
     across[ahead] = _fade(arc[ahead] - s[-1], shift[-1], slope[-1], ahead_m)
     result = xyz.copy()
-    result[:, :2] += across[:, None] * _left(headings(xyz))
+    result[:, :2] += across[:, None] * left_normals(headings(xyz))
     return result
 
 
@@ -350,7 +314,7 @@ def _shifts(xyz: Float[Array, "point 3"], driven: Float[Array, "step 2"]) -> tup
     rows = np.array(keep[::-1])
     arc, course = arc_lengths(xyz), np.unwrap(headings(xyz))
     foot = np.stack([np.interp(s[rows], arc, xyz[:, axis]) for axis in (0, 1)], axis=-1)
-    offset = np.einsum("ij,ij->i", driven[rows] - foot, _left(np.interp(s[rows], arc, course)))
+    offset = np.einsum("ij,ij->i", driven[rows] - foot, left_normals(np.interp(s[rows], arc, course)))
     return s[rows], np.sign(offset) * np.maximum(np.abs(offset) - OFFSET_M, 0.0)
 
 
@@ -360,43 +324,36 @@ def _fade(distance: Array, shift: float, slope: float, length: float) -> Array:
     return shift * (1.0 + t**2 * (2.0 * t - 3.0)) + slope * length * t * (1.0 - t) ** 2
 
 
-def _left(heading: Array) -> Array:
-    return np.stack((-np.sin(heading), np.cos(heading)), axis=-1)
-
-
-def log_route(graph: LaneGraph, on: LaneSegments, ego: EgoLog, most_points: int) -> Route:
+def log_route(on: LaneSegments, ego: EgoLog, most_points: int) -> Route:
     """Path of the logged ego (privileged), continued along its last lane, else straight on.
 
     Positions within half a metre of the previous one are skipped as jitter; a log that stays within 2 m has only its
     last pose.
     """
     seen, heading = ego.seen, ego.heading[ego.valid]
-    keep = [0]
-    for i in range(1, len(seen)):
-        if np.hypot(*(seen[i] - seen[keep[-1]])[:2]) >= STEP_M:
-            keep.append(i)
+    keep = spaced(seen[:, :2], STEP_M)
     if np.hypot(*(seen - seen[0])[:, :2].T).max() < STANDS_M:
         keep = keep[-1:]
     pose, course = seen[keep[-1]], float(heading[keep[-1]])
-    line = np.concatenate((seen[keep], _ahead(graph, on, pose, course)))
+    line = np.concatenate((seen[keep], _ahead(on, pose, course)))
     probe = np.arange(0, len(line), LABEL_EVERY)
     lane, _, _ = on.nearest(line[probe], headings(line)[probe], REACH_M, SAME_TURN_RAD)
     return Route.along(line, np.repeat(lane, LABEL_EVERY)[: len(line)], most_points)
 
 
-def _ahead(graph: LaneGraph, on: LaneSegments, pose: Float[Array, "3"], heading: float) -> Array:
+def _ahead(on: LaneSegments, pose: Float[Array, "3"], heading: float) -> Array:
     """Points 1 m apart ahead of a pose: along its lane, its lateral offset fading within 20 m; else straight."""
+    lines = on.graph.lines
     count = int(LOG_AHEAD_M)
     distance = np.arange(1.0, count + 1.0)
     lane, s, _ = on.nearest(pose[None], np.array([heading]), REACH_M, SAME_TURN_RAD)
     if lane[0] < 0:
         xy = pose[:2] + distance[:, None] * np.array([np.cos(heading), np.sin(heading)])
     else:
-        foot, course = graph.lines.at(lane, s)[0], float(graph.lines.heading(lane, s)[0])
-        lateral = float((pose[:2] - foot[:2]) @ np.array([-np.sin(course), np.cos(course)]))
-        points, courses = walk(graph, lane, s, 1.0, count)
+        lateral = float((pose[:2] - lines.at(lane, s)[0, :2]) @ left_normals(lines.heading(lane, s))[0])
+        points, courses = walk(on.graph, lane, s, 1.0, count)
         fade = lateral * np.maximum(1.0 - distance / BEHIND_M, 0.0)
-        xy = points[0] + fade[:, None] * np.stack((-np.sin(courses[0]), np.cos(courses[0])), axis=-1)
+        xy = points[0] + fade[:, None] * left_normals(courses[0])
     return np.concatenate((xy, np.full((count, 1), pose[2])), axis=1)
 
 

@@ -1,7 +1,8 @@
-"""Map features as polylines and as short straight segments for map queries."""
+"""Map features as polylines, as segments of at most 4 m for queries, and as ranked pieces to observe."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from drivax.geometry.polylines import Polylines, arc_lengths, cut_counts, simplify
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import MapFeature
-from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, POLYGON_KINDS, RoadKind, among
+from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, RoadKind, among
 
 Array = np.ndarray[Any, Any]
 
@@ -22,17 +24,21 @@ TOLERANCE_M = 0.05
 Z_WEIGHT = 0.25
 #: Largest gap between the first and last point of a closed ring.
 CLOSED_M = 0.05
+#: Larger speed limits of a source are not believed.
+MOST_LIMIT_MPS = 100.0
+PIECE_M = 10.0
+#: A closed ring is cut into at least this many pieces, so that each has a direction.
+RING_PIECES = 4
+#: Pieces rank by rings of this width around the log of the ego.
+RING_M = 50.0
 
 
 @dataclass(frozen=True)
 class RoadLines:
     """All drawn map features as polylines in the local frame: split at clipping gaps, polygons closed.
 
-    Attributes:
-        lines: The polylines; ``lines.arc`` is measured per polyline.
-        feature: Row of the source feature.
-        closed: Mask of closed rings.
-        arc: Arc length of every point along its source feature (gaps included), metres.
+    ``feature`` is the row of the source feature, ``closed`` the mask of closed rings. ``arc`` is the arc length of each
+    point along its source feature, gaps included (``lines.arc`` that along its polyline), metres.
     """
 
     lines: Polylines
@@ -41,17 +47,18 @@ class RoadLines:
     closed: Bool[Array, " polyline"]
     arc: Float[Array, " point"]
 
+    @property
+    def rings_closed(self) -> bool:
+        """Whether there are road edges, and all of them are closed rings."""
+        rings = self.closed[among(self.kind, EDGE_KINDS)]
+        return len(rings) > 0 and bool(rings.all())
+
 
 @dataclass(frozen=True)
 class Segments:
-    """Straight pieces of at most 4 m, in the local frame, float64.
+    """Straight pieces of at most 4 m from ``a`` to ``b``, in the local frame, float64.
 
-    Attributes:
-        a, b: Start and end points.
-        polyline: Row of the polyline.
-        feature: Row of the source feature.
-        start_m: Arc length at ``a`` along the source feature.
-        span_m: Arc length between ``a`` and ``b`` along the source feature.
+    ``start_m`` is the arc length at ``a``, and ``span_m`` that from ``a`` to ``b``, both along the source feature.
     """
 
     a: Float[Array, "segment 3"]
@@ -85,7 +92,7 @@ class Segments:
 def road_lines(
     features: Sequence[MapFeature], origin: Float[Array, " 3"], split_gap_m: float | None
 ) -> RoadLines:
-    """Features of two or more points as polylines in the local frame; stop signs are left out.
+    """Draw features of two or more points, other than stop signs, as polylines in the local frame.
 
     Polylines other than polygons are split where neighbouring points are more than ``split_gap_m`` apart.
     """
@@ -98,9 +105,8 @@ def road_lines(
     if split_gap_m is not None and len(points):
         step = np.hypot(*np.diff(points[:, :2], axis=0, prepend=points[:1, :2]).T)
         breaks |= (step > split_gap_m) & ~among(kind, POLYGON_KINDS)[whole.row]
-    source = whole.row
     lines, keep = _long_enough(points, np.flatnonzero(breaks))
-    row = source[keep][lines.start[:-1]]
+    row = whole.row[keep][lines.start[:-1]]
     first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
     closed = (np.hypot(*(last - first)[:, :2].T) <= CLOSED_M) & (np.diff(lines.start) >= 4)
     lines.points[lines.start[1:][closed] - 1] = first[closed]
@@ -117,13 +123,12 @@ def _outline(feature: MapFeature) -> Array:
 
 def _long_enough(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " point"]]:
     """Polylines that begin at these points, and the mask of their points; those without length are left out."""
-    start = np.concatenate((begin, [len(points)])).astype(np.int64)
+    start = np.append(begin, len(points))
     counts = np.diff(start)
     arc = arc_lengths(points, start)
     long = (counts >= 2) & (arc[start[1:] - 1] > 1e-3) if len(points) else counts >= 2
     keep = np.repeat(long, counts)
-    kept_start = np.concatenate(([0], np.cumsum(counts[long]))).astype(np.int64)
-    return Polylines(points[keep], kept_start, arc[keep]), keep
+    return Polylines(points[keep], np.concatenate(([0], np.cumsum(counts[long]))), arc[keep]), keep
 
 
 def cut(roads: RoadLines) -> Segments:
@@ -165,9 +170,107 @@ def thin_path(xy: Float[Array, "step 2"], spacing_m: float = 5.0) -> Float[Array
     return xy[keep]
 
 
+def spaced(xy: Float[Array, "step 2"], least_m: float) -> list[int]:
+    """Return the first position and those at least ``least_m`` from the one kept before."""
+    keep = [0]
+    for i in range(1, len(xy)):
+        if np.hypot(*(xy[i] - xy[keep[-1]])) >= least_m:
+            keep.append(i)
+    return keep
+
+
 def inside_box(
     xy: Float[Array, "point 2"], path: Float[Array, "step 2"], margin_m: float
 ) -> Bool[Array, " point"]:
     """Return whether points lie in the axis-aligned box of a trajectory, widened by a margin."""
     low, high = path.min(axis=0) - margin_m, path.max(axis=0) + margin_m
     return np.all((xy >= low) & (xy <= high), axis=1)
+
+
+def known_limit(feature: MapFeature) -> float:
+    """Plausible speed limit of a lane in m/s, else -1."""
+    limit = feature.limit_mps if feature.kind in LANE_KINDS else None
+    return limit if limit is not None and 0.0 < limit <= MOST_LIMIT_MPS else -1.0
+
+
+@dataclass(frozen=True)
+class RoadRows:
+    """Pieces of road in the local frame, in order of rank.
+
+    Each has its midpoint by arc length, unit vector from its first to its last point, arc length (m), speed limit (m/s,
+    -1 unknown or no lane), and curvature (1/m, left positive).
+    """
+
+    xy: Float[Array, "row 2"]
+    direction: Float[Array, "row 2"]
+    length: Float[Array, " row"]
+    kind: Int[Array, " row"]
+    limit: Float[Array, " row"]
+    curvature: Float[Array, " row"]
+    overflow: dict[str, int]
+
+
+def road_rows(
+    roads: RoadLines, features: Sequence[MapFeature], path: Float[Array, "step 2"], margin_m: float, most: int
+) -> RoadRows:
+    """Cut lanes, road edges and crosswalks into pieces and keep the ``most`` highest ranks.
+
+    Pieces whose midpoint lies more than ``margin_m`` outside the box of ``path``, the log of the ego, are left out.
+    """
+    line = np.flatnonzero(np.isin(roads.kind, (*LANE_KINDS, *EDGE_KINDS, RoadKind.CROSSWALK)))
+    length = roads.lines.length[line]
+    pieces = np.maximum(cut_counts(length, PIECE_M), np.where(roads.closed[line], RING_PIECES, 1))
+    owner = np.repeat(line, pieces)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    span = np.repeat(length / pieces, pieces)
+    begin = number * span
+    middle = roads.lines.at(owner, begin + span / 2)[..., :2]
+    near = np.flatnonzero(inside_box(middle, path, margin_m))
+    owner, begin, span, middle = owner[near], begin[near], span[near], middle[near]
+    kind = roads.kind[owner]
+    group = np.where(among(kind, LANE_KINDS), 0, np.where(among(kind, EDGE_KINDS), 1, 2))
+    order = rank(group, path_distance(middle, path))[:most]
+    overflow = +Counter(road_rows=len(owner) - len(order))
+    owner, begin, span, middle, kind = owner[order], begin[order], span[order], middle[order], kind[order]
+    angle = _angle(roads, owner, begin, begin + span)
+    first, last = _angle(roads, owner, begin, begin + span / 3), begin + span * 2 / 3
+    turn = wrap(_angle(roads, owner, last, begin + span) - first)
+    limits = np.array([known_limit(feature) for feature in features], dtype=np.float64)
+    return RoadRows(
+        xy=middle,
+        direction=np.stack((np.cos(angle), np.sin(angle)), axis=-1),
+        length=span,
+        kind=kind,
+        limit=limits[roads.feature[owner]] if len(owner) else np.zeros(0),
+        # Rounded: the last bits of angles depend on the processor.
+        curvature=np.round(turn / (span * 2 / 3), 6) + 0.0,
+        overflow=overflow,
+    )
+
+
+def _angle(roads: RoadLines, line: Array, begin: Array, end: Array) -> Float[Array, " row"]:
+    """Angle of the chord between two arc lengths of each polyline."""
+    chord = roads.lines.at(line, end) - roads.lines.at(line, begin)
+    return np.arctan2(chord[..., 1], chord[..., 0])
+
+
+def rank(group: Int[Array, " row"], far: Float[Array, " row"]) -> Int[Array, " row"]:
+    """Order pieces so that every prefix spreads evenly over each group, nearer rings first.
+
+    Within a ring of 50 m around the log, the rows of a group (in order along the map) are taken in bit-reversed
+    order (van der Corput's sequence), and the groups are interleaved in proportion to their sizes.
+    """
+    ring = np.floor(far / RING_M).astype(np.int64)
+    label, place = ring * 3 + group, np.zeros(len(group))
+    for number in np.unique(label):
+        members = np.flatnonzero(label == number)
+        place[members] = (_bit_reversed_place(len(members)) + 0.5) / len(members)
+    return np.lexsort((np.arange(len(group)), place, ring))
+
+
+def _bit_reversed_place(count: int) -> Int[Array, " count"]:
+    """Rank of each of ``count`` items in the order of their bit-reversed indices."""
+    bits = max(int(count - 1).bit_length(), 1)
+    index = np.arange(count)
+    reverse = sum(((index >> bit) & 1) << (bits - 1 - bit) for bit in range(bits))
+    return np.argsort(np.argsort(reverse))

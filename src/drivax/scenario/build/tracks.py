@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from drivax.geometry.polylines import left_normals
 from drivax.geometry.vectors import wrap
 from drivax.scenario.build.lane_paths import walk
-from drivax.scenario.build.lanes import LaneGraph, LaneSegments
+from drivax.scenario.build.lanes import LaneSegments
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind, among
 
@@ -29,13 +31,9 @@ MOVER_M = 2.0
 EGO_BIT, PREDICT_BIT, INTEREST_BIT = 1, 2, 4
 #: Length, width and height where a source has none, metres (medians of Argoverse 2 sensor logs by class).
 DEFAULT_SIZES = {
-    AgentKind.NONE: (1.0, 1.0, 1.0),
-    AgentKind.VEHICLE: (4.1, 1.9, 1.6),
-    AgentKind.PEDESTRIAN: (0.7, 0.7, 1.8),
-    AgentKind.CYCLIST: (1.8, 0.6, 1.7),
-    AgentKind.OTHER: (1.0, 1.0, 1.0),
-    AgentKind.STATIC: (0.5, 0.5, 1.0),
-}
+    AgentKind.NONE: (1.0, 1.0, 1.0), AgentKind.VEHICLE: (4.1, 1.9, 1.6), AgentKind.PEDESTRIAN: (0.7, 0.7, 1.8),
+    AgentKind.CYCLIST: (1.8, 0.6, 1.7), AgentKind.OTHER: (1.0, 1.0, 1.0), AgentKind.STATIC: (0.5, 0.5, 1.0),
+}  # fmt: skip
 DEFAULT_EGO_SIZE = (4.9, 2.0, 1.5)
 #: Larger measured sizes are ignored.
 MOST_SIZE_M = 100.0
@@ -43,12 +41,9 @@ MOST_SIZE_M = 100.0
 
 @dataclass(frozen=True)
 class LocalTracks:
-    """Tracks in the local frame, float64, cleaned: zeros where not valid, headings wrapped.
+    """Tracks in the local frame, float64: box centres, headings in [-pi, pi), m/s; zeros where not valid.
 
     Attributes:
-        xyz: Box centres, metres.
-        heading: Radians in [-pi, pi).
-        velocity: m/s.
         size: Median length, width and height over the valid steps, metres.
         ego: Row of the ego.
         defaulted: Number of tracks with a default size.
@@ -71,21 +66,12 @@ def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTr
     The size is the median of valid measurements between 0 and 100 m, since sizes of one object vary by metres in public
     data; without any it is the default of the class.
     """
-    valid = tracks.valid.astype(bool)
-    mask = valid[..., None]
-    xyz = np.concatenate((tracks.xy, tracks.z[..., None]), axis=-1) - origin
+    valid, mask = tracks.valid, tracks.valid[..., None]
+    xyz = np.where(mask, np.concatenate((tracks.xy, tracks.z[..., None]), axis=-1) - origin, 0.0)
+    heading, velocity = np.where(valid, wrap(tracks.heading), 0.0), np.where(mask, tracks.velocity, 0.0)
     size, defaulted = _sizes(tracks, ego)
-    return LocalTracks(
-        xyz=np.where(mask, xyz, 0.0),
-        heading=np.where(valid, wrap(tracks.heading), 0.0),
-        velocity=np.where(mask, tracks.velocity, 0.0),
-        size=size,
-        valid=valid,
-        kind=tracks.kind.astype(np.int64),
-        track_id=tracks.track_id.astype(np.int64),
-        ego=ego,
-        defaulted=defaulted,
-    )
+    kind, track_id = tracks.kind.astype(np.int64), tracks.track_id.astype(np.int64)
+    return LocalTracks(xyz, heading, velocity, size, valid, kind, track_id, ego, defaulted)
 
 
 def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], int]:
@@ -103,23 +89,19 @@ def masked_median(values: Float[Array, "*row time"], valid: Bool[Array, "*row ti
     """Median over the valid entries of the last axis; 0 where none is valid."""
     ordered = np.sort(np.where(valid, values, np.inf), axis=-1)
     count = valid.sum(axis=-1)
-    low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[..., None], axis=-1)[..., 0]
-    high = np.take_along_axis(
-        ordered, np.maximum(count // 2, 0).clip(max=values.shape[-1] - 1)[..., None], -1
+    middle = np.stack(
+        (np.maximum((count - 1) // 2, 0), np.minimum(count // 2, values.shape[-1] - 1)), axis=-1
     )
+    low, high = np.moveaxis(np.take_along_axis(ordered, middle, axis=-1), -1, 0)
     with np.errstate(invalid="ignore"):
-        return np.where(count > 0, (low + high[..., 0]) / 2, 0.0)
+        return np.where(count > 0, (low + high) / 2, 0.0)
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Slots of tracks.
+    """Tracks of the moving block (the ego first) and of the parked block, in slot order.
 
-    Attributes:
-        moving: Tracks of the moving block in slot order; the ego first.
-        parked: Tracks of the parked block in slot order.
-        pose: Median x, y, z and heading of every track.
-        overflow: Numbers of tracks that did not fit, by name.
+    ``pose`` is the median x, y, z and heading of every track.
     """
 
     moving: Int[Array, " slot"]
@@ -145,32 +127,22 @@ def place(tracks: LocalTracks, marked: Sequence[int], agents: int, parked: int) 
     rank = _rank(tracks, np.where(tracks.valid, away, 0.0).max(axis=1), marked)
     order = np.argsort(rank, kind="stable")
     moving, standing = order[(seen & ~parks)[order]], order[parks[order]]
-    overflow = {"agents": max(len(moving) - agents, 0), "parked": max(len(standing) - parked, 0)}
-    return Placement(
-        moving[:agents], standing[:parked], pose, {name: count for name, count in overflow.items() if count}
-    )
+    overflow = +Counter(agents=len(moving) - agents, parked=len(standing) - parked)
+    return Placement(moving[:agents], standing[:parked], pose, overflow)
 
 
 def median_pose(tracks: LocalTracks) -> Float[Array, "track 4"]:
     """Median x, y, z and heading over the valid steps; the heading relative to its circular mean."""
-    xyz = masked_median(
-        np.swapaxes(tracks.xyz, 1, 2), np.broadcast_to(tracks.valid[:, None], _swapped(tracks))
-    )
+    by_axis = np.swapaxes(tracks.xyz, 1, 2)
+    xyz = masked_median(by_axis, np.broadcast_to(tracks.valid[:, None], by_axis.shape))
     weight = tracks.valid.astype(np.float64)
     mean = np.arctan2((np.sin(tracks.heading) * weight).sum(1), (np.cos(tracks.heading) * weight).sum(1))
     turn = masked_median(wrap(tracks.heading - mean[:, None]), tracks.valid)
     return np.concatenate((xyz, wrap(mean + turn)[:, None]), axis=1)
 
 
-def _swapped(tracks: LocalTracks) -> tuple[int, int, int]:
-    rows, steps, width = tracks.xyz.shape
-    return rows, width, steps
-
-
-def _rank(
-    tracks: LocalTracks, moved: Float[Array, " track"], marked: Sequence[int]
-) -> Float[Array, " track"]:
-    """Sort key of every track, smaller is more relevant."""
+def _rank(tracks: LocalTracks, moved: Array, marked: Sequence[int]) -> Float[Array, " track"]:
+    """Sort key of every track, smaller is more relevant; ``moved`` is its largest distance from its median pose."""
     both = tracks.valid & tracks.valid[tracks.ego]
     apart = np.hypot(*np.moveaxis((tracks.xyz - tracks.xyz[tracks.ego])[..., :2], -1, 0))
     rank = np.where(both, apart, 1e6).min(axis=1) - MOVER_BONUS_M * (moved > MOVER_M)
@@ -180,7 +152,7 @@ def _rank(
 
 
 def extend(
-    tracks: LocalTracks, rows: Int[Array, " slot"], graph: LaneGraph, on: LaneSegments, count: int
+    tracks: LocalTracks, rows: Int[Array, " slot"], on: LaneSegments, count: int
 ) -> Float[Array, "slot count 2"]:
     """Extend tracks by ``count`` points 4 m apart beyond their last valid pose: along their lane, else straight on.
 
@@ -197,14 +169,10 @@ def extend(
     follows = np.flatnonzero((lane >= 0) & drives)
     if len(follows) == 0:
         return points
-    foot = graph.lines.at(lane[follows], s[follows])[..., :2]
-    normal = _left_normal(graph.lines.heading(lane[follows], s[follows]))
-    lateral = np.einsum("ai,ai->a", xyz[follows, :2] - foot, normal)
-    ahead, lane_heading = walk(graph, lane[follows], s[follows], EXTENSION_STEP_M, count)
+    lines, lane, s = on.graph.lines, lane[follows], s[follows]
+    offset = xyz[follows, :2] - lines.at(lane, s)[..., :2]
+    lateral = np.einsum("ai,ai->a", offset, left_normals(lines.heading(lane, s)))
+    ahead, lane_heading = walk(on.graph, lane, s, EXTENSION_STEP_M, count)
     fade = np.maximum(1.0 - distance / FADE_M, 0.0)
-    points[follows] = ahead + (lateral[:, None] * fade)[..., None] * _left_normal(lane_heading)
+    points[follows] = ahead + (lateral[:, None] * fade)[..., None] * left_normals(lane_heading)
     return points
-
-
-def _left_normal(heading: Float[Array, "*pose"]) -> Float[Array, "*pose 2"]:
-    return np.stack((-np.sin(heading), np.cos(heading)), axis=-1)

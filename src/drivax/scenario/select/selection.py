@@ -7,7 +7,9 @@ nor ``!=``; :meth:`Selection.unknown` counts such scenarios.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import functools
 import math
 import operator
 import re
@@ -48,19 +50,14 @@ _TRUTHS = {"true": True, "false": False}
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that filters compare.
-
-    Attributes:
-        kind: A number, a truth (``true`` or ``false``) or a word.
-        meaning: Description of a line.
-        words: Possible words; empty for any.
-    """
+    """A quantity that filters compare; ``words`` are the possible ones, empty for any."""
 
     kind: _Kind
     meaning: str
     words: tuple[str, ...] = ()
 
 
+_EXCEEDS = "share of steps at which following the log exceeds the limits of"
 #: Findings of the audit (``evaluation.audit``); filters write ``audit.NAME``.
 FINDINGS: Mapping[str, Quantity] = {
     "log_collides": Quantity("truth", "the logged ego overlaps an agent that it did not overlap at first"),
@@ -76,15 +73,10 @@ FINDINGS: Mapping[str, Quantity] = {
     "route_reaches_goal": Quantity("truth", "the route ends within 3 m of where the log ends"),
     "lights_seen": Quantity("number", "lights with an observed state"),
     "ignored_overlaps": Quantity(
-        "number", "largest number of agents that overlapped ego from the beginning and are ignored"
+        "number", "most agents that overlapped ego from the beginning and are ignored"
     ),
-    "clipped_physical": Quantity(
-        "number",
-        "share of steps at which following the log exceeds the limits of `physical` and `discrete`",
-    ),
-    "clipped_published": Quantity(
-        "number", "share of steps at which following the log exceeds the limits of `published`"
-    ),
+    "clipped_physical": Quantity("number", f"{_EXCEEDS} `physical` and `discrete`"),
+    "clipped_published": Quantity("number", f"{_EXCEEDS} `published`"),
     "default_sizes": Quantity("truth", "some box sizes are those of the class"),
     "velocity": Quantity("word", "where velocities come from", ("measured", "differentiated")),
     "dt_jitter": Quantity("truth", "some step differs from the median step by more than 2 ms"),
@@ -111,13 +103,9 @@ def vocabulary() -> dict[str, Quantity]:
 
 @dataclass(frozen=True)
 class Filter:
-    """One condition on a scenario.
+    """One condition on a quantity: ``text`` as written by the user, and its parts.
 
-    Attributes:
-        text: The filter as written by the user.
-        name: Name of the quantity.
-        operator: ``=``, ``!=``, ``<``, ``<=``, ``>`` or ``>=``.
-        values: The alternatives: words, numbers or truths; one number where the operator compares.
+    ``values`` are alternatives (words, numbers or truths); there is one number where the operator compares.
     """
 
     text: str
@@ -127,11 +115,7 @@ class Filter:
 
     @classmethod
     def parse(cls, text: str) -> Filter:
-        """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison of NAME with a number.
-
-        Raises:
-            UsageError: The form, the name, the operator or a value is invalid.
-        """
+        """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison; raise UsageError if any part is invalid."""
         form = _FILTER.fullmatch(text)
         if form is None or form[3].startswith("="):
             raise _refusal(text, "is no filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
@@ -169,16 +153,11 @@ class Filter:
             return entry["audit"].get(name)
         if group == "overflow":
             return entry["overflow"].get(name, 0)
-        if group == "tag":
-            return tag_words(entry, name) or None
         if group in _NAMES:
             return entry[group]
         if self.name in _COUNTS and not isinstance(self.values[0], str):
-            value: Any = entry
-            for key in _COUNTS[self.name]:
-                value = value.get(key, 0)
-            return value
-        return tag_words(entry, self.name) or None
+            return functools.reduce(lambda value, key: value.get(key, 0), _COUNTS[self.name], entry)
+        return tag_words(entry, self.name.removeprefix("tag.")) or None
 
 
 @dataclass(frozen=True)
@@ -189,11 +168,7 @@ class Selection:
 
     @classmethod
     def parse(cls, filters: Sequence[str]) -> Selection:
-        """Parse filters such as ``type=turn_left|turn_right`` or ``audit.distance_m>5``.
-
-        Raises:
-            UsageError: A filter is invalid.
-        """
+        """Parse filters such as ``type=turn_left|turn_right`` or ``audit.distance_m>5``."""
         return cls(tuple(Filter.parse(text) for text in filters))
 
     def matches(self, entry: Mapping[str, Any]) -> bool:
@@ -205,11 +180,9 @@ class Selection:
         return [row for row, entry in enumerate(entries) if self.matches(entry)]
 
     def unknown(self, entries: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-        """Nonzero numbers of scenarios without the value of a filter, by filter."""
-        counts = dict.fromkeys((condition.text for condition in self.filters), 0)
-        for entry in entries:
-            for condition in self.filters:
-                counts[condition.text] += condition.find(entry) is None
+        """Return the nonzero numbers of scenarios without the value of a filter, by filter."""
+        known = list(entries)
+        counts = {own.text: sum(own.find(entry) is None for entry in known) for own in self.filters}
         return {text: count for text, count in counts.items() if count}
 
 
@@ -251,7 +224,7 @@ def select_scenarios(
         data: The set.
         filters: Conditions that must all hold.
         names: Ids, or data set, tab and id; paths of files with one name per line. Empty selects all.
-        limit: Largest number of scenarios; the first are selected.
+        limit: Number of scenarios to select at most, the first ones.
 
     Raises:
         DataError: A name is not in the set, a file cannot be read, or no scenario is selected.
@@ -268,11 +241,7 @@ def select_scenarios(
 
 
 def read_names(file: Path) -> list[_Name]:
-    """Read names from a file, one per line; empty lines are skipped.
-
-    Raises:
-        DataError: The file cannot be read or is no text.
-    """
+    """Read names from a text file, one per line; empty lines are skipped."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except OSError as error:
@@ -344,21 +313,14 @@ def _value(text: str, name: str, quantity: Quantity, word: str) -> str | float |
             raise _refusal(text, f"{word!r} is neither true nor false", f"write {name}=true or {name}=false")
         return _TRUTHS[word.lower()]
     if quantity.kind == "number":
-        number = _number(word)
-        if number is None and word not in quantity.words:
+        with contextlib.suppress(ValueError):
+            if math.isfinite(number := float(word)):
+                return number
+        if word not in quantity.words:
             raise _refusal(text, f"{word!r} is no number", f"write {name}>=10, say")
-        return word if number is None else number
     if quantity.words and word not in quantity.words:
         raise _refusal(text, f"{name} is never {word!r}", did_you_mean(word, quantity.words))
     return word
-
-
-def _number(word: str) -> float | None:
-    try:
-        number = float(word)
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None
 
 
 def _refusal(text: str, problem: str, cure: str) -> UsageError:

@@ -22,21 +22,15 @@ FOLDER = "splits"
 
 
 def parse_shares(text: str) -> Shares:
-    """Parse shares such as ``80/10/10``.
-
-    Raises:
-        UsageError: The text is not three percentages that add up to 100.
-    """
+    """Parse three percentages that add up to 100, such as ``80/10/10``."""
     try:
         train, validation, test = (float(part) for part in text.split("/"))
     except ValueError:
         train = validation = test = math.nan
     shares = train, validation, test
     if not all(share >= 0 for share in shares) or abs(sum(shares) - 100.0) > 1e-6:
-        raise UsageError(
-            f"{text!r} is no split",
-            cure="give percentages of train/validation/test that add up to 100: 80/10/10",
-        )
+        cure = "give percentages of train/validation/test that add up to 100: 80/10/10"
+        raise UsageError(f"{text!r} is no split", cure=cure)
     return shares
 
 
@@ -51,10 +45,9 @@ def split_of(dataset: str, segment: str, shares: Shares) -> str:
 
 
 def write_splits(folder: Path, entries: Iterable[Mapping[str, Any]], shares: Shares) -> dict[str, int]:
-    """Write ``splits/{train,validation,test}.txt``: one line ``dataset<TAB>scenario_id`` per scenario, in order.
+    """Write ``splits/{train,validation,test}.txt`` and return the number of scenarios per split.
 
-    Returns:
-        Number of scenarios per split.
+    Each has one line ``dataset<TAB>scenario_id`` per scenario, in order.
     """
     lines: dict[str, list[str]] = {name: [] for name in NAMES}
     for entry in entries:

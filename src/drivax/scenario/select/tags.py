@@ -15,9 +15,10 @@ from jaxtyping import Bool, Float, Int
 
 from drivax.geometry.polylines import arc_lengths
 from drivax.geometry.vectors import wrap
-from drivax.scenario.build.filling import Parts
-from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph
-from drivax.scenario.build.routes import STEP_M, Route
+from drivax.scenario.build.lanes import LaneGraph, end_headings
+from drivax.scenario.build.lights import Lights
+from drivax.scenario.build.routes import STEP_M, RouteSet
+from drivax.scenario.build.segments import spaced
 from drivax.scenario.build.tracks import LocalTracks
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import DT_S, AgentKind, Flag, among
@@ -58,12 +59,9 @@ BRAKING_MPS = 2.0
 
 @dataclass(frozen=True)
 class Driven:
-    """Log of the ego as poses at least half a metre apart.
+    """Log of the ego as poses at least half a metre apart: distance driven, unwrapped headings.
 
-    Attributes:
-        arc: Distance driven, metres.
-        heading: Unwrapped, radians.
-        lane: Dense lane index under every metre of the log, -1 without a lane.
+    ``lane`` is the dense index of the lane under every metre of the log, -1 without one.
     """
 
     arc: Float[Array, " pose"]
@@ -71,51 +69,38 @@ class Driven:
     lane: Int[Array, " metre"]
 
     @classmethod
-    def of(cls, tracks: LocalTracks, log: Route) -> Driven:
-        """Build from the track of the ego and the route of its log."""
+    def of(cls, tracks: LocalTracks, routes: RouteSet) -> Driven:
+        """Build from the track of the ego and the route of its log (row 1, if stored)."""
         valid = tracks.valid[tracks.ego]
         xy, heading = tracks.xyz[tracks.ego, valid, :2], tracks.heading[tracks.ego, valid]
-        keep = [0]
-        for i in range(1, len(xy)):
-            if np.hypot(*(xy[i] - xy[keep[-1]])) >= STEP_M:
-                keep.append(i)
+        keep = spaced(xy, STEP_M)
         arc = arc_lengths(xy[keep])
-        return cls(arc, np.unwrap(heading[keep]), log.lane[: int(arc[-1]) + 1])
+        lane = routes.routes[1].lane if len(routes.routes) > 1 else np.zeros(0, dtype=np.int64)
+        return cls(arc, np.unwrap(heading[keep]), lane[: int(arc[-1]) + 1])
 
 
-def scenario_tags(recording: Recording, parts: Parts, flags: Flag, routes: str) -> dict[str, str]:
-    """Return all tags of a scenario; ``routes`` names the source of its candidate routes."""
-    driven = Driven.of(parts.tracks, parts.routes.routes[1] if len(parts.routes.routes) > 1 else _nowhere())
-    kind = type_of(driven, parts.graph)
-    density = density_of(parts.tracks, recording.current_step)
+def scenario_tags(
+    recording: Recording, tracks: LocalTracks, graph: LaneGraph, routes: RouteSet, lights: Lights,
+    flags: Flag, style: str,
+) -> dict[str, str]:  # fmt: skip
+    """Return all tags of a scenario; ``style`` names the source of its candidate routes."""
+    driven = Driven.of(tracks, routes)
+    kind = type_of(driven, graph)
+    density = density_of(tracks, recording.current_step)
+    limits = "measured" if Flag.SPEED_LIMITS in flags else "none"
+    links = "chained" if Flag.CHAINED_GRAPH in flags else "given"
     return {
         **recording.tags,
         "dataset": recording.dataset,
         "type": kind,
-        "difficulty": difficulty_of(parts.tracks, kind, density),
+        "difficulty": difficulty_of(tracks, kind, density),
         "density": density,
         "moves": "yes" if driven.arc[-1] >= MOVES_M else "no",
-        "lights": "yes" if len(parts.lights.z) else "no",
-        "limits": _limits(flags),
-        "lane_graph": _lane_graph(flags),
-        "routes": routes,
+        "lights": "yes" if len(lights.z) else "no",
+        "limits": "default" if Flag.DEFAULT_LIMITS in flags else limits,
+        "lane_graph": links if Flag.LANE_GRAPH in flags else "none",
+        "routes": style,
     }
-
-
-def _nowhere() -> Route:
-    return Route(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64))
-
-
-def _limits(flags: Flag) -> str:
-    if Flag.DEFAULT_LIMITS in flags:
-        return "default"
-    return "measured" if Flag.SPEED_LIMITS in flags else "none"
-
-
-def _lane_graph(flags: Flag) -> str:
-    if Flag.LANE_GRAPH not in flags:
-        return "none"
-    return "chained" if Flag.CHAINED_GRAPH in flags else "given"
 
 
 def type_of(driven: Driven, graph: LaneGraph) -> str:
@@ -158,10 +143,7 @@ def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
     result = graph.interpolating.copy()
     if graph.count == 0:
         return result
-    row = np.arange(graph.count)
-    begin, end = (
-        graph.lines.heading(row, s, END_SPAN_M) for s in (np.zeros(graph.count), graph.lines.length)
-    )
+    begin, end = end_headings(graph.lines)
     for links, heading in ((graph.successor, end), (graph.predecessor, begin)):
         angle = wrap(heading[links][:, :, None] - heading[links][:, None])
         both = (links >= 0)[:, :, None] & (links >= 0)[:, None]
@@ -173,27 +155,17 @@ def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
 def _merges(lane: Int[Array, " metre"], graph: LaneGraph, junction: Bool[Array, " lane"]) -> bool:
     """Return whether the log continues on a lane that another lane enters, neither in a junction."""
     changes = np.flatnonzero(lane[1:] != lane[:-1])
-    for a, b in zip(lane[changes], lane[changes + 1], strict=True):
-        into = graph.predecessor[b]
-        into = into[into >= 0]
-        if a in into and len(into) > 1 and not junction[into].any():
-            return True
-    return False
+    entries = ((a, graph.predecessor[b]) for a, b in zip(lane[changes], lane[changes + 1], strict=True))
+    entries = ((a, into[into >= 0]) for a, into in entries)
+    return any(a in into and len(into) > 1 and not junction[into].any() for a, into in entries)
 
 
 def density_of(tracks: LocalTracks, current_step: int) -> str:
     """Return the density of road users within 50 m at the current step: below 5, 5 to 19, 20 or more."""
-    here = tracks.valid[:, current_step] & _is_road_user(tracks)
-    apart = np.hypot(*(tracks.xyz[:, current_step, :2] - tracks.xyz[tracks.ego, current_step, :2]).T)
-    count = int((here & (apart <= NEAR_M)).sum())
-    return TAGS["density"][int(np.searchsorted(DENSITY, count, side="right"))]
-
-
-def _is_road_user(tracks: LocalTracks) -> Bool[Array, " track"]:
-    """Mask of vehicles, pedestrians and cyclists other than the ego."""
     users = among(tracks.kind, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST))
     users[tracks.ego] = False
-    return users
+    apart = _apart(tracks, np.flatnonzero(users))[:, current_step]
+    return TAGS["density"][int(np.searchsorted(DENSITY, (apart <= NEAR_M).sum(), side="right"))]
 
 
 def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
@@ -203,10 +175,11 @@ def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
     within 15 m; a vehicle at 1 m/s or more within 20 m that crosses ego's heading at 45 to 135 degrees; and the log's
     ego losing 2 m/s of speed within a second. Distances are between centres at the same step, at any step of the log.
     """
+    vulnerable = np.flatnonzero(among(tracks.kind, (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)))
     demands = (
         kind not in ("straight", "lane_follow"),
         density == "high",
-        _meets_vulnerable(tracks),
+        bool((_apart(tracks, vulnerable) <= VULNERABLE_M).any()),
         _meets_crossing(tracks),
         _brakes(tracks),
     )
@@ -218,11 +191,6 @@ def _apart(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array, "row t
     offset = tracks.xyz[rows, :, :2] - tracks.xyz[tracks.ego, :, :2]
     both = tracks.valid[rows] & tracks.valid[tracks.ego]
     return np.where(both, np.hypot(offset[..., 0], offset[..., 1]), np.inf)
-
-
-def _meets_vulnerable(tracks: LocalTracks) -> bool:
-    rows = np.flatnonzero(among(tracks.kind, (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)))
-    return bool((_apart(tracks, rows) <= VULNERABLE_M).any())
 
 
 def _meets_crossing(tracks: LocalTracks) -> bool:

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.expert.comfort import discomfort
 from drivax.synthetic.expert.plan import plan_ego
-from drivax.synthetic.expert.violations import Violation, find_violation, is_staged, last_stop
+from drivax.synthetic.expert.violations import Violation, discomfort, find_violation, is_staged, last_stop
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import LaneChange, Path, Sway, lane_path, random_lanes
-from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, Staging
+from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Staging
 
-#: Experts that brake harder than this are rejected, m/s2: comfort (-4.05) in common driving, the end of the
-#: common law's range where an event leaves no choice.
+#: Hardest braking of an accepted expert, m/s2: nuPlan's comfort limit, and the IDM's limit in events.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
-#: Causes that no ego plan can fix, and a cause that a plan rarely fixes unless an event is staged.
+#: Causes that no plan can fix, and one that a plan rarely fixes unless an event is staged.
 _HOPELESS, _STUCK = ("ego_leaves_map", "other_runs_red", "others_collide"), "ego_hardly_moves"
 
 #: Runs traffic with a staging and ego's plan.
@@ -28,10 +26,7 @@ TrafficRun = Callable[[Staging, EgoPlan | None], Motion]
 
 def draw_expert(rng: np.random.Generator) -> Drivers:
     """Draw ego's car and driver: below the speed limit and well within comfort limits."""
-
-    def uniform(low: float, high: float) -> Float64[np.ndarray, " 1"]:
-        return rng.uniform(low, high, size=1)
-
+    uniform = partial(rng.uniform, size=1)
     size = np.array([[rng.uniform(4.5, 5.0), rng.uniform(1.85, 2.05), rng.uniform(1.5, 1.8)]])
     return Drivers(
         kind=np.full(1, AgentKind.VEHICLE, np.int8),
@@ -54,10 +49,7 @@ def draw_expert(rng: np.random.Generator) -> Drivers:
 def expert_lanes(
     network: RoadNetwork, lane: int, change_share: float, rng: np.random.Generator
 ) -> tuple[tuple[int, ...], LaneChange | None]:
-    """Draw ego's lanes from its first lane on, and sometimes a lane change on the third or fourth lane.
-
-    A predecessor of the first lane is included: a route needs room behind ego.
-    """
+    """Draw ego's lanes, a predecessor of the first one included, and sometimes a change on the third or fourth lane."""
     lanes = random_lanes(network, lane, rng)
     before = network.lanes[lane].predecessors
     if before:
@@ -72,7 +64,7 @@ def expert_lanes(
 
 
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
-    """Adjacent lanes that are long enough to change to."""
+    """Adjacent lanes of a lane that is long enough for a change."""
     this = network.lanes[lane]
     neighbour = [other for other in (this.left, this.right) if other >= 0]
     return [] if this.connector or not 70.0 < this.length_m < 100.0 else neighbour
@@ -96,16 +88,16 @@ def drive_ego(
 ) -> tuple[Motion, str]:
     """Drive ego like other traffic if that is acceptable, else along a plan that knows the others' motion.
 
-    Other agents react to a plan, so each plan is simulated and checked, and replaced where it fails.
+    Others react to a plan, so each plan is simulated and checked, and replaced where it fails.
 
     Args:
         roles: All users.
         times_s: Times of all steps, on the clock of the lights.
-        staging: What is staged.
-        first_step: Where the recording begins; from here on ego may be planned.
+        staging: The staged event.
+        first_step: First step of the recording and, at the earliest, of a plan.
         traffic_run: Runs the traffic: :meth:`drivax.synthetic.traffic.simulation.Traffic.run`.
-        aware_step: Ego reacts to the event from this step on, if that is early enough.
-        unplanned: What ``traffic_run`` gives without a plan, where that is known.
+        aware_step: Step from which ego reacts to the event, if that is early enough.
+        unplanned: Result of ``traffic_run`` without a plan, if known.
 
     Returns:
         The motion, and the cause of its rejection (empty: accepted).
@@ -142,10 +134,7 @@ def drive_ego(
 def _beginnings(
     roles: Roles, motion: Motion, violation: Violation, first_step: int, aware_step: int
 ) -> tuple[int, int, int]:
-    """Return the first steps of three plans, each earlier than the previous.
-
-    Only the last plan may begin before ego's last stop at a stop sign.
-    """
+    """Return the first steps of three plans, ever earlier; only the last may precede ego's last stop at a sign."""
     late = max(first_step, aware_step)
     stood = last_stop(roles, motion, first_step)
     if violation.cause == "ego_collides":

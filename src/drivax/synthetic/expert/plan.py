@@ -10,63 +10,62 @@ from jaxtyping import Bool, Float64
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.expert.reservations import Conflicts, StopLine, arrivals, find_conflicts, stop_lines
-from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smoothed
-from drivax.synthetic.expert.speed_search import TOUCH, Occupancy, SpeedPlan, search
-from drivax.synthetic.expert.trajectories import (
+from drivax.synthetic.expert.candidates import (
     SPACING_M,
     CandidatePath,
+    Conflicts,
     Shift,
+    StopLine,
+    arrivals,
     candidate_corners,
+    find_conflicts,
     shifted_path,
+    stop_lines,
 )
+from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smoothed
+from drivax.synthetic.expert.speed_search import TOUCH, Occupancy, SpeedPlan, search
 from drivax.synthetic.expert.violations import against_traffic, inside, user_boxes
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.traffic.lateral import located
 from drivax.synthetic.traffic.paths import Path
 from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 
-#: Bounds in the order in which they are tried: acceleration (m/s2) and jerk (m/s3).
-_BOUNDS: tuple[tuple[tuple[float, float], float], ...] = (
-    ((-3.4, 2.0), 2.6),
-    ((-4.0, 2.3), 4.1),
-    ((-5.9, 2.3), 25.0),
-)
-#: A plan along the path that costs less than this needs no alternatives.
+#: Bounds of acceleration (m/s2) and jerk (m/s3), tried in this order.
+_BOUNDS = (((-3.4, 2.0), 2.6), ((-4.0, 2.3), 4.1), ((-5.9, 2.3), 25.0))
+#: Cost below which the original path needs no alternatives.
 _CHEAP = 12.0
-#: Costs of leaving the path: constant, per m of offset, per second against traffic.
+#: Costs of a shift: constant, per m of offset, per second against traffic.
 _LEAVING, _ASIDE, _AGAINST = 8.0, 2.0, 6.0
 #: Cost of passing a line when the light is about to turn red or ego must give way.
 _LATE = 30.0
 #: Factor on proximity costs for pedestrians and cyclists.
 _PEOPLE = 12.0
-#: Steps by which the others' motion is extrapolated beyond the last one.
+#: Steps by which motion is extrapolated.
 _BEYOND_STEPS = 20
-#: Room left between ego and what it passes, m, and the lateral acceleration of the quintic step aside, m/s2: as
-#: liked, and when there is neither room nor time.
+#: Lateral gap to what ego passes, m, and lateral acceleration of the shift, m/s2: preferred and tightest.
 _ROOM_M, _STEP_MPS2 = (0.8, 0.4), (1.6, 3.8)
-#: Distance over which what is left of the difference between ego and its way disappears, m.
+#: Distance over which the remaining offset between ego and its path fades, m.
 _FADE_M = 10.0
-#: Furthest that ego goes aside, m.
+#: Largest shift, m.
 _FURTHEST_M = 4.5
 #: Exceeding a bound by this (m, m/s or m/s2) is rounding.
 _TOLERANCE = 0.03
 
+_Series = Float64[np.ndarray, " time"]
+_Hit = tuple[int, int, int]
+
 
 @dataclass(frozen=True)
-class _Scene:
-    """Planning input that all candidate paths share, from the first step of the plan on.
+class _State:
+    """Planning input that all candidates share, from the first step of the plan on.
 
     Attributes:
-        path: Ego's path.
-        pose, from_m: Where ego is now, and where on the path that is.
-        speed, acceleration: Ego's now; the acceleration is that of the step before.
-        size_m: Ego's size.
+        pose, from_m: Ego's pose and path position.
+        acceleration: Ego's acceleration in the step before.
         others, valid: Boxes of the other users, and when they exist.
-        passed_m: How far along the way ego came at each step in the last run.
-        lines: Stop lines ahead.
-        people: Rows of ``others`` on foot or on a bicycle.
-        unreactive: Rows of ``others`` who do not react to ego.
+        passed_m: Ego's distance along the path at each step of the last run.
+        people: Mask of pedestrians and cyclists among the others.
+        unreactive: Mask of others that do not react to ego.
     """
 
     roles: Roles
@@ -78,20 +77,16 @@ class _Scene:
     size_m: Float64[np.ndarray, " 3"]
     others: Float64[np.ndarray, "user time 6"]
     valid: Bool[np.ndarray, "user time"]
-    passed_m: Float64[np.ndarray, " time"]
+    passed_m: _Series
     lines: list[StopLine]
     people: Bool[np.ndarray, " user"]
     unreactive: Bool[np.ndarray, " user"]
 
-    @property
-    def reach_m(self) -> float:
-        """Largest distance that ego can travel, m."""
-        top = max(self.speed, 1.05 * float(np.max(self.path.limit_mps)))
-        return top * DT_S * self.others.shape[1] + 15.0
-
     def candidate(self, shift: Shift) -> CandidatePath:
-        """Return ego's path with a lateral shift."""
-        return shifted_path(self.path, self.roles.drivers, self.pose, (self.from_m, self.reach_m), shift)
+        """Return ego's path with a lateral shift, as far as ego can travel."""
+        top = max(self.speed, 1.05 * float(np.max(self.path.limit_mps)))
+        reach_m = top * DT_S * self.others.shape[1] + 15.0
+        return shifted_path(self.path, self.roles.drivers, self.pose, (self.from_m, reach_m), shift)
 
 
 @dataclass(frozen=True)
@@ -105,48 +100,34 @@ class _Option:
 
 
 def plan_ego(
-    roles: Roles,
-    motion: Motion,
-    times_s: Float64[np.ndarray, " time"],
-    first_step: int,
-    unreactive: frozenset[int] = frozenset(),
+    roles: Roles, motion: Motion, times_s: _Series, first_step: int, unreactive: frozenset[int] = frozenset()
 ) -> EgoPlan:
-    """Plan ego's motion.
+    """Plan ego's motion from a step on, given all users' motion in the last run.
 
-    Args:
-        roles: All users.
-        motion: Their motion in the last run; row 0 is ego.
-        times_s: Times of the motion's steps, on the clock of the lights.
-        first_step: Step from which ego drives as planned.
-        unreactive: Users that are not expected to react: they hit ego in an earlier run.
+    ``unreactive`` users hit ego in an earlier run and are not expected to react; ``times_s`` are on the lights' clock.
     """
-    scene = _scene(roles, motion, times_s, first_step, unreactive)
-    candidate, drive = _best_candidate(scene)
+    state = _state(roles, motion, times_s, first_step, unreactive)
+    candidate, drive = _best_candidate(state)
     steps = motion.xy.shape[1] - first_step
     xy, heading = candidate.pose(drive.at_m[:steps])
-    # The way begins within millimetres of the present pose; the rest fades over the first metres.
+    # The path starts within millimetres of ego; the difference fades over the first metres.
     fade = np.clip(1.0 - drive.at_m[:steps] / _FADE_M, 0.0, 1.0)
     xy += fade[:, None] * (motion.xy[0, first_step] - xy[0])
-    heading += fade * wrap(scene.pose.heading - heading[0])
+    heading += fade * wrap(state.pose.heading - heading[0])
     heading = heading[0] + np.concatenate([[0.0], np.cumsum(wrap(np.diff(heading)))])
     return EgoPlan(first_step, xy, heading, drive.speed[:steps])
 
 
-def _scene(
-    roles: Roles,
-    motion: Motion,
-    times_s: Float64[np.ndarray, " time"],
-    first_step: int,
-    unreactive: frozenset[int],
-) -> _Scene:
+def _state(
+    roles: Roles, motion: Motion, times_s: _Series, first_step: int, unreactive: frozenset[int]
+) -> _State:
     x, y = motion.xy[0, first_step]
     pose = Pose(float(x), float(y), float(motion.heading[0, first_step]))
     paths = motion.paths or roles.paths
     from_m = located(paths[0], motion.xy[0, first_step], float(motion.distance_m[0, first_step]))[0]
     boxes, valid = _continued(motion, first_step)
-    unreactive_rows = np.arange(1, len(motion.kind)) >= motion.vehicles
-    unreactive_rows |= np.isin(np.arange(1, len(motion.kind)), sorted(unreactive))
-    scene = _Scene(
+    rows = np.arange(1, len(motion.kind))
+    state = _State(
         roles=roles,
         path=paths[0],
         pose=pose,
@@ -159,15 +140,18 @@ def _scene(
         passed_m=np.zeros(boxes.shape[1]),
         lines=[],
         people=np.isin(motion.kind[1:], (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)),
-        unreactive=unreactive_rows,
+        unreactive=(rows >= motion.vehicles) | np.isin(rows, sorted(unreactive)),
     )
-    candidate = scene.candidate(Shift())
+    candidate = state.candidate(Shift())
     gap = candidate.xy[:, None] - motion.xy[0, first_step:]
     passed_m = candidate.base_m[np.argmin(np.sum(gap**2, axis=-1), axis=0)]
-    passed_m = np.append(passed_m, np.full(_BEYOND_STEPS, passed_m[-1]))
-    return replace(
-        scene, passed_m=passed_m, lines=_lines(roles, motion, times_s[first_step:], scene, passed_m)
-    )
+    state = replace(state, passed_m=_longer(passed_m))
+    return replace(state, lines=_lines(motion, times_s[first_step:], state))
+
+
+def _longer(values: np.ndarray) -> np.ndarray:
+    """Repeat the last value."""
+    return np.append(values, np.repeat(values[-1:], _BEYOND_STEPS))
 
 
 def _continued(
@@ -182,39 +166,31 @@ def _continued(
     return np.concatenate([box, longer], axis=1), np.concatenate([valid, more], axis=1)
 
 
-def _lines(
-    roles: Roles,
-    motion: Motion,
-    times_s: Float64[np.ndarray, " time"],
-    scene: _Scene,
-    passed_m: Float64[np.ndarray, " longer"],
-) -> list[StopLine]:
-    """Stop lines ahead, as they are during the plan and after it."""
+def _lines(motion: Motion, times_s: _Series, state: _State) -> list[StopLine]:
+    """Stop lines ahead, during the plan and after it."""
     steps, half = len(times_s), motion.size_m[: motion.vehicles, 0] / 2
-    paths = motion.paths or roles.paths
+    roles = state.roles
     distance, valid = motion.distance_m[:, -steps:], motion.valid[: motion.vehicles, -steps:]
-    first = {
-        lane: np.append(taken, np.repeat(taken[-1:], _BEYOND_STEPS))
-        for lane, taken in arrivals(roles.network, paths, distance, valid, half).items()
-    }
+    coming = arrivals(roles.network, motion.paths or roles.paths, distance, valid, half)
+    first = {lane: _longer(taken) for lane, taken in coming.items()}
     longer = np.append(times_s, times_s[-1] + DT_S * np.arange(1, _BEYOND_STEPS + 1))
-    ego = (scene.from_m, float(half[0]))
-    return stop_lines(roles.network, scene.path, ego, longer, scene.from_m + passed_m, first)
+    ego, passed = (state.from_m, float(half[0])), state.from_m + state.passed_m
+    return stop_lines(roles.network, state.path, ego, longer, passed, first)
 
 
-def _best_candidate(scene: _Scene) -> tuple[CandidatePath, SpeedProfile]:
-    """Return the cheapest smooth collision-free candidate, else the one that violates its bounds least."""
-    candidate = scene.candidate(Shift())
-    conflicts = _conflicts(scene, candidate)
-    options = [_option(scene, candidate, conflicts)]
+def _best_candidate(state: _State) -> tuple[CandidatePath, SpeedProfile]:
+    """Return the cheapest feasible candidate, else the one that violates its bounds least."""
+    candidate = state.candidate(Shift())
+    conflicts = _conflicts(state, candidate)
+    options = [_option(state, candidate, conflicts)]
     drives: list[tuple[float, CandidatePath, SpeedProfile]] = []
     if options[0].cost < _CHEAP:
-        drive = _smooth(scene, options[0])
+        drive = _smooth(state, options[0])
         if drive.excess <= _TOLERANCE:
             return candidate, drive
-    options += _passing_options(scene, candidate, conflicts)
+    options += _passing_options(state, candidate, conflicts)
     for option in sorted(options, key=lambda option: option.cost):
-        drive = _smooth(scene, option)
+        drive = _smooth(state, option)
         if drive.excess <= _TOLERANCE and not option.speeds.touches:
             return option.candidate, drive
         drives.append((drive.excess + 100.0 * option.speeds.touches, option.candidate, drive))
@@ -222,65 +198,59 @@ def _best_candidate(scene: _Scene) -> tuple[CandidatePath, SpeedProfile]:
     return candidate, drive
 
 
-def _conflicts(scene: _Scene, candidate: CandidatePath) -> Conflicts:
-    """Return conflicts along a path, without vehicles that follow ego and will react."""
-    conflicts = find_conflicts(candidate, scene.size_m, scene.others, scene.valid, scene.people)
-    follows = np.zeros(len(scene.others), bool)
+def _conflicts(state: _State, candidate: CandidatePath) -> Conflicts:
+    """Return conflicts along a candidate, without those of vehicles that follow ego and will react."""
+    conflicts = find_conflicts(candidate, state.size_m, state.others, state.valid, state.people)
+    follows = np.zeros(len(state.others), bool)
     order = np.lexsort((-conflicts.point, conflicts.step, conflicts.user))
     users, first = np.unique(conflicts.user[order], return_index=True)
     step, point = conflicts.step[order][first], conflicts.point[order][first]
-    box = scene.others[users, step]
+    box = state.others[users, step]
     along = box[:, 2] * np.cos(candidate.heading[point]) + box[:, 3] * np.sin(candidate.heading[point])
-    behind = candidate.base_m[point] < scene.passed_m[step]
-    follows[users] = behind & (along > 0.7) & ~scene.unreactive[users]
+    behind = candidate.base_m[point] < state.passed_m[step]
+    follows[users] = behind & (along > 0.7) & ~state.unreactive[users]
     return conflicts.only(~follows[conflicts.user])
 
 
-def _option(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> _Option:
-    occupancy = _occupancy(scene, candidate, conflicts)
-    speeds = search(occupancy, candidate.preferred_mps, candidate.limit_mps, scene.speed)
+def _option(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Option:
+    occupancy = _occupancy(state, candidate, conflicts)
+    speeds = search(occupancy, candidate.preferred_mps, candidate.limit_mps, state.speed)
     cost = speeds.cost
     if candidate.shift.aside_m:
-        wrong = (
-            against_traffic(scene.roles.network, candidate.xy[::4], candidate.heading[::4]).sum()
-            * 4
-            * SPACING_M
-        )
-        cost += (
-            _LEAVING + _ASIDE * abs(candidate.shift.aside_m) + _AGAINST * float(wrong) / max(scene.speed, 4.0)
-        )
+        wrong = against_traffic(state.roles.network, candidate.xy[::4], candidate.heading[::4])
+        wrong_m, aside = float(wrong.sum() * 4 * SPACING_M), abs(candidate.shift.aside_m)
+        cost += _LEAVING + _ASIDE * aside + _AGAINST * wrong_m / max(state.speed, 4.0)
     return _Option(candidate, occupancy, speeds, cost)
 
 
-def _occupancy(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> Occupancy:
-    """Return the occupancy of a path by others, closed stop lines, and the end of the map."""
-    shape = (scene.others.shape[1], len(candidate.xy))
+def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> Occupancy:
+    """Return the occupancy of a candidate by others, stop lines, and the end of the map."""
+    shape = (state.others.shape[1], len(candidate.xy))
     hard, near = np.zeros(shape, bool), np.zeros(shape)
-    np.maximum.at(
-        near, (conflicts.step, conflicts.point), np.where(scene.people[conflicts.user], _PEOPLE, 1.0)
-    )
+    weight = np.where(state.people[conflicts.user], _PEOPLE, 1.0)
+    np.maximum.at(near, (conflicts.step, conflicts.point), weight)
     hard[conflicts.step[conflicts.hard], conflicts.point[conflicts.hard]] = True
-    thick = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + scene.speed) + 0.5) / SPACING_M))
-    for line in scene.lines:
+    thick = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + state.speed) + 0.5) / SPACING_M))
+    for line in state.lines:
         if line.base_m < candidate.base_m[-1]:
             place = int(np.searchsorted(candidate.base_m, line.base_m))
             hard[line.closed, place : place + thick] = True
             near[line.late, place : place + thick] = _LATE
-    room = scene.path.length_m - scene.from_m - scene.size_m[0] / 2 - 0.5
+    room = state.path.length_m - state.from_m - state.size_m[0] / 2 - 0.5
     hard[:, candidate.base_m > room] = True
     return Occupancy(SPACING_M, hard, near)
 
 
-def _smooth(scene: _Scene, option: _Option) -> SpeedProfile:
+def _smooth(state: _State, option: _Option) -> SpeedProfile:
     """Smooth an option's speeds within the tightest feasible bounds."""
-    at, speed = option.speeds.fine(scene.others.shape[1])
-    speed[0] = scene.speed
+    at, speed = option.speeds.fine(state.others.shape[1])
+    speed[0] = state.speed
     hard = option.occupancy.hard[1:]
     place = np.arange(hard.shape[1])
     own = np.clip(np.rint(at[1:] / SPACING_M).astype(int), 0, len(place) - 1)
     below = np.where(hard & (place < own[:, None]), place, -1).max(axis=1)
     above = np.where(hard & (place > own[:, None]), place, len(place)).min(axis=1)
-    # Where even the best speeds touch something there is nothing to keep to.
+    # Steps at which even the best speeds touch something are unbounded.
     lost = hard[np.arange(len(hard)), own]
     low = np.where((below >= 0) & ~lost, (below + 1) * SPACING_M, -np.inf)
     high = np.where(lost, np.inf, (above - 1) * SPACING_M)
@@ -289,46 +259,45 @@ def _smooth(scene: _Scene, option: _Option) -> SpeedProfile:
     drive = None
     for acceleration, jerk in _BOUNDS:
         bounds = Bounds(low, np.maximum(high, low), top, acceleration, jerk)
-        drive = smoothed(at, speed, scene.acceleration, bounds)
+        drive = smoothed(at, speed, state.acceleration, bounds)
         if drive.excess <= _TOLERANCE:
             break
     assert drive is not None
     return drive
 
 
-def _passing_options(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> list[_Option]:
-    """Return options that pass the first obstacle at the preferred speed; none without an obstacle."""
-    hit = _first_hit(scene, candidate, conflicts)
+def _passing_options(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> list[_Option]:
+    """Return options that pass the first obstacle, if there is one."""
+    hit = _first_hit(state, candidate, conflicts)
     if hit is None:
         return []
-    rings = tuple(edge.xy for edge in scene.roles.network.edges)
+    rings = tuple(edge.xy for edge in state.roles.network.edges)
     result = []
     for side in (1.0, -1.0):
-        for room, step_mps2 in zip(_ROOM_M, _STEP_MPS2, strict=True):
-            shift = _shift(scene, candidate, conflicts, hit, side, room, step_mps2)
+        for margins in zip(_ROOM_M, _STEP_MPS2, strict=True):
+            shift = _shift(state, candidate, conflicts, hit, side, margins)
             if shift is None:
                 continue
-            candidate_aside = scene.candidate(shift)
-            if not bool(inside(candidate_corners(candidate_aside, scene.size_m + 0.2), rings).all()):
+            shifted = state.candidate(shift)
+            if not bool(inside(candidate_corners(shifted, state.size_m + 0.2), rings).all()):
                 continue
-            option = _option(scene, candidate_aside, _conflicts(scene, candidate_aside))
+            option = _option(state, shifted, _conflicts(state, shifted))
             result.append(option)
             if option.cost < TOUCH:
                 break
     return result
 
 
-def _first_hit(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> tuple[int, int, int] | None:
-    """Return user, step and path sample of the first collision of a drive that ignores all users."""
-    at, speed, places = 0.0, scene.speed, []
-    for _ in range(scene.others.shape[1]):
+def _first_hit(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Hit | None:
+    """Return user, step and path sample of the first collision at the preferred speeds."""
+    at, speed, places = 0.0, state.speed, []
+    for _ in range(state.others.shape[1]):
         places.append(at)
         index = min(int(at / SPACING_M), len(candidate.xy) - 1)
         speed = min(speed + 1.5 * DT_S, max(float(candidate.preferred_mps[index]), speed - 2.0 * DT_S))
         at += speed * DT_S
-    touch = conflicts.hard & (
-        np.abs(conflicts.point * SPACING_M - np.array(places)[conflicts.step]) < 0.3 + 0.05 * scene.speed
-    )
+    apart = np.abs(conflicts.point * SPACING_M - np.array(places)[conflicts.step])
+    touch = conflicts.hard & (apart < 0.3 + 0.05 * state.speed)
     if not touch.any():
         return None
     first = int(np.flatnonzero(touch)[np.argmin(conflicts.step[touch])])
@@ -336,30 +305,34 @@ def _first_hit(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) ->
 
 
 def _shift(
-    scene: _Scene,
+    state: _State,
     candidate: CandidatePath,
     conflicts: Conflicts,
-    hit: tuple[int, int, int],
+    hit: _Hit,
     side: float,
-    room_m: float,
-    step_mps2: float,
+    margins: tuple[float, float],
 ) -> Shift | None:
-    """Return the shift that passes a user, and standing users close behind it, on one side."""
-    begin, end, edge = _extent(scene, candidate, hit, side)
-    half_l, half_w = scene.size_m[0] / 2 + 1.0, scene.size_m[1] / 2
+    """Return the shift that passes a user, and standing users close behind it, on one side (1: left, -1: right)."""
+    room_m, step_mps2 = margins
+    begin, end, edge = _extent(state, candidate, hit, side)
+    half_l, half_w = state.size_m[0] / 2 + 1.0, state.size_m[1] / 2
     seen = {hit[0]}
-    standing = [int(u) for u in np.unique(conflicts.user[conflicts.hard]) if _stands(scene, int(u))]
+    standing = [
+        user
+        for user in np.unique(conflicts.user[conflicts.hard]).tolist()
+        if np.ptp(state.others[user, state.valid[user], :2], axis=0).max() < 0.5
+    ]
     for user in sorted(standing, key=lambda u: int(conflicts.point[conflicts.user == u].min())):
         mine = conflicts.hard & (conflicts.user == user)
         place = int(conflicts.point[mine].min())
         if user not in seen and begin < place * SPACING_M < end + 20.0:
-            more = _extent(scene, candidate, (user, int(conflicts.step[mine].min()), place), side)
+            more = _extent(state, candidate, (user, int(conflicts.step[mine].min()), place), side)
             end, edge = max(end, more[1]), max(edge, more[2])
             seen.add(user)
     aside = edge + half_w + room_m
     if not 0.15 < aside < _FURTHEST_M:
         return None
-    speed = max(scene.speed, float(candidate.preferred_mps[hit[2]]) * 0.7)
+    speed = max(state.speed, float(candidate.preferred_mps[hit[2]]) * 0.7)
     length = max(speed * float(np.sqrt(5.77 * aside / step_mps2)), 3.0 * aside, 8.0)
     gentle = max(length, speed * float(np.sqrt(5.77 * aside / _STEP_MPS2[0])))
     out = max(0.0, begin - half_l - length)
@@ -368,24 +341,16 @@ def _shift(
     return Shift(side * aside, out, there, back, back + gentle)
 
 
-def _stands(scene: _Scene, user: int) -> bool:
-    """Whether a user stays within half a metre."""
-    xy = scene.others[user, scene.valid[user], :2]
-    return bool(np.ptp(xy, axis=0).max() < 0.5)
-
-
-def _extent(
-    scene: _Scene, candidate: CandidatePath, hit: tuple[int, int, int], side: float
-) -> tuple[float, float, float]:
+def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> tuple[float, float, float]:
     """Return a user's longitudinal range and its lateral extent on one side of the path at the conflict."""
     user, step, point = hit
-    box = scene.others[user, step]
+    box = state.others[user, step]
     c, s = float(np.cos(candidate.heading[point])), float(np.sin(candidate.heading[point]))
     offset = corners(box) - candidate.xy[point]
     along, left = offset @ np.array([c, s]), offset @ np.array([-s, c])
-    # Who goes along with ego, or against it, is passed over a longer stretch.
-    later = min(step + 10, len(scene.others[user]) - 1)
-    moved = (scene.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
+    # Moving users are passed over a longer stretch.
+    later = min(step + 10, len(state.others[user]) - 1)
+    moved = (state.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
     at = point * SPACING_M
     ahead, behind = max(3.0 * moved, 0.7 * -moved, 0.0), max(0.7 * abs(moved), 0.0)
     return at + float(along.min()) - behind, at + float(along.max()) + ahead, float((side * left).max())

@@ -1,8 +1,8 @@
-"""From a coarse drive to a smooth one: the least squares of acceleration and jerk within bounds.
+"""Smooth a coarse speed plan: least squares of acceleration and jerk within bounds.
 
-A quadratic programme whose bounds are quadratic penalties on what exceeds them, solved by Newton's method: the
-function is convex and piecewise quadratic, so it ends after a few steps when each goes to the least value on its line
-(Mangasarian, "A finite Newton method for classification", Optim. Methods Softw. 17, 2002).
+A quadratic programme with quadratic penalties for its bounds, solved by Newton's method with an exact line search:
+the objective is convex and piecewise quadratic, so a few steps suffice (Mangasarian, "A finite Newton method for
+classification", Optim. Methods Softw. 17, 2002).
 """
 
 from __future__ import annotations
@@ -15,49 +15,45 @@ from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S
 
-#: Weights of squared acceleration, jerk, and difference to the coarse drive's speed and place.
+#: Weights of squared acceleration, jerk, and deviation from the coarse speed and position.
 _ACCELERATION, _JERK, _SPEED, _PLACE = 0.3, 0.6, 0.4, 0.03
 _PENALTY = 3e5
 #: Steps from one knot of acceleration to the next.
 _KNOT_STEPS = 3
 _NEWTON_STEPS, _BISECTIONS, _SMALLEST = 40, 12, 1e-4
 
+_Series = Float64[np.ndarray, " time"]
+_Later = Float64[np.ndarray, " later"]
+_Rows = Float64[np.ndarray, " m"]
+_Knots = Float64[np.ndarray, " n"]
+_Matrix = Float64[np.ndarray, "m n"]
+
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a drive must keep to.
+    """Bounds of positions (low and high) and top speed at each step but the first, of acceleration, and of jerk."""
 
-    Attributes:
-        low_m, high_m: Where ego's centre may be at each step but the first.
-        top_mps: Highest speed at each step but the first.
-        acceleration_mps2: Lowest and highest acceleration.
-        jerk_mps3: Largest jerk.
-    """
-
-    low_m: Float64[np.ndarray, " later"]
-    high_m: Float64[np.ndarray, " later"]
-    top_mps: Float64[np.ndarray, " later"]
+    low_m: _Later
+    high_m: _Later
+    top_mps: _Later
     acceleration_mps2: tuple[float, float]
     jerk_mps3: float
 
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """A drive from the present step on: distance and speed, and by how much it exceeds its bounds (in their units)."""
+    """Distance and speed from the present step on, and the largest excess over a bound (in its unit)."""
 
-    at_m: Float64[np.ndarray, " time"]
-    speed: Float64[np.ndarray, " time"]
+    at_m: _Series
+    speed: _Series
     excess: float
 
 
 @cache
 def _matrices(steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """From accelerations at knots to distances, speeds, accelerations and jerks, one below the other.
+    """Map accelerations at knots to stacked distances, speeds, accelerations and jerks.
 
-    Acceleration is constant within a step and linear between knots from step to step.
-
-    Returns:
-        The rows, and the matrix of the squares in the sum that is minimised.
+    Acceleration is constant within a step and linear between knots. Also returns the matrix of the objective.
     """
     n, m = np.arange(steps)[:, None], np.arange(steps)
     knots = np.arange(0, steps + _KNOT_STEPS - 1, _KNOT_STEPS)
@@ -70,30 +66,19 @@ def _matrices(steps: int) -> tuple[np.ndarray, np.ndarray]:
     return rows, _squares(rows, weight)
 
 
-def _squares(
-    rows: Float64[np.ndarray, "m n"], weight: Float64[np.ndarray, " m"]
-) -> Float64[np.ndarray, "n n"]:
-    """``R' diag(w) R``. Unlike a product by BLAS its bits do not depend on the number of threads."""
+def _squares(rows: _Matrix, weight: _Rows) -> Float64[np.ndarray, "n n"]:
+    """``R' diag(w) R``, whose bits do not depend on the number of threads as those of BLAS do."""
     return np.einsum("ki,kj->ij", rows * weight[:, None], rows)
 
 
-def _times(rows: Float64[np.ndarray, "m n"], values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
+def _times(rows: _Matrix, values: _Knots) -> _Rows:
     return np.einsum("ij,j->i", rows, values)
 
 
-def smoothed(
-    at_m: Float64[np.ndarray, " time"],
-    speed: Float64[np.ndarray, " time"],
-    acceleration_mps2: float,
-    bounds: Bounds,
-) -> SpeedProfile:
-    """The smoothest drive near a coarse one.
+def smoothed(at_m: _Series, speed: _Series, acceleration_mps2: float, bounds: Bounds) -> SpeedProfile:
+    """Return the smoothest speed profile near a coarse plan (distances from 0, speeds; the first speed is kept).
 
-    Args:
-        at_m: Distances of the coarse drive; the first is 0.
-        speed: Its speeds; the first is kept.
-        acceleration_mps2: Acceleration just before the first step.
-        bounds: What to keep to.
+    ``acceleration_mps2`` is the acceleration just before the first step.
     """
     steps = len(at_m) - 1
     rows, base = _matrices(steps)
@@ -105,7 +90,7 @@ def smoothed(
     )
     target = _times(rows.T, linear_terms)
     low_a, high_a = (np.full(steps, a) for a in bounds.acceleration_mps2)
-    # Jerk counts a tenth, so that a bound is exceeded by about as much as one of the others.
+    # Jerk counts a tenth, so that all bounds are exceeded by similar amounts.
     scale = np.repeat([1.0, 0.1], [3 * steps, steps])
     limit = np.full(steps, bounds.jerk_mps3)
     high = np.concatenate([bounds.high_m - free, bounds.top_mps - speed[0], high_a, before + limit])
@@ -118,12 +103,8 @@ def smoothed(
 
 
 def _least(
-    base: Float64[np.ndarray, "n n"],
-    target: Float64[np.ndarray, " n"],
-    rows: Float64[np.ndarray, "m n"],
-    low: Float64[np.ndarray, " m"],
-    high: Float64[np.ndarray, " m"],
-) -> Float64[np.ndarray, " n"]:
+    base: Float64[np.ndarray, "n n"], target: _Knots, rows: _Matrix, low: _Rows, high: _Rows
+) -> _Knots:
     """Minimise ``a B a / 2 - t a`` and the penalties of ``low <= R a <= high`` by Newton steps with a line search."""
     a = np.linalg.solve(base, target)
     value = _times(rows, a)
@@ -145,19 +126,10 @@ def _least(
     return a
 
 
-def _share(
-    value: Float64[np.ndarray, " m"],
-    change: Float64[np.ndarray, " m"],
-    limits: tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]],
-    rise: tuple[float, float],
-) -> float:
-    """How much of a Newton step leads to the least value on its line: where the derivative is zero, by bisection.
+def _share(value: _Rows, change: _Rows, limits: tuple[_Rows, _Rows], rise: tuple[float, float]) -> float:
+    """Share of a Newton step that minimises the objective: its derivative vanishes, by bisection.
 
-    Args:
-        value: What is bounded, before the step.
-        change: By how much the whole step changes it.
-        limits: Its bounds.
-        rise: First and second derivative of the function without penalties.
+    ``rise`` is the first and second derivative of the objective without penalties.
     """
     low, high = limits
 
@@ -176,7 +148,7 @@ def _share(
 
 
 def _profile(speed: float, a: Float64[np.ndarray, " step"], excess: float) -> SpeedProfile:
-    """Speeds below zero, and creeping where the car has as good as stopped, become standing."""
+    """Integrate accelerations; speeds below 3 cm/s become 0."""
     after = speed + np.cumsum(a) * DT_S
     after = np.where(after < 0.03, 0.0, after)
     whole = np.concatenate([[speed], after])

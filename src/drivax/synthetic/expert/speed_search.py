@@ -1,7 +1,7 @@
 """Speed search along a path by dynamic programming over position, speed and time.
 
-Steps of 0.5 s, speeds on a grid that holds the present speed, and a grid of places on which every step ends exactly:
-with speeds ``i dv`` a step covers ``(i + j) dv dt / 2``. One step is one gather over (acceleration, speed, place).
+Steps of 0.5 s, and grids of speeds and positions on which every step ends exactly: with speeds ``i dv`` a step covers
+``(i + j) dv dt / 2``. One step is one gather over (acceleration, speed, position).
 """
 
 from __future__ import annotations
@@ -16,28 +16,25 @@ from drivax.scenario.schema import DT_S
 #: Steps of the recording in one step of the search.
 COARSE = 5
 _STEP_S = COARSE * DT_S
-#: Speeds are at most this far apart, m/s: accelerations are then at most 1.5 m/s2 apart.
+#: Largest spacing of speeds, m/s: accelerations are at most 1.5 m/s2 apart.
 _SPEED_STEP_MPS = 0.75
-#: Bounds of acceleration, m/s2; comfort ends where accelerations begin to cost more.
+#: Lowest and highest acceleration, m/s2, and the one below which braking costs more.
 _HARDEST_MPS2, _FASTEST_MPS2, _COMFORT_MPS2 = -6.05, 2.3, -3.0
-#: Costs per second: of (m/s2)^2, of (m/s)^2 below and above the liked speed, and of speed beyond what bends allow.
+#: Costs per second: of (m/s2)^2, and of (m/s)^2 below and above the preferred speed, and above the limit of bends.
 _ACCELERATION, _SLOW, _FAST, _BEND = 1.0, 0.1, 0.6, 50.0
-#: Cost of acceleration beyond comfort, of driving close behind, of being close at 5 m/s.
+#: Costs of hard braking, of a short time gap, and of a small distance at 5 m/s.
 _HARD_BRAKING, _CLOSE_BEHIND, _CLOSE = 3.0, 6.0, 8.0
-#: Liked distance to what is ahead: 1 m and this many seconds.
+#: Preferred gap to what is ahead: 1 m and this time, s.
 _HEADWAY_S = 1.1
-#: Cost of touching, times at least 0.02: larger than any other sum.
+#: Cost of contact, times at least 0.02: larger than any other sum.
 TOUCH = 1e5
 
 
 @dataclass(frozen=True)
 class Occupancy:
-    """Occupancy of a path by step (axis 0) and distance from ego (axis 1, even spacing).
+    """Occupancy of a path by step (axis 0) and evenly spaced distance from ego (axis 1).
 
-    Attributes:
-        spacing_m: Distance between places.
-        hard: True where ego's centre must not be.
-        near: How much it should not be there: 0 to 1 or more.
+    ``hard`` is a mask of places that ego's centre must avoid, ``near`` the weight of those that it should avoid.
     """
 
     spacing_m: float
@@ -47,7 +44,7 @@ class Occupancy:
 
 @dataclass(frozen=True)
 class SpeedPlan:
-    """Speeds at the coarse steps, and what they cost (``TOUCH`` or more: something is touched)."""
+    """Speeds at the coarse steps, their cost, and whether something is touched."""
 
     speed: Float64[np.ndarray, " coarse"]
     cost: float
@@ -63,11 +60,10 @@ class SpeedPlan:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Speeds, places, accelerations, and from where each (acceleration, speed, place) is reached."""
+    """Speeds, places, the state from which each (acceleration, speed, place) is reached, and costs of acceleration."""
 
     speed: Float32[np.ndarray, " speed"]
     place: Float64[np.ndarray, " place"]
-    change: Int64[np.ndarray, " change"]
     source: Int64[np.ndarray, "change speed place"]
     effort: Float32[np.ndarray, " change"]
 
@@ -85,14 +81,12 @@ def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]
     before = v - change[:, None]
     source = s - (before + v)[..., None]
     possible = (before >= 0)[..., None] & (before < speeds)[..., None] & (source >= 0)
-    # Impossible ones lead to one more entry at the end, which is infinite.
+    # Impossible transitions come from an extra state with infinite cost.
     source = np.where(possible, before[..., None] * places + source, speeds * places)
     a = change * unit
     effort = _ACCELERATION * a**2 + _HARD_BRAKING * np.maximum(_COMFORT_MPS2 - a, 0.0) ** 2
-    grid = _Grid(
-        (v * step).astype(np.float32), s * spacing, change, source, (effort * _STEP_S).astype(np.float32)
-    )
-    return grid, index
+    effort = (effort * _STEP_S).astype(np.float32)
+    return _Grid((v * step).astype(np.float32), s * spacing, source, effort), index
 
 
 def search(
@@ -101,23 +95,16 @@ def search(
     limit_mps: Float64[np.ndarray, " place"],
     speed_mps: float,
 ) -> SpeedPlan:
-    """Return the cheapest speeds.
-
-    Args:
-        occupancy: What is taken, from the present step on.
-        preferred_mps: Liked speed at the places of ``occupancy``.
-        limit_mps: Speed that bends allow there.
-        speed_mps: Speed now.
-    """
+    """Return the cheapest speeds from the present one, with preferred and largest speeds at the places of a path."""
     steps = -(-(len(occupancy.hard) - 1) // COARSE)
     reach = occupancy.spacing_m * (occupancy.hard.shape[1] - 1)
     top = max(float(preferred_mps.max()), speed_mps)
     reach = min(reach, (top + 1.0) * (steps + 1) * _STEP_S)
     grid, start = _grid(speed_mps, top, reach)
     speeds, places = len(grid.speed), len(grid.place)
-    liked = np.interp(grid.place, occupancy.spacing_m * np.arange(len(preferred_mps)), preferred_mps)
+    preferred = np.interp(grid.place, occupancy.spacing_m * np.arange(len(preferred_mps)), preferred_mps)
     bound = np.interp(grid.place, occupancy.spacing_m * np.arange(len(limit_mps)), limit_mps)
-    difference = grid.speed[:, None] - liked
+    difference = grid.speed[:, None] - preferred
     over = np.maximum(grid.speed[:, None] - bound, 0.0)
     always = np.where(difference > 0, _FAST, _SLOW) * difference**2 + _BEND * over**2
     always = (always * _STEP_S).astype(np.float32)
@@ -148,15 +135,15 @@ def _traced(grid: _Grid, layers: Float32[np.ndarray, "coarse state"], taken: _Ta
 
 
 class _Taken:
-    """Costs of claims at (speed, place); within half a coarse step a state is taken to keep its speed."""
+    """Costs of occupied states (speed, place), which keep their speed within half a coarse step."""
 
     def __init__(self, occupancy: Occupancy, grid: _Grid) -> None:
-        self._occupancy, self._grid = occupancy, grid
+        self._occupancy = occupancy
         half = COARSE // 2
         places = occupancy.hard.shape[1]
         moved = grid.place + (DT_S * np.arange(-half, half + 1))[:, None, None] * grid.speed[:, None]
         self._index = np.clip(np.rint(moved / occupancy.spacing_m).astype(int), 0, places - 1)
-        # The steps around one, as one row: what happens at the last step goes on.
+        # The last step is continued.
         price = TOUCH * occupancy.hard + (_CLOSE * DT_S) * occupancy.near
         price = np.concatenate([price, np.repeat(price[-1:], COARSE + half, axis=0)]).astype(np.float32)
         self._price, self._places = price.ravel(), places
@@ -184,7 +171,7 @@ class _Taken:
 
 
 def _free_ahead(occupancy: Occupancy) -> Float32[np.ndarray, "time place"]:
-    """Distance from each place to the next one ahead that is taken, m; 1 km where none is."""
+    """Distance from each place to the next hard one ahead, m (1 km: none)."""
     places = occupancy.hard.shape[1]
     index = np.where(occupancy.hard, np.arange(places), places + round(1000.0 / occupancy.spacing_m))
     nearest = np.minimum.accumulate(index[:, ::-1], axis=1)[:, ::-1]

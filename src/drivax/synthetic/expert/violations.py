@@ -1,14 +1,19 @@
-"""Violations that reject a generated scenario: collisions, broken rules, harsh braking, leaving the road."""
+"""Checks of a generated motion: violations that reject it, and nuPlan's comfort limits.
+
+The quantities of comfort are those of :mod:`drivax.metrics.comfort`, over a whole recording at once, without JAX.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from drivax.geometry.boxes import corners, overlap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
@@ -17,27 +22,37 @@ from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 
 #: Margin around ego in overlap tests, m: covers replay in float32 and the noise of recorded tracks.
 EGO_SKIN_M = 0.1
-#: An ego that moves less than this shows nothing, m.
+#: Least distance that ego must travel, m.
 _LEAST_M = 10.0
-#: A stop at a line: below this speed, within this distance, this long before passing.
+#: A stop at a line: below this speed, within this distance, within this time before passing.
 _STANDING_MPS, _BEFORE_LINE_M, _STOOD_S = 0.5, 3.0, 3.0
-#: Travelling against traffic for longer than this within 1 s is what the metric ``wrong_way`` counts, m.
+#: Distance against traffic within 1 s from which on the metric ``wrong_way`` counts it, m.
 _WRONG_WAY_M = 2.0
 #: Ego is off its route beyond this distance from the route's lanes, m; the metric uses 2.
 _OFF_ROUTE_M = 1.9
-#: Lanes of both directions that are as near as this, to each other, tell nothing, m.
+#: Lanes of both directions whose distances differ by less than this leave the direction open, m.
 _DOUBT_M = 0.5
+#: Lowest and highest value of each quantity of comfort (nuPlan).
+LIMITS: dict[str, tuple[float, float]] = {
+    "longitudinal_mps2": (-4.05, 2.40),
+    "lateral_mps2": (-4.89, 4.89),
+    "jerk_mps3": (-4.13, 4.13),
+    "jerk_magnitude_mps3": (-8.37, 8.37),
+    "yaw_rate_rps": (-0.95, 0.95),
+    "yaw_acceleration_rps2": (-1.93, 1.93),
+}
+
+#: A number and a flag per time step.
+_Series = Float64[np.ndarray, " time"]
+_Steps = Bool[np.ndarray, " step"]
+_UserPairs = Bool[np.ndarray, "user user"]
+_LaneSteps = Bool[np.ndarray, "step lane"]
+_Points = Float64[np.ndarray, "time 2"]
 
 
 @dataclass(frozen=True)
 class Violation:
-    """Why a scenario is rejected.
-
-    Attributes:
-        cause: A word for it, or empty.
-        users: The rows of the motion that ego touches, if that is the cause.
-        step: When it first does.
-    """
+    """Reason to reject a scenario (empty: none), and for collisions the users that ego touches and the first step."""
 
     cause: str = ""
     users: tuple[int, ...] = ()
@@ -52,22 +67,11 @@ def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
 
 
 def find_violation(
-    roles: Roles,
-    motion: Motion,
-    times_s: Float64[np.ndarray, " time"],
-    first_step: int,
-    staging: Staging,
-    hardest_mps2: float,
+    roles: Roles, motion: Motion, times_s: _Series, first_step: int, staging: Staging, hardest_mps2: float
 ) -> Violation:
-    """Find the first violation of a motion from a step on.
+    """Find the first violation of a motion from a step on; a staged event excuses driving against traffic.
 
-    Args:
-        roles: All users.
-        motion: Their motion.
-        times_s: Times of its steps, on the clock of the lights.
-        first_step: Where the recording begins.
-        staging: The staged event, which excuses driving against traffic.
-        hardest_mps2: Ego must not brake harder than this.
+    ``times_s`` are on the clock of the lights.
     """
     now = slice(first_step, None)
     speed = motion.speed[0, now]
@@ -77,9 +81,9 @@ def find_violation(
         return Violation("ego_leaves_map")
     box = user_boxes(motion)[:, now]
     pairs = touching(box, motion.valid[:, now], _tested(motion))
-    if (pairs[0] < box.shape[1]).any():
-        users = np.flatnonzero(pairs[0] < box.shape[1])
-        return Violation("ego_collides", tuple(users.tolist()), first_step + int(pairs[0].min()))
+    touched = np.flatnonzero(pairs[0] < box.shape[1])
+    if len(touched):
+        return Violation("ego_collides", tuple(touched.tolist()), first_step + int(pairs[0].min()))
     if np.diff(speed).min() < -(hardest_mps2 + 0.02) * DT_S:
         return Violation("ego_brakes_hard")
     if leaves_road(roles.network, box[0]):
@@ -87,8 +91,8 @@ def find_violation(
     cause = _rules_broken(roles, motion, times_s, first_step)
     if cause:
         return Violation(cause)
-    excused = bool(roles.parked) or is_staged(staging)
-    if not excused and goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, now]):
+    against = goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, now])
+    if against and not roles.parked and not is_staged(staging):
         return Violation("ego_wrong_way")
     return Violation("others_collide" if (pairs < box.shape[1]).any() else "")
 
@@ -98,7 +102,7 @@ def is_staged(staging: Staging) -> bool:
     return any(vars(staging).values())
 
 
-def _tested(motion: Motion) -> Bool[np.ndarray, "user user"]:
+def _tested(motion: Motion) -> _UserPairs:
     """Mask of pairs that must not overlap: not two pedestrians, not two static users."""
     person = motion.kind == AgentKind.PEDESTRIAN
     moves = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
@@ -106,24 +110,13 @@ def _tested(motion: Motion) -> Bool[np.ndarray, "user user"]:
 
 
 def touching(
-    box: Float64[np.ndarray, "user time 6"],
-    valid: Bool[np.ndarray, "user time"],
-    tested: Bool[np.ndarray, "user user"],
+    box: Float64[np.ndarray, "user time 6"], valid: Bool[np.ndarray, "user time"], tested: _UserPairs
 ) -> Int64[np.ndarray, "user user"]:
-    """Return when pairs of users first overlap; row 0 (ego) has a margin of 10 cm.
-
-    Args:
-        box: Boxes.
-        valid: When they exist.
-        tested: The pairs to look at.
-
-    Returns:
-        The step, or the number of steps for pairs that never do.
-    """
+    """Return the step at which tested pairs first overlap (the number of steps: never); ego has a margin of 10 cm."""
     box = box.copy()
     box[0, :, 4:] += 2 * EGO_SKIN_M
     reach = np.hypot(box[:, 0, 4], box[:, 0, 5]) / 2
-    # Who never comes near: the rectangles that hold the centres, the reaches added, do not meet.
+    # Broad phase: bounding rectangles of the trajectories.
     at = np.where(valid[..., None], box[..., :2], np.nan)
     with np.errstate(all="ignore"):
         low = np.where(valid[..., None], at, np.inf).min(axis=1) - reach[:, None]
@@ -142,13 +135,13 @@ def touching(
 def inside(
     points: Float64[np.ndarray, "point 2"], rings: tuple[Float64[np.ndarray, "_ 2"], ...]
 ) -> Bool[np.ndarray, " point"]:
-    """Whether points lie in the area that closed rings bound, islands left out (even-odd rule, exact)."""
+    """Mask of points inside the area bounded by closed rings (even-odd rule, exact)."""
     crossings = np.zeros(len(points), int)
     x, y = points[:, 0, None], points[:, 1, None]
     for ring in rings:
         a, b = ring, np.roll(ring, -1, axis=0)
         near = (np.minimum(a, b) <= points.max(axis=0)) & (np.maximum(a, b) >= points.min(axis=0))
-        # A ray to the right meets only sides at the points' heights that do not end left of them all.
+        # A ray to the right only meets sides at the points' heights that do not end left of all points.
         keep = near[:, 1] & (np.maximum(a, b)[:, 0] >= points[:, 0].min())
         (ax, ay), (bx, by) = a[keep].T, b[keep].T
         across = (ay > y) != (by > y)
@@ -164,16 +157,8 @@ def leaves_road(network: RoadNetwork, box: Float64[np.ndarray, "time 6"]) -> boo
     return not bool(inside(points, tuple(edge.xy for edge in network.edges)).all())
 
 
-def passes(
-    lane: Lane, front: Float64[np.ndarray, "time 2"], heading: Float64[np.ndarray, " time"]
-) -> Bool[np.ndarray, " step"]:
-    """During which steps a front bumper passes the line where a lane begins, in the lane's direction.
-
-    Args:
-        lane: The lane; its line is as wide as it is and square to it.
-        front: Middle of the front bumper.
-        heading: Heading.
-    """
+def passes(lane: Lane, front: _Points, heading: _Series) -> _Steps:
+    """Mask of steps in which the middle of a front bumper passes the line at the start of a lane, in its direction."""
     begin = lane.curve.start
     c, s = math.cos(begin.heading), math.sin(begin.heading)
     dx, dy = front[:, 0] - begin.x, front[:, 1] - begin.y
@@ -182,13 +167,8 @@ def passes(
     return (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & within[1:]
 
 
-def _rules_broken(
-    roles: Roles,
-    motion: Motion,
-    times_s: Float64[np.ndarray, " time"],
-    first_step: int,
-) -> str:
-    """Return whether a vehicle runs a red light or ego a stop sign."""
+def _rules_broken(roles: Roles, motion: Motion, times_s: _Series, first_step: int) -> str:
+    """Return ``ego_runs_red``, ``other_runs_red``, ``ego_runs_stop_sign``, or an empty string."""
     network, now = roles.network, slice(first_step, None)
     red = np.zeros((len(times_s) - first_step, len(network.lanes)), bool)
     if network.signals is not None:
@@ -196,8 +176,7 @@ def _rules_broken(
     red_steps = red[:-1] & red[1:]
     for i, path in enumerate(motion.paths or roles.paths):
         heading, valid = motion.heading[i, now], motion.valid[i, now]
-        ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[i, 0] / 2
-        front = motion.xy[i, now] + ahead
+        front = _front(motion, i)[now]
         for span in path.spans:
             lane = network.lanes[span.lane]
             stop = i == 0 and lane.control in (Control.STOP, Control.ALL_WAY_STOP)
@@ -214,14 +193,9 @@ def _rules_broken(
 
 
 def _passes_red_off_route(
-    network: RoadNetwork,
-    path: Path,
-    xy: Float64[np.ndarray, "time 2"],
-    front: Float64[np.ndarray, "time 2"],
-    heading: Float64[np.ndarray, " time"],
-    red_steps: Bool[np.ndarray, "step lane"],
+    network: RoadNetwork, path: Path, xy: _Points, front: _Points, heading: _Series, red_steps: _LaneSteps
 ) -> bool:
-    """Whether ego, off its route, passes the line of another lane at red, as the metric counts it."""
+    """Whether ego, off its route, passes the line of another lane at red, as the metric does."""
     own = {span.lane for span in path.spans}
     others = [k for k in np.flatnonzero(red_steps.any(axis=0)) if network.lanes[k].connector and k not in own]
     passed = [passes(network.lanes[k], front, heading) & red_steps[:, k] for k in others]
@@ -232,30 +206,29 @@ def _passes_red_off_route(
     return bool((np.any(passed, axis=0) & off[1:]).any())
 
 
+def _front(motion: Motion, user: int) -> _Points:
+    """Middle of a user's front bumper."""
+    heading = motion.heading[user]
+    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[user, 0] / 2
+    return motion.xy[user] + ahead
+
+
 def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
     """Return the step of ego's last stop at a stop sign that it then passes, else the first step."""
-    heading = motion.heading[0]
-    front = motion.xy[0] + np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[0, 0] / 2
-    result = first_step
+    front, result = _front(motion, 0), first_step
     for span in (motion.paths or roles.paths)[0].spans:
         lane = roles.network.lanes[span.lane]
         if lane.connector and lane.control in (Control.STOP, Control.ALL_WAY_STOP):
-            for step in np.flatnonzero(passes(lane, front, heading)):
+            for step in np.flatnonzero(passes(lane, front, motion.heading[0])):
                 standing = np.flatnonzero(motion.speed[0, first_step : step + 1] < _STANDING_MPS)
                 result = max([result, *(first_step + standing[-1:]).tolist()])
     return result
 
 
-def _stood(
-    lane: Lane,
-    motion: Motion,
-    first_step: int,
-    front: Float64[np.ndarray, "time 2"],
-    passed: Bool[np.ndarray, " step"],
-) -> bool:
-    """Whether ego stood close before a line in the seconds before it passed (which it may never do)."""
+def _stood(lane: Lane, motion: Motion, first_step: int, front: _Points, passed: _Steps) -> bool:
+    """Whether ego stopped before each passing of a line."""
     for step in np.flatnonzero(passed):
-        # Ego may have stood before the recording begins: the motion knows.
+        # The stop may lie before the recording.
         begin = max(0, first_step + int(step) - round(_STOOD_S / DT_S))
         gap = np.hypot(*(motion.xy[0, begin : first_step + step + 1] - lane.curve.xy[0]).T)
         close = gap < motion.size_m[0, 0] / 2 + _BEFORE_LINE_M
@@ -268,9 +241,9 @@ def _stood(
 def against_traffic(
     network: RoadNetwork, xy: Float64[np.ndarray, "place 2"], heading: Float64[np.ndarray, " place"]
 ) -> Bool[np.ndarray, " place"]:
-    """Which poses are nearest to the centre of a lane that leads the other way (135 degrees or more apart).
+    """Mask of poses whose nearest lane leads the other way (135 degrees or more apart).
 
-    In junctions lanes cross: another lane that is hardly further away and is not against the heading decides.
+    Where lanes cross, a lane that is hardly further away and not against the heading decides.
     """
     at = np.concatenate([lane.curve.xy[::2] for lane in network.lanes])
     course = np.concatenate([lane.curve.heading[::2] for lane in network.lanes])
@@ -284,12 +257,69 @@ def against_traffic(
     return opposed < np.where(against, np.inf, gap).min(axis=1) - _DOUBT_M
 
 
-def goes_against_traffic(
-    network: RoadNetwork, xy: Float64[np.ndarray, "time 2"], heading: Float64[np.ndarray, " time"]
-) -> bool:
-    """Whether more than 2 m are travelled against traffic within any second."""
+def goes_against_traffic(network: RoadNetwork, xy: _Points, heading: _Series) -> bool:
+    """Whether ego travels more than 2 m against traffic within a second."""
     every = 2
     wrong = against_traffic(network, xy[::every], heading[::every])
     travelled = np.hypot(*np.diff(xy[::every], axis=0).T) * wrong[1:]
     window = round(1.0 / (every * DT_S))
     return bool(np.convolve(travelled, np.ones(window)).max() > _WRONG_WAY_M)
+
+
+@cache
+def smoother(count: int, window: int, order: int, derivative: int = 0) -> Float64[np.ndarray, "count count"]:
+    """The Savitzky-Golay filter (Savitzky and Golay 1964) of ``count`` samples as a matrix.
+
+    At the ends the first and last polynomial are evaluated. As in SciPy, an even window is centred half a sample before
+    its upper middle.
+    """
+    half = window // 2
+    first = np.clip(np.arange(count) - half + (window % 2 == 0), 0, count - window)
+    at = np.arange(count) - first.astype(float)
+    if window % 2 == 0:
+        inner = (np.arange(count) >= half) & (np.arange(count) < count - half)
+        at[inner] = half - 0.5
+    factorial = float(np.prod(np.arange(1, derivative + 1))) if derivative else 1.0
+    rows = np.zeros((count, count))
+    for row in range(count):
+        powers = (np.arange(window) - at[row])[:, None] ** np.arange(order + 1)
+        rows[row, first[row] : first[row] + window] = np.linalg.pinv(powers)[derivative] * factorial
+    return rows
+
+
+def quantities(heading: _Series, speed: _Series) -> dict[str, Float64[np.ndarray, " step"]]:
+    """Return the smoothed quantities of :data:`LIMITS` at each step but the first."""
+    turned = wrap(np.diff(heading))
+    along, lateral = np.diff(speed) / DT_S, (speed[1:] + speed[:-1]) / 2 * turned / DT_S
+    course = np.cumsum(turned)
+    jerk = {"window": 15, "order": 2, "derivative": 1}
+    return {
+        "longitudinal_mps2": _smoothed(along, 8, 2),
+        "lateral_mps2": _smoothed(lateral, 8, 2),
+        "jerk_mps3": _smoothed(along, **jerk),
+        "jerk_magnitude_mps3": _smoothed(np.hypot(along, lateral), **jerk),
+        "yaw_rate_rps": _smoothed(course, **jerk),
+        "yaw_acceleration_rps2": _smoothed(course, 15, 3, 2),
+    }
+
+
+def _smoothed(
+    values: Float64[np.ndarray, " n"], window: int, order: int, derivative: int = 0
+) -> Float64[np.ndarray, " n"]:
+    # The last bits of BLAS would depend on the number of threads.
+    weights = smoother(len(values), window, order, derivative)
+    return np.einsum("ij,j->i", weights, values) / DT_S**derivative
+
+
+def broken_limits(heading: _Series, speed: _Series) -> tuple[str, ...]:
+    """Return the quantities that exceed their limits, in the order of :data:`LIMITS`."""
+    return tuple(
+        name
+        for name, values in quantities(heading, speed).items()
+        if values.min() < LIMITS[name][0] or values.max() > LIMITS[name][1]
+    )
+
+
+def discomfort(heading: _Series, speed: _Series) -> str:
+    """Return the first of :func:`broken_limits`, or an empty string."""
+    return next(iter(broken_limits(heading, speed)), "")

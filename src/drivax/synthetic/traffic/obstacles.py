@@ -1,4 +1,4 @@
-"""Obstacles in a vehicle's corridor that are on no lane: parked cars, pedestrians, swerving vehicles."""
+"""Obstacles in the corridor of a vehicle's path: parked cars, pedestrians, vehicles off their lanes."""
 
 from __future__ import annotations
 
@@ -8,84 +8,82 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask
 from drivax.synthetic.traffic.paths import Path
 
-#: Room that a driver keeps on both sides, m.
-_MARGIN_M = 0.2
-#: Less is kept to vehicles, which keep to their lanes, m.
-_VEHICLES_M = 0.05
-#: Half width of a vehicle that stands or drives askew, as others see it, m.
+#: Lateral margin of the corridor, m; less for vehicles, which keep to their lanes.
+_MARGIN_M, _VEHICLES_M = 0.2, 0.05
+#: Largest half width of other vehicles, m: of a turning one only the middle part counts.
 _MIDDLE_M = 1.3
-#: How far ahead of the centre things in motion are looked at, m, how finely, and how far aside.
+#: Range of the search for moving obstacles ahead, m, its step along the path, and its half width.
 _AHEAD_M, _EVERY_M, _ASIDE_M = 50.0, 2.0, 16.0
-#: How far ahead other vehicles are looked at, m.
+#: Range of the search for vehicles, m.
 _NEAR_M = 25.0
 #: Crossing users are ignored when they leave the corridor this long before arrival, s.
 _WELL_S = 0.8
-#: Sideways motion is foreseen for this long, s.
+#: Time over which lateral motion is extrapolated, s.
 _FORESEEN_S = 0.7
-#: Boxes that are looked for together along a path.
-_TOGETHER = 256
+#: Boxes per batch: the table of distances stays in the processor's cache.
+_BATCH = 256
+#: Distances ahead of a vehicle at which its path is sampled, m.
+_LOOKS_M = np.arange(0.0, _AHEAD_M + 6.0, _EVERY_M)
+
+#: A number and an index per pair.
+_Values = Float64[np.ndarray, " k"]
+_Indices = Int64[np.ndarray, " k"]
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """Things at one moment: centres, headings, signed speeds along them, lengths and widths."""
+    """Boxes at one moment: centres, headings, signed speeds along them, lengths and widths."""
 
-    xy: Float64[np.ndarray, "thing 2"]
-    heading: Float64[np.ndarray, " thing"]
-    speed: Float64[np.ndarray, " thing"]
-    size_m: Float64[np.ndarray, "thing 2"]
+    xy: Float64[np.ndarray, "box 2"]
+    heading: Float64[np.ndarray, " box"]
+    speed: Float64[np.ndarray, " box"]
+    size_m: Float64[np.ndarray, "box 2"]
 
     def __len__(self) -> int:
-        """How many."""
         return len(self.speed)
 
     @cached_property
-    def direction(self) -> tuple[Float64[np.ndarray, " thing"], Float64[np.ndarray, " thing"]]:
+    def direction(self) -> tuple[Float64[np.ndarray, " box"], Float64[np.ndarray, " box"]]:
         """Cosine and sine of the headings."""
         return np.cos(self.heading), np.sin(self.heading)
 
     def chosen(self, which: np.ndarray) -> Boxes:
-        """Some of them."""
+        """Return the boxes of some rows."""
         return Boxes(self.xy[which], self.heading[which], self.speed[which], self.size_m[which])
 
     def joined(self, other: Boxes) -> Boxes:
-        """These and others."""
+        """Return these boxes and others."""
         if not len(other):
             return self
-        return Boxes(
-            np.concatenate([self.xy, other.xy]),
-            np.concatenate([self.heading, other.heading]),
-            np.concatenate([self.speed, other.speed]),
-            np.concatenate([self.size_m, other.size_m]),
-        )
+        names = ("xy", "heading", "speed", "size_m")
+        return Boxes(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
 
 @dataclass(frozen=True)
 class Extents:
-    """Boxes as seen along a path: from where to where along it, and from right to left of it, m."""
+    """Longitudinal and lateral extent of boxes in the coordinates of a path, m."""
 
-    near_m: Float64[np.ndarray, " thing"]
-    far_m: Float64[np.ndarray, " thing"]
-    right_m: Float64[np.ndarray, " thing"]
-    left_m: Float64[np.ndarray, " thing"]
+    near_m: Float64[np.ndarray, " box"]
+    far_m: Float64[np.ndarray, " box"]
+    right_m: Float64[np.ndarray, " box"]
+    left_m: Float64[np.ndarray, " box"]
 
 
-def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, Int64[np.ndarray, " thing"]]:
-    """Boxes near a path in its coordinates (straight over the length of a box), and which ones they are."""
+def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, Int64[np.ndarray, " box"]]:
+    """Extents of the boxes near a path, which counts as straight over the length of a box, and their rows."""
     coarse = path.curve.xy[::8]
     around = (boxes.xy > coarse.min(axis=0) - within_m) & (boxes.xy < coarse.max(axis=0) + within_m)
     inside = np.flatnonzero(around[:, 0] & around[:, 1])
     near, rough = np.zeros(0, int), np.zeros(0, int)
-    # So few at a time that the table of distances stays in the processor's cache.
-    for first in range(0, len(inside), _TOGETHER):
-        some = inside[first : first + _TOGETHER]
-        gap = _squared(boxes.xy[some, None], coarse)
+    for first in range(0, len(inside), _BATCH):
+        batch = inside[first : first + _BATCH]
+        gap = _squared(boxes.xy[batch, None], coarse)
         best = gap.argmin(axis=1)
-        close = gap[np.arange(len(some)), best] < within_m**2
-        near, rough = np.append(near, some[close]), np.append(rough, 8 * best[close])
+        close = gap[np.arange(len(batch)), best] < within_m**2
+        near, rough = np.append(near, batch[close]), np.append(rough, 8 * best[close])
     window = np.clip(rough[:, None] + np.arange(-8, 9), 0, len(path.curve.xy) - 1)
     fine = _squared(boxes.xy[near, None], path.curve.xy[window])
     place = window[np.arange(len(near)), fine.argmin(axis=1)]
@@ -107,48 +105,36 @@ def _squared(
 
 
 def _relative(
-    boxes: Boxes,
-    which: Int64[np.ndarray, " k"],
-    xy: Float64[np.ndarray, "k 2"],
-    heading: Float64[np.ndarray, " k"],
-) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
-    """Boxes in frames at the given poses: ahead, to the left, and turned."""
+    boxes: Boxes, which: _Indices, xy: Float64[np.ndarray, "k 2"], heading: _Values
+) -> tuple[_Values, _Values, _Values]:
+    """Positions of boxes ahead and to the left of poses, and their relative headings."""
     dx, dy = (boxes.xy[which] - xy).T
     cos, sin = np.cos(heading), np.sin(heading)
     return dx * cos + dy * sin, dy * cos - dx * sin, boxes.heading[which] - heading
 
 
-def _reach(
-    size_m: Float64[np.ndarray, "k 2"], turned: Float64[np.ndarray, " k"]
-) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
+def _reach(size_m: Float64[np.ndarray, "k 2"], turned: _Values) -> tuple[_Values, _Values]:
     """Half extents along and across a direction."""
     cos, sin = np.abs(np.cos(turned)) / 2, np.abs(np.sin(turned)) / 2
     return cos * size_m[:, 0] + sin * size_m[:, 1], sin * size_m[:, 0] + cos * size_m[:, 1]
 
 
 class Standing:
-    """Things that never move, as seen along every vehicle's path.
+    """Static obstacles, in the coordinates of every vehicle's path."""
 
-    Args:
-        boxes: The things.
-        tables: All paths.
-        width_m: Widths of the vehicles.
-    """
-
-    def __init__(self, boxes: Boxes, tables: PathTables, width_m: Float64[np.ndarray, " v"]) -> None:
+    def __init__(self, boxes: Boxes, tables: PathTables, width_m: PerVehicle) -> None:
         self.boxes, self._half = boxes, width_m / 2
         self.near_m = np.full((len(width_m), 1), np.inf)
-        self._seen: list[tuple[Extents, Int64[np.ndarray, " k"]]] = []
+        self._seen = [Extents(*np.zeros((4, 0))) for _ in tables.paths]
         for row, path in enumerate(tables.paths):
-            self._seen.append((Extents(*np.zeros((4, 0))), np.zeros(0, int)))
             self.replace(row, path)
 
     def replace(self, row: int, path: Path) -> None:
-        """A vehicle has another path."""
+        """Enter the path of one vehicle."""
         if not len(self.boxes):
             return
-        seen, which = extents(path, self.boxes)
-        self._seen[row] = (seen, which)
+        seen, _ = extents(path, self.boxes)
+        self._seen[row] = seen
         half = self._half[row] + _MARGIN_M
         block = np.sort(seen.near_m[(seen.right_m < half) & (seen.left_m > -half)])
         if len(block) > self.near_m.shape[1]:
@@ -157,55 +143,35 @@ class Standing:
         self.near_m[row] = np.inf
         self.near_m[row, : len(block)] = block
 
-    def copy(self) -> Standing:
-        """A copy whose rows can be replaced without changing this one."""
-        result = object.__new__(Standing)
-        for name, value in vars(self).items():
-            setattr(result, name, value.copy() if isinstance(value, np.ndarray | list) else value)
-        return result
-
     def meets(self, row: int, front_m: float, half_m: float, within_m: float) -> bool:
-        """Whether something stands so near ahead of a vehicle's front in a band of this half width."""
-        seen = self._seen[row][0]
+        """Whether an obstacle lies within a distance ahead of a vehicle's front, in a band of some half width."""
+        seen = self._seen[row]
         block = (seen.right_m < half_m) & (seen.left_m > -half_m)
         block &= (seen.near_m > front_m - 0.5) & (seen.near_m < front_m + within_m)
         return bool(block.any())
 
-    def gap(self, front_m: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
-        """Distance from the front bumper to the next thing in the way (infinite: none)."""
+    def gap(self, front_m: PerVehicle) -> PerVehicle:
+        """Distance from the front bumper to the next obstacle in the corridor (infinite: none)."""
         gap = self.near_m - front_m[:, None]
         return np.where(gap > -1.0, gap, np.inf).min(axis=1)
 
 
 def nearest_obstacles(
-    tables: PathTables,
-    vehicles: Boxes,
-    at_m: Float64[np.ndarray, " v"],
-    active: Bool[np.ndarray, " v"],
-    others: Boxes,
-) -> tuple[Float64[np.ndarray, " v"], Float64[np.ndarray, " v"]]:
-    """Gap from each front bumper to the nearest thing in the corridor of the own path, and its speed along it.
-
-    Args:
-        tables: All paths.
-        vehicles: The vehicles.
-        at_m: Where they are on their paths.
-        active: Which of them are there.
-        others: Other possible obstacles: moving users, including those that stand for now.
-    """
-    count, things = len(vehicles), vehicles.joined(others)
+    tables: PathTables, vehicles: Boxes, at_m: PerVehicle, active: VehicleMask, others: Boxes
+) -> tuple[PerVehicle, PerVehicle]:
+    """Gap from each front bumper to the nearest obstacle in the corridor of the own path, and its speed along it."""
+    count, users = len(vehicles), vehicles.joined(others)
     gap, speed = np.full(count, np.inf), np.zeros(count)
-    viewer, thing = _close(vehicles, things, active)
+    viewer, user = _close(vehicles, users, active)
     if not len(viewer):
         return gap, speed
-    pose, place_m, apart2 = _nearest(tables, at_m, viewer, things.xy[thing])
-    at, left, turned = _relative(things, thing, pose[:, :2], pose[:, 2])
+    pose, place_m, apart2 = _nearest(tables, at_m, viewer, users.xy[user])
+    at, left, turned = _relative(users, user, pose[:, :2], pose[:, 2])
     at = at + place_m
-    length, width = _reach(things.size_m[thing], turned)
-    # Vehicles keep out of each other's way by the rules: of one that turns, only the middle part counts.
-    vehicle = thing < count
+    length, width = _reach(users.size_m[user], turned)
+    vehicle = user < count
     width = np.where(vehicle, np.minimum(width, _MIDDLE_M), width)
-    drift = things.speed[thing] * np.sin(turned)
+    drift = users.speed[user] * np.sin(turned)
     soon = left + drift * _FORESEEN_S
     size = vehicles.size_m[viewer]
     half = size[:, 1] / 2 + np.where(vehicle, _VEHICLES_M, _MARGIN_M)
@@ -215,30 +181,27 @@ def nearest_obstacles(
     k = inside.nonzero()[0]
     if not len(k):
         return gap, speed
-    viewer, thing, left, drift = viewer[k], thing[k], left[k], drift[k]
+    viewer, user, left, drift = viewer[k], user[k], left[k], drift[k]
     room = at[k] - length[k] - at_m[viewer] - size[k, 0] / 2
     stays = ~_gone(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[viewer], 1.0))
-    # The nearest is entered last.
+    # Of several obstacles of a vehicle the nearest is entered last.
     order = np.argsort(-room, kind="stable")
     order = order[stays[order]]
     gap[viewer[order]] = room[order]
-    speed[viewer[order]] = np.maximum(things.speed[thing] * np.cos(turned[k]), 0.0)[order]
+    speed[viewer[order]] = np.maximum(users.speed[user] * np.cos(turned[k]), 0.0)[order]
     return gap, speed
 
 
-def _close(
-    vehicles: Boxes, things: Boxes, active: Bool[np.ndarray, " v"]
-) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
-    """Pairs of a vehicle and what is ahead of it and near enough to matter, roughly; vehicles come first in things."""
+def _close(vehicles: Boxes, users: Boxes, active: VehicleMask) -> tuple[_Indices, _Indices]:
+    """Pairs of a vehicle and a user (vehicles first) in a wedge ahead of it."""
     count = len(vehicles)
-    dx, dy = things.xy[:, 0] - vehicles.xy[:, 0, None], things.xy[:, 1] - vehicles.xy[:, 1, None]
-    cos, sin = (part[:, None] for part in vehicles.direction)
+    dx, dy = users.xy[:, 0] - vehicles.xy[:, 0, None], users.xy[:, 1] - vehicles.xy[:, 1, None]
+    cos, sin = (component[:, None] for component in vehicles.direction)
     ahead = dx * cos + dy * sin
     dy *= cos
     dx *= sin
     dy -= dx
-    # Within reach: what the vehicle could not stop for comfortably in time, and a little more; of vehicles, which
-    # follow each other and the rules, those that are near. Who is not there sees nothing, and is not seen.
+    # Somewhat beyond the comfortable stopping distance; less for vehicles, which follow each other and the rules.
     reach = np.where(active, np.minimum(_AHEAD_M, 12.0 + 2.5 * vehicles.speed), 0.0)[:, None]
     near = ahead > 0.5
     near[:, :count] &= ahead[:, :count] < np.minimum(reach, _NEAR_M)
@@ -248,20 +211,13 @@ def _close(
     ahead += 3.0
     near &= np.abs(dy, out=dy) < np.minimum(ahead, _ASIDE_M, out=ahead)
     pairs = near.ravel().nonzero()[0]
-    return pairs // len(things), pairs % len(things)
-
-
-#: Where ahead of a vehicle its path is looked at, m.
-_LOOKS_M = np.arange(0.0, _AHEAD_M + 6.0, _EVERY_M)
+    return pairs // len(users), pairs % len(users)
 
 
 def _nearest(
-    tables: PathTables,
-    at_m: Float64[np.ndarray, " v"],
-    viewer: Int64[np.ndarray, " k"],
-    xy: Float64[np.ndarray, "k 2"],
-) -> tuple[Float64[np.ndarray, "k 4"], Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
-    """The sample ahead on the path of a vehicle that is nearest to a point, where it is, and the squared distance."""
+    tables: PathTables, at_m: PerVehicle, viewer: _Indices, xy: Float64[np.ndarray, "k 2"]
+) -> tuple[Float64[np.ndarray, "k 4"], _Values, _Values]:
+    """The sample of a vehicle's path ahead that is nearest to a point, its position, and the squared distance."""
     step = tables.step_m[viewer]
     place = np.rint((at_m[viewer, None] + _LOOKS_M) / step[:, None]).astype(int)
     place = np.minimum(place, tables.last[viewer, None])
@@ -273,12 +229,7 @@ def _nearest(
     return points[pair], place[pair] * step, apart[pair]
 
 
-def _gone(
-    left: Float64[np.ndarray, " k"],
-    drift: Float64[np.ndarray, " k"],
-    reach: Float64[np.ndarray, " k"],
-    seconds: Float64[np.ndarray, " k"],
-) -> Bool[np.ndarray, " k"]:
+def _gone(left: _Values, drift: _Values, reach: _Values, seconds: _Values) -> Bool[np.ndarray, " k"]:
     """Mask of crossing users that leave the corridor well before the vehicle arrives."""
     then = left + drift * np.maximum(seconds - _WELL_S, 0.0)
     return (seconds > 2 * _WELL_S) & (np.abs(then) > reach) & (then * drift > 0)

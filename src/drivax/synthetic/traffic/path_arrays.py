@@ -1,19 +1,24 @@
-"""All paths as arrays of one shape: a traffic step is a few operations over all vehicles."""
+"""All paths as arrays of one shape, so that a traffic step is a few operations over all vehicles."""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import SLOTS, Path
+from drivax.synthetic.traffic.roles import Drivers
+
+#: A number, a flag and an index per vehicle.
+PerVehicle = Float64[np.ndarray, " v"]
+VehicleMask = Bool[np.ndarray, " v"]
+VehicleRows = Int64[np.ndarray, " v"]
 
 
 def speed_profile(
     path: Path, factor: float, lateral_mps2: float, slowing_mps2: float, top_mps: float = np.inf
 ) -> Float64[np.ndarray, " p"]:
-    """The fastest speed at each sample that respects limits, bends and the braking towards them.
+    """Fastest speed at each sample within limits, in bends, and braking towards both.
 
     ``v(s)^2 = min over s' >= s of (vmax(s')^2 + 2 b (s' - s))`` with ``vmax = min(factor x limit, sqrt(a_lat / |k|))``.
     """
@@ -23,19 +28,23 @@ def speed_profile(
     return np.sqrt(np.minimum.accumulate((cap + ramp)[::-1])[::-1] - ramp)
 
 
+def driver_profile(path: Path, drivers: Drivers, row: int) -> Float64[np.ndarray, " p"]:
+    """Speed profile of one of the drivers."""
+    names = ("speed_factor", "lateral_mps2", "slowing_mps2", "top_speed_mps")
+    return speed_profile(path, *(float(getattr(drivers, name)[row]) for name in names))
+
+
 class PathTables:
-    """Lookup tables of all paths; a row changes when its vehicle goes over to another path.
+    """Lookup tables of all paths, one row per vehicle; a row is replaced when its vehicle changes to another path.
 
     Attributes:
         table: x, y, heading and fastest speed at each sample.
         step_m, last: Distance between samples and index of the last one.
-        lane, lane_m: Lanes taken up at each sample, and where on them.
-        begin, scale, since, until: Per lane of the network: where it begins on the path (nan: it does not), and the
-            range of own positions in which others on it matter.
-        connector, connector_begin, connector_end: Connectors on the path in order (-1: none), and where they begin and
-            end.
-        crossing, crossing_m: Crossings on the path in order of travel (-1: none), and where their near side is.
-        stop_m: Where the last lane ends although the road goes on, m (infinite: it does not).
+        lane, lane_m: Lanes occupied at each sample (-1: none), and positions on them.
+        begin, scale, since, until: Per lane of the network the fields of its span (``begin`` is nan without a span).
+        connector, connector_begin, connector_end: Connectors in order of travel (-1: none), and path positions.
+        crossing, crossing_m: Marked crossings in order of travel (-1: none), and positions of their near side.
+        stop_m: End of the last lane if the road continues without it, m (else infinite).
     """
 
     def __init__(self, network: RoadNetwork, paths: list[Path], drivers: Drivers) -> None:
@@ -46,7 +55,7 @@ class PathTables:
         for number, crossing in enumerate(network.crossings):
             for lane, along in crossing.lanes if crossing.marked else ():
                 self._crossings.setdefault(lane, []).append((number, along - crossing.width_m / 2))
-        # Later paths may be longer: half as much room again costs nothing.
+        # Later paths may be longer.
         points = int(1.5 * max(len(path.curve.xy) for path in paths))
         connectors = 4 + max(sum(network.lanes[s.lane].connector for s in path.spans) for path in paths)
         self.table = np.zeros((count, points, 4))
@@ -56,10 +65,7 @@ class PathTables:
         self.begin, self.scale = np.full((count, lanes), np.nan), np.ones((count, lanes))
         self.since, self.until = np.full((count, lanes), -np.inf), np.full((count, lanes), np.inf)
         self.connector = np.full((count, connectors), -1)
-        self.connector_begin, self.connector_end = (
-            np.full((count, connectors), np.inf),
-            np.full((count, connectors), np.inf),
-        )
+        self.connector_begin, self.connector_end = np.full((2, count, connectors), np.inf)
         self.crossing = np.full((count, 4), -1)
         self.crossing_m = np.full((count, 4), np.inf)
         self.stop_m = np.full(count, np.inf)
@@ -69,13 +75,10 @@ class PathTables:
     def replace(self, row: int, path: Path) -> None:
         """Enter the path of one vehicle."""
         self.paths[row] = path
-        d, n = self._drivers, len(path.curve.xy)
+        n = len(path.curve.xy)
         self._grow(n)
-        fastest = speed_profile(
-            path, d.speed_factor[row], d.lateral_mps2[row], d.slowing_mps2[row], d.top_speed_mps[row]
-        )
-        self.table[row, :n, :2] = path.curve.xy
-        self.table[row, :n, 2], self.table[row, :n, 3] = path.curve.heading, fastest
+        self.table[row, :n, :2], self.table[row, :n, 2] = path.curve.xy, path.curve.heading
+        self.table[row, :n, 3] = driver_profile(path, self._drivers, row)
         self.table[row, n:] = self.table[row, n - 1]
         self.lane[row, :n], self.lane_m[row, :n] = path.lane, path.lane_m
         self.lane[row, n:] = -1
@@ -99,13 +102,10 @@ class PathTables:
             for number, along in self._crossings.get(lane, ()):
                 crossings.append((span.begin_m + span.scale * along, number))
         for k, (begin, end, lane) in enumerate(sorted(connectors)[: self.connector.shape[1]]):
-            self.connector[row, k], self.connector_begin[row, k], self.connector_end[row, k] = (
-                lane,
-                begin,
-                end,
-            )
-        if len(crossings) > self.crossing.shape[1]:
-            more = len(crossings) - self.crossing.shape[1]
+            self.connector[row, k], self.connector_begin[row, k] = lane, begin
+            self.connector_end[row, k] = end
+        more = len(crossings) - self.crossing.shape[1]
+        if more > 0:
             self.crossing = np.pad(self.crossing, ((0, 0), (0, more)), constant_values=-1)
             self.crossing_m = np.pad(self.crossing_m, ((0, 0), (0, more)), constant_values=np.inf)
         self.crossing[row], self.crossing_m[row] = -1, np.inf
@@ -120,16 +120,7 @@ class PathTables:
             self.lane = np.pad(self.lane, pad, constant_values=-1)
             self.lane_m = np.pad(self.lane_m, pad)
 
-    def copy(self) -> PathTables:
-        """A copy whose rows can be replaced without changing this one."""
-        result = object.__new__(PathTables)
-        for name, value in vars(self).items():
-            setattr(result, name, value.copy() if isinstance(value, np.ndarray | list) else value)
-        return result
-
-    def at(
-        self, position_m: Float64[np.ndarray, " v"], rows: Int64[np.ndarray, " v"]
-    ) -> Float64[np.ndarray, "v 4"]:
+    def at(self, position_m: PerVehicle, rows: VehicleRows) -> Float64[np.ndarray, "v 4"]:
         """x, y, heading and fastest speed at positions on the paths of some vehicles."""
         place = position_m / self.step_m[rows]
         index = np.minimum(np.maximum(place.astype(int), 0), self.last[rows] - 1)
@@ -139,9 +130,9 @@ class PathTables:
         return low + share * (flat.take(index + 1, axis=0) - low)
 
     def on(
-        self, position_m: Float64[np.ndarray, " v"], rows: Int64[np.ndarray, " v"]
+        self, position_m: PerVehicle, rows: VehicleRows
     ) -> tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]]:
-        """The lanes taken up at positions on the paths (-1: no more), and where on them, m."""
+        """Lanes occupied at positions on the paths (-1: none), and positions on them, m."""
         step = self.step_m[rows]
         index = np.minimum(np.maximum(np.rint(position_m / step).astype(int), 0), self.last[rows])
         beyond, index = position_m - index * step, index + rows * self.lane.shape[1]

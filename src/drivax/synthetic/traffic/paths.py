@@ -1,19 +1,18 @@
-"""The path of a vehicle: a sequence of lanes as one smooth curve, and where on it each lane lies."""
+"""The path of a vehicle: a sequence of lanes as one smooth curve, and the position of each lane on it."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.synthetic.roads.curves import STEP_M, Curve, join_curves, resample
+from drivax.synthetic.roads.curves import STEP_M, Curve, join_curves, resample, smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
 
-#: Lanes that a vehicle can be on at once: its own, and those that need the same space at this place.
+#: Largest number of lanes that a vehicle occupies: its own, and those that share space with it.
 SLOTS = 3
-_NOWHERE = -1
 #: Length over which curvature is averaged before it limits the speed, m.
 _CURVATURE_WINDOW_M = 3.0
 
@@ -24,10 +23,9 @@ class LaneSpan:
 
     Attributes:
         lane: Its index.
-        begin_m: Path position of the lane's start, m; below zero where the path begins inside the lane.
+        begin_m, end_m: Path positions of the lane's start and end, m; the start may be negative.
         scale: Path metres per lane metre.
-        from_m, until_m: The range of path positions of the driver's centre in which others on this lane matter.
-        end_m: Path position of the lane's end, m.
+        from_m, until_m: Range of positions of the vehicle's centre in which it occupies the lane.
     """
 
     lane: int
@@ -38,24 +36,24 @@ class LaneSpan:
     end_m: float = math.inf
 
     def stretched(self, by: float) -> LaneSpan:
-        """The same on a path that is longer by a factor."""
-        begin_m, from_m, until_m, end_m = (
-            m * by for m in (self.begin_m, self.from_m, self.until_m, self.end_m)
-        )
-        return LaneSpan(self.lane, begin_m, self.scale * by, from_m, until_m, end_m)
+        """Return the span on a path that is longer by a factor."""
+        metres = {
+            name: getattr(self, name) * by for name in ("begin_m", "scale", "from_m", "until_m", "end_m")
+        }
+        return replace(self, **metres)
 
 
 @dataclass(frozen=True)
 class Path:
-    """A curve to drive along, sampled every ``STEP_M`` (nearly: equal steps that end at the end).
+    """A curve to drive along, sampled at equal steps of about ``STEP_M``.
 
     Attributes:
-        curve: Where the vehicle's centre goes; its heading is the vehicle's.
+        curve: Pose of the vehicle's centre.
         step_m: Distance between samples, m.
         curvature: Curvature, 1/m, averaged over 3 m.
-        limit_mps: Speed limit of the lane there.
+        limit_mps: Speed limit.
         spans: The lanes in order of travel.
-        lane, lane_m: Which lanes the vehicle is on when its centre is at a sample (-1: no more), and where, m.
+        lane, lane_m: Lanes that the vehicle occupies with its centre at a sample (-1: none), and positions on them, m.
     """
 
     curve: Curve
@@ -74,13 +72,7 @@ class Path:
 
 @dataclass(frozen=True)
 class LaneChange:
-    """A planned change from one lane to its neighbour, both in sections that run side by side.
-
-    Attributes:
-        section: Index in the lane sequence of the lane that is left; the next one in the sequence is adjacent.
-        begin_m: Where on that lane the change begins, m.
-        length_m: Distance over which it is carried out, m.
-    """
+    """A planned change between adjacent lanes: index of the old one in the lane sequence, position on it, length."""
 
     section: int
     begin_m: float
@@ -111,14 +103,7 @@ def random_lanes(
 def lane_path(
     network: RoadNetwork, lanes: tuple[int, ...], sway: Sway, change: LaneChange | None = None
 ) -> Path:
-    """The path along a sequence of lanes, each of which follows the one before.
-
-    Args:
-        network: The roads.
-        lanes: Lane indices in order; with a lane change the lane that is left is followed by its neighbour.
-        sway: How the driver strays from the centre.
-        change: The lane change, if there is one.
-    """
+    """Build the path along consecutive lanes; with a lane change the new lane comes after the old one."""
     pieces, spans, at = [], [], 0.0
     for place, lane in enumerate(lanes):
         if change is not None and place == change.section + 1:
@@ -136,8 +121,7 @@ def lane_path(
             spans.append(LaneSpan(lane, at, 1.0, end_m=at + length))
         pieces.append(curve)
         at += length
-    middle = join_curves(*pieces) if len(pieces) > 1 else pieces[0]
-    return _finished(network, resample(sway.applied(middle), STEP_M), at, spans)
+    return _finished(network, resample(sway.applied(join_curves(*pieces)), STEP_M), at, spans)
 
 
 def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
@@ -145,35 +129,29 @@ def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: flo
 
 
 def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float, float]]:
-    """From curve ``a`` to the parallel ``b`` by a quintic step; also where both lanes begin and cease to matter."""
+    """Change from curve ``a`` to the parallel ``b``; also where the new lane is occupied from and the old one until."""
     count = max(len(a.xy), len(b.xy))
     a, b = (resample(c, float(c.arc_m[-1]) / (count - 1)) for c in (a, b))
     arc = a.arc_m
-    t = np.clip((arc - change.begin_m) / change.length_m, 0.0, 1.0)[:, None]
-    weight = t**3 * (10 - 15 * t + 6 * t**2)
+    weight = smooth_step((arc - change.begin_m) / change.length_m)[:, None]
     xy = a.xy + weight * (b.xy - a.xy)
     rate = np.gradient(xy, axis=0)
-    heading = a.heading + _turned(np.arctan2(rate[:, 1], rate[:, 0]) - a.heading)
+    turned = np.arctan2(rate[:, 1], rate[:, 0]) - a.heading
+    heading = a.heading + ((turned + math.pi) % (2 * math.pi) - math.pi)
     # The ends are exactly those of the lanes: a one-sided difference would bend the joint.
-    heading[0], heading[-1] = (
-        a.heading[0],
-        b.heading[-1] + 2 * math.pi * round((a.heading[-1] - b.heading[-1]) / (2 * math.pi)),
-    )
+    whole_turns = round((a.heading[-1] - b.heading[-1]) / (2 * math.pi))
+    heading[0], heading[-1] = a.heading[0], b.heading[-1] + 2 * math.pi * whole_turns
     end = change.begin_m + change.length_m
     return Curve(xy, heading), (max(0.0, change.begin_m - 15.0), end - 0.3 * change.length_m)
 
 
-def _turned(angle: Float64[np.ndarray, " point"]) -> Float64[np.ndarray, " point"]:
-    return (angle + math.pi) % (2 * math.pi) - math.pi
-
-
 def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[LaneSpan]) -> Path:
-    """Add curvature, limits and the lane slots; straying makes the curve longer, so spans are stretched."""
+    """Add curvature, limits and lane slots; spans are stretched to the length of the swaying curve."""
     stretch = float(curve.arc_m[-1]) / length
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
     spans = [span.stretched(stretch) for span in spans]
     at = step * np.arange(len(curve.xy))
-    lane = np.full((len(at), SLOTS), _NOWHERE)
+    lane = np.full((len(at), SLOTS), -1)
     lane_m = np.zeros((len(at), SLOTS))
     used = np.zeros(len(at), int)
     limit = np.full(len(at), math.inf)
@@ -181,18 +159,26 @@ def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[Lan
         size = span.scale * network.lanes[span.lane].length_m
         # Samples beyond the last lane's end by rounding still belong to it.
         first, last = np.searchsorted(at, [span.begin_m - 1e-6, span.begin_m + size - 1e-6])
-        part = slice(int(first), len(at) if span is spans[-1] else int(last))
-        limit[part] = np.minimum(limit[part], network.lanes[span.lane].limit_mps)
-        here = at[part]
+        samples = slice(int(first), len(at) if span is spans[-1] else int(last))
+        limit[samples] = np.minimum(limit[samples], network.lanes[span.lane].limit_mps)
+        here = at[samples]
         inside = (here >= span.from_m) & (here <= span.until_m)
         along = np.maximum(here - span.begin_m, 0.0) / span.scale
         for shared_lane, shared in _sharing(network, span.lane, along):
-            chosen = np.flatnonzero(inside & shared & (used[part] < SLOTS))
-            slot = used[part][chosen]
-            lane[part][chosen, slot] = shared_lane
-            lane_m[part][chosen, slot] = along[chosen]
-            used[part][chosen] += 1
+            chosen = np.flatnonzero(inside & shared & (used[samples] < SLOTS))
+            slot = used[samples][chosen]
+            lane[samples][chosen, slot] = shared_lane
+            lane_m[samples][chosen, slot] = along[chosen]
+            used[samples][chosen] += 1
     return Path(curve, step, smoothed_curvature(curve, step), limit, tuple(spans), lane, lane_m)
+
+
+def interpolated(
+    curve: Curve, arc_m: Float64[np.ndarray, " point"], at_m: Float64[np.ndarray, " n"]
+) -> Curve:
+    """Interpolate a curve, whose samples lie at ``arc_m``, linearly at positions."""
+    xy = np.stack([np.interp(at_m, arc_m, curve.xy[:, k]) for k in (0, 1)], axis=-1)
+    return Curve(xy, np.interp(at_m, arc_m, curve.heading))
 
 
 def smoothed_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]:
@@ -207,19 +193,19 @@ def smoothed_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " poi
 def _sharing(
     network: RoadNetwork, lane: int, along: Float64[np.ndarray, " point"]
 ) -> list[tuple[int, np.ndarray]]:
-    """The lanes that a vehicle on ``lane`` occupies too: those that leave the same lane, while still close."""
+    """Masks of where a vehicle on a lane occupies it, and lanes that branch off the same lane and are still close."""
     result = [(lane, np.ones(len(along), bool))]
     for before in network.lanes[lane].predecessors:
         for other in network.lanes[before].successors:
             if other != lane:
-                # Half a vehicle's length longer: its tail is in the way after its centre has left.
+                # Half a vehicle's length longer: its rear leaves after its centre.
                 result.append((other, along < network.shared_m[lane, other] + 2.5))
     return result
 
 
 @dataclass(frozen=True)
 class Sway:
-    """How a driver strays from the lane's centre: a few slow waves, m, 1/m and rad."""
+    """Lateral deviation of a driver from the lane's centre: slow waves (m, 1/m, rad)."""
 
     amplitude_m: tuple[float, ...] = ()
     wave_per_m: tuple[float, ...] = ()
@@ -227,18 +213,17 @@ class Sway:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, largest_m: float, aside_m: float = 0.0) -> Sway:
-        """Two waves 60 to 160 m long whose amplitudes add up to at most ``largest_m``, about a line aside."""
+        """Draw two waves 60 to 160 m long with amplitudes of at most ``largest_m`` in sum, about a constant offset."""
         share = rng.uniform(0.2, 0.5, size=2) * largest_m
         waves = 2 * math.pi / rng.uniform(60.0, 160.0, size=2)
         phases = rng.uniform(0.0, 2 * math.pi, size=2)
-        result = cls(tuple(share.tolist()), tuple(waves.tolist()), tuple(phases.tolist()))
-        if not aside_m:
-            return result
         # A wave without end is a constant.
-        return cls((*result.amplitude_m, aside_m), (*result.wave_per_m, 0.0), (*result.phase, math.pi / 2))
+        offset = ([aside_m], [0.0], [math.pi / 2]) if aside_m else ([], [], [])
+        drawn = (values.tolist() for values in (share, waves, phases))
+        return cls(*(tuple(values + constant) for values, constant in zip(drawn, offset, strict=True)))
 
     def applied(self, curve: Curve) -> Curve:
-        """The curve that is really driven; its heading is its own tangent (to first order in the straying)."""
+        """Return the curve that is driven; its heading is its tangent (to first order in the deviation)."""
         if not self.amplitude_m:
             return curve
         aside, slope = np.zeros((2, len(curve.xy)))

@@ -1,4 +1,4 @@
-"""Pedestrians: they walk along sidewalks, wait at kerbs until it is safe to cross, and then cross."""
+"""Pedestrians: they walk along sidewalks, wait at kerbs until it is safe to cross, and cross."""
 
 from __future__ import annotations
 
@@ -15,84 +15,80 @@ from drivax.synthetic.roads.curves import STEP_M, Curve, resample
 from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes
+from drivax.synthetic.traffic.path_arrays import PerVehicle, VehicleMask
 from drivax.synthetic.traffic.roles import Walker
 
-#: Where people wait, m before the kerb, how near to it they occupy the crossing, and from where on they look.
+#: Distances from the kerb, m: where people wait, from where on they occupy the crossing, and look for a gap.
 _WAIT_M, _CLAIM_M, _LOOK_M = 0.4, 1.0, 1.8
-#: How fast a walker gains and loses speed, m/s2.
+#: Acceleration of walkers, m/s2.
 _ACCELERATION_MPS2 = 1.5
-#: A driver who needs less than this to stop before the crosswalk will do so, m/s2, and stops so far before it, m.
+#: Drivers that need less braking than this yield at a crosswalk, m/s2; distance at which they stop before it, m.
 _YIELDING_MPS2, _STOP_SHORT_M = 2.5, 2.0
 #: Slower vehicles count as standing, m/s.
 _STANDING_MPS = 0.3
-#: Safety margin of the time to the next vehicle beyond the crossing time, s: where drivers yield, and where they need
-#: not.
+#: Time gap to the next vehicle beyond the crossing time, s: where drivers yield, and where they do not.
 _MARGIN_S, _GAP_MARGIN_S = 1.0, 1.5
-#: Vehicles that see the crossing under a larger angle or head another way do not come to it.
+#: Vehicles that see the crossing at a larger angle, or head elsewhere, do not approach it.
 _BEARING, _ASIDE = math.radians(75.0), math.radians(80.0)
-#: People keep this distance from the side of a vehicle, m.
+#: Distance that people keep from vehicles, m.
 _BERTH_M = 0.4
 #: Steps between looks at vehicles.
 _LOOK_STEPS = 2
-#: Lanes that begin or end so near to a crossing have the lights of their neighbours, m.
+#: Connectors next to lanes that begin or end this close to a crossing control it, m.
 _NEAR_JUNCTION_M = 25.0
+
+#: A number and a flag per walker.
+_Values = Float64[np.ndarray, " w"]
+_Mask = Bool[np.ndarray, " w"]
+_Point = Float64[np.ndarray, " 2"]
 
 
 @dataclass(frozen=True)
 class _CrossingConflicts:
-    """Where crossings meet lanes, one row per meeting, and what the lights say there.
+    """Intersections of crossings and lanes, and a mask of the connectors whose light must be red while people cross."""
 
-    Attributes:
-        red: Per crossing the connectors whose lights must be red while people cross: all but those that turn
-            into the crossed road at green and must yield.
-    """
-
-    xy: Float64[np.ndarray, "meeting 2"]
-    heading: Float64[np.ndarray, " meeting"]
-    crossing: Int64[np.ndarray, " meeting"]
+    xy: Float64[np.ndarray, "conflict 2"]
+    heading: Float64[np.ndarray, " conflict"]
+    crossing: Int64[np.ndarray, " conflict"]
     strip: Float64[np.ndarray, "crossing 6"]
     marked: Bool[np.ndarray, " crossing"]
     red: Bool[np.ndarray, "crossing lane"]
 
 
 def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
-    xy, heading, owner = [], [], []
+    poses, owner = [], []
     for index, crossing in enumerate(network.crossings):
         for lane, along in crossing.lanes:
             curve = network.lanes[lane].curve
             place = min(int(np.searchsorted(curve.arc_m, along)), len(curve.xy) - 1)
-            xy.append(curve.xy[place])
-            heading.append(curve.heading[place])
+            poses.append([*curve.xy[place], curve.heading[place]])
             owner.append(index)
+    pose = np.array(poses, float).reshape(-1, 3)
     axes = np.array([crossing.axis for crossing in network.crossings]).reshape(-1, 2, 2)
     across = axes[:, 1] - axes[:, 0]
     length = np.hypot(*across.T)
-    # People walk in the middle of the crosswalk: who stands on its rim does not block it.
-    strip = np.column_stack(
-        [axes.mean(axis=1), across / length[:, None], length, np.ones(len(axes))],
-    )
+    # People walk in the middle of the crosswalk: a vehicle on its rim does not block it.
+    strip = np.column_stack([axes.mean(axis=1), across / length[:, None], length, np.ones(len(axes))])
+    red = [_must_be_red(network, crossing) for crossing in network.crossings]
     return _CrossingConflicts(
-        xy=np.array(xy).reshape(-1, 2),
-        heading=np.array(heading, float),
+        xy=pose[:, :2],
+        heading=pose[:, 2],
         crossing=np.array(owner, int),
         strip=strip,
         marked=np.array([crossing.marked for crossing in network.crossings], bool),
-        red=np.array([_must_be_red(network, c) for c in network.crossings], bool).reshape(
-            len(axes), len(network.lanes)
-        ),
+        red=np.array(red, bool).reshape(len(axes), len(network.lanes)),
     )
 
 
 def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, " lane"]:
-    """See :attr:`_CrossingConflicts.red`."""
+    """Mask of connectors with lights over a crossing, but for turns into the crossed road, which yield."""
     result = np.zeros(len(network.lanes), bool)
     if network.signals is None:
         return result
     arrows = {lane for group in network.signals.groups if group.arrow for lane in group.lanes}
     for lane, along in crossing.lanes:
         this = network.lanes[lane]
-        entering: tuple[int, ...] = ()
-        leaving: tuple[int, ...] = ()
+        entering, leaving = (), ()
         if this.connector:
             entering, leaving = ((lane,), ()) if along < this.length_m / 2 else ((), (lane,))
         elif this.length_m - along < _NEAR_JUNCTION_M:
@@ -102,21 +98,13 @@ def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, "
         for connector in (*entering, *leaving):
             curve = network.lanes[connector].curve
             straight = abs(float(curve.heading[-1] - curve.heading[0])) < math.radians(45.0)
-            if network.lanes[connector].control == Control.SIGNAL and (
-                connector in entering or straight or connector in arrows
-            ):
-                result[connector] = True
+            held = connector in entering or straight or connector in arrows
+            result[connector] |= held and network.lanes[connector].control == Control.SIGNAL
     return result
 
 
 class Walkers:
-    """Pedestrians, moved step by step.
-
-    Args:
-        network: The roads.
-        walkers: Who walks.
-        times_s: Times of all steps to come, on the clock of the signals.
-    """
+    """Pedestrians, moved step by step."""
 
     def __init__(
         self, network: RoadNetwork, walkers: tuple[Walker, ...], times_s: Float64[np.ndarray, " time"]
@@ -131,38 +119,27 @@ class Walkers:
             row[: len(curve.xy)] = np.column_stack([curve.xy, curve.heading])
             row[len(curve.xy) :] = row[len(curve.xy) - 1]
         self._step_m = np.array([float(curve.arc_m[-1]) / (len(curve.xy) - 1) for curve in curves])
-        self._at = np.array([walker.start_m for walker in walkers], float)
-        self._free_speed = np.array([walker.speed_mps for walker in walkers], float)
+        numbers = [[w.start_m, w.speed_mps, w.kerb_m, w.across_m] for w in walkers]
+        self._at, self._free_speed, self._kerb, self._across = (
+            np.array(numbers, float).reshape(-1, 4).T.copy()
+        )
         self._size_m = np.array([walker.size_m[:2] for walker in walkers], float).reshape(-1, 2)
         self._speed = self._free_speed.copy()
         self._crossing = np.array([walker.crossing for walker in walkers], int)
-        self._kerb = np.array([walker.kerb_m for walker in walkers], float)
-        self._across = np.array([walker.across_m for walker in walkers], float)
         self._crosses = self._crossing >= 0
         self._any_crosses = bool(self._crosses.any())
-        # At lights and unmarked crossings only users on the crossing count.
+        # At lights and unmarked crossings drivers need not yield to people at the kerb.
         asking = self._conflicts.marked & ~self._conflicts.red.any(axis=1)
         self._asking = asking[self._crossing] if len(asking) else np.zeros(len(curves), bool)
         self._released, self._into = np.zeros((2, len(curves)), bool)
 
     def step(
-        self,
-        t: int,
-        vehicles: Boxes,
-        active: Bool[np.ndarray, " v"],
-        colour_row: Int8[np.ndarray, " lane"],
+        self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
-        """Return all walkers at step ``t``, then advance them.
+        """Return all walkers at step ``t``, then advance them; steps come in order.
 
-        Args:
-            t: The step; steps come in order.
-            vehicles: All vehicles.
-            active: Which of them are there.
-            colour_row: What every lane's light shows now.
-
-        Returns:
-            The walkers, and which crossings drivers must keep free: a walker is on it or, where drivers must yield,
-            about to step on it.
+        Also return a mask of the crossings that drivers must keep free: a walker is on it or, where drivers must yield,
+        about to step on it.
         """
         place = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
         index = np.minimum(place.astype(int), self._last - 1)
@@ -172,26 +149,19 @@ class Walkers:
         occupied = np.zeros(len(self._conflicts.marked), bool)
         if t % _LOOK_STEPS == 0:
             self._into = _walks_into(pose, vehicles, active)
-            self._release(t, vehicles, active, colour_row)
+            self._release(t, vehicles, active, colour)
         if self._any_crosses:
-            self._mark_occupied(occupied)
+            users = self._crosses & (self._at < self._across) & (self._at > self._kerb - _CLAIM_M)
+            users &= self._released | self._asking | (self._at > self._kerb)
+            occupied[self._crossing[users]] = True
         result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)
         self._advance()
         return result, occupied
 
-    def _mark_occupied(self, occupied: Bool[np.ndarray, " crossing"]) -> None:
-        some = self._crosses & (self._at < self._across) & (self._at > self._kerb - _CLAIM_M)
-        some &= self._released | self._asking | (self._at > self._kerb)
-        occupied[self._crossing[some]] = True
-
     def _release(
-        self,
-        t: int,
-        vehicles: Boxes,
-        active: Bool[np.ndarray, " v"],
-        colour_row: Int8[np.ndarray, " lane"],
+        self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
     ) -> None:
-        """Release walkers at the kerb of a crossing that is safe for long enough."""
+        """Let walkers at the kerb go where the crossing is safe for long enough."""
         before = self._kerb - self._at
         asks = self._crosses & ~self._released & (before >= 0) & (before < _LOOK_M)
         if not np.count_nonzero(asks):
@@ -199,29 +169,27 @@ class Walkers:
         conflicts, crossing = self._conflicts, self._crossing[asks]
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])[active]
         any_s, hard_s = _arrivals(conflicts, boxes, vehicles.speed[active])
-        # Who stands first has to gain speed, which takes v / (2 a) longer.
+        # Starting from standstill takes v / (2 a) longer.
         start_s = self._free_speed / (2 * _ACCELERATION_MPS2)
         needed = ((self._across - self._at) / self._free_speed + start_s)[asks]
         # A standing queue blocks the crossing.
         free = ~overlap(conflicts.strip[:, None], boxes[None]).any(axis=1)
-        red = ~(conflicts.red & (colour_row != Colour.RED)).any(axis=1)
+        red = ~(conflicts.red & (colour != Colour.RED)).any(axis=1)
         yielded = conflicts.marked | conflicts.red.any(axis=1)
         gap = np.where(
-            yielded[crossing],
-            hard_s[crossing] > needed + _MARGIN_S,
-            any_s[crossing] > needed + _GAP_MARGIN_S,
+            yielded[crossing], hard_s[crossing] > needed + _MARGIN_S, any_s[crossing] > needed + _GAP_MARGIN_S
         )
         lasting = self._red_left_s[t, crossing] >= needed
         self._released[asks] = gap & free[crossing] & red[crossing] & lasting
 
     def _advance(self) -> None:
-        """Advance by one step; unreleased walkers stop at the kerb, and none walks into a vehicle."""
+        """Advance by one step; walkers stop at the kerb unless released, and before vehicles."""
         room = self._last * self._step_m - self._at
         if self._any_crosses:
             waits = self._crosses & ~self._released & (self._at <= self._kerb)
             kerb = np.where(waits, self._kerb - _WAIT_M - self._at, math.inf)
             room = np.minimum(np.maximum(kerb, 0.0), room)
-        # v^2 / (2 a) is the way to stop; a step ahead, so that the end is not passed.
+        # The stopping distance is v^2 / (2 a), counted from the end of the step.
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
         after = np.minimum(self._free_speed, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
         after = np.maximum(after, 0.0)
@@ -234,11 +202,11 @@ class Walkers:
 def _red_left(
     network: RoadNetwork, red: Bool[np.ndarray, "crossing lane"], times_s: Float64[np.ndarray, " time"]
 ) -> Float64[np.ndarray, "time crossing"]:
-    """For how long the lights will hold back those who must stand while people cross, s; infinite without lights."""
+    """Remaining time for which the lights hold back all conflicting vehicles, s (infinite: no lights)."""
     left = np.full((len(times_s), len(red)), math.inf)
     if network.signals is None or not red.any():
         return left
-    # People see how much time is left: a cycle beyond the end shows when green comes next.
+    # People know the cycle: the colours are continued by one cycle beyond the last step.
     beyond = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
     colour, _ = network.signals.colours(np.concatenate([times_s, beyond]), len(network.lanes))
     for crossing in np.flatnonzero(red.any(axis=1)):
@@ -250,19 +218,18 @@ def _red_left(
 
 
 def _arrivals(
-    conflicts: _CrossingConflicts, boxes: Float64[np.ndarray, "v 6"], speed: Float64[np.ndarray, " v"]
+    conflicts: _CrossingConflicts, boxes: Float64[np.ndarray, "v 6"], speed: PerVehicle
 ) -> tuple[Float64[np.ndarray, " crossing"], Float64[np.ndarray, " crossing"]]:
-    """When the next vehicle reaches each crossing, s: any that moves, and any that cannot stop with ease."""
-    any_s, hard_s = np.full(len(conflicts.marked), math.inf), np.full(len(conflicts.marked), math.inf)
+    """Arrival time of the next moving vehicle at each crossing, s: of all, and of those that cannot yield."""
+    any_s, hard_s = np.full((2, len(conflicts.marked)), math.inf)
     if not len(boxes):
         return any_s, hard_s
     rel = conflicts.xy[:, None] - boxes[None, :, :2]
     cos, sin = boxes[:, 2], boxes[:, 3]
     ahead = rel[..., 0] * cos + rel[..., 1] * sin
     aside = np.abs(rel[..., 1] * cos - rel[..., 0] * sin)
-    same = np.cos(conflicts.heading)[:, None] * cos + np.sin(conflicts.heading)[:, None] * sin > math.cos(
-        _ASIDE
-    )
+    same = np.cos(conflicts.heading)[:, None] * cos + np.sin(conflicts.heading)[:, None] * sin
+    same = same > math.cos(_ASIDE)
     coming = (ahead > -1.0) & (aside < 2.0 + math.tan(_BEARING) * np.maximum(ahead, 0.0))
     coming &= same & (speed > _STANDING_MPS)
     distance = np.maximum(np.hypot(ahead, aside) - boxes[:, 4] / 2, 0.0)
@@ -273,10 +240,8 @@ def _arrivals(
     return any_s, hard_s
 
 
-def _walks_into(
-    pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: Bool[np.ndarray, " v"]
-) -> Bool[np.ndarray, " w"]:
-    """Mask of walkers about to come too near to a vehicle, and not near one already."""
+def _walks_into(pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask) -> _Mask:
+    """Mask of walkers that are about to come too close to a vehicle and are not close to one yet."""
     x, y, angle = pose.T
     into = _within(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
     if np.count_nonzero(into):
@@ -284,13 +249,8 @@ def _walks_into(
     return into
 
 
-def _within(
-    x: Float64[np.ndarray, " w"],
-    y: Float64[np.ndarray, " w"],
-    vehicles: Boxes,
-    active: Bool[np.ndarray, " v"],
-) -> Bool[np.ndarray, " w"]:
-    """Which points lie in any vehicle grown by the berth that people give it."""
+def _within(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Mask:
+    """Mask of points in a vehicle's box grown by the distance that people keep."""
     cos, sin = vehicles.direction
     half = vehicles.size_m / 2 + _BERTH_M
     dx, dy = x[:, None] - vehicles.xy[:, 0], y[:, None] - vehicles.xy[:, 1]
@@ -305,14 +265,9 @@ def _within(
 def place_walkers(
     network: RoadNetwork, per_100m: float, rng: np.random.Generator, times_s: Float64[np.ndarray, " time"]
 ) -> tuple[Walker, ...]:
-    """Draw walkers: along the sidewalks in both directions, and over the crossings.
+    """Draw walkers along the sidewalks in both directions, and half as many at each crossing as per 100 m.
 
-    Args:
-        network: The roads.
-        per_100m: Mean number of people per 100 m of sidewalk; each crossing gets about half as many.
-        rng: Source of chance.
-        times_s: Times of all steps; people reach their kerbs between 4 s before and 8 s after time 0, where the
-            recording begins.
+    They reach the kerbs between 4 s before and 8 s after time 0.
     """
     people = []
     for walk in network.walks:
@@ -347,19 +302,14 @@ def _crosser(
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     kerb, across = float(arc[len(before)]), float(arc[len(before) + 1])
     pace = _pace(rng)
-    # Time 0 is where the recording begins.
-    arrives = rng.uniform(-4.0, 8.0)
-    start = max(0.0, kerb - pace * (arrives - begin_s))
+    start = max(0.0, kerb - pace * (rng.uniform(-4.0, 8.0) - begin_s))
     return Walker(_polyline(points), start, pace, index, kerb, across)
 
 
 def _along_walk(
-    network: RoadNetwork,
-    kerb: Float64[np.ndarray, " 2"],
-    out: Float64[np.ndarray, " 2"],
-    rng: np.random.Generator,
+    network: RoadNetwork, kerb: _Point, out: _Point, rng: np.random.Generator
 ) -> Float64[np.ndarray, "point 2"]:
-    """Where a way goes on from a kerb: along a sidewalk nearby, in either direction, or straight off the road."""
+    """Continue from a kerb: along a nearby sidewalk, in either direction, or straight off the road."""
     best: tuple[float, Curve, int] | None = None
     for walk in network.walks:
         gap = np.hypot(*(walk.xy - kerb).T)
@@ -370,15 +320,12 @@ def _along_walk(
         return kerb + np.outer([2.0, 20.0], out)
     _, walk, place = best
     pieces = [piece for piece in (walk.xy[place:], walk.xy[place::-1]) if len(piece) > 4]
-    # The crossing's axis is met at a right angle, some way from the kerb.
     piece = pieces[int(rng.integers(len(pieces)))]
     return piece[1:81]
 
 
 def _polyline(points: Float64[np.ndarray, "point 2"]) -> Curve:
     """Return a curve through points; the heading turns at the corners."""
-    steps = np.diff(points, axis=0)
-    kept = np.concatenate([[True], np.hypot(*steps.T) > 1e-6])
-    points = points[kept]
+    points = points[np.append(True, np.hypot(*np.diff(points, axis=0).T) > 1e-6)]
     angle = np.unwrap(np.arctan2(*np.diff(points, axis=0).T[::-1]))
     return resample(Curve(points, np.concatenate([angle, angle[-1:]])), STEP_M)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -12,16 +12,44 @@ from jaxtyping import Float64
 from drivax.scenario.schema import AgentKind, RoadKind
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.roads.network import Bay, Lane, RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import Path, Sway, lane_path
-from drivax.synthetic.traffic.roles import Scripted
+from drivax.synthetic.traffic.roles import Drivers, Scripted
 
-#: Who passes a double-parked car without leaving the road needs this width, m.
+#: Width left next to a double-parked car where it can be passed within the lane, m.
 _PASSAGE_M = 2.3
-#: Room that is left in a bay before and behind the car, m.
+#: Free length in an occupied bay, m.
 _MANOEUVRE_M = 0.6
-#: Double-parked cars keep so far from the ends of lanes, m.
+#: Distance of double-parked cars from the ends of lanes, m.
 _FROM_ENDS_M = 15.0
+#: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time gap added to it, s.
+_GAP_M, _GAP_S = 5.0, 0.9
+#: Free gaps on busy lanes as a share of those elsewhere.
+_BUSY = 0.4
+#: No cyclists where the speed limit is higher, m/s; their distance from the lane's right side, m.
+_CYCLED_MPS, _KERB_M = 16.0, 0.55
+#: No vehicle is placed within this time of a lane's end, s.
+_MERGE_S = 5.0
+#: No vehicle is placed this far before and behind an obstacle in its lane, m; the widest vehicle, m.
+_BEFORE_M, _BEHIND_M, _WIDEST_M = 30.0, 14.0, 2.55
+#: Distance between centres of vehicles on different lanes that share space, m.
+_APART_M = 15.0
+_CAR, _VAN, _TRUCK, _BUS, _CYCLIST = range(5)
+#: Smallest and largest length, width and height of each type, m.
+_SIZES = np.array(
+    [
+        [[3.9, 1.7, 1.35], [5.3, 2.05, 1.85]],
+        [[5.0, 1.95, 2.0], [6.4, 2.1, 2.7]],
+        [[7.0, 2.3, 2.8], [9.5, 2.5, 3.6]],
+        [[10.5, 2.5, 2.9], [12.0, 2.55, 3.3]],
+        [[1.7, 0.6, 1.65], [1.9, 0.7, 1.85]],
+    ]
+)
+#: Length and width of the largest vehicle, m.
+LONGEST_M: tuple[float, float] = (float(_SIZES[_BUS, 1, 0]), float(_SIZES[_BUS, 1, 1]))
+
+#: Lane and distance along it, m.
+_Place = tuple[int, float]
+_Places = list[_Place]
 
 
 def parked_cars(
@@ -29,25 +57,20 @@ def parked_cars(
 ) -> tuple[Scripted, ...]:
     """Draw parked cars in bays, and sometimes a double-parked one.
 
-    Args:
-        network: The roads.
-        share: Share of bays that are taken.
-        double_share: Chance of a double-parked car next to a bay, where others can pass: on a lane of the
-            same direction, on the oncoming lane, or because 2.3 m are left.
-        rng: Source of chance.
-        steps: Length of the result, time steps.
+    ``share`` bays are occupied. With probability ``double_share`` a car is double-parked next to a bay where others can
+    pass: on an adjacent or oncoming lane, or within the lane.
     """
     result = []
     for bay in network.bays:
-        # All values are drawn for every bay: the share must not change other cars.
+        # All values are drawn for every bay, so that the share does not change other cars.
         size = _size(rng, bay.length_m)
         along, aside = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
         turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
         occupied = rng.random() < share
         if occupied and size[0] < bay.length_m:
             play = (bay.length_m - size[0]) / 2
-            pose = _moved(bay.pose, float(np.clip(along, -play, play)), float(np.clip(aside, -0.15, 0.15)))
-            pose = Pose(pose.x, pose.y, pose.heading + turn)
+            pose = bay.pose.ahead(float(np.clip(along, -play, play)))
+            pose = replace(pose.aside(float(np.clip(aside, -0.15, 0.15))), heading=pose.heading + turn)
             result.append(Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
     doubled, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
     for place in rng.permutation(len(network.bays)).tolist() if doubled else ():
@@ -59,26 +82,20 @@ def parked_cars(
 
 
 def _size(rng: np.random.Generator, room_m: float) -> tuple[float, float, float]:
-    """A car or, in one case of eight, a van, that fits the bay."""
+    """Draw the size of a car or, in one case of eight, a van that fits a bay."""
     length = float(np.clip(rng.normal(4.5, 0.35), 3.6, 5.2))
-    van = rng.random() < 0.125 and room_m > 6.2
-    if van:
+    if rng.random() < 0.125 and room_m > 6.2:
         return min(length + 0.8, room_m - _MANOEUVRE_M), 2.0, 2.3
     return min(length, room_m - _MANOEUVRE_M), float(np.clip(rng.normal(1.82, 0.06), 1.65, 1.95)), 1.55
 
 
-def _moved(pose: Pose, ahead_m: float, left_m: float) -> Pose:
-    cos, sin = math.cos(pose.heading), math.sin(pose.heading)
-    return Pose(pose.x + ahead_m * cos - left_m * sin, pose.y + ahead_m * sin + left_m * cos, pose.heading)
-
-
 def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> Pose:
-    """Return the pose in the lane next to a bay, as near to it as the lane's border allows."""
+    """Return the pose in the lane next to a bay, at the lane's border."""
     lane = network.lanes[bay.lane]
     centre = _pose_at(lane, bay.along_m)
     dx, dy = bay.pose.x - centre.x, bay.pose.y - centre.y
     side = math.copysign(1.0, dy * math.cos(centre.heading) - dx * math.sin(centre.heading))
-    return _moved(centre, 0.0, side * ((lane.width_m - width_m) / 2 - gap_m))
+    return centre.aside(side * ((lane.width_m - width_m) / 2 - gap_m))
 
 
 def _passable(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
@@ -91,7 +108,7 @@ def _passable(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> b
 
 
 def _oncoming(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
-    """Whether a lane of the other direction is adjacent here."""
+    """Whether a lane of the other direction is adjacent."""
     here = _pose_at(lane, along_m)
     for other in network.lanes:
         gap = np.hypot(other.curve.xy[:, 0] - here.x, other.curve.xy[:, 1] - here.y)
@@ -108,45 +125,16 @@ def _pose_at(lane: Lane, along_m: float) -> Pose:
     return Pose(x, y, float(np.interp(along_m, arc, lane.curve.heading)))
 
 
-#: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time added per m/s.
-_GAP_M, _GAP_S = 5.0, 0.9
-#: Free gaps on busy lanes as a share of those elsewhere.
-_BUSY = 0.4
-#: No cyclists where the speed limit is higher, m/s.
-_CYCLED_MPS = 16.0
-#: How far from the lane's right side cyclists ride, m.
-_KERB_M = 0.55
-#: No vehicle is placed within this time of a lane's end, s.
-_MERGE_S = 5.0
-#: No vehicle is placed this far before and behind an obstacle in its lane, m; the widest vehicle, m.
-_BEFORE_M, _BEHIND_M, _WIDEST_M = 30.0, 14.0, 2.55
-#: Vehicles on different lanes that take up the same strip are this far apart, centre to centre, m.
-_APART_M = 15.0
-_CAR, _VAN, _TRUCK, _BUS, _CYCLIST = range(5)
-#: Smallest and largest length, width and height of each type, m.
-_SIZES = np.array(
-    [
-        [[3.9, 1.7, 1.35], [5.3, 2.05, 1.85]],
-        [[5.0, 1.95, 2.0], [6.4, 2.1, 2.7]],
-        [[7.0, 2.3, 2.8], [9.5, 2.5, 3.6]],
-        [[10.5, 2.5, 2.9], [12.0, 2.55, 3.3]],
-        [[1.7, 0.6, 1.65], [1.9, 0.7, 1.85]],
-    ]
-)
-#: Length and width of the largest vehicle, m.
-LONGEST_M: tuple[float, float] = (float(_SIZES[_BUS, 1, 0]), float(_SIZES[_BUS, 1, 1]))
-
-
 @dataclass(frozen=True)
 class Density:
-    """How full the roads are.
+    """Density and composition of traffic.
 
     Attributes:
         spacing_m: Mean free gap between vehicles of a lane, drawn per scenario, low and high.
-        vehicles: Most vehicles besides ego; the nearest to ego are kept.
-        van_share, truck_share, bus_share: Shares of these among all; the rest are cars.
-        cyclist_share: Share of cyclists among those who are placed on streets.
-        leader_share: Share of scenarios in which a vehicle is placed right ahead of ego.
+        vehicles: Largest number of vehicles without ego; the nearest to ego are kept.
+        van_share, truck_share, bus_share: Shares of vehicle types; the rest are cars.
+        cyclist_share: Share of cyclists on streets.
+        leader_share: Share of scenarios with a vehicle right ahead of ego.
     """
 
     spacing_m: tuple[float, float] = (25.0, 90.0)
@@ -175,19 +163,12 @@ def placed(
     parked: tuple[Scripted, ...] = (),
     busy: Collection[int] = (),
 ) -> Placement:
-    """Draw initial positions: none on a connector, none too close to ego or another vehicle.
+    """Draw initial positions: none on a connector, none too close to ego, another vehicle or a parked car.
 
-    Args:
-        network: The roads.
-        ego_lane: Lane on which ego begins.
-        ego_along_m: Distance of ego along that lane, m.
-        density: How full the roads are.
-        rng: Source of chance.
-        parked: Parked cars; no vehicle begins in or right behind one.
-        busy: Lanes that are as full as the network's busy ones.
+    ``busy`` are lanes that are as dense as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
-    vehicles: list[tuple[int, float]] = []
+    vehicles: _Places = []
     if rng.random() < density.leader_share:
         ahead = ego_along_m + rng.uniform(18.0, 45.0)
         if ahead < network.lanes[ego_lane].length_m - 6.0:
@@ -206,7 +187,7 @@ def placed(
                 occupied.append(float(at))
             at += least + rng.exponential(mean)
     vehicles = [place for place in vehicles if not _blocked(network, *place, parked)]
-    vehicles = _apart_at_joints(network, vehicles, ego_lane, ego_along_m)
+    vehicles = _apart_at_joints(network, vehicles, (ego_lane, ego_along_m))
     here = network.lanes[ego_lane].curve
     ego_xy = here.xy[np.searchsorted(here.arc_m, ego_along_m).clip(max=len(here.xy) - 1)]
     vehicles.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
@@ -214,10 +195,8 @@ def placed(
     return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
 
 
-def _apart_in_space(
-    network: RoadNetwork, vehicles: list[tuple[int, float]], ego: tuple[int, float]
-) -> list[tuple[int, float]]:
-    """Drop who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
+def _apart_in_space(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
+    """Drop vehicles that share space with an earlier one on another lane, as where lanes fork or merge."""
     kept: list[tuple[float, float]] = []
     result = []
     for place in [ego, *vehicles]:
@@ -236,7 +215,7 @@ def _apart_in_space(
 
 
 def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
-    """Whether a parked car is in the lane here or too near ahead to be passed."""
+    """Whether a parked car is in the lane at or close to a position."""
     curve = network.lanes[lane].curve
     place = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
     cos, sin = np.cos(curve.heading[place]), np.sin(curve.heading[place])
@@ -248,24 +227,20 @@ def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Script
     return False
 
 
-def _apart_at_joints(
-    network: RoadNetwork, vehicles: list[tuple[int, float]], ego_lane: int, ego_along_m: float
-) -> list[tuple[int, float]]:
-    """Drop who stands too close behind the first vehicle of a following lane."""
+def _apart_at_joints(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
+    """Drop vehicles that are too close behind the first vehicle of the next lane."""
     kept = []
     first: dict[int, float] = {}
-    for lane, along in [*vehicles, (ego_lane, ego_along_m)]:
-        first[lane] = min(along, first.get(lane, np.inf))
-    last: dict[int, float] = {ego_lane: ego_along_m}
-    for lane, along in vehicles:
-        last[lane] = max(along, last.get(lane, 0.0))
+    last: dict[int, float] = {}
+    for lane, along in [*vehicles, ego]:
+        first[lane], last[lane] = min(along, first.get(lane, np.inf)), max(along, last.get(lane, 0.0))
     for lane, along in vehicles:
         this = network.lanes[lane]
         least = 10.0 + _GAP_M + _GAP_S * this.limit_mps
         after = min((first.get(b, np.inf) for b in this.successors), default=np.inf)
         # Only the last vehicle of a lane can be too close to the next lane's first one. Ego always stays.
-        behind_ego = ego_lane in this.predecessors
-        gap_to_ego = network.lanes[ego_lane].length_m - ego_along_m + along if behind_ego else np.inf
+        before_ego = network.lanes[ego[0]].length_m - ego[1] + along
+        gap_to_ego = before_ego if ego[0] in this.predecessors else np.inf
         if (along < last[lane] or this.length_m - along + after > least) and gap_to_ego > least:
             kept.append((lane, along))
     return kept
@@ -281,11 +256,7 @@ def draw_drivers(
 ) -> Drivers:
     """Draw vehicles and drivers.
 
-    Args:
-        count: How many.
-        density: Shares of the types.
-        rng: Source of chance.
-        lanes: First lane of each: no cyclists on fast roads, only cyclists on bicycle lanes.
+    With the first lane of each, there are no cyclists on fast roads, and only cyclists on bicycle lanes.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
     drawn = np.searchsorted(shares, rng.random(count), side="right")
@@ -295,8 +266,7 @@ def draw_drivers(
         fast = np.array([lane.limit_mps > _CYCLED_MPS for lane in lanes], bool)
         kind[(kind == _CYCLIST) & fast] = _CAR
         kind[np.array([lane.kind == RoadKind.LANE_BIKE for lane in lanes], bool)] = _CYCLIST
-    low, high = _SIZES[kind, 0], _SIZES[kind, 1]
-    size = rng.uniform(low, high)
+    size = rng.uniform(_SIZES[kind, 0], _SIZES[kind, 1])
     heavy, cyclist = (kind == _TRUCK) | (kind == _BUS), kind == _CYCLIST
     slower = np.where(heavy, 0.85, 1.0)
     return Drivers(

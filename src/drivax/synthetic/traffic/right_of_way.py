@@ -1,7 +1,7 @@
 """Right of way at connectors: lights, signs, priority, and room to leave.
 
-A driver asks for a connector when it comes so near that it would have to begin to brake for its line. Once granted,
-the connector is held until the tail has left what others need of it; conflicting connectors are not granted.
+A driver requests a connector shortly before it would have to brake for its stop line. Once granted, the connector is
+held until the rear bumper has left the conflict zones; conflicting connectors are not granted meanwhile.
 """
 
 from __future__ import annotations
@@ -10,35 +10,40 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int8, Int64
+from jaxtyping import Float64, Int8, Int64
 
 from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S
 from drivax.synthetic.roads.curves import resample
 from drivax.synthetic.roads.network import CLEARANCE_M, Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
-from drivax.synthetic.traffic.drivers import Drivers
-from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows
+from drivax.synthetic.traffic.roles import Drivers
 
-#: A driver asks for the way when it would brake this gently for the line, m/s2, with this much time and room to spare.
+#: A driver requests a connector when it can still stop with this braking, m/s2, with this time and distance to spare.
 _ASK_MPS2, _ASK_S, _ASK_M = 2.0, 0.7, 3.5
-#: A driver that expects a blocker to clear in time brakes at this deceleration at the latest, m/s2; turning speed.
+#: A driver that expects a blocker to clear waits with braking until this much is needed, m/s2; turning speed, m/s.
 _LATEST_MPS2, _TURNING_MPS = 3.4, 7.0
-#: A driver that would have to brake harder than this does not stop for others, m/s2.
+#: Drivers that would have to brake harder than this do not stop for others, m/s2.
 _HARDEST_MPS2 = 6.5
-#: Standing at a stop sign: slower than this, and nearer to the line.
+#: A vehicle has stopped at a sign below this speed, m/s, and within this distance of the line, m.
 _STANDS_MPS, _STANDS_M = 0.2, 4.5
-#: How long drivers look before they leave a stop sign, s.
+#: Least duration of a stop at a stop sign, s.
 _PAUSE_S = 0.45
-#: Who stood within this time of each other arrived together, s.
+#: Vehicles that stop within this time of each other arrive simultaneously, s.
 _TIE_S = 0.35
-#: Slowest speed with which others with priority are expected to come, m/s.
+#: Lowest speed at which vehicles with priority are expected to approach, m/s.
 _EXPECTED_MPS = 3.0
-#: Waiting this long makes drivers accept two thirds of their usual gap, s.
+#: After this time drivers accept two thirds of their usual gap, s.
 _IMPATIENT_S = 30.0
 # Plain numbers: members of enumerations are looked up slowly.
 _NONE, _STOP, _ALL_WAY_STOP = int(Control.NONE), int(Control.STOP), int(Control.ALL_WAY_STOP)
 _RED, _YELLOW = int(Colour.RED), int(Colour.YELLOW)
+
+#: Rows of the vehicles that request a connector.
+_Requests = Int64[np.ndarray, " request"]
+#: Row and connector of each vehicle that holds one.
+_Holders = list[tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -46,33 +51,32 @@ class TrafficState:
     """State of all vehicles when drivers decide.
 
     Attributes:
-        step, colour, to_red: The step, and what each lane's light shows and how long until it turns red, s.
+        colour, to_red: Colour of each lane's light, and time until it turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
-        promised: Number of connectors on the path that a vehicle will enter whatever others do (-1: it asks).
-        promises: Whether any vehicle has promised.
+        committed: Number of connectors that a planned ego enters whatever others do (-1: ego is not planned).
     """
 
+    tables: PathTables
     step: int
     colour: Int8[np.ndarray, " lane"]
     to_red: Float64[np.ndarray, " lane"]
-    front_m: Float64[np.ndarray, " v"]
-    rear_m: Float64[np.ndarray, " v"]
-    speed: Float64[np.ndarray, " v"]
-    active: Bool[np.ndarray, " v"]
-    room_m: Float64[np.ndarray, " v"]
-    leader: Int64[np.ndarray, " v"]
-    leader_speed: Float64[np.ndarray, " v"]
-    promised: Int64[np.ndarray, " v"]
-    promises: bool
+    front_m: PerVehicle
+    rear_m: PerVehicle
+    speed: PerVehicle
+    active: VehicleMask
+    room_m: PerVehicle
+    leader: VehicleRows
+    leader_speed: PerVehicle
+    committed: int
 
 
 def conflict_zones(
     network: RoadNetwork,
 ) -> tuple[Float64[np.ndarray, "lane lane"], Float64[np.ndarray, "lane lane"]]:
-    """From where to where along each connector the space is needed by each other one, m (nan: nowhere).
+    """Begin and end on each connector of the stretch that conflicts with each other connector, m (nan: no conflict).
 
-    Connectors that leave the same lane do not conflict: there the one behind follows.
+    Connectors that leave the same lane do not conflict: vehicles on them follow each other.
     """
     count = len(network.lanes)
     begin, end = np.full((count, count), np.nan), np.full((count, count), np.nan)
@@ -97,7 +101,7 @@ def conflict_zones(
 def time_to_cover(
     distance_m: Float64[np.ndarray, "*n"], speed: float, acceleration: float, top: float
 ) -> Float64[np.ndarray, "*n"]:
-    """Time to cover distances when speeding up evenly to a top speed, s (0 for distances below zero)."""
+    """Time to cover distances at constant acceleration up to a top speed, s (0 for negative distances)."""
     distance = np.maximum(distance_m, 0.0)
     top = max(top, speed, 0.1)
     ramp = (top**2 - speed**2) / (2 * acceleration)
@@ -106,18 +110,31 @@ def time_to_cover(
     return np.where(distance < ramp, early, late)
 
 
-def _number(mask: Bool[np.ndarray, "v k"]) -> Int64[np.ndarray, " v"]:
-    """How many of each row are true."""
-    return np.add.reduce(mask, axis=1, dtype=np.int64)
+@dataclass(frozen=True)
+class _Request:
+    """A vehicle's request for the connector at an index (``place``) of its path, and the distance to its stop line."""
+
+    row: int
+    connector: int
+    place: int
+    line_m: float
+    distance_m: float
+    speed: float
+
+    @classmethod
+    def at(cls, state: TrafficState, row: int, place: int) -> _Request:
+        line = float(state.tables.connector_begin[row, place])
+        connector, distance = int(state.tables.connector[row, place]), float(line - state.front_m[row])
+        return cls(row, connector, place, line, distance, float(state.speed[row]))
+
+    @property
+    def needed_mps2(self) -> float:
+        """Braking that it takes to stop at the line."""
+        return self.speed**2 / (2 * max(self.distance_m, 0.05))
 
 
 class RightOfWay:
-    """Grants connectors to drivers.
-
-    Args:
-        network: The roads.
-        drivers: Who drives.
-    """
+    """Grants connectors to drivers."""
 
     def __init__(self, network: RoadNetwork, drivers: Drivers) -> None:
         self._lanes, self._drivers = network.lanes, drivers
@@ -136,90 +153,82 @@ class RightOfWay:
     def reset(self) -> None:
         """Reset for a new run."""
         count = len(self._length)
-        self._granted = np.zeros(count, int)
-        self._stood = np.full(count, np.inf)
-        self._asked = np.full(count, -1)
+        self._granted = np.zeros(count, int)  # number of connectors on the path
+        self._stood = np.full(count, np.inf)  # time of the stop at the requested connector, s
+        self._requested = np.full(count, -1)
         self._denied = np.zeros(count, bool)
 
     def swapped(self, row: int, tables: PathTables, front_m: float) -> None:
-        """A vehicle has gone over to another path: it holds what it has entered there, and asks for the rest."""
+        """Reset a vehicle that has changed to another path: it keeps only the connectors that it has entered."""
         self._granted[row] = int(np.sum(tables.connector_begin[row] < front_m))
-        self._stood[row], self._asked[row] = np.inf, -1
+        self._stood[row], self._requested[row] = np.inf, -1
 
-    def lines(self, state: TrafficState, tables: PathTables) -> Float64[np.ndarray, " v"]:
+    def lines(self, state: TrafficState) -> PerVehicle:
         """Distance from the front bumper to the next line at which to stop (infinite: none)."""
-        connectors = tables.connector.shape[1]
-        entered = _number(tables.connector_begin < state.front_m[:, None])
+        begin = state.tables.connector_begin
+        connectors = begin.shape[1]
+        entered = np.add.reduce(begin < state.front_m[:, None], axis=1, dtype=np.int64)
         self._granted = np.maximum(self._granted, entered)
-        stop, halts = self._lights(state, tables)
+        stop, halts = self._lights(state)
         self._granted = np.maximum(np.minimum(self._granted, halts), entered)
-        ask = state.speed**2 / (2 * _ASK_MPS2) + _ASK_S * state.speed + _ASK_M
-        if state.promises:
-            self._granted = np.where(state.promised >= 0, np.maximum(state.promised, entered), self._granted)
+        if state.committed >= 0:
+            self._granted[0] = max(state.committed, entered[0])
+        near = state.speed**2 / (2 * _ASK_MPS2) + _ASK_S * state.speed + _ASK_M
         place = np.minimum(self._granted, connectors - 1)
-        flat = place + connectors * self._rows
-        distance = tables.connector_begin.ravel().take(flat) - state.front_m
-        # Where there is no connector ahead, it is infinitely far away.
-        asks = (distance >= 0) & (distance <= ask) & state.active & (halts > place)
-        if state.promises:
-            promises = state.promised >= 0
-            asks &= ~promises
-            stop[promises] = np.inf
-        self._denied &= asks
-        asking = asks.nonzero()[0]
-        if len(asking):
-            self._decide(state, tables, asking, place, stop)
+        # Without a connector ahead the distance is infinite.
+        distance = begin.ravel().take(place + connectors * self._rows) - state.front_m
+        requests = (distance >= 0) & (distance <= near) & state.active & (halts > place)
+        if state.committed >= 0:
+            requests[0], stop[0] = False, np.inf
+        self._denied &= requests
+        rows = requests.nonzero()[0]
+        if len(rows):
+            self._decide(state, rows, place, stop)
         return stop
 
-    def _lights(
-        self, state: TrafficState, tables: PathTables
-    ) -> tuple[Float64[np.ndarray, " v"], Int64[np.ndarray, " v"]]:
-        """Distance to the nearest line held by a light, and which connector it is (none: their number)."""
-        begin, count = tables.connector_begin, tables.connector.shape[1]
+    def _lights(self, state: TrafficState) -> tuple[PerVehicle, VehicleRows]:
+        """Distance to the nearest line closed by a light, and index of its connector (their number: none)."""
+        begin, connector = state.tables.connector_begin, state.tables.connector
+        count = connector.shape[1]
         if not np.count_nonzero(state.colour):
             return np.full(len(begin), np.inf), np.full(len(begin), count)
         distance = begin - state.front_m[:, None]
         distance[distance < 0.0] = np.inf
         speed = state.speed[:, None]
         needed = speed**2 / (2 * np.maximum(distance, 0.05))
-        colour = state.colour.take(tables.connector)
-        late = distance > speed * state.to_red.take(tables.connector)
-        yellow = (colour == _YELLOW) & (
-            (needed <= self._drivers.yellow_mps2[:, None]) | (late & (needed <= 5.0))
-        )
-        halt = (yellow | ((colour == _RED) & (needed <= 8.0))) & (distance < np.inf)
+        colour = state.colour.take(connector)
+        late = distance > speed * state.to_red.take(connector)
+        stops_at_yellow = (needed <= self._drivers.yellow_mps2[:, None]) | (late & (needed <= 5.0))
+        halt = ((colour == _YELLOW) & stops_at_yellow) | ((colour == _RED) & (needed <= 8.0))
+        halt &= distance < np.inf
         first = halt.argmax(axis=1)
         flat = first + count * self._rows
         held = halt.ravel().take(flat)
         return np.where(held, distance.ravel().take(flat), np.inf), np.where(held, first, count)
 
-    def _decide(
-        self,
-        state: TrafficState,
-        tables: PathTables,
-        asking: Int64[np.ndarray, " asking"],
-        place: Int64[np.ndarray, " v"],
-        stop: Float64[np.ndarray, " v"],
-    ) -> None:
-        """Grant or deny what drivers ask for, nearest in time first, at all-way stops in the order of standing."""
-        index = np.arange(tables.connector.shape[1])
-        held = (
-            (index < self._granted[:, None])
-            & (tables.connector_end > state.rear_m[:, None])
-            & state.active[:, None]
-        )
-        holder, slot = np.nonzero(held & (tables.connector >= 0))
-        holders = list(zip(holder.tolist(), tables.connector[holder, slot].tolist(), strict=True))
-        for i in asking.tolist():
-            self._note_standing(state, tables, i, int(place[i]))
-        waiting: list[tuple[int, int]] = []  # who stands at an all-way stop and has not been let in
-        for i in self._in_order(state, tables, asking, place):
-            connector = int(tables.connector[i, place[i]])
-            distance = float(tables.connector_begin[i, place[i]] - state.front_m[i])
-            hard = state.speed[i] ** 2 / (2 * max(distance, 0.05)) > _HARDEST_MPS2
+    def _decide(self, state: TrafficState, rows: _Requests, place: VehicleRows, stop: PerVehicle) -> None:
+        """Grant or deny requests, nearest in time first, at all-way stops in the order of arrival."""
+        tables = state.tables
+        held = np.arange(tables.connector.shape[1]) < self._granted[:, None]
+        held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
+        row, slot = np.nonzero(held & (tables.connector >= 0))
+        holders = list(zip(row.tolist(), tables.connector[row, slot].tolist(), strict=True))
+        requests = [_Request.at(state, i, int(place[i])) for i in rows.tolist()]
+        for request in requests:
+            i = request.row
+            if self._requested[i] != request.connector:
+                self._requested[i], self._stood[i] = request.connector, np.inf
+            stands = request.speed < _STANDS_MPS and request.distance_m < _STANDS_M
+            if stands and not np.isfinite(self._stood[i]):
+                self._stood[i] = state.step * DT_S
+        waiting: list[int] = []  # connectors of vehicles that stand at an all-way stop and must still wait
+        for k in self._order(requests):
+            request = requests[k]
+            i, connector = request.row, request.connector
+            hard = request.needed_mps2 > _HARDEST_MPS2
             ok = self._free[connector] or (hard and state.speed[i] > 2.0)
-            ok = ok or self._may_enter(state, tables, (i, connector, int(place[i])), holders, waiting)
-            if not ok and self._clears_in_time(state, tables, (i, connector, int(place[i])), holders):
+            ok = ok or self._may_enter(state, request, holders, waiting)
+            if not ok and self._clears_in_time(state, request, holders):
                 continue
             self._denied[i] = not ok
             if ok:
@@ -227,137 +236,96 @@ class RightOfWay:
                 self._stood[i] = np.inf
                 holders.append((i, connector))
             else:
-                stop[i] = min(stop[i], distance)
+                stop[i] = min(stop[i], request.distance_m)
                 if self._control[connector] == _ALL_WAY_STOP and np.isfinite(self._stood[i]):
-                    waiting.append((i, connector))
+                    waiting.append(connector)
 
-    def _note_standing(self, state: TrafficState, tables: PathTables, i: int, place: int) -> None:
-        connector, distance = (
-            int(tables.connector[i, place]),
-            tables.connector_begin[i, place] - state.front_m[i],
-        )
-        if self._asked[i] != connector:
-            self._asked[i], self._stood[i] = connector, np.inf
-        if state.speed[i] < _STANDS_MPS and distance < _STANDS_M and not np.isfinite(self._stood[i]):
-            self._stood[i] = state.step * DT_S
-
-    def _in_order(
-        self,
-        state: TrafficState,
-        tables: PathTables,
-        asking: Int64[np.ndarray, " asking"],
-        place: Int64[np.ndarray, " v"],
-    ) -> list[int]:
-        connectors = tables.connector[asking, place[asking]]
-        arrival = (tables.connector_begin[asking, place[asking]] - state.front_m[asking]) / np.maximum(
-            state.speed[asking], 1.0
-        )
+    def _order(self, requests: list[_Request]) -> list[int]:
+        """Order in which requests are decided."""
+        rows = np.array([request.row for request in requests])
+        connectors = np.array([request.connector for request in requests])
+        arrival = [request.distance_m / max(request.speed, 1.0) for request in requests]
         all_way = self._control[connectors] == _ALL_WAY_STOP
-        stood = self._stood[asking]
+        stood = self._stood[rows]
         key = np.where(all_way, 1e3 + np.minimum(stood, 1e6), arrival)
         for k in np.flatnonzero(all_way & np.isfinite(stood)):
-            # Of those who came together the vehicle without another to its right goes first.
+            # Of vehicles that arrived simultaneously the one without another to its right goes first.
             tied = all_way & (np.abs(stood - stood[k]) < _TIE_S)
             here = self._lanes[connectors[k]].curve.heading[0]
             turned = np.array([wrap(self._lanes[w].curve.heading[0] - here) for w in connectors[tied]])
             key[k] += 0.5 * _TIE_S * bool(np.any((turned > math.pi / 4) & (turned < 3 * math.pi / 4)))
-        return asking[np.lexsort((asking, key))].tolist()
+        return np.lexsort((rows, key)).tolist()
 
     def _may_enter(
-        self,
-        state: TrafficState,
-        tables: PathTables,
-        request: tuple[int, int, int],
-        holders: list[tuple[int, int]],
-        waiting: list[tuple[int, int]],
+        self, state: TrafficState, request: _Request, holders: _Holders, waiting: list[int]
     ) -> bool:
-        i, connector, place = request
+        i, connector, line = request.row, request.connector, request.line_m
         control = self._control[connector]
         if control >= _STOP and state.step * DT_S - self._stood[i] < _PAUSE_S:
             return False
-        ahead = int(state.leader[i])
-        line = tables.connector_begin[i, place]
         tail = state.front_m[i] + state.room_m[i]
-        if tail < line and self._denied[ahead]:
+        if tail < line and self._denied[int(state.leader[i])]:
             return False
-        if self._blockers(state, tables, i, connector, holders):
+        if self._blockers(state, request, holders) or self._conflict[connector, waiting].any():
             return False
-        if any(self._conflict[connector, other] for _, other in waiting):
-            return False
-        full = tail < tables.connector_end[i, place] + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
+        exit_m = state.tables.connector_end[i, request.place]
+        full = tail < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
         if full and tail >= line - 1.0 and control != _NONE:
             return False
-        return not len(self._yields[connector]) or self._gap_is_accepted(state, tables, request)
+        return not len(self._yields[connector]) or self._accepts_gap(state, request)
 
     def _blockers(
-        self, state: TrafficState, tables: PathTables, i: int, connector: int, holders: list[tuple[int, int]]
+        self, state: TrafficState, request: _Request, holders: _Holders
     ) -> list[tuple[int, int, float]]:
-        """Who holds what a driver needs: its row, its connector, and how far its tail has to go to leave it, m."""
-        result = []
+        """Row and connector of each conflicting vehicle, and distance until its rear bumper clears the zone, m."""
+        result, tables = [], state.tables
         for j, other in holders:
-            if j != i and self._conflict[connector, other]:
-                past = tables.begin[j, other] + tables.scale[j, other] * self._zone_end[other, connector]
+            if j != request.row and self._conflict[request.connector, other]:
+                past = (
+                    tables.begin[j, other] + tables.scale[j, other] * self._zone_end[other, request.connector]
+                )
                 if state.rear_m[j] < past + 0.3:
                     result.append((j, other, float(past - state.rear_m[j]) + 0.3))
         return result
 
-    def _clears_in_time(
-        self,
-        state: TrafficState,
-        tables: PathTables,
-        request: tuple[int, int, int],
-        holders: list[tuple[int, int]],
-    ) -> bool:
-        """Whether a driver with priority need not brake yet: those in its way move and will be gone."""
-        i, connector, place = request
-        away = float(tables.connector_begin[i, place] - state.front_m[i])
-        gentle = state.speed[i] ** 2 / (2 * max(away, 0.05)) < _LATEST_MPS2
-        blockers = self._blockers(state, tables, i, connector, holders)
-        connectors = {other for _, other, _ in blockers}
-        if (
-            not blockers
-            or not gentle
-            or self._control[connector] >= _STOP
-            or connectors & set(self._yields[connector].tolist())
-        ):
+    def _clears_in_time(self, state: TrafficState, request: _Request, holders: _Holders) -> bool:
+        """Whether a driver with priority need not brake yet because all blockers move and will have cleared."""
+        connector, blockers = request.connector, self._blockers(state, request, holders)
+        yields = {other for _, other, _ in blockers} & set(self._yields[connector].tolist())
+        gentle = request.needed_mps2 < _LATEST_MPS2
+        if not blockers or not gentle or self._control[connector] >= _STOP or yields:
             return False
         for j, other, left in blockers:
             leaves = time_to_cover(np.array([left]), float(state.speed[j]), 1.0, _TURNING_MPS)[0]
-            if state.speed[j] < 0.5 or leaves + 1.0 > (away + self._zone_begin[connector, other]) / max(
-                state.speed[i], 1.0
-            ):
+            arrives = (request.distance_m + self._zone_begin[connector, other]) / max(request.speed, 1.0)
+            if state.speed[j] < 0.5 or leaves + 1.0 > arrives:
                 return False
         return True
 
-    def _gap_is_accepted(
-        self, state: TrafficState, tables: PathTables, request: tuple[int, int, int]
-    ) -> bool:
-        """Whether the gap to users with priority is accepted."""
-        i, connector, place = request
+    def _accepts_gap(self, state: TrafficState, request: _Request) -> bool:
+        """Whether the gap to vehicles with priority is large enough."""
+        i, connector, tables = request.row, request.connector, state.tables
         others = self._yields[connector]
-        begin = tables.begin[:, others]
-        scale = tables.scale[:, others]
+        begin, scale = tables.begin[:, others], tables.scale[:, others]
         reach = begin + scale * self._zone_begin[others, connector] - state.front_m[:, None]
         clear = begin + scale * self._zone_end[others, connector] - state.rear_m[:, None]
         coming = (clear > 0) & state.active[:, None]
         coming[i] = False
-        # Who faces a red light or has been made to wait is not coming.
+        # Vehicles at a red light or with a denied request are not coming.
         waits = (state.colour[others] == _RED) | (self._denied & (state.speed < 0.5))[:, None]
         coming &= ~(waits & (reach > 0))
         if not coming.any():
             return True
         rows, columns = np.nonzero(coming)
-        speed = state.speed[rows]
+        speed, own = state.speed[rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         gone = clear[rows, columns] / np.maximum(speed, 0.3)
-        own = others[columns]
-        start = tables.connector_begin[i, place] - state.front_m[i]
-        top = float(tables.at(np.array([tables.connector_begin[i, place] + 5.0]), np.array([i]))[0, 3])
-        push = float(self._drivers.acceleration_mps2[i])
-        enter = time_to_cover(start + self._zone_begin[connector, own], state.speed[i], push, top)
-        leave = time_to_cover(
-            start + self._zone_end[connector, own] + self._length[i], state.speed[i], push, top
-        )
+        top = float(tables.at(np.array([request.line_m + 5.0]), np.array([i]))[0, 3])
+        own_speed, push = request.speed, float(self._drivers.acceleration_mps2[i])
+        to_zone = request.distance_m + self._zone_begin[connector, own]
+        through_zone = request.distance_m + self._zone_end[connector, own] + self._length[i]
+        enter = time_to_cover(to_zone, own_speed, push, top)
+        leave = time_to_cover(through_zone, own_speed, push, top)
         waited = state.step * DT_S - self._stood[i] if np.isfinite(self._stood[i]) else 0.0
         patience = 1.0 - min(waited / _IMPATIENT_S, 1.0) / 3.0
         needed = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)

@@ -1,10 +1,10 @@
-"""Assign the roles of a scenario: ego's route, other vehicles and drivers, walkers, parked cars, lights."""
+"""Draw the roles of a scenario: ego's route, other vehicles and drivers, walkers, parked cars, lights."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -21,23 +21,23 @@ from drivax.synthetic.events.destinations import (
 from drivax.synthetic.expert import driver as expert
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import SignalPlan
-from drivax.synthetic.traffic.drivers import Drivers
-from drivax.synthetic.traffic.path_arrays import speed_profile
+from drivax.synthetic.traffic.path_arrays import driver_profile
 from drivax.synthetic.traffic.paths import Path, random_lanes
 from drivax.synthetic.traffic.pedestrians import place_walkers
-from drivax.synthetic.traffic.population import (
-    draw_drivers,
-    driven_path,
-    join_drivers,
-    parked_cars,
-    placed,
-)
-from drivax.synthetic.traffic.roles import Roles
+from drivax.synthetic.traffic.population import draw_drivers, driven_path, join_drivers, parked_cars, placed
+from drivax.synthetic.traffic.roles import Drivers, Roles
 
-#: Lanes that lead to a meeting are followed back for this long, m.
+#: Length of the approaches to a conflict that carry dense traffic, m.
 _BACK_M = 160.0
-#: When ego would come to where it gives way if nothing held it up, s after the recording's beginning.
+#: Time at which an unhindered ego arrives where it gives way, s after the recording begins.
 _WHEN_S = (0.4, 4.0)
+#: Ego begins at least this far along its path, m.
+_LEAST_M = 12.0
+#: Further routes drawn for ego until it has to give way.
+_ROUTES = 4
+#: Shares of what the light does for ego: green on arrival, turning green, turning red.
+SignalTiming = tuple[float, float, float]
+_Values = Float64[np.ndarray, " n"]
 
 
 def giving_way(network: RoadNetwork) -> tuple[Destination, ...]:
@@ -50,12 +50,7 @@ def giving_way(network: RoadNetwork) -> tuple[Destination, ...]:
 
 
 def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
-    """Return connectors that a path yields to (unless they yield themselves) and lanes it changes to.
-
-    Args:
-        network: The roads.
-        path: Ego's.
-    """
+    """Return connectors that a path yields to (unless they yield themselves) and lanes it changes to."""
     result: set[int] = set()
     for before, span in pairwise((path.spans[0], *path.spans)):
         lane, previous = network.lanes[span.lane], network.lanes[before.lane]
@@ -68,7 +63,7 @@ def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
 
 
 def with_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
-    """Lanes, and those from which they are reached within 160 m."""
+    """Add the lanes from which some lanes are reached within 160 m."""
     result: set[int] = set()
     ahead = [(lane, 0.0) for lane in sorted(lanes)]
     while ahead:
@@ -80,18 +75,10 @@ def with_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
     return frozenset(result)
 
 
-#: Shares of what the light does for ego: green on arrival, turning green, turning red.
-SignalTiming = tuple[float, float, float]
-#: Ego begins at least this far along its path, m.
-_LEAST_M = 12.0
-#: Further routes drawn for ego until it has to give way.
-_ROUTES = 4
-
-
 def assign_roles(
     network: RoadNetwork,
     domain: Domain,
-    times_s: Float64[np.ndarray, " time"],
+    times_s: _Values,
     lane_change_share: float,
     timing: SignalTiming,
     rng: np.random.Generator,
@@ -102,30 +89,23 @@ def assign_roles(
 
     Args:
         network: The roads.
-        domain: Traffic density and composition.
-        times_s: Times of all steps; the recording begins at time 0, before it traffic warms up.
-        lane_change_share: Share of scenarios with room for it in which ego plans a lane change.
+        domain: Density and composition of traffic.
+        times_s: Times of all steps; the warm-up of traffic ends at time 0.
+        lane_change_share: Share of scenarios, of those with room, in which ego plans a lane change.
         timing: Shares of what the light does for ego.
-        rng: Source of chance.
-        destinations: Places of which ego should pass one unhindered; without any it begins and goes where it likes.
-        critical: Ego's route leads where it must give way to dense traffic, if the roads allow it.
+        rng: Source of randomness.
+        destinations: Places of which ego passes one unhindered; none: ego's route is random.
+        critical: Ego must give way to dense traffic, if the roads allow it.
     """
     driver = expert.draw_expert(rng)
     aimed = draw_route(network, giving_way(network) if critical else destinations, rng)
-    first_s = float(times_s[0])
-    route = _draw_route(network, driver, first_s, lane_change_share, rng, aimed)
-    for _ in range(_ROUTES if critical and aimed is None else 0):
-        if conflicts_on(network, route.path):
-            break
-        route = _draw_route(network, driver, first_s, lane_change_share, rng, None)
-    rivals = with_feeders(network, conflicts_on(network, route.path)) if critical else frozenset()
-    path, lanes, at = route.path, route.lanes, route.at_m
+    first_s, tries = float(times_s[0]), _ROUTES if critical and aimed is None else 0
+    lanes, path, at = _draw_route(network, driver, first_s, lane_change_share, rng, aimed, tries)
+    rivals = with_feeders(network, conflicts_on(network, path)) if critical else frozenset()
     network = replace(network, signals=_lights(network, lanes, timing, aimed, rng))
     here = max((span for span in path.spans if span.begin_m <= at), key=lambda span: span.begin_m)
-    density = domain.density
-    parked = parked_cars(
-        network, float(rng.uniform(*domain.parked_share)), domain.double_share, rng, len(times_s)
-    )
+    density, share = domain.density, float(rng.uniform(*domain.parked_share))
+    parked = parked_cars(network, share, domain.double_share, rng, len(times_s))
     others = placed(network, here.lane, at - here.begin_m, density, rng, parked, rivals)
     if aimed is not None:
         others = rearrange(others, aimed, (here.lane, at - here.begin_m), rng)
@@ -147,15 +127,6 @@ def assign_roles(
     )
 
 
-@dataclass(frozen=True)
-class _Route:
-    """Ego's lanes, its path along them, and where on it it begins."""
-
-    lanes: tuple[int, ...]
-    path: Path
-    at_m: float
-
-
 def _draw_route(
     network: RoadNetwork,
     driver: Drivers,
@@ -163,8 +134,9 @@ def _draw_route(
     lane_change_share: float,
     rng: np.random.Generator,
     aimed: DestinationRoute | None,
-) -> _Route:
-    """Ego begins so far back that the warm-up brings it to where the recording should begin."""
+    tries: int = 0,
+) -> tuple[tuple[int, ...], Path, float]:
+    """Draw ego's lanes, path and position before the warm-up; draw again, up to ``tries`` times, without conflicts."""
     if aimed is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
         lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
@@ -174,7 +146,9 @@ def _draw_route(
     cruise = 0.9 * float(driver.speed_factor[0]) * network.lanes[start.lane].limit_mps
     first = next(span for span in path.spans if span.lane == start.lane)
     at = max(_LEAST_M, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + first_s * cruise))
-    return _Route(lanes, path, at)
+    if tries and not conflicts_on(network, path):
+        return _draw_route(network, driver, first_s, lane_change_share, rng, aimed, tries - 1)
+    return lanes, path, at
 
 
 def _lights(
@@ -184,48 +158,31 @@ def _lights(
     aimed: DestinationRoute | None,
     rng: np.random.Generator,
 ) -> SignalPlan | None:
-    """The lights with their clock set for the first one on ego's way, or on its way past the place it is aimed at."""
+    """Set the clock so that ego's next light is green, turns green or turns yellow when the recording begins."""
     plan, ahead = network.signals, lanes if aimed is None else lanes[aimed.place :]
     lit = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
     if plan is None or not lit:
         return plan
     if aimed is not None and aimed.alone:
         return green_on_arrival(plan, lit[0])
-    return _timed(plan, lit[0], timing, rng)
-
-
-def _timed(
-    plan: SignalPlan, route: int, shares: tuple[float, float, float], rng: np.random.Generator
-) -> SignalPlan:
-    """Set the plan's clock so that ego's light does something of interest during the recording (time 0 on)."""
-    phase = plan.phase_of(route)
-    what = int(rng.choice(3, p=shares))
-    if what == 0:  # green for a while before ego comes
+    phase = plan.phase_of(lit[0])
+    case = int(rng.choice(3, p=timing))
+    if case == 0:
         green_at = -rng.uniform(0.0, 3.0)
-    elif what == 1:  # turns green
+    elif case == 1:
         green_at = rng.uniform(0.5, 5.0)
-    else:  # turns yellow, then red
+    else:
         green_at = rng.uniform(0.3, 4.5) - plan.green_s[phase]
     return replace(plan, offset_s=float(green_at) - plan.starts_s[phase])
 
 
 def _first_speeds(
-    network: RoadNetwork,
-    paths: list[Path],
-    drivers: Drivers,
-    distance: Float64[np.ndarray, " vehicle"],
-    rng: np.random.Generator,
-) -> Float64[np.ndarray, " vehicle"]:
-    """Draw speeds from which each vehicle can stop at the next stop line, whatever the light will do."""
+    network: RoadNetwork, paths: list[Path], drivers: Drivers, distance: _Values, rng: np.random.Generator
+) -> _Values:
+    """Draw speeds from which each vehicle can stop at its next stop line."""
     speeds = []
     for i, path in enumerate(paths):
-        fastest = speed_profile(
-            path,
-            drivers.speed_factor[i],
-            drivers.lateral_mps2[i],
-            drivers.slowing_mps2[i],
-            drivers.top_speed_mps[i],
-        )
+        fastest = driver_profile(path, drivers, i)
         speed = fastest[min(int(distance[i] / path.step_m), len(fastest) - 1)] * rng.uniform(0.7, 1.0)
         front = distance[i] + drivers.size_m[i, 0] / 2
         lines = [s.begin_m - front for s in path.spans if network.lanes[s.lane].connector]

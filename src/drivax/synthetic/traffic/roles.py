@@ -1,4 +1,4 @@
-"""The roles of a scenario, the staged changes, and the resulting motion."""
+"""Road users of a scenario and their drivers, the staged changes, and the resulting motion."""
 
 from __future__ import annotations
 
@@ -8,10 +8,69 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int8
 
 from drivax.scenario.schema import AgentKind
+from drivax.simulator.idm import IdmParameters
 from drivax.synthetic.roads.curves import Curve, Pose
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import Path
+
+
+@dataclass(frozen=True)
+class Drivers:
+    """Vehicles (and cyclists) and their drivers, one entry per vehicle.
+
+    Attributes:
+        kind: ``AgentKind``: VEHICLE or CYCLIST.
+        size_m: Length, width and height.
+        speed_factor: Preferred speed as a multiple of the limit.
+        top_speed_mps: Largest speed whatever the limit.
+        lateral_mps2: Largest lateral acceleration in bends.
+        slowing_mps2: Deceleration towards slower stretches.
+        yellow_mps2: Largest deceleration to stop at yellow.
+        jerk_mps3: Jerk in ordinary driving.
+        headway_s, acceleration_mps2, braking_mps2: Parameters of the IDM.
+        politeness: Weight of others' accelerations in lane changes (MOBIL).
+        reaction_s: Delay between a decision and its execution.
+        critical_gap_s: Smallest accepted time gap to vehicles with priority.
+    """
+
+    kind: Int8[np.ndarray, " vehicle"]
+    size_m: Float64[np.ndarray, "vehicle 3"]
+    speed_factor: Float64[np.ndarray, " vehicle"]
+    top_speed_mps: Float64[np.ndarray, " vehicle"]
+    lateral_mps2: Float64[np.ndarray, " vehicle"]
+    slowing_mps2: Float64[np.ndarray, " vehicle"]
+    yellow_mps2: Float64[np.ndarray, " vehicle"]
+    jerk_mps3: Float64[np.ndarray, " vehicle"]
+    headway_s: Float64[np.ndarray, " vehicle"]
+    acceleration_mps2: Float64[np.ndarray, " vehicle"]
+    braking_mps2: Float64[np.ndarray, " vehicle"]
+    politeness: Float64[np.ndarray, " vehicle"]
+    reaction_s: Float64[np.ndarray, " vehicle"]
+    critical_gap_s: Float64[np.ndarray, " vehicle"]
+
+    @property
+    def idm(self) -> IdmParameters:
+        """Parameters of the IDM."""
+        return IdmParameters(
+            headway_s=self.headway_s,
+            acceleration_mps2=self.acceleration_mps2,
+            comfortable_braking_mps2=self.braking_mps2,
+        )
+
+    @property
+    def cyclist(self) -> Bool[np.ndarray, " vehicle"]:
+        """Mask of cyclists."""
+        return self.kind == AgentKind.CYCLIST
+
+    def chosen(self, rows: np.ndarray) -> Drivers:
+        """Return the drivers of some rows (indices or a mask), in that order."""
+        return Drivers(**{name: value[rows] for name, value in vars(self).items()})
+
+    def with_headway(self, row: int, headway_s: float) -> Drivers:
+        """Return the drivers with one time gap changed."""
+        changed = self.headway_s.copy()
+        changed[row] = headway_s
+        return replace(self, headway_s=changed)
 
 
 @dataclass(frozen=True)
@@ -19,11 +78,11 @@ class Walker:
     """A pedestrian: walks along a curve and waits at kerbs.
 
     Attributes:
-        curve: Where the feet go: along a sidewalk, or over a crossing from one sidewalk to the other.
-        start_m: Position along the curve when traffic begins, before the warm-up.
+        curve: Along a sidewalk, or over a crossing from one sidewalk to the other.
+        start_m: Position along the curve when the warm-up begins.
         speed_mps: Free walking speed.
-        crossing: Index of the crossing that the curve leads over, -1 none.
-        kerb_m, across_m: Where on the curve the kerbs are: where to wait, and where the road is left again.
+        crossing: Index of the crossing on the curve (-1: none).
+        kerb_m, across_m: Positions along the curve of the kerbs before and after the crossing.
         size_m: Length, width, height.
     """
 
@@ -38,12 +97,7 @@ class Walker:
 
 @dataclass(frozen=True)
 class Scripted:
-    """A road user with a fixed trajectory: parked, or part of an event.
-
-    Attributes:
-        speed: Along the heading; negative when reversing.
-        valid: False before it exists and after it is gone.
-    """
+    """A road user with a fixed trajectory: parked, or part of an event; speeds are negative when reversing."""
 
     kind: AgentKind
     size_m: tuple[float, float, float]
@@ -60,14 +114,19 @@ class Scripted:
         xy = np.tile([pose.x, pose.y], (steps, 1))
         return cls(kind, size_m, xy, np.full(steps, pose.heading), np.zeros(steps), np.ones(steps, bool))
 
+    @property
+    def is_static(self) -> bool:
+        """Whether the user exists and stands still at all steps."""
+        return bool(self.valid.all() and not self.speed.any() and not np.ptp(self.xy, axis=0).any())
+
 
 @dataclass(frozen=True)
 class Roles:
     """All users of a scenario; row 0 of ``paths`` and ``drivers`` is ego.
 
     Attributes:
-        paths: Of vehicles and of cyclists who ride on lanes.
-        distance_m: Where on its path each centre begins.
+        paths: Paths of vehicles and of cyclists on lanes.
+        distance_m, speed_mps: Initial positions of their centres along the paths, and speeds.
         route: Lanes of ego's intended route, in order.
         parked: Cars parked next to or in the lanes.
     """
@@ -125,11 +184,9 @@ class Motion:
     """Motion of all users, in this order: vehicles and cyclists (ego first), walkers, parked, extras.
 
     Attributes:
-        kind: ``AgentKind`` of each user.
-        size_m: Length, width, height.
-        xy, heading, speed: Pose of the box centre and speed along the heading (signed).
+        xy, heading, speed: Pose of the box centre and signed speed along the heading.
         valid: False before a user exists and after it has left the map.
-        distance_m: Position along each vehicle's (present) path; only for vehicles.
+        distance_m: Position along each vehicle's present path.
         acceleration: Acceleration of each vehicle during the step that begins here.
     """
 

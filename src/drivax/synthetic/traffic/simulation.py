@@ -1,23 +1,22 @@
 """Traffic at 10 Hz: vehicles on paths follow, stop, give way, change lanes and avoid obstacles.
 
-The law of following is the simulator's own (:mod:`drivax.simulator.idm`). All vehicles move at once: one step is a
-few dozen array operations over vehicles, whatever their number. Who may enter a junction is decided in
-:mod:`drivax.synthetic.traffic.right_of_way`, who changes lanes in :mod:`drivax.synthetic.traffic.lane_changes`,
-obstacles in :mod:`drivax.synthetic.traffic.obstacles`.
+The car-following law is the simulator's (:mod:`drivax.simulator.idm`). All vehicles move at once: one step is a few
+dozen array operations over all vehicles.
 """
 
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.drivers import Drivers
-from drivax.synthetic.traffic.lane_changes import HELP_MPS2, Change, Helped, LaneChanges, Situation
+from drivax.synthetic.traffic.lane_changes import HELP_MPS2, NO_HELP, Change, LaneChanges, Situation
 from drivax.synthetic.traffic.lateral import (
     DETOUR_MARGIN_M,
     LOOK_M,
@@ -27,123 +26,111 @@ from drivax.synthetic.traffic.lateral import (
     followed,
 )
 from drivax.synthetic.traffic.obstacles import Boxes, Standing, nearest_obstacles
-from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows
 from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, onward
 from drivax.synthetic.traffic.pedestrians import Walkers
 from drivax.synthetic.traffic.right_of_way import RightOfWay, TrafficState
-from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, Scripted, Staging
+from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Scripted, Staging
+
+#: Half the lane width that passing a cyclist takes, m: half a bicycle, its distance from the kerb, and 1.5 m to a car.
+_PASS_CYCLIST_M = 0.35 + 0.55 + 1.5
+#: Distance between the front bumper and a stop line at standstill, m.
+_STOP_SHORT_M = 1.0
+#: Distance kept to an obstacle in the lane, to leave room for passing it, and to the end of a lane, m.
+_KEEP_M, _END_M = 5.0, 10.0
+#: Time constant with which a driver follows the speed profile, s.
+_SPEED_TIME_S = 0.6
+#: Jerk limit beyond a driver's own when braking harder than this, m/s2 and m/s3.
+_EMERGENCY_MPS2, _EMERGENCY_JERK = 3.6, 25.0
+#: Steps between decisions about lane changes and detours.
+_DECIDE_EVERY = 5
+#: Steps between the end of a decision to leave the lane and the next one.
+_REST_STEPS = round(4.0 / DT_S)
+#: Braking that drivers accept for pedestrians, m/s2: to begin to stop, and once they brake.
+_YIELD_MPS2, _HARDEST_MPS2 = 3.0, 8.0
+#: Limit of the braking for lines, as a multiple of what is needed.
+_FIRMLY = 1.3
+#: Longest reaction, steps.
+_SLOWEST = 6
+#: A planned ego claims junctions this many steps ahead.
+_FORESEEN = 25
 
 
 def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
-    """Where scripted users are at a step."""
-    if not scripted:
-        return Boxes(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 2)))
+    """Boxes of scripted users at a step."""
     return Boxes(
-        np.array([s.xy[step] for s in scripted]),
-        np.array([s.heading[step] for s in scripted]),
-        np.array([s.speed[step] for s in scripted]),
-        np.array([s.size_m[:2] for s in scripted]),
+        np.array([user.xy[step] for user in scripted]).reshape(-1, 2),
+        np.array([user.heading[step] for user in scripted], float),
+        np.array([user.speed[step] for user in scripted], float),
+        np.array([user.size_m[:2] for user in scripted]).reshape(-1, 2),
     )
 
 
-def standing_and_moving(extras: tuple[Scripted, ...]) -> tuple[tuple[Scripted, ...], tuple[Scripted, ...]]:
-    """Split scripted users into static and moving ones."""
-    fixed = [bool(e.valid.all() and not e.speed.any() and not np.ptp(e.xy, axis=0).any()) for e in extras]
-    return (
-        tuple(e for e, still in zip(extras, fixed, strict=True) if still),
-        tuple(e for e, still in zip(extras, fixed, strict=True) if not still),
-    )
+@dataclass(frozen=True)
+class _Log:
+    """What a run records of its vehicles (x, y, heading) and walkers (x, y, heading, speed)."""
 
+    pose: Float64[np.ndarray, "v time 3"]
+    speed: Float64[np.ndarray, "v time"]
+    valid: Bool[np.ndarray, "v time"]
+    at_m: Float64[np.ndarray, "v time"]
+    acceleration: Float64[np.ndarray, "v time"]
+    walked: Float64[np.ndarray, "walker time 4"]
 
-def collect_motion(
-    roles: Roles,
-    staging: Staging,
-    vehicles: tuple[
-        Float64[np.ndarray, "v time 3"],
-        Float64[np.ndarray, "v time"],
-        Bool[np.ndarray, "v time"],
-        Float64[np.ndarray, "v time"],
-        Float64[np.ndarray, "v time"],
-    ],
-    walked: Float64[np.ndarray, "walker time 4"],
-    paths: list[Path],
-) -> Motion:
-    """The motion of all users of a scenario, in their order.
+    def motion(self, roles: Roles, staging: Staging, paths: list[Path]) -> Motion:
+        """Return the motion of all users, the scripted ones included."""
+        scripted, steps = (*roles.parked, *staging.extras), self.speed.shape[1]
+        users = [*roles.walkers, *scripted]
+        kinds = [AgentKind.PEDESTRIAN] * len(roles.walkers) + [user.kind for user in scripted]
 
-    Args:
-        roles: Who there is.
-        staging: Whose extras are there too.
-        vehicles: Their poses (x, y, heading), speeds, presence, path positions and accelerations.
-        walked: x, y, heading and speed of the walkers.
-        paths: The vehicles' paths.
-    """
-    pose, speed, valid, at, acceleration = vehicles
-    steps = pose.shape[1]
-    scripted = (*roles.parked, *staging.extras)
-    kinds = [AgentKind.PEDESTRIAN] * len(roles.walkers) + [s.kind for s in scripted]
-    sizes = [w.size_m for w in roles.walkers] + [s.size_m for s in scripted]
-    there = np.ones(walked.shape[:2], bool)
-    return Motion(
-        kind=np.concatenate([roles.drivers.kind, np.array(kinds, np.int8)]),
-        size_m=np.concatenate([roles.drivers.size_m, np.array(sizes, float).reshape(-1, 3)]),
-        xy=np.concatenate([pose[..., :2], walked[..., :2], *(s.xy[None, :steps] for s in scripted)]),
-        heading=np.concatenate([pose[..., 2], walked[..., 2], *(s.heading[None, :steps] for s in scripted)]),
-        speed=np.concatenate([speed, walked[..., 3], *(s.speed[None, :steps] for s in scripted)]),
-        valid=np.concatenate([valid, there, *(s.valid[None, :steps] for s in scripted)]),
-        distance_m=at,
-        acceleration=acceleration,
-        paths=paths,
-    )
+        def joined(vehicles: np.ndarray, walkers: np.ndarray, name: str) -> np.ndarray:
+            return np.concatenate([vehicles, walkers, *(vars(s)[name][None, :steps] for s in scripted)])
 
-
-#: What a cyclist at a lane's side needs of half its width: half a bicycle, its place, and 1.5 m to a car.
-_PASS_CYCLIST_M = 0.35 + 0.55 + 1.5
+        return Motion(
+            kind=np.concatenate([roles.drivers.kind, np.array(kinds, np.int8)]),
+            size_m=np.concatenate([roles.drivers.size_m, np.array([u.size_m for u in users]).reshape(-1, 3)]),
+            xy=joined(self.pose[..., :2], self.walked[..., :2], "xy"),
+            heading=joined(self.pose[..., 2], self.walked[..., 2], "heading"),
+            speed=joined(self.speed, self.walked[..., 3], "speed"),
+            valid=joined(self.valid, np.ones(self.walked.shape[:2], bool), "valid"),
+            distance_m=self.at_m,
+            acceleration=self.acceleration,
+            paths=paths,
+        )
 
 
 class Leaders:
-    """Finds the leader of every vehicle.
-
-    Args:
-        network: The roads.
-        drivers: Who drives.
-    """
+    """Finds the leader of every vehicle."""
 
     def __init__(self, network: RoadNetwork, drivers: Drivers) -> None:
         self._half_m, width_m = drivers.size_m[:, 0] / 2, drivers.size_m[:, 1]
         self._rows = np.arange(len(width_m))
         self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
-        # Half the widest car that passes a cyclist at the side of a lane.
+        # Half the width of the widest car that may pass a cyclist within the lane.
         spare_m = np.array([lane.width_m for lane in network.lanes]) / 2 - _PASS_CYCLIST_M
         self._passes = spare_m >= width_m[:, None] / 2
         self._nearest = np.full(len(width_m), np.inf), np.zeros(len(width_m), int)
 
     def ahead(
-        self, tables: PathTables, at_m: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
-    ) -> tuple[Float64[np.ndarray, " v"], Int64[np.ndarray, " v"]]:
-        """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and that vehicle.
-
-        Args:
-            tables: All paths.
-            at_m: Where they are on them.
-            active: Which of them are there.
-        """
+        self, tables: PathTables, at_m: PerVehicle, active: VehicleMask
+    ) -> tuple[PerVehicle, VehicleRows]:
+        """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and its row."""
         own = at_m[:, None]
         lane, along = tables.on(at_m, self._rows)
         lane[~active] = -1
-        # position[i, k]: where the k-th occupied (vehicle, lane) is on the path of vehicle i.
+        # position[i, k]: position of the k-th occupied (vehicle, lane) on the path of vehicle i.
         used = (lane.ravel() >= 0).nonzero()[0]
         if not len(used):
             return self._nearest
         vehicles_ahead, taken = used // SLOTS, lane.ravel().take(used)
-        # nan where the lane is not on the path, or does not matter now: comparisons with it are false.
+        # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
         begin = np.where((tables.since <= own) & (own <= tables.until), tables.begin, np.nan)
         position = tables.scale.take(taken, axis=1)
         position *= along.ravel().take(used)
         position = begin.take(taken, axis=1) + position
-        seen = position > own
-        seen &= vehicles_ahead != self._rows[:, None]
+        seen = (position > own) & (vehicles_ahead != self._rows[:, None])
         if self._any_cyclist:
-            # Cyclists are overtaken within the lane where it is wide enough.
+            # Where the lane is wide enough, cyclists are overtaken within it.
             seen &= ~(self._cyclist[vehicles_ahead] & self._passes.take(taken, axis=1))
         position -= self._half_m[vehicles_ahead]
         gap = np.where(seen, position, np.inf) - own - self._half_m[:, None]
@@ -152,36 +139,8 @@ class Leaders:
         return self._nearest
 
 
-#: Where drivers want to come to rest before a stop line, m from the front bumper.
-_STOP_SHORT_M = 1.0
-#: Before a thing that stands in the lane they keep room to pass it, m; before a lane's end, to change.
-_KEEP_M, _END_M = 5.0, 10.0
-#: A driver follows the speed profile with this reaction, s.
-_SPEED_TIME_S = 0.6
-#: Jerk beyond a driver's own is used when braking harder than this, m/s2.
-_EMERGENCY_MPS2, _EMERGENCY_JERK = 3.6, 25.0
-#: Steps between decisions about lane changes and detours.
-_DECIDE_EVERY = 5
-#: A driver stays in its lane for this long after a change, s.
-_REST_S = 4.0
-#: Drivers stop for people where this is enough when they come, m/s2, and once they do brake up to this.
-_YIELD_MPS2, _HARDEST_MPS2 = 3.0, 8.0
-#: Braking for lines, as a multiple of what is needed.
-_FIRMLY = 1.3
-#: Longest reaction, steps.
-_SLOWEST = 6
-#: A planned ego is expected at stop lines this far ahead of time, steps.
-_FORESEEN = 25
-_NO_BOXES = boxes_at((), 0)
-
-
 class Traffic:
-    """Traffic of all users, advanced step by step.
-
-    Args:
-        roles: All users.
-        times_s: Times of all steps to come, on the clock of the signals.
-    """
+    """Traffic of all users, advanced step by step."""
 
     def __init__(self, roles: Roles, times_s: Float64[np.ndarray, " time"]) -> None:
         self.roles, self.times_s = roles, times_s
@@ -202,132 +161,123 @@ class Traffic:
         return shorter
 
     def run(self, staging: Staging | None = None, ego: EgoPlan | None = None) -> Motion:
-        """Run all steps.
+        """Run all steps, with the changes of an event, and with ego on a plan (None: ego drives like the others)."""
+        return _Run(self, staging or Staging(), ego).finish()
 
-        Args:
-            staging: What an event changes.
-            ego: Ego's plan from a step on; None: ego drives like the others.
-        """
-        return _Run(self, staging or Staging(), ego).finished()
+
+_Tables = TypeVar("_Tables", PathTables, Standing)
+
+
+def _copied(tables: _Tables) -> _Tables:
+    """Copy tables with their arrays and lists."""
+    result = copy.copy(tables)
+    for name, value in vars(tables).items():
+        setattr(result, name, copy.copy(value) if isinstance(value, np.ndarray | list) else value)
+    return result
 
 
 class _Run:
-    """One run of a traffic."""
+    """State of one run."""
 
     def __init__(self, traffic: Traffic, staging: Staging, ego: EgoPlan | None) -> None:
         self._fixed, self._staging, self._ego = traffic, staging, ego
         roles = traffic.roles
         self._network, self._drivers = roles.network, roles.drivers
-        for override in staging.tailgates:
-            self._drivers = self._drivers.with_headway(override.vehicle, override.headway_s)
-        self._size_m = roles.drivers.size_m[:, :2]
-        self._half_m, self._width_m = self._size_m[:, 0] / 2, self._size_m[:, 1]
+        for tailgate in staging.tailgates:
+            self._drivers = self._drivers.with_headway(tailgate.vehicle, tailgate.headway_s)
+        self._half_m, self._width_m = roles.drivers.size_m[:, 0] / 2, roles.drivers.size_m[:, 1]
         count = len(roles.paths)
         self._rows = np.arange(count)
-        self._twice = np.concatenate([self._rows, self._rows])
         self._idm = self._drivers.idm
-        self._tables = traffic.tables.copy()
-        self._fixtures, self._movers = standing_and_moving(staging.extras)
-        boxes = traffic.parked.joined(boxes_at(self._fixtures, 0))
-        self._standing = traffic.standing.copy()
-        if self._fixtures:
-            self._standing = Standing(boxes, self._tables, self._width_m)
+        self._tables = _copied(traffic.tables)
+        static = tuple(user for user in staging.extras if user.is_static)
+        self._movers = tuple(user for user in staging.extras if not user.is_static)
+        boxes = traffic.parked.joined(boxes_at(static, 0))
+        self._standing = Standing(boxes, self._tables, self._width_m) if static else _copied(traffic.standing)
         self._right_of_way = traffic.right_of_way
         self._right_of_way.reset()
         self._changes = LaneChanges(self._network, roles.drivers, boxes)
         self._walkers = Walkers(self._network, roles.walkers, traffic.times_s) if roles.walkers else None
         self._occupied_crossings = np.zeros(len(self._network.crossings), bool)
-        self._halting = np.zeros((0, 0), bool)  # [vehicle, crossing on its path]: stops for walkers
+        self._halting = np.zeros((0, 0), bool)  # per vehicle and crossing on its path
         self._delay = np.rint(roles.drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
         self._at, self._speed = roles.distance_m.copy(), roles.speed_mps.copy()
-        for row in staging.removed:  # it has left before anything begins
+        for row in staging.removed:
             self._at[row] = roles.paths[row].length_m
         self._last = np.zeros(count)
         self._memory = np.zeros((_SLOWEST + 1, count))
-        self._busy_m = np.full(count, -np.inf)  # until here on its path a vehicle is changing or passing
-        self._rest = np.zeros(count, int)  # from this step on it may change again
-        self._helped = Helped(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+        self._busy_m = np.full(count, -np.inf)  # path position at which a lane change or detour ends
+        self._rest = np.zeros(count, int)  # first step of the next decision
+        self._helped = NO_HELP
         self._leaders = Leaders(self._network, self._drivers)
-        # Of leaders, lines and things: the gaps to them, and how fast they are.
+        # Gap to and speed of the next leader, line and obstacle.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
-        self._promised = np.full(count, -1)
         self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
-        self._people = self._vehicles = _NO_BOXES
+        self._people = self._vehicles = boxes_at((), 0)
+        shape = (count, len(traffic.times_s))
+        speed, at, acceleration = np.zeros((3, *shape))
+        walked = np.zeros((len(roles.walkers), shape[1], 4))
+        self._log = _Log(np.zeros((*shape, 3)), speed, np.zeros(shape, bool), at, acceleration, walked)
 
-    def finished(self) -> Motion:
+    def finish(self) -> Motion:
         """Run all steps and collect the motion."""
-        count, steps = len(self._rows), len(self._fixed.times_s)
-        pose, walked = np.zeros((count, steps, 3)), np.zeros((len(self._fixed.roles.walkers), steps, 4))
-        speed, at, acceleration = (np.zeros((count, steps)) for _ in range(3))
-        valid = np.zeros((count, steps), bool)
-        for t in range(steps):
-            planned = self._put_ego(t)
-            active = self._at + self._half_m < self._tables.last * self._tables.step_m
-            active[0] |= planned
-            soon = self._at + self._speed * _SPEED_TIME_S
-            row = self._tables.at(np.concatenate([self._at, soon]), self._twice)
-            here, fastest = row[:count, :3], row[:count, 3]
-            if planned and self._ego is not None:
-                k = t - self._ego.first_step
-                here[0] = (*self._ego.xy[k], self._ego.heading[k])
-            self._vehicles = Boxes(here[:, :2], here[:, 2], self._speed, self._size_m)
-            self._walk(t, active, walked)
-            pose[:, t], speed[:, t], at[:, t], valid[:, t] = here, self._speed, self._at, active
-            preferred = self._preferred_acceleration(t, fastest, row[count:, 3], active)
-            if t % _DECIDE_EVERY == 0:
-                self._decide(t, preferred, fastest, active)
-            acceleration[:, t] = self._advance(self._acted(t, preferred), active)
+        for t in range(len(self._fixed.times_s)):
+            self._step(t)
         if self._ego is not None:
-            k = slice(self._ego.first_step, steps - 1)
-            acceleration[0, k] = np.diff(speed[0, self._ego.first_step :]) / DT_S
-        vehicles = (pose, speed, valid, at, acceleration)
-        return collect_motion(self._fixed.roles, self._staging, vehicles, walked, self._tables.paths)
+            first, log = self._ego.first_step, self._log
+            log.acceleration[0, first:-1] = np.diff(log.speed[0, first:]) / DT_S
+        return self._log.motion(self._fixed.roles, self._staging, self._tables.paths)
 
-    def _swap(self, row: int, path: Path, at: float) -> None:
+    def _step(self, t: int) -> None:
+        """Record a step and advance all users to the next one."""
+        count, log = len(self._rows), self._log
+        k = self._plan_step(t)
+        if self._ego is not None and k >= 0:
+            self._at[0], self._speed[0] = self._plan_at[k], self._ego.speed[k]
+        active = self._at + self._half_m < self._tables.last * self._tables.step_m
+        soon = self._at + self._speed * _SPEED_TIME_S
+        sample = self._tables.at(np.concatenate([self._at, soon]), np.tile(self._rows, 2))
+        pose, fastest, fastest_soon = sample[:count, :3], sample[:count, 3], sample[count:, 3]
+        if self._ego is not None and k >= 0:
+            active[0] = True
+            pose[0] = (*self._ego.xy[k], self._ego.heading[k])
+        self._vehicles = Boxes(pose[:, :2], pose[:, 2], self._speed, self._drivers.size_m[:, :2])
+        self._walk(t, active)
+        log.pose[:, t], log.speed[:, t], log.at_m[:, t], log.valid[:, t] = pose, self._speed, self._at, active
+        preferred = self._preferred_acceleration(t, fastest, fastest_soon, active)
+        if t % _DECIDE_EVERY == 0:
+            self._decide(t, preferred, fastest, active)
+        log.acceleration[:, t] = self._advance(self._delayed(t, preferred), active)
+
+    def _plan_step(self, t: int) -> int:
+        """Step of ego's plan (negative: ego is not planned)."""
+        return -1 if self._ego is None else t - self._ego.first_step
+
+    def _swap(self, t: int, row: int, path: Path, at: float, end_m: float) -> None:
+        """Put a vehicle on another path, which it follows undisturbed up to a position."""
         self._tables.replace(row, path)
         self._standing.replace(row, path)
         self._at[row] = at
         self._halting[row : row + 1] = False
         self._right_of_way.swapped(row, self._tables, at + self._half_m[row])
+        self._busy_m[row], self._rest[row] = end_m, t + _REST_STEPS
 
-    def _put_ego(self, t: int) -> bool:
-        """Put ego where its plan says; whether there is a plan for this step."""
-        if self._ego is None or t < self._ego.first_step:
-            return False
-        k = t - self._ego.first_step
-        self._at[0], self._speed[0] = self._plan_at[k], self._ego.speed[k]
-        return True
-
-    def _walk(
-        self, t: int, active: Bool[np.ndarray, " v"], walked: Float64[np.ndarray, "walker time 4"]
-    ) -> None:
+    def _walk(self, t: int, active: VehicleMask) -> None:
         """Advance the walkers and gather scripted users."""
-        self._people = _NO_BOXES
+        people, colour = boxes_at((), 0), self._fixed.colour[t]
         if self._walkers is not None:
-            people, self._occupied_crossings = self._walkers.step(
-                t, self._vehicles, active, self._fixed.colour[t]
-            )
-            walked[:, t, :2], walked[:, t, 2], walked[:, t, 3] = people.xy, people.heading, people.speed
-            self._people = people
-        there = tuple(extra for extra in self._movers if extra.valid[t])
-        if there:
-            self._people = self._people.joined(boxes_at(there, t))
+            people, self._occupied_crossings = self._walkers.step(t, self._vehicles, active, colour)
+            self._log.walked[:, t] = np.column_stack([people.xy, people.heading, people.speed])
+        self._people = people.joined(boxes_at(tuple(user for user in self._movers if user.valid[t]), t))
 
     def _preferred_acceleration(
-        self,
-        t: int,
-        fastest: Float64[np.ndarray, " v"],
-        ahead: Float64[np.ndarray, " v"],
-        active: Bool[np.ndarray, " v"],
-    ) -> Float64[np.ndarray, " v"]:
-        """The acceleration that each driver would like: the least that leaders, lines, things and speed allow.
-
-        The fastest speed that each driver likes is given for here, and for where it will be a little later.
-        """
+        self, t: int, fastest: PerVehicle, fastest_soon: PerVehicle, active: VehicleMask
+    ) -> PerVehicle:
+        """The least of the accelerations towards leaders, lines, obstacles and the preferred speed (here and soon)."""
         gaps, leads = self._gaps, self._leads
         gaps[0], leader = self._leaders.ahead(self._tables, self._at, active)
         leads[0] = self._speed[leader]
-        # Lines and things are looked at by turns; in between they come nearer as they did.
+        # Lines and obstacles are updated in alternate steps, and extrapolated in between.
         if t % 2 or t == 0:
             gaps[1] = self._stops(t, active, leader)
         else:
@@ -341,16 +291,14 @@ class _Run:
         # Only a planned ego reverses; the IDM treats it as standing.
         speed = np.maximum(self._speed, 0.0)
         following = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
-        # What stands still is not braked for harder than it takes to stop there, and a little more.
+        # Braking for a line is limited to a little more than it takes to stop there.
         needed = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _STOP_SHORT_M), 0.1))
         lines = np.maximum(following[1], -_FIRMLY * needed - 0.5)
         preferred = np.minimum(np.minimum(following[0], lines), following[2])
-        preferred = np.minimum(preferred, (ahead - self._speed) / _SPEED_TIME_S)
+        preferred = np.minimum(preferred, (fastest_soon - self._speed) / _SPEED_TIME_S)
         return self._helping(preferred, fastest)
 
-    def _helping(
-        self, preferred: Float64[np.ndarray, " v"], fastest: Float64[np.ndarray, " v"]
-    ) -> Float64[np.ndarray, " v"]:
+    def _helping(self, preferred: PerVehicle, fastest: PerVehicle) -> PerVehicle:
         """Open gaps for mandatory lane changes on both lanes."""
         h = self._helped
         if len(h.behind):
@@ -358,21 +306,20 @@ class _Run:
             idm = self._drivers.chosen(h.behind).idm
             speed = self._speed[h.behind]
             helpful = idm_acceleration(speed, fastest[h.behind], gap, self._speed[h.ahead], idm)
-            # Vehicles already past need no room, and a standstill does not help.
+            # Vehicles that are already past need no gap, and slow ones open none.
             helpful = np.where((gap > -2.0) & (speed > 1.5), np.maximum(helpful, -HELP_MPS2), np.inf)
             np.minimum.at(preferred, h.behind, helpful)
         return preferred
 
-    def _stops(
-        self, t: int, active: Bool[np.ndarray, " v"], leader: Int64[np.ndarray, " v"]
-    ) -> Float64[np.ndarray, " v"]:
-        """Room as the law counts it (2 m are kept) to where to stop: lines, crossings, things, the lane's end."""
+    def _stops(self, t: int, active: VehicleMask, leader: VehicleRows) -> PerVehicle:
+        """Gap to the next place to stop (line, crossing, obstacle, end of the lane), plus the IDM's gap of 2 m."""
         p, front = self._tables, self._at + self._half_m
-        promised = self._promised
-        if self._ego is not None and t >= self._ego.first_step:
-            then = min(t - self._ego.first_step + _FORESEEN, len(self._plan_at) - 1)
-            promised[0] = np.sum(p.connector_begin[0] < self._plan_at[then] + self._half_m[0])
+        committed, k = -1, self._plan_step(t)
+        if k >= 0:
+            then = min(k + _FORESEEN, len(self._plan_at) - 1)
+            committed = int(np.sum(p.connector_begin[0] < self._plan_at[then] + self._half_m[0]))
         now = TrafficState(
+            tables=p,
             step=t,
             colour=self._fixed.colour[t],
             to_red=self._fixed.to_red[t],
@@ -383,11 +330,9 @@ class _Run:
             room_m=self._gaps[0],
             leader=leader,
             leader_speed=self._leads[0],
-            promised=promised,
-            promises=bool(promised[0] >= 0),
+            committed=committed,
         )
-        # Drivers stop closer to a line than to a bumper.
-        room = self._right_of_way.lines(now, p) + 2.0 - _STOP_SHORT_M
+        room = self._right_of_way.lines(now) + 2.0 - _STOP_SHORT_M
         if np.count_nonzero(self._occupied_crossings):
             room = np.minimum(room, self._crossings(front) + 2.0 - _STOP_SHORT_M)
         room = np.minimum(room, p.stop_m - front - _END_M)
@@ -395,8 +340,8 @@ class _Run:
             room = np.minimum(room, self._standing.gap(front) + 2.0 - _KEEP_M)
         return room
 
-    def _crossings(self, front: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
-        """Distance to the next occupied crossing at which a vehicle can stop comfortably."""
+    def _crossings(self, front: PerVehicle) -> PerVehicle:
+        """Distance to the next occupied crossing at which a vehicle can stop."""
         away = self._tables.crossing_m - front[:, None]
         needed = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
         halt = self._occupied_crossings[self._tables.crossing] & (self._tables.crossing >= 0) & (away > -0.5)
@@ -405,8 +350,8 @@ class _Run:
         self._halting = halt & (needed < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
         return np.where(self._halting, away, np.inf).min(axis=1)
 
-    def _acted(self, t: int, preferred: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
-        """Return applied accelerations: the preferred ones a reaction time ago, bounded by overrides."""
+    def _delayed(self, t: int, preferred: PerVehicle) -> PerVehicle:
+        """Return the accelerations preferred a reaction time ago, bounded by overrides."""
         depth = len(self._memory)
         if t == 0:
             self._memory[:] = preferred
@@ -414,19 +359,16 @@ class _Run:
         result = self._memory[(t - self._delay) % depth, self._rows]
         for override in self._staging.overrides:
             if override.first_step <= t <= override.last_step:
-                vehicles_ahead = override.vehicle
-                result[vehicles_ahead] = min(result[vehicles_ahead], override.acceleration_mps2)
+                result[override.vehicle] = min(result[override.vehicle], override.acceleration_mps2)
         return result
 
-    def _advance(
-        self, preferred: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
-    ) -> Float64[np.ndarray, " v"]:
+    def _advance(self, preferred: PerVehicle, active: VehicleMask) -> PerVehicle:
         """Advance by one step and return accelerations; speeds stay non-negative."""
         jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
         a = np.clip(preferred, self._last - jerk, self._last + self._drivers.jerk_mps3 * DT_S)
         after = self._speed + a * DT_S
         halted = after <= 0.0
-        # Who stops inside the step travels v^2 / (2 |a|), and stands.
+        # Vehicles that stop within the step travel v^2 / (2 |a|).
         travelled = np.where(
             halted, self._speed**2 / (2 * np.maximum(-a, 1e-9)), (self._speed + after) * DT_S / 2
         )
@@ -435,16 +377,11 @@ class _Run:
         self._speed = np.where(active, np.maximum(after, 0.0), 0.0)
         return a
 
-    def _decide(
-        self,
-        t: int,
-        preferred: Float64[np.ndarray, " v"],
-        fastest: Float64[np.ndarray, " v"],
-        active: Bool[np.ndarray, " v"],
-    ) -> None:
+    def _decide(self, t: int, preferred: PerVehicle, fastest: PerVehicle, active: VehicleMask) -> None:
         """Start lane changes and detours."""
         calm = (self._at > self._busy_m) & (self._rest <= t) & active
-        calm &= ~self._staged(t)
+        for override in self._staging.overrides:
+            calm[override.vehicle] &= t < override.first_step
         free = calm.copy()
         free[0] = False
         now = Situation(self._at, self._speed, active, free, fastest, preferred)
@@ -452,48 +389,36 @@ class _Run:
         for change in changes:
             self._change(t, change)
             calm[change.vehicle] = False
-        if self._ego is not None and t >= self._ego.first_step:
-            calm[0] = False
+        calm[0] &= self._plan_step(t) < 0
         self._pass(t, calm)
 
-    def _staged(self, t: int) -> Bool[np.ndarray, " v"]:
-        """Mask of vehicles under an override."""
-        result = np.zeros(len(self._rows), bool)
-        for override in self._staging.overrides:
-            result[override.vehicle] |= t >= override.first_step
-        return result
-
     def _change(self, t: int, change: Change) -> None:
+        """Start a lane change; beyond it the vehicle keeps to its old lanes where it can."""
         row, present = change.vehicle, self._tables.paths[change.vehicle]
         lanes = [change.lane]
         ahead = {span.lane for span in present.spans}
         while self._network.lanes[lanes[-1]].successors:
             after = onward(self._network, lanes)
-            on_present_path = [k for k in after if k in ahead]
-            # The old way where it is open, else one of the ways by turns: no chance is needed here.
-            lanes.append(on_present_path[0] if on_present_path else after[(row + len(lanes)) % len(after)])
+            kept = [lane for lane in after if lane in ahead]
+            # Elsewhere branches take turns: no random number is drawn here.
+            lanes.append(kept[0] if kept else after[(row + len(lanes)) % len(after)])
         sway = Sway((0.08,), (0.07,), (float(row),))
-        path, at = change_onto(
-            lane_path(self._network, tuple(lanes), sway), present, self._at[row], change.length_m
-        )
-        self._swap(row, path, at)
-        self._busy_m[row], self._rest[row] = at + change.length_m, t + round(_REST_S / DT_S)
+        target = lane_path(self._network, tuple(lanes), sway)
+        path, at = change_onto(target, present, self._at[row], change.length_m)
+        self._swap(t, row, path, at, at + change.length_m)
 
-    def _pass(self, t: int, calm: Bool[np.ndarray, " v"]) -> None:
+    def _pass(self, t: int, calm: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
         halted = self._people.chosen(np.abs(self._people.speed) < 0.05)
         stuck = np.zeros(len(self._rows), bool)
         for override in self._staging.overrides:
-            stuck[override.vehicle] |= (
-                override.first_step <= t <= override.last_step and self._speed[override.vehicle] < 0.05
-            )
-        any_halted = bool(stuck.any())
-        standing = self._standing.boxes
-        if any_halted or len(halted):
+            now = override.first_step <= t <= override.last_step
+            stuck[override.vehicle] |= now and self._speed[override.vehicle] < 0.05
+        big = halted.chosen(halted.size_m[:, 0] > 1.2)
+        any_halted = bool(stuck.any()) or len(big) > 0
+        standing = self._standing.boxes.joined(self._vehicles.chosen(stuck)).joined(big)
+        if stuck.any() or len(halted):
             near = calm & (self._speed < 3.0)
-            big = halted.chosen(halted.size_m[:, 0] > 1.2)
-            any_halted |= len(big) > 0
-            standing = standing.joined(self._vehicles.chosen(stuck)).joined(big)
         else:
             near = calm & (self._standing.gap(self._at + self._half_m) < 45.0)
         if not len(standing):
@@ -503,16 +428,12 @@ class _Run:
             if any_halted or self._standing.meets(row, front, half + DETOUR_MARGIN_M, LOOK_M):
                 self._pass_by(t, row, standing, stuck)
 
-    def _pass_by(self, t: int, row: int, standing: Boxes, stuck: Bool[np.ndarray, " v"]) -> None:
+    def _pass_by(self, t: int, row: int, standing: Boxes, stuck: VehicleMask) -> None:
         """Start a detour around an obstacle ahead, if there is one."""
         others = self._vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
         moving = others.joined(self._people.chosen(np.abs(self._people.speed) >= 0.05))
-        size = (float(2 * self._half_m[row]), float(self._width_m[row]))
-        vehicles_ahead = detour_request(
-            self._network, self._tables, row, (self._at[row], self._speed[row]), size
-        )
-        detour = self._fixed.detours.find(vehicles_ahead, standing, moving)
+        at, size = float(self._at[row]), (float(2 * self._half_m[row]), float(self._width_m[row]))
+        request = detour_request(self._network, self._tables, row, (at, self._speed[row]), size)
+        detour = self._fixed.detours.find(request, standing, moving)
         if detour is not None:
-            path, end = detour
-            self._swap(row, path, float(self._at[row]))
-            self._busy_m[row], self._rest[row] = end, t + round(_REST_S / DT_S)
+            self._swap(t, row, detour[0], at, detour[1])

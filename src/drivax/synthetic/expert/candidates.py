@@ -1,0 +1,276 @@
+"""Candidate paths of ego, their conflicts with other users, and their stop lines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from drivax.geometry.boxes import corners, overlap
+from drivax.geometry.vectors import wrap
+from drivax.synthetic.roads.curves import Curve, Pose
+from drivax.synthetic.roads.network import Control, RoadNetwork
+from drivax.synthetic.roads.signals import Colour
+from drivax.synthetic.traffic.lateral import located, quintic_step
+from drivax.synthetic.traffic.path_arrays import speed_profile
+from drivax.synthetic.traffic.paths import Path, interpolated, smoothed_curvature
+from drivax.synthetic.traffic.roles import Drivers
+
+#: Distance between the samples of a candidate, m.
+SPACING_M = 0.5
+#: Largest lateral acceleration and yaw rate of a plan: nuPlan's comfort limits with a reserve.
+_LATERAL_MPS2, _YAW_RATE_RPS = 4.2, 0.8
+#: Distance over which ego returns to its path, m.
+_RETURN_M = 30.0
+#: Hard margin at ego's bumpers and sides, m; the final check uses 0.1 m.
+HARD_M = (0.35, 0.2)
+#: Preferred margin, m, for vehicles and for pedestrians and cyclists.
+NEAR_M, NEAR_PEOPLE_M = (1.2, 0.5), (2.0, 1.2)
+#: Stride of the coarse pass over path samples.
+_STRIDE = 4
+#: Ego avoids passing a light that turns red sooner than this, s.
+_LATE_YELLOW_S = 1.0
+#: Smallest time gap to users with priority where ego gives way, s.
+_YIELD_S = 2.0
+#: Distance to a stop line at standstill, m.
+_SHORT_M = 0.5
+
+#: A number and a flag per time step, and a number per sample of a path.
+_Series = Float64[np.ndarray, " time"]
+_Steps = Bool[np.ndarray, " time"]
+_Points = Float64[np.ndarray, " point"]
+_Boxes = Float64[np.ndarray, "user time 6"]
+_PathBoxes = Float64[np.ndarray, "point 6"]
+_Exists = Bool[np.ndarray, "user time"]
+_Size = Float64[np.ndarray, " 3"]
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Lateral offset to the left with quintic transitions, from begin to there and from back to end, m ahead of ego."""
+
+    aside_m: float = 0.0
+    begin_m: float = 0.0
+    there_m: float = 1.0
+    back_m: float = 2.0
+    end_m: float = 3.0
+
+
+@dataclass(frozen=True)
+class CandidatePath:
+    """A curve that begins at ego's centre, sampled every ``SPACING_M``, with preferred and largest speeds.
+
+    ``base_m`` is the position of each sample along the original path, m ahead of ego.
+    """
+
+    xy: Float64[np.ndarray, "point 2"]
+    heading: _Points
+    base_m: _Points
+    preferred_mps: _Points
+    limit_mps: _Points
+    shift: Shift = Shift()
+
+    def pose(
+        self, at_m: Float64[np.ndarray, " n"]
+    ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
+        """Position and heading at distances from ego."""
+        arc = SPACING_M * np.arange(len(self.xy))
+        curve = interpolated(Curve(self.xy, self.heading), arc, at_m)
+        return curve.xy, curve.heading
+
+
+def shifted_path(
+    path: Path, drivers: Drivers, pose: Pose, span_m: tuple[float, float], shift: Shift
+) -> CandidatePath:
+    """Return ego's path with a shift, or without; it starts at ego and ends where the path does, or earlier.
+
+    ``span_m`` is the approximate position of ego on the path, and the reach of the result, m.
+    """
+    begin, left, direction = located(path, np.array([pose.x, pose.y]), span_m[0])
+    ahead = np.arange(0.0, min(span_m[1], path.length_m - begin - 1e-6), SPACING_M)
+    grid = path.step_m * np.arange(len(path.curve.xy))
+    base = interpolated(path.curve, grid, begin + ahead)
+    aside = quintic_step(ahead, (0.0, left, math.tan(wrap(pose.heading - direction))), _RETURN_M)
+    there, back = shift.there_m - shift.begin_m, shift.end_m - shift.back_m
+    aside += shift.aside_m * quintic_step(ahead, (shift.back_m, 1.0, 0.0), back)
+    aside -= shift.aside_m * quintic_step(ahead, (shift.begin_m, 1.0, 0.0), there)
+    normal = np.stack([-np.sin(base.heading), np.cos(base.heading)], axis=-1)
+    stretch = np.maximum(1.0 - aside * np.interp(begin + ahead, grid, path.curvature), 0.2)
+    turned = np.arctan2(np.gradient(aside, SPACING_M), stretch)
+    curve = Curve(base.xy + aside[:, None] * normal, base.heading + turned)
+    arc = curve.arc_m
+    at = np.arange(0.0, float(arc[-1]), SPACING_M)
+    return _with_speeds(
+        path, drivers, interpolated(curve, arc, at), (begin, np.interp(at, arc, ahead)), shift
+    )
+
+
+def _with_speeds(
+    path: Path, drivers: Drivers, curve: Curve, base_m: tuple[float, _Points], shift: Shift
+) -> CandidatePath:
+    """Add the speeds; ``base_m`` is ego's position and the samples' distances along the path."""
+    curvature = smoothed_curvature(curve, SPACING_M)
+    grid = path.step_m * np.arange(len(path.curve.xy))
+    limit = np.interp(base_m[0] + base_m[1], grid, path.limit_mps)
+    none = np.full((len(limit), 1), -1)
+    driver = drivers.speed_factor[0], drivers.lateral_mps2[0], drivers.slowing_mps2[0]
+    driven = Path(curve, SPACING_M, curvature, limit, (), none, np.zeros((len(limit), 1)))
+    fastest = speed_profile(driven, *map(float, driver))
+    bend = np.maximum(np.abs(curvature), 1e-6)
+    bound = np.minimum(np.sqrt(_LATERAL_MPS2 / bend), _YAW_RATE_RPS / bend)
+    return CandidatePath(curve.xy, curve.heading, base_m[1], fastest, bound, shift)
+
+
+def candidate_boxes(candidate: CandidatePath, size_m: _Size) -> _PathBoxes:
+    """Return ego's box at the samples of a path."""
+    heading = candidate.heading[:, None]
+    size = np.broadcast_to(size_m[:2], (len(heading), 2))
+    return np.concatenate([candidate.xy, np.cos(heading), np.sin(heading), size], axis=-1)
+
+
+def candidate_corners(candidate: CandidatePath, size_m: _Size) -> Float64[np.ndarray, "corner 2"]:
+    """Return corners of ego's box every metre of the stretch where a candidate leaves the original path."""
+    base, shift = candidate.base_m, candidate.shift
+    away = (base >= shift.begin_m - 2.0) & (base <= shift.end_m + 2.0)
+    return corners(candidate_boxes(candidate, size_m)[away][::2]).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class Conflicts:
+    """Overlaps of ego's box along its path with other users; ``hard`` where they touch, else they are only close."""
+
+    user: Int64[np.ndarray, " conflict"]
+    step: Int64[np.ndarray, " conflict"]
+    point: Int64[np.ndarray, " conflict"]
+    hard: Bool[np.ndarray, " conflict"]
+
+    def only(self, keep: Bool[np.ndarray, " conflict"]) -> Conflicts:
+        """Return a subset."""
+        return Conflicts(self.user[keep], self.step[keep], self.point[keep], self.hard[keep])
+
+
+@dataclass(frozen=True)
+class StopLine:
+    """A line that ego's centre must not pass at some steps (closed) and should not at others (late).
+
+    ``base_m`` is its distance ahead of ego along the path.
+    """
+
+    base_m: float
+    closed: _Steps
+    late: _Steps
+
+
+def find_conflicts(
+    candidate: CandidatePath, size_m: _Size, others: _Boxes, valid: _Exists, people: Bool[np.ndarray, " user"]
+) -> Conflicts:
+    """Find conflicts of ego's box along a path with boxes of others, of which ``people`` walk or cycle."""
+    margin = np.where(people[:, None], NEAR_PEOPLE_M, NEAR_M)
+    still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
+    ego = candidate_boxes(candidate, size_m)
+    moving = _box_conflicts(ego, others, valid & ~still[:, None], margin)
+    # Static users are tested at one step only.
+    once = _box_conflicts(ego, others[:, :1], still[:, None], margin)
+    steps = others.shape[1]
+    user, point, hard = (np.repeat(values, steps) for values in (once.user, once.point, once.hard))
+    return Conflicts(
+        user=np.concatenate([moving.user, user]),
+        step=np.concatenate([moving.step, np.tile(np.arange(steps), len(once.step))]),
+        point=np.concatenate([moving.point, point]),
+        hard=np.concatenate([moving.hard, hard]),
+    )
+
+
+def _box_conflicts(
+    ego: _PathBoxes, others: _Boxes, valid: _Exists, margin_m: Float64[np.ndarray, "user 2"]
+) -> Conflicts:
+    """Find conflicts of boxes: circles at every fourth sample first, then exact overlap."""
+    reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + margin_m).T)
+    reach += _STRIDE * SPACING_M / 2
+    user, step = np.nonzero(valid & _around(others, ego, reach))
+    coarse = ego[::_STRIDE, :2]
+    at = others[user, step, :2]
+    gap = (at[:, None, 0] - coarse[:, 0]) ** 2 + (at[:, None, 1] - coarse[:, 1]) ** 2
+    row, block = np.nonzero(gap < reach[user, None] ** 2)
+    point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
+    row = np.repeat(row, _STRIDE)
+    inside = (point >= 0) & (point < len(ego))
+    row, point = row[inside], point[inside]
+    other, mine = others[user[row], step[row]], ego[point]
+    close = overlap(_wider(mine, margin_m[user[row]]), other)
+    row, point, other, mine = row[close], point[close], other[close], mine[close]
+    hard = overlap(_wider(mine, np.array(HARD_M)), other)
+    return Conflicts(user[row], step[row], point, hard)
+
+
+def _wider(box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "n 6"]:
+    """Grow boxes at each end and each side."""
+    size = box[:, 4:] + 2 * by_m
+    return np.concatenate([box[:, :4], size], axis=1)
+
+
+def _around(others: _Boxes, ego: _PathBoxes, reach: Float64[np.ndarray, " user"]) -> _Exists:
+    """Mask of users near the bounding rectangle of the path."""
+    low, high = ego[:, :2].min(axis=0), ego[:, :2].max(axis=0)
+    outside = np.maximum(low - others[..., :2], others[..., :2] - high).max(axis=-1)
+    return outside < reach[:, None]
+
+
+def stop_lines(
+    network: RoadNetwork,
+    path: Path,
+    ego_m: tuple[float, float],
+    times_s: _Series,
+    passed: _Series,
+    arrivals: dict[int, _Steps],
+) -> list[StopLine]:
+    """Return the stop lines ahead of ego (path position of its centre, half length).
+
+    ``passed`` is the path position of ego's centre at each time (on the clock of the lights) in the last run.
+    """
+    from_m, half_m = ego_m
+    result = []
+    colour, to_red = None, None
+    if network.signals is not None:
+        colour, to_red = network.signals.colours(times_s, len(network.lanes))
+    for span in path.spans:
+        lane = network.lanes[span.lane]
+        line = span.begin_m - half_m
+        if not lane.connector or line <= from_m:
+            continue
+        closed = np.zeros(len(times_s), bool)
+        late = closed.copy()
+        if colour is not None and to_red is not None:
+            closed |= colour[:, span.lane] == Colour.RED
+            late |= (colour[:, span.lane] == Colour.YELLOW) & (to_red[:, span.lane] < _LATE_YELLOW_S)
+        if lane.control in (Control.STOP, Control.ALL_WAY_STOP):
+            closed |= passed <= line
+        for first in lane.yields_to:
+            late |= arrivals.get(first, np.zeros(len(times_s), bool))
+        if closed.any() or late.any():
+            result.append(StopLine(line - _SHORT_M - from_m, closed, late))
+    return result
+
+
+def arrivals(
+    network: RoadNetwork,
+    paths: list[Path],
+    distance_m: Float64[np.ndarray, "vehicle time"],
+    valid: Bool[np.ndarray, "vehicle time"],
+    half_m: Float64[np.ndarray, " vehicle"],
+) -> dict[int, _Steps]:
+    """Steps at which a vehicle other than ego is on, or about to enter, each connector to which another yields."""
+    watched = {first for lane in network.lanes for first in lane.yields_to}
+    result: dict[int, _Steps] = {}
+    for vehicle in range(1, len(paths)):
+        for span in paths[vehicle].spans:
+            if span.lane in watched:
+                at, half = distance_m[vehicle], half_m[vehicle]
+                end = span.begin_m + span.scale * network.lanes[span.lane].length_m
+                here = (at + half > span.begin_m) & (at - half < end) & valid[vehicle]
+                early = round(_YIELD_S / 0.1)
+                coming = np.convolve(here[::-1], np.ones(early + 1), mode="full")[: len(here)][::-1] > 0
+                result[span.lane] = result.get(span.lane, np.zeros(len(here), bool)) | coming
+    return result
