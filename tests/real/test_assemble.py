@@ -1,4 +1,4 @@
-"""Assembly of the real recordings at ``../shared/data``: what must hold on any real map."""
+"""Assembly of the real recordings at ``../shared/data``: properties of any real map."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_routes_are_a_metre_apart_and_pass_the_log(scenario):
 
 
 def test_other_vehicles_as_ego_have_routes(recording):
-    """A sweep over ten logged cars: those that end on a lane must have a route of lanes beside their log."""
+    """A sweep over ten logged cars: those that end on a lane have a route of lanes along their log."""
     reach = 2.0 if recording.flags & Flag.LANE_GRAPH else 4.0  # a truncated map lacks lanes
     tracks, now = recording.tracks, recording.current_step
     rows = np.flatnonzero((tracks.kind == AgentKind.VEHICLE) & tracks.valid[:, now])[:40:4]
