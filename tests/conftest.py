@@ -1,10 +1,10 @@
-"""What every test runs under: few threads, a shared compilation cache, and type checks of the whole package.
+"""Environment of every test: few threads, a shared compilation cache, and type checks of the whole package.
 
 Run time checks: jaxtyping's import hook puts beartype on every annotated function of drivax, so a wrong shape
 or type fails the test that caused it. ``DRIVAX_UNCHECKED=1`` leaves the hook out (for timing).
 
-Most programs here run once on tiny arrays, so that compiling them is what takes the time: they are compiled with little
-optimisation, in half of it. ``DRIVAX_OPTIMISED=1`` compiles as users do; ``make test-all`` sets it.
+Most programs run once on tiny arrays, and compiling them takes most of the time; with little optimisation it takes half
+as long. ``DRIVAX_OPTIMISED=1`` compiles as users do; ``make test-all`` sets it.
 """
 
 from __future__ import annotations

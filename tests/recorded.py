@@ -1,4 +1,4 @@
-"""Recorded episodes of control tasks: a table of what was seen, done and earned, as an environment's data."""
+"""Logged episodes of control tasks: a table of observations, actions and rewards, as an environment's data."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pendulum import MAX_TORQUE, STEPS, Pendulum, Swing, swing
 
 @record
 class Table:
-    """Episodes side by side: observations ``[N, T, 3]`` and what was done at each, and what came of it ``[N, T]``."""
+    """Stacked episodes: observations ``[N, T, 3]``, actions ``[N, T, 1]``, and their outcomes ``[N, T]``."""
 
     seen: jax.Array
     action: jax.Array
@@ -27,7 +27,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Logged(Pendulum):
-    """An environment that is only described by its steps; its observations are three numbers."""
+    """An environment that is known from logged steps only; its observations are three numbers."""
 
     def expert_steps(self, data: Table) -> ExpertSteps:
         fields = {
@@ -40,7 +40,7 @@ class Logged(Pendulum):
 
 
 def arms(action, reward) -> Table:
-    """A bandit: each episode is one step, from the same state, behind which nothing comes."""
+    """A bandit: each episode is one step from the same state, and ends there."""
     action, reward = (jnp.asarray(array, jnp.float32)[:, None] for array in (action, reward))
     first = jnp.broadcast_to(jnp.arange(2) == 0, (len(action), 2))
     return Table(

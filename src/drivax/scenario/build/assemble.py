@@ -55,14 +55,10 @@ from drivax.scenario.select.tags import scenario_tags
 Array = np.ndarray[Any, Any]
 Record = np.ndarray[Any, Any]
 
-#: Margin of the map around the box of the ego's log.
-MARGIN_M = 100.0
-#: Largest total length of map lines; readers crop the map of a city.
-MAP_M = 500_000.0
-#: Largest deviation from the median step without ``JITTERED_TIME``.
-JITTER_S = 0.002
-#: Smallest range of heights that counts as elevation.
-FLAT_M = 0.01
+#: Margin of the map around the box of the ego's log, and largest total length of its lines (readers crop a city's map).
+MARGIN_M, MAP_M = 100.0, 500_000.0
+#: Largest deviation from the median step without ``JITTERED_TIME``, and largest range of heights without ``ELEVATION``.
+JITTER_S, FLAT_M = 0.002, 0.01
 #: Flags that are measured here and override those of the reader. ``LIGHTS`` is not among them: a source may know that
 #: there are no lights.
 MEASURED = (
@@ -80,14 +76,9 @@ MISSING = (
 #: Lanes whose class has a limit (``scenario.bank.scenario_bank.CLASS_LIMIT_MPS``).
 _LIMITED_KINDS = (RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE)
 _COUNTED = {
-    "lane": LANE_KINDS,
-    "road_line": LINE_KINDS,
-    "road_edge": EDGE_KINDS,
-    "crosswalk": (RoadKind.CROSSWALK,),
-    "speed_bump": (RoadKind.SPEED_BUMP,),
-    "stop_sign": (RoadKind.STOP_SIGN,),
-    "driveway": (RoadKind.DRIVEWAY,),
-}
+    "lane": LANE_KINDS, "road_line": LINE_KINDS, "road_edge": EDGE_KINDS, "crosswalk": (RoadKind.CROSSWALK,),
+    "speed_bump": (RoadKind.SPEED_BUMP,), "stop_sign": (RoadKind.STOP_SIGN,), "driveway": (RoadKind.DRIVEWAY,),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -22,20 +22,15 @@ Array = np.ndarray[Any, Any]
 Line = tuple[Float[Array, "_ 3"], Int[Array, " _"]]
 #: Least stretch over which a route moves to the next lane.
 CHANGE_M = 20.0
-#: Gaps of this size between lanes are faded out; wider ones are crossed in a straight line.
-GAP_M = (0.05, 2.0)
-FADE_M = 10.0
+#: Gaps of this size between lanes fade out over ``FADE_M``; wider ones are crossed in a straight line.
+GAP_M, FADE_M = (0.05, 2.0), 10.0
 #: Lateral distance and heading difference within which a lane is under the ego or the goal.
-REACH_M = 4.0
-TURN_RAD = np.deg2rad(60.0)
-SAME_TURN_RAD = np.deg2rad(45.0)
+REACH_M, TURN_RAD, SAME_TURN_RAD = 4.0, np.deg2rad(60.0), np.deg2rad(45.0)
 #: Costs in metres: of a lane change, of a metre between ego and its first lane, of a radian of turning.
 CHANGE_COST_M, LATERAL_COST, TURN_COST_M = 60.0, 30.0, 10.0
 #: Of a radian between the headings of ego and of its first lane, and of a lane outside the intended corridor.
 ASKEW_COST_M, OUTSIDE_COST_M = 30.0, 200.0
-MOST_CHANGES = 2
-MOST_EXPANSIONS = 400
-MOST_GOAL_LANES = 3
+MOST_CHANGES, MOST_EXPANSIONS, MOST_GOAL_LANES = 2, 400, 3
 #: Cost of each missing metre of an unfinished path, which makes the search go forward.
 EAGERNESS = 0.1
 

@@ -20,15 +20,12 @@ Array = np.ndarray[Any, Any]
 
 #: Links stored per lane and direction.
 LINKS = 4
-#: Geometric chaining of lanes whose source has no graph.
-CHAIN_GAP_M = 0.5
-CHAIN_HEADING_RAD = np.deg2rad(20.0)
-#: Neighbours run the same way when their headings differ by less.
+#: Largest gap and turn between lanes that are chained because their source has no graph.
+CHAIN_GAP_M, CHAIN_HEADING_RAD = 0.5, np.deg2rad(20.0)
+#: Neighbours have the same direction if their headings differ by less.
 SAME_WAY_RAD = np.deg2rad(45.0)
-#: Lane widths believed when measured from the spacing of neighbours, metres.
-WIDTHS_M = (2.2, 5.5)
-#: Larger widths of a source are not believed.
-MOST_WIDTH_M = 50.0
+#: Plausible widths measured from the spacing of neighbours, and the largest plausible width of a source, metres.
+WIDTHS_M, MOST_WIDTH_M = (2.2, 5.5), 50.0
 LEVEL_M = 3.0
 #: Headings at lane ends are measured over this chord: the last source points lie close together.
 END_SPAN_M = 2.0
@@ -37,9 +34,7 @@ _DANGLING = {
     "dangling_links": ("successors", "predecessors"),
     "dangling_neighbours": ("left_neighbours", "right_neighbours"),
 }
-_SAMPLES = 33
-_PROBES = (0.1, 0.3, 0.5, 0.7, 0.9)
-_CHUNK = 512
+_SAMPLES, _PROBES, _CHUNK = 33, (0.1, 0.3, 0.5, 0.7, 0.9), 512
 
 
 @dataclass(frozen=True)
@@ -107,10 +102,10 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     ]  # fmt: skip
     lanes = [features[i] for i in rows]
     ids = [lane.feature_id for lane in lanes]
-    if len(set(ids)) < len(ids):
+    index = {lane_id: i for i, lane_id in enumerate(ids)}
+    if len(index) < len(ids):
         twice = next(i for i in ids if ids.count(i) > 1)
         raise DataError(f"two lanes have the id {twice}", cure="give every map feature its own id")
-    index = {lane_id: i for i, lane_id in enumerate(ids)}
     lines = Polylines.of([np.asarray(lane.points, dtype=np.float64) - origin for lane in lanes])
     begin, end = end_headings(lines)
     kind = np.array([lane.kind for lane in lanes], dtype=np.int64)
@@ -198,8 +193,6 @@ def _link_table(
 def _samples(lines: Polylines) -> Float[Array, "lane sample 2"]:
     """Evenly spaced points of every lane, to measure neighbours."""
     fraction = np.linspace(0.0, 1.0, _SAMPLES)
-    if lines.count == 0:
-        return np.zeros((0, _SAMPLES, 2))
     return lines.at(np.arange(lines.count)[:, None], lines.length[:, None] * fraction)[..., :2]
 
 

@@ -2,8 +2,7 @@
 
 Row 0 leads to the goal, row 1 is the log itself (privileged), the others are alternatives. All but the route of the log
 depend on the poses up to the current step and on the goal region only; among routes that reach the goal equally well
-the nearest to the log is taken. Candidates come from the search of this project (``graph``) or from the published
-search (``published``).
+the nearest to the log is taken. Candidates come from this project's search (``graph``) or the ``published`` one.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -33,45 +33,36 @@ from drivax.scenario.build.lane_paths import (
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments
 from drivax.scenario.build.segments import spaced, thin_path
 
-#: A route may run this far from the driven path; a larger offset is taken back.
-OFFSET_M = 1.0
-#: Least distance between driven poses that are compared with a line.
-_APART_M = 1.0
-#: The ego drifts across a line by at most this many metres per metre (a change of 3.5 m within 12 m).
+Array = np.ndarray[Any, Any]
+#: Source of candidates: the search of this project, or the published one.
+RouteStyle = Literal["graph", "published"]
+#: Largest offset of a route from the driven path, and least distance between driven poses that are compared with it.
+OFFSET_M, _APART_M = 1.0, 1.0
+#: Largest drift of the ego across a line, metres per metre (a change of 3.5 m within 12 m).
 _MOST_SLOPE = 0.3
 #: The line goes over to the ego's poses within this distance behind the first of them.
 _BEHIND_M = 20.0
 #: Published candidates begin on lanes within this distance of the ego at the start of the log, m.
 PUBLISHED_REACH_M = 2.5
-LEAST_M, MOST_PATHS = 250.0, 10
-#: A lane that turns by more than this is a turn.
+LEAST_M, MOST_PATHS, MOST_EXPANSIONS = 250.0, 10, 5000
+#: Least heading change along a lane that is a turn.
 TURN_RAD = np.deg2rad(30.0)
 CHANGE_WEIGHT, TURN_WEIGHT, LENGTH_WEIGHT, CURVATURE_WEIGHT = -0.3, -0.2, 0.1, -0.1
-#: Paths that the published search expands at most.
-MOST_EXPANSIONS = 5000
-Array = np.ndarray[Any, Any]
-#: How candidates are made: by the search of this project, or as published.
-RouteStyle = Literal["graph", "published"]
 SPACING_M = 1.0
 #: Candidates are this long at least, or as far as the present speed carries in ``AHEAD_S``.
 AHEAD_M, AHEAD_S = 200.0, 12.0
-#: Routes run this far past the goal, straight on where the map ends.
-PAST_GOAL_M = 50.0
-BEHIND_M = 20.0
-#: Half a second before a lane change begins.
-REACTION_S = 0.5
-#: Time that a lane change takes at the present speed.
-CHANGE_S = 3.0
+#: Routes begin this far behind the driven path and go on this far past the goal, straight on where the map ends.
+BEHIND_M, PAST_GOAL_M = 20.0, 50.0
+#: Seconds until a lane change begins, and that it takes.
+REACTION_S, CHANGE_S = 0.5, 3.0
 #: A route to the goal passes it within this distance.
 GOAL_M = 10.0
 #: Where along the stretch of two parallel lanes a route may change from one to the other.
 CHANGE_PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Shorter steps of the log are jitter of a standing car; a log that stays within the second distance has no path.
 STEP_M, STANDS_M = 0.5, 2.0
-#: The log's route goes on this far beyond the log.
-LOG_AHEAD_M = 100.0
-#: Its lanes are looked up at every n-th of its points (0.5 to 3 m apart).
-LABEL_EVERY = 4
+#: The log's route goes on this far beyond the log; its lanes are looked up at every n-th point (0.5 to 3 m apart).
+LOG_AHEAD_M, LABEL_EVERY = 100.0, 4
 
 
 @dataclass(frozen=True)
@@ -117,13 +108,10 @@ class EgoLog:
 
 @dataclass(frozen=True)
 class RouteSet:
-    """Routes of a scenario.
+    """Routes of a scenario: to the goal, the log's own, then alternatives.
 
-    Attributes:
-        routes: Route to the goal, the log's own, then alternatives.
-        on_lanes: Whether row 0 comes from the lane graph.
-        goal: The last logged position projected on row 0.
-        progress: Arc length of the logged ego on row 0 at every step, metres.
+    ``on_lanes`` says whether the first comes from the lane graph. ``goal`` is the last logged position projected on it,
+    and ``progress`` the arc length of the logged ego on it at every step, metres.
     """
 
     routes: tuple[Route, ...]
@@ -254,8 +242,7 @@ class _Drawer:
         """Routes along lane paths; those with lane changes are drawn with early to late changes."""
         routes = []
         for lane_path in lane_paths:
-            steps = zip(lane_path.lanes, lane_path.lanes[1:], strict=False)
-            changes = any(is_change(self.graph, a, b) for a, b in steps)
+            changes = any(is_change(self.graph, a, b) for a, b in pairwise(lane_path.lanes))
             routes += [self.draw(lane_path, place) for place in (CHANGE_PLACES if changes else (0.0,))]
         return routes
 
@@ -327,8 +314,7 @@ def _fade(distance: Array, shift: float, slope: float, length: float) -> Array:
 def log_route(on: LaneSegments, ego: EgoLog, most_points: int) -> Route:
     """Path of the logged ego (privileged), continued along its last lane, else straight on.
 
-    Positions within half a metre of the previous one are skipped as jitter; a log that stays within 2 m has only its
-    last pose.
+    Positions within half a metre of the previous one are jitter; a log that stays within 2 m has only its last pose.
     """
     seen, heading = ego.seen, ego.heading[ego.valid]
     keep = spaced(seen[:, :2], STEP_M)
@@ -358,10 +344,9 @@ def _ahead(on: LaneSegments, pose: Float[Array, "3"], heading: float) -> Array:
 
 
 def log_progress(route: Route, ego: EgoLog) -> Float[Array, " time"]:
-    """Arc length of the logged ego along a route at every step, never decreasing, metres.
+    """Arc length of the logged ego along a route at every step, never decreasing, metres; gaps repeat the last value.
 
     Each position is searched no further ahead than 1.5 times the distance driven since the last valid step, plus 2 m.
-    Invalid steps repeat the last value.
     """
     rows = np.flatnonzero(ego.valid)
     moved = np.hypot(*np.diff(ego.seen[:, :2], axis=0, prepend=ego.seen[:1, :2]).T)

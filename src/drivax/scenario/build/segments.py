@@ -19,16 +19,14 @@ Array = np.ndarray[Any, Any]
 
 #: Longest segment: 4 m, as the grid requires, less a margin for rounding to float32.
 LONGEST_M = 3.99
-TOLERANCE_M = 0.05
-#: Weight of heights in the tolerance: 20 cm count as 5 cm in the plane.
-Z_WEIGHT = 0.25
+#: Tolerance of simplification, and the weight of heights in it: 20 cm count as 5 cm in the plane.
+TOLERANCE_M, Z_WEIGHT = 0.05, 0.25
 #: Largest gap between the first and last point of a closed ring.
 CLOSED_M = 0.05
 #: Larger speed limits of a source are not believed.
 MOST_LIMIT_MPS = 100.0
-PIECE_M = 10.0
-#: A closed ring is cut into at least this many pieces, so that each has a direction.
-RING_PIECES = 4
+#: Longest piece of road, and fewest pieces of a closed ring, so that each has a direction.
+PIECE_M, RING_PIECES = 10.0, 4
 #: Pieces rank by rings of this width around the log of the ego.
 RING_M = 50.0
 

@@ -19,14 +19,12 @@ from drivax.scenario.schema import AgentKind, among
 
 Array = np.ndarray[Any, Any]
 
-PARKED_M = 0.3
-PARKED_RAD = 0.1
+PARKED_M, PARKED_RAD = 0.3, 0.1
 EXTENSION_STEP_M = 4.0
 #: Over this distance an extension fades from the agent's lateral offset to the centre of its lane.
 FADE_M = 20.0
-#: Agents that move rank as if they were nearer to the ego by this distance.
-MOVER_BONUS_M = 50.0
-MOVER_M = 2.0
+#: Agents that move by more than the second distance rank as if they were nearer to the ego by the first.
+MOVER_BONUS_M, MOVER_M = 50.0, 2.0
 #: Bits of ``agent_flags``.
 EGO_BIT, PREDICT_BIT, INTEREST_BIT = 1, 2, 4
 #: Length, width and height where a source has none, metres (medians of Argoverse 2 sensor logs by class).
@@ -35,18 +33,15 @@ DEFAULT_SIZES = {
     AgentKind.CYCLIST: (1.8, 0.6, 1.7), AgentKind.OTHER: (1.0, 1.0, 1.0), AgentKind.STATIC: (0.5, 0.5, 1.0),
 }  # fmt: skip
 DEFAULT_EGO_SIZE = (4.9, 2.0, 1.5)
-#: Larger measured sizes are ignored.
-MOST_SIZE_M = 100.0
+MOST_SIZE_M = 100.0  # larger measurements are ignored
 
 
 @dataclass(frozen=True)
 class LocalTracks:
     """Tracks in the local frame, float64: box centres, headings in [-pi, pi), m/s; zeros where not valid.
 
-    Attributes:
-        size: Median length, width and height over the valid steps, metres.
-        ego: Row of the ego.
-        defaulted: Number of tracks with a default size.
+    ``size`` is the median length, width and height over the valid steps, metres; ``defaulted`` counts tracks that have
+    a default size.
     """
 
     xyz: Float[Array, "track time 3"]

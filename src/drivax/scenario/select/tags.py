@@ -42,10 +42,9 @@ MOVES_M = 5.0
 TURN_RAD, U_TURN_RAD, TURN_WITHIN_M = np.deg2rad(45.0), np.deg2rad(135.0), 40.0
 #: Largest range of headings of a straight log.
 STRAIGHT_RAD = np.deg2rad(10.0)
-#: Lanes that leave or enter the same lane at angles that differ by more than this belong to a junction ...
-FORK_RAD = np.deg2rad(30.0)
-#: ... unless they are longer than this (ramps).
-JUNCTION_LANE_M = 60.0
+#: Lanes that fork or join at angles that differ by more than the first belong to a junction, unless they
+#: are longer than the second (ramps).
+FORK_RAD, JUNCTION_LANE_M = np.deg2rad(30.0), 60.0
 #: Density is low below the first number of agents within ``NEAR_M`` at the current step, high from the second on.
 NEAR_M, DENSITY = 50.0, (5, 20)
 #: Difficulty is medium from the first number of demands on, hard from the second on.
