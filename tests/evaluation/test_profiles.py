@@ -8,7 +8,16 @@ import pytest
 import shapely
 
 from drivax.cli import main
-from drivax.evaluation.profiles import TERMS, ProfileRow, _objects, devkit_rows, format_rows, write_rows
+from drivax.evaluation.episode_table import Crash
+from drivax.evaluation.profiles import (
+    TERMS,
+    ProfileRow,
+    _objects,
+    _speeds,
+    devkit_rows,
+    format_rows,
+    write_rows,
+)
 from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.build.assemble import assemble
@@ -51,6 +60,37 @@ def test_hitting_a_standing_car_is_at_fault_by_both_definitions(data, run):
     assert free.devkit["score"] == pytest.approx(1.0) == free.ours["score"] and not free.differing
     assert blocked.devkit["fault_score"] == blocked.ours["fault_score"] == 0.0
     assert blocked.devkit["ttc_ok"] == blocked.devkit["score"] == 0.0
+
+
+def test_simulated_traffic_is_read_from_its_stored_poses(data, tmp_path):
+    """In a set whose banks are smaller than its records; the standing car stays where it is."""
+    table = run_evaluation(
+        EvaluationConfig("constant_velocity", traffic="idm"),
+        make_planner("constant_velocity"),
+        data,
+        tmp_path / "idm",
+    )
+    assert table.trajectories.others is not None
+    free, blocked = devkit_rows(table, data)
+    assert free.devkit["fault_score"] == 1.0 and blocked.devkit["fault_score"] == 0.0
+
+
+def test_speeds_of_stored_poses_bridge_absences():
+    time_s = 0.1 * np.arange(12)
+    xy = np.stack(
+        [np.stack([5.0 * time_s, 0 * time_s], -1), np.stack([0 * time_s, 2.0 * time_s], -1)], axis=1
+    )
+    xy[:4, 1] = np.nan
+    speed = _speeds(xy)
+    np.testing.assert_allclose(speed[:, 0], 5.0)
+    np.testing.assert_allclose(speed[4:, 1], 2.0)
+
+
+def test_crashed_episodes_score_nothing(data, run):
+    table, _ = run
+    crash = Crash(table.keys["dataset"][0], "free", 20, "error")
+    free, _ = devkit_rows(replace(table, crashes=(crash,)), data)
+    assert free.devkit["score"] == 0.0
 
 
 def test_judge_writes_and_prints_both_definitions(data, run, capsys):

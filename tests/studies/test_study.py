@@ -345,7 +345,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     run.write_text(json.dumps(told))
     drive.write_text(json.dumps(json.loads(drive.read_text()) | {"started": "2020-01-01T00:00:00+00:00"}))
     assert main([*arguments, "--anyway"]) == 2
-    assert "is older than the run that evaluated it" in capsys.readouterr().err
+    assert "is older than the run that it evaluates" in capsys.readouterr().err
     assert main([*arguments, "--anyway", "--rare", "0.3"]) == 2
     assert "holds a study with other settings" in capsys.readouterr().err
 

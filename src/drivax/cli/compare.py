@@ -60,7 +60,6 @@ def run(args: Compare, overrides: Sequence[str] = ()) -> int:
         if out is not None:
             check_output(out, args.overwrite)
     if args.save is not None:
-        args.save.parent.mkdir(parents=True, exist_ok=True)
         write_text(args.save, settings.dump(plan))
         print(f"wrote {args.save}")
         return 0

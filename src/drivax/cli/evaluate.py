@@ -67,6 +67,8 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     traffic = find_traffic(args.traffic)
     metrics = tuple(name for name in args.metrics if name != _DEVKIT)
     select_metrics(metrics)
+    if _DEVKIT in args.metrics:
+        import drivax.evaluation.profiles  # noqa: F401  (needs an optional package)
     requested = _task(overrides)
     data = ScenarioSet.open(args.data)
     some = load(args.data, 1, filters=args.filter, scenarios=args.scenarios)

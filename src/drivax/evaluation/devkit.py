@@ -53,7 +53,7 @@ class EgoMotion:
     Attributes:
         xy: Centre, m.
         heading: Heading, rad.
-        speed: Speed of the centre, m/s.
+        speed: Speed, m/s, at least 0.
         acceleration: Acceleration of the rear axle along the heading, m/s2.
         yaw_rate: Yaw rate, rad/s.
         yaw_acceleration: Yaw acceleration, rad/s2.
@@ -258,8 +258,9 @@ def devkit_verdict(ego: EgoMotion, tracks: Tracks, road: Road, expert_xy: Points
         "comfortable": float(all(comfort.within.values())),
     }
     terms["making_progress"] = float(terms["progress"] >= 0.2)
-    weights = dict(zip(("ttc_ok", "progress", "speed", "comfortable"), NUPLAN_WEIGHTS.values(), strict=True))
-    mean = sum(weight * terms[name] for name, weight in weights.items()) / sum(weights.values())
+    ours = {"progress_ratio": "progress", "speed_compliance": "speed"}
+    weighted = sum(weight * terms[ours.get(name, name)] for name, weight in NUPLAN_WEIGHTS.items())
+    mean = weighted / sum(NUPLAN_WEIGHTS.values())
     gates = ("fault_score", "drivable", "direction", "making_progress")
     return DevkitVerdict(
         score=mean * float(np.prod([terms[name] for name in gates])),
@@ -326,31 +327,31 @@ def _in_one_lane(ego: EgoMotion, road: Road) -> Bool[np.ndarray, " t"]:
     inside = road.containing(ego.corners.reshape(-1, 2)).reshape(len(ego.xy), 4, -1)
     result, candidates = np.zeros(len(ego.xy), bool), set[int]()
     for sample, corners in enumerate(inside):
-        found: list[set[int]] = []
+        lanes: list[set[int]] = []
         for corner in corners:
             known = _candidates(road, corner, candidates)
-            found.append(known or _current(road, corner))
+            lanes.append(known or _current(road, corner))
             # As in the devkit: only in the second sample a corner's lanes become candidates of the next corners.
-            candidates |= found[-1] if sample == 1 and not known else set()
-        result[sample] = all(found) and _common_or_connected(road, found)
-        candidates = set().union(*found)
+            candidates |= lanes[-1] if sample == 1 and not known else set()
+        result[sample] = all(lanes) and _common_or_connected(road, lanes)
+        candidates = set().union(*lanes)
     return result
 
 
 def _current(road: Road, inside: Bool[np.ndarray, " o"]) -> set[int]:
     """Return the lane of a point, else the connectors (``get_current_route_objects``)."""
-    found = np.flatnonzero(inside).tolist()
-    lanes = [index for index in found if not road.objects[index].connector]
-    return set(lanes[:1] or found)
+    containing = np.flatnonzero(inside).tolist()
+    lanes = [index for index in containing if not road.objects[index].connector]
+    return set(lanes[:1] or containing)
 
 
 def _candidates(road: Road, inside: Bool[np.ndarray, " o"], candidates: set[int]) -> set[int]:
     """Return the candidates that contain a point, or those that follow a single one."""
-    found = {index for index in candidates if inside[index]}
-    if not found and len(candidates) == 1:
+    matching = {index for index in candidates if inside[index]}
+    if not matching and len(candidates) == 1:
         (only,) = candidates
-        found = {index for index in road.objects[only].successors if inside[index]}
-    return found
+        matching = {index for index in road.objects[only].successors if inside[index]}
+    return matching
 
 
 def _common_or_connected(road: Road, corners: Sequence[set[int]]) -> bool:
@@ -450,9 +451,11 @@ def _swept(
 def _stays_on_road(ego: EgoMotion, road: Road, driven: Sequence[Sequence[int]]) -> bool:
     """Return whether no corner is 0.3 m or more outside (``drivable_area_compliance``).
 
-    A corner may also be within 0.3 m of the lanes of ego's centre.
+    Corners in a lane are inside, and so are those within 0.3 m of the lanes of ego's centre.
     """
     for sample, corner in np.argwhere(road.outside_m(ego) >= _OUTSIDE_M):
+        if road.containing(ego.corners[sample, corner][None]).any():
+            continue
         point = shapely.points(ego.corners[sample, corner])
         lanes = [road.objects[index].polygon for index in driven[sample]]
         if not any(shapely.distance(lane, point) < _OUTSIDE_M for lane in lanes):
@@ -465,10 +468,10 @@ def _route(road: Road, points: Points) -> list[list[int]]:
     inside, crossing = road.containing(points), road.intersection(points)
     route: list[list[int]] = []
     current: list[int] = []
-    for sample, found in enumerate(inside):
-        current = sorted(_candidates(road, found, set(current))) if current else []
+    for sample, here in enumerate(inside):
+        current = sorted(_candidates(road, here, set(current))) if current else []
         if not current:
-            current = sorted(_current(road, found))
+            current = sorted(_current(road, here))
             connects = bool(current) and road.objects[current[0]].connector
             last = route[-1] if sample > 1 else []
             if last and road.objects[last[0]].connector and (connects or (not current and crossing[sample])):

@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import shapely
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from drivax.errors import DataError
 from drivax.evaluation.devkit import DevkitVerdict, EgoMotion, Road, RoadObject, Tracks, devkit_verdict
 from drivax.evaluation.episode_table import EpisodeTable, Trajectories
 from drivax.evaluation.rollout import unpack_poses
@@ -25,7 +26,7 @@ from drivax.files import write_text
 from drivax.geometry.boxes import corners
 from drivax.scenario.bank.queries import LEVEL_M, around_lanes, offroad_distance
 from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M, ScenarioBank, Sizes
-from drivax.scenario.schema import DT_S, Scenario
+from drivax.scenario.schema import DT_S, AgentKind, Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.table import Cell, Column, Table
 
@@ -37,6 +38,8 @@ TERMS = {
 }  # fmt: skip
 #: Terms that are 1 less our metric.
 _NEGATED = ("fault_score", "drivable")
+#: Longest window of the speeds of simulated traffic, steps.
+_SPEED_STEPS = 5
 #: Terms count as different beyond this.
 _DIFFERENT = 0.005
 FILE = "devkit.csv"
@@ -80,18 +83,25 @@ def devkit_rows(
         table: Episodes with trajectories.
         data: The scenario set that was evaluated.
         progress: Called with (done, total) after every episode.
+
+    Raises:
+        DataError: The table lacks a metric that the devkit's terms are compared with.
     """
+    missing = [metric for metric in TERMS.values() if metric not in table.metrics]
+    if missing:
+        raise DataError(
+            f"lacks the metric {missing[0]!r}", file=table.folder, cure="run drivax evaluate again"
+        )
     rows = {(entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(data.entries)}
-    sizes, result = Sizes.used(data), []
+    sizes, crashes, result = Sizes.used(data), table.crash_by_scenario, []
     for number, key in enumerate(table.scenarios):
-        scenario = data[rows[key]]
-        verdict = devkit_episode(scenario, table.trajectories, number, sizes)
-        ours = {
-            name: 1.0 - value if name in _NEGATED else value
-            for name, metric in TERMS.items()
-            for value in (float(table.metrics[metric][number]),)
-        }
-        result.append(ProfileRow(*key, ours, {name: float(getattr(verdict, name)) for name in TERMS}))
+        verdict = devkit_episode(data[rows[key]], table.trajectories, number, sizes)
+        ours = {name: float(table.metrics[metric][number]) for name, metric in TERMS.items()}
+        ours |= {name: 1.0 - ours[name] for name in _NEGATED}
+        devkit = {name: float(getattr(verdict, name)) for name in TERMS}
+        # After a crash ego stands still, which is comfortable and hits nothing; a crash never improves a score.
+        devkit |= {"score": 0.0} if key in crashes else {}
+        result.append(ProfileRow(*key, ours, devkit))
         progress(number + 1, len(table))
     return result
 
@@ -132,18 +142,16 @@ def format_rows(rows: Sequence[ProfileRow]) -> str:
     lines = []
     for name, metric in TERMS.items():
         pairs = np.array([(row.ours[name], row.devkit[name]) for row in rows])
-        means = [
-            f"{pairs[~np.isnan(side), n].mean():.3f}" if (~np.isnan(side)).any() else ""
-            for n, side in enumerate(pairs.T)
-        ]
+        pairs = pairs[~np.isnan(pairs).any(axis=1)]
+        means = [f"{mean:.3f}" for mean in pairs.mean(axis=0)] if len(pairs) else ["", ""]
         differ = int((np.abs(pairs[:, 0] - pairs[:, 1]) > _DIFFERENT).sum())
         term = f"1 - {metric}" if name in _NEGATED else metric
-        lines.append((Cell(name), Cell(term), *map(Cell, means), Cell(f"{differ:,}")))
+        numbers = (*means, f"{differ:,}", f"{len(pairs):,}")
+        lines.append((Cell(name), Cell(term), *map(Cell, numbers)))
     columns = (
-        Column("devkit's term", label=True),
-        Column("ours", left=True),
-        *map(Column, ("drivax", "devkit", "differ in")),
-    )
+        Column("devkit's term", label=True), Column("ours", left=True),
+        *map(Column, ("drivax", "devkit", "differ in", "n")),
+    )  # fmt: skip
     return Table("profile", columns, tuple(lines)).text()
 
 
@@ -151,47 +159,77 @@ def _ego(scenario: Scenario, motion: Float[np.ndarray[Any, Any], "t 4"], start: 
     """Ego's motion: acceleration over the last step (the first one logged), yaw rate over the next."""
     x, y, heading, speed = motion.T
     before = max(start - 1, 0)
+    # A noisy start does not come from the log.
     logged = (
-        float(np.hypot(*scenario.agent_velocity[before, 0])) if scenario.agent_valid[before, 0] else speed[0]
+        np.allclose(motion[0, :2], scenario.agent_xy[start, 0], atol=1e-3) and scenario.agent_valid[before, 0]
     )
+    last = float(np.hypot(*scenario.agent_velocity[before, 0])) if logged else speed[0]
     turned = np.diff(np.unwrap(heading))
     yaw_rate = np.append(turned, turned[-1:]) / DT_S if len(turned) else np.zeros(1)
     length, width = scenario.agent_size[0, :2].astype(np.float64)
     return EgoMotion(
-        np.stack([x, y], axis=-1), heading, np.abs(speed), np.diff(speed, prepend=logged) / DT_S, yaw_rate,
+        np.stack([x, y], axis=-1), heading, np.abs(speed), np.diff(speed, prepend=last) / DT_S, yaw_rate,
         np.diff(yaw_rate, prepend=yaw_rate[:1]) / DT_S, (float(length), float(width)),
     )  # fmt: skip
 
 
 def _tracks(scenario: Scenario, steps: slice, others: Float[np.ndarray[Any, Any], "t A 3"] | None) -> Tracks:
     """The other agents: moving ones where traffic put them, and parked ones."""
-    count = steps.stop - steps.start
-    xy, heading = scenario.agent_xy[steps, 1:], scenario.agent_heading[steps, 1:]
-    velocity, present = scenario.agent_velocity[steps, 1:], scenario.agent_valid[steps, 1:].copy()
-    if others is not None:
-        agents = others[:, 1 : xy.shape[1] + 1].astype(np.float64)
-        xy, heading, present = agents[..., :2], agents[..., 2], ~np.isnan(agents[..., 0])
-        velocity = np.diff(xy, axis=0, prepend=xy[:1] - DT_S * velocity[:1]) / DT_S
-    ground = scenario.agent_z[steps, :1]
-    present &= np.abs(scenario.agent_z[steps, 1:] - ground) <= LEVEL_M
-    parked = scenario.parked_valid[steps] & (np.abs(scenario.parked_z - ground) <= LEVEL_M)
-    static = np.broadcast_to(scenario.parked_xy, (count, *scenario.parked_xy.shape))
-    present = np.concatenate([present, parked], axis=1)
-    there = present.any(axis=0)
-    return Tracks(
-        np.nan_to_num(np.concatenate([xy, static], axis=1)[:, there]).astype(np.float64),
-        np.nan_to_num(
-            np.concatenate([heading, np.broadcast_to(scenario.parked_heading, parked.shape)], axis=1)[
-                :, there
-            ]
-        ).astype(np.float64),
-        np.concatenate([np.hypot(velocity[..., 0], velocity[..., 1]), np.zeros(parked.shape)], axis=1)[
-            :, there
-        ].astype(np.float64),
-        present[:, there],
-        np.concatenate([scenario.agent_size[1:, :2], scenario.parked_size[:, :2]])[there].astype(np.float64),
-        np.concatenate([scenario.agent_kind[1:], scenario.parked_kind])[there],
+    count = scenario.agent_xy.shape[1] if others is None else others.shape[1]
+    slots = slice(1, count)
+    kind = np.concatenate([scenario.agent_kind[slots], scenario.parked_kind])
+    if others is None:
+        xy, heading = scenario.agent_xy[steps, slots], scenario.agent_heading[steps, slots]
+        moving = scenario.agent_valid[steps, slots]
+        velocity = scenario.agent_velocity[steps, slots]
+        speed = np.hypot(velocity[..., 0], velocity[..., 1])
+    else:
+        poses = others[:, 1:].astype(np.float64)
+        xy, heading, moving = poses[..., :2], poses[..., 2], ~np.isnan(poses[..., 0])
+        speed = _speeds(xy)
+    ground = _filled(scenario.agent_z[:, :1], scenario.agent_valid[:, :1])[steps]
+    level = (
+        np.abs(_filled(scenario.agent_z[:, slots], scenario.agent_valid[:, slots])[steps] - ground) <= LEVEL_M
     )
+    parked = scenario.parked_valid[steps] & (np.abs(scenario.parked_z - ground) <= LEVEL_M)
+    present = np.concatenate([moving & level, parked], axis=1)
+    there = present.any(axis=0)
+
+    def joined(of_moving: Any, of_parked: Any) -> Any:
+        still = np.broadcast_to(of_parked, (len(parked), *np.shape(of_parked)))
+        return np.nan_to_num(np.concatenate([of_moving, still], axis=1)[:, there]).astype(np.float64)
+
+    static = np.isin(kind[there], (AgentKind.STATIC, AgentKind.OTHER))
+    size = np.concatenate([scenario.agent_size[slots, :2], scenario.parked_size[:, :2]])[there]
+    return Tracks(
+        joined(xy, scenario.parked_xy),
+        joined(heading, scenario.parked_heading),
+        np.where(static, 0.0, joined(speed, np.zeros(parked.shape[1]))),
+        present[:, there], size.astype(np.float64), kind[there],
+    )  # fmt: skip
+
+
+def _speeds(xy: Float[np.ndarray[Any, Any], "t A 2"]) -> Float[np.ndarray[Any, Any], "t A"]:
+    """Speeds over up to 0.5 s, since stored poses have steps of 2 cm; NaN rows are absent agents.
+
+    The earliest pose of a window is the one to which the agent was present without a gap.
+    """
+    speed = np.zeros(xy.shape[:2])
+    for back in range(1, _SPEED_STEPS + 1):
+        moved = np.linalg.norm(xy[back:] - xy[:-back], axis=-1) / (back * DT_S)
+        speed[back:] = np.where(np.isnan(moved), speed[back:], moved)
+    first = np.isnan(np.concatenate([xy[:1] + np.nan, xy[:-1]])[..., 0])
+    ahead = np.linalg.norm(np.diff(xy, axis=0, append=xy[-1:]), axis=-1) / DT_S
+    return np.where(first, np.nan_to_num(ahead), speed)
+
+
+def _filled(
+    values: Float[np.ndarray[Any, Any], "t A"], valid: Bool[np.ndarray[Any, Any], "t A"]
+) -> Float[np.ndarray[Any, Any], "t A"]:
+    """Values with each gap filled by the nearest valid step before it, else by the first valid one."""
+    steps = np.arange(len(values))[:, None]
+    last = np.maximum.accumulate(np.where(valid, steps, -1), axis=0)
+    return np.take_along_axis(values, np.where(last >= 0, last, valid.argmax(axis=0)), axis=0)
 
 
 def _road(scenario: Scenario, steps: slice, sizes: Sizes) -> Road:
@@ -262,6 +300,6 @@ def _blocks(scenario: Scenario, count: int) -> list[int]:
         before, after = (
             int(links[index, 0]) for links in (scenario.lane_predecessor, scenario.lane_successor)
         )
-        if min(before, after) >= 0:
+        if 0 <= before < count and 0 <= after < count:
             blocks[index] = pairs.setdefault((blocks[before], blocks[after]), index)
     return blocks

@@ -24,7 +24,7 @@ from drivax.scenario.schema import DT_S
 WINDOW, TAIL = 15, 12
 #: Windows, orders and derivatives: smoothed acceleration, jerk of it, yaw rate, yaw acceleration.
 SMOOTH, JERK, YAW_RATE, YAW_ACCELERATION = (8, 2, 0), (15, 2, 1), (5, 2, 1), (5, 3, 2)
-#: Accelerations that the last steps depend on, and the first of them whose smoothed value does not change any more.
+#: Motions that the last steps depend on, and the first acceleration whose smoothed value does not change any more.
 _SAMPLES, _SETTLED = 23, 4
 #: nuPlan's closed-loop limits: m/s2, m/s2, m/s3, m/s3, rad/s, rad/s2.
 LONGITUDINAL_MPS2 = (-4.05, 2.40)

@@ -132,7 +132,7 @@ def step_metrics(situation: Situation, values: Sequence[StepValue] | None = None
     """Return step values of one situation, for tables and plots; by default all that belong to one step.
 
     The facts of the situation must hold what the values read (a task with ``metrics: full`` holds all). Comfort needs
-    the seven steps that follow; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
+    the eleven steps that follow; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
     """
     moment = Moment(situation, situation.context.step, jnp.zeros((), bool))
     result = {}

@@ -15,11 +15,14 @@ import numpy as np
 
 from drivax import settings
 from drivax.curation.ensemble import EnsembleConfig
+from drivax.curation.methods import METHODS
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import Scale, WeightConfig, permute_scores, sampling_weights
 from drivax.errors import UsageError, did_you_mean
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
+from drivax.metrics.catalogue import METRICS
+from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.store import ScenarioSet
 
 #: Scenarios that a claim is about: all, weighted as in ordinary traffic, or those of one stratum.
@@ -131,6 +134,15 @@ class StudyDefinition:
     checkpoints_by: str
 
     def __post_init__(self) -> None:
+        if len(self.baselines) < 2:
+            raise ValueError("a study needs two baselines")
+        for names, known, what in (
+            (self.baselines, self.arms, "baseline"), (self.planners, PLANNERS, "planner"),
+            (self.metrics, METRICS, "metric"), ([arm.method for arm in self.arms.values()], METHODS, "method"),
+        ):  # fmt: skip
+            for name in names:
+                if name not in known:
+                    raise ValueError(f"there is no {what} {name!r}; {did_you_mean(name, list(known))}")
         for claim in self.claims:
             for name, known in (
                 (claim.arm, self.arms), (claim.reference, self.arms), (claim.group, self.groups),
@@ -213,7 +225,8 @@ class StudySets:
         """
         if (data / "train").is_dir():
             rest = tuple(path for path in (data / "test", data / "test-rare") if path.is_dir())
-            return cls(data / "train", validation or data / "validation", tuple(test) or rest)
+            validation, test = validation or data / "validation", tuple(test) or rest
+            data = data / "train"
         if not data.is_dir():
             raise UsageError("does not exist", file=data, cure="name a scenario set, or a benchmark's folder")
         if validation is None or not test:

@@ -214,19 +214,22 @@ def validations_table(results: Results, rule: str) -> Table:
 
 
 def _conditions(definition: StudyDefinition, results: Results) -> str:
+    baselines = escape(" and ".join(definition.baselines))
     smallest = ", ".join(f"{_label(name)} {value:.3f}" for name, value in results["detectable"].items())
     return conditions_table(results).html() + (
         "<p>Progress is a share of the expert's, at the best checkpoint; scores change from the third to the last "
         "quarter of the validations. The smallest difference in ordinary traffic that this study detects with a "
         "probability of 80 %, at the strictest level of the first group of claims, if seeds vary as the baseline's: "
-        f"{escape(smallest)}. {' and '.join(definition.baselines)} had to be good enough before the others were "
+        f"{escape(smallest)}. {baselines} had to be good enough before the others were "
         "trained; the others are shown next to them.</p>"
     )
 
 
 def _verdicts(definition: StudyDefinition, results: Results) -> str:
     groups = {heading: claims_table(results, group) for group, heading in definition.groups.items()}
-    return "".join(f"<h3>{heading}</h3>{table.html()}" for heading, table in groups.items() if table.rows) + (
+    return "".join(
+        f"<h3>{escape(heading)}</h3>{table.html()}" for heading, table in groups.items() if table.rows
+    ) + (
         "<p><small>Differences are means over seeds and scenarios with 95 % intervals; both seeds and recordings are "
         "random (Welch-Satterthwaite). P-values are adjusted for the number of claims in their group (Holm). A claim "
         "is supported or contradicted below 0.05, otherwise undecided; the number of seeds or recordings that would "

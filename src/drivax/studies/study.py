@@ -120,7 +120,7 @@ def run_study(
         raise UsageError(
             "the baseline does not drive well enough for a comparison",
             file=study.folder,
-            cure="train longer, choose other settings, or pass --anyway",
+            cure="train longer or with other settings in another --out, or pass --anyway",
         )
     _train_and_evaluate(jobs, cores, log)
     results = _results(study, test, strata, tables, usable) | {
@@ -147,7 +147,7 @@ def _open(study: Study) -> None:
     """Create the folder of a study, or check that it holds this one."""
     sets = study.sets
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
-    if not study.folder.exists():
+    if not study.folder.exists() or not any(study.folder.iterdir()):
         rest = [name for name, arm in study.arms.items() if arm.method != "oracle"]
         if len(rest) < len(study.arms) and not event_kinds(data[0]).any():
             raise UsageError(
@@ -155,7 +155,7 @@ def _open(study: Study) -> None:
                 file=sets.train,
                 cure=f"pass --arms [{','.join(rest)}]",
             )
-        RunFolder.create(study.folder, study.config, data, kind="longtail")
+        RunFolder.create(study.folder, study.config, data, overwrite=study.folder.exists(), kind="study")
         return
     folder = RunFolder.open(study.folder)
     sources = [entry["hash"] for entry in folder.info.get("data", [])]
@@ -191,7 +191,7 @@ def _test_set(study: Study) -> ScenarioSet:
             count = min(with_event.sum(), (~with_event).sum())
             chosen = [np.flatnonzero(stratum)[:count] for stratum in (with_event, ~with_event)]
             rows = [rows[index] for index in np.sort(np.concatenate(chosen))]
-        source = {"command": "study longtail", "sets": [part.hash for part in parts]}
+        source = {"command": "study", "sets": [part.hash for part in parts]}
         with ScenarioWriter(study.test, parts[0].capacity, source) as writer:
             for part, row in rows:
                 writer.add(part[row])
@@ -202,11 +202,18 @@ def _strata(study: Study, test: ScenarioSet) -> Strata:
     """Return which test scenarios are rare (labelled, else most critical), and the share of rare ones on the road."""
     recordings = recordings_of(test.entries)
     rare = event_kinds(test) > 0
-    if not rare.any():
+    labelled = bool(rare.any())
+    if not labelled:
         scores = curate("kinematic", Request(test)).scenarios
         rare = scores >= np.quantile(scores, 1.0 - study.config.rare)
-    labelled = event_kinds(ScenarioSet.open(study.sets.test[0])) > 0
-    return Strata(recordings, rare, float(labelled.mean()) if labelled.any() else None)
+    ordinary = event_kinds(ScenarioSet.open(study.sets.test[0])) > 0
+    if labelled and not ordinary.any():
+        raise UsageError(
+            "has no labelled event, so that their share of ordinary traffic is unknown",
+            file=study.sets.test[0],
+            cure="name a test set with events as frequent as on the road first",
+        )
+    return Strata(recordings, rare, float(ordinary.mean()) if labelled else None)
 
 
 def _train_and_evaluate(jobs: Sequence[Job], cores: int | None, log: Log) -> None:
@@ -226,13 +233,14 @@ def _is_finished(job: Job) -> bool:
     if not (run / "config.yaml").is_file():
         return False
     folder = RunFolder.open(run)
+    evaluations = [job.study.evaluation(name, job.seed) for name in job.study.evaluations(job.arm)]
     expected = hashes(ScenarioSet.open(job.study.sets.validation), job.weighted().weights)
     if folder.config(TrainConfig) != job.study.train_config(job.arm, job.seed) or any(
         folder.info.get(name) != value for name, value in expected.items()
     ):
         raise UsageError(
             "was trained with other settings or weights than this study asks for", file=run,
-            cure=f"remove it and {job.study.evaluation(job.arm, job.seed)}; both are made again",
+            cure=f"remove it and {' and '.join(map(str, evaluations))}; all are made again",
         )  # fmt: skip
     return is_evaluated(job.study, job.arm, job.seed)
 
@@ -251,9 +259,9 @@ def is_evaluated(study: Study, arm: str, seed: int) -> bool:
         )
         if evaluated < trained:
             raise UsageError(
-                "is older than the run that evaluated it",
+                "is older than the run that it evaluates",
                 file=folder,
-                cure="remove it; it is evaluated again",
+                cure="remove it; it is made again",
             )
     return all(folder.is_dir() for folder in evaluations)
 
@@ -279,10 +287,18 @@ def _run_job(job: Job) -> float:
 
 
 def _best_step(job: Job) -> int:
-    """Return the step of the validation at which ``checkpoints_by`` is largest."""
-    metric = job.study.definition.checkpoints_by
-    rows = read_rows(job.study.run(job.arm, job.seed) / "metrics.jsonl")
-    return int(max((row for row in rows if metric in row), key=lambda row: row[metric])["step"])
+    """Return the step of the validation at which ``checkpoints_by`` is largest.
+
+    Raises:
+        UsageError: The training never logged it at a validation.
+    """
+    metric, file = job.study.definition.checkpoints_by, job.study.run(job.arm, job.seed) / "metrics.jsonl"
+    rows = [row for row in read_rows(file) if _PROGRESS in row and row.get(metric) is not None]
+    if not rows:
+        raise UsageError(
+            f"has no {metric!r} at a validation", file=file, cure="choose another checkpoints_by"
+        )
+    return int(max(rows, key=lambda row: row[metric])["step"])
 
 
 def _conditions(study: Study, arms: Sequence[str]) -> list[Condition]:
@@ -299,7 +315,7 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
             {
                 "score": [_score_of(row) for row in rows],
                 "progress": [row[_PROGRESS] for row in rows],
-                "rule": [row[metric] for row in rows if metric in row],
+                "rule": [row[metric] for row in rows if row.get(metric) is not None],
             }
         )
     return curves

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 from drivax.curation.scores import ScoreTable
 from drivax.curation.subset import top_rows
+from drivax.evaluation.episode_table import SHARES
 from drivax.metrics.catalogue import METRICS
 from drivax.stats.ranking import correlation_interval, rank_correlation
 from drivax.stats.seeds import Crossed, crossed_difference, crossed_mean, log_ratio, seeds_interval
@@ -24,6 +25,8 @@ UNRELATED, RELATED = 0.1, 0.3
 #: Share of the scenarios that are compared as the most critical ones of two methods.
 _TOP = 0.05
 _LEVEL = 0.05
+#: Metrics that lie between 0 and 1.
+_SHARES = (*SHARES, "progress_ratio")
 
 Values = Float[np.ndarray, "seed scenario"]
 #: Values of an arm by metric.
@@ -183,9 +186,9 @@ def _effects(claim: Claim, episodes: Mapping[str, Episodes], strata: Strata) -> 
 
 def _decided(result: ClaimResult, claims: int) -> ClaimResult:
     if result.tested is None or result.adjusted is None:
-        why = "there are no such scenarios"
+        why = "fewer than two recordings define it"
         if result.difference is not None:
-            why = "an arm never collides: no ratio"
+            why = "the mean of an arm is 0: no ratio"
         return replace(result, needed=why)
     if result.adjusted >= _LEVEL:
         return replace(result, needed=needed(result.tested, claims))
@@ -253,12 +256,14 @@ def rates(
         weights = strata.weights(stratum)
         defined = {name: episodes[name] for name in metrics if strata.is_comparable(episodes[name], weights)}
         if defined:
-            means[stratum] = {name: _rate(values, strata, weights) for name, values in defined.items()}
+            means[stratum] = {
+                name: _rate(values, strata, weights, name in _SHARES) for name, values in defined.items()
+            }
     return means
 
 
-def _rate(values: Values, strata: Strata, weights: Weights) -> dict[str, float | int | None]:
-    interval = seeds_interval(values, strata.recordings, weights, share=True).as_dict()
+def _rate(values: Values, strata: Strata, weights: Weights, share: bool) -> dict[str, float | int | None]:
+    interval = seeds_interval(values, strata.recordings, weights, share=share).as_dict()
     return {"scenarios" if name == "n" else name: value for name, value in interval.items()}
 
 

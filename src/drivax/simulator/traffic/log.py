@@ -34,7 +34,7 @@ class LogTraffic:
 
 
 def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Float[Array, "history 4"]:
-    """Return the last 16 logged motions of a slot up to ``step``.
+    """Return the last logged motions of a slot up to ``step``.
 
     Where the log does not reach back (before its start, or before the agent appeared) the motion is extended
     backwards at the velocity of the earliest known step.
@@ -68,7 +68,7 @@ def frame_of(
     """Return the frame of ``step - back`` from the traffic model's rows, driven agents and parked agents.
 
     ``driven`` stacks the contexts of all driven agents of the scenario ``[K]``; slots beyond the last are empty.
-    ``back`` is 0 to 15; reactive traffic remembers 9.
+    ``back`` is less than its length; reactive traffic remembers 9.
     """
     motion, present = driven.history[:, HISTORY - 1 - back], jnp.ones_like(driven.z)
     # Before the recording no other agent was seen.
