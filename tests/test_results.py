@@ -177,6 +177,12 @@ def test_longtail_verdicts_hold_under_joint_adjustment(found):
     assert [p < 0.05 for p in together] == [one["verdict"] != "undecided" for one in claims]
 
 
+def test_nuplan_page_shows_stored_counts(script, stored):
+    nuplan = script("data.nuplan")
+    shown = f"{nuplan.BEGIN}\n\n{nuplan.shown(stored('nuplan'))}\n\n{nuplan.END}" in nuplan.PAGE.read_text()
+    assert shown, "run python -m experiments.data.nuplan --table, and read what the page says about it"
+
+
 def test_offline_page_shows_stored_speed(script, stored):
     offline = script("speed.offline")
     shown = (

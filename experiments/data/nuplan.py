@@ -27,7 +27,8 @@ from experiments.repository import DOCS, RESULTS
 RESULT = RESULTS / "nuplan.json"
 PAGE = DOCS / "results" / "nuplan.md"
 BEGIN, END = "<!-- nuplan.py: begin -->", "<!-- nuplan.py: end -->"
-_WIDTH_M, _BEGIN_M, _END_M, _CAR_M = 3.7, -150.0, 350.0, (5.176, 2.297, 1.777)
+_WIDTH_M, _BEGIN_M, _JOINT_M, _END_M = 3.7, -150.0, 300.0, 350.0
+_CAR_M = (5.176, 2.297, 1.777)
 #: Our metric of each of the devkit's verdicts; the first two are 1 less ours.
 METRICS = {
     "fault_score": "at_fault_collision", "drivable": "offroad", "ttc_ok": "ttc_ok", "direction": "direction",
@@ -49,10 +50,17 @@ def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
     ]
     heading = np.stack([rows[:, 2], *(np.full(len(rows), agent["h"]) for agent in agents)])
     velocity = rows[:, 6:7] * np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], axis=-1)
-    ends = [[_BEGIN_M, 0.0], [_END_M, 0.0]]
-    other = [[_BEGIN_M, _WIDTH_M], [_END_M, _WIDTH_M]]
     lane = {"limit_mps": scene["limit"], "width_m": _WIDTH_M}
-    beside = {} if scene["two_way"] else {"left": [1]}, {} if scene["two_way"] else {"right": [0]}
+    other = [[_BEGIN_M, _WIDTH_M], [_END_M, _WIDTH_M]]
+    # In two pieces, so that there is a lane graph.
+    lanes = [
+        {"points": [[_BEGIN_M, 0.0], [_JOINT_M, 0.0]], "successors": [1], **lane},
+        {"points": [[_JOINT_M, 0.0], [_END_M, 0.0]], **lane},
+        {"points": other[::-1] if scene["two_way"] else other, **lane},
+    ]
+    if not scene["two_way"]:
+        lanes[0]["left"] = lanes[1]["left"] = [2]
+        lanes[2]["right"] = [0, 1]
     half = _WIDTH_M / 2
     edge = [[_BEGIN_M, -half], [_END_M, -half], [_END_M, 3 * half], [_BEGIN_M, 3 * half], [_BEGIN_M, -half]]
     return scenario_from_arrays(
@@ -65,14 +73,8 @@ def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
             "size": np.array([_CAR_M, *([*agent["size"], 1.5] for agent in agents)]),
             "kind": ["vehicle", *(agent["kind"] for agent in agents)],
         },
-        {
-            "lanes": [
-                {"points": ends, **lane, **beside[0]},
-                {"points": other[::-1] if scene["two_way"] else other, **lane, **beside[1]},
-            ],
-            "edges": [edge],
-        },
-        route=[0],
+        {"lanes": lanes, "edges": [edge]},
+        route=[0, 1],
         dataset="nuplan-devkit",
     )
 
@@ -90,6 +92,7 @@ def measured(data: Path) -> dict[str, Any]:
             ours = 1.0 - values if name in ("fault_score", "drivable") else values
             theirs = np.array([_verdict(scene["devkit"], name) for scene in scenes])
             counts[group][name] = int((np.abs(ours - theirs) <= _AGREES).sum())
+            counts[group][f"{name}_undefined"] = int(np.isnan(ours).sum())
     return counts
 
 
@@ -125,6 +128,8 @@ def main() -> None:
     args = parser.parse_args()
     result = json.loads(RESULT.read_text()) if RESULT.exists() else {}
     if not args.table:
+        if args.data is None:
+            parser.error("the following arguments are required: --data")
         result[args.state] = measured(args.data)
         print(json.dumps(result[args.state], indent=1))
         if not args.write:

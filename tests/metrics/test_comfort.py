@@ -84,3 +84,11 @@ def test_wrapping_heading_is_comfortable():
     heading = (np.linspace(np.pi - 0.1, np.pi + 0.1, 23) + np.pi) % (2 * np.pi) - np.pi
     judged = check_comfort(jnp.asarray(histories(np.full(23, 5.0), heading)[0]))
     assert bool(judged.comfortable.all())
+
+
+def test_steering_weave_of_1_hz_is_uncomfortable():
+    """Yaw rates up to 1.26 rad/s; a window of 1.5 s, as nuPlan's devkit declares but does not use, would hide them."""
+    heading = 0.2 * np.sin(2 * np.pi * 0.1 * np.arange(60))
+    motion = jnp.asarray(np.stack([0 * heading, 0 * heading, heading, np.full(60, 2.0)], -1), jnp.float32)
+    assert not bool(jax.jit(check_trip_comfort)(motion).comfortable.any())
+    assert np.abs(savgol_filter(heading, 15, 2, deriv=1, delta=0.1)[11:-11]).max() < 0.95
