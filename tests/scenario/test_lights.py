@@ -53,7 +53,7 @@ def test_the_nearest_lights_are_kept():
     assert lights.overflow == {"lights": 2}
 
 
-def test_stop_signs_name_the_lanes_that_they_control():
+def test_stop_signs_refer_to_the_lanes_they_control():
     features = (
         *(lane(i, line((0, i), (9, i))) for i in range(6)),
         MapFeature(50, RoadKind.STOP_SIGN, np.array([[9.0, 3, 0]]), lanes=(2, 99, 4)),
