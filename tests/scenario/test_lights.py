@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.scenario.build.lanes import LaneSegments, lane_graph
-from drivax.scenario.build.lights import place_lights, place_stops
+from drivax.scenario.build.lanes import LaneSegments, lane_graph, place_lights, place_stops
 from drivax.scenario.build.segments import cut, road_lines
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import LightState, RoadKind

@@ -12,8 +12,17 @@ from jaxtyping import Float, Int
 
 from drivax.errors import DataError
 from drivax.scenario.build.grid import EDGE_BLOCK, LANE_BLOCK, GridSegments, arrange, cell_sides
-from drivax.scenario.build.lanes import LaneGraph, LaneSegments, lane_graph, lane_of_feature, select
-from drivax.scenario.build.lights import Lights, Stops, place_lights, place_stops
+from drivax.scenario.build.lanes import (
+    LaneGraph,
+    LaneSegments,
+    Lights,
+    Stops,
+    lane_graph,
+    lane_of_feature,
+    place_lights,
+    place_stops,
+    select,
+)
 from drivax.scenario.build.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
 from drivax.scenario.build.segments import (
     RoadLines,
