@@ -57,6 +57,11 @@ class LanePath:
     until: float = np.inf
     lateral: float = 0.0
 
+    def then(self, lane: int, ahead: float, entry: float, penalty: float, changes: int = 0) -> LanePath:
+        """Return the path with one more lane."""
+        lanes, changes = (*self.lanes, lane), self.changes + changes
+        return LanePath(lanes, self.s, ahead, entry, penalty, changes, self.until, self.lateral)
+
 
 @dataclass(frozen=True)
 class LaneSearch:
@@ -121,11 +126,8 @@ class LaneSearch:
     def to_goal(self, xyz: Float[Array, "3"], heading: float) -> list[LanePath]:
         """Cheapest paths to the lanes under the goal (Dijkstra's search)."""
         goals = self._goals(xyz, heading)
-        complete: list[LanePath] = []
-        done: set[int] = set()
-        serial = count()
-        heap = [(lane_path.penalty, next(serial), lane_path) for lane_path in self.starts]
-        heapq.heapify(heap)
+        complete, done, serial = list[LanePath](), set[int](), count()
+        heap = [(lane_path.penalty, next(serial), lane_path) for lane_path in self.starts]  # sorted
         while heap and len(complete) < len(goals):
             lane_path = heapq.heappop(heap)[2]
             lane = lane_path.lanes[-1]
@@ -172,17 +174,15 @@ class LaneSearch:
         for other in (int(x) for x in graph.successor[lane] if x >= 0):
             if self.drivable[other] and other not in lanes:
                 penalty = lane_path.penalty + TURN_COST_M * float(self.bend[other]) + self.outside[other]
-                longer = replace(lane_path, lanes=(*lanes, other), ahead=self.reach(lane_path))
-                result.append(replace(longer, entry=0.0, penalty=penalty))
+                result.append(lane_path.then(other, self.reach(lane_path), 0.0, penalty))
         if lane_path.changes >= MOST_CHANGES:
             return result
         for other, shift in graph.neighbours(lane):
             low, high, _ = change_room(graph, lane, other, lane_path.entry)
             if self.drivable[other] and other not in lanes and high - low >= CHANGE_M:
                 penalty = lane_path.penalty + CHANGE_COST_M + self.outside[other]
-                longer = replace(lane_path, lanes=(*lanes, other), ahead=lane_path.ahead - shift)
-                changed = replace(longer, entry=low + shift + CHANGE_M, changes=lane_path.changes + 1)
-                result.append(replace(changed, penalty=penalty))
+                entry = low + shift + CHANGE_M
+                result.append(lane_path.then(other, lane_path.ahead - shift, entry, penalty, changes=1))
         return result
 
     def goes_on(self, following: Sequence[LanePath]) -> bool:
