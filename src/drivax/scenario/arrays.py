@@ -21,8 +21,7 @@ _AGENT_KEYS = ("xy", "heading", "valid", "size", "kind", "velocity", "z", "id")
 _ROAD_KEYS = ("lanes", "edges", "crosswalks", "stop_signs")
 _LANE_KEYS = ("points", "successors", "left", "right", "limit_mps", "width_m", "kind")
 _LIGHT_KEYS = ("lane", "states", "stop_point")
-_KINDS = {"vehicle": AgentKind.VEHICLE, "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST,
-          "other": AgentKind.OTHER, "static": AgentKind.STATIC}  # fmt: skip
+_KINDS = {kind.name.lower(): kind for kind in AgentKind if kind}
 _LANE_KINDS = {"surface": RoadKind.LANE_SURFACE, "freeway": RoadKind.LANE_FREEWAY, "bike": RoadKind.LANE_BIKE}
 _COLOURS = {"red": LightState.STOP, "yellow": LightState.CAUTION, "green": LightState.GO,
             "unknown": LightState.UNKNOWN, None: LightState.UNOBSERVED}  # fmt: skip
