@@ -65,14 +65,10 @@ class LanePath:
 
 @dataclass(frozen=True)
 class LaneSearch:
-    """Best-first search from the lanes under the ego.
+    """Best-first search from ``starts``, paths of one lane under the ego, the best fitting first.
 
-    Attributes:
-        starts: Paths of one lane under the ego, the best fitting first.
-        need_m: Length of a complete path ahead of the ego.
-        bend: Heading change along every lane, radians.
-        drivable: Mask of car lanes.
-        outside: Cost of entering a lane outside the intended corridor, metres.
+    A complete path is ``need_m`` long ahead of the ego. ``bend`` is the heading change along every lane (radians), and
+    ``outside`` the cost of entering it where it is outside the intended corridor (metres).
     """
 
     on: LaneSegments
@@ -219,16 +215,11 @@ def trace(
     graph: LaneGraph, lanes: Sequence[int], begin_m: float, ahead_m: float, window_m: tuple[float, float],
     place: float, change_m: float = CHANGE_M,
 ) -> Line:  # fmt: skip
-    """Draw the line along a sequence of lanes, each a successor or neighbour of the previous one.
+    """Draw the line along lanes, each a successor or neighbour of the previous one, from ``begin_m`` on the first.
 
-    Args:
-        graph: The lane graph.
-        lanes: Dense indices.
-        begin_m: Arc length on the first lane where the line begins.
-        ahead_m: Distance from the ego to the start of the first lane (negative: behind), metres.
-        window_m: Range ahead of the ego for lane changes, where there is room.
-        place: Position of a lane change in its stretch: 0 as early, 1 as late as possible.
-        change_m: Length of a lane change, where there is room.
+    Where there is room, a lane change is ``change_m`` long and lies in ``window_m`` ahead of the ego; ``place`` is its
+    position in its stretch: 0 as early, 1 as late as possible. ``ahead_m`` is the distance from the ego to the start of
+    the first lane (negative: behind), metres.
     """
     parts: list[Line] = []
     s = begin_m

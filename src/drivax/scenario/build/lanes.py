@@ -345,12 +345,8 @@ def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array,
 class Lights:
     """Traffic lights in the local frame.
 
-    Attributes:
-        line: Stop lines from left to right of the lane: x, y, x, y.
-        lane: Dense lane index, -1 if the lane is missing in the map.
-        heading, exit_heading: Headings of the lane at the stop point and at its end.
-        state: States over time, -1 unobserved.
-        overflow: Numbers of lights that do not fit or have no known direction, by name.
+    Each has a stop line from left to right of its lane (x, y, x, y), the dense index of the lane (-1 if the map lacks
+    it) with its headings at the stop point and at its end, and states over time (-1 unobserved).
     """
 
     line: Float[Array, "light 4"]
