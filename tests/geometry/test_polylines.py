@@ -107,7 +107,7 @@ def test_simplify_drops_no_point_further_than_the_tolerance(seed):
         assert _distance(walk[i, :2], walk[kept[after - 1], :2], walk[kept[after], :2]) <= 0.05 + 1e-12
 
 
-def test_simplify_minds_height_where_asked():
+def test_simplify_respects_weighted_height():
     hill = np.array([[0.0, 0, 0], [10, 0, 1], [20, 0, 0]])
     lines = Polylines.of([hill])
     assert simplify(lines, 0.05).tolist() == [True, False, True]

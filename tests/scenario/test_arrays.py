@@ -47,7 +47,7 @@ def roads() -> dict[str, Any]:
     }
 
 
-def test_a_scenario(agents, roads):
+def test_arrays_become_a_scenario(agents, roads):
     states = ["red"] * 40 + [None] * 11 + ["green"] * 40
     scenario = scenario_from_arrays("own-1", agents, roads, [{"lane": 1, "states": states}], route=[0, 1])
     assert (scenario.id, bytes(scenario.dataset[()]), int(scenario.current_step)) == ("own-1", b"own", 10)
@@ -66,7 +66,7 @@ def test_a_scenario(agents, roads):
     }  # fmt: skip
 
 
-def test_places_become_links(agents, roads):
+def test_lane_indices_become_links(agents, roads):
     recording = recording_from_arrays("a", agents, roads, [{"lane": 1, "states": [6] * 91}], route=[0, 1])
     first, second, beside, edge, walk, sign = recording.features
     assert [f.feature_id for f in recording.features] == [0, 1, 2, 3, 4, 5]
@@ -81,7 +81,7 @@ def test_places_become_links(agents, roads):
     assert (recording.lights[0].stop_point == second.points[0]).all()
 
 
-def test_what_is_not_valid_may_hold_anything(agents, roads):
+def test_invalid_entries_may_hold_anything(agents, roads):
     agents["xy"][1, :30] = np.nan
     agents["heading"][1, 70:] = 1e9
     tracks = recording_from_arrays("a", agents, roads).tracks
@@ -89,7 +89,7 @@ def test_what_is_not_valid_may_hold_anything(agents, roads):
     scenario_from_arrays("a", agents, roads)
 
 
-def test_heights(agents, roads):
+def test_heights_are_required_where_roads_have_them(agents, roads):
     np.testing.assert_allclose(recording_from_arrays("a", agents, roads).tracks.z[:, 40], [0.75, 0.9])
     roads["lanes"][0]["points"] = [(-50, 0, 0), (50, 0, 3)]
     with pytest.raises(UsageError, match=r'agents\["z"\] is missing'):
@@ -109,14 +109,14 @@ def test_given_velocity_size_and_id_are_kept(agents, roads):
     ]
 
 
-def test_no_sizes_are_those_of_the_class(agents, roads):
+def test_missing_sizes_are_those_of_the_class(agents, roads):
     del agents["size"], agents["kind"]
     scenario = scenario_from_arrays("a", agents, roads)
     assert Flag.DEFAULT_SIZES in scenario.has
     assert scenario.agent_size[0].tolist() == pytest.approx([4.9, 2.0, 1.5])
 
 
-def test_long_data_become_windows(agents, roads):
+def test_long_recordings_are_cut_into_windows(agents, roads):
     long = {name: np.repeat(np.array(agents[name]), 2, axis=1) for name in ("xy", "heading", "valid")}
     long["xy"][0, :, 0] = np.arange(182)
     with pytest.raises(DataError, match=r"182 steps.*windows"):
@@ -193,7 +193,7 @@ def test_16_resampling_interpolates_and_turns_the_short_way(agents, roads):
     np.testing.assert_allclose(fast["z"][0], np.linspace(0, 9, 91))
 
 
-def test_16_nothing_is_made_up_over_gaps():
+def test_16_resampling_never_bridges_gaps():
     valid = np.array([[True, True, False, True, True, False, True]])
     slow = {"xy": np.zeros((1, 7, 2)), "heading": np.zeros((1, 7)), "valid": valid}
     slow["xy"][0, ~valid[0]] = np.nan
@@ -202,7 +202,7 @@ def test_16_nothing_is_made_up_over_gaps():
     assert np.isfinite(fast["xy"][fast["valid"]]).all()
 
 
-def test_16_faster_data_keep_every_other_step():
+def test_16_resampling_20_hz_keeps_every_other_step():
     x = np.random.default_rng(0).normal(size=(1, 41, 2))
     fast = {"xy": x, "heading": np.zeros((1, 41)), "valid": np.ones((1, 41), bool), "velocity": x}
     found = resample(fast, 0.05)
@@ -213,7 +213,7 @@ def test_16_faster_data_keep_every_other_step():
         resample(fast, 0)
 
 
-def test_velocities_are_differences_within_what_was_seen():
+def test_velocities_are_differences_within_observed_intervals():
     """By hand: one-sided at the ends, central inside, zero without a neighbour and over gaps."""
     xy = np.zeros((1, 7, 2))
     xy[0, :, 0] = [0, 1, 4, 9, 50, 60, 80]
@@ -224,7 +224,7 @@ def test_velocities_are_differences_within_what_was_seen():
     np.testing.assert_array_equal(found[0, :, 1], 0)
 
 
-def test_light_states_by_enumeration(agents, roads):
+def test_light_states_may_be_enumeration_members(agents, roads):
     states = [LightState.FLASHING_STOP] * 91
     recording = recording_from_arrays(
         "a", agents, roads, [{"lane": 0, "states": states, "stop_point": (1, 2)}]

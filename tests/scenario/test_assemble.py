@@ -63,7 +63,7 @@ def same(one, other, skip=(), **tolerance) -> bool:
     )
 
 
-def test_a_recording_by_hand():
+def test_assembled_record_equals_hand_computation():
     scenario = assemble(busy_recording())
     assert (scenario.id, scenario.tags["dataset"], scenario.overflow) == ("hand-made", "test", {})
     expected = Flag.LIGHTS | Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.CLOSED_EDGES | Flag.ROUTE
@@ -97,7 +97,7 @@ def test_a_recording_by_hand():
     assert scenario.road_rows == (scenario.road_length > 0).sum()
 
 
-def test_segments_point_at_their_lane_and_feature():
+def test_segments_refer_to_their_lane_and_feature():
     scenario = assemble(busy_recording())
     blocks = scenario.segment_blocks
     assert blocks[0] == 0
@@ -124,17 +124,17 @@ def test_the_map_is_cropped_but_lanes_of_routes_stay_whole():
     assert scenario.segment_b[lanes, 0].max() == pytest.approx(300.0)
 
 
-def test_the_map_frame_does_not_matter_even_far_away():
+def test_assembly_is_independent_of_a_distant_map_origin():
     here, there = assemble(busy_recording()), assemble(moved(busy_recording(), FAR))
     assert there.origin == pytest.approx(FAR)
     assert same(here, there, skip=("origin",), atol=2e-4)
 
 
-def test_assembling_twice_gives_the_same_bytes():
+def test_assembly_is_deterministic():
     assert assemble(busy_recording()).record.tobytes() == assemble(busy_recording()).record.tobytes()
 
 
-def test_the_order_of_features_and_tracks_does_not_matter_to_the_ego():
+def test_order_of_features_and_tracks_does_not_change_ego():
     plain = busy_recording()
     order = np.array([2, 0, 3, 1])
     fields = ("xy", "z", "heading", "velocity", "size", "valid", "kind", "track_id")
@@ -149,7 +149,7 @@ def test_the_order_of_features_and_tracks_does_not_matter_to_the_ego():
         assert np.allclose(getattr(straight, name), getattr(shuffled, name), atol=1e-5), name
 
 
-def test_unused_slots_hold_what_the_schema_promises():
+def test_unused_slots_hold_the_padding_values_of_the_schema():
     record = blank(CAPACITIES["default"])
     for name in record.dtype.names:
         assert (record[name] == (-1 if name in MISSING else type(record[name].flat[0])())).all(), name
@@ -177,7 +177,7 @@ def test_short_recordings_are_stored_masked_without_a_future(steps):
     assert Flag.NO_FUTURE not in assemble(make_recording()).has
 
 
-def test_a_recording_without_a_map_is_a_scenario_too():
+def test_recording_without_a_map_is_assembled():
     scenario = assemble(make_recording(()))
     assert scenario.has == Flag.NONE
     assert scenario.segment_blocks.tolist() == [0, 0, 0, 0]
@@ -185,7 +185,7 @@ def test_a_recording_without_a_map_is_a_scenario_too():
     assert scenario.route_points[0] > 140
 
 
-def test_flags_are_measured_not_believed():
+def test_flags_are_measured_rather_than_taken_from_the_reader():
     lying = make_recording((), flags=Flag.LANE_GRAPH | Flag.LIGHTS | Flag.TRUNCATED_MAP | Flag.ROUTE)
     # A source may know that there are no lights; everything else that the data show is not believed.
     assert assemble(lying).has == Flag.TRUNCATED_MAP | Flag.LIGHTS
@@ -200,7 +200,7 @@ def test_flags_are_measured_not_believed():
     assert Flag.DEFAULT_SIZES in assemble(make_recording(tracks=unsized)).has
 
 
-def test_what_does_not_fit_is_counted_and_flagged():
+def test_overflow_is_counted_and_flagged():
     small = Capacity(
         agents=2, segments=200, features=2, lanes=1, routes=2, route_points=100, road_rows=10, events=0, parked=0,
         stops=0, lights=0,
@@ -216,7 +216,7 @@ def test_what_does_not_fit_is_counted_and_flagged():
     assert scenario.route_points[0] == 100
 
 
-def test_what_the_source_names_but_does_not_hold_is_counted():
+def test_dangling_references_of_the_source_are_counted():
     """Check-list 11: dense lane indices, dangling links and unknown lanes of the route counted, not followed."""
     road = straight_road()
     linked = (replace(road[0], successors=(7, 8), predecessors=(2, 9), right_neighbours=(5,)), *road[1:])
@@ -233,7 +233,7 @@ def test_what_the_source_names_but_does_not_hold_is_counted():
     assert assemble(busy_recording()).source.lost == {}
 
 
-def test_numbers_that_cannot_be_metres_become_no_numbers():
+def test_implausible_limits_and_widths_become_unknown():
     """Sizes, widths and limits beyond all reason are unknown; they would not fit into float32."""
     road = tuple(
         replace(f, limit_mps=1e300, width_m=1e300) if f.kind == RoadKind.LANE_SURFACE else f
@@ -302,7 +302,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("recording", "message"), REFUSED, ids=[message[:34] for _, message in REFUSED])
-def test_nonsense_is_refused_in_one_line_that_names_the_record_and_a_cure(recording, message):
+def test_invalid_recordings_are_refused_with_record_and_cure(recording, message):
     with pytest.raises(DataError, match=message) as caught:
         assemble(recording)
     assert caught.value.record == recording.scenario_id
@@ -310,7 +310,7 @@ def test_nonsense_is_refused_in_one_line_that_names_the_record_and_a_cure(record
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_not_valid_may_be_anything():
+def test_invalid_steps_may_hold_anything():
     valid = at(TRACKS.valid, (1, slice(5, 9)), False)
     junk = at(TRACKS.xy, (1, slice(5, 9)), np.nan)
     scenario = assemble(with_tracks(valid=valid, xy=junk))
@@ -318,7 +318,7 @@ def test_what_is_not_valid_may_be_anything():
     assert np.isfinite(scenario.agent_xy).all()
 
 
-def test_long_recordings_must_be_cut_and_windows_do_it():
+def test_long_recordings_must_be_cut_with_windows():
     steps = 200
     tracks = make_tracks([driving(steps=steps), driving(x=20.0, steps=steps)])
     long = make_recording(

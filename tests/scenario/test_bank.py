@@ -25,7 +25,7 @@ def without_future(scenario: Scenario) -> Scenario:
     return replace(scenario, record=record)
 
 
-def test_a_bank_refuses_nothing_and_test_splits():
+def test_bank_refuses_empty_input_and_test_splits():
     with pytest.raises(DrivaxError, match="at least one"):
         ScenarioBank.from_scenarios([])
     short = without_future(assemble(straight_road([car(0, 0, 0, 5)])))
@@ -34,7 +34,7 @@ def test_a_bank_refuses_nothing_and_test_splits():
     assert len(ScenarioBank.from_scenarios([short], allow_no_future=True)) == 1
 
 
-def test_size_per_scenario():
+def test_bank_size_per_scenario_is_bounded():
     scenarios = [assemble(generate_recording(3, i)) for i in range(3)]
     whole, trimmed = (ScenarioBank.from_scenarios(scenarios, trim=trim) for trim in (False, True))
     assert trimmed.nbytes // 3 < 300_000 < whole.nbytes // 3 <= 600_000
@@ -64,13 +64,13 @@ def moments(bank):
 
 
 @pytest.mark.slow
-def test_trimming_changes_nothing_that_is_measured(both):
+def test_trimming_keeps_all_measurements(both):
     one, other = map(moments, both)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), one, other)
 
 
 @pytest.mark.slow
-def test_trimming_changes_no_result(both):
+def test_trimming_keeps_all_results(both):
     simulator, rows, keys = (
         Simulator(evaluation_task(Task())),
         np.arange(3),

@@ -51,7 +51,7 @@ def test_rows(options, rows):
     assert select_scenarios(Set(), **options) == rows
 
 
-def test_a_file_of_names_among_names(tmp_path, monkeypatch):
+def test_names_may_include_a_file_of_names(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "some.txt").write_text("log-2\r\n\n two\tlog-1\n")
     (tmp_path / "log-3").write_text("log-0\n")  # what is an id in the set is one
@@ -75,7 +75,7 @@ def test_a_file_of_names_among_names(tmp_path, monkeypatch):
         ({"limit": 0}, UsageError, "--limit 0 leaves no scenario; use 1 or more"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_meant_gets_one_line(options, error, words, tmp_path, monkeypatch):
+def test_invalid_selections_give_one_line(options, error, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ids.txt").write_text("log-1\nlog-7\n")
     with pytest.raises(error) as raised:

@@ -89,7 +89,7 @@ def test_the_grid_is_centred_on_the_map_or_on_the_log_where_the_map_is_too_large
     assert large.origin.tolist() == [20 - 320, -320]
 
 
-def test_what_does_not_fit_is_the_farthest_and_counted():
+def test_farthest_segments_overflow_and_are_counted():
     segments = cut(road_lines([lane(1, line((-200, 0), (200, 0)))], np.zeros(3), None))
     arranged = arrange(segments, PATH, replace(CAPACITY, segments=40))
     assert arranged.overflow == {"segments": len(segments) - 40}

@@ -13,7 +13,7 @@ from drivax.scenario.build.assemble import assemble
 from scenes import SMALL, car, straight_road
 
 
-def test_numbers_are_those_of_another_program():
+def test_identities_equal_an_independent_implementation():
     """``b2sum`` of coreutils, first four bytes, little-endian."""
     names = [("womd", "a"), ("av2", "a"), ("womd", "a")]
     wanted = []
@@ -29,7 +29,7 @@ def test_numbers_are_those_of_another_program():
     assert identities(names).tolist() == wanted and len(set(wanted)) == 3
 
 
-def test_it_goes_with_the_scenario():
+def test_identity_moves_with_its_scenario():
     scenarios = [
         assemble(replace(straight_road([car()]), scenario_id=name), SMALL) for name in ("a", "b", "c", "a")
     ]

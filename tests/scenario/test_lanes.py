@@ -45,7 +45,7 @@ def test_links_beyond_four_are_counted():
     assert graph.dropped_links == 2
 
 
-def test_oncoming_neighbours_are_no_neighbours_and_spacing_gives_the_width():
+def test_oncoming_lanes_are_not_neighbours_and_spacing_gives_the_width():
     """Check-list 13: neighbours are tested for direction."""
     graph = graph_of(
         lane(1, line((0, 0), (100, 0)), left_neighbours=(2, 3), right_neighbours=(4,)),
@@ -61,7 +61,7 @@ def test_oncoming_neighbours_are_no_neighbours_and_spacing_gives_the_width():
     assert graph.neighbours(0) == [(2, pytest.approx(-60.0)), (3, pytest.approx(0.0))]
 
 
-def test_the_neighbour_along_most_of_the_lane_is_taken():
+def test_neighbour_is_the_lane_alongside_for_longest():
     graph = graph_of(
         lane(1, line((0, 0), (100, 0)), left_neighbours=(2, 3)),
         lane(2, line((0, 3), (25, 3))),
@@ -85,7 +85,7 @@ def test_lanes_without_any_links_are_chained_by_geometry():
     assert linked.flags == Flag.NONE  # a source with links is taken at its word
 
 
-def test_chaining_is_the_same_whatever_the_number_of_lanes():
+def test_chaining_is_independent_of_the_number_of_lanes():
     """Check-list 24: lanes of a source without a graph, more of them than are looked at at once."""
     rows = 30
     features = [
@@ -100,7 +100,7 @@ def test_chaining_is_the_same_whatever_the_number_of_lanes():
     assert graph.flags == Flag.LANE_GRAPH | Flag.CHAINED_GRAPH
 
 
-def test_limits_and_widths_that_say_nothing_are_unknown():
+def test_implausible_limits_and_widths_are_unknown():
     graph = graph_of(
         lane(1, line((0, 0), (9, 0)), limit_mps=0.0, width_m=0.0),
         lane(2, line((0, 9), (9, 9)), limit_mps=13.4, width_m=float("nan")),
@@ -129,7 +129,7 @@ def test_selected_lanes_are_renumbered():
     assert graph.lines.length.tolist() == [10.0] * 4
 
 
-def test_the_lane_under_a_pose_obeys_reach_heading_and_level():
+def test_lane_under_a_pose_respects_reach_heading_and_level():
     features = (
         lane(1, line((0, 0), (100, 0))),
         lane(2, line((100, 1), (0, 1))),
@@ -148,7 +148,7 @@ def test_the_lane_under_a_pose_obeys_reach_heading_and_level():
     assert on(graph_of(), ()).around(np.zeros(3), 0.0, 4.0, 1.0) == []
 
 
-def test_walking_follows_successors_and_goes_straight_where_they_end():
+def test_walk_follows_successors_then_goes_straight():
     features = (
         lane(1, line((0, 0), (10, 0)), successors=(2,)),
         lane(2, arc((10, 20), 20.0, -np.pi / 2, 0.0, step=0.05), successors=(3,)),

@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.scenario.build.lanes import LaneSegments, lane_graph
-from drivax.scenario.build.lights import place_lights, place_stops
+from drivax.scenario.build.lanes import LaneSegments, lane_graph, place_lights, place_stops
 from drivax.scenario.build.segments import cut, road_lines
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import LightState, RoadKind
@@ -53,7 +52,7 @@ def test_the_nearest_lights_are_kept():
     assert lights.overflow == {"lights": 2}
 
 
-def test_stop_signs_name_the_lanes_that_they_control():
+def test_stop_signs_refer_to_the_lanes_they_control():
     features = (
         *(lane(i, line((0, i), (9, i))) for i in range(6)),
         MapFeature(50, RoadKind.STOP_SIGN, np.array([[9.0, 3, 0]]), lanes=(2, 99, 4)),

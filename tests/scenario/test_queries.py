@@ -157,7 +157,7 @@ def test_side_of_a_sharp_vertex():
         assert bool(distance[0] > 0) == inside, tip
 
 
-def test_another_level_is_ignored():
+def test_segments_of_other_levels_are_ignored():
     bank = bank_of(straight_road([car(0, 0, 0, 5)]))
     point = jnp.array([[0.0, -3.0]])
     below, known = edges_at(bank, jnp.asarray(0), point[0], point, jnp.asarray(0.0))
@@ -189,7 +189,7 @@ def test_lanes_of_a_two_lane_road():
     assert bool(edge.straddling)
 
 
-def test_a_car_follows_the_lane_that_fits_place_and_heading():
+def test_followed_lane_fits_position_and_heading():
     """Lanes along +x on y = 0 and y = 3.7."""
     bank = bank_of(straight_road([car(0, 0, 0, 5)]))
 

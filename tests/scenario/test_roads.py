@@ -36,7 +36,7 @@ def test_curvature_of_circles_has_size_and_sign():
     assert np.hypot(*left.xy.T) == pytest.approx(np.full(len(left.xy), 25.0), abs=0.01)
 
 
-def test_lanes_edges_and_crosswalks_are_rows_and_nothing_else():
+def test_only_lanes_edges_and_crosswalks_become_pieces():
     square = np.array([[5.0, 5, 0], [7, 5, 0], [7, 7, 0], [5, 7, 0]])
     rows = rows_of(
         lane(1, line((0, 0), (9, 0)), kind=RoadKind.LANE_BIKE),
@@ -82,7 +82,7 @@ def test_every_prefix_of_the_rank_spreads_evenly_within_a_ring(seed):
             assert gaps.max() <= 4 * len(members) / max(len(place), 1) + 1  # no stretch is left out
 
 
-def test_nearer_rings_come_first_and_what_does_not_fit_is_counted():
+def test_nearer_rings_come_first_and_overflow_is_counted():
     far = np.array([120.0, 10.0, 60.0, 20.0])
     assert sorted(rank(np.zeros(4, int), far)[:2]) == [1, 3]
     assert rank(np.zeros(4, int), far)[2:].tolist() == [2, 0]

@@ -27,11 +27,11 @@ def test_coverage_is_the_share_of_steps_within_reach():
     assert routes.candidate_coverage(scenario) == pytest.approx(71 / 91)  # the log's own route does not count
 
 
-def test_a_route_that_is_the_log_is_no_candidate():
+def test_log_route_is_not_a_candidate():
     assert routes.candidate_coverage(assemble(make_recording(()))) == 0.0
 
 
-def test_lanes_cover_what_drives_near_them_the_same_way():
+def test_lanes_cover_nearby_vehicles_of_the_same_direction():
     """Lanes at y = 0 and y = 3.5 to the east."""
     beside = driving()
     beside[50:60, 1] = 1.75  # between the lanes

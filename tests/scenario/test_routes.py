@@ -95,7 +95,7 @@ def test_the_route_turns_where_the_goal_is():
     assert len(ends) >= 2  # the other way is among the alternatives
 
 
-def test_a_lane_change_of_the_log_is_followed_without_a_jump():
+def test_route_follows_a_logged_lane_change_smoothly():
     path = driving(speed=12.0)
     path[:, 1] = 3.5 / (1 + np.exp(-(path[:, 0] - 45) / 5))
     found, ego, _ = routes_of(two_lanes(), path)
@@ -108,7 +108,7 @@ def test_a_lane_change_of_the_log_is_followed_without_a_jump():
     assert np.abs(np.diff(route.xyz[:, 1])).max() < 0.19  # at most 1.875 x 3.5 m / 36 m
 
 
-def test_two_changes_share_the_stretch_up_to_the_goal_on_lanes_that_begin_elsewhere():
+def test_two_lane_changes_share_the_stretch_to_the_goal():
     features = (
         lane(1, line((-100, 0), (600, 0)), left_neighbours=(2,)),
         lane(2, line((-150, 3.5), (600, 3.5)), right_neighbours=(1,), left_neighbours=(3,)),
@@ -121,7 +121,7 @@ def test_two_changes_share_the_stretch_up_to_the_goal_on_lanes_that_begin_elsewh
     assert list(dict.fromkeys(label.tolist())) == [0, 1, 2]
 
 
-def test_a_given_route_is_taken_as_it_is():
+def test_intended_route_is_used_unchanged():
     found, _, graph = routes_of(junction(), driving(speed=3.0), given=(1, 3, 4))
     assert found.on_lanes
     assert [graph.lane_id[x] for x in dict.fromkeys(found.routes[0].lane.tolist()) if x >= 0] == [1, 3, 4]
@@ -148,7 +148,7 @@ def test_routes_go_fifty_metres_past_the_goal_where_the_map_ends():
 PAST_GOAL = 50.0
 
 
-def test_where_lanes_begin_at_the_ego_the_route_begins_behind_it():
+def test_route_begins_behind_ego_where_lanes_begin_at_ego():
     found, _, _ = routes_of(two_lanes(begin=-5.0), driving(speed=10.0))
     assert found.routes[0].xyz[0, :2] == pytest.approx([-30.0, 0.0])
     assert found.routes[0].lane[0] == -1
@@ -173,7 +173,7 @@ def test_without_a_lane_in_reach_the_route_is_the_log(features):
     assert set(found.routes[0].lane) == {-1}
 
 
-def test_bike_lanes_and_oncoming_lanes_are_no_way():
+def test_routes_avoid_bike_lanes_and_oncoming_lanes():
     features = (
         lane(1, line((-100, 0), (400, 0)), kind=RoadKind.LANE_BIKE),
         lane(2, line((400, 1), (-100, 1))),
@@ -181,7 +181,7 @@ def test_bike_lanes_and_oncoming_lanes_are_no_way():
     assert not routes_of(features, driving())[0].on_lanes
 
 
-def test_a_standing_ego_has_a_way_ahead_and_no_progress():
+def test_standing_ego_has_a_route_ahead_and_no_progress():
     rng = np.random.default_rng(0)
     still = np.array([0.0, 0.5]) + rng.normal(0.0, 0.02, (91, 2))
     found, _, _ = routes_of(two_lanes(), still, heading=np.zeros((1, 91)))
@@ -196,7 +196,7 @@ def test_a_standing_ego_has_a_way_ahead_and_no_progress():
     assert np.arctan2(direction[1], direction[0]) == pytest.approx(1.0, abs=0.05)
 
 
-def test_the_log_route_is_the_logged_way_and_goes_on_along_the_lane():
+def test_log_route_follows_the_log_then_its_lane():
     path = driving(speed=10.0)
     path[:, 1] = 0.5 * np.sin(path[:, 0] / 15)
     found, ego, _ = routes_of(two_lanes(), path)
@@ -226,7 +226,7 @@ def test_chained_lanes_with_gaps_give_a_continuous_route():
     check_smooth(found.routes[0], kink=0.06)
 
 
-def test_progress_repeats_over_gaps_and_never_runs_back():
+def test_progress_repeats_over_gaps_and_never_decreases():
     valid = np.ones((1, 91), dtype=bool)
     valid[0, :3] = valid[0, 40:60] = False
     path = driving(speed=10.0)
@@ -257,7 +257,7 @@ def changing(at_step: int, speed: float = 12.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("at_step", [5, 8, 10, 12, 16])
-def test_a_lane_change_under_way_at_the_current_step_is_gone_on_with(at_step):
+def test_lane_change_under_way_at_the_current_step_is_continued(at_step):
     path = changing(at_step)
     found, ego, _ = routes_of(two_lanes(), path)
     _, apart = project(found.routes[0].xyz, ego.seen[:, :2])
@@ -268,7 +268,7 @@ def test_a_lane_change_under_way_at_the_current_step_is_gone_on_with(at_step):
         check_smooth(route, kink=0.12)
 
 
-def test_the_line_is_bent_by_what_its_distance_exceeds_a_metre():
+def test_offset_path_bends_only_beyond_one_metre():
     straight = line((0, 0), (200, 0))
     driven = np.stack((np.linspace(40, 60, 21), np.full(21, 3.0)), axis=-1)
     bent = join(straight, driven, 30.0)
@@ -329,7 +329,7 @@ def search_of(features, need=200.0, corridor=(), xy=(0.0, 0.0), heading=0.0):
     return LaneSearch.start(on, np.array([*xy, 0.0]), heading, need, [index[i] for i in corridor])
 
 
-def test_candidates_are_as_long_as_speed_and_map_ask_and_at_most_ten():
+def test_candidates_are_as_long_as_speed_and_map_require():
     """At least max(200 m, v x 12 s) ahead and 50 m past the goal, 400 points at 1 m."""
     fast, ego, _ = routes_of(two_lanes(end=900.0), driving(speed=25.0))
     for route in fast.routes[2:]:
@@ -417,7 +417,7 @@ def network(seed: int, layers: int, width: int):
 
 @given(st.integers(0, 10**6), st.integers(2, 4), st.integers(1, 3))
 @settings(max_examples=40)
-def test_published_ways_are_those_of_brute_force_enumeration(seed, layers, width):
+def test_published_paths_equal_brute_force_enumeration(seed, layers, width):
     search = search_of(network(seed, layers, width), need=LEAST_M)
     lane_paths = published_paths(search)
     expected = brute_force(search)

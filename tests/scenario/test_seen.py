@@ -24,7 +24,7 @@ def recording():
     return make_recording(straight_road(), tracks)
 
 
-def test_what_was_recorded_was_seen_where_nothing_else_is_known(recording):
+def test_all_recorded_steps_are_seen_by_default(recording):
     scenario = assemble(recording)
     assert np.array_equal(scenario.agent_seen, scenario.agent_valid)
     assert np.array_equal(scenario.parked_seen, scenario.parked_valid)
@@ -32,7 +32,7 @@ def test_what_was_recorded_was_seen_where_nothing_else_is_known(recording):
     assert restore(scenario).seen is None
 
 
-def test_the_mask_goes_with_its_track_and_never_beyond_its_validity(recording):
+def test_seen_mask_moves_with_its_track_and_implies_validity(recording):
     seen = np.ones((3, 91), bool)
     seen[1, 20:40] = False
     seen[2, :50] = False
@@ -53,7 +53,7 @@ def test_the_mask_goes_with_its_track_and_never_beyond_its_validity(recording):
     assert np.array_equal(again.parked_seen, scenario.parked_seen)
 
 
-def test_windows_cut_it_and_another_ego_has_not_seen_it(recording):
+def test_windows_cut_the_seen_mask_and_another_ego_drops_it(recording):
     long = make_recording(
         straight_road(),
         make_tracks([driving(5.0, steps=140), driving(5.0, y=3.5, steps=140)]),

@@ -85,7 +85,7 @@ def test_a_ring_is_closed_exactly():
     assert open_line.closed.tolist() == [False]
 
 
-def test_origin_is_subtracted_before_anything_loses_digits():
+def test_origin_is_subtracted_in_double_precision():
     points = FAR + arc((0.0, 0.0), 30.0, 0.0, 1.0)
     roads = road_lines([lane(1, points)], FAR, None)
     assert roads.lines.points == pytest.approx(arc((0.0, 0.0), 30.0, 0.0, 1.0), abs=1e-8)

@@ -88,7 +88,7 @@ def chosen(*filters):
         ("overflow.lanes=0", True),
     ],
 )
-def test_one_filter(text, expected):
+def test_single_filter_matches(text, expected):
     assert chosen(text) is expected
 
 
@@ -109,7 +109,7 @@ def test_all_filters_must_hold():
         "tag.nothing!=x",
     ],
 )
-def test_what_a_scenario_does_not_know_matches_nothing_and_is_counted(text):
+def test_unknown_values_match_nothing_and_are_counted(text):
     selection = Selection.parse([text, "agents>0"])
     assert not selection.matches(ENTRY)
     assert selection.unknown([ENTRY, ENTRY]) == {text: 2}
@@ -144,7 +144,7 @@ def test_what_a_scenario_does_not_know_matches_nothing_and_is_counted(text):
         ("=5", ["is no filter"]),
     ],
 )
-def test_filters_that_cannot_be_meant_get_one_line(text, words):
+def test_invalid_filters_give_one_line(text, words):
     with pytest.raises(UsageError) as caught:
         Selection.parse([text])
     line = str(caught.value)
@@ -176,7 +176,7 @@ def test_rows_are_those_that_the_operator_selects(counts, sign, number):
     assert Selection.parse([f"tracks{sign}{number}"]).rows(entries) == expected
 
 
-def test_every_name_finds_something_in_a_stored_scenario():
+def test_every_name_has_a_value_in_a_stored_scenario():
     tags = {"place": "here", "source_format": "x", "domain": "x", "family": "x", "event": "x"}
     tags |= {"location": "x", "scenario_types": "x|y"}
     recording = replace(straight_road([car(0, 0, 0, 8)], light=GREEN), tags=tags)

@@ -90,7 +90,7 @@ def nearest_side(segments, xy) -> int:
     return int(np.sign(cross[np.abs(cross).argmax()]))
 
 
-def test_open_edges_say_nothing_beyond_their_ends():
+def test_sides_beyond_open_edge_ends_are_unknown():
     # One edge along +x from 0 to 100: left of it is road, right of it is not, beyond its ends nobody knows.
     grid, _, side = sides_of(edge(1, line((0, 0), (100, 0), step=1.0)), closed=False)
 

@@ -40,12 +40,12 @@ def test_shares(text, shares):
 @pytest.mark.parametrize(
     "text", ["", "80", "80/20", "80/10/20", "90/-10/20", "a/b/c", "nan/50/50", "1/1/1/97"]
 )
-def test_shares_that_cannot_be_meant(text):
+def test_invalid_shares_are_refused(text):
     with pytest.raises(UsageError, match="is no split; give percentages"):
         parse_shares(text)
 
 
-def test_place_is_the_sha_256_of_data_set_and_segment():
+def test_split_follows_the_sha_256_of_data_set_and_segment():
     """Computed here from the definition: the first 64 bits of the digest as a fraction of one."""
     for segment in map(str, range(50)):
         place = int(hashlib.sha256(b"nuplan\0" + segment.encode()).hexdigest()[:16], 16) / 16**16
@@ -53,7 +53,7 @@ def test_place_is_the_sha_256_of_data_set_and_segment():
         assert split_of("nuplan", segment, (50, 20, 30)) == expected
 
 
-def test_windows_of_a_recording_never_straddle(tmp_path):
+def test_windows_of_a_recording_share_a_split(tmp_path):
     counts = write_splits(tmp_path, entries(400), (60, 20, 20))
     found = read(tmp_path)
     logs = {name: {scenario.split("@")[0] for _, scenario in rows} for name, rows in found.items()}

@@ -207,7 +207,7 @@ def test_overwrite(scenario_set: Path):
     assert [path.name for path in scenario_set.parent.iterdir()] == ["set"]
 
 
-def test_overwrite_never_replaces_what_is_no_set(tmp_path: Path):
+def test_overwrite_never_replaces_other_folders(tmp_path: Path):
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(UsageError, match="not a scenario set"):
         ScenarioWriter(tmp_path, SMALL, overwrite=True)
@@ -223,7 +223,7 @@ def test_an_empty_folder_may_be_filled(tmp_path: Path):
     assert len(ScenarioSet.open(tmp_path / "set")) == 1
 
 
-def test_writer_refuses_what_does_not_belong(tmp_path: Path):
+def test_writer_refuses_foreign_and_duplicate_scenarios(tmp_path: Path):
     with pytest.raises(DataError, match="no scenario"), ScenarioWriter(tmp_path / "empty", SMALL):
         pass
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
@@ -453,7 +453,7 @@ def test_unfinished_sets_of_another_identity_are_not_continued(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_overwrite_continues_the_same(tmp_path: Path):
+def test_overwrite_continues_an_unfinished_set_of_the_same_identity(tmp_path: Path):
     continued(tmp_path / "set")
     with pytest.raises(RuntimeError):
         continued(tmp_path / "set", stop=5, overwrite=True)

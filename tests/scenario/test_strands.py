@@ -35,7 +35,7 @@ def codes(*features, path=None):
 BOX = edge(99, line((-150, -60), (250, -60), (250, 60), (-150, 60), (-150, -60)))
 
 
-def test_lanes_that_follow_each_other_are_one_strand():
+def test_consecutive_lanes_are_one_strand():
     found = codes(
         lane(1, line((-60, 0), (40, 0)), successors=(3,), left_neighbours=(2,)),
         lane(2, line((-60, 3.5), (150, 3.5)), right_neighbours=(1, 3)),
@@ -46,7 +46,7 @@ def test_lanes_that_follow_each_other_are_one_strand():
     assert found == {1: (3, 2, None, None, None), 2: (2, None, 3, None, None), 3: (3, 2, None, None, None)}
 
 
-def test_a_lane_that_ends_while_its_neighbour_goes_on_merges():
+def test_ending_lane_merges_onto_its_continuing_neighbour():
     drop = codes(
         lane(1, line((-60, 0), (60, 0)), left_neighbours=(2,)),
         lane(2, line((-60, 3.5), (60, 3.5)), successors=(3,), right_neighbours=(1,)),
@@ -66,7 +66,7 @@ def test_a_lane_that_ends_while_its_neighbour_goes_on_merges():
     assert codes(lane(1, line((-60, 0), (60, 0))), BOX)[1] == (1, None, None, None, None)
 
 
-def test_of_two_lanes_that_become_one_the_one_that_comes_in_merges():
+def test_joining_lane_merges_onto_the_through_lane():
     for first in ("taper", "through"):
         lanes = {
             "taper": lane(1, line((-60, 0), (30, 0), (90, 3.5)), successors=(3,)),
@@ -135,7 +135,7 @@ def test_a_scenario_without_lanes_has_an_empty_table():
 
 
 @pytest.mark.parametrize("turn", [0.0, 2.0])
-def test_codes_do_not_depend_on_the_frame(turn):
+def test_strand_table_is_independent_of_the_frame(turn):
     cos, sin = np.cos(turn), np.sin(turn)
     spin = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
     features = [replace(f, points=f.points @ spin) for f in junction()]

@@ -45,7 +45,7 @@ def test_every_scenario_has_every_tag_and_only_allowed_values():
     assert found["dataset"] == "test"
 
 
-def test_the_sources_own_words_are_kept_and_computed_ones_win():
+def test_source_tags_are_kept_and_computed_tags_win():
     found = tags_of(straight_road(), tags={"place": "boston", "family": "ring", "type": "nonsense"})
     assert (found["place"], found["family"], found["type"]) == ("boston", "ring", "straight")
 
@@ -62,7 +62,7 @@ def test_types_by_heading_where_there_are_no_lanes(angle, expected):
     assert tags_of((), bend(angle * DEGREE, radius, lead=15.0))["type"] == expected
 
 
-def test_a_turn_that_takes_more_than_forty_metres_is_a_bend():
+def test_turn_over_more_than_forty_metres_is_a_bend():
     # 45 degrees within 40 m of driving are a radius of 51 m.
     assert tags_of((), bend(80 * DEGREE, 48.0, lead=0.0))["type"] == "turn_left"
     assert tags_of((), bend(80 * DEGREE, 56.0, lead=0.0))["type"] == "lane_follow"
@@ -79,11 +79,11 @@ def curve(*, forks: bool):
     return [*lanes, lane(4, line((30, 0), (70, 0)))] if forks else lanes
 
 
-def test_a_road_that_bends_is_no_turn_but_a_junction_is():
+def test_bending_road_is_not_a_turn_outside_junctions():
     path = bend(90 * DEGREE)
     assert tags_of(curve(forks=False), path)["type"] == "lane_follow"
     assert tags_of(curve(forks=True), path)["type"] == "turn_left"
-    assert tags_of(curve(forks=False)[:1], path)["type"] == "turn_left"  # beside all lanes
+    assert tags_of(curve(forks=False)[:1], path)["type"] == "turn_left"  # off all lanes
     assert tags_of(curve(forks=True), driving())["type"] == "junction"  # straight on where others turn
 
 
@@ -152,7 +152,7 @@ def test_density_counts_road_users_within_fifty_metres_now(count, expected):
     assert tags_of((), others=[*others, *[still(3.0, 5.0)] * 30], kinds=cones)["density"] == expected
 
 
-def test_density_counts_only_who_is_there_at_the_current_step():
+def test_density_counts_only_agents_valid_at_the_current_step():
     valid = np.ones((11, 91), dtype=bool)
     valid[1:, 10] = False
     tracks = make_tracks([driving(), *[still(10, 9)] * 10], valid=valid)

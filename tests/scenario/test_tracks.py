@@ -114,7 +114,7 @@ def test_rank_is_ego_then_marked_then_distance_with_a_bonus_for_movers():
     assert crowd.overflow == {"parked": 1}
 
 
-def test_agents_go_on_along_their_lane_else_straight():
+def test_extensions_follow_the_lane_or_go_straight():
     features = (
         lane(1, line((-50, 0), (10, 0)), successors=(2,)),
         lane(2, arc((10, 40), 40.0, -np.pi / 2, 0.0, step=0.05)),

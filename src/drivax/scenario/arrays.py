@@ -21,8 +21,7 @@ _AGENT_KEYS = ("xy", "heading", "valid", "size", "kind", "velocity", "z", "id")
 _ROAD_KEYS = ("lanes", "edges", "crosswalks", "stop_signs")
 _LANE_KEYS = ("points", "successors", "left", "right", "limit_mps", "width_m", "kind")
 _LIGHT_KEYS = ("lane", "states", "stop_point")
-_KINDS = {"vehicle": AgentKind.VEHICLE, "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST,
-          "other": AgentKind.OTHER, "static": AgentKind.STATIC}  # fmt: skip
+_KINDS = {kind.name.lower(): kind for kind in AgentKind if kind}
 _LANE_KINDS = {"surface": RoadKind.LANE_SURFACE, "freeway": RoadKind.LANE_FREEWAY, "bike": RoadKind.LANE_BIKE}
 _COLOURS = {"red": LightState.STOP, "yellow": LightState.CAUTION, "green": LightState.GO,
             "unknown": LightState.UNKNOWN, None: LightState.UNOBSERVED}  # fmt: skip
@@ -91,27 +90,17 @@ def scenario_from_arrays(
 ) -> Scenario:  # fmt: skip
     """Return a scenario from plain arrays of at most 91 steps; step 10 is the current one.
 
-    Arguments and errors are those of :func:`recording_from_arrays`; cut longer recordings with
-    :func:`drivax.scenario.recording.windows`.
-
-    Raises:
-        DataError: The recording is invalid (the ego is not valid at the current step, a number is not finite).
+    Arguments and errors are those of :func:`recording_from_arrays` and :func:`~drivax.scenario.build.assemble`; cut
+    longer recordings with :func:`drivax.scenario.recording.windows`.
     """
     return assemble(recording_from_arrays(scenario_id, agents, roads, lights, route, ego, dt_s, dataset))
 
 
 def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
-    """Resample agents to 10 Hz by linear interpolation, headings along the shorter arc.
+    """Resample agents, as for :func:`recording_from_arrays` but ``dt_s`` apart, to 10 Hz by linear interpolation.
 
-    A new step is valid if it falls on a valid step or between two neighbouring valid steps. Velocities are left out, to
-    be differentiated from the new positions.
-
-    Args:
-        agents: As for :func:`recording_from_arrays`.
-        dt_s: Seconds between the given steps.
-
-    Raises:
-        UsageError: ``dt_s`` is not positive, or an array has another shape.
+    Headings turn along the shorter arc. A new step is valid if it falls on a valid step or between two neighbouring
+    valid steps. Velocities are left out, to be differentiated from the new positions.
     """
     _check_keys(agents, _AGENT_KEYS, "agents")
     if not 0.0 < dt_s <= 10.0:
@@ -148,12 +137,9 @@ def differentiate(
     No difference spans a gap; invalid steps and those without a valid neighbour get zero.
     """
     step = np.arange(len(timestamps_s))
-    behind = np.zeros_like(valid)
-    ahead = np.zeros_like(valid)
-    behind[:, 1:] = valid[:, 1:] & valid[:, :-1]
-    ahead[:, :-1] = behind[:, 1:]
-    first = np.maximum(step - behind, 0)
-    last = np.minimum(step + ahead, len(step) - 1)
+    behind = np.pad(valid[:, 1:] & valid[:, :-1], ((0, 0), (1, 0)))
+    ahead = np.pad(behind[:, 1:], ((0, 0), (0, 1)))
+    first, last = np.maximum(step - behind, 0), np.minimum(step + ahead, len(step) - 1)
     rows = np.arange(len(xy))[:, None]
     seconds_apart = (timestamps_s[last] - timestamps_s[first])[..., None]
     moved = xy[rows, last] - xy[rows, first]

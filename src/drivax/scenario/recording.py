@@ -14,7 +14,6 @@ from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, AgentKind, Capacity, Flag, RoadKind
 
 Array = np.ndarray[Any, Any]
-#: The median step may differ from 0.1 s by this much.
 STEP_TOLERANCE_S = 0.005
 TEXT_BYTES = {"scenario_id": 64, "segment": 64, "dataset": 16}
 #: Largest distance from the ego and largest speed; beyond them the file is damaged or its unit is not the metre.
@@ -43,10 +42,9 @@ class Tracks:
 
 @dataclass(frozen=True)
 class MapFeature:
-    """An element of the map: a lane centre, a marking, an edge, a polygon or a stop sign.
+    """An element of the map: a lane centre, a marking, an edge, an implicitly closed polygon, or a stop sign (a point).
 
-    ``points`` are (x, y, z) in metres; polygons are implicitly closed; a stop sign has one point. Road edges have
-    the drivable side on their left. Links name other features by ``feature_id`` and may dangle.
+    Points are (x, y, z) in metres. Road edges have the drivable side on their left. Links are ids and may dangle.
     """
 
     feature_id: int
@@ -130,7 +128,6 @@ def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
     ``windows_without_ego``. A recording of at most 91 steps is its own window.
 
     Raises:
-        UsageError: The stride is not positive.
         DataError: No window has a valid ego at its current step.
     """
     if stride < 1:
@@ -170,11 +167,7 @@ def _window(recording: Recording, start: int) -> Recording:
 
 
 def with_ego(recording: Recording, row: int) -> Recording:
-    """Return the recording with another logged vehicle as the ego, without the route and ``seen`` of the former ego.
-
-    Raises:
-        UsageError: The row is no vehicle that is valid at the current step.
-    """
+    """Return the recording with another vehicle, valid at the current step, as the ego; its route and ``seen`` go."""
     tracks = recording.tracks
     is_vehicle = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
     if not is_vehicle or not tracks.valid[row, recording.current_step]:
@@ -198,11 +191,10 @@ def check(recording: Recording, capacity: Capacity) -> None:
 
 def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
     """Median step and largest deviation from it, seconds; 0.1 and 0 for a single step."""
-    steps = np.diff(timestamps_s)
-    if len(steps) == 0:
+    if len(timestamps_s) < 2:
         return DT_S, 0.0
-    median = float(np.median(steps))
-    return median, float(np.abs(steps - median).max())
+    steps = np.diff(timestamps_s)
+    return float(np.median(steps)), float(np.abs(steps - np.median(steps)).max())
 
 
 def _check_names(recording: Recording) -> Finding:

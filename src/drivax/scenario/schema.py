@@ -212,8 +212,8 @@ def record_dtype(capacity: Capacity) -> np.dtype[Any]:
     for form in fields.values():
         offsets.append(-(-end // 64) * 64)
         end = offsets[-1] + np.dtype(form).itemsize
-    formats, itemsize = list(fields.values()), -(-end // 4096) * 4096
-    return np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": itemsize})
+    names, formats, itemsize = list(fields), list(fields.values()), -(-end // 4096) * 4096
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
 
 
 @dataclass(frozen=True)

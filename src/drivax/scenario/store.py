@@ -20,7 +20,7 @@ import json
 import math
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from operator import itemgetter
 from pathlib import Path
@@ -60,16 +60,10 @@ class ScenarioWriter:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        capacity: Capacity,
-        source: Mapping[str, Any] | None = None,
-        shard_size: int = 512,
-        overwrite: bool = False,
-        shares: Shares | None = None,
-        identity: Mapping[str, Any] | None = None,
-        further: Callable[[Path], None] | None = None,
-    ) -> None:
+        self, path: str | Path, capacity: Capacity, source: Mapping[str, Any] | None = None,
+        shard_size: int = 512, overwrite: bool = False, shares: Shares | None = None,
+        identity: Mapping[str, Any] | None = None, further: Callable[[Path], None] | None = None,
+    ) -> None:  # fmt: skip
         if shard_size < 1:
             raise UsageError(f"shard_size is {shard_size}", cure="use 1 or more")
         self.path, self.capacity, self.overwrite = Path(path), capacity, overwrite
@@ -77,9 +71,7 @@ class ScenarioWriter:
         self.source: dict[str, Any] = plain(dict(source or {}))
         #: Notes given to :meth:`add` with the last scenario of every shard that an earlier writer closed.
         self.notes: list[Any] = []
-        self._shard_size = shard_size
-        self._shares = shares
-        self._further = further
+        self._shard_size, self._shares, self._further = shard_size, shares, further
         self._buffer = np.zeros(1, record_dtype(capacity))
         self._entries: list[dict[str, Any]] = []
         self._known: set[tuple[str, str]] = set()
@@ -207,18 +199,13 @@ class ScenarioWriter:
 
 
 class ScenarioSet(Sequence[Scenario]):
-    """A memory-mapped scenario set; the checksum of a record is tested when it is first read.
+    """A memory-mapped scenario set; with ``verify`` the checksum of a record is tested when it is first read.
 
-    Attributes:
-        capacity: Padded sizes of all records.
-        entries: Manifest entry of every scenario (:func:`manifest_entry`).
-        verify: Whether to test checksums.
+    ``entries`` holds the manifest entry of every scenario (:func:`manifest_entry`).
     """
 
     def __init__(self, path: str | Path, manifest: dict[str, Any], verify: bool = True) -> None:
-        self.path = Path(path)
-        self.manifest = manifest
-        self.verify = verify
+        self.path, self.manifest, self.verify = Path(path), manifest, verify
         self.capacity = Capacity(**manifest["capacity"])
         self.entries: list[dict[str, Any]] = manifest["scenarios"]
         self._dtype = record_dtype(self.capacity)
@@ -227,12 +214,7 @@ class ScenarioSet(Sequence[Scenario]):
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = True) -> ScenarioSet:
-        """Open a set and check its manifest and the size and layout of its shards.
-
-        Raises:
-            DataError: The manifest is missing, damaged or of another version; a shard is missing, truncated or laid
-                out differently.
-        """
+        """Open a set; raise DataError if its manifest or the size or layout of a shard is wrong."""
         opened = cls(path, read_manifest(Path(path)), verify)
         if len(opened) != int(opened._starts[-1]):
             problem = f"lists {len(opened)} scenarios but its shards hold {opened._starts[-1]}"
@@ -258,9 +240,6 @@ class ScenarioSet(Sequence[Scenario]):
         stored = record.view(self._dtype).reshape(())
         return Scenario(stored, self.capacity, SourceCounts(**entry["source"]), **findings)
 
-    def __iter__(self) -> Iterator[Scenario]:
-        return (self[index] for index in range(len(self)))
-
     def __reduce__(self) -> tuple[Any, ...]:
         return ScenarioSet.open, (self.path, self.verify)  # Each process maps the files itself.
 
@@ -271,14 +250,11 @@ class ScenarioSet(Sequence[Scenario]):
         return hashlib.sha256(digests.encode()).hexdigest()
 
     def records(self, indices: Any, out: _Bytes | None = None) -> _Bytes:
-        """Copy records into a structured array ``[n]``, in the order of ``indices``.
+        """Copy records into a structured array ``[n]``, in the order of ``indices``; negative ones count from the end.
 
-        Args:
-            indices: Negative ones count from the end.
-            out: Result of an earlier call with as many indices, to fill again; twice as fast as new memory.
+        ``out`` is the result of an earlier call with as many indices, to fill again: twice as fast as new memory.
 
         Raises:
-            IndexError: An index is out of range.
             DataError: A record is damaged.
         """
         index = np.asarray(indices, np.int64).reshape(-1)
@@ -396,11 +372,7 @@ def field_table(capacity: Capacity) -> list[dict[str, Any]]:
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """Read and check the manifest of the set at ``path``.
-
-    Raises:
-        DataError: No such folder, no manifest, damaged JSON, a missing key, another schema version or layout.
-    """
+    """Read the manifest of the set at ``path``; raise DataError if it is missing, damaged or of another version."""
     file = path / MANIFEST
     if not path.is_dir():
         problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"

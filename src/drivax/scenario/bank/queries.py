@@ -30,15 +30,12 @@ OFFROAD_TOLERANCE_M = 0.3
 LANE_MARGIN_M = 0.2
 #: Largest distance to the centre of a followed lane, m.
 _FOLLOWED_M = 2.5
-#: A passage to another lane counts from this far beyond the line between the two lanes, m.
-BEYOND_M = 0.3
-#: Least distance between the centres of parallel lanes, m; nearer lanes fork or join.
-SIDE_BY_SIDE_M = 2.0
-#: Largest distance to the end of a lane at which leaving it is a merge, m.
-MERGE_M = 100.0
+#: A car passes to another lane this far beyond the line between them; centres of parallel lanes are at least the second
+#: distance apart (nearer lanes fork or join); a lane is left in a merge up to the third distance before its end, m.
+BEYOND_M, SIDE_BY_SIDE_M, MERGE_M = 0.3, 2.0, 100.0
 _FAR = 1e9
-_WINDOW = 40
-_WINDOW_BEHIND = 6
+#: Points in the window of a projection on a route, and those behind the last known arc length.
+_WINDOW, _WINDOW_BEHIND = 40, 6
 
 
 def left_of_edges(
@@ -302,8 +299,7 @@ def project_on_route(
 ) -> RouteHit:  # fmt: skip
     """Project a point on a route from 6 m behind to ``ahead_m`` ahead of its last known arc length ``near_m``.
 
-    ``ahead_m`` keeps a car off the other leg of a hairpin; ``route`` is 0 for the route to the goal, 1 for the log's
-    own.
+    ``ahead_m`` keeps a car off the other leg of a hairpin. Route 0 leads to the goal, 1 is the log's own.
     """
     count = bank.routes.shape[2]
     first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
@@ -320,12 +316,8 @@ def project_on_route(
     u, w = b[k, RouteColumn.XY] - a[k, RouteColumn.XY], xy - a[k, RouteColumn.XY]
     part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
     distance = root(squared[0, k])
-    return RouteHit(
-        along_m=(first + k).astype(jnp.float32) + part,
-        lateral_m=jnp.where(side[0, k] >= 0, distance, -distance),
-        distance_m=distance,
-        heading=window[k, RouteColumn.HEADING],
-    )
+    lateral = jnp.where(side[0, k] >= 0, distance, -distance)
+    return RouteHit((first + k).astype(jnp.float32) + part, lateral, distance, window[k, RouteColumn.HEADING])
 
 
 def route_ahead(

@@ -282,8 +282,8 @@ def _join(*parts: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     names = ("xy", "z", "heading", "velocity", "valid", "size", "kind")
     xy, z, heading, velocity, valid, size, kind = _columns(scenarios, "agent", *names)
-    agents, box = _join(xy, z, np.cos(heading), np.sin(heading), velocity, valid), _join(size, kind)
-    box = box[:, : sizes.agents]
+    agents = _join(xy, z, np.cos(heading), np.sin(heading), velocity, valid)
+    box = _join(size, kind)[:, : sizes.agents]
     return {
         "agents": agents[:, :, : sizes.agents],
         "extension": _column(scenarios, "agent_extension")[:, : sizes.agents],
@@ -374,17 +374,17 @@ def _stop_arcs(scenario: Scenario, middle: np.ndarray[Any, Any]) -> np.ndarray[A
 
 def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     blocks = _column(scenarios, "segment_blocks").astype(np.int64)
-    edge_count, lane_count = blocks[:, 1], blocks[:, 2] - blocks[:, 1]
     # Queries read whole runs, so a run must fit behind the last start.
     edges = np.full((len(scenarios), 5, sizes.edges + sizes.edge_run), 1e6, np.float32)
     lanes = np.full((len(scenarios), 8, sizes.lanes + sizes.lane_run), 1e6, np.float32)
     box = np.zeros((len(scenarios), 4), np.float32)
     for row, scenario in enumerate(scenarios):
-        e, n = int(edge_count[row]), int(lane_count[row])
-        a, b = scenario.segment_a, scenario.segment_b
-        edges[row, :, :e] = np.stack([a[:e, 0], a[:e, 1], b[:e, 0], b[:e, 1], (a[:e, 2] + b[:e, 2]) / 2])
-        lanes[row, :, :n] = _lane_rows(scenario, slice(e, e + n))
-        points = np.concatenate([a[: e + n, :2], b[: e + n, :2]])
+        e, end = blocks[row, 1:3]
+        a, b = scenario.segment_a[:end], scenario.segment_b[:end]
+        ends = np.stack([*a[:, :2].T, *b[:, :2].T, (a[:, 2] + b[:, 2]) / 2])
+        edges[row, :, :e] = ends[:, :e]
+        lanes[row, :, : end - e] = [*ends[:, e:], *_lane_values(scenario, scenario.segment_lane[e:end])]
+        points = np.concatenate([a[:, :2], b[:, :2]])
         if len(points):
             box[row] = [*points.min(0), *points.max(0)]
     return {
@@ -413,14 +413,10 @@ def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     }
 
 
-def _lane_rows(scenario: Scenario, rows: slice) -> np.ndarray[Any, Any]:
-    a, b = scenario.segment_a[rows], scenario.segment_b[rows]
-    lane = scenario.segment_lane[rows].astype(np.int64)
-    width = scenario.lane_width[lane]
+def _lane_values(scenario: Scenario, lane: Int[np.ndarray, " segment"]) -> tuple[Any, Any, Any]:
+    """Half width, limit and number of the lane of each segment, as in :class:`LaneRow`."""
+    width, limit = scenario.lane_width[lane], scenario.lane_limit[lane]
     half = np.where(width > 0, width, DEFAULT_LANE_WIDTH_M) / 2
-    limit = scenario.lane_limit[lane].astype(np.float32)
     for kind, fallback in CLASS_LIMIT_MPS.items():
         limit = np.where((limit <= 0) & (scenario.lane_kind[lane] == kind), fallback, limit)
-    number = lane + 0.5 * corridor_lanes(scenario)[lane]
-    columns = [a[:, 0], a[:, 1], b[:, 0], b[:, 1], (a[:, 2] + b[:, 2]) / 2, half, limit, number]
-    return np.stack(columns).astype(np.float32)
+    return half, limit, lane + 0.5 * corridor_lanes(scenario)[lane]

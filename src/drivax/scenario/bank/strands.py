@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import StrandColumn
+from drivax.scenario.build.segments import inside_box
 from drivax.scenario.schema import Scenario
 
 Array = np.ndarray[Any, Any]
@@ -27,10 +28,9 @@ _BEND_M, _END_M = 20.0, 1.0
 _UNKNOWN = 100.0
 #: Lanes that meet merge if their headings differ by less 20 m before; others cross or turn in.
 _MERGING_RAD = np.deg2rad(30.0)
-#: An adjacent lane continues beyond the end of a lane if it reaches further than this, m.
-_ON_M = 10.0
-#: Distance from the box of the ego's log beyond which lanes may end at the crop of the map, m.
-_KNOWN_M = 95.0
+#: An adjacent lane continues beyond the end of a lane if it reaches further than the first distance. Lanes may end at
+#: the crop of the map beyond the second distance from the box of the ego's log, m.
+_ON_M, _KNOWN_M = 10.0, 95.0
 #: Largest excess of the length of a lane over its drawing (height, rounding), and upper bound of lengths, m.
 _SLACK_M, _KEY_M = 1.0, 1e6
 
@@ -111,8 +111,7 @@ class _Courses:
             return result
 
         if not len(lane):
-            nothing = np.full(count, np.nan)
-            return cls(*[nothing] * 5, stop=np.full((count, 2), np.nan))
+            return cls(*[np.full(count, np.nan)] * 5, stop=np.full((count, 2), np.nan))
         look = np.minimum(_BEND_M, length)
         begin, end = (values(heading, np.clip(m, 0.0, length)) for m in (_END_M, length - _END_M))
         before = values(heading, length - look)
@@ -144,10 +143,7 @@ def _strands(follows: Int[Array, " lane"]) -> tuple[Int[Array, " lane"], Int[Arr
 def _known(scenario: Scenario, xy: Float[Array, "lane 2"]) -> Array:
     """Mask of points so near to the log of the ego that the map around them is stored."""
     log = scenario.agent_xy[scenario.agent_valid[:, 0], 0]
-    if not len(log):
-        return np.zeros(len(xy), bool)
-    low, high = log.min(axis=0) - _KNOWN_M, log.max(axis=0) + _KNOWN_M
-    return ((xy >= low) & (xy <= high)).all(axis=1)
+    return inside_box(xy, log, _KNOWN_M) if len(log) else np.zeros(len(xy), bool)
 
 
 def corridor_lanes(scenario: Scenario) -> Bool[np.ndarray, " lane"]:

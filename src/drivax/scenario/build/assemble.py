@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,8 +11,17 @@ from jaxtyping import Float, Int
 
 from drivax.errors import DataError
 from drivax.scenario.build.grid import EDGE_BLOCK, LANE_BLOCK, GridSegments, arrange, cell_sides
-from drivax.scenario.build.lanes import LaneGraph, LaneSegments, lane_graph, lane_of_feature, select
-from drivax.scenario.build.lights import Lights, Stops, place_lights, place_stops
+from drivax.scenario.build.lanes import (
+    LaneGraph,
+    LaneSegments,
+    Lights,
+    Stops,
+    lane_graph,
+    lane_of_feature,
+    place_lights,
+    place_stops,
+    select,
+)
 from drivax.scenario.build.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
 from drivax.scenario.build.segments import (
     RoadLines,
@@ -140,7 +148,6 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     roads = road_lines(recording.features, origin, recording.split_gap_m)
     _refuse_endless(roads)
     segments = cut(roads)
-    block = segments.block
     whole = lane_graph(recording.features, origin)
     on = LaneSegments.of(segments, whole)
     intent, unknown = _intent(recording, whole)
@@ -155,7 +162,8 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     polylines, lost_features = _kept_polylines(roads, grid, path, capacity.features)
     marked = (*recording.to_predict, *recording.of_interest)
     placement = place(tracks, marked, capacity.agents, capacity.parked)
-    edges, lanes = segments.take(block == EDGE_BLOCK), segments.take(block == LANE_BLOCK)
+    edges, lanes = (segments.take(segments.block == block) for block in (EDGE_BLOCK, LANE_BLOCK))
+    on_stored = LaneSegments.of(segments, graph)
     parts = Parts(
         tracks=tracks,
         placement=placement,
@@ -167,18 +175,18 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
         roads=roads,
         polylines=polylines,
         rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),
-        lights=place_lights(
-            recording.lights, LaneSegments.of(segments, graph), origin, path, capacity.lights
-        ),
+        lights=place_lights(recording.lights, on_stored, origin, path, capacity.lights),
         stops=place_stops(recording.features, graph, origin, path, capacity.stops),
     )
+    lost = Counter({name: int(count) for name, count in recording.lost.items()})
+    lost += Counter({**whole.lost, **unknown})
     overflow = _overflow(parts, recording, capacity, {"lanes": lost_lanes, "features": lost_features})
     flags = _flags(recording, parts, capacity)
     flags |= Flag.OVERFLOW if overflow else Flag.NONE
     return Scenario(
         record=fill(parts, recording, capacity, origin, flags),
         capacity=capacity,
-        source=replace(count_source(recording), lost=_lost(recording, {**whole.lost, **unknown})),
+        source=replace(count_source(recording), lost=dict(lost)),
         overflow=overflow,
         tags=scenario_tags(recording, tracks, graph, parts.routes, parts.lights, flags, style),
     )
@@ -186,18 +194,10 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
 
 def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
     """Intended route in dense indices, and the numbers of its missing lanes."""
-    index = graph.index()
-    source = {"route_lanes": recording.route_lanes, "route_corridor": recording.route_corridor}
-    known = {name: tuple(index[lane] for lane in lanes if lane in index) for name, lanes in source.items()}
-    missing = {f"{name}_missing": len(source[name]) - len(known[name]) for name in source}
-    return Intent(known["route_lanes"], known["route_corridor"]), missing
-
-
-def _lost(recording: Recording, lost: Mapping[str, int]) -> dict[str, int]:
-    """Nonzero numbers of items that the reader and the assembly left out, by name."""
-    names = dict.fromkeys((*recording.lost, *lost))
-    counts = {name: int(recording.lost.get(name, 0)) + lost.get(name, 0) for name in names}
-    return {name: count for name, count in counts.items() if count}
+    index, named = graph.index(), (recording.route_lanes, recording.route_corridor)
+    known = [tuple(index[lane] for lane in lanes if lane in index) for lanes in named]
+    missing = [len(lanes) - len(dense) for lanes, dense in zip(named, known, strict=True)]
+    return Intent(*known), {"route_lanes_missing": missing[0], "route_corridor_missing": missing[1]}
 
 
 def _refuse_endless(roads: RoadLines) -> None:
@@ -228,10 +228,8 @@ def _kept_lanes(
     rows = np.flatnonzero(np.isin(graph.feature, near))
     far = np.full(graph.count, np.inf)
     np.minimum.at(far, graph.lines.row, path_distance(graph.lines.points[:, :2], path))
-    last = ~among(graph.kind, CAR_LANE_KINDS)
-    first = np.zeros(graph.count, dtype=bool)
-    first[on_route] = True
-    order = rows[np.lexsort((far[rows], last[rows], ~first[rows]))]
+    not_for_cars, off_route = ~among(graph.kind, CAR_LANE_KINDS), ~np.isin(np.arange(graph.count), on_route)
+    order = rows[np.lexsort((far[rows], not_for_cars[rows], off_route[rows]))]
     return np.sort(order[:most]), max(len(rows) - most, 0)
 
 

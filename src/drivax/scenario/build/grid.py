@@ -20,10 +20,8 @@ CUTOFF_M = 3.0
 SPLIT = 3
 #: Codes of a packed side cell; 0 is unknown.
 DRIVABLE, NOT_DRIVABLE = 1, 2
-#: Edges decide the side of cells up to this distance, m.
-_REACH_M = 20.0
-#: End points within this distance are one vertex, m.
-_JOINED_M = 0.01
+#: Edges decide the side of cells up to the first distance; end points within the second are one vertex, m.
+_REACH_M, _JOINED_M = 20.0, 0.01
 Array = np.ndarray[Any, Any]
 EDGE_BLOCK, LANE_BLOCK, REST_BLOCK = 0, 1, 2
 #: A scenario is refused if an edge this near to the logged ego does not fit: off-road tests would be wrong.
@@ -62,8 +60,7 @@ class Grid:
 
     def cell(self, xy: Float[Array, "point 2"]) -> Int[Array, " point"]:
         """Row-major cell index of points inside the square."""
-        cell = self.column_row(xy)
-        return cell[:, 1] * self.side + cell[:, 0]
+        return self.column_row(xy) @ np.array([1, self.side])
 
     def runs(self, counts: Int[Array, " cell"]) -> Int[Array, "row column"]:
         """Number of entries in the run of three neighbouring cells of a row, centred on each cell."""
@@ -106,12 +103,9 @@ class GridSegments:
 
 
 def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity) -> GridSegments:
-    """Sort segments into the grid; drop those that fit neither the square, the table nor the runs of a query.
+    """Sort segments into the grid; drop those that do not fit the square, the table or the runs of a query.
 
-    Segments that are farthest from ``path``, the log of the ego, are dropped first.
-
-    Raises:
-        DataError: Road edges near the ego's log would have to be dropped.
+    Those farthest from ``path``, the log of the ego, are dropped first; dropped road edges near it raise DataError.
     """
     middle = segments.middle
     grid = Grid.around(middle, path, capacity)
@@ -133,8 +127,7 @@ def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity
         raise DataError(problem, cure="convert with a larger capacity")
     rows = np.flatnonzero(keep)
     cell = grid.cell(middle[rows])
-    sort_key = block[rows] * grid.side**2 + np.where(block[rows] == REST_BLOCK, 0, cell)
-    order = np.argsort(sort_key, kind="stable")
+    order = np.lexsort((np.where(block[rows] == REST_BLOCK, 0, cell), block[rows]))
     rows, cell = rows[order], cell[order]
     ends = np.searchsorted(block[rows], [0, 1, 2, 3])
     return GridSegments(

@@ -57,17 +57,18 @@ class LanePath:
     until: float = np.inf
     lateral: float = 0.0
 
+    def then(self, lane: int, ahead: float, entry: float, penalty: float, changes: int = 0) -> LanePath:
+        """Return the path with one more lane."""
+        lanes, changes = (*self.lanes, lane), self.changes + changes
+        return LanePath(lanes, self.s, ahead, entry, penalty, changes, self.until, self.lateral)
+
 
 @dataclass(frozen=True)
 class LaneSearch:
-    """Best-first search from the lanes under the ego.
+    """Best-first search from ``starts``, paths of one lane under the ego, the best fitting first.
 
-    Attributes:
-        starts: Paths of one lane under the ego, the best fitting first.
-        need_m: Length of a complete path ahead of the ego.
-        bend: Heading change along every lane, radians.
-        drivable: Mask of car lanes.
-        outside: Cost of entering a lane outside the intended corridor, metres.
+    A complete path is ``need_m`` long ahead of the ego. ``bend`` is the heading change along every lane (radians), and
+    ``outside`` the cost of entering it where it is outside the intended corridor (metres).
     """
 
     on: LaneSegments
@@ -121,11 +122,8 @@ class LaneSearch:
     def to_goal(self, xyz: Float[Array, "3"], heading: float) -> list[LanePath]:
         """Cheapest paths to the lanes under the goal (Dijkstra's search)."""
         goals = self._goals(xyz, heading)
-        complete: list[LanePath] = []
-        done: set[int] = set()
-        serial = count()
-        heap = [(lane_path.penalty, next(serial), lane_path) for lane_path in self.starts]
-        heapq.heapify(heap)
+        complete, done, serial = list[LanePath](), set[int](), count()
+        heap = [(lane_path.penalty, next(serial), lane_path) for lane_path in self.starts]  # sorted
         while heap and len(complete) < len(goals):
             lane_path = heapq.heappop(heap)[2]
             lane = lane_path.lanes[-1]
@@ -172,17 +170,15 @@ class LaneSearch:
         for other in (int(x) for x in graph.successor[lane] if x >= 0):
             if self.drivable[other] and other not in lanes:
                 penalty = lane_path.penalty + TURN_COST_M * float(self.bend[other]) + self.outside[other]
-                longer = replace(lane_path, lanes=(*lanes, other), ahead=self.reach(lane_path))
-                result.append(replace(longer, entry=0.0, penalty=penalty))
+                result.append(lane_path.then(other, self.reach(lane_path), 0.0, penalty))
         if lane_path.changes >= MOST_CHANGES:
             return result
         for other, shift in graph.neighbours(lane):
             low, high, _ = change_room(graph, lane, other, lane_path.entry)
             if self.drivable[other] and other not in lanes and high - low >= CHANGE_M:
                 penalty = lane_path.penalty + CHANGE_COST_M + self.outside[other]
-                longer = replace(lane_path, lanes=(*lanes, other), ahead=lane_path.ahead - shift)
-                changed = replace(longer, entry=low + shift + CHANGE_M, changes=lane_path.changes + 1)
-                result.append(replace(changed, penalty=penalty))
+                entry = low + shift + CHANGE_M
+                result.append(lane_path.then(other, lane_path.ahead - shift, entry, penalty, changes=1))
         return result
 
     def goes_on(self, following: Sequence[LanePath]) -> bool:
@@ -219,16 +215,11 @@ def trace(
     graph: LaneGraph, lanes: Sequence[int], begin_m: float, ahead_m: float, window_m: tuple[float, float],
     place: float, change_m: float = CHANGE_M,
 ) -> Line:  # fmt: skip
-    """Draw the line along a sequence of lanes, each a successor or neighbour of the previous one.
+    """Draw the line along lanes, each a successor or neighbour of the previous one, from ``begin_m`` on the first.
 
-    Args:
-        graph: The lane graph.
-        lanes: Dense indices.
-        begin_m: Arc length on the first lane where the line begins.
-        ahead_m: Distance from the ego to the start of the first lane (negative: behind), metres.
-        window_m: Range ahead of the ego for lane changes, where there is room.
-        place: Position of a lane change in its stretch: 0 as early, 1 as late as possible.
-        change_m: Length of a lane change, where there is room.
+    Where there is room, a lane change is ``change_m`` long and lies in ``window_m`` ahead of the ego; ``place`` is its
+    position in its stretch: 0 as early, 1 as late as possible. ``ahead_m`` is the distance from the ego to the start of
+    the first lane (negative: behind), metres.
     """
     parts: list[Line] = []
     s = begin_m

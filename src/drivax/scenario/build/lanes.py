@@ -1,19 +1,20 @@
-"""The lane graph: lanes, their links and widths, and the lanes under a pose."""
+"""The lane graph: lanes, their links and widths, the lanes under a pose, and their traffic lights and stop signs."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int8
 
 from drivax.errors import DataError
-from drivax.geometry.polylines import Polylines, point_to_segment
+from drivax.geometry.polylines import Polylines, left_normals, point_to_segment
 from drivax.geometry.vectors import wrap
-from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box, known_limit
-from drivax.scenario.recording import MapFeature
+from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box, known_limit, path_distance
+from drivax.scenario.recording import Light, MapFeature
 from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among
 
 Array = np.ndarray[Any, Any]
@@ -34,6 +35,11 @@ _DANGLING = {
     "dangling_links": ("successors", "predecessors"),
     "dangling_neighbours": ("left_neighbours", "right_neighbours"),
 }
+#: Half the width of a stop line on a lane of unknown width, metres.
+HALF_WIDTH_M = 1.85
+#: A light without a lane takes the heading of a lane segment within this distance.
+LANE_REACH_M = 2.0
+LANES_PER_STOP = 4
 _SAMPLES, _PROBES, _CHUNK = 33, (0.1, 0.3, 0.5, 0.7, 0.9), 512
 
 
@@ -333,3 +339,107 @@ def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array,
     table = np.full(size, -1)
     table[graph.feature] = np.arange(graph.count)
     return table[feature]
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Traffic lights in the local frame.
+
+    Each has a stop line from left to right of its lane (x, y, x, y), the dense index of the lane (-1 if the map lacks
+    it) with its headings at the stop point and at its end, and states over time (-1 unobserved).
+    """
+
+    line: Float[Array, "light 4"]
+    z: Float[Array, " light"]
+    lane: Int[Array, " light"]
+    heading: Float[Array, " light"]
+    exit_heading: Float[Array, " light"]
+    state: Int8[Array, "light time"]
+    overflow: dict[str, int]
+
+
+def place_lights(
+    lights: Sequence[Light],
+    on: LaneSegments,
+    origin: Float[Array, "3"],
+    path: Float[Array, "step 2"],
+    most: int,
+) -> Lights:
+    """Place stop lines across the lanes at the stop points; keep the ``most`` lights nearest to ``path``."""
+    graph, steps = on.graph, len(lights[0].states) if lights else 0
+    stop = np.array([light.stop_point for light in lights], dtype=np.float64).reshape(-1, 3) - origin
+    index = graph.index()
+    lane = np.array([index.get(light.lane_id, -1) for light in lights], dtype=np.int64)
+    heading, exit_heading = np.full(len(lights), np.nan), np.full(len(lights), np.nan)
+    known = np.flatnonzero(lane >= 0)
+    s = _arc_at(graph, lane[known], stop[known, :2])
+    heading[known] = graph.lines.heading(lane[known], s, END_SPAN_M)
+    exit_heading[known] = graph.lines.heading(lane[known], graph.lines.length[lane[known]], END_SPAN_M)
+    for i in np.flatnonzero(lane < 0):
+        heading[i] = exit_heading[i] = _heading_near(on, stop[i])
+    width = np.append(graph.width, -1.0)[lane]
+    half = np.where(width > 0, width / 2, HALF_WIDTH_M)
+    directed = np.flatnonzero(~np.isnan(heading))
+    rows = directed[np.argsort(path_distance(stop[directed, :2], path), kind="stable")]
+    overflow = +Counter(lights=len(rows) - most, lights_without_lane=len(lights) - len(directed))
+    rows = rows[:most]
+    left = half[rows, None] * left_normals(heading[rows])
+    states = [np.asarray(lights[i].states, dtype=np.int8) for i in rows]
+    return Lights(
+        line=np.concatenate((stop[rows, :2] + left, stop[rows, :2] - left), axis=1),
+        z=stop[rows, 2],
+        lane=lane[rows],
+        heading=heading[rows],
+        exit_heading=exit_heading[rows],
+        state=np.stack(states) if states else np.zeros((0, steps), dtype=np.int8),
+        overflow=overflow,
+    )
+
+
+def _arc_at(
+    graph: LaneGraph, lane: Int[Array, " light"], xy: Float[Array, "light 2"]
+) -> Float[Array, " light"]:
+    """Arc length on each lane of the point nearest to its stop point."""
+    result = np.zeros(len(lane))
+    for i, (row, point) in enumerate(zip(lane, xy, strict=True)):
+        line, arc = graph.lines.line(row)[:, :2], graph.lines.arc[graph.lines.start[row] :]
+        distance, along = point_to_segment(point, line[:-1], line[1:])
+        best = distance.argmin()
+        result[i] = arc[best] + along[best] * (arc[best + 1] - arc[best])
+    return result
+
+
+def _heading_near(on: LaneSegments, stop: Float[Array, "3"]) -> float:
+    """Heading of the nearest lane segment, NaN without one in reach."""
+    if len(on.segments) == 0:
+        return float("nan")
+    distance, _ = point_to_segment(stop[:2], on.segments.a[:, :2], on.segments.b[:, :2])
+    best = distance.argmin()
+    return float(on.heading[best]) if distance[best] <= LANE_REACH_M else float("nan")
+
+
+@dataclass(frozen=True)
+class Stops:
+    """Stop signs in the local frame, each with up to four dense lane indices (-1 padded)."""
+
+    xy: Float[Array, "stop 2"]
+    lane: Int[Array, "stop 4"]
+    overflow: dict[str, int]
+
+
+def place_stops(
+    features: Sequence[MapFeature], graph: LaneGraph, origin: Float[Array, "3"], path: Float[Array, "step 2"],
+    most: int,
+) -> Stops:  # fmt: skip
+    """Place stop signs with the lanes that they control; keep the ``most`` signs nearest to ``path``."""
+    signs = [f for f in features if f.kind == RoadKind.STOP_SIGN and len(f.points)]
+    xy = np.array([f.points[0] for f in signs], dtype=np.float64).reshape(-1, 3)[:, :2] - origin[:2]
+    index = graph.index()
+    lane = np.full((len(signs), LANES_PER_STOP), -1)
+    lost = 0
+    for i, sign in enumerate(signs):
+        known = [index[number] for number in sign.lanes if number in index]
+        lane[i, : min(len(known), LANES_PER_STOP)] = known[:LANES_PER_STOP]
+        lost += max(len(known) - LANES_PER_STOP, 0)
+    rows = np.argsort(path_distance(xy, path), kind="stable")
+    return Stops(xy[rows[:most]], lane[rows[:most]], +Counter(stops=len(rows) - most, stop_lanes=lost))

@@ -202,12 +202,8 @@ def score(search: LaneSearch, lane_path: LanePath) -> float:
     """
     length = max(search.reach(lane_path), 1.0)
     bend = search.bend[list(lane_path.lanes)]
-    return float(
-        CHANGE_WEIGHT * lane_path.changes
-        + TURN_WEIGHT * int((bend > TURN_RAD).sum())
-        + LENGTH_WEIGHT * length
-        + CURVATURE_WEIGHT * float(bend.sum()) / length
-    )
+    turning = CHANGE_WEIGHT * lane_path.changes + TURN_WEIGHT * int((bend > TURN_RAD).sum())
+    return float(turning + LENGTH_WEIGHT * length + CURVATURE_WEIGHT * float(bend.sum()) / length)
 
 
 def _same(route: Route, other: Route) -> bool:
@@ -227,7 +223,7 @@ def _best(ego: EgoLog, routes: Sequence[Route], reach_m: float) -> Route | None:
 
 @dataclass(frozen=True)
 class _Drawer:
-    """Draws routes of at most ``most`` points along lane paths.
+    """Draw routes of at most ``most`` points along lane paths.
 
     A plain route begins at the ego and keeps to the lanes; others begin 20 m behind the first logged position and bend
     to the driven path.
@@ -275,14 +271,12 @@ def join(
     interpolated between the poses and fades out ahead of the last one by a cubic polynomial that continues in the ego's
     direction (Hermite: shift and slope at the ego, zero both ``ahead_m`` ahead). Points of ``xyz`` are about 1 m apart.
     """
-    first = int(arc_lengths(driven)[-1] + 2 * _BEHIND_M) + 2
-    s, shift = _shifts(xyz[: max(first, 2)], driven)
+    near = int(arc_lengths(driven)[-1] + 2 * _BEHIND_M) + 2
+    s, shift = _shifts(xyz[:near], driven)
     if not shift.any():
         return xyz
     arc = arc_lengths(xyz)
-    across = np.interp(arc, s, shift)
-    back = slice(0, int(np.searchsorted(arc, s[0])))
-    ahead = slice(int(np.searchsorted(arc, s[-1], side="right")), len(arc))
+    across, back, ahead = np.interp(arc, s, shift), arc < s[0], arc > s[-1]
     slope = np.clip(np.diff(shift) / np.diff(s), -_MOST_SLOPE, _MOST_SLOPE) if len(s) > 1 else np.zeros(1)
     across[back] = _fade(s[0] - arc[back], shift[0], -slope[0], _BEHIND_M)
     across[ahead] = _fade(arc[ahead] - s[-1], shift[-1], slope[-1], ahead_m)

@@ -218,13 +218,9 @@ class _Name:
 def select_scenarios(
     data: Listing, filters: Sequence[str] = (), names: Sequence[str | Path] = (), limit: int | None = None
 ) -> list[int]:
-    """Return the indices of the selected scenarios, in order of the set.
+    """Return the indices of the first ``limit`` scenarios that meet all filters, in order of the set.
 
-    Args:
-        data: The set.
-        filters: Conditions that must all hold.
-        names: Ids, or data set, tab and id; paths of files with one name per line. Empty selects all.
-        limit: Number of scenarios to select at most, the first ones.
+    ``names`` are ids, or data set, tab and id, or paths of files with one name per line; empty selects all.
 
     Raises:
         DataError: A name is not in the set, a file cannot be read, or no scenario is selected.

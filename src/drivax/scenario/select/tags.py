@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from drivax.geometry.polylines import arc_lengths
 from drivax.geometry.vectors import wrap
-from drivax.scenario.build.lanes import LaneGraph, end_headings
-from drivax.scenario.build.lights import Lights
+from drivax.scenario.build.lanes import LaneGraph, Lights, end_headings
 from drivax.scenario.build.routes import STEP_M, RouteSet
 from drivax.scenario.build.segments import spaced
 from drivax.scenario.build.tracks import LocalTracks
