@@ -27,7 +27,7 @@ from drivax import settings
 from drivax.curation.ensemble import EnsembleConfig, train_ensemble
 from drivax.learning.algorithm import training_data
 from drivax.learning.config import TrainConfig
-from drivax.learning.experience import draw, sampler
+from drivax.learning.experience import sample_steps, sampler
 from drivax.learning.program import Program, Seeds
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
@@ -130,7 +130,7 @@ def members(data: ScenarioSet, repeats: int) -> dict[str, Any]:
 def draws() -> int:
     """Places drawn per second among 10,000 scenarios of 91 steps, by uneven weights."""
     made = sampler(np.random.default_rng(0).gamma(0.5, size=(SCENARIOS, 91)))
-    call = partial(jax.jit, static_argnums=2)(draw)
+    call = partial(jax.jit, static_argnums=2)(sample_steps)
     return round(DRAWS / seconds(lambda: call(made, jax.random.key(0), (DRAWS,)), 5))
 
 

@@ -27,7 +27,7 @@ from drivax.curation.scores import read_scores
 from drivax.errors import UsageError
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.driving import Driving
-from drivax.learning.experience import draw
+from drivax.learning.experience import sample_steps
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Grid, Mixture, SquashedGaussian
 from drivax.networks.entity import EntityConfig
@@ -194,7 +194,7 @@ def test_more_scenarios_than_fit_are_refused(data, monkeypatch):
 def test_all_recordings_are_drawn(ensemble, data):
     environment, bank = Driving(Simulator(TINY.task)), ScenarioBank.from_scenarios(data)
     experience, _ = experience_of(TINY, environment, bank)
-    rows, steps = draw(experience.critic, jax.random.key(0), (30_000,))
+    rows, steps = sample_steps(experience.critic, jax.random.key(0), (30_000,))
     usable = np.asarray(experience.usable)
     assert usable[np.asarray(rows), np.asarray(steps)].all()
     shares = np.bincount(ensemble.fold[np.asarray(rows)]) / 30_000

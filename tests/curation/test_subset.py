@@ -149,7 +149,7 @@ def test_command_prints_the_most_critical(data, tmp_path, capsys):
     assert main([*command, "--out", str(out)]) == 0
     lines = capsys.readouterr().out.replace(str(tmp_path), "").splitlines()
     assert max(map(len, lines)) < 100
-    place = lines.index("/top: the 3 most critical, one of each recording at most")
+    place = lines.index("/top: the 3 most critical scenarios, at most one per recording")
     assert lines[place + 1 : place + 3] == ["/top/scores.npz: their scores", "  rank  score  scenario"]
     table = read_scores(out, data)
     rows = top_rows(table, 3, recordings_of(data.entries))

@@ -301,7 +301,7 @@ def test_folders_of_several_planners_are_refused():
     "change",
     [
         "ratio: 1.0", "confidence: 95", "power: 0", "minimum_scenarios: 1", "resamples: 10", "smallest_difference: 0",
-        "secondary: [collision, vmax_score]", "secondary: [offroad, offroad]", "split: halves",
+        "secondary: [offroad, offroad]", "split: halves",
         "{split: random, test: bootstrap}", "minimum: 3",
     ],
 )  # fmt: skip

@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 
 from drivax.errors import DataError
-from drivax.learning.experience import Sampler, draw, sampler
+from drivax.learning.experience import Sampler, sample_steps, sampler
 
 COUNT = 200_000
-_draw = partial(jax.jit, static_argnums=2)(draw)
+_draw = partial(jax.jit, static_argnums=2)(sample_steps)
 
 
 def drawn(weights, seed=0, count=COUNT):

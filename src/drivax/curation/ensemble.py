@@ -24,7 +24,14 @@ from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
 from drivax.learning.driving import Driving
-from drivax.learning.experience import Experience, ExperienceConfig, draw, expert_actions, recorded, sampler
+from drivax.learning.experience import (
+    Experience,
+    ExperienceConfig,
+    expert_actions,
+    recorded,
+    sample_steps,
+    sampler,
+)
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig
@@ -270,7 +277,7 @@ def fit(
     used = math.ceil(cloning.batch * (1.0 - 1.0 / config.folds))
 
     def update(experience: Experience, fold: Array, trained: Any, key: Array) -> tuple[tuple[Any, Any], None]:
-        indices = draw(experience.critic, key, (cloning.batch,))
+        indices = sample_steps(experience.critic, key, (cloning.batch,))
         observation, action, _ = expert_actions(environment, experience, indices)
 
         def update_member(member: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:

@@ -69,7 +69,7 @@ def sampler(weights: np.ndarray) -> Sampler:
     return Sampler(jnp.asarray(cumulative), effective, weights.shape[1])
 
 
-def draw(sampler: Sampler, key: Array, shape: tuple[int, ...]) -> StepIndex:
+def sample_steps(sampler: Sampler, key: Array, shape: tuple[int, ...]) -> StepIndex:
     """Draw step indices with replacement."""
     number = jnp.minimum(jax.random.bits(key, shape, jnp.uint32), jnp.uint32(_LAST - 1))
     # The first step whose share exceeds the number: never a step without weight.

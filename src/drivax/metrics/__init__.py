@@ -1,4 +1,4 @@
-"""From a situation to step values, episode metrics and scores."""
+"""Episode metrics: a metric is an entry of ``METRICS`` (``catalogue``), a quantity of a step one of ``STEP_VALUES``."""
 
 import lazy_loader
 

@@ -1,5 +1,6 @@
 from .contact import CollisionType as CollisionType
 from .contact import Contact as Contact
+from .contact import time_to_collision as time_to_collision
 from .idm import IdmParameters as IdmParameters
 from .idm import idm_acceleration as idm_acceleration
 from .potentials import collision_potential as collision_potential

@@ -128,9 +128,18 @@ def run_study(
         "detectable": smallest,
     }
     write_json(study.results, results)
+    _write_pages(study, data, results, tables)
+    log(f"wrote {study.folder / 'report.html'}")
+    return results
+
+
+def _write_pages(
+    study: Study, data: ScenarioSet, results: Mapping[str, Any], tables: Mapping[str, ScoreTable]
+) -> None:
+    """Write the report, and the player of the most critical scenarios."""
     expert = score_steps(data, ExpertActions())
-    report = study.folder / "report.html"
-    write_report(definition, results, tables, expert["action"][expert["known"]], report)
+    actions = expert["action"][expert["known"]]
+    write_report(study.definition, results, tables, actions, study.folder / "report.html")
     tops = {row: tables[name] for name in _SHOWN if name in tables for row in top_rows(tables[name], _TOP)}
     write_player(
         [data[row] for row in tops],
@@ -139,8 +148,6 @@ def run_study(
         title="most critical drives",
         details=[criticality_html(table, row) for row, table in tops.items()],
     )
-    log(f"wrote {report}")
-    return results
 
 
 def _open(study: Study) -> None:

@@ -21,9 +21,9 @@ from drivax.learning.experience import (
     Experience,
     ExperienceConfig,
     ExpertActions,
-    draw,
     expert_actions,
     recorded,
+    sample_steps,
 )  # fmt: skip
 from drivax.learning.program import divided
 from drivax.networks.actor_critic import NetworkConfig, Policy
@@ -85,7 +85,7 @@ class Cloning:
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
         """Return the imitation loss on a random batch of expert actions, and values to log."""
         if isinstance(data, Experience):
-            index = draw(data.policy or data.critic, key, (self.batch,))
+            index = sample_steps(data.policy or data.critic, key, (self.batch,))
             batch = expert_actions(recorded(environment), data, index)
         else:
             batch = environment.demonstrations(data, key, self.batch)

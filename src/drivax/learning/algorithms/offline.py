@@ -23,9 +23,9 @@ from drivax.learning.experience import (
     Experience,
     ExperienceConfig,
     Recorded,
-    draw,
     expert_actions,
     recorded,
+    sample_steps,
     transitions,
 )
 from drivax.learning.program import divided
@@ -97,7 +97,7 @@ class FittedQ:
 
         def update(carry: tuple[Any, Any, Any], key: Array) -> tuple[tuple[Any, Any, Any], None]:
             parameters, target_parameters, state = carry
-            batch = transitions(self.environment, data, draw(data.critic, key, (config.batch,)))
+            batch = transitions(self.environment, data, sample_steps(data.critic, key, (config.batch,)))
             next_action = act(batch.next_observation)
             next_value = q_values(target_parameters, batch.next_observation, next_action)
             target = td_target(batch.reward, next_value, batch.terminated, self.gamma)
@@ -271,16 +271,16 @@ class Offline(OffPolicy[Config]):
         """Draw steps to learn values from, and steps to improve the policy at."""
         environment, count = recorded(self.environment), (self.config.batch,)
         critic_key, policy_key = jax.random.split(key)
-        batch = divided(transitions(environment, data, draw(data.critic, critic_key, count)), axis=0)
+        batch = divided(transitions(environment, data, sample_steps(data.critic, critic_key, count)), axis=0)
         if data.policy is None:
             return batch, (batch.observation, batch.action)
-        drawn = expert_actions(environment, data, draw(data.policy, policy_key, count))
+        drawn = expert_actions(environment, data, sample_steps(data.policy, policy_key, count))
         observation, action, _ = divided(drawn, axis=0)
         return batch, (observation, action)
 
     def _statistics(self, data: Experience) -> Statistics:
         """Statistics of features over uniformly drawn steps, the same for every seed."""
-        index = draw(data.uniform, jax.random.key(0), (_SAMPLES // _BATCH, _BATCH))
+        index = sample_steps(data.uniform, jax.random.key(0), (_SAMPLES // _BATCH, _BATCH))
         observe = partial(recorded(self.environment).observe_recorded, data.data)
         return feature_statistics(jax.lax.map(observe, index))
 
@@ -296,7 +296,7 @@ class Offline(OffPolicy[Config]):
 
     @partial(jax.jit, static_argnums=0)
     def _mean_q(self, data: Experience, policy: Any, critic: Any) -> Float[Array, ""]:
-        index = draw(data.critic, jax.random.key(0), (_SAMPLES,))
+        index = sample_steps(data.critic, jax.random.key(0), (_SAMPLES,))
         observation = recorded(self.environment).observe_recorded(data.data, index)
         action = self.distribution(policy, observation).mode()
         return jnp.mean(jnp.min(self.q_values(critic, observation, action), axis=0))
