@@ -2,10 +2,12 @@
 
 import csv
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
 import shapely
+from scipy.sparse.csgraph import connected_components
 
 from drivax.cli import main
 from drivax.evaluation.episode_table import Crash
@@ -22,6 +24,7 @@ from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.synthetic.world import generate_recording
 from scenes import SMALL, car, straight_road
 
 
@@ -51,6 +54,29 @@ def test_lanes_become_strips_of_their_width(data):
         width = float(scenario.lane_width[index])
         assert lane.polygon.area == pytest.approx(lane.line.length * (width if width > 0 else 3.7), rel=1e-3)
         assert shapely.contains_xy(lane.polygon, *lane.line.interpolate(5.0).coords[0])
+
+
+def test_roadblocks_hold_parallel_lanes_and_connectors_of_the_same_two_blocks():
+    scenario = assemble(generate_recording(seed=0, index=4))
+    objects = _objects(scenario)
+    lanes = [index for index, each in enumerate(objects) if not each.connector]
+    assert lanes and len(lanes) < len(objects)
+    adjacent = np.zeros((len(objects), len(objects)), bool)
+    for index in lanes:
+        for other in (scenario.lane_left[index], scenario.lane_right[index]):
+            adjacent[index, other] |= other >= 0
+    groups = connected_components(adjacent, directed=False)[1]
+    for first, second in combinations(lanes, 2):
+        assert (objects[first].block == objects[second].block) == (groups[first] == groups[second])
+    ends = {
+        index: (groups[each.predecessors[0]], groups[each.successors[0]])
+        for index, each in enumerate(objects)
+        if each.connector and {*each.predecessors[:1], *each.successors[:1]} <= set(lanes) and each.predecessors
+        and each.successors
+    }  # fmt: skip
+    assert len(ends) > 1
+    for first, second in combinations(ends, 2):
+        assert (objects[first].block == objects[second].block) == (ends[first] == ends[second])
 
 
 def test_hitting_a_standing_car_is_at_fault_by_both_definitions(data, run):

@@ -12,6 +12,7 @@ import tyro
 from drivax import settings
 from drivax.api import find_planner, load
 from drivax.cli import judge, record_of
+from drivax.datasets.parsing import import_extra
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.runner import (
     EvaluationConfig,
@@ -68,7 +69,7 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     metrics = tuple(name for name in args.metrics if name != _DEVKIT)
     select_metrics(metrics)
     if _DEVKIT in args.metrics:
-        import drivax.evaluation.profiles  # noqa: F401  (needs an optional package)
+        import_extra("shapely")
     requested = _task(overrides)
     data = ScenarioSet.open(args.data)
     some = load(args.data, 1, filters=args.filter, scenarios=args.scenarios)

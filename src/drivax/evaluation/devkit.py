@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float64, Int
 
+from drivax.geometry.boxes import corners
 from drivax.metrics.catalogue import NUPLAN_WEIGHTS
 from drivax.metrics.comfort import (
     JERK,
@@ -34,8 +35,8 @@ from drivax.scenario.schema import DT_S, AgentKind
 
 #: Rear axle to centre of nuPlan's car (Chrysler Pacifica), m.
 REAR_AXLE_M = 1.461
-#: Order of corners: front left, rear left, rear right, front right, as shares of half the box.
-_CORNERS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+#: From the corners of ``geometry.boxes`` to the devkit's order: front left, rear left, rear right, front right.
+_DEVKIT_ORDER = (0, 3, 2, 1)
 _STOPPED_MPS, _TTC_STOPPED_MPS = 0.05, 0.005
 _AHEAD_DEG, _BEHIND_DEG = 30.0, 150.0
 _TTC_STEP_S, _TTC_HORIZON_S, _TTC_LEAST_S = 0.1, 3.0, 0.95
@@ -73,9 +74,14 @@ class EgoMotion:
     dt_s: float = DT_S
 
     @cached_property
+    def boxes(self) -> Float64[np.ndarray, "t 6"]:
+        """The box as ``geometry.boxes`` takes it."""
+        return _boxes(self.xy, self.heading, np.array(self.size_m))
+
+    @cached_property
     def corners(self) -> Float64[np.ndarray, "t 4 2"]:
         """Corners of the box."""
-        return _corners(self.xy, self.heading, np.array(self.size_m))
+        return corners(self.boxes)
 
     @cached_property
     def rear_axle(self) -> Float64[np.ndarray, "t 2"]:
@@ -106,7 +112,7 @@ class Tracks:
     @cached_property
     def corners(self) -> Float64[np.ndarray, "t a 4 2"]:
         """Corners of the boxes."""
-        return _corners(self.xy, self.heading, self.size_m)
+        return corners(_boxes(self.xy, self.heading, self.size_m))
 
 
 @dataclass(frozen=True)
@@ -305,12 +311,10 @@ def _directions(heading: Any) -> Float64[np.ndarray, "*n 2"]:
     return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
 
 
-def _corners(
+def _boxes(
     xy: Float64[np.ndarray, "*n 2"], heading: Float64[np.ndarray, "*n"], size: Float64[np.ndarray, "*a 2"]
-) -> Float64[np.ndarray, "*n 4 2"]:
-    ahead = _directions(heading)
-    axes = np.stack([ahead, np.stack([-ahead[..., 1], ahead[..., 0]], axis=-1)], axis=-2)
-    return xy[..., None, :] + (_CORNERS * size[..., None, :]) @ axes
+) -> Float64[np.ndarray, "*n 6"]:
+    return np.concatenate([xy, _directions(heading), np.broadcast_to(size, xy.shape)], axis=-1)
 
 
 def _angle_deg(
@@ -324,11 +328,11 @@ def _angle_deg(
 
 def _in_one_lane(ego: EgoMotion, road: Road) -> Bool[np.ndarray, " t"]:
     """Return whether all corners are in one lane, or in lanes that follow each other (``ego_lane_change``)."""
-    inside = road.containing(ego.corners.reshape(-1, 2)).reshape(len(ego.xy), 4, -1)
+    inside = road.containing(ego.corners[:, _DEVKIT_ORDER].reshape(-1, 2)).reshape(len(ego.xy), 4, -1)
     result, candidates = np.zeros(len(ego.xy), bool), set[int]()
-    for sample, corners in enumerate(inside):
+    for sample, by_corner in enumerate(inside):
         lanes: list[set[int]] = []
-        for corner in corners:
+        for corner in by_corner:
             known = _candidates(road, corner, candidates)
             lanes.append(known or _current(road, corner))
             # As in the devkit: only in the second sample a corner's lanes become candidates of the next corners.
@@ -354,8 +358,8 @@ def _candidates(road: Road, inside: Bool[np.ndarray, " o"], candidates: set[int]
     return matching
 
 
-def _common_or_connected(road: Road, corners: Sequence[set[int]]) -> bool:
-    if set.intersection(*corners):
+def _common_or_connected(road: Road, by_corner: Sequence[set[int]]) -> bool:
+    if set.intersection(*by_corner):
         return True
     front_left, rear_left, rear_right, front_right = (
         side
@@ -364,9 +368,9 @@ def _common_or_connected(road: Road, corners: Sequence[set[int]]) -> bool:
             for index in side
             for n in (road.objects[index].successors if rear else road.objects[index].predecessors)
         }
-        for side, rear in zip(corners, (False, True, True, False), strict=True)
+        for side, rear in zip(by_corner, (False, True, True, False), strict=True)
     )
-    rears = corners[1] & rear_right or corners[2] & rear_left
+    rears = by_corner[1] & rear_right or by_corner[2] & rear_left
     return bool(rears and front_left & rear_right & front_right & rear_left)
 
 
@@ -375,7 +379,7 @@ def _collisions(ego: EgoMotion, tracks: Tracks, in_lane: Bool[np.ndarray, " t"])
     ego_boxes: Any = shapely.polygons(ego.corners)
     boxes: Any = shapely.polygons(tracks.corners)
     touches = shapely.intersects(ego_boxes[:, None], boxes) & tracks.present
-    fronts: Any = shapely.linestrings(ego.corners[:, [0, 3]])
+    fronts: Any = shapely.linestrings(ego.corners[:, :2])
     collisions = []
     for agent in np.flatnonzero(touches.any(axis=0)).tolist():
         sample = int(touches[:, agent].argmax())
@@ -441,11 +445,11 @@ def _time_to_collision(
 
 
 def _swept(
-    corners: Float64[np.ndarray, "*a 4 2"], heading: Any, speed: Any, times: Float64[np.ndarray, " k"]
+    boxes: Float64[np.ndarray, "*a 4 2"], heading: Any, speed: Any, times: Float64[np.ndarray, " k"]
 ) -> Any:
     """Return the boxes moved along their headings to every time."""
     way = _directions(heading) * np.asarray(speed)[..., None]
-    return shapely.polygons(corners[..., None, :, :] + times[:, None, None] * way[..., None, None, :])
+    return shapely.polygons(boxes[..., None, :, :] + times[:, None, None] * way[..., None, None, :])
 
 
 def _stays_on_road(ego: EgoMotion, road: Road, driven: Sequence[Sequence[int]]) -> bool:

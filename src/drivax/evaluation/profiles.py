@@ -28,6 +28,7 @@ from drivax.scenario.bank.queries import LEVEL_M, around_lanes, offroad_distance
 from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M, ScenarioBank, Sizes
 from drivax.scenario.schema import DT_S, AgentKind, Scenario
 from drivax.scenario.store import ScenarioSet
+from drivax.simulator.contact import REAR_AXLE
 from drivax.table import Cell, Column, Table
 
 #: Our metric of each term of the devkit's score.
@@ -169,7 +170,7 @@ def _ego(scenario: Scenario, motion: Float[np.ndarray[Any, Any], "t 4"], start: 
     length, width = scenario.agent_size[0, :2].astype(np.float64)
     return EgoMotion(
         np.stack([x, y], axis=-1), heading, np.abs(speed), np.diff(speed, prepend=last) / DT_S, yaw_rate,
-        np.diff(yaw_rate, prepend=yaw_rate[:1]) / DT_S, (float(length), float(width)),
+        np.diff(yaw_rate, prepend=yaw_rate[:1]) / DT_S, (float(length), float(width)), float(length) * REAR_AXLE,
     )  # fmt: skip
 
 
@@ -210,10 +211,7 @@ def _tracks(scenario: Scenario, steps: slice, others: Float[np.ndarray[Any, Any]
 
 
 def _speeds(xy: Float[np.ndarray[Any, Any], "t A 2"]) -> Float[np.ndarray[Any, Any], "t A"]:
-    """Speeds over up to 0.5 s, since stored poses have steps of 2 cm; NaN rows are absent agents.
-
-    The earliest pose of a window is the one to which the agent was present without a gap.
-    """
+    """Speeds over the longest window, up to 0.5 s, of which both ends are present: stored poses have steps of 2 cm."""
     speed = np.zeros(xy.shape[:2])
     for back in range(1, _SPEED_STEPS + 1):
         moved = np.linalg.norm(xy[back:] - xy[:-back], axis=-1) / (back * DT_S)
@@ -236,12 +234,11 @@ def _road(scenario: Scenario, steps: slice, sizes: Sizes) -> Road:
     objects = _objects(scenario)
     crossing = shapely.unary_union([each.polygon for each in objects if each.connector])
     bank = ScenarioBank.from_scenarios([scenario], trim=sizes)
-    z = jnp.asarray(scenario.agent_z[steps, 0] - scenario.agent_size[0, 2] / 2)
+    heights = _filled(scenario.agent_z[:, :1], scenario.agent_valid[:, :1])[steps, 0]
+    z = jnp.asarray(heights - scenario.agent_size[0, 2] / 2)
 
     def outside_m(ego: EgoMotion) -> np.ndarray[Any, Any]:
-        pose = np.stack([*ego.xy.T, np.cos(ego.heading), np.sin(ego.heading)], axis=-1)
-        box = np.concatenate([pose, np.broadcast_to(ego.size_m, (len(pose), 2))], axis=-1)
-        return np.asarray(_beyond_edges(bank, jnp.asarray(box, jnp.float32), z), np.float64)
+        return np.asarray(_beyond_edges(bank, jnp.asarray(ego.boxes, jnp.float32), z), np.float64)
 
     return Road(objects, outside_m, lambda points: shapely.contains_xy(crossing, points[:, 0], points[:, 1]))
 
@@ -250,13 +247,13 @@ def _road(scenario: Scenario, steps: slice, sizes: Sizes) -> Road:
 def _beyond_edges(
     bank: ScenarioBank, boxes: Float[Array, "t 6"], z: Float[Array, " t"]
 ) -> Float[Array, "t 4"]:
-    """Distance of the corners of boxes beyond the road edges, in the devkit's order."""
+    """Distance of the corners of boxes beyond the road edges."""
     index = jnp.zeros((), jnp.int32)
 
     def beyond(box: Float[Array, " 6"], ground: Float[Array, ""]) -> Float[Array, " 4"]:
         points = corners(box)
         near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
-        return offroad_distance(bank, index, box[:2], points, near, ground)[jnp.array([0, 3, 2, 1])]
+        return offroad_distance(bank, index, box[:2], points, near, ground)
 
     return jax.vmap(beyond)(boxes, z)
 
