@@ -378,3 +378,19 @@ def test_invalid_studies_are_refused(data, tmp_path):
     with pytest.raises(UsageError, match=r"recorded: has no labelled events.*--arms \[bc,baseline,.*o\]"):
         runner.run_study(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
     assert not (tmp_path / "study").exists()
+
+
+def test_changed_claims_are_refused_when_a_study_resumes(data, tmp_path):
+    sets = StudySets(data.path, data.path, (data.path,))
+    runner._open(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
+    runner._open(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
+    fewer = replace(LONGTAIL, claims=LONGTAIL.claims[:-1])
+    with pytest.raises(UsageError, match="holds a study with other arms or claims"):
+        runner._open(Study(fewer, StudyConfig(), sets, tmp_path / "study"))
+
+
+def test_evaluated_run_without_checkpoints_is_not_trained_again(data, tmp_path):
+    study = Study(LONGTAIL, StudyConfig(), StudySets(data.path, data.path, (data.path,)), tmp_path)
+    study.evaluation("bc", 0).mkdir(parents=True)
+    with pytest.raises(UsageError, match=r"has no checkpoints, but evaluations; remove .*bc.*seed-0"):
+        runner._run_job(runner.Job(study, "bc", 0, np.zeros((1, 1), bool)))

@@ -6,6 +6,7 @@ set; claims compare arms scenario by scenario. What is finished is not repeated:
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from drivax import settings
 from drivax.curation.logged import score_steps
 from drivax.curation.methods import Request, check_current, curate, event_kinds
 from drivax.curation.rarity import ExpertActions
@@ -154,6 +156,7 @@ def _open(study: Study) -> None:
     """Create the folder of a study, or check that it holds this one."""
     sets = study.sets
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
+    definition = hashlib.sha256(settings.dump(study.definition).encode()).hexdigest()
     if not study.folder.exists() or not any(study.folder.iterdir()):
         rest = [name for name, arm in study.arms.items() if arm.method != "oracle"]
         if len(rest) < len(study.arms) and not event_kinds(data[0]).any():
@@ -162,7 +165,7 @@ def _open(study: Study) -> None:
                 file=sets.train,
                 cure=f"pass --arms [{','.join(rest)}]",
             )
-        RunFolder.create(study.folder, study.config, data, overwrite=study.folder.exists(), kind="study")
+        RunFolder.create(study.folder, study.config, data, kind="study", definition=definition)
         return
     folder = RunFolder.open(study.folder)
     sources = [entry["hash"] for entry in folder.info.get("data", [])]
@@ -171,6 +174,11 @@ def _open(study: Study) -> None:
             "holds a study with other settings, or of other scenarios",
             file=study.folder,
             cure="choose another name",
+        )
+    # Claims are fixed before the evaluation. Studies of earlier versions do not name their definition.
+    if folder.info.get("definition", definition) != definition:
+        raise UsageError(
+            "holds a study with other arms or claims", file=study.folder, cure="choose another name"
         )
 
 
@@ -279,6 +287,7 @@ def _run_job(job: Job) -> float:
     config, run = study.train_config(job.arm, job.seed), study.run(job.arm, job.seed)
     steps = Checkpoints(run / "checkpoints").steps()
     if config.iterations * config.algorithm.steps_per_iteration not in steps:
+        _refuse_evaluated(job, steps)
         validation = ScenarioSet.open(study.sets.validation)
         train(config, job.weighted(), run, validation=validation, resume=bool(steps), overwrite=not steps)
     test = ScenarioSet.open(study.test)
@@ -291,6 +300,19 @@ def _run_job(job: Job) -> float:
             planner_name = str(run) if step is None else f"{run}@{step}"
             run_evaluation(EvaluationConfig(planner_name, task=task), planner, test, folder)
     return time.perf_counter() - started
+
+
+def _refuse_evaluated(job: Job, steps: Sequence[int]) -> None:
+    """Refuse to train again a run that lost its checkpoints after it was evaluated: pairs would mix two trainings."""
+    names = job.study.evaluations(job.arm)
+    evaluated = [folder for name in names if (folder := job.study.evaluation(name, job.seed)).is_dir()]
+    if not steps and evaluated:
+        run = job.study.run(job.arm, job.seed)
+        raise UsageError(
+            "has no checkpoints, but evaluations",
+            file=run,
+            cure=f"remove {' and '.join(map(str, evaluated))}",
+        )
 
 
 def _best_step(job: Job) -> int:
