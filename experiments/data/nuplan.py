@@ -29,12 +29,12 @@ PAGE = DOCS / "results" / "nuplan.md"
 BEGIN, END = "<!-- nuplan.py: begin -->", "<!-- nuplan.py: end -->"
 _WIDTH_M, _BEGIN_M, _JOINT_M, _END_M = 3.7, -150.0, 300.0, 350.0
 _CAR_M = (5.176, 2.297, 1.777)
-#: Our metric of each of the devkit's verdicts; the first two are 1 less ours.
+#: Our metric of each of the devkit's terms that do not depend on the logged ego; the first two are 1 less ours. Not
+#: taken from ``evaluation.profiles``, so that the script also runs with sources that lack it.
 METRICS = {
     "fault_score": "at_fault_collision", "drivable": "offroad", "ttc_ok": "ttc_ok", "direction": "direction",
     "speed": "speed_compliance", "comfortable": "comfortable",
 }  # fmt: skip
-#: Speed compliance agrees within this.
 _AGREES = 0.005
 
 
@@ -105,15 +105,14 @@ def shown(result: Mapping[str, Mapping[str, Mapping[str, int]]]) -> str:
     groups = list(next(iter(result.values())))
     heads = ["metric", "ours", *(f"{group}, {state}" for group in groups for state in result)]
     rows = [
-        [name, metric]
-        + [
-            f"{result[state][group][name]} of {result[state][group]['scenes']}"
-            for group in groups
-            for state in result
-        ]
+        [name, metric] + [_agreement(result[state][group], name) for group in groups for state in result]
         for name, metric in METRICS.items()
     ]
     return "\n".join(table(heads, rows))
+
+
+def _agreement(counts: Mapping[str, int], name: str) -> str:
+    return f"{counts[name]} of {counts['scenes'] - counts[f'{name}_undefined']}"
 
 
 def main() -> None:
@@ -122,7 +121,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path)
-    parser.add_argument("--state", default="now", help="name of the state of the code, stored beside others")
+    parser.add_argument("--state", default="now", help="name under which the counts are stored")
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--table", action="store_true")
     args = parser.parse_args()
