@@ -144,11 +144,13 @@ def test_command_help(probe: Any, capsys: pytest.CaptureFixture[str]):
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_each_command_help_has_an_example(name: str, capsys: pytest.CaptureFixture[str]):
+def test_each_command_help_has_an_example_within_100_columns(name: str, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
     command = cli.COMMANDS[name]
     assert cli.main([name, "--help"]) == 0
     out = capsys.readouterr().out
     assert f"drivax {name}" in out
+    assert max(map(len, out.splitlines())) <= 100
     config = getattr(importlib.import_module(command.module), command.config)
     assert dataclasses.is_dataclass(config)
     assert config.__dataclass_params__.frozen  # type: ignore[attr-defined]

@@ -135,7 +135,7 @@ def test_perturbs_fewer_steps_where_the_log_starts_later(open_road):
         )
     late = bank_of(straight_road([car(0, 0.9, 0, 6, steps=range(6, 91))]))
     history = np.asarray(noisy(late, 10, keys(64)).history)
-    assert np.ptp(history[:, 18], axis=0).max() < 1e-4, "before step 6 nobody knows the agent"
+    assert np.ptp(history[:, 18], axis=0).max() < 1e-4, "the agent is unknown before step 6"
     assert np.ptp(history[:, 19:, 1], axis=0).max() > 1e-4
 
 

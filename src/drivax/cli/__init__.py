@@ -16,6 +16,7 @@ import textwrap
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from importlib import metadata
 from inspect import getdoc
 from pathlib import Path
@@ -167,16 +168,12 @@ def _run(name: str, command: Command, arguments: list[str]) -> int:
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     module = importlib.import_module(command.module)
     config = getattr(module, command.config)
-    args, overrides = tyro.cli(
+    parse: Any = partial(tyro.cli, return_unknown_args=True) if command.overrides else tyro.cli
+    parsed = parse(
         config, prog=f"drivax {name}", args=arguments, description=_wrapped(getdoc(config) or ""),
-        config=(tyro.conf.FlagCreatePairsOff,), return_unknown_args=True,
+        config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
-    if command.overrides:
-        return int(module.run(args, overrides))
-    if overrides:
-        # tyro's own error for unknown options, with the closest ones.
-        tyro.cli(config, prog=f"drivax {name}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
-    return int(module.run(args))
+    return int(module.run(*parsed) if command.overrides else module.run(parsed))
 
 
 def _wrapped(text: str) -> str:

@@ -99,7 +99,7 @@ def _print(opened: list[Inspection]) -> None:
     console.print(tables.overview(inspection).rich())
     console.print()
     audit = tables.audit_table(inspection)
-    console.print("audit: none" if audit is None else audit.rich())
+    console.print("audit: not done" if audit is None else audit.rich())
     console.print()
     console.print(tables.listing(inspection).rich())
     if len(inspection) > tables.LISTED:
