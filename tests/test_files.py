@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import pytest
 
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.files import (
     PartialFolder,
     atomic_write,
     can_resume,
     check_output,
+    check_space,
+    explain_full_disk,
+    format_bytes,
+    free_bytes,
     replace_folder,
     write_json,
     write_text,
@@ -140,3 +146,63 @@ def test_a_partial_folder_has_one_writer_at_a_time(tmp_path: Path):
         PartialFolder(tmp_path / "set", {"seed": 1}).open()
     folder.close()
     assert names(tmp_path) == set()
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_is_reported_with_path_need_and_cure(tmp_path: Path, code: int):
+    with (
+        pytest.raises(
+            DataError, match=r"set: no space left on device \(.+ free, of about 3\.0 MB needed\); make"
+        ),
+        explain_full_disk(tmp_path / "set", needed=3_000_000),
+    ):
+        raise OSError(code, os.strerror(code))
+
+
+def test_of_nested_blocks_the_outermost_names_the_output(tmp_path: Path):
+    with (
+        pytest.raises(DataError, match=r"^\S+/set: no space left on device \([^,]+ free\)"),
+        explain_full_disk(tmp_path / "set"),
+        atomic_write(tmp_path / "set" / "manifest.json"),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_partial_folder_that_cannot_start_leaves_nothing_behind(tmp_path: Path, monkeypatch):
+    def full(path: Path, value: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("drivax.files.write_json", full)
+    with pytest.raises(OSError):
+        PartialFolder(tmp_path / "set", {"seed": 1}).open()
+    assert names(tmp_path) == set()
+
+
+def test_other_errors_of_the_system_pass_unchanged(tmp_path: Path):
+    with pytest.raises(PermissionError), explain_full_disk(tmp_path / "set"):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+
+def test_a_full_disk_during_an_atomic_write_keeps_the_old_file(tmp_path: Path):
+    path = tmp_path / "value.json"
+    write_json(path, 1)
+    with pytest.raises(DataError, match=r"value\.json: no space left on device"), atomic_write(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert json.loads(path.read_text()) == 1
+    assert [entry.name for entry in tmp_path.iterdir()] == ["value.json"]
+
+
+def test_space_is_checked_on_the_disk_of_a_folder_that_does_not_exist_yet(tmp_path: Path):
+    out = tmp_path / "sets" / "world"
+    check_space(out, free_bytes(tmp_path) // 2)
+    with pytest.raises(
+        DataError, match=r"world: no space: needs about .+, the disk has .+ left; use --limit"
+    ):
+        check_space(out, 1 << 60, cure="use --limit")
+
+
+@pytest.mark.parametrize(
+    ("size", "text"), [(999, "999 bytes"), (54_321, "54 kB"), (6.61e9, "6.6 GB"), (4.123e13, "41 TB")]
+)
+def test_sizes_are_readable(size: float, text: str):
+    assert format_bytes(size) == text

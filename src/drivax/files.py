@@ -12,6 +12,7 @@ While the folder ``sets/a`` is being written, ``sets/.a.partial`` holds::
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import glob
 import json
@@ -21,7 +22,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
+
+
+class FullDiskError(DataError):
+    """The disk is full."""
 
 
 def sync_and_close(file: IO[bytes]) -> None:
@@ -58,13 +63,56 @@ def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
         )
 
 
+def free_bytes(path: Path) -> int:
+    """Return the free bytes of the disk on which a path lies, or would."""
+    path = path.absolute()
+    while not path.exists():
+        path = path.parent
+    return shutil.disk_usage(path).free
+
+
+def format_bytes(size: float) -> str:
+    """Return a readable size: ``540 kB``, ``6.6 GB``, ``412 GB``."""
+    for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if size >= scale:
+            return f"{size / scale:.1f} {unit}" if size < 10 * scale else f"{size / scale:,.0f} {unit}"
+    return f"{size / 1e3:.0f} kB" if size >= 1e3 else f"{size:.0f} bytes"
+
+
+def check_space(path: Path, needed: int, cure: str = "make room, or choose another disk") -> None:
+    """Refuse an output of about ``needed`` bytes for which the disk has no space, before any work is done.
+
+    Raises:
+        DataError: The disk has less space left.
+    """
+    if needed > (free := free_bytes(path)):
+        problem = f"no space: needs about {format_bytes(needed)}, the disk has {format_bytes(free)} left"
+        raise DataError(problem, file=path, cure=cure)
+
+
+@contextlib.contextmanager
+def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
+    """Raise a FullDiskError that names ``path`` when the block fills the disk, and the bytes ``needed`` if known.
+
+    The operating system's error for a write names no file; of nested blocks the outermost names the output.
+    """
+    try:
+        yield
+    except (OSError, FullDiskError) as error:
+        if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        need = f", of about {format_bytes(needed)} needed" if needed else ""
+        problem = f"no space left on device ({format_bytes(free_bytes(path.parent))} free{need})"
+        raise FullDiskError(problem, file=path, cure="make room, or choose another disk") from error
+
+
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     """Yield a binary file that appears as ``path`` when the block ends; an error leaves nothing behind."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
-        with partial.open("wb") as file:
+        with explain_full_disk(path), partial.open("wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -92,8 +140,9 @@ def replace_folder(path: Path) -> Iterator[Path]:
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        yield partial
-        _publish(partial, path)
+        with explain_full_disk(path):
+            yield partial
+            _publish(partial, path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
@@ -129,8 +178,12 @@ class PartialFolder:
         except BaseException:
             self._release()
             raise
-        if not notes:
-            self._start()
+        try:
+            if not notes:
+                self._start()
+        except BaseException:
+            self.close()
+            raise
         return notes
 
     def note(self, number: int, value: Mapping[str, Any]) -> None:

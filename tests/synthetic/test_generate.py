@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ import pytest
 from numpy._core import _multiarray_umath as umath
 
 from drivax.cli.generate import Generate, run, summary
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic import generate as generation
@@ -22,6 +23,7 @@ from drivax.synthetic.generate import (
     GeneratedSet,
     Generation,
     generate,
+    generate_benchmark,
     portable_workers,
 )
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
@@ -195,6 +197,15 @@ def test_invalid_requests_are_refused(tmp_path):
     ):
         with pytest.raises(UsageError, match=text):
             generate(tmp_path / "set", *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_disk_space_is_checked_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000_000))
+    with pytest.raises(DataError, match=r"set: no space: needs about 59 MB, the disk has 5\.0 MB left"):
+        generate(tmp_path / "set", 100, progress=lambda done, total: pytest.fail("drew a scenario"))
+    with pytest.raises(DataError, match=r"sets: no space: needs about 3\.\d GB"):
+        generate_benchmark(tmp_path / "sets")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from drivax.datasets.doctor import Diagnosis, Part, counted, diagnose, free_bytes, gigabytes
+from drivax.datasets.doctor import Diagnosis, Part, counted, diagnose
+from drivax.files import format_bytes, free_bytes
 
 _COLUMNS = 100
 #: Modules of every extra, and what it is for.
@@ -74,8 +75,8 @@ def machine() -> Iterator[tuple[str, str]]:
         yield f"{extra} ({purpose})", state
     yield "cores", str(os.cpu_count())
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    yield "memory", gigabytes(memory)
-    yield "disk", f"{gigabytes(free_bytes(Path.cwd()))} free here"
+    yield "memory", format_bytes(memory)
+    yield "disk", f"{format_bytes(free_bytes(Path.cwd()))} free here"
 
 
 def _installed(module: str) -> bool:
@@ -114,7 +115,7 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
             others.append(f"{diagnosis.ignored:,} of no known format, ignored")
         if others:
             yield "other files", ", ".join(others)
-        yield "input", gigabytes(diagnosis.input_bytes)
+        yield "input", format_bytes(diagnosis.input_bytes)
     for problem in diagnosis.problems:
         # The path is printed above; only a file inside it is named.
         file = None if problem.file == diagnosis.path else problem.file
@@ -125,8 +126,8 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     if diagnosis.convertible:
         yield (
             "after convert",
-            f"about {counted(diagnosis.scenarios, 'scenario')}, {gigabytes(diagnosis.set_bytes)}"
-            f" ({gigabytes(diagnosis.free_bytes)} free)",
+            f"about {counted(diagnosis.scenarios, 'scenario')}, {format_bytes(diagnosis.set_bytes)}"
+            f" ({format_bytes(diagnosis.free_bytes)} free)",
         )
         yield "next", f"drivax convert {diagnosis.path} OUT"
     else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,6 +14,7 @@ from drivax.datasets import unsupported
 from drivax.datasets.formats import AUTO, Survey, reader_named, survey
 from drivax.datasets.reader import BadRecord, Description, Reader
 from drivax.errors import DataError, UsageError
+from drivax.files import check_space, format_bytes, free_bytes
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
 
@@ -179,18 +179,13 @@ class Estimate:
     sampled: bool = False
 
     def __str__(self) -> str:
-        size, free = gigabytes(self.size_bytes), gigabytes(self.free_bytes)
+        size, free = format_bytes(self.size_bytes), format_bytes(self.free_bytes)
         return f"about {counted(self.scenarios, 'scenario')}, {size}; {free} free"
 
     def check(self, out: Path, written: int = 0) -> None:
         """Refuse a set that will not fit; ``written`` of its scenarios are on the disk already."""
         needed = self.size_bytes * max(self.scenarios - written, 0) // max(self.scenarios, 1)
-        if needed > self.free_bytes:
-            raise DataError(
-                f"the disk has {gigabytes(self.free_bytes)} left, the set needs about {gigabytes(needed)}",
-                file=out,
-                cure="make room, choose another disk, or use --limit",
-            )
+        check_space(out, needed, "make room, choose another disk, or use --limit")
 
 
 def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: int | None) -> Estimate:
@@ -229,22 +224,6 @@ def count(reader: Reader, path: Path, stride: int = STRIDE) -> int:
     # Readers count windows of the usual stride, which tell about how long the recordings are.
     steps = STEPS + STRIDE * (scenarios / recordings - 1)
     return round(recordings * ((steps - STEPS) // stride + 1))
-
-
-def free_bytes(path: Path) -> int:
-    """Free bytes of the disk on which a path lies, or would."""
-    path = path.absolute()
-    while not path.exists():
-        path = path.parent
-    return shutil.disk_usage(path).free
-
-
-def gigabytes(size: float) -> str:
-    """A readable size: ``540 kB``, ``6.6 GB``, ``412 GB``."""
-    for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
-        if size >= scale:
-            return f"{size / scale:.1f} {unit}" if size < 10 * scale else f"{size / scale:,.0f} {unit}"
-    return f"{size / 1e3:.0f} kB" if size >= 1e3 else f"{size:.0f} bytes"
 
 
 def counted(number: int, noun: str) -> str:

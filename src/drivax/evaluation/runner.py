@@ -24,7 +24,7 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import ADDED, KEYS, Crash, EpisodeTable, Trajectories, fail_crashed
 from drivax.evaluation.memory import free_memory, report_out_of_memory, scenarios_at_a_time
 from drivax.evaluation.rollout import Episodes, check_actions, drive, episode_keys, evaluation_task
-from drivax.files import replace_folder
+from drivax.files import check_space, replace_folder
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.planners.functions import raised
@@ -113,6 +113,9 @@ def run_evaluation(
     """
     scenarios = [data[row] for row in select_scenarios(data, config.filter, config.scenarios, config.limit)]
     RunFolder.check(Path(out), overwrite, "evaluation")
+    # The scenarios to evaluate have been verified; of the others only the sizes are read.
+    sizes = sizes or Sizes.used(ScenarioSet.open(data.path, verify=False))
+    check_space(Path(out), len(scenarios) * _episode_bytes(config.traffic, sizes))
     with ProgressBar(f"evaluating {planner.name}", "scenarios", len(scenarios)) as bar:
         table = evaluate(
             planner,
@@ -123,8 +126,7 @@ def run_evaluation(
             start_step=config.start_step,
             seed=config.seed,
             batch=config.batch,
-            # The scenarios to evaluate have been verified; of the others only the sizes are read.
-            sizes=sizes or Sizes.used(ScenarioSet.open(data.path, verify=False)),
+            sizes=sizes,
             progress=lambda done, total: bar.update(done),
         )
     info: dict[str, Any] = {"kind": "evaluation", **table.info}
@@ -134,6 +136,11 @@ def run_evaluation(
         RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)
         table.write(partial_folder)
     return table
+
+
+def _episode_bytes(traffic: str, sizes: Sizes) -> int:
+    """Return about how many bytes an episode takes in a run folder, as measured on the built-in world."""
+    return 2_000 if traffic == "log" else 2_000 + STEPS * sizes.agents * 3
 
 
 def with_metrics(task: Task, more: tuple[str, ...]) -> Task:

@@ -29,7 +29,15 @@ from typing import IO, Any, Self
 import numpy as np
 
 from drivax.errors import DataError, UsageError
-from drivax.files import PartialFolder, check_output, sync_and_close, write_json
+from drivax.files import (
+    FullDiskError,
+    PartialFolder,
+    check_output,
+    check_space,
+    explain_full_disk,
+    sync_and_close,
+    write_json,
+)
 from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
 from drivax.scenario.select.splits import Shares, write_splits
 
@@ -53,16 +61,18 @@ class ScenarioWriter:
         identity: What is written, for a set that can be resumed: closed shards survive an exception or a kill, and the
             next writer with the same identity continues after them (:attr:`notes`).
         further: Writes additional files into the complete folder before it is published.
+        expected: Number of scenarios that the set will have, to check that the disk has space for them.
 
     Raises:
         UsageError: ``path`` exists, another process writes it, or a scenario has another capacity.
-        DataError: A scenario's id is in the set already, or no scenario was added.
+        DataError: A scenario's id is in the set already, no scenario was added, or the disk is full.
     """
 
     def __init__(
         self, path: str | Path, capacity: Capacity, source: Mapping[str, Any] | None = None,
         shard_size: int = 512, overwrite: bool = False, shares: Shares | None = None,
         identity: Mapping[str, Any] | None = None, further: Callable[[Path], None] | None = None,
+        expected: int = 0,
     ) -> None:  # fmt: skip
         if shard_size < 1:
             raise UsageError(f"shard_size is {shard_size}", cure="use 1 or more")
@@ -73,6 +83,7 @@ class ScenarioWriter:
         self.notes: list[Any] = []
         self._shard_size, self._shares, self._further = shard_size, shares, further
         self._buffer = np.zeros(1, record_dtype(capacity))
+        self._needed = max(expected, 1) * self._buffer.dtype.itemsize
         self._entries: list[dict[str, Any]] = []
         self._known: set[tuple[str, str]] = set()
         self._shards: list[dict[str, Any]] = []
@@ -81,7 +92,10 @@ class ScenarioWriter:
         self._partial = PartialFolder(self.path, identity)
 
     def __enter__(self) -> Self:
-        for part in self._partial.open(restart=self.overwrite):
+        check_space(self.path, self._needed)
+        with explain_full_disk(self.path, self._needed):
+            parts = self._partial.open(restart=self.overwrite)
+        for part in parts:
             if part["shard"]["count"] < self._shard_size:  # The last shard of the data is written again.
                 break
             self._shards.append(part["shard"])
@@ -158,10 +172,13 @@ class ScenarioWriter:
         self._shards.append(shard)
         self._crcs = []
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         try:
-            if kind is None:
-                self._finish()
+            with explain_full_disk(self.path, self._needed):
+                if isinstance(error, OSError | FullDiskError):
+                    raise error
+                if kind is None:
+                    self._finish()
         finally:
             if self._file is not None:
                 self._file.close()

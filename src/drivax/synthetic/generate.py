@@ -24,8 +24,9 @@ from types import MappingProxyType
 from typing import Any
 
 from drivax.errors import DrivaxError, UsageError
+from drivax.files import check_space
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.schema import CAPACITIES, Scenario
+from drivax.scenario.schema import CAPACITIES, Scenario, record_dtype
 from drivax.scenario.store import ScenarioWriter
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
 from drivax.tracking.workers import await_interrupt, worker_pool
@@ -215,7 +216,9 @@ def write_set(
     counts = _Counts()
     batch: list[Scenario] = []
     with (
-        ScenarioWriter(out, CAPACITIES[options.capacity], source, overwrite=options.overwrite) as writer,
+        ScenarioWriter(
+            out, CAPACITIES[options.capacity], source, overwrite=options.overwrite, expected=scenarios
+        ) as writer,
         closing(_draws(scenarios, seed, options)) as draws,
     ):
         for done, draw in enumerate(draws, start=1):
@@ -321,6 +324,7 @@ def generate_benchmark(
             "the benchmark's world is fixed but for its domain", cure="use generate for other settings"
         )
     counts, sets = sizes(train), dict[str, GeneratedSet]()
+    check_space(Path(out), sum(counts.values()) * record_dtype(CAPACITIES[options.capacity]).itemsize)
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:

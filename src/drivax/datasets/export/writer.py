@@ -14,7 +14,7 @@ from drivax.datasets.export.tfexample import PATHS, tf_example
 from drivax.datasets.gpudrive import file_name, gpudrive_scene
 from drivax.datasets.womd.tfrecord import example, shard_name, write_record
 from drivax.errors import UsageError
-from drivax.files import PartialFolder, check_output, sync_and_close, write_json
+from drivax.files import PartialFolder, check_output, explain_full_disk, sync_and_close, write_json
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
@@ -92,7 +92,8 @@ def export(
     partial.open()
     try:
         work = _Work(opened, rows, partial.content, out.name, options, progress)
-        files, lost = write(work)
+        with explain_full_disk(out):
+            files, lost = write(work)
         write_json(partial.content / NOTE, _note(work, files, +lost))
         _refuse_existing(out, options)  # another process may have written it in the meantime
         partial.publish()
@@ -127,7 +128,9 @@ def write_part(
     refuse_part(opened, out)
     part = {"set": opened.path.name, "hash": opened.hash, **(chosen_by or {})}
     source = {**opened.manifest["source"], "part_of": part}
-    with ScenarioWriter(out, opened.capacity, source, overwrite=overwrite, further=further) as writer:
+    with ScenarioWriter(
+        out, opened.capacity, source, overwrite=overwrite, further=further, expected=len(rows)
+    ) as writer:
         for done, row in enumerate(rows, start=1):
             writer.add(opened[row])
             if progress is not None:
