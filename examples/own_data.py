@@ -1,4 +1,4 @@
-"""Convert arrays of your own to a scenario set, audit it, and evaluate on it."""
+"""Convert your own arrays to a scenario set and evaluate the expert on it."""
 
 import tempfile
 from pathlib import Path

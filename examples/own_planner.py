@@ -1,4 +1,4 @@
-"""Evaluate a planner of your own against IDM and compare the two."""
+"""Evaluate your own planner and IDM, and print their metrics."""
 
 import tempfile
 from pathlib import Path

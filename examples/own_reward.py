@@ -1,4 +1,4 @@
-"""Add a reward term of your own, check it, and train with it."""
+"""Add your own reward term, check it, and train with it."""
 
 import tempfile
 from pathlib import Path
