@@ -1,4 +1,4 @@
-"""The long-tail study on the built-in world's benchmark, kept so that it can go on elsewhere.
+"""Store and resume the long-tail study on the built-in world's benchmark.
 
 drivax study longtail --data BENCHMARK --out STUDY
 python -m experiments.longtail keep --out STUDY      (what is done, into experiments/state/longtail)

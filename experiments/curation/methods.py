@@ -1,4 +1,4 @@
-"""Does curation find rare events? Scores of every method against the labels of the built-in world's benchmark.
+"""Evaluate every curation method against the event labels of the built-in world's benchmark.
 
     drivax generate sets/bench --benchmark
     python -m experiments.curation.methods events --bench sets/bench [--method NAME ...]
@@ -6,7 +6,7 @@
     python -m experiments.curation.methods speed --data sets/bench/train sets/womd
     python -m experiments.curation.methods table
 
-``events`` scores both test sets with the methods as they are and stores the result; ``table`` writes it into the page.
+``events`` scores both test sets and stores the result; ``table`` writes it to the page.
 ``check`` ranks scenarios of other sets by ``kinematic``: those whose events its weights were chosen by, and others that
 that were new (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare_rate 0.5``).
 Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. All measures count them

@@ -1,4 +1,4 @@
-"""One picture of each family of criticality: the scenario that it finds most critical, and why.
+"""Draw the most critical scenario of each family of methods, with its components.
 
 Run: python -m experiments.curation.pictures --data SET [--folder docs/guide] [--only kinematic|ensemble|rarity]
 """

@@ -1,9 +1,9 @@
-"""What the expert does wrong, which is what map, converter or metric do wrong.
+"""Audit the expert: its violations reveal defects of map, converter or metric.
 
-Replays logs exactly (``expert``) and drives them through the dynamics (``expert_actions``) on the built-in world and on
-every file that a reader exists for: every window, with the ego of the source and with every logged vehicle that moves
-as ego. Steps at which the log does not know the ego do not count. Off-road steps are checked a second way: they
-are "contradicted" where every corner is on the drivable side of its nearest edge, however far that is.
+Replays logs exactly (``expert``) and through the dynamics (``expert_actions``) on the built-in world and on every real
+file: every window, with the source's ego and with every moving logged vehicle as ego. Steps without the ego in the log
+are skipped. An off-road step is "contradicted" if every corner is on the drivable side of its nearest edge, however
+far.
 
     python -m experiments.data.expert_audit --data ../shared/data [--write] [--pictures FOLDER]
 

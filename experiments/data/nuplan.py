@@ -1,9 +1,9 @@
-"""Our metrics and the devkit profile against figures of nuPlan's devkit on made-up scenes.
+"""Compare our metrics and the devkit profile with values of nuPlan's devkit on synthetic scenes.
 
 python -m experiments.data.nuplan --data ../shared/data [--write]     (--write stores the result and the page)
-python -m experiments.data.nuplan --table                             (what is stored, into the page)
+python -m experiments.data.nuplan --table                             (write the stored result to the page)
 
-Every scene becomes a scenario whose logged ego is the scene's motion, so that the planner `expert` replays it.
+Every scene becomes a scenario whose logged ego has the scene's motion; the planner `expert` replays it.
 """
 
 from __future__ import annotations

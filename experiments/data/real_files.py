@@ -1,9 +1,9 @@
-"""How every planner drives every real file: outcome and score per scenario, in recorded and in reactive traffic.
+"""Evaluate every planner on every real file: outcome and score per scenario, in log replay and reactive traffic.
 
 python -m experiments.data.real_files --data ../shared/data [--write]     (--write stores the result and the page)
-python -m experiments.data.real_files --table                             (what is stored, into the page)
+python -m experiments.data.real_files --table                             (write the stored result to the page)
 
-A file that is longer than a scenario gives several, one after the other; the ego is the one of the source.
+A file longer than a scenario gives several; the ego is the source's.
 """
 
 from __future__ import annotations

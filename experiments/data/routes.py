@@ -1,7 +1,7 @@
-"""Do the candidate routes cover the log? In real files, with every logged vehicle that moves as ego in turn.
+"""Measure how well candidate routes cover logs in real files, with every moving logged vehicle as ego.
 
-A candidate covers the log when it stays within 1.5 m of it for 95 % of its steps. Where none does, the table says for
-what share of the steps the log is within 1.5 m of any lane of its direction at all: no route along lanes can do better.
+A candidate covers the log if it stays within 1.5 m of it for 95 % of its steps. Otherwise the table shows the share of
+steps at which any lane of its direction is within 1.5 m of the log: the upper bound for routes along lanes.
 
     python -m experiments.data.routes --data ../shared/data [--routes published] [--pictures FOLDER] [--write]
 

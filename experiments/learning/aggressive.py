@@ -1,4 +1,4 @@
-"""The aggressive driver of the zoo: how it is trained, whether it is aggressive, and how it gets into the package.
+"""Train, measure and export the zoo's aggressive policy.
 
 drivax train aggressive --data BENCHMARK/train --out RUNS/aggressive
 drivax train aggressive --data BENCHMARK/train --out RUNS/clone --total_steps 1536000 --algorithm.kind bc

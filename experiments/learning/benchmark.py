@@ -1,11 +1,11 @@
-"""The main table: every planner on the benchmark's test split, in recorded and in reactive traffic.
+"""Evaluate every planner on the benchmark's test split, in log replay and reactive traffic.
 
 python -m experiments.learning.benchmark drive --data BENCHMARK [--planner NAME ...] [--traffic KIND ...]
-python -m experiments.learning.benchmark judge     (what was driven, as means with intervals, and the page)
-python -m experiments.learning.benchmark table     (what is stored, into the page)
+python -m experiments.learning.benchmark judge     (means with intervals of the episodes, and the page)
+python -m experiments.learning.benchmark table     (write the stored result to the page)
 
-`drive` keeps the episodes of each planner and kind of traffic in a file of its own. Learned planners are those in
-experiments/state/policies, where `presets.py train` puts them, with several seeds each.
+`drive` stores the episodes of each planner and traffic in one file. Learned planners are read from
+experiments/state/policies, where `presets.py train` stores them, with several seeds each.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How boldly ego drives, as metrics of an evaluation (``boldness:speed_ratio``); ``aggressive.py`` uses them."""
+"""Metrics of aggressive driving (``boldness:speed_ratio``), used by ``aggressive.py``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What our presets reach on the built-in world's benchmark: trained with several seeds, judged on the test split.
+"""Train the presets with several seeds and evaluate them on the built-in world's benchmark.
 
 python -m experiments.learning.presets train PRESET --data BENCHMARK --runs RUNS [--seeds 3] [--first 0]
     [--key value ...]

@@ -1,6 +1,6 @@
-"""What ``presets.py`` and ``training.py`` stored, as tables and learning curves in the pages of the docs.
+"""Write the results of ``presets.py`` and ``training.py`` as tables and learning curves to the pages of the docs.
 
-A page shows what stands between ``<!-- presets.py: WHAT -->`` and ``<!-- presets.py: end -->``; see :func:`written`.
+The content goes between ``<!-- presets.py: WHAT -->`` and ``<!-- presets.py: end -->``; see :func:`written`.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Conversion and reading on one core: scenarios per second from TFRecord to stored, with audit, and from set to memory.
+"""Time conversion (TFRecord to set, with audit) and reading (set to memory) on one core.
 
     python -m experiments.speed.convert --data ../shared/data [--write]
 
 The Scenario proto of the real data is repeated under new ids. ``--write`` stores experiments/results/convert.json.
-Aims: 8 converted per second and core with routes and audit; read back 5,000 per second with checksums tested and
-20,000 without, from a warm page cache. The process keeps to one core; rates are per second of its processor time,
-which on an idle machine is the time that passes (given as well), and does not count what others take from the core.
+Targets per second and core: 8 scenarios converted with routes and audit; 5,000 read with checksums and 20,000 without,
+from a warm page cache. The process uses one core. Rates are per second of CPU time, which on an idle machine equals
+wall time (also given) and excludes the time of other processes.
 """
 
 from __future__ import annotations

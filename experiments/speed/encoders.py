@@ -1,8 +1,8 @@
-"""Sizes and times of the encoders on the ``optimal`` observation: stored, and put into their page.
+"""Measure sizes and times of the encoders on the ``optimal`` observation and write them to their page.
 
 python -m experiments.speed.encoders            # counts and times everything; needs a quiet machine
 python -m experiments.speed.encoders --counts   # numbers of parameters only
-python -m experiments.speed.encoders --table    # what is stored, into the page
+python -m experiments.speed.encoders --table    # write the stored result to the page
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""How long evaluations take: every planner in recorded and in reactive traffic, compilation aside.
+"""Time evaluations of every planner in log replay and reactive traffic, without compilation.
 
-An evaluation works batch by batch and compiles in the first; what is timed are the others, and the time of all batches
-follows from theirs. Nothing else may run on the machine.
+The first batch compiles, so the others are timed and extrapolated to all batches. Nothing else may run on the machine.
 
 python -m experiments.speed.evaluation --data SET [--planner NAME ...] [--write]     SET: at least 1,024 scenarios
 python -m experiments.speed.evaluation --table                                       what is stored, into the page

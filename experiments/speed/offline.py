@@ -1,4 +1,4 @@
-"""How fast offline learning is: updates of every preset ``offline/*``, ensemble members alone and together, and draws.
+"""Time offline learning: updates of every preset ``offline/*``, ensemble members alone and together, and draws.
 
 Nothing else may run on the machine.
 

@@ -1,6 +1,6 @@
-"""The simulator's speed: how it grows with maps, banks and agents, what reactive traffic costs, and each part alone.
+"""Time the simulator: scaling with maps, banks and agents, the cost of reactive traffic, and each part alone.
 
-Every ratio is of two timings of one run; every timing is a median. Nothing else may run on the machine.
+Timings are medians; a ratio compares two timings of one run. Nothing else may run on the machine.
 
 Run: python -m experiments.speed.simulator --data SET [--write]      SET: at least 4,096 scenarios of the built-in world
      python -m experiments.speed.simulator --data SET --again     (the speeds once more, added to simulator_runs.json)

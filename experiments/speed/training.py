@@ -1,7 +1,7 @@
-"""How fast PPO trains, and what of an iteration is simulation, inference and update.
+"""Time PPO training and the shares of simulation, inference and update in an iteration.
 
-Three programs by turns in one run: a whole iteration, one that only collects experience, and one that collects it with
-constant actions; the differences of their medians are the shares. Nothing else may run on the machine.
+Times three programs alternately in one run: a whole iteration, collection only, and collection with constant actions.
+The differences of their medians give the shares. Nothing else may run on the machine.
 
 python -m experiments.speed.training --data SET [--write]     SET: at least 1,024 scenarios
 """

@@ -1,4 +1,4 @@
-"""What is measured on stored scenarios of the built-in world without driving them: arrays in, numbers out."""
+"""Statistics of stored scenarios of the built-in world, without simulation."""
 
 from __future__ import annotations
 

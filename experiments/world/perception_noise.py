@@ -1,10 +1,9 @@
-"""Jitter in the tracks of real logs: the level of the built-in world's perception noise.
+"""Estimate jitter in tracks of real logs, for the built-in world's perception noise.
 
-Tracks of other moving vehicles are smoothed with a Savitzky-Golay filter of 1.1 s and order 3; what is left over is
-noise of the tracker (and the little of a drive's own snap that a cubic cannot follow). Noise that is correlated over
-time is partly taken for motion, so the residual alone understates it: the standard deviation and the correlation of
-an AR(1) process are chosen such that its residual under the same filter has the measured standard deviation and the
-measured lag-1 autocorrelation (both follow in closed form from the filter's matrix).
+Tracks of other moving vehicles are smoothed with a Savitzky-Golay filter of 1.1 s and order 3; the residual is the
+tracker's noise (and the motion that a cubic cannot follow). The filter takes part of correlated noise for motion, so
+an AR(1) process is fitted whose residual under the same filter has the measured standard deviation and lag-1
+autocorrelation (both in closed form from the filter's matrix).
 
 Run: python -m experiments.world.perception_noise --data ../shared/data --out experiments/results/perception_noise.json
 """

@@ -1,7 +1,7 @@
-"""Pictures of the built-in world: every family of roads in each domain, and every kind of labelled event.
+"""Draw the built-in world: every family of roads in each domain, and every kind of labelled event.
 
-Scenarios are generated one after the other, and the first of each family (or event) is drawn. An event is drawn at the
-moment at which ego and its actor are nearest, with the ways of both.
+Draws the first generated scenario of each family or event. An event is drawn at the step at which ego and its actor are
+closest, with both paths.
 
 Run: python -m experiments.world.pictures [--seed 0] [--folder docs/guide] [--only grid|ring|events]
 """

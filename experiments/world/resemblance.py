@@ -1,9 +1,8 @@
-"""How the built-in world compares with the real recordings at hand: one figure, medians, Kolmogorov-Smirnov distances.
+"""Compare the built-in world with real recordings: one figure, medians, Kolmogorov-Smirnov distances.
 
-Subjects are ego and every other vehicle within 50 m of it on average that is there all the time and drives at least
-5 m, in the world as in the recordings: with a dozen recordings their egos alone would be a dozen drives. The files at
-hand are a handful of places, no fair sample of any data set: differences in the number of agents say as much about
-them as about the world.
+Compares ego and every other vehicle that is always valid, within 50 m of ego on average and drives at least 5 m, in the
+world and the recordings. The recordings come from a few places and do not represent any data set, so differences in
+the number of agents may reflect these places.
 
 Run: python -m experiments.world.resemblance --data ../shared/data --scenarios 256 [--write]
 """

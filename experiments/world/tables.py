@@ -1,4 +1,4 @@
-"""Tables of what ``targets.py`` measures: all of it for a terminal, the targets in Markdown for the guide."""
+"""Tables of the measurements of ``targets.py``: all for the terminal, targets in Markdown for the guide."""
 
 from __future__ import annotations
 

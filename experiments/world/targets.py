@@ -1,9 +1,9 @@
-"""The built-in world, measured: the expert, the others, the events, how difficult it is, and how much it covers.
+"""Measure the built-in world: expert, other agents, events, difficulty and coverage.
 
-Two sets are written (or read, where an earlier run kept them): one at the configured rate of rare events, and one in
-which every scenario has an event. Everything is driven through the simulator and its metrics, on the tracks as
-recorded, with their perception noise: the generator judged its expert on the tracks without noise, with 10 cm to
-spare. The comparison with real recordings is ``experiments/world/resemblance.py``.
+Writes (or reads from an earlier run) two sets: one at the configured rate of rare events, and one with an event in
+every scenario. The simulator evaluates all scenarios on the recorded tracks with perception noise; the generator
+checked its expert on noise-free tracks with a margin of 10 cm. ``experiments/world/resemblance.py`` compares with real
+recordings.
 
 Run: python -m experiments.world.targets --scenarios 256 --workers 2 [--domain ring] [--keep FOLDER] [--write]
      python -m experiments.world.targets --timed 1000   (scenarios per second, on a machine that does nothing else)
