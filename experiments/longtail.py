@@ -1,14 +1,14 @@
 """Store and resume the long-tail study on the built-in world's benchmark.
 
 drivax study longtail --data BENCHMARK --out STUDY
-python -m experiments.longtail keep --out STUDY      (what is done, into experiments/state/longtail)
-python -m experiments.longtail restore --out STUDY   (what was kept, into a new folder, where the study continues)
-python -m experiments.longtail finish --out STUDY    (its results, into experiments/results/longtail.json)
-python -m experiments.longtail table                 (the results that were kept, into the page)
+python -m experiments.longtail keep --out STUDY      (store finished parts in experiments/state/longtail)
+python -m experiments.longtail restore --out STUDY   (restore them to a new folder, where the study continues)
+python -m experiments.longtail finish --out STUDY    (write the results to experiments/results/longtail.json)
+python -m experiments.longtail table                 (write the stored results to the page)
 
-Of every arm the run without its checkpoints and the episodes are kept, and so are the scores, without what they are
-made of: another processor rounds otherwise, and what was trained with other weights belongs to another study.
-BENCHMARK is what `drivax generate BENCHMARK --benchmark` tested.
+`keep` stores each arm's run without checkpoints, its episodes, and the scores without components. Scores are stored
+because another processor rounds differently, and runs trained with other weights belong to another study.
+BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv")
 
 
 def keep(folder: Path) -> None:
-    """Keep every evaluated arm that is not kept yet, the study's own files, its scores and its results."""
+    """Store every evaluated arm that is not stored yet, the study's own files, scores and results."""
     study = _study(folder)
     KEPT.mkdir(parents=True, exist_ok=True)
     _pack([folder], folder, KEPT / "study.tar.xz")
@@ -60,7 +60,7 @@ def keep(folder: Path) -> None:
 
 
 def restore(folder: Path) -> None:
-    """Put what was kept, or else the study of the repository's history, where the study looks for it."""
+    """Restore the stored study, or else the one in the repository's history, to the study's folder."""
     kept = fetched("benchmarks/results/longtail", KEPT)
     folder.mkdir(parents=True)
     for file in sorted(kept.glob("*.tar.xz")):
@@ -106,7 +106,7 @@ def filled(page: str, results: dict[str, Any]) -> str:
 
 
 def _pack(folders: list[Path], study: Path, out: Path) -> None:
-    """Pack the files of some folders, without paths of this machine."""
+    """Pack the files of folders, without local paths."""
     with tarfile.open(out, "w:xz") as packed:
         for file in (folder / name for folder in folders for name in FILES):
             if file.is_file():
@@ -117,7 +117,7 @@ def _pack(folders: list[Path], study: Path, out: Path) -> None:
 
 
 def _without_paths(file: Path) -> bytes:
-    """Return the content of a file with data and runs by name instead of the paths of this machine."""
+    """Replace local paths in the content of a file by names of data and runs."""
     if file.name == "run.json":
         info = json.loads(file.read_bytes())
         info.pop("command", None)  # a restored study has none
@@ -130,7 +130,7 @@ def _without_paths(file: Path) -> bytes:
 
 
 def main() -> None:
-    """Keep, restore, store the results, or fill the page."""
+    """Store, restore, finish, or write the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -21,7 +21,7 @@ STORED = "03b904f"
 
 
 def fetched(path: str, out: Path) -> Path:
-    """Return ``out``; where it does not exist, extract the folder ``path`` of commit ``STORED`` into it first."""
+    """Return ``out``, after extracting ``path`` of commit ``STORED`` into it if it does not exist."""
     if not out.exists():
         archive = subprocess.run(
             ["git", "archive", f"{STORED}:{path}"], cwd=ROOT, check=True, capture_output=True
@@ -32,7 +32,7 @@ def fetched(path: str, out: Path) -> Path:
 
 
 def save_picture(figure: Figure, out: Path) -> None:
-    """Write a figure as a PNG of 256 colours, a third of the size of one in true colour."""
+    """Write a figure as a PNG of 256 colours, a third of the size of true colour."""
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png")
     Image.open(drawn).convert("RGB").quantize(dither=Image.Dither.NONE).save(out, optimize=True)

@@ -7,11 +7,11 @@
     python -m experiments.curation.methods table
 
 ``events`` scores both test sets and stores the result; ``table`` writes it to the page.
-``check`` ranks scenarios of other sets by ``kinematic``: those whose events its weights were chosen by, and others that
-that were new (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare_rate 0.5``).
-Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. All measures count them
-as if the natural share of scenarios had an event, so that precision is that of an ordinary set. How usual an action is,
-``test`` alone says; ensembles are trained on ``train``. With ``--method`` only these are scored, and the rest stays.
+``check`` ranks scenarios of other sets by ``kinematic``: those used to choose its weights, and new ones (``drivax
+generate sets/fresh --scenarios 1024 --seed 20261124 --rare_rate 0.5``).
+Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. Measures are weighted to
+the natural share of events, so precision is that of an ordinary set. The density of actions comes from ``test`` alone;
+ensembles are trained on ``train``. ``--method`` scores only these methods and keeps the other results.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ NATURAL = 0.05
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known of the scenarios of both test sets: kind and severity of the event, its steps, where ego is."""
+    """Facts of the scenarios of both test sets: kind, severity and steps of the event, valid steps of ego."""
 
     kind: Any
     severity: Any
@@ -95,7 +95,7 @@ class Truth:
         )
 
     def groups(self) -> dict[str, Any]:
-        """Which scenarios are to be found: all with an event, those that do and do not force a reaction, every kind."""
+        """Masks of scenarios to detect: all events, events with and without a forced reaction, each kind."""
         forced = self.severity >= FORCED_MPS2
         found = {
             "all": self.kind > 0, "forced": (self.kind > 0) & forced, "mild": (self.kind > 0) & ~forced
@@ -104,7 +104,7 @@ class Truth:
 
 
 def measured(truth: Truth, events: Any, steps: Any, scenarios: Any) -> dict[str, Any]:
-    """How well scores find a group of events among scenarios that have none, at both scales."""
+    """Return how well scores detect a group of events among scenarios without an event, at both scales."""
     rows = events | (truth.kind == 0)
     label = events[rows]
     weight = np.where(label, NATURAL / label.sum(), (1 - NATURAL) / (~label).sum())
@@ -130,7 +130,7 @@ def measured(truth: Truth, events: Any, steps: Any, scenarios: Any) -> dict[str,
 
 
 def events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, Any]:
-    """Methods, or all of them, on both test sets, next to those that are stored."""
+    """Evaluate methods (default: all) on both test sets and merge them with stored results."""
     sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
     hashes = {data.path.name: data.hash for data in sets}
     if only and stored.get("sets") != hashes:
@@ -151,7 +151,7 @@ def events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, An
 def scored(
     sets: list[ScenarioSet], train: Path, names: list[str]
 ) -> Iterator[tuple[str, ScoreTable, ScoreTable]]:
-    """By method: the table of the first set, and of all sets one after the other."""
+    """Return, by method, the score table of the first set and of all sets concatenated."""
     for name in ("kinematic", "published"):
         if name in names:
             tables = [curate(name, Request(data)) for data in sets]
@@ -178,7 +178,7 @@ def scored(
 
 
 def checked(paths: list[Path]) -> dict[str, Any]:
-    """How well ``kinematic`` finds the events that force a reaction in each of some sets."""
+    """Return how well ``kinematic`` detects events that force a reaction, by set."""
     found = {}
     for path in paths:
         data = ScenarioSet.open(path)
@@ -196,14 +196,14 @@ def checked(paths: list[Path]) -> dict[str, Any]:
 
 
 def error_interval(ensemble: Ensemble, table: ScoreTable, data: ScenarioSet) -> tuple[float, float]:
-    """Of the rank correlation of scores and errors of steps: 95 %, from scenarios drawn with replacement."""
+    """Bootstrap 95 % interval, over scenarios, of the rank correlation of step scores and errors."""
     predictions = ensemble.predictions(data)
     error, known = predictions.error(ensemble.deviation, None), predictions.known
     return correlation_interval(table.steps[known], error[known], np.nonzero(known)[0])
 
 
 def joined(tables: list[ScoreTable]) -> ScoreTable:
-    """Tables one after the other."""
+    """Concatenate score tables."""
     first = tables[0]
     stacked = {
         name: np.concatenate([getattr(table, name) for table in tables])
@@ -214,7 +214,7 @@ def joined(tables: list[ScoreTable]) -> ScoreTable:
 
 
 def found_by(truth: Truth, table: ScoreTable) -> dict[str, Any]:
-    """What a method finds of every group."""
+    """Measure one method on every group of events."""
     return {
         "events": {
             name: measured(truth, events, table.steps, table.scenarios)
@@ -224,7 +224,7 @@ def found_by(truth: Truth, table: ScoreTable) -> dict[str, Any]:
 
 
 def draws(table: ScoreTable) -> dict[str, Any]:
-    """What the default weights of a table do."""
+    """Statistics of the default weights of a table."""
     return {
         scale: vars(draw_statistics(sampling_weights(table, WeightConfig(), scale), table.drawable))
         for scale in ("step", "scenario")
@@ -252,7 +252,7 @@ def speed(paths: list[Path], count: int) -> dict[str, Any]:
 
 
 def stacking(data: list[Any], sizes: Sizes) -> float:
-    """Processor seconds to stack scenarios as scoring does, batch after batch."""
+    """CPU seconds to stack scenarios batch by batch, as scoring does."""
     began = time.process_time()
     for first in range(0, len(data), BATCH):
         ScenarioBank.from_scenarios(data[first : first + BATCH], trim=sizes)
@@ -260,7 +260,7 @@ def stacking(data: list[Any], sizes: Sizes) -> float:
 
 
 def events_table(stored: dict[str, Any]) -> str:
-    """By method: all events and those that force a reaction, at both scales."""
+    """Table by method: all events and those that force a reaction, at both scales."""
     lines = [
         "| method | events | scenarios: AUC | precision | steps: AUC | precision |",
         "|---|---|---|---|---|---|",
@@ -275,13 +275,13 @@ def events_table(stored: dict[str, Any]) -> str:
 
 
 def cell(one: dict[str, Any], measure: str, digits: int) -> str:
-    """A measure with its interval."""
+    """Format a value with its interval."""
     low, high = one[f"{measure}_interval"]
     return f"{one[measure]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def ensemble_checks_table(stored: dict[str, Any]) -> str:
-    """How far members disagree where they err."""
+    """Table of the correlation of disagreement and errors."""
     lines = ["| ensemble | rank correlation of scores and errors, by step |", "|---|---|"]
     for name in ENSEMBLES:
         one = stored["methods"][name]
@@ -291,7 +291,7 @@ def ensemble_checks_table(stored: dict[str, Any]) -> str:
 
 
 def checks_table(stored: dict[str, Any]) -> str:
-    """What ``kinematic`` finds in other sets."""
+    """Table of ``kinematic`` on other sets."""
     lines = ["| set | scenarios | of them with an event that forces a reaction | AUC |", "|---|---|---|---|"]
     for name, one in stored["checks"].items():
         lines.append(f"| `{name}` | {one['scenarios']} | {one['events']} | {cell(one, 'auc', 3)} |")
@@ -299,7 +299,7 @@ def checks_table(stored: dict[str, Any]) -> str:
 
 
 def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
-    """One measure by kind of event and method."""
+    """Table of one measure by kind of event and method."""
     methods = stored["methods"]
     kinds = [kind.name.lower() for kind in EventKind if kind]
     lines = ["| event | scenarios | " + " | ".join(f"`{name}`" for name in methods) + " |"]
@@ -312,7 +312,7 @@ def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
 
 
 def draws_table(stored: dict[str, Any]) -> str:
-    """What the default weights do to an ordinary set."""
+    """Table of the effect of the default weights on an ordinary set."""
     lines = [
         "| method | scale | effective sample | of scenarios | tilt | largest | draws from 5 % |",
         "|---|---|---|---|---|---|---|",
@@ -327,7 +327,7 @@ def draws_table(stored: dict[str, Any]) -> str:
 
 
 def speed_table(stored: dict[str, Any]) -> str:
-    """Seconds per 10,000 scenarios."""
+    """Table of seconds per 10,000 scenarios."""
     cores = stored["speed"]["cores"]
     lines = [
         f"| set | method | 10,000 scenarios on {cores} cores (s) | processor seconds | over stacking alone |",
@@ -343,7 +343,7 @@ def speed_table(stored: dict[str, Any]) -> str:
 
 
 def filled(text: str, stored: dict[str, Any]) -> str:
-    """The page with its tables as stored."""
+    """Return the page with the stored tables."""
     tables = {
         "events": events_table(stored),
         "scenario auc": kinds_table(stored, "auc", 3),

@@ -35,7 +35,7 @@ DrawPlots = Callable[[list[Axes], int, int], None]
 
 
 def picture(data: ScenarioSet, table: ScoreTable, plots: int, draw_plots: DrawPlots, out: Path) -> None:
-    """The most critical scenario at its most critical step, and plots next to it."""
+    """Draw the most critical scenario at its most critical step, with plots next to it."""
     row = int(table.order[0])
     step = int(table.steps[row].argmax())
     page = Figure(figsize=SIZE, dpi=DPI, facecolor="white", layout="constrained")
@@ -50,7 +50,7 @@ def picture(data: ScenarioSet, table: ScoreTable, plots: int, draw_plots: DrawPl
 
 
 def over_time(axes: Axes, step: int, what: str) -> None:
-    """Seconds along the axis, and the moment of the scene."""
+    """Label the time axis in seconds and mark the drawn step."""
     axes.axvline(step * DT_S, color=LIGHT["log"], linewidth=1.0, linestyle=":")
     axes.set(xlabel="s", xlim=(0.0, (STEPS - 1) * DT_S), title=what)
     axes.title.set_fontsize(10)
@@ -58,7 +58,7 @@ def over_time(axes: Axes, step: int, what: str) -> None:
 
 
 def kinematic(data: ScenarioSet, out: Path) -> None:
-    """Components over time, each as it counts, and the score."""
+    """Plot weighted components over time, and the score."""
     table = curate("kinematic", Request(data))
 
     def draw_plots(axes: list[Axes], row: int, step: int) -> None:
@@ -80,7 +80,7 @@ def _weights(table: ScoreTable) -> dict[str, float]:
 
 
 def ensemble(data: ScenarioSet, out: Path) -> None:
-    """What each member would do, what the expert did, and the score."""
+    """Plot the members' predictions, the expert's actions, and the score."""
     ensemble = train_ensemble(EnsembleConfig(), data)
     table, predictions = ensemble_table(ensemble, data), ensemble.predictions(data)
 
@@ -105,7 +105,7 @@ def ensemble(data: ScenarioSet, out: Path) -> None:
 
 
 def rarity(data: ScenarioSet, out: Path) -> None:
-    """The density of all actions, and the actions of the scenario."""
+    """Plot the density of all actions, and the actions of the scenario."""
     table = curate("action_rarity", Request(data))
     found = score_steps(data, ExpertActions(), None)
     action, known = np.asarray(found["action"]), np.asarray(found["known"])
@@ -128,7 +128,7 @@ def rarity(data: ScenarioSet, out: Path) -> None:
 
 
 def main() -> None:
-    """Scores, draws, and says which scenarios were drawn."""
+    """Score, draw, and print the drawn scenarios."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

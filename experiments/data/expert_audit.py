@@ -7,9 +7,8 @@ far.
 
     python -m experiments.data.expert_audit --data ../shared/data [--write] [--pictures FOLDER]
 
-``--write`` stores docs/results/expert-audit.md and experiments/results/expert_audit.json; ``--pictures`` draws every
-exact replay that is not clean at its first fault.
-"""
+``--write`` stores docs/results/expert-audit.md and experiments/results/expert_audit.json; ``--pictures`` draws the
+first violation of every exact replay. """
 
 from __future__ import annotations
 
@@ -53,14 +52,14 @@ HEAD = (
 
 @dataclass(frozen=True)
 class Case:
-    """A scenario and the line of the table that it counts for."""
+    """A scenario and its line in the table."""
 
     group: str
     scenario: Scenario
 
 
 def moving_vehicles(recording: Recording) -> list[int]:
-    """Rows of logged vehicles, ego aside, that are there now and move."""
+    """Rows of logged vehicles, without ego, that are valid at the current step and move."""
     now, tracks = recording.current_step, recording.tracks
     rows = []
     for row in np.flatnonzero((tracks.kind == AgentKind.VEHICLE) & tracks.valid[:, now]):
@@ -74,7 +73,7 @@ def moving_vehicles(recording: Recording) -> list[int]:
 
 
 def cases(data: Path | None, world: int) -> Iterator[Case]:
-    """The built-in world, then every window of every file: its ego, then its other vehicles."""
+    """Yield the built-in world, then every window of every file with its ego and its other vehicles."""
     for index in range(world):
         yield Case("built-in world: ego", assemble(generate_recording(0, index)))
     if data is None:
@@ -91,7 +90,7 @@ def cases(data: Path | None, world: int) -> Iterator[Case]:
 
 
 def rows_of(batch: list[Case], planner: str) -> list[dict[str, Any]]:
-    """What the audit tells of each case of a batch, which is filled up so that one program serves all."""
+    """Return the audit of each case of a batch, padded so that one program serves all batches."""
     filled = [case.scenario for case in batch] + [batch[-1].scenario] * (BATCH - len(batch))
     bank = ScenarioBank.from_scenarios(filled, trim=False)
     facts = {name: np.asarray(v) for name, v in replay(bank, jnp.arange(BATCH), planner != "expert").items()}
@@ -147,7 +146,7 @@ def nearest_edges_say_on_road(scenario: Scenario, step: int) -> bool:
 
 
 def _left_of_nearest(point: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Distance of a point to the nearest segment, m, positive on its left; at a vertex the clearer side counts."""
+    """Signed distance of a point to the nearest segment, m, positive on its left."""
     along, from_a = b - a, point - a
     squared = np.maximum((along**2).sum(1), 1e-12)
     share = np.clip((along * from_a).sum(1) / squared, 0.0, 1.0)
@@ -163,12 +162,12 @@ def _first(holds: np.ndarray) -> int | None:
 
 
 def is_clean(row: Mapping[str, Any]) -> bool:
-    """No collision, never off the road, no red light."""
+    """Whether there is no collision, off-road step or red light."""
     return row["collision_step"] is None and row["offroad_steps"] == 0 and row["red_light_step"] is None
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """One line per group and planner."""
+    """Table with one line per group and planner."""
     lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
     for group in dict.fromkeys(row["group"] for row in rows):
         for planner in PLANNERS:
@@ -196,7 +195,7 @@ def _middle(rows: list[dict[str, Any]], name: str, digits: int) -> str:
 
 
 def offenders(rows: list[dict[str, Any]]) -> str:
-    """Every exact replay that is not clean."""
+    """Table of exact replays with a violation."""
     found = [row for row in rows if row["planner"] == "expert" and not is_clean(row)]
     if not found:
         return "Every exact replay is clean."
@@ -221,7 +220,7 @@ def offenders(rows: list[dict[str, Any]]) -> str:
 
 
 def draw(row: Mapping[str, Any], scenario: Scenario, folder: Path) -> None:
-    """A picture of a fault at its first step."""
+    """Draw a violation at its first step."""
     from drivax.report.pictures.still import draw_scenario
 
     steps = [row[name] for name in ("collision_step", "first_offroad_step", "red_light_step")]
@@ -231,7 +230,7 @@ def draw(row: Mapping[str, Any], scenario: Scenario, folder: Path) -> None:
 
 
 def main() -> int:
-    """Audit, print, and store where asked to."""
+    """Audit, print, and store on request."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -39,7 +39,7 @@ _AGREES = 0.005
 
 
 def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
-    """The scene as a scenario: ego replays its motion, the others keep their velocity."""
+    """Return the scene as a scenario: ego has its motion, other agents keep their velocity."""
     rows = np.concatenate([np.array(scene["past"])[:-1], np.array(scene["ego"])])
     time_s = DT_S * (np.arange(len(rows)) - 10)
     agents = scene["agents"]
@@ -80,7 +80,7 @@ def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
 
 
 def measured(data: Path) -> dict[str, Any]:
-    """Of each group of scenes, in how many every metric agrees with the devkit."""
+    """Count, for each group, the scenes in which a metric agrees with the devkit."""
     groups = json.loads(gzip.decompress((data / "nuplan_metrics" / "verdicts.json.gz").read_bytes()))
     counts: dict[str, Any] = {}
     for group, scenes in groups.items():
@@ -101,7 +101,7 @@ def _verdict(devkit: Mapping[str, Any], name: str) -> float:
 
 
 def shown(result: Mapping[str, Mapping[str, Mapping[str, int]]]) -> str:
-    """The counts of every stored state, in Markdown."""
+    """Return the counts of every stored state in Markdown."""
     groups = list(next(iter(result.values())))
     heads = ["metric", "ours", *(f"{group}, {state}" for group in groups for state in result)]
     rows = [
@@ -116,7 +116,7 @@ def _agreement(counts: Mapping[str, int], name: str) -> str:
 
 
 def main() -> None:
-    """Measure, store, and fill the page."""
+    """Measure, store, and write the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -44,7 +44,7 @@ TRAFFIC = ("log", "idm")
 
 
 def scenarios_of(data: Path) -> Iterator[tuple[str, Scenario]]:
-    """Every scenario of every file, with the name of the folder of its file."""
+    """Yield every scenario of every file, with the name of its folder."""
     for file in find_files(data)[0]:
         for recording in detect(file).read(file):
             if isinstance(recording, BadRecord):
@@ -54,7 +54,7 @@ def scenarios_of(data: Path) -> Iterator[tuple[str, Scenario]]:
 
 
 def measured(data: Path) -> dict[str, Any]:
-    """Outcome, score and progress of every planner, scenario by scenario."""
+    """Return outcome, score and progress of every planner by scenario."""
     sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
     sources, scenarios = zip(*scenarios_of(data), strict=True)
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
@@ -86,7 +86,7 @@ def _number(value: float) -> float | None:
 
 
 def tables(result: dict[str, Any]) -> str:
-    """A table per kind of traffic: a row per scenario, a column per planner."""
+    """Return a table per kind of traffic: scenarios in rows, planners in columns."""
     lines: list[str] = []
     for kind, planners in result["planners"].items():
         lines += [
@@ -109,13 +109,13 @@ def _cell(one: dict[str, Any]) -> str:
 
 
 def into_page(result: dict[str, Any]) -> None:
-    """Puts the tables into the page."""
+    """Write the tables to the page."""
     before, rest = PAGE.read_text().split(BEGIN)
     PAGE.write_text(f"{before}{BEGIN}\n\n{tables(result)}\n\n{END}{rest.split(END)[1]}")
 
 
 def main() -> None:
-    """Measures as asked, stores and shows."""
+    """Measure, store and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

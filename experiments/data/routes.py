@@ -57,7 +57,7 @@ def coverage(scenario: Scenario, reach_m: float = REACH_M) -> Float[Array, " rou
 
 
 def candidate_coverage(scenario: Scenario) -> float:
-    """The largest coverage of a candidate: of any route that does not come from the log itself."""
+    """Largest coverage of a candidate, that is of a route that does not come from the log."""
     of_log = [LOG_ROW] if Flag.ROUTE in scenario.has else [GOAL_ROW, LOG_ROW]
     return float(np.delete(coverage(scenario), of_log).max(initial=0.0))
 
@@ -80,7 +80,7 @@ def lane_coverage(scenario: Scenario, reach_m: float = REACH_M) -> float:
 
 @dataclass(frozen=True)
 class Row:
-    """One vehicle taken as ego.
+    """One vehicle as ego.
 
     Attributes:
         source: The file.
@@ -104,12 +104,12 @@ class Row:
 
     @property
     def covered(self) -> bool:
-        """Whether some candidate covers the log."""
+        """Whether a candidate covers the log."""
         return self.candidate >= SHARE
 
 
 def movers(recording: Recording, style: RouteStyle) -> Iterator[tuple[Scenario, bool]]:
-    """Every vehicle that is there now and drives 5 m or more, as ego; and whether it is the source's ego."""
+    """Yield every vehicle that is valid now and drives 5 m or more as ego; flag the source's ego."""
     tracks = recording.tracks
     there = (tracks.kind == AgentKind.VEHICLE) & tracks.valid[:, recording.current_step]
     for row in np.flatnonzero(there):
@@ -119,7 +119,7 @@ def movers(recording: Recording, style: RouteStyle) -> Iterator[tuple[Scenario, 
 
 
 def recordings(data: Path | None, world: int) -> Iterator[tuple[str, Recording]]:
-    """Windows of the world and of all real files."""
+    """Yield windows of the built-in world and of all real files."""
     for index in range(world):
         yield "built-in world", generate_recording(0, index)
     for file in find_files(data)[0] if data else ():
@@ -131,7 +131,7 @@ def recordings(data: Path | None, world: int) -> Iterator[tuple[str, Recording]]
 
 
 def measured(source: str, scenario: Scenario, ego: bool) -> Row:
-    """The row of one scenario."""
+    """Return the row of one scenario."""
     return Row(
         source=source,
         scenario_id=scenario.id,
@@ -145,7 +145,7 @@ def measured(source: str, scenario: Scenario, ego: bool) -> Row:
 
 
 def draw(scenario: Scenario, row: Row, folder: Path) -> None:
-    """A picture of the log (dots), the route to the goal, the other candidates, lanes and road edges."""
+    """Draw the log (dots), the route to the goal, the other candidates, lanes and road edges."""
     import matplotlib.pyplot as plt
 
     blocks = scenario.segment_blocks
@@ -171,7 +171,7 @@ def draw(scenario: Scenario, row: Row, folder: Path) -> None:
 
 
 def table(rows: list[Row]) -> str:
-    """Per source: logs, those with a route to the goal, those covered, those that lanes could cover."""
+    """Table by source: logs, logs with a route to the goal, covered logs, logs coverable by lanes."""
     lines = [
         "| source | lane graph | logs | with a route | covered | coverable by lanes | source's ego |",
         "|---|---|---|---|---|---|---|",
@@ -186,7 +186,7 @@ def table(rows: list[Row]) -> str:
 
 
 def main() -> None:
-    """Measures, prints, and draws or writes what was asked for."""
+    """Measure, print, draw or store."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

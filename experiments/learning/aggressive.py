@@ -9,12 +9,10 @@ python -m experiments.learning.aggressive judge --data BENCHMARK/validation --ru
 python -m experiments.learning.aggressive pack --data BENCHMARK/validation --runs RUNS
 python -m experiments.learning.aggressive table
 
-BENCHMARK is what `drivax generate BENCHMARK --benchmark` made. The clone has the same observation and as many
-updates toward the log as the aggressive driver has before it learns by reward. `judge` measures on the validation
-split who drives how in ego's place; how the two policies drive in the place of other vehicles, one at a time, which
-is what they do as traffic; and what meets a car that follows IDM in each kind of traffic. `pack` writes the policy
-into the package, with what was measured of it.
-"""
+BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. The clone has the observation of the aggressive
+policy and its number of behaviour cloning updates. `judge` evaluates on the validation split: all planners as ego, both
+policies in place of other vehicles, one at a time, as in traffic, and an IDM car in each kind of traffic. `pack`
+exports the policy and its measurements to the package. """
 
 from __future__ import annotations
 
@@ -62,7 +60,7 @@ Table = dict[str, dict[str, Any]]
 
 
 def in_egos_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> dict[str, Any]:
-    """The log, IDM along the route, the clone and the aggressive driver, as ego."""
+    """Evaluate log, IDM, behaviour cloning and aggressive policy as ego."""
     drivers: dict[str, tuple[Planner, Task]] = {
         "log": (make_planner("expert"), Task()),
         "idm": (make_planner("idm"), Task()),
@@ -92,7 +90,7 @@ def _summary(episodes: EpisodeTable, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
-    """Both policies in the place of the vehicles nearest to ego, one at a time, all others as logged."""
+    """Evaluate both policies in place of the vehicles nearest to ego, one at a time, among logged agents."""
     traffic = policy_traffic(runs / "aggressive", count=OTHERS)
     start = jax.jit(jax.vmap(lambda bank, row: traffic.start(bank, row, CURRENT_STEP), (None, 0)))
     table: Table = {}
@@ -118,7 +116,7 @@ def _driven(
     row: np.ndarray[Any, Any],
     slot: np.ndarray[Any, Any],
 ) -> dict[str, np.ndarray[Any, Any]]:
-    """Metrics of one agent of each of these rows that a planner drives; NaN where undefined."""
+    """Return metrics of a planner-driven agent for each row; NaN where undefined."""
 
     def one(planner: Planner, bank: ScenarioBank, row: jax.Array, slot: jax.Array) -> Any:
         keys = jax.random.key(0)[None]
@@ -135,7 +133,7 @@ def _driven(
 
 
 def in_traffic(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
-    """What meets a car that follows IDM along its route, by how the others drive."""
+    """Evaluate an IDM car along its route in each kind of traffic."""
     kinds = {name: find_traffic(name) for name in ("log", "idm")}
     kinds |= {name: policy_traffic(runs / name) for name in ("clone", "aggressive")}
     metrics_shown = ("short_ttc", "min_ttc", "max_braking", "collision", "at_fault_collision", "success")
@@ -151,7 +149,7 @@ PARTS = {"ego": in_egos_place, "others": in_others_place, "traffic": in_traffic}
 
 
 def judged(args: argparse.Namespace) -> None:
-    """Measures, prints, and with --write stores what was measured next to what is stored of the other parts."""
+    """Measure, print, and with --write merge the result with the stored parts."""
     stored = ScenarioSet.open(args.data)
     scenarios = list(stored)
     bank, names = ScenarioBank.from_scenarios(scenarios), [dict(row) for row in scenario_names(scenarios)]
@@ -170,14 +168,14 @@ def judged(args: argparse.Namespace) -> None:
 
 
 def _means(found: Mapping[str, Any]) -> dict[str, Any]:
-    """The same tables with means only."""
+    """Return the same tables with means only."""
     if "mean" in found:
         return found["mean"] if found["mean"] is None else round(found["mean"], 4)
     return {name: _means(part) for name, part in found.items()}
 
 
 def packed(args: argparse.Namespace) -> None:
-    """Writes the policy into the package, with what is stored of it."""
+    """Export the policy and its measurements to the package."""
     found = json.loads(RESULT.read_text())
     bank = ScenarioBank.from_scenarios([ScenarioSet.open(args.data)[0]])
     measured = {
@@ -199,7 +197,7 @@ COLUMNS = {
 
 
 def tables() -> str:
-    """What is stored, as the tables of the guide."""
+    """Return the stored results as tables of the guide."""
     found = json.loads(RESULT.read_text())
     parts = (found["ego"]["drivers"], found["ego"]["minus"], found["others"], found["traffic"])
     return "\n".join(_table(rows) for rows in parts)
@@ -218,7 +216,7 @@ def _table(rows: Mapping[str, Any]) -> str:
 
 
 def main() -> None:
-    """Judges, packs, or prints what is stored."""
+    """Measure, export, or print the stored results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

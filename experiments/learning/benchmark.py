@@ -77,12 +77,12 @@ class Driven:
 
 
 def learned() -> dict[str, list[Path]]:
-    """The folders of every seed of every learned planner."""
+    """Return the folders of all seeds of every learned planner."""
     return {path.name: sorted(path.glob("seed-*")) for path in sorted(POLICIES.glob("*")) if path.is_dir()}
 
 
 def drivers(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
-    """What is called so: one planner, or one for each seed."""
+    """Return the planners of a name: one, or one per seed."""
     if name == BOX:
         return [(RandomActions(), Task(actions=Published()))]
     folders = learned().get(name)
@@ -105,7 +105,7 @@ def until_failure(results: EpisodeTable) -> Metrics:
 
 
 def drive(args: argparse.Namespace) -> None:
-    """Drives every planner asked for in every kind of traffic, and stores the episodes."""
+    """Evaluate the requested planners in each kind of traffic and store the episodes."""
     stored = ScenarioSet.open(args.data / "test")
     scenarios = list(stored)
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
@@ -141,12 +141,12 @@ def drive(args: argparse.Namespace) -> None:
 
 
 def file_of(name: str, kind: str) -> Path:
-    """Where the episodes are kept."""
+    """File of the stored episodes."""
     return EPISODES / f"{name.replace(' ', '_')}-{kind}.npz"
 
 
 def episodes(name: str, kind: str) -> Driven | None:
-    """What is stored of a planner; None where it has not driven."""
+    """Return the stored episodes of a planner; None if there are none."""
     file = file_of(name, kind)
     if not file.is_file():
         return None
@@ -156,7 +156,7 @@ def episodes(name: str, kind: str) -> Driven | None:
 
 
 def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval:
-    """Mean, or mean difference scenario by scenario; several seeds are drawn by chance as segments are."""
+    """Mean or paired mean difference with its interval over segments and, if there are several, seeds."""
     own, segments = driven.values[metric].astype(np.float64), driven.segments
     if against is None:
         if len(own) == 1:
@@ -169,7 +169,7 @@ def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval
 
 
 def change(driven: Driven, metric: str, before: Driven) -> Interval:
-    """Mean of what changes, scenario by scenario, for the very same agents."""
+    """Mean paired difference of the same agents between two kinds of traffic."""
     apart = driven.values[metric].astype(np.float64) - before.values[metric]
     if len(apart) == 1:
         return bootstrap_mean(apart[0], driven.segments, seed=0)
@@ -177,7 +177,7 @@ def change(driven: Driven, metric: str, before: Driven) -> Interval:
 
 
 def judged() -> dict[str, Any]:
-    """Everything that the page shows, of what has driven."""
+    """Return all results of the page from the stored episodes."""
     driven = {
         (name, kind): found
         for name in (*PLANNERS, *learned())
@@ -223,7 +223,7 @@ def judged() -> dict[str, Any]:
 
 
 def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
-    """Accuracy in recorded traffic by tag of the scenarios and its value, of every planner."""
+    """Accuracy of every planner in log replay traffic, by tag and value."""
     with np.load(EPISODES / STRATA, allow_pickle=False) as stored:
         tags, of = {tag: stored[tag] for tag in TAGS}, str(stored["test"])
     if any(one.about["test"] != of for one in driven.values()):
@@ -250,7 +250,7 @@ def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
 
 
 def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Lines of the tables of the page, by what its places are called."""
+    """Return the lines of the page's tables by name."""
     planners = result["planners"]
     order = sorted(
         (name for name in planners if name != BOX and "log" in planners[name]),
@@ -309,7 +309,7 @@ def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
 def cells(
     found: Mapping[str, Any], metrics: Sequence[str] | Mapping[str, str], signed: bool = False
 ) -> list[str]:
-    """Means with intervals; metres with one digit."""
+    """Format means with intervals; metres with one digit."""
     return [
         interval(found[metric], signed=signed, digits=1 if "progress" in metric or metric in UNTIL else 3)
         for metric in metrics
@@ -317,7 +317,7 @@ def cells(
 
 
 def filled(text: str, result: Mapping[str, Any]) -> str:
-    """The page with what is stored in its places."""
+    """Return the page with the stored tables."""
     for what, lines in page(result).items():
         begin, end = f"<!-- benchmark.py: {what} -->", "<!-- benchmark.py: end -->"
         before, rest = text.split(begin)
@@ -327,7 +327,7 @@ def filled(text: str, result: Mapping[str, Any]) -> str:
 
 
 def main() -> None:
-    """Drives, judges, or shows what is stored."""
+    """Evaluate, compare, or write the stored results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -3,11 +3,11 @@
 python -m experiments.learning.presets train PRESET --data BENCHMARK --runs RUNS [--seeds 3] [--first 0]
     [--key value ...]
 python -m experiments.learning.benchmark drive --data BENCHMARK --planner PRESET --traffic log
-python -m experiments.learning.presets judge     (what was driven, as means with intervals)
+python -m experiments.learning.presets judge     (means with intervals of the evaluations)
 python -m experiments.learning.presets table     (the stored results into the pages, and the curves of docs/algorithms)
 
-BENCHMARK is what `drivax generate BENCHMARK --benchmark` made; RUNS holds a run folder per preset. Checkpoints are
-chosen on the split `validation`, and everything is judged once on `test`. Intervals of means over seeds and differences
+BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`; RUNS holds a run folder per preset. Checkpoints are
+selected on the split `validation` and evaluated once on `test`. Intervals of means over seeds and differences
 resample seeds and segments of the world, both with replacement.
 """
 
@@ -45,7 +45,7 @@ REFERENCES = ("expert", "idm", "constant_velocity")
 
 
 def trained(args: argparse.Namespace, overrides: list[str]) -> None:
-    """Trains one preset, each seed by itself on one core, as many side by side as there are cores.
+    """Train the seeds of one preset, each on one core, as many at a time as there are cores.
 
     Store their policies in experiments/state/policies, with the longest training time and their curves. With --first
     they join those of the seeds before it.
@@ -75,7 +75,7 @@ def trained(args: argparse.Namespace, overrides: list[str]) -> None:
 
 
 def _trained_alone(data: Path, out: Path, config: TrainConfig) -> int:
-    """Seconds that one agent took."""
+    """Train one agent and return the seconds it took."""
     began = time.perf_counter()
     splits = {split: ScenarioSet.open(data / split) for split in ("train", "validation")}
     train(config, splits["train"], out / f"seed-{config.seed}", validation=splits["validation"], log=print)
@@ -83,7 +83,7 @@ def _trained_alone(data: Path, out: Path, config: TrainConfig) -> int:
 
 
 def judged() -> dict[str, Any]:
-    """Every preset that `benchmark.py drive` has driven, and the references, with differences in pairs."""
+    """Return results and paired differences of all evaluated presets and the references."""
     found = {name: episodes(name, "log") for name in (*REFERENCES, *learned())}
     driven = {name: one for name, one in found.items() if one is not None}
     tests = {one.about["test"] for one in driven.values()}
@@ -134,7 +134,7 @@ def learning_curves(run: Path) -> dict[str, dict[str, list[list[float]]]]:
 
 
 def tabled() -> None:
-    """Puts what is stored into the pages, and draws its learning curves."""
+    """Write the stored results to the pages, and draw the learning curves."""
     learning, training = (json.loads(path.read_text()) for path in (RESULT, SPEEDS))
     for name, curves in learning.get("curves", {}).items():
         save_picture(drawn(name, curves), picture(name))
@@ -143,7 +143,7 @@ def tabled() -> None:
 
 
 def main() -> None:
-    """Trains, judges, or shows what is stored."""
+    """Train, compare, or write the stored results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -31,14 +31,14 @@ Result = dict[str, Any]
 
 
 def pages() -> Iterator[Path]:
-    """Pages with something to fill in."""
+    """Yield the pages that contain markers."""
     for page in (DOCS / "results" / "learning.md", *sorted(FOLDER.glob("*.md"))):
         if _BLOCK.search(page.read_text()):
             yield page
 
 
 def filled(page: Path, learning: Result, training: Result) -> str:
-    """The text of a page with the stored results in their places."""
+    """Return the text of a page with the stored results between its markers."""
 
     def block(found: re.Match[str]) -> str:
         what, *names = found["what"].split()
@@ -49,7 +49,7 @@ def filled(page: Path, learning: Result, training: Result) -> str:
 
 
 def written(what: str, names: list[str], learning: Result, training: Result, page: Path) -> str:
-    """One block: ``reached``, ``differences``, ``aims``, ``training``, ``speed``, or ``curves`` of presets."""
+    """Return a block: ``reached``, ``differences``, ``aims``, ``training``, ``speed`` or ``curves``."""
     parts: dict[str, Callable[[], list[str]]] = {
         "reached": lambda: reached(learning),
         "differences": lambda: differences(learning),
@@ -62,7 +62,7 @@ def written(what: str, names: list[str], learning: Result, training: Result, pag
 
 
 def reached(learning: Result) -> list[str]:
-    """A row per driver, the highest score first."""
+    """Table with one row per planner, highest score first."""
     planners = learning["planners"]
     order = sorted(planners, key=lambda name: -planners[name]["vmax_score"]["mean"])
     rows = [[name, *(interval(planners[name][column]) for column in COLUMNS)] for name in order]
@@ -70,7 +70,7 @@ def reached(learning: Result) -> list[str]:
 
 
 def differences(learning: Result) -> list[str]:
-    """A row per pair of drivers."""
+    """Table with one row per pair of planners."""
     rows = [
         [pair, *(interval(found[column], signed=True) for column in CURVES)]
         for pair, found in learning["differences"].items()
@@ -84,7 +84,7 @@ def best(learning: Result) -> str:
 
 
 def aims(learning: Result, training: Result) -> list[str]:
-    """Every target next to what was measured of the best preset."""
+    """Table of targets and measurements of the best preset."""
     name = best(learning)
     rows = []
     for metric, aim in AIMS.items():
@@ -104,7 +104,7 @@ def aims(learning: Result, training: Result) -> list[str]:
 
 
 def times(learning: Result) -> list[str]:
-    """How long each preset trained."""
+    """Table of the training time of each preset."""
     rows = [
         [f"`{name}`", str(one["seeds"]), f"{one['seconds']:,}"] for name, one in learning["training"].items()
     ]
@@ -112,7 +112,7 @@ def times(learning: Result) -> list[str]:
 
 
 def speeds(training: Result) -> list[str]:
-    """How fast each kind trains, and on what it spends its time."""
+    """Table of training speeds and the shares of an iteration."""
     rows = []
     for name, one in training["training"].items():
         shares = [f"{share:.0%}" for share in one["share"].values()]
@@ -122,7 +122,7 @@ def speeds(training: Result) -> list[str]:
 
 
 def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
-    """The curves of these presets (of all, where none is named), with what came of each on the test split."""
+    """Return the curves of presets (default: all), with their results on the test split."""
     stored = learning.get("curves", {})
     lines = []
     for name in names or stored:
@@ -142,12 +142,12 @@ def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
 
 
 def picture(name: str) -> Path:
-    """Where the curves of a preset are drawn."""
+    """File of a preset's learning curves."""
     return FOLDER / f"curve-{name}.png"
 
 
 def drawn(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> Figure:
-    """Learning curves of one preset: a panel per quantity, a line per seed.
+    """Draw learning curves of one preset: a panel per quantity, a line per seed.
 
     Args:
         name: The preset.
@@ -171,7 +171,7 @@ def drawn(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> F
 
 
 def interval(found: Mapping[str, Any], signed: bool = False, digits: int = 3) -> str:
-    """A mean with its interval."""
+    """Format a mean with its interval."""
     numbers = [found[name] for name in ("mean", "low", "high")]
     if numbers[0] is None:
         return "-"
@@ -180,6 +180,6 @@ def interval(found: Mapping[str, Any], signed: bool = False, digits: int = 3) ->
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table in Markdown."""
+    """Format the lines of a Markdown table."""
     lines = [f"| {' | '.join(line)} |" for line in (heads, *rows)]
     return [lines[0], "|---" * len(heads) + "|", *lines[1:]]

@@ -54,7 +54,7 @@ _CROSSES_MPS = 4.5
 
 @record
 class Trend:
-    """How the motion of all agents changes, smoothed over about half a second.
+    """Change of the motion of all agents, smoothed over about half a second.
 
     Attributes:
         direction: Cosine and sine of the heading one step ago.
@@ -74,7 +74,7 @@ class Trend:
 
     @classmethod
     def logged(cls, bank: ScenarioBank, context: AgentContext) -> Trend:
-        """From the log's rows of the present step and of half a second ago; parked agents keep still."""
+        """Build from the log's current step and half a second before; parked agents are stationary."""
         now = bank.agents[context.index, context.step]
         before = bank.agents[context.index, jnp.maximum(context.step - _PAST, 0)]
         known = (now[:, AgentColumn.VALID] > 0) & (before[:, AgentColumn.VALID] > 0) & (context.step >= _PAST)
@@ -95,7 +95,7 @@ class Trend:
         )
 
     def updated(self, frame: Frame) -> Trend:
-        """One step later."""
+        """Advance by one step."""
         direction, speed = frame.box[:, COS : SIN + 1], _length(frame.velocity)
         known = frame.valid & self.valid
 
@@ -116,18 +116,18 @@ def _turn(before: Float[Array, "S 2"], now: Float[Array, "S 2"]) -> Float[Array,
 
 @record
 class Others:
-    """The nearest agents, rolled out in two ways.
+    """The nearest agents, predicted in two ways.
 
     Attributes:
-        box: What each is expected to do: boxes at each time.
-        maybe: Where those are who may come into ego's way and stay there.
-        enters: Who may do so.
-        speed: Expected speeds, m/s.
-        valid: Who is there.
-        behind: Who follows ego.
-        stood_s: For how long each has stood, s.
-        vehicle: Who is a vehicle.
-        vulnerable: Who walks or rides.
+        box: Predicted boxes at each time.
+        maybe: Boxes of agents that may enter ego's path and stay there.
+        enters: Mask of these agents.
+        speed: Predicted speeds, m/s.
+        valid: Mask of agents.
+        behind: Mask of agents that follow ego.
+        stood_s: Time since each agent stopped, s.
+        vehicle: Mask of vehicles.
+        vulnerable: Mask of pedestrians and cyclists.
     """
 
     box: Float[Array, "H K 6"]
@@ -149,13 +149,13 @@ class Others:
         trend: Trend,
         route: tuple[Array, Array, Array],
     ) -> Others:
-        """Those of ego's level.
+        """Select the agents on ego's level.
 
         Args:
             bank: The scenarios.
-            context: Who is ego, and where.
+            context: Ego's context.
             frame: All agents.
-            trend: How they have moved.
+            trend: Change of their motion.
             route: Ego's route: points ahead, whether they exist, their offsets in m.
         """
         me = frame.box[context.slot]
@@ -202,7 +202,7 @@ def rolled_out(
     box: Float[Array, "K 6"], velocity: Float[Array, "K 2"], turning: Float[Array, " K"],
     faster: Float[Array, " K"],
 ) -> tuple[Float[Array, "H K 6"], Float[Array, "H K"]]:  # fmt: skip
-    """Boxes and speeds at each time: constant yaw rate, acceleration for a second, no reversing."""
+    """Predict boxes and speeds at each time: constant yaw rate, acceleration for a second, no reversing."""
     times = prediction_times()[:, None]
     start = _length(velocity)
     longer = jnp.minimum(times, jnp.where(faster > 0.0, _SPEEDS_UP_S, _ACCELERATES_S))
@@ -227,7 +227,7 @@ def _along_lanes(
     bank: ScenarioBank, context: AgentContext, box: Float[Array, "K 6"], speed: Float[Array, "H K"],
     turning: Float[Array, " K"],
 ) -> tuple[Float[Array, "H K 6"], Bool[Array, " K"]]:  # fmt: skip
-    """Boxes of those who follow the lane that they are on, and whether they are on one."""
+    """Predict boxes of agents that follow their lane, and whether they are on one."""
     ways = speed.reshape(_LANE_STEPS, -1, speed.shape[1]).mean(axis=1) * _LANE_STEP_S
 
     def one(start: Array, way: Array, rate: Array) -> tuple[Array, Array]:
@@ -259,7 +259,7 @@ def _entering(
     box: Float[Array, "K 6"], velocity: Float[Array, "K 2"], speed: Float[Array, "H K"],
     route: tuple[Array, Array, Array], me: Float[Array, " 6"], people: Bool[Array, " K"],
 ) -> tuple[Float[Array, "H K 6"], Bool[Array, " K"], Bool[Array, " K"]]:  # fmt: skip
-    """Boxes of those who move sideways into ego's way and stay in it; who may do so, and who surely does."""
+    """Predict boxes of agents that enter ego's path and stay; masks of possible and certain ones."""
     path, there, offsets = route
     along, lateral, cos, sin = project(path, there, offsets, box[:, :2], velocity)
     toward = -jnp.sign(lateral) * sin
@@ -286,7 +286,7 @@ def _entering(
 
 
 def at(line: Float[Array, "P 7"], offsets: Float[Array, " P"], way: Array) -> Array:
-    """x, y, cos, sin at ways along a line of evenly spaced points."""
+    """Interpolate x, y, cos, sin at arc lengths along a line of evenly spaced points."""
     place = way / (offsets[1] - offsets[0])
     low = jnp.clip(place.astype(jnp.int32), 0, line.shape[0] - 2)
     part = jnp.clip(place - low, 0.0, 1.0)[..., None]
@@ -299,7 +299,7 @@ def _length(vector: Float[Array, "... 2"]) -> Float[Array, ...]:
 
 
 def prediction_times() -> Float[Array, " H"]:
-    """Times at which others are predicted, s."""
+    """Prediction times, s."""
     return (jnp.arange(HORIZON) + 1.0) * STEP_S
 
 
@@ -334,7 +334,7 @@ _WAY, _ASIDE, _SHIFTING, _LEAVES, _BRAKING = 0.2, 0.8, 0.2, 6.0, 0.05
 
 @record
 class SearchPlanner:
-    """Chooses among 42 manoeuvres along the route; knows the present truth, and nothing of the future.
+    """Choose among 42 manoeuvres along the route from the true current state.
 
     A manoeuvre is a lateral offset to go to and an acceleration that is not exceeded; below that, the car follows
     what is ahead of it by IDM; one more drives faster to clear conflicts. Each is driven for
@@ -363,7 +363,7 @@ class SearchPlanner:
         observation: Any,
         key: Array,
     ) -> tuple[Float[Array, " D"], Any]:
-        """The first step of the cheapest manoeuvre."""
+        """Return the first step of the cheapest manoeuvre."""
         context, frame = situation.context, situation.surroundings.frame
         me, speed = frame.box[context.slot], context.history[-1, 3]
         offsets = jnp.arange(_POINTS) * _STEP_M
@@ -397,7 +397,7 @@ class SearchPlanner:
     def _driven(
         self, line: Array, there: Array, offsets: Array, others: Others, ego: tuple[Array, ...]
     ) -> tuple[Float[Array, "C H 4"], Float[Array, " C"], Float[Array, "C 2"]]:
-        """Poses along a line under each cap, the way made, and the first acceleration and curvature."""
+        """Poses along a line for each cap, travelled distances, and first acceleration and curvature."""
         me, start, desired, stop = ego
         sharpest = self.actions.sharpest(me[LENGTH])
         rear, leader_speed = jax.vmap(lambda now: _corridor(line, there, offsets, others, now, me))(
@@ -435,7 +435,7 @@ class SearchPlanner:
 
 
 def advanced(pose: Float[Array, " 4"], curvature: Array, distance: Array) -> Float[Array, " 4"]:
-    """x, y, cos, sin after a distance at a curvature, along the mean heading, as the kinematic bicycle does it."""
+    """Advance x, y, cos, sin by a distance at a curvature, like the kinematic bicycle."""
 
     def turned(cos: Array, sin: Array) -> Float[Array, " 2"]:
         c, s = jnp.cos(curvature * distance / 2), jnp.sin(curvature * distance / 2)
@@ -452,7 +452,7 @@ def _line(
     me: Array,
     speed: Array,
 ) -> Float[Array, "P 7"]:
-    """Route shifted laterally from the present offset and heading of the car to a target offset.
+    """Shift the route laterally from the car's current offset and heading to a target offset.
 
     A cubic whose largest lateral acceleration, 6 d / T^2 for a shift by d within T, is 3.5 m/s2.
     """
@@ -474,7 +474,7 @@ def _line(
 def _corridor(
     line: Array, there: Array, offsets: Array, others: Others, now: tuple[Array, Array], me: Array
 ) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
-    """Where on a line the rears of those are who drive along it at a time, infinite for all others; their speeds."""
+    """Rear positions of agents in a line's corridor at a time (else infinite), and their speeds."""
     box, speed = now
     along, lateral, cos, sin = project(line, there, offsets, box[:, :2], box[:, COS : SIN + 1])
     half_length = (jnp.abs(cos) * box[:, LENGTH] + jnp.abs(sin) * box[:, WIDTH]) / 2
@@ -487,7 +487,7 @@ def _corridor(
 def _stuck(
     path: Array, there: Array, offsets: Array, others: Others, me: Array, stop: Array
 ) -> Bool[Array, ""]:
-    """Whether what is next on the route stays where it is, so that it may be passed."""
+    """Whether the next agent on the route is stationary, so that ego may pass it."""
     along, lateral, cos, sin = project(
         path, there, offsets, others.box[0, :, :2], others.box[0, :, COS : SIN + 1]
     )
@@ -503,7 +503,7 @@ def _stuck(
 
 
 def _danger(pose: Float[Array, "H 4"], me: Array, others: Others) -> Array:
-    """Price of what a manoeuvre would hit, might hit, or pass closely."""
+    """Cost of predicted, possible and near collisions of a manoeuvre."""
 
     def meets(boxes: Array, margin: tuple[float, float]) -> Bool[Array, "H K"]:
         size = jnp.broadcast_to(me[LENGTH:] + 2.0 * jnp.asarray(margin), (HORIZON, 2))
@@ -532,7 +532,7 @@ def _danger(pose: Float[Array, "H 4"], me: Array, others: Others) -> Array:
 def _bad_ground(
     bank: ScenarioBank, situation: Situation, pose: Float[Array, "H 4"], line: tuple[Array, Array], me: Array
 ) -> tuple[Array, Array]:
-    """Whether the car would leave the road within 3 s, and whether a line leads out of the lanes that go its way."""
+    """Whether the car leaves the road within 3 s, and whether a line leaves the lanes in its direction."""
     context = situation.context
     ground = context.z - bank.height_m(context.index, context.slot) / 2
 

@@ -41,7 +41,7 @@ BATCH = 64
 
 
 def repeated(source: Path, target: Path, copies: int) -> Path:
-    """The first record of a TFRecord file of protos, repeated, each with an id of its own."""
+    """Return the first record of a TFRecord file of protos, repeated under new ids."""
     _, payload = next(read_records(source))
     message = message_class("Scenario").FromString(payload)
     with target.open("wb") as file:
@@ -52,14 +52,14 @@ def repeated(source: Path, target: Path, copies: int) -> Path:
 
 
 def timed(work: Callable[[], object]) -> tuple[float, float]:
-    """Seconds of processor time that some work takes, and seconds that pass."""
+    """Return CPU seconds and wall seconds of a call."""
     processor, passed = time.process_time(), time.perf_counter()
     work()
     return time.process_time() - processor, time.perf_counter() - passed
 
 
 def conversion(source: Path, folder: Path, scenarios: int) -> dict[str, float]:
-    """Scenarios per second to a stored and audited set, and what the parts take."""
+    """Scenarios per second to a stored and audited set, and the time of each part."""
     data = repeated(source, folder / "data.tfrecord", scenarios)
     few = repeated(source, folder / "few.tfrecord", 2)
     convert(few, folder / "compiled", audit=audit)  # the audit is compiled once and kept for later runs
@@ -82,7 +82,7 @@ def conversion(source: Path, folder: Path, scenarios: int) -> dict[str, float]:
 
 
 def large_set(source: Path, folder: Path, scenarios: int) -> Path:
-    """A set of copies of one scenario under new ids."""
+    """Write a set of copies of one scenario under new ids."""
     (first, *_) = ScenarioSet.open(source)
     record = np.array(first.record)
     with ScenarioWriter(folder, first.capacity) as writer:
@@ -136,7 +136,7 @@ def reading(path: Path, repeats: int) -> dict[str, float]:
 
 
 def measure(data: Path, scenarios: int, stored: int, repeats: int) -> dict[str, Any]:
-    """Everything that the table shows."""
+    """Return all measurements of the table."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         converted = conversion(data / PROTO, folder, scenarios)
@@ -159,7 +159,7 @@ def measure(data: Path, scenarios: int, stored: int, repeats: int) -> dict[str, 
 
 
 def table(result: dict[str, Any]) -> str:
-    """The result for people."""
+    """Format the result."""
     rows = []
     for name, value in {**result["convert"], **result["read"]}.items():
         aim = result["aims"].get(name)
@@ -169,7 +169,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measures and prints, and with ``--write`` stores the JSON."""
+    """Measure, print, and with ``--write`` store the JSON."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -21,7 +21,7 @@ BEGIN, END = "<!-- sizes: python -m experiments.speed.encoders --table -->\n", "
 
 
 def table(result: dict[str, Any]) -> str:
-    """In Markdown; with times where the result has them. Types that change no size share a row until then."""
+    """Markdown table. Without times, types of equal size share a row."""
     rows = result["rows"]
     timed = all("gradient_us" in row for row in rows)
     if not timed:
@@ -44,7 +44,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def into_page(result: dict[str, Any]) -> str:
-    """Puts the table into the page, and returns it."""
+    """Write the table to the page and return it."""
     found, page = table(result), PAGE.read_text()
     before, rest = page.split(BEGIN)
     _, after = rest.split(END)
@@ -53,7 +53,7 @@ def into_page(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measures as asked, stores and shows."""
+    """Measure, store and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

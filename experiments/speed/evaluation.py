@@ -37,7 +37,7 @@ TRAFFIC = ("log", "idm")
 
 
 def timed(planner: str, traffic: str, bank: ScenarioBank, names: list[dict[str, str]]) -> float:
-    """Seconds for 1,000 scenarios x 80 steps."""
+    """Seconds for 1,000 scenarios of 80 steps."""
     driver, task = find_planner(planner, bank, False)
     ends: list[float] = []
     evaluate(
@@ -83,7 +83,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measures as asked, stores and shows."""
+    """Measure, store and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -42,19 +42,19 @@ SCENARIOS, DRAWS = 10_000, 1_000_000
 
 
 def seconds(call: Callable[[], Any], repeats: int) -> float:
-    """Median time of a call, the first of which is not counted."""
+    """Median time of a call after the first."""
     return statistics.median([elapsed(call) for _ in range(repeats + 1)][1:])
 
 
 def elapsed(call: Callable[[], Any]) -> float:
-    """Seconds that a call takes."""
+    """Seconds of a call."""
     began = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - began
 
 
 def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any], dict[str, Any]]:
-    """What runs an iteration of a training, and its size: gradients change that many parameters."""
+    """Return a training's iteration function and its number of trained parameters."""
     environment, bank = config.environment(), ScenarioBank.from_scenarios(data)
     learner = config.algorithm.build(environment, bank, config.iterations)
     began = time.perf_counter()
@@ -79,7 +79,7 @@ def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any],
 
 
 def updates(data: ScenarioSet, repeats: int) -> dict[str, dict[str, Any]]:
-    """Of every algorithm, by turns: updates per second with the slowest and quickest, and its size."""
+    """Updates per second of every algorithm (median, slowest, fastest) and its size, measured alternately."""
     configs = {name: replace(settings.load(TrainConfig, f"offline/{name}"), devices=1) for name in ALGORITHMS}
     made = {name: training(config, data) for name, config in configs.items()}
     rates = {name: list[float]() for name in ALGORITHMS}
@@ -100,7 +100,7 @@ def updates(data: ScenarioSet, repeats: int) -> dict[str, dict[str, Any]]:
 
 
 def members(data: ScenarioSet, repeats: int) -> dict[str, Any]:
-    """Seconds per iteration of the default ensemble and of one of its members alone, by turns."""
+    """Seconds per iteration of the default ensemble and of a single member, measured alternately."""
     config = EnsembleConfig()
     iterate, size = training(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data)
     config = replace(config, total_steps=(repeats + 1) * config.cloning.steps_per_iteration)
@@ -128,14 +128,14 @@ def members(data: ScenarioSet, repeats: int) -> dict[str, Any]:
 
 
 def draws() -> int:
-    """Places drawn per second among 10,000 scenarios of 91 steps, by uneven weights."""
+    """Steps drawn per second among 10,000 scenarios of 91 steps, with uneven weights."""
     made = sampler(np.random.default_rng(0).gamma(0.5, size=(SCENARIOS, 91)))
     call = partial(jax.jit, static_argnums=2)(sample_steps)
     return round(DRAWS / seconds(lambda: call(made, jax.random.key(0), (DRAWS,)), 5))
 
 
 def table(result: dict[str, Any]) -> str:
-    """What the page shows."""
+    """Table of the page."""
     rows = [
         "| algorithm | updates/s | slowest to quickest | batch | parameters |",
         "|---|---:|---:|---:|---:|",
@@ -154,7 +154,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measures, shows and stores."""
+    """Measure, print and store."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

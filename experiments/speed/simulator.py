@@ -69,7 +69,7 @@ SCENARIOS, MANY = 1024, 4096
 
 
 def speeds(bank: ScenarioBank, config: BenchConfig) -> dict[str, Any]:
-    """Both tasks in both kinds of traffic, each at its best batch size, all timed by turns."""
+    """Time both tasks in both kinds of traffic alternately, each at its best batch size."""
     kinds = [(name, traffic, batch) for name in TASKS for traffic in ("log", "idm") for batch in BATCHES]
     bank = spread(prepare_bank(IdmTraffic(), bank))
     programs = [
@@ -94,7 +94,7 @@ def speeds(bank: ScenarioBank, config: BenchConfig) -> dict[str, Any]:
 
 
 def machine_ms() -> float:
-    """Milliseconds of a fixed program on one core, which tells how fast a shared machine is just now.
+    """Milliseconds of a fixed program on one core, the current speed of a shared machine.
 
     It reads rows at random and computes on what it read, as a step does.
     """
@@ -110,7 +110,7 @@ def machine_ms() -> float:
 
 
 def again(folder: Path, repeats: int) -> dict[str, Any]:
-    """The speeds once more, at the batch sizes that were the best in the stored result, timed by turns."""
+    """Time the speeds again, alternately, at the best batch sizes of the stored result."""
     use_all_cores()
     stored = ScenarioSet.open(folder)
     bank = spread(
@@ -130,7 +130,7 @@ def again(folder: Path, repeats: int) -> dict[str, Any]:
 
 
 def step_compiled(bank: ScenarioBank, task: Task, traffic: str) -> float:
-    """Seconds from the functions to a program that steps, or begins, and observes a batch, on one device.
+    """Seconds to compile a program that steps or resets, and observes a batch, on one device.
 
     The program that is timed does more: it drives by IDM, judges episodes, loops, and spans all devices.
     """
@@ -154,7 +154,7 @@ def step_compiled(bank: ScenarioBank, task: Task, traffic: str) -> float:
 
 
 def more_segments(bank: ScenarioBank) -> ScenarioBank:
-    """As many segments again that are nowhere near: what a larger capacity costs."""
+    """Double the map with distant segments, to measure the cost of a larger capacity."""
     pad = ((0, 0), (0, 0), (0, 4096))
     return replace(
         bank,
@@ -164,7 +164,7 @@ def more_segments(bank: ScenarioBank) -> ScenarioBank:
 
 
 def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
-    """The bank with this many slots: the first ones, and empty ones where it has fewer."""
+    """Return the bank with a number of slots: the first ones, padded with empty ones."""
     few = replace(
         bank,
         agents=bank.agents[:, :, :count],
@@ -177,13 +177,13 @@ def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
 
 
 def growth(small: ScenarioBank, large: ScenarioBank, config: BenchConfig) -> float:
-    """Time per step of the large bank over that of the small one, timed by turns."""
+    """Ratio of the time per step of a large and a small bank, measured alternately."""
     one, other = steps_per_second([compiled(small, config), compiled(large, config)], config.repeats)
     return round(one / other, 3)
 
 
 def state_bytes(bank: ScenarioBank) -> dict[str, int]:
-    """Bytes of one environment's state in each kind of traffic, full task."""
+    """Bytes of an environment's state in each kind of traffic, full task."""
     some = jax.tree.map(lambda leaf: leaf[:1], bank)
     slots = jnp.arange(1, 5)[None]
     motion = jnp.zeros((1, bank.steps, 4, 4))
@@ -203,7 +203,7 @@ def state_bytes(bank: ScenarioBank) -> dict[str, int]:
 
 
 def measure(folder: Path, repeats: int) -> dict[str, Any]:
-    """Everything, one after the other."""
+    """Run all measurements."""
     use_all_cores()
     stored = ScenarioSet.open(folder)
     if len(stored) < MANY:
@@ -226,7 +226,7 @@ def measure(folder: Path, repeats: int) -> dict[str, Any]:
 
 
 def runs_table(runs: list[dict[str, Any]]) -> list[str]:
-    """The speeds of every run, as they came."""
+    """Table of the speeds of every run."""
     if not runs:
         return []
     names = list(runs[0]["steps_per_second"])
@@ -246,7 +246,7 @@ def runs_table(runs: list[dict[str, Any]]) -> list[str]:
 
 
 def table(result: dict[str, Any], runs: list[dict[str, Any]]) -> str:
-    """The page's tables."""
+    """Return the page's tables."""
     rows = ["| task | traffic | steps/s | batch | state (B) | a step, compiled (s) | all, compiled (s) |"]
     rows += ["|---|---|---|---|---|---|---|"]
     for name, one in result["speed"].items():
@@ -282,7 +282,7 @@ BEGIN, END = "<!-- simulator.py: begin -->", "<!-- simulator.py: end -->"
 
 
 def main() -> None:
-    """Measures and stores, or puts what is stored into the page."""
+    """Measure and store, or write the stored result to the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -51,7 +51,7 @@ KINDS = {
 
 
 def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], Any]]:
-    """What is timed: each call runs one iteration, or its part, from one and the same state."""
+    """Return the programs to time: an iteration or its part, always from the same state."""
     learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
     assert isinstance(learner, Ppo)
     program = Program(Seeds(learner, (0,)), bank, config.devices)
@@ -96,7 +96,7 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
 
 
 def measured(data: Path, repeats: int, environments: int | None) -> dict[str, Any]:
-    """Steps per second of training and the split, of every kind, all by turns, as ``drivax train`` runs them."""
+    """Steps per second of training and its shares, measured alternately, as in ``drivax train``."""
     stored = ScenarioSet.open(data)
     bank = ScenarioBank.from_scenarios([stored[row] for row in range(SCENARIOS)])
     calls, steps = {}, {}
@@ -137,7 +137,7 @@ def measured(data: Path, repeats: int, environments: int | None) -> dict[str, An
 
 
 def main() -> None:
-    """Measures, shows and stores."""
+    """Measure, print and store."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -20,13 +20,13 @@ NEAR_S, HORIZON_S = 1.0, 5.0
 
 
 def uncomfortable(scenario: Scenario) -> tuple[str, ...]:
-    """Names of the limits of comfort that ego's log breaks."""
+    """Names of the comfort limits that ego's log violates."""
     speed = np.hypot(*scenario.agent_velocity[:, 0].astype(np.float64).T)
     return broken_limits(scenario.agent_heading[:, 0].astype(np.float64), speed)
 
 
 def all_agents(scenario: Scenario) -> tuple[Array, Array, Array, Array, Array]:
-    """Boxes ``[step, user, 6]``, velocities, validity, kinds and ids of moving and parked users, ego first."""
+    """Boxes ``[step, agent, 6]``, velocities, validity, kinds and ids of all agents, ego first."""
     moving = np.flatnonzero(scenario.agent_valid.any(axis=0))
     parked = np.flatnonzero(scenario.parked_valid.any(axis=0))
     steps = scenario.agent_valid.shape[0]
@@ -55,7 +55,7 @@ def all_agents(scenario: Scenario) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def overlapping_pairs(scenario: Scenario) -> int:
-    """Pairs of vehicles, ego left out, whose boxes overlap at some step."""
+    """Pairs of vehicles other than ego whose boxes overlap at some step."""
     box, _, valid, kind, _ = all_agents(scenario)
     vehicles = np.flatnonzero((kind == AgentKind.VEHICLE) & (np.arange(len(kind)) > 0))
     first, second = np.triu_indices(len(vehicles), 1)
@@ -65,7 +65,7 @@ def overlapping_pairs(scenario: Scenario) -> int:
 
 
 def constant_speed_ttc_s(scenario: Scenario) -> float:
-    """Smallest time to collision with the labelled actors of an ego that keeps its speed from the event on.
+    """Smallest time to collision with the event's actors if ego keeps its speed from the event on.
 
     It starts at the event's first step, with the speed that it has then, and goes on along its route, as far off
     it as it is (the log's own way may already avoid the actor). Time to collision is that of boxes at constant
@@ -93,7 +93,7 @@ def constant_speed_ttc_s(scenario: Scenario) -> float:
 
 
 def _way(scenario: Scenario, start: int) -> Array:
-    """Points of the route from where the ego is on, as far off it as the ego is then."""
+    """Points of the route from ego's position on, at ego's lateral offset."""
     count = int(scenario.route_points[0])
     route = scenario.route_xy[0, :count].astype(np.float64)
     heading = scenario.route_heading[0, :count].astype(np.float64)
@@ -105,7 +105,7 @@ def _way(scenario: Scenario, start: int) -> Array:
 
 
 def binomial(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Clopper and Pearson's interval of a share."""
+    """Clopper-Pearson interval of a share."""
     if not trials:
         return 0.0, 1.0
     tail = (1.0 - level) / 2
@@ -115,13 +115,13 @@ def binomial(successes: int, trials: int, level: float = 0.95) -> tuple[float, f
 
 
 def share(successes: int, trials: int) -> dict[str, Any]:
-    """A share with its 95 % interval, for tables and JSON."""
+    """Return a share with its 95 % interval, for tables and JSON."""
     low, high = binomial(successes, trials)
     return {"share": successes / trials if trials else math.nan, "low": low, "high": high, "n": trials}
 
 
 def against(configured: float, successes: int, trials: int, comparisons: int) -> dict[str, Any]:
-    """A share next to the probability that was configured.
+    """Compare a share with its configured probability.
 
     Of many 95 % intervals one in twenty misses the truth, so ``outside`` says whether the configured value is outside
     Bonferroni's interval, of level 1 - 0.05 / comparisons; ``outside_95`` says the same of the usual one.
@@ -137,6 +137,6 @@ def against(configured: float, successes: int, trials: int, comparisons: int) ->
 
 
 def largest_noise_m(scenario: Scenario, config: NoiseConfig) -> float:
-    """How far perception noise can have moved a corner of any agent in a scenario, at most."""
+    """Largest displacement of any agent's corner that perception noise can cause in a scenario."""
     sizes = scenario.agent_size[1:][scenario.agent_valid[:, 1:].any(axis=0), :2]
     return max((largest_shift_m(config, float(length), float(width)) for length, width in sizes), default=0.0)

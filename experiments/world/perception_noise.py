@@ -34,7 +34,7 @@ Array = np.ndarray[Any, Any]
 
 
 def residual_filter(steps: int) -> Float[Array, "step step"]:
-    """The matrix that takes a series to what smoothing leaves over (inner rows only are used)."""
+    """Matrix that maps a series to its smoothing residual (only inner rows are used)."""
     smooth = savgol_filter(np.eye(steps), WINDOW, ORDER, axis=0)
     return np.eye(steps) - smooth
 
@@ -49,7 +49,7 @@ def expected(correlation: float) -> tuple[float, float]:
 
 
 def fitted(deviation: float, lag_one: float) -> tuple[float, float]:
-    """Standard deviation and correlation (0 to 0.95 per step) of the AR(1) noise with such a residual."""
+    """Standard deviation and correlation (0 to 0.95 per step) of the AR(1) noise with a given residual."""
     grid = np.linspace(0.0, 0.95, 96)
     table = np.array([expected(value) for value in grid])
     best = int(np.argmin(np.abs(table[:, 1] - lag_one)))
@@ -73,7 +73,7 @@ def runs(tracks: Tracks, ego: int) -> list[tuple[int, slice]]:
 
 
 def residuals(recording: Recording) -> dict[str, list[Array]]:
-    """Residuals per quantity and run, ends left out."""
+    """Residuals by quantity and run, without the ends."""
     tracks, result = recording.tracks, {name: [] for name in QUANTITIES}
     inner = slice(WINDOW // 2, -(WINDOW // 2))
     for row, steps in runs(tracks, recording.ego):
@@ -94,7 +94,7 @@ def residuals(recording: Recording) -> dict[str, list[Array]]:
 
 
 def summary(pieces: list[Array]) -> dict[str, float]:
-    """The median run's residual, its autocorrelation, and the noise that explains them."""
+    """Median residual, its autocorrelation, and the fitted noise."""
     # The median over runs: a few tracks with swapped identities must not set the level for all.
     deviation = float(np.median([np.std(piece) for piece in pieces]))
     lag = float(np.median([np.mean(p[1:] * p[:-1]) / max(np.mean(p * p), 1e-12) for p in pieces]))
@@ -109,7 +109,7 @@ def summary(pieces: list[Array]) -> dict[str, float]:
 
 
 def measure(data: Path) -> dict[str, Any]:
-    """All recordings under a folder, by data set."""
+    """Measure all recordings under a folder, by data set."""
     found: dict[str, dict[str, list[Array]]] = {}
     for item in survey(data).inputs:
         if item.format is None:
@@ -133,7 +133,7 @@ def measure(data: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measures, prints a table, and writes the JSON."""
+    """Measure, print a table, and write the JSON."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -50,7 +50,7 @@ TRIES = 600
 
 @dataclass(frozen=True)
 class Tile:
-    """A scenario, its title, and the index that makes it again."""
+    """A scenario, its title, and its index in the seed."""
 
     title: str
     scenario: Scenario
@@ -58,7 +58,7 @@ class Tile:
 
 
 def scenarios(domain: str, seed: int, rare_rate: float) -> Iterator[tuple[int, Scenario]]:
-    """Scenarios of a domain with their indices, one of each map."""
+    """Yield scenarios of a domain with their indices, one per map."""
     config = replace(WorldConfig(), domain=domain, rare_rate=rare_rate, scenarios_per_map=1)
     for index in range(TRIES):
         try:
@@ -68,7 +68,7 @@ def scenarios(domain: str, seed: int, rare_rate: float) -> Iterator[tuple[int, S
 
 
 def family_tiles(domain: str, seed: int) -> list[Tile]:
-    """A common scenario of each family: of the first few, the one with the most to see."""
+    """Return a common scenario of each family: of the first few, the one with the most to see."""
     found: dict[str, list[tuple[float, Tile]]] = {family.name: [] for family, _ in DOMAINS[domain].families}
     for index, scenario in scenarios(domain, seed, 0.0):
         name = scenario.tags["family"]
@@ -80,7 +80,7 @@ def family_tiles(domain: str, seed: int) -> list[Tile]:
 
 
 def sight(scenario: Scenario) -> tuple[float, int]:
-    """How much there is to see near ego at most, and when: road edges that turn (rad), crosswalks, lanes that end."""
+    """Largest number of map features near ego and its step: road bends (rad), crosswalks, lane ends."""
     layers = road_lines(scenario)
     places, worth = [np.zeros((0, 2))], [np.zeros(0)]
     for line in layers["edge"]:
@@ -104,7 +104,7 @@ def sight(scenario: Scenario) -> tuple[float, int]:
 
 
 def event_tiles(seed: int) -> list[Tile]:
-    """The first scenario of each kind of event, in turn from each domain."""
+    """Return the first scenario of each kind of event, alternating between domains."""
     found: dict[str, Tile] = {}
     names = [kind.name.lower() for kind in EventKind if kind]
     # Kinds are drawn from seed and index, so domains with the same seed would show the same ones.
@@ -120,7 +120,7 @@ def event_tiles(seed: int) -> list[Tile]:
 
 
 def draw_family(axes: Axes, scenario: Scenario) -> None:
-    """The place with the most to see, a little before ego is there; ego's log to its end."""
+    """Draw the step just before ego reaches the most map features, and ego's log to its end."""
     way = scenario.agent_xy[:, 0].astype(np.float64)
     _, there = sight(scenario)
     left = np.hypot(*(way[: there + 1] - way[there]).T)
@@ -133,7 +133,7 @@ def draw_family(axes: Axes, scenario: Scenario) -> None:
 
 
 def draw_event(axes: Axes, scenario: Scenario) -> None:
-    """The moment at which ego and an actor are nearest during the event, and the ways of both from first to last."""
+    """Draw the step at which ego and an actor are closest during the event, with both paths."""
     box, _, valid, _, number = all_agents(scenario)
     actors = scenario.event_actor[0]
     rows = np.flatnonzero(np.isin(number, actors[actors >= 0]))
@@ -170,7 +170,7 @@ def draw_event(axes: Axes, scenario: Scenario) -> None:
 
 
 def nearest(box: np.ndarray, valid: np.ndarray, rows: np.ndarray, first: int) -> tuple[int, int]:
-    """Step and row at which an actor's box is nearest to ego's, from the event's first step on."""
+    """Step and row at which an actor's box is closest to ego's, from the event's first step on."""
     shapes = shapely.polygons(corners(box[first:, [0, *rows]]))
     apart = np.where(valid[first:, rows], shapely.distance(shapes[:, :1], shapes[:, 1:]), np.inf)
     step, column = np.unravel_index(int(apart.argmin()), apart.shape)
@@ -178,7 +178,7 @@ def nearest(box: np.ndarray, valid: np.ndarray, rows: np.ndarray, first: int) ->
 
 
 def sheet(tiles: list[Tile], draw: Callable[[Axes, Scenario], None], out: Path) -> None:
-    """All tiles on one page."""
+    """Draw all tiles on one page."""
     rows = -(-len(tiles) // COLUMNS)
     page = Figure(
         figsize=(COLUMNS * TILE_IN, rows * (TILE_IN + 0.3)), dpi=DPI, facecolor="white", layout="constrained"
@@ -194,7 +194,7 @@ def sheet(tiles: list[Tile], draw: Callable[[Axes, Scenario], None], out: Path) 
 
 
 def main() -> None:
-    """Generates, draws, and says which scenarios were drawn."""
+    """Generate, draw, and print the drawn scenarios."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

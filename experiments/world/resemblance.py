@@ -61,7 +61,7 @@ EVERY = 5
 
 
 def quantities(scenario: Scenario) -> dict[str, Array]:
-    """Values of all subjects and steps of one scenario."""
+    """Values of all compared vehicles and steps of one scenario."""
     box, velocity, valid, kind, _ = all_agents(scenario)
     subjects = np.flatnonzero(valid.all(axis=0) & (kind == AgentKind.VEHICLE))
     way = np.hypot(*np.moveaxis(np.diff(box[:, subjects, :2], axis=0), -1, 0)).sum(axis=0)
@@ -96,7 +96,7 @@ def _subject(row: int, box: Array, velocity: Array, valid: Array, kind: Array) -
 
 
 def _leader_gap(me: Array, others: Array, apart: Array, there: Array) -> Array:
-    """Bumper to bumper distance to the vehicle ahead at every step, infinite where there is none."""
+    """Bumper-to-bumper distance to the vehicle ahead at every step, infinite without one."""
     cos, sin = me[:, None, 2], me[:, None, 3]
     ahead = apart[..., 0] * cos + apart[..., 1] * sin
     aside = np.abs(apart[..., 1] * cos - apart[..., 0] * sin)
@@ -107,13 +107,13 @@ def _leader_gap(me: Array, others: Array, apart: Array, there: Array) -> Array:
 
 
 def pooled(scenarios: Iterable[Scenario]) -> tuple[dict[str, Array], int]:
-    """All scenarios together, and how many."""
+    """Pool all scenarios and count them."""
     parts = [quantities(scenario) for scenario in scenarios]
     return {name: np.concatenate([part[name] for part in parts]) for name in QUANTITIES}, len(parts)
 
 
 def real(data: Path) -> Iterable[Scenario]:
-    """Windows of all recordings that are long enough, one after the other without overlap."""
+    """Yield windows, without overlap, of all recordings that are long enough."""
     for item in survey(data).inputs:
         if item.format is None:
             continue
@@ -128,7 +128,7 @@ def real(data: Path) -> Iterable[Scenario]:
 
 
 def world(scenarios: int, seed: int, domain: str) -> Iterable[Scenario]:
-    """Scenarios of the built-in world."""
+    """Yield scenarios of the built-in world."""
     config = replace(WorldConfig(), domain=domain)
     for index in range(scenarios):
         try:
@@ -138,7 +138,7 @@ def world(scenarios: int, seed: int, domain: str) -> Iterable[Scenario]:
 
 
 def compared(theirs: dict[str, Array], ours: dict[str, Array]) -> dict[str, Any]:
-    """Percentiles of both, and the largest difference of their distribution functions."""
+    """Percentiles of both distributions, and the largest difference of their distribution functions."""
     result = {}
     for name in QUANTITIES:
         row: dict[str, Any] = {
@@ -182,7 +182,7 @@ def figure(sources: dict[str, dict[str, Array]], out: Path) -> None:
 
 
 def main() -> None:
-    """Measures, prints a table in Markdown, and draws the figure."""
+    """Measure, print a Markdown table, and draw the figure."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -19,7 +19,7 @@ Result = dict[str, Any]
 
 @dataclass(frozen=True)
 class Target:
-    """A number that the world should have.
+    """A target value of the world.
 
     Attributes:
         what: In words.
@@ -96,7 +96,7 @@ TARGETS = (
 
 
 def covered(result: Result) -> list[tuple[str, Result]]:
-    """Every share that has a configured value, with its name."""
+    """Return every share that has a configured value, with its name."""
     cover = result["coverage"]
     return [
         ("rare events", cover["rare_rate"]),
@@ -106,12 +106,12 @@ def covered(result: Result) -> list[tuple[str, Result]]:
 
 
 def text(one: Result, digits: int = 4) -> str:
-    """A share with its interval and the number of trials."""
+    """Format a share with its interval and the number of trials."""
     return f"{one['share']:.{digits}f} [{one['low']:.{digits}f}, {one['high']:.{digits}f}] of {one['n']}"
 
 
 def lines(result: Result) -> list[tuple[str, str]]:
-    """All of a result: names and values."""
+    """Names and values of a result."""
     found = [(f"expert {name}", text(one)) for name, one in result["expert"].items()]
     found.append(("expert comfortable, common (0.95)", text(result["expert_comfortable_common"])))
     found += [(f"  within {name}", text(one)) for name, one in result["within_limits_common"].items()]
@@ -158,7 +158,7 @@ def _generation(result: Result) -> list[tuple[str, str]]:
 
 
 def markdown(results: dict[str, Result]) -> str:
-    """Targets in rows, domains in columns; what is not on target is in bold."""
+    """Table with targets in rows and domains in columns; missed targets are bold."""
     head = "".join(
         f" {name}: {result['scenarios']:,} + {result['rare_scenarios']:,} rare |"
         for name, result in results.items()
@@ -179,7 +179,7 @@ def markdown(results: dict[str, Result]) -> str:
 
 
 def into_guide(results: dict[str, Result]) -> str:
-    """Puts the table of targets into the guide, and returns it."""
+    """Write the table of targets to the guide and return it."""
     table, page = markdown(results), GUIDE.read_text()
     before, rest = page.split(BEGIN)
     _, after = rest.split(END)

@@ -62,7 +62,7 @@ NOISE = WorldConfig().noise
 
 
 def written(folder: Path, scenarios: int, seed: int, workers: int, world: WorldConfig) -> dict[str, Any]:
-    """Generates a set if it is not there, and tells how that went."""
+    """Generate a set if it does not exist, and return the generation statistics."""
     note = folder.with_suffix(".json")
     if note.is_file():
         source = json.loads((folder / "manifest.json").read_text())["source"]
@@ -84,7 +84,7 @@ def written(folder: Path, scenarios: int, seed: int, workers: int, world: WorldC
 
 
 def speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
-    """Wall time of the command for a set that is thrown away, from its start to its end, at the default rare rate."""
+    """Wall time of the command for a temporary set at the default rare rate."""
     with tempfile.TemporaryDirectory() as folder:
         call = ["generate", str(Path(folder) / "set"), "--domain", domain, "--seed", "3"]
         call += ["--scenarios", str(scenarios), "--workers", str(workers)]
@@ -95,7 +95,7 @@ def speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
 
 
 def measured(folder: Path, planners: tuple[str, ...], driven: int | None = None) -> list[dict[str, Any]]:
-    """One row per scenario: tags, what its arrays show, what the expert did, and the planners the first ones."""
+    """Return a row per scenario: tags, statistics, and results of the expert and the planners."""
     data, rows = ScenarioSet.open(folder), []
     for first in range(0, len(data), CHUNK):
         scenarios = [data[i] for i in range(first, min(first + CHUNK, len(data)))]
@@ -129,13 +129,13 @@ def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[st
 
 
 def rate_of(rows: list[dict[str, Any]], column: str) -> dict[str, float | int]:
-    """Share of rows in which a metric is 1, where it was measured and is defined."""
+    """Share of rows in which a metric is 1, where it is defined."""
     values = [row[column] for row in rows if np.isfinite(row.get(column, np.nan))]
     return share(int(sum(value > 0.5 for value in values)), len(values))
 
 
 def difficulty(rows: list[dict[str, Any]], rare: list[dict[str, Any]], planner: str) -> dict[str, Any]:
-    """Success of a planner over all, common and rare scenarios, and how much more often it fails in rare ones."""
+    """Success of a planner over all, common and rare scenarios, and its ratio of failures."""
     column = f"{planner}.success"
     common = rate_of([row for row in rows if row["event"] is None], column)
     in_rare = rate_of([row for row in rare if row["event"] is not None], column)
@@ -149,7 +149,7 @@ def difficulty(rows: list[dict[str, Any]], rare: list[dict[str, Any]], planner: 
 
 
 def coverage(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig) -> dict[str, Any]:
-    """Families, events and their rate and what was configured.
+    """Compare the shares of families and events with the configuration.
 
     Families are counted over the maps of common scenarios: a rare one takes roads that give occasion to its event, and
     scenarios on the same map have their family from one draw. Kinds of events are counted over all rare scenarios.
@@ -175,7 +175,7 @@ def coverage(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: Worl
 
 
 def severity(labelled: list[dict[str, Any]]) -> dict[str, Any]:
-    """How the required decelerations of rare events spread over thirds of their range; medians per kind."""
+    """Distribution of required decelerations over thirds of their range; medians by kind."""
     values = np.array([row["severity_mps2"] for row in labelled])
     edges = np.linspace(*SEVERITY_MPS2, 4)
     third = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, 2)
@@ -192,7 +192,7 @@ def severity(labelled: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def near_misses(labelled: list[dict[str, Any]]) -> dict[str, Any]:
-    """In how many rare scenarios an ego that keeps its speed comes near the actor: of all, and of each kind."""
+    """Share of rare scenarios, overall and by kind, in which a constant-speed ego nears the actor."""
     kinds = {"all": labelled}
     for row in labelled:
         kinds.setdefault(row["event"], []).append(row)
@@ -202,7 +202,7 @@ def near_misses(labelled: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def summary(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig) -> dict[str, Any]:
-    """Everything that the table shows, from the rows of both sets."""
+    """Return all values of the table from the rows of both sets."""
     both = [*rows, *rare]
     common = [row for row in rows if row["event"] is None]
     labelled = [row for row in both if row["event"] is not None]
@@ -225,7 +225,7 @@ def summary(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: World
 
 
 def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Generates, drives and sums up."""
+    """Generate, evaluate and summarise."""
     world = replace(WorldConfig(), domain=args.domain, rare_rate=args.rare_rate)
     rare_world = replace(world, rare_rate=1.0)
     name = f"{args.domain}-{args.seed}-{args.scenarios}"
@@ -251,18 +251,18 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 
 def made_with() -> dict[str, Any]:
-    """What a result was made with."""
+    """Provenance of a result."""
     processor = platform.processor() or platform.machine()
     return {**versions(), "world": WORLD_VERSION, "processor": processor, "cores": os.cpu_count()}
 
 
 def stored(name: str, result: dict[str, Any]) -> None:
-    """Writes a result."""
+    """Write a result."""
     write_text(RESULTS / name, json.dumps(result, indent=1) + "\n")
 
 
 def tabulate() -> None:
-    """The stored results of both domains into the guide."""
+    """Write the stored results of both domains to the guide."""
     rates = json.loads((RESULTS / "world_speed.json").read_text())
     results = {name: json.loads((RESULTS / f"world_{name}.json").read_text()) for name in DOMAINS}
     for name, result in results.items():
@@ -271,7 +271,7 @@ def tabulate() -> None:
 
 
 def clock(scenarios: int, workers: int) -> None:
-    """Times both domains, prints and stores that."""
+    """Time both domains, print and store the result."""
     rates = {name: speed(name, scenarios, workers) for name in DOMAINS}
     for name, rate in rates.items():
         print(f"{name}: {rate['scenarios_per_second']:.1f}/s")
@@ -279,12 +279,12 @@ def clock(scenarios: int, workers: int) -> None:
 
 
 def command() -> str:
-    """How this was called."""
+    """The command line of this run."""
     return " ".join(["python", "experiments/world/targets.py", *sys.argv[1:]])
 
 
 def main() -> None:
-    """Measures, prints the table, and writes the JSON."""
+    """Measure, print the table, and write the JSON."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
