@@ -8,7 +8,8 @@ far.
     python -m experiments.data.expert_audit --data ../shared/data [--write] [--pictures FOLDER]
 
 ``--write`` stores docs/results/expert-audit.md and experiments/results/expert_audit.json; ``--pictures`` draws the
-first violation of every exact replay. """
+first violation of every exact replay.
+"""
 
 from __future__ import annotations
 

@@ -12,7 +12,8 @@ python -m experiments.learning.aggressive table
 BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. The clone has the observation of the aggressive
 policy and its number of behaviour cloning updates. `judge` evaluates on the validation split: all planners as ego, both
 policies in place of other vehicles, one at a time, as in traffic, and an IDM car in each kind of traffic. `pack`
-exports the policy and its measurements to the package. """
+exports the policy and its measurements to the package.
+"""
 
 from __future__ import annotations
 
