@@ -135,7 +135,7 @@ def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
         lines += [
             f"![Learning curves of {name}]({where.as_posix()})",
             "",
-            f"Preset `{name}`, {count} seeds, in validation on the way. On the test split: {cell}.",
+            f"Preset `{name}`, {count} seeds, on the validation split during training. On the test split: {cell}.",
             "",
         ]
     return lines[:-1]
