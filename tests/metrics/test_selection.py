@@ -241,7 +241,7 @@ def test_no_metric_is_defined_before_the_first_step(traced):
 
 def test_the_guide_lists_every_metric_with_its_unit(repository):
     page = (repository / "docs" / "guide" / "metrics.md").read_text()
-    rows = dict(re.findall(r"^\| `(\w+)` \| ([\w/-]+) \|", page.partition("## What happened")[2], re.M))
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([\w/-]+) \|", page.partition("## Events")[2], re.M))
     assert rows == {name: metric.unit for name, metric in METRICS.items()}
     training = next(line for line in page.splitlines() if line.startswith("| `training`"))
     assert tuple(re.findall(r"`(\w+)`", training)[1:]) == SETS["training"]
