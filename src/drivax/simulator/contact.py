@@ -122,11 +122,13 @@ def classify_contacts(
     vulnerable = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
     head_on, same_way = cos < -(0.5**0.5), cos > 0.5**0.5
     c = CollisionType
-    kind = jnp.select(
-        [vulnerable, other_stopped & front, head_on & (front | ~behind), front & same_way, behind],
-        [c.VULNERABLE, c.STOPPED_OBJECT, c.HEAD_ON, c.REAR_END, c.REAR_ENDED],
-        c.SIDE_SWIPE,
-    )
+    cases = (
+        (vulnerable, c.VULNERABLE), (other_stopped & front, c.STOPPED_OBJECT), (head_on & (front | ~behind), c.HEAD_ON),
+        (front & same_way, c.REAR_END), (behind, c.REAR_ENDED),
+    )  # fmt: skip
+    kind = jnp.full(front.shape, c.SIDE_SWIPE)
+    for case, name in reversed(cases):  # jnp.select finds the first case by argmax: 5 % of a step
+        kind = jnp.where(case, name, kind)
     nearest = jnp.argmin(jnp.where(fresh, ahead**2 + left**2, jnp.inf))
     return fresh & fault, jnp.where(fresh.any(), kind[nearest], c.NONE).astype(jnp.int8)
 
