@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from operator import attrgetter
 from typing import Any
 
@@ -11,13 +12,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int8, Int64
 
 from drivax.errors import DataError, UsageError
+from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, AgentKind, Capacity, Flag, RoadKind
 
 Array = np.ndarray[Any, Any]
 STEP_TOLERANCE_S = 0.005
 TEXT_BYTES = {"scenario_id": 64, "segment": 64, "dataset": 16}
-#: Largest distance from the ego and largest speed; beyond them the file is damaged or its unit is not the metre.
-EXTENT_M, SPEED_MPS = 100_000.0, 500.0
+#: Largest distance from the ego and largest speed; beyond them a track or file is damaged or its unit is not the metre.
+EXTENT_M, SPEED_MPS = 100_000.0, 100.0
 #: Steps between the starts of two windows.
 STRIDE = 40
 _UNITS = "repair it, or convert it to metres in the reader"
@@ -127,38 +129,104 @@ def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
     make three). Windows without a valid ego at the current step are left out, and counted in ``lost`` of the others as
     ``windows_without_ego``. A recording of at most 91 steps is its own window.
 
+    A single dropped frame is interpolated and counted in ``lost`` of its windows as ``dropped_frames``. No window spans
+    a longer gap: each side is cut on its own, the gaps are counted as ``time_gaps``. Where no side fills a window, the
+    longest one is the window.
+
     Raises:
         DataError: No window has a valid ego at its current step.
     """
     if stride < 1:
         raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
+    recording, filled = _with_dropped_frames(recording)
     steps = len(recording.timestamps_s)
-    if steps <= STEPS:
-        yield recording
+    gaps = np.flatnonzero(frames_between(recording.timestamps_s) != 1) + 1
+    if steps <= STEPS and not len(gaps):
+        yield _counting(recording, dropped_frames=len(filled))
         return
-    starts = range(0, steps - STEPS + 1, stride)
-    usable = [start for start in starts if recording.tracks.valid[recording.ego, start + CURRENT_STEP]]
+    pieces = list(pairwise([0, *gaps.tolist(), steps]))
+    starts, length = [start for a, b in pieces for start in range(a, b - STEPS + 1, stride)], STEPS
+    if not starts:
+        begin, end = max(pieces, key=lambda piece: piece[1] - piece[0])
+        starts, length = [begin], end - begin
+    now = min(CURRENT_STEP, length - 1)
+    usable = [start for start in starts if recording.tracks.valid[recording.ego, start + now]]
     if not usable:
         problem = f"the ego is not valid at the current step of any of {len(starts)} windows"
         raise DataError(problem, record=recording.scenario_id, cure="skip the recording")
-    left_out = {"windows_without_ego": len(starts) - len(usable)} if len(usable) < len(starts) else {}
+    left_out = {"windows_without_ego": len(starts) - len(usable), "time_gaps": len(gaps)}
     for start in usable:
-        yield _window(replace(recording, lost={**recording.lost, **left_out}), start)
+        dropped = ((filled >= start) & (filled < start + length)).sum()
+        yield _counting(_window(recording, start, length), **left_out, dropped_frames=int(dropped))
 
 
-def _window(recording: Recording, start: int) -> Recording:
-    """The 91 steps from ``start`` on."""
-    part = slice(start, start + STEPS)
+def _counting(recording: Recording, **lost: int) -> Recording:
+    """The recording with more counts in ``lost``; itself if they are all 0."""
+    lost = {name: count for name, count in lost.items() if count}
+    return replace(recording, lost={**recording.lost, **lost}) if lost else recording
+
+
+def frames_between(timestamps_s: Float[Array, " time"]) -> Int64[np.ndarray, " interval"]:
+    """Median steps from each frame to the next: 1, or 2 where a frame was dropped; 1 unless timestamps increase."""
+    steps = np.diff(timestamps_s)
+    if not (steps > 0).all():
+        return np.ones(len(steps), dtype=np.int64)
+    return np.rint(steps / step_seconds(timestamps_s)[0]).astype(np.int64)
+
+
+def _with_dropped_frames(recording: Recording) -> tuple[Recording, Int64[np.ndarray, " filled"]]:
+    """Put a frame half-way into every interval of two steps; also return the steps of these frames."""
+    at = np.flatnonzero(frames_between(recording.timestamps_s) == 2) + 1
+    if not len(at):
+        return recording, at
+    times, seen = recording.timestamps_s, recording.seen
+    lights = [np.insert(light.states, at, light.states[at - 1]) for light in recording.lights]
+    filled = replace(
+        recording,
+        timestamps_s=np.insert(times, at, (times[at - 1] + times[at]) / 2),
+        current_step=_shifted(recording.current_step, at),
+        tracks=_halfway(recording.tracks, at),
+        seen=None if seen is None else np.insert(seen, at, seen[:, at - 1] & seen[:, at], axis=1),
+        lights=tuple(map(lambda light, states: replace(light, states=states), recording.lights, lights)),
+        events=tuple(
+            replace(event, start=_shifted(event.start, at), end=_shifted(event.end, at))
+            for event in recording.events
+        ),
+    )
+    return filled, at + np.arange(len(at))
+
+
+def _shifted(step: int, at: Int64[np.ndarray, " filled"]) -> int:
+    """Number of a step after frames are put before the steps ``at``."""
+    return step + int((at <= step).sum())
+
+
+def _halfway(tracks: Tracks, at: Int64[np.ndarray, " filled"]) -> Tracks:
+    """Put a state half-way before each of the steps ``at``, valid where both neighbours are."""
+    valid = tracks.valid[:, at - 1] & tracks.valid[:, at]
+    result = {"valid": np.insert(tracks.valid, at, valid, axis=1)}
+    for name in _WIDTHS.keys() - {"valid"}:
+        values = getattr(tracks, name)
+        step = values[:, at] - values[:, at - 1]
+        middle = values[:, at - 1] + (wrap(step) if name == "heading" else step) / 2
+        middle[~valid] = 0.0
+        result[name] = np.insert(values, at, middle, axis=1)
+    return replace(tracks, **result)
+
+
+def _window(recording: Recording, start: int, length: int) -> Recording:
+    """The steps from ``start`` on."""
+    part = slice(start, start + length)
     timed = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
     events = (
-        replace(event, start=max(event.start - start, 0), end=min(event.end - start, STEPS - 1))
+        replace(event, start=max(event.start - start, 0), end=min(event.end - start, length - 1))
         for event in recording.events
     )
     return replace(
         recording,
         scenario_id=f"{recording.scenario_id}@{start}",
         timestamps_s=recording.timestamps_s[part],
-        current_step=CURRENT_STEP,
+        current_step=min(CURRENT_STEP, length - 1),
         tracks=replace(recording.tracks, **timed),
         seen=None if recording.seen is None else recording.seen[:, part],
         lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
@@ -217,6 +285,9 @@ def _check_time(recording: Recording, most_steps: int) -> Finding:
     median, _ = step_seconds(times)
     if abs(median - DT_S) > STEP_TOLERANCE_S:
         return f"steps of {median:.3f} s instead of {DT_S} s", "resample the recording to 10 Hz"
+    if len(gaps := np.flatnonzero(frames_between(times) != 1)):
+        seconds = times[gaps[0] + 1] - times[gaps[0]]
+        return f"step {gaps[0] + 1} comes {seconds:.3f} s after the one before", "cut it with windows()"
     return None
 
 
@@ -262,17 +333,43 @@ def _here(recording: Recording) -> Float[Array, "3"]:
 
 
 def _check_extent(recording: Recording) -> Finding:
-    """Positions and speeds of any size would not fit into memory or float32."""
-    tracks, here = recording.tracks, _here(recording)
-    places = np.concatenate((tracks.xy[tracks.valid], tracks.z[tracks.valid][:, None]), axis=1)
-    if np.abs(places - here).max() > EXTENT_M:
-        return f"a track is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
-    if np.abs(tracks.velocity[tracks.valid]).max() > SPEED_MPS:
-        return f"a track is faster than {SPEED_MPS:.0f} m/s", _UNITS
+    """Positions and speeds of any size would not fit into memory or float32; other tracks lose such steps."""
+    here = _here(recording)
+    lost = np.flatnonzero(recording.tracks.valid[recording.ego] & ~plausible(recording, recording.ego))
+    if len(lost):
+        return f"the ego jumps or is faster than {SPEED_MPS:.0f} m/s at step {lost[0]}", _UNITS
     stops = [np.asarray(light.stop_point) for light in recording.lights if np.shape(light.stop_point) == (3,)]
     if stops and np.nanmax(np.abs(np.array(stops) - here), initial=0.0) > EXTENT_M:
         return f"a light is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
     return None
+
+
+def plausible(recording: Recording, track: int) -> Bool[np.ndarray, " time"]:
+    """Valid steps of a track without those beyond ``EXTENT_M`` and ``SPEED_MPS``, and without jumps.
+
+    A track jumps between two observations that it could not connect at ``SPEED_MPS``. Of the pieces between jumps the
+    longest is kept, and before and after it those that connect.
+    """
+    tracks = recording.tracks
+    xy, here = tracks.xy[track], _here(recording)
+    away = np.abs(np.column_stack((xy, tracks.z[track])) - here).max(axis=1)
+    slow = np.abs(tracks.velocity[track]).max(axis=1) <= SPEED_MPS
+    at = np.flatnonzero(tracks.valid[track] & (away <= EXTENT_M) & slow)
+    pieces = np.split(at, np.flatnonzero(~_connected(xy, at[:-1], at[1:])) + 1)
+    longest = int(np.argmax([len(piece) for piece in pieces]))
+    kept = pieces[longest]
+    for piece in pieces[longest + 1 :]:
+        kept = np.append(kept, piece) if _connected(xy, kept[-1], piece[0]) else kept
+    for piece in reversed(pieces[:longest]):
+        kept = np.append(piece, kept) if _connected(xy, piece[-1], kept[0]) else kept
+    result = np.zeros(len(xy), dtype=bool)
+    result[kept] = True
+    return result
+
+
+def _connected(xy: Float[Array, "time 2"], earlier: Any, later: Any) -> Any:
+    """Whether a track could drive from its earlier to its later positions."""
+    return np.hypot(*(xy[later] - xy[earlier]).T) <= SPEED_MPS * DT_S * (later - earlier)
 
 
 def _check_map(recording: Recording) -> Finding:
