@@ -43,12 +43,12 @@ def test_single_dropped_frame_is_interpolated_for_all_agents(frame):
     wrapped = (turning + np.pi) % (2 * np.pi) - np.pi
     whole.tracks.heading[1] = wrapped
     (filled,) = windows(without(whole, [frame]))
-    assert filled.lost == {"dropped_frames": 1}
+    assert filled.lost == {"interpolated_steps": 1}
     assert filled.timestamps_s == pytest.approx(whole.timestamps_s)
     assert (filled.current_step, filled.scenario_id) == (10, "hand-made")
     assert filled.lights[0].states.tolist() == whole.lights[0].states.tolist()
     one, other = assemble(whole), assemble(filled)
-    assert other.source.lost == {"dropped_frames": 1}
+    assert other.source.lost == {"interpolated_steps": 1}
     assert Flag.JITTERED_TIME not in other.has
     for name in ("agent_xy", "agent_velocity", "agent_valid", "agent_size"):
         assert np.allclose(getattr(one, name), getattr(other, name), atol=1e-5), name
@@ -73,7 +73,7 @@ def test_windows_of_a_long_drive_count_their_own_dropped_frames():
     drive = without(long_drive(), [30, 100])
     cut = list(windows(drive))
     assert [each.scenario_id for each in cut] == [f"hand-made@{start}" for start in (0, 40, 80)]
-    assert [each.lost.get("dropped_frames", 0) for each in cut] == [1, 1, 1]
+    assert [each.lost.get("interpolated_steps", 0) for each in cut] == [1, 1, 1]
     assert [each.lost for each in windows(without(long_drive(), [30]))][1:] == [{}, {}]
     for each, plain in zip(cut, windows(long_drive()), strict=True):
         assert each.tracks.xy == pytest.approx(plain.tracks.xy)
@@ -83,7 +83,10 @@ def test_windows_of_a_long_drive_count_their_own_dropped_frames():
 def test_no_window_spans_a_longer_gap():
     drive = without(long_drive(), range(50, 55))  # 50 frames, 0.6 s, 145 frames
     cut = list(windows(drive))
-    assert [each.scenario_id for each in cut] == ["hand-made@50", "hand-made@90"]
+    assert [each.scenario_id for each in cut] == [
+        "hand-made@55",
+        "hand-made@95",
+    ]  # 5.5 and 9.5 s after the first frame
     assert [each.lost for each in cut] == [{"time_gaps": 1}] * 2
     for each in cut:
         moved = np.diff(each.tracks.xy[0, :, 0])
@@ -96,24 +99,32 @@ def test_no_window_spans_a_longer_gap():
 def test_longest_side_of_a_gap_is_kept_where_none_fills_a_window():
     whole = straight_road([car(speed=10.0)], light=LightState.GO)
     (side,) = windows(without(whole, range(30, 33)))
-    assert (side.scenario_id, side.current_step, side.lost) == ("hand-made@30", 10, {"time_gaps": 1})
+    assert (side.scenario_id, side.current_step, side.lost) == ("hand-made@33", 10, {"time_gaps": 1})
     assert len(side.timestamps_s) == len(side.lights[0].states) == STEPS - 33
     assert side.tracks.xy[0] == pytest.approx(whole.tracks.xy[0, 33:])
     assert assemble(side).steps == STEPS - 33
 
 
-def test_frame_that_comes_too_early_is_a_gap():
-    drive = long_drive(200)
-    times = drive.timestamps_s.copy()
-    times[100:] -= 0.08  # 0.02 s after the frame before
-    assert [each.scenario_id for each in windows(replace(drive, timestamps_s=times))] == [
-        "hand-made@0", "hand-made@100",
-    ]  # fmt: skip
+@pytest.mark.parametrize("late_s", [0.05, -0.08, 0.03])
+def test_frames_off_their_time_are_resampled_by_time(late_s):
+    """One frame late by 50 ms, as where a sweep of 20 Hz is missing in a drive at 10 Hz; one 80 ms early."""
+    times = np.arange(200) * 0.1
+    times[100:] += late_s
+    tracks = make_tracks([np.stack([10.0 * times, 0.2 * times], -1)], heading=np.zeros((1, 200)))
+    drive = make_recording(tracks=tracks, timestamps_s=times)
+    cut = list(windows(drive))
+    assert [each.scenario_id for each in cut] == [f"hand-made@{start}" for start in (0, 40, 80)]
+    # From 10.0 s on there is no frame at any step: none of steps 0 to 90, 31 of 40 to 130, 71 of 80 to 170.
+    assert [each.lost.get("interpolated_steps", 0) for each in cut] == [0, 31, 71]
+    for each in cut:
+        assert np.diff(each.tracks.xy[0, :, 0]) == pytest.approx(np.ones(STEPS - 1), abs=1e-9)
+        assert each.tracks.xy[0, :, 0] == pytest.approx(10.0 * each.timestamps_s, abs=1e-9)
+        assert Flag.JITTERED_TIME not in assemble(each).has
 
 
-def test_jitter_below_half_a_step_is_played_and_flagged():
+def test_jitter_up_to_twenty_milliseconds_is_played_and_flagged():
     whole = straight_road([car(speed=10.0)])
-    times = whole.timestamps_s + np.where(np.arange(STEPS) % 2, 0.02, 0.0)
+    times = whole.timestamps_s + np.where(np.arange(STEPS) % 2, 0.009, 0.0)
     late = replace(whole, timestamps_s=times)
     assert [each is late for each in windows(late)] == [True]
     assert Flag.JITTERED_TIME in assemble(late).has

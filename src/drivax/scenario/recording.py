@@ -17,6 +17,8 @@ from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, AgentKind, Capacit
 
 Array = np.ndarray[Any, Any]
 STEP_TOLERANCE_S = 0.005
+#: A recording with steps that differ more from the median is resampled; longer ones (in median steps) are gaps.
+LATE_S, GAP_STEPS = 0.02, 2.5
 TEXT_BYTES = {"scenario_id": 64, "segment": 64, "dataset": 16}
 #: Largest distance from the ego and largest speed; beyond them a track or file is damaged or its unit is not the metre.
 EXTENT_M, SPEED_MPS = 100_000.0, 100.0
@@ -129,35 +131,31 @@ def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
     make three). Windows without a valid ego at the current step are left out, and counted in ``lost`` of the others as
     ``windows_without_ego``. A recording of at most 91 steps is its own window.
 
-    A single dropped frame is interpolated and counted in ``lost`` of its windows as ``dropped_frames``. No window spans
-    a longer gap: each side is cut on its own, the gaps are counted as ``time_gaps``. Where no side fills a window, the
-    longest one is the window.
+    No window spans a gap of two or more frames: each side is cut on its own, and ``lost`` counts the ``time_gaps``.
+    Where no side fills a window, the longest one is the window. A side with a frame more than 20 ms early or late, such
+    as one after a dropped frame, is interpolated at even times; ``interpolated_steps`` counts steps without a frame.
 
     Raises:
         DataError: No window has a valid ego at its current step.
     """
     if stride < 1:
         raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
-    recording, filled = _with_dropped_frames(recording)
-    steps = len(recording.timestamps_s)
-    gaps = np.flatnonzero(frames_between(recording.timestamps_s) != 1) + 1
-    if steps <= STEPS and not len(gaps):
-        yield _counting(recording, dropped_frames=len(filled))
+    pieces = [_even(piece) for piece in _between_gaps(recording)]
+    if len(pieces) == 1 and len(pieces[0][1]) <= STEPS:
+        piece, filled = pieces[0]
+        yield _counting(piece, interpolated_steps=int(filled.sum()))
         return
-    pieces = list(pairwise([0, *gaps.tolist(), steps]))
-    starts, length = [start for a, b in pieces for start in range(a, b - STEPS + 1, stride)], STEPS
-    if not starts:
-        begin, end = max(pieces, key=lambda piece: piece[1] - piece[0])
-        starts, length = [begin], end - begin
-    now = min(CURRENT_STEP, length - 1)
-    usable = [start for start in starts if recording.tracks.valid[recording.ego, start + now]]
+    cut = [
+        _window(piece, filled, start, recording)
+        for piece, filled in pieces
+        for start in range(0, len(filled) - STEPS + 1, stride)
+    ] or [_window(*max(pieces, key=lambda piece: len(piece[1])), 0, recording)]
+    usable = [window for window in cut if window.tracks.valid[window.ego, window.current_step]]
     if not usable:
-        problem = f"the ego is not valid at the current step of any of {len(starts)} windows"
+        problem = f"the ego is not valid at the current step of any of {len(cut)} windows"
         raise DataError(problem, record=recording.scenario_id, cure="skip the recording")
-    left_out = {"windows_without_ego": len(starts) - len(usable), "time_gaps": len(gaps)}
-    for start in usable:
-        dropped = ((filled >= start) & (filled < start + length)).sum()
-        yield _counting(_window(recording, start, length), **left_out, dropped_frames=int(dropped))
+    left_out = {"windows_without_ego": len(cut) - len(usable), "time_gaps": len(pieces) - 1}
+    yield from (_counting(window, **left_out) for window in usable)
 
 
 def _counting(recording: Recording, **lost: int) -> Recording:
@@ -166,67 +164,90 @@ def _counting(recording: Recording, **lost: int) -> Recording:
     return replace(recording, lost={**recording.lost, **lost}) if lost else recording
 
 
-def frames_between(timestamps_s: Float[Array, " time"]) -> Int64[np.ndarray, " interval"]:
-    """Median steps from each frame to the next: 1, or 2 where a frame was dropped; 1 unless timestamps increase."""
-    steps = np.diff(timestamps_s)
-    if not (steps > 0).all():
-        return np.ones(len(steps), dtype=np.int64)
-    return np.rint(steps / step_seconds(timestamps_s)[0]).astype(np.int64)
+def _between_gaps(recording: Recording) -> Iterator[Recording]:
+    """The pieces of a recording between gaps; timestamps that do not increase are left to ``check``."""
+    times = recording.timestamps_s
+    ends = np.flatnonzero(np.diff(times) > GAP_STEPS * step_seconds(times)[0]) + 1
+    if not len(ends) or not (np.diff(times) > 0).all():
+        yield recording
+        return
+    for first, last in pairwise([0, *ends.tolist(), len(times)]):
+        yield _part(recording, slice(first, last))
 
 
-def _with_dropped_frames(recording: Recording) -> tuple[Recording, Int64[np.ndarray, " filled"]]:
-    """Put a frame half-way into every interval of two steps; also return the steps of these frames."""
-    at = np.flatnonzero(frames_between(recording.timestamps_s) == 2) + 1
-    if not len(at):
-        return recording, at
-    times, seen = recording.timestamps_s, recording.seen
-    lights = [np.insert(light.states, at, light.states[at - 1]) for light in recording.lights]
-    filled = replace(
+def _even(recording: Recording) -> tuple[Recording, Bool[np.ndarray, " time"]]:
+    """Interpolate a recording at even times if a step is too short or too long; mask the steps without a frame."""
+    times = recording.timestamps_s
+    step, off = step_seconds(times)
+    if off <= LATE_S or not (np.diff(times) > 0).all():
+        return recording, np.zeros(len(times), dtype=bool)
+    count = int((times[-1] - times[0] + STEP_TOLERANCE_S) / step) + 1
+    even = times[0] + step * np.arange(count)
+    at = np.interp(even, times, np.arange(len(times)))
+    frame = np.rint(at).astype(np.int64)
+    exact = np.abs(times[frame] - even) <= STEP_TOLERANCE_S
+    return _at(recording, np.where(exact, frame, at), even), ~exact
+
+
+def _at(recording: Recording, at: Float64[np.ndarray, " step"], even: Float64[Array, " step"]) -> Recording:
+    """The recording at fractional steps, which come at even times; lights keep their state until the next frame."""
+    before, after = np.floor(at).astype(np.int64), np.ceil(at).astype(np.int64)
+    tracks, seen = recording.tracks, recording.seen
+    timed = {"valid": tracks.valid[:, before] & tracks.valid[:, after]}
+    for name in _WIDTHS.keys() - timed.keys():
+        timed[name] = interpolate(getattr(tracks, name), tracks.valid, at, angle=name == "heading")
+
+    def step_of(old: int) -> int:
+        return min(int(np.searchsorted(at, old)), len(at) - 1)
+
+    return replace(
         recording,
-        timestamps_s=np.insert(times, at, (times[at - 1] + times[at]) / 2),
-        current_step=_shifted(recording.current_step, at),
-        tracks=_halfway(recording.tracks, at),
-        seen=None if seen is None else np.insert(seen, at, seen[:, at - 1] & seen[:, at], axis=1),
-        lights=tuple(map(lambda light, states: replace(light, states=states), recording.lights, lights)),
+        timestamps_s=even,
+        current_step=step_of(recording.current_step),
+        tracks=replace(tracks, **timed),
+        seen=None if seen is None else seen[:, before] & seen[:, after],
+        lights=tuple(replace(light, states=light.states[before]) for light in recording.lights),
         events=tuple(
-            replace(event, start=_shifted(event.start, at), end=_shifted(event.end, at))
-            for event in recording.events
+            replace(event, start=step_of(event.start), end=step_of(event.end)) for event in recording.events
         ),
     )
-    return filled, at + np.arange(len(at))
 
 
-def _shifted(step: int, at: Int64[np.ndarray, " filled"]) -> int:
-    """Number of a step after frames are put before the steps ``at``."""
-    return step + int((at <= step).sum())
+def interpolate(
+    values: Float[Array, "track time *value"], valid: Bool[Array, "track time"], at: Float[Array, " step"],
+    angle: bool = False,
+) -> Float[Array, "track step *value"]:  # fmt: skip
+    """Interpolate values of tracks at fractional steps, angles along the shorter arc; 0 unless both sides are valid."""
+    before, after = np.floor(at).astype(np.int64), np.ceil(at).astype(np.int64)
+    widen = (..., *[None] * (values.ndim - 2))
+    step = values[:, after] - values[:, before]
+    result = values[:, before] + (at - before)[widen] * (wrap(step) if angle else step)
+    return np.where((valid[:, before] & valid[:, after])[widen], result, 0.0)
 
 
-def _halfway(tracks: Tracks, at: Int64[np.ndarray, " filled"]) -> Tracks:
-    """Put a state half-way before each of the steps ``at``, valid where both neighbours are."""
-    valid = tracks.valid[:, at - 1] & tracks.valid[:, at]
-    result = {"valid": np.insert(tracks.valid, at, valid, axis=1)}
-    for name in _WIDTHS.keys() - {"valid"}:
-        values = getattr(tracks, name)
-        step = values[:, at] - values[:, at - 1]
-        middle = values[:, at - 1] + (wrap(step) if name == "heading" else step) / 2
-        middle[~valid] = 0.0
-        result[name] = np.insert(values, at, middle, axis=1)
-    return replace(tracks, **result)
+def _window(piece: Recording, filled: Bool[Array, " time"], start: int, whole: Recording) -> Recording:
+    """The steps from ``start`` of a piece on, named by the steps since the beginning of the whole recording."""
+    part = slice(start, min(start + STEPS, len(filled)))
+    begin = (piece.timestamps_s[0] - whole.timestamps_s[0]) / step_seconds(whole.timestamps_s)[0]
+    window = replace(
+        _part(piece, part),
+        scenario_id=f"{whole.scenario_id}@{round(begin) + start}",
+        current_step=min(CURRENT_STEP, part.stop - part.start - 1),
+    )
+    return _counting(window, interpolated_steps=int(filled[part].sum()))
 
 
-def _window(recording: Recording, start: int, length: int) -> Recording:
-    """The steps from ``start`` on."""
-    part = slice(start, start + length)
+def _part(recording: Recording, part: slice) -> Recording:
+    """These steps of a recording, without another current step."""
+    last = part.stop - part.start - 1
     timed = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
     events = (
-        replace(event, start=max(event.start - start, 0), end=min(event.end - start, length - 1))
+        replace(event, start=max(event.start - part.start, 0), end=min(event.end - part.start, last))
         for event in recording.events
     )
     return replace(
         recording,
-        scenario_id=f"{recording.scenario_id}@{start}",
         timestamps_s=recording.timestamps_s[part],
-        current_step=min(CURRENT_STEP, length - 1),
         tracks=replace(recording.tracks, **timed),
         seen=None if recording.seen is None else recording.seen[:, part],
         lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
@@ -285,9 +306,11 @@ def _check_time(recording: Recording, most_steps: int) -> Finding:
     median, _ = step_seconds(times)
     if abs(median - DT_S) > STEP_TOLERANCE_S:
         return f"steps of {median:.3f} s instead of {DT_S} s", "resample the recording to 10 Hz"
-    if len(gaps := np.flatnonzero(frames_between(times) != 1)):
-        seconds = times[gaps[0] + 1] - times[gaps[0]]
-        return f"step {gaps[0] + 1} comes {seconds:.3f} s after the one before", "cut it with windows()"
+    off = np.abs(np.diff(times) - median)
+    if len(off) and off.max() > LATE_S:
+        step = int(off.argmax()) + 1
+        problem = f"step {step} comes {times[step] - times[step - 1]:.3f} s after the one before"
+        return problem, "cut and resample it with windows()"
     return None
 
 
