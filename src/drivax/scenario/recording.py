@@ -124,12 +124,12 @@ class Recording:
     split_gap_m: float | None = None
 
 
-def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
-    """Cut a recording into windows of 91 steps that share its segment.
+def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> Iterator[Recording]:
+    """Cut a recording into windows of ``length`` steps that share its segment; step 10 of each is the current one.
 
     Window ``k`` starts at step ``k * stride``; a rest that fills no window is left out (110 steps make one window, 199
     make three). Windows without a valid ego at the current step are left out, and counted in ``lost`` of the others as
-    ``windows_without_ego``. A recording of at most 91 steps is its own window.
+    ``windows_without_ego``. A recording of at most ``length`` steps is its own window.
 
     No window spans a gap of two or more frames: each side is cut on its own, and ``lost`` counts the ``time_gaps``.
     Where no side fills a window, the longest one is the window. A side with a frame more than 20 ms early or late, such
@@ -141,15 +141,15 @@ def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
     if stride < 1:
         raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
     pieces = [_even(piece) for piece in _between_gaps(recording)]
-    if len(pieces) == 1 and len(pieces[0][1]) <= STEPS:
+    if len(pieces) == 1 and len(pieces[0][1]) <= length:
         piece, filled = pieces[0]
         yield _counting(piece, interpolated_steps=int(filled.sum()))
         return
     cut = [
-        _window(piece, filled, start, recording)
+        _window(piece, filled, start, length, recording)
         for piece, filled in pieces
-        for start in range(0, len(filled) - STEPS + 1, stride)
-    ] or [_window(*max(pieces, key=lambda piece: len(piece[1])), 0, recording)]
+        for start in range(0, len(filled) - length + 1, stride)
+    ] or [_window(*max(pieces, key=lambda piece: len(piece[1])), 0, length, recording)]
     usable = [window for window in cut if window.tracks.valid[window.ego, window.current_step]]
     if not usable:
         problem = f"the ego is not valid at the current step of any of {len(cut)} windows"
@@ -178,9 +178,9 @@ def _between_gaps(recording: Recording) -> Iterator[Recording]:
 def _even(recording: Recording) -> tuple[Recording, Bool[np.ndarray, " time"]]:
     """Interpolate a recording at even times if a step is too short or too long; mask the steps without a frame."""
     times = recording.timestamps_s
-    step, off = step_seconds(times)
-    if off <= LATE_S or not (np.diff(times) > 0).all():
+    if is_even(times) or not (np.diff(times) > 0).all():
         return recording, np.zeros(len(times), dtype=bool)
+    step, _ = step_seconds(times)
     count = int((times[-1] - times[0] + STEP_TOLERANCE_S) / step) + 1
     even = times[0] + step * np.arange(count)
     at = np.interp(even, times, np.arange(len(times)))
@@ -225,9 +225,11 @@ def interpolate(
     return np.where((valid[:, before] & valid[:, after])[widen], result, 0.0)
 
 
-def _window(piece: Recording, filled: Bool[Array, " time"], start: int, whole: Recording) -> Recording:
+def _window(
+    piece: Recording, filled: Bool[Array, " time"], start: int, length: int, whole: Recording
+) -> Recording:
     """The steps from ``start`` of a piece on, named by the steps since the beginning of the whole recording."""
-    part = slice(start, min(start + STEPS, len(filled)))
+    part = slice(start, min(start + length, len(filled)))
     begin = (piece.timestamps_s[0] - whole.timestamps_s[0]) / step_seconds(whole.timestamps_s)[0]
     window = replace(
         _part(piece, part),
@@ -286,6 +288,11 @@ def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
     return float(np.median(steps)), float(np.abs(steps - np.median(steps)).max())
 
 
+def is_even(timestamps_s: Float[Array, " time"]) -> bool:
+    """Whether all steps are near enough to the median to be played as equal."""
+    return step_seconds(timestamps_s)[1] <= LATE_S
+
+
 def _check_names(recording: Recording) -> Finding:
     for name, size in TEXT_BYTES.items():
         text = getattr(recording, name)
@@ -306,9 +313,8 @@ def _check_time(recording: Recording, most_steps: int) -> Finding:
     median, _ = step_seconds(times)
     if abs(median - DT_S) > STEP_TOLERANCE_S:
         return f"steps of {median:.3f} s instead of {DT_S} s", "resample the recording to 10 Hz"
-    off = np.abs(np.diff(times) - median)
-    if len(off) and off.max() > LATE_S:
-        step = int(off.argmax()) + 1
+    if not is_even(times):
+        step = int(np.abs(np.diff(times) - median).argmax()) + 1
         problem = f"step {step} comes {times[step] - times[step - 1]:.3f} s after the one before"
         return problem, "cut and resample it with windows()"
     return None
