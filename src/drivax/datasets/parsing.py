@@ -140,7 +140,7 @@ def windows_of(steps: int) -> int:
     return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
 
 
-#: Told where the frames of a recording do not come evenly.
+#: Note of ``drivax doctor`` where the frames of a recording do not come evenly.
 UNEVEN = "frames are missing or off their time: steps are interpolated by time, and cut at gaps"
 
 
