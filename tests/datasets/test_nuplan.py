@@ -356,14 +356,17 @@ def test_short_logs_are_one_recording_without_a_future(tmp_path):
 
 
 def test_gaps_in_time_are_never_bridged(tmp_path):
-    """More than one missing sweep cuts; a single one leaves a step of 0.15 s, which is flagged."""
+    """More than one missing sweep cuts; a single one leaves a step of 0.15 s, which is resampled by time."""
     path = sample.write_full(tmp_path, missing=frozenset({201, *range(230, 240)}))
     recordings = read(path)
     assert all(np.diff(recording.timestamps_s).max() < 0.2 for recording in recordings)
     assert [len(recording.timestamps_s) for recording in recordings] == [115, 130]
     assert np.diff(recordings[0].timestamps_s).max() == pytest.approx(0.15, abs=2e-3)
+    # Sweep 200, before the missing one, is step 75; later steps are half-way between the sweeps that were taken.
     *_, last = windows(recordings[0], stride=10)
-    assert assemble(last).has & Flag.JITTERED_TIME
+    assert last.scenario_id.endswith("@20") and last.lost["interpolated_steps"] == 110 - 75
+    assert np.diff(last.timestamps_s) == pytest.approx(0.1, abs=1e-4)
+    assert not assemble(last).has & Flag.JITTERED_TIME
 
 
 def test_ten_hertz_logs_are_not_subsampled(tmp_path):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from datasets.samples import scenarionet as sample
+from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.scenarionet import pickles
 from drivax.datasets.scenarionet.map import (
@@ -405,6 +406,14 @@ def test_description_names_what_is_missing(tree, tmp_path):
     assert [note.split(":")[0] for note in described.notes] == [
         "no lane graph", "no traffic lights", "velocities are taken from the positions"
     ]  # fmt: skip
+
+
+def test_description_and_windows_tell_of_frames_off_their_time(tree, tmp_path):
+    tree["metadata"]["ts"][50:] += 0.1  # frame 50 was dropped
+    path = written(tree, tmp_path)
+    assert ScenarioNet().describe(path).notes == (parsing.UNEVEN,)
+    (window,) = windows(decode(tree))
+    assert assemble(window).source.lost["interpolated_steps"] == 1
 
 
 def test_long_files_are_counted_by_their_windows(tmp_path):

@@ -11,8 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.womd import messages
+from drivax.datasets.womd.records import notes_of
 from drivax.datasets.womd.scenario_reader import WomdScenario, decode
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
@@ -386,6 +388,9 @@ def test_describe_and_count(wire, write_records):
     assert told.version is None and len(told.notes) == 3 and "no lane graph" in told.notes[2]
     assert "no future" in reader.describe(write_records("d", wire.scenario(steps=11))).notes[1]
     assert "3 windows" in reader.describe(write_records("e", wire.scenario(steps=199))).notes[1]
+    (recording,) = reader.read(write_records("f", wire.scenario()))
+    gap = recording.timestamps_s + 0.5 * (np.arange(91) > 40)
+    assert notes_of(replace(recording, timestamps_s=gap))[-1] == parsing.UNEVEN
 
 
 def test_describe_names_the_damage(wire, write_records, tmp_path):

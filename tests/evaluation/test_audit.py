@@ -15,7 +15,7 @@ from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Light, windows
-from drivax.scenario.schema import CURRENT_STEP, Flag, LightState
+from drivax.scenario.schema import CURRENT_STEP, AgentKind, Flag, LightState
 from drivax.scenario.select.selection import FINDINGS
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
@@ -107,6 +107,48 @@ def test_leaving_and_entering_the_road_have_their_first_steps():
     assert enters["log_offroad_fraction"] == 14 / 80
     assert leaves["log_left_map"] is True and enters["log_left_map"] is True
     assert leaves["clean"] is enters["clean"] is False
+
+
+def turned(track):
+    """The same motion with headings off by pi, as in sources that know them up to pi."""
+    return track | {"heading": (track["heading"] + 2 * np.pi) % (2 * np.pi) - np.pi}
+
+
+def test_log_with_headings_off_by_pi_is_named():
+    right, wrong = audited(straight_road([car(speed=10)]), straight_road([turned(car(speed=10))]))
+    assert (right["reverse_m"], right["log_reverses"], right["clean"]) == (0.0, False, True)
+    assert wrong["reverse_m"] == pytest.approx(80.0, abs=0.01)  # 8 s at 10 m/s
+    assert (wrong["log_reverses"], wrong["clean"], wrong["agents_reversing"]) == (True, False, 0)
+
+
+def test_manoeuvre_in_reverse_is_measured_and_no_violation():
+    # Backs out at 2 m/s until 4 s after the current step, 8 m, then drives forward at up to 3 m/s.
+    t = np.arange(91) * 0.1
+    speed = np.where(t < 5, -2.0, np.minimum((t - 5) * 1.5, 3.0))
+    x = np.cumsum(speed) * 0.1
+    backs = car() | {"xy": np.stack([x, 0 * x], -1), "velocity": np.stack([speed, 0 * x], -1)}
+    (finding,) = audited(straight_road([backs]))
+    assert finding["reverse_m"] == pytest.approx(7.8, abs=0.01)  # steps 11 to 49
+    assert (finding["log_reverses"], finding["clean"]) == (False, True)
+
+
+def test_other_agents_with_headings_off_by_pi_are_counted():
+    kinds = (AgentKind.VEHICLE, AgentKind.CYCLIST, AgentKind.PEDESTRIAN)
+    others = [turned(car(30 + 20 * i, 3.7, speed=6, kind=kind)) for i, kind in enumerate(kinds)]
+    gap = turned(car(120, 3.7, speed=6, steps=[*range(30), *range(70, 91)]))  # seen for 4 s: 23.4 m
+    slow = turned(car(150, 3.7, speed=2))  # 16 m
+    (finding,) = audited(straight_road([car(speed=6), *others, gap, slow]))
+    assert finding["agents_reversing"] == 3  # whichever way pedestrians look
+    assert (finding["log_reverses"], finding["clean"]) == (False, True)
+
+
+def test_jitter_of_a_parked_car_is_not_driving_backwards():
+    noise = np.random.default_rng(0).normal(
+        0, 0.03, (91, 2)
+    )  # about 1 m of motion per second, back and forth
+    parked = car()
+    (finding,) = audited(straight_road([parked | {"xy": parked["xy"] + noise}]))
+    assert finding["reverse_m"] < 5.0 and finding["clean"] is True
 
 
 def test_distance_and_distance_to_the_route():

@@ -216,6 +216,54 @@ def test_overflow_is_counted_and_flagged():
     assert scenario.route_points[0] == 100
 
 
+def fan(x):
+    """A lane with six successors, a hill on them."""
+    ends = [line((x + 20, 0), (x + 40, 0.5 * i - 1)) for i in range(6)]
+    for points in ends:
+        points[:, 2] = np.linspace(0, 5, len(points))
+    first = lane(700, line((x, 0), (x + 20, 0)), limit_mps=10.0, successors=tuple(range(701, 707)))
+    return (first, *(lane(701 + i, points, limit_mps=None) for i, points in enumerate(ends)))
+
+
+def city(x):
+    """Six successors of one lane, 40 lights without a lane, 17 stop signs, each with a lane, from ``x`` on."""
+    signs = (
+        MapFeature(800 + i, RoadKind.STOP_SIGN, np.array([[x + i, 9.0, 0]]), lanes=(700,)) for i in range(17)
+    )
+    return (*fan(x), *signs), tuple(light(900 + i, x + i, 30.0, [4] * 91) for i in range(40))
+
+
+def test_overflow_and_flags_do_not_speak_of_the_city_outside_the_crop():
+    """The crop ends 100 m ahead of the log, at x = 180 m."""
+    beside, near = (
+        assemble(
+            replace(busy_recording(straight_road()), features=(*straight_road(), *features), lights=lights)
+        )
+        for features, lights in (city(400.0), city(120.0))
+    )
+    assert beside.overflow == {} and beside.source.map_features["lane"] == 9
+    of_city = Flag.OVERFLOW | Flag.ELEVATION | Flag.DEFAULT_LIMITS | Flag.LANE_GRAPH
+    assert not beside.has & of_city
+    assert near.overflow == {"lane_links": 2, "lights_without_lane": 40, "stops": 1}
+    assert near.has & of_city == of_city
+
+
+def test_default_sizes_speak_of_stored_agents():
+    tracks = make_tracks([driving(), driving(8.0, x=500.0)])
+    tracks.size[1] = 0.0
+    recording = make_recording(tracks=tracks)
+    assert Flag.DEFAULT_SIZES in assemble(recording).has
+    assert Flag.DEFAULT_SIZES not in assemble(recording, Capacity(agents=1)).has
+
+
+def test_lane_of_the_route_that_leaves_the_grid_is_no_overflow():
+    """The grid is a square of 640 m around the log; the lane that ego drives goes on for 2 km."""
+    scenario = assemble(make_recording(straight_road(end=2000.0)[:2]))
+    assert scenario.overflow == {} and Flag.OVERFLOW not in scenario.has
+    x = scenario.segment_b[: scenario.segment_blocks[2], 0]
+    assert 340 < x.max() < 360  # the middle of the log is at 30 m
+
+
 def test_dangling_references_of_the_source_are_counted():
     """Check-list 11: dense lane indices, dangling links and unknown lanes of the route counted, not followed."""
     road = straight_road()
@@ -293,8 +341,9 @@ REFUSED = [
     (broken(features=(lane(8, line((0, 0), (2e5, 0), step=5e4)),)), "feature 8 has a point more than 100 km away"),
     (broken(features=(lane(2**63, line((0, 0), (9, 0))),)), "the feature id 9223372036854775808 does not fit"),
     (broken(features=tuple(lane(i, line((0, i), (9e4, i), step=1e4)) for i in range(6))), "are 540 km long"),
-    (with_tracks(xy=at(TRACKS.xy, (1, 7, 0), 1e30)), "a track is more than 100 km away from the ego"),
-    (with_tracks(velocity=at(TRACKS.velocity, (1, 7, 0), -1e30)), "a track is faster than 500 m/s"),
+    (with_tracks(xy=at(TRACKS.xy, (0, 7, 0), 1e30)), "the ego jumps or is faster than 100 m/s at step 7"),
+    (with_tracks(velocity=at(TRACKS.velocity, (0, 7, 0), -1e30)), "the ego jumps or is faster than 100 m/s at step 7"),
+    (broken(timestamps_s=np.arange(91) * 0.1 + 0.6 * (np.arange(91) > 49)), r"step 50 comes 0.700 s .* windows\(\)"),
     (broken(lights=(light(1, 1e9, 0, [4] * 91),)), "a light is more than 100 km away from the ego"),
     (broken(lights=(light(1, 0, 0, [4]),)), "the light of lane 1 has no state from -1 to 8 per step"),
     (broken(lights=(light(1, np.nan, 0, [4] * 91),)), "the light of lane 1 has no finite stop point"),

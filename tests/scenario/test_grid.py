@@ -49,7 +49,7 @@ def block_members(arranged, start, xy):
 def test_every_segment_within_eight_metres_is_in_the_block_of_nine_cells(seed):
     segments = random_map(seed)
     capacity = replace(CAPACITY, edge_run=500, lane_run=500)
-    arranged = arrange(segments, PATH, capacity)
+    arranged = arrange(segments, PATH, 100.0, capacity)
     assert arranged.overflow.get("edge_run", 0) == 0
     a, b = (x.astype(np.float32).astype(np.float64) for x in (arranged.segments.a, arranged.segments.b))
     rng = np.random.default_rng(seed)
@@ -67,7 +67,7 @@ def test_every_segment_within_eight_metres_is_in_the_block_of_nine_cells(seed):
 @given(st.integers(0, 10_000))
 def test_blocks_are_sorted_by_cell_and_nothing_is_lost(seed):
     segments = random_map(seed)
-    arranged = arrange(segments, PATH, replace(CAPACITY, edge_run=500, lane_run=500))
+    arranged = arrange(segments, PATH, 1000.0, replace(CAPACITY, edge_run=500, lane_run=500))
     ends = arranged.blocks
     assert ends[0] == 0
     assert ends[3] == len(arranged.segments) == len(segments) - arranged.overflow.get("segments", 0)
@@ -91,22 +91,24 @@ def test_the_grid_is_centred_on_the_map_or_on_the_log_where_the_map_is_too_large
 
 def test_farthest_segments_overflow_and_are_counted():
     segments = cut(road_lines([lane(1, line((-200, 0), (200, 0)))], np.zeros(3), None))
-    arranged = arrange(segments, PATH, replace(CAPACITY, segments=40))
+    arranged = arrange(segments, PATH, 100.0, replace(CAPACITY, segments=40))
     assert arranged.overflow == {"segments": len(segments) - 40}
     assert np.abs(arranged.segments.middle[:, 0]).max() < 40 * 4 / 2
     far = cut(road_lines([lane(1, line((-50, 0), (900, 0)))], np.zeros(3), None))
-    cropped = arrange(far, PATH, CAPACITY)
-    assert cropped.overflow["segments"] == int((far.middle[:, 0] >= 320).sum())
+    cropped = arrange(far, PATH, 400.0, CAPACITY)
+    x = far.middle[:, 0]
+    assert cropped.overflow == {"segments": int(((x >= 320) & (x <= 400)).sum())}
+    assert arrange(far, PATH, 320.0, CAPACITY).overflow == {}  # the rest is outside the crop
 
 
 def test_crowded_runs_are_thinned_and_counted_and_refused_near_the_log():
     comb = [line((300 + 0.1 * i, -2), (300 + 0.1 * i, 1.9)) for i in range(30)]
     segments = cut(road_lines([edge(i, c) for i, c in enumerate(comb)], np.zeros(3), None))
     tight = replace(CAPACITY, edge_run=10)
-    arranged = arrange(segments, PATH, tight)
+    arranged = arrange(segments, PATH, 100.0, tight)
     assert arranged.overflow == {"edge_run": 20}
     assert arranged.segments.middle[:, 0].max() < 301.0  # the nearest ones stay
     with pytest.raises(DataError, match=r"20 road-edge segments .* larger capacity"):
-        arrange(segments, np.array([[295.0, 0.0]]), tight)
+        arrange(segments, np.array([[295.0, 0.0]]), 100.0, tight)
     runs = arranged.grid.runs(np.diff(arranged.edge_start))
     assert runs.max() == 10

@@ -41,8 +41,13 @@ def test_links_named_by_either_side_are_kept_and_dangling_ones_dropped():
 def test_links_beyond_four_are_counted():
     fan = [lane(i, line((20, 0), (40, 2.0 * i))) for i in range(6)]
     graph = graph_of(*fan, lane(9, line((0, 0), (20, 0)), successors=tuple(range(6))))
-    assert graph.successor[6].tolist() == [0, 1, 2, 3]
-    assert graph.dropped_links == 2
+    assert graph.successor[6].tolist() == [0, 1, 2, 3, 4, 5]  # routes may use all of them
+    stored = select(graph, np.arange(7))
+    assert stored.successor[6].tolist() == [0, 1, 2, 3]
+    assert (graph.dropped_links, stored.dropped_links) == (0, 2)
+    # Of the lanes that are kept, the fifth link is the second: none is lost.
+    part = select(graph, np.array([0, 4, 6]))
+    assert (part.successor[2].tolist(), part.dropped_links) == ([0, 1, -1, -1], 0)
 
 
 def test_oncoming_lanes_are_not_neighbours_and_spacing_gives_the_width():

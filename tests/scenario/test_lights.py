@@ -17,7 +17,7 @@ PATH = np.array([[0.0, 0.0]])
 def placed(features, lights, most=8):
     graph = lane_graph(features, ZERO)
     on = LaneSegments.of(cut(road_lines(features, ZERO, None)), graph)
-    return place_lights(lights, on, ZERO, PATH, most)
+    return place_lights(lights, on, ZERO, PATH, 100.0, most)
 
 
 def test_a_stop_line_lies_across_its_lane_from_left_to_right():
@@ -42,6 +42,7 @@ def test_a_light_without_its_lane_takes_the_nearest_direction_or_is_counted():
     assert lights.line[0] == pytest.approx([10, 2.85, 10, -0.85])
     assert lights.overflow == {"lights_without_lane": 1}
     assert placed((), [light(1, 0, 0, [4])]).overflow == {"lights_without_lane": 1}
+    assert placed((), [light(1, 101, 0, [4])]).overflow == {}  # beyond the margin lanes are cropped too
     assert len(placed((), []).z) == 0
 
 
@@ -59,7 +60,21 @@ def test_stop_signs_refer_to_the_lanes_they_control():
         MapFeature(51, RoadKind.STOP_SIGN, np.array([[1.0, 1, 0]]), lanes=(0, 1, 2, 3, 4)),
         MapFeature(52, RoadKind.STOP_SIGN, np.array([[90.0, 0, 0]])),
     )
-    stops = place_stops(features, lane_graph(features, ZERO), ZERO, PATH, 2)
+    stops = place_stops(features, lane_graph(features, ZERO), ZERO, PATH, 100.0, 2)
     assert stops.xy.tolist() == [[1, 1], [9, 3]]
     assert stops.lane.tolist() == [[0, 1, 2, 3], [2, 4, -1, -1]]
     assert stops.overflow == {"stops": 1, "stop_lanes": 1}
+
+
+def test_stop_signs_outside_the_crop_neither_count_nor_take_slots():
+    far = [MapFeature(60 + i, RoadKind.STOP_SIGN, np.array([[101.0 + i, 0, 0]])) for i in range(3)]
+    corner = MapFeature(
+        70, RoadKind.STOP_SIGN, np.array([[99.0, 99.0, 0]])
+    )  # 140 m away, inside the margin of 100 m
+    graph = lane_graph((), ZERO)
+    stops = place_stops((*far, corner), graph, ZERO, PATH, 100.0, 2)
+    assert stops.xy.tolist() == [[101, 0], [99, 99]]
+    assert stops.overflow == {}
+    two = MapFeature(71, RoadKind.STOP_SIGN, np.array([[-50.0, 0, 0]]))
+    stops = place_stops((*far, corner, two), graph, ZERO, PATH, 100.0, 1)
+    assert (stops.xy.tolist(), stops.overflow) == ([[-50, 0]], {"stops": 1})

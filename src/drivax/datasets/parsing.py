@@ -140,6 +140,10 @@ def windows_of(steps: int) -> int:
     return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
 
 
+#: Note of ``drivax doctor`` where the frames of a recording do not come evenly.
+UNEVEN = "frames are missing or off their time: steps are interpolated by time, and cut at gaps"
+
+
 def nonzero(**counts: int) -> dict[str, int]:
     """Counts that are not zero, for ``Recording.lost``."""
     return {name: int(count) for name, count in counts.items() if count}

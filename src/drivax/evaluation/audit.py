@@ -12,11 +12,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.schema import CURRENT_STEP, Flag, Scenario
+from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import AgentContext, Facts, Frame, SimState, Situation, Surroundings
 from drivax.tasks.actions import PHYSICAL, PUBLISHED
@@ -25,6 +25,9 @@ Finding = dict[str, float | int | bool | str | None]
 
 #: Logs per batch.
 BATCH = 64
+#: Agents that drive further backwards do not manoeuvre: their headings are wrong by pi. Slower motion is jitter.
+REVERSE_M, CREEP_MPS = 20.0, 0.5
+_DRIVERS = (AgentKind.VEHICLE, AgentKind.CYCLIST)
 #: A route leads to the goal when the log ends within this distance of it (semantics, ``reached_goal``).
 GOAL_M = 3.0
 _READ = (
@@ -152,6 +155,8 @@ def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) ->
     deviation = series["route_deviation_m"][evaluated] if Flag.ROUTE in flags else np.zeros(0)
     ran_red = bool(red.any()) if Flag.LIGHTS in flags else None
     reached = bool((series["goal_distance_m"][evaluated][-1:] <= GOAL_M).all())
+    backwards = _reverse_m(scenario)
+    reverses = backwards > REVERSE_M
     return {
         "log_collides": bool(hit.any()),
         "first_collision_step": _first(hit),
@@ -161,13 +166,26 @@ def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) ->
         "log_left_map": bool((series["left_map"] & evaluated).any()) if mapped else None,
         "log_runs_red": ran_red,
         "distance_m": _rounded(series["moved_m"][evaluated].sum()),
+        "reverse_m": _rounded(backwards[0]),
+        "log_reverses": bool(reverses[0]),
+        "agents_reversing": int(reverses[1:].sum()),
         "route_deviation_mean_m": _rounded(deviation.mean()) if len(deviation) else None,
         "route_deviation_max_m": _rounded(deviation.max()) if len(deviation) else None,
         "route_reaches_goal": reached if len(deviation) else None,
         "ignored_overlaps": int(series["ignored"].max()),
         **{name: _share(series[name], evaluated) for name in _SPACES},
-        "clean": not hit.any() and not off.any() and not ran_red if mapped else None,
+        "clean": not hit.any() and not off.any() and not ran_red and not reverses[0] if mapped else None,
     }
+
+
+def _reverse_m(scenario: Scenario) -> Float[np.ndarray, " agent"]:
+    """Return the distance that vehicles and cyclists drive against their heading after the current step, metres."""
+    now = slice(CURRENT_STEP, int(scenario.steps))
+    valid, heading = scenario.agent_valid[now], scenario.agent_heading[now][:-1]
+    step = np.diff(scenario.agent_xy[now].astype(np.float64), axis=0)
+    along = step[..., 0] * np.cos(heading) + step[..., 1] * np.sin(heading)
+    counted = valid[1:] & valid[:-1] & (along < -CREEP_MPS * DT_S) & np.isin(scenario.agent_kind, _DRIVERS)
+    return np.where(counted, -along, 0.0).sum(axis=0)
 
 
 def _share(clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:

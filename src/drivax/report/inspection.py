@@ -37,6 +37,7 @@ def described(entry: Entry) -> dict[str, Any]:
         **{name: entry[name] for name in ("scenario_id", "dataset", "segment")},
         **{name: entry["source"][name] for name in _SOURCE},
         **{name: entry[name] for name in ("segments", "overflow", "flags", "audit")},
+        "lost": entry["source"].get("lost", {}),
     }
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int8
 from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.tracks import DEFAULT_SIZES
-from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, interpolate
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind, Scenario
 
 Array = np.ndarray[Any, Any]
@@ -108,17 +108,12 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     valid = _array(agents, "valid", bool, (None, None))
     count, steps = valid.shape
     at = np.arange(int((steps - 1) * dt_s / DT_S + 1e-6) + 1) * (DT_S / dt_s)
-    before = np.minimum(np.floor(at + 1e-6).astype(np.int64), max(steps - 2, 0))
-    after = np.minimum(before + 1, steps - 1)
-    share = np.clip(at - before, 0.0, 1.0)
-    share = np.where(share < 1e-6, 0.0, np.where(share > 1 - 1e-6, 1.0, share))
-    seen = (valid[:, before] | (share == 1.0)) & (valid[:, after] | (share == 0.0))
+    at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
+    seen = valid[:, np.floor(at).astype(np.int64)] & valid[:, np.ceil(at).astype(np.int64)]
 
     def between(name: str, columns: tuple[int, ...]) -> Array:
-        values = _where(_array(agents, name, float, (count, steps, *columns)), valid)
-        step = values[:, after] - values[:, before]
-        step = (step + np.pi) % (2 * np.pi) - np.pi if name == "heading" else step
-        return values[:, before] + share.reshape(-1, *[1] * len(columns)) * step
+        values = _array(agents, name, float, (count, steps, *columns))
+        return interpolate(values, valid, at, angle=name == "heading")
 
     widths: dict[str, tuple[int, ...]] = {"xy": (2,), "heading": ()}
     widths |= {"z": ()} if "z" in agents else {}

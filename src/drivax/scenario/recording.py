@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from operator import attrgetter
 from typing import Any
 
@@ -11,13 +12,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int8, Int64
 
 from drivax.errors import DataError, UsageError
+from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, AgentKind, Capacity, Flag, RoadKind
 
 Array = np.ndarray[Any, Any]
 STEP_TOLERANCE_S = 0.005
+#: A recording with steps that differ more from the median is resampled; longer ones (in median steps) are gaps.
+LATE_S, GAP_STEPS = 0.02, 2.5
 TEXT_BYTES = {"scenario_id": 64, "segment": 64, "dataset": 16}
-#: Largest distance from the ego and largest speed; beyond them the file is damaged or its unit is not the metre.
-EXTENT_M, SPEED_MPS = 100_000.0, 500.0
+#: Largest distance from the ego and largest speed; beyond them a track or file is damaged or its unit is not the metre.
+EXTENT_M, SPEED_MPS = 100_000.0, 100.0
 #: Steps between the starts of two windows.
 STRIDE = 40
 _UNITS = "repair it, or convert it to metres in the reader"
@@ -120,45 +124,132 @@ class Recording:
     split_gap_m: float | None = None
 
 
-def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
-    """Cut a recording into windows of 91 steps that share its segment.
+def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> Iterator[Recording]:
+    """Cut a recording into windows of ``length`` steps that share its segment; step 10 of each is the current one.
 
     Window ``k`` starts at step ``k * stride``; a rest that fills no window is left out (110 steps make one window, 199
     make three). Windows without a valid ego at the current step are left out, and counted in ``lost`` of the others as
-    ``windows_without_ego``. A recording of at most 91 steps is its own window.
+    ``windows_without_ego``. A recording of at most ``length`` steps is its own window.
+
+    No window spans a gap of two or more frames: each side is cut on its own, and ``lost`` counts the ``time_gaps``.
+    Where no side fills a window, the longest one is the window. A side with a frame more than 20 ms early or late, such
+    as one after a dropped frame, is interpolated at even times; ``interpolated_steps`` counts steps without a frame.
 
     Raises:
         DataError: No window has a valid ego at its current step.
     """
     if stride < 1:
         raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
-    steps = len(recording.timestamps_s)
-    if steps <= STEPS:
+    pieces = [_even(piece) for piece in _between_gaps(recording)]
+    if len(pieces) == 1 and len(pieces[0][1]) <= length:
+        piece, filled = pieces[0]
+        yield _counting(piece, interpolated_steps=int(filled.sum()))
+        return
+    cut = [
+        _window(piece, filled, start, length, recording)
+        for piece, filled in pieces
+        for start in range(0, len(filled) - length + 1, stride)
+    ] or [_window(*max(pieces, key=lambda piece: len(piece[1])), 0, length, recording)]
+    usable = [window for window in cut if window.tracks.valid[window.ego, window.current_step]]
+    if not usable:
+        problem = f"the ego is not valid at the current step of any of {len(cut)} windows"
+        raise DataError(problem, record=recording.scenario_id, cure="skip the recording")
+    left_out = {"windows_without_ego": len(cut) - len(usable), "time_gaps": len(pieces) - 1}
+    yield from (_counting(window, **left_out) for window in usable)
+
+
+def _counting(recording: Recording, **lost: int) -> Recording:
+    """The recording with more counts in ``lost``; itself if they are all 0."""
+    lost = {name: count for name, count in lost.items() if count}
+    return replace(recording, lost={**recording.lost, **lost}) if lost else recording
+
+
+def _between_gaps(recording: Recording) -> Iterator[Recording]:
+    """The pieces of a recording between gaps; timestamps that do not increase are left to ``check``."""
+    times = recording.timestamps_s
+    ends = np.flatnonzero(np.diff(times) > GAP_STEPS * step_seconds(times)[0]) + 1
+    if not len(ends) or not (np.diff(times) > 0).all():
         yield recording
         return
-    starts = range(0, steps - STEPS + 1, stride)
-    usable = [start for start in starts if recording.tracks.valid[recording.ego, start + CURRENT_STEP]]
-    if not usable:
-        problem = f"the ego is not valid at the current step of any of {len(starts)} windows"
-        raise DataError(problem, record=recording.scenario_id, cure="skip the recording")
-    left_out = {"windows_without_ego": len(starts) - len(usable)} if len(usable) < len(starts) else {}
-    for start in usable:
-        yield _window(replace(recording, lost={**recording.lost, **left_out}), start)
+    for first, last in pairwise([0, *ends.tolist(), len(times)]):
+        yield _part(recording, slice(first, last))
 
 
-def _window(recording: Recording, start: int) -> Recording:
-    """The 91 steps from ``start`` on."""
-    part = slice(start, start + STEPS)
+def _even(recording: Recording) -> tuple[Recording, Bool[np.ndarray, " time"]]:
+    """Interpolate a recording at even times if a step is too short or too long; mask the steps without a frame."""
+    times = recording.timestamps_s
+    if is_even(times) or not (np.diff(times) > 0).all():
+        return recording, np.zeros(len(times), dtype=bool)
+    step, _ = step_seconds(times)
+    count = int((times[-1] - times[0] + STEP_TOLERANCE_S) / step) + 1
+    even = times[0] + step * np.arange(count)
+    at = np.interp(even, times, np.arange(len(times)))
+    frame = np.rint(at).astype(np.int64)
+    exact = np.abs(times[frame] - even) <= STEP_TOLERANCE_S
+    return _at(recording, np.where(exact, frame, at), even), ~exact
+
+
+def _at(recording: Recording, at: Float64[np.ndarray, " step"], even: Float64[Array, " step"]) -> Recording:
+    """The recording at fractional steps, which come at even times; lights keep their state until the next frame."""
+    before, after = np.floor(at).astype(np.int64), np.ceil(at).astype(np.int64)
+    tracks, seen = recording.tracks, recording.seen
+    timed = {"valid": tracks.valid[:, before] & tracks.valid[:, after]}
+    for name in _WIDTHS.keys() - timed.keys():
+        timed[name] = interpolate(getattr(tracks, name), tracks.valid, at, angle=name == "heading")
+
+    def step_of(old: int) -> int:
+        return min(int(np.searchsorted(at, old)), len(at) - 1)
+
+    return replace(
+        recording,
+        timestamps_s=even,
+        current_step=step_of(recording.current_step),
+        tracks=replace(tracks, **timed),
+        seen=None if seen is None else seen[:, before] & seen[:, after],
+        lights=tuple(replace(light, states=light.states[before]) for light in recording.lights),
+        events=tuple(
+            replace(event, start=step_of(event.start), end=step_of(event.end)) for event in recording.events
+        ),
+    )
+
+
+def interpolate(
+    values: Float[Array, "track time *value"], valid: Bool[Array, "track time"], at: Float[Array, " step"],
+    angle: bool = False,
+) -> Float[Array, "track step *value"]:  # fmt: skip
+    """Interpolate values of tracks at fractional steps, angles along the shorter arc; 0 unless both sides are valid."""
+    before, after = np.floor(at).astype(np.int64), np.ceil(at).astype(np.int64)
+    widen = (..., *[None] * (values.ndim - 2))
+    step = values[:, after] - values[:, before]
+    result = values[:, before] + (at - before)[widen] * (wrap(step) if angle else step)
+    return np.where((valid[:, before] & valid[:, after])[widen], result, 0.0)
+
+
+def _window(
+    piece: Recording, filled: Bool[Array, " time"], start: int, length: int, whole: Recording
+) -> Recording:
+    """The steps from ``start`` of a piece on, named by the steps since the beginning of the whole recording."""
+    part = slice(start, min(start + length, len(filled)))
+    begin = (piece.timestamps_s[0] - whole.timestamps_s[0]) / step_seconds(whole.timestamps_s)[0]
+    window = replace(
+        _part(piece, part),
+        scenario_id=f"{whole.scenario_id}@{round(begin) + start}",
+        current_step=min(CURRENT_STEP, part.stop - part.start - 1),
+    )
+    return _counting(window, interpolated_steps=int(filled[part].sum()))
+
+
+def _part(recording: Recording, part: slice) -> Recording:
+    """These steps of a recording, without another current step."""
+    last = part.stop - part.start - 1
     timed = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
     events = (
-        replace(event, start=max(event.start - start, 0), end=min(event.end - start, STEPS - 1))
+        replace(event, start=max(event.start - part.start, 0), end=min(event.end - part.start, last))
         for event in recording.events
     )
     return replace(
         recording,
-        scenario_id=f"{recording.scenario_id}@{start}",
         timestamps_s=recording.timestamps_s[part],
-        current_step=CURRENT_STEP,
         tracks=replace(recording.tracks, **timed),
         seen=None if recording.seen is None else recording.seen[:, part],
         lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
@@ -197,6 +288,11 @@ def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
     return float(np.median(steps)), float(np.abs(steps - np.median(steps)).max())
 
 
+def is_even(timestamps_s: Float[Array, " time"]) -> bool:
+    """Whether all steps are near enough to the median to be played as equal."""
+    return step_seconds(timestamps_s)[1] <= LATE_S
+
+
 def _check_names(recording: Recording) -> Finding:
     for name, size in TEXT_BYTES.items():
         text = getattr(recording, name)
@@ -217,6 +313,10 @@ def _check_time(recording: Recording, most_steps: int) -> Finding:
     median, _ = step_seconds(times)
     if abs(median - DT_S) > STEP_TOLERANCE_S:
         return f"steps of {median:.3f} s instead of {DT_S} s", "resample the recording to 10 Hz"
+    if not is_even(times):
+        step = int(np.abs(np.diff(times) - median).argmax()) + 1
+        problem = f"step {step} comes {times[step] - times[step - 1]:.3f} s after the one before"
+        return problem, "cut and resample it with windows()"
     return None
 
 
@@ -262,17 +362,43 @@ def _here(recording: Recording) -> Float[Array, "3"]:
 
 
 def _check_extent(recording: Recording) -> Finding:
-    """Positions and speeds of any size would not fit into memory or float32."""
-    tracks, here = recording.tracks, _here(recording)
-    places = np.concatenate((tracks.xy[tracks.valid], tracks.z[tracks.valid][:, None]), axis=1)
-    if np.abs(places - here).max() > EXTENT_M:
-        return f"a track is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
-    if np.abs(tracks.velocity[tracks.valid]).max() > SPEED_MPS:
-        return f"a track is faster than {SPEED_MPS:.0f} m/s", _UNITS
+    """Positions and speeds of any size would not fit into memory or float32; other tracks lose such steps."""
+    here = _here(recording)
+    lost = np.flatnonzero(recording.tracks.valid[recording.ego] & ~plausible(recording, recording.ego))
+    if len(lost):
+        return f"the ego jumps or is faster than {SPEED_MPS:.0f} m/s at step {lost[0]}", _UNITS
     stops = [np.asarray(light.stop_point) for light in recording.lights if np.shape(light.stop_point) == (3,)]
     if stops and np.nanmax(np.abs(np.array(stops) - here), initial=0.0) > EXTENT_M:
         return f"a light is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
     return None
+
+
+def plausible(recording: Recording, track: int) -> Bool[np.ndarray, " time"]:
+    """Valid steps of a track without those beyond ``EXTENT_M`` and ``SPEED_MPS``, and without jumps.
+
+    A track jumps between two observations that it could not connect at ``SPEED_MPS``. Of the pieces between jumps the
+    longest is kept, and before and after it those that connect.
+    """
+    tracks = recording.tracks
+    xy, here = tracks.xy[track], _here(recording)
+    away = np.abs(np.column_stack((xy, tracks.z[track])) - here).max(axis=1)
+    slow = np.abs(tracks.velocity[track]).max(axis=1) <= SPEED_MPS
+    at = np.flatnonzero(tracks.valid[track] & (away <= EXTENT_M) & slow)
+    pieces = np.split(at, np.flatnonzero(~_connected(xy, at[:-1], at[1:])) + 1)
+    longest = int(np.argmax([len(piece) for piece in pieces]))
+    kept = pieces[longest]
+    for piece in pieces[longest + 1 :]:
+        kept = np.append(kept, piece) if _connected(xy, kept[-1], piece[0]) else kept
+    for piece in reversed(pieces[:longest]):
+        kept = np.append(piece, kept) if _connected(xy, piece[-1], kept[0]) else kept
+    result = np.zeros(len(xy), dtype=bool)
+    result[kept] = True
+    return result
+
+
+def _connected(xy: Float[Array, "time 2"], earlier: Any, later: Any) -> Any:
+    """Whether a track could drive from its earlier to its later positions."""
+    return np.hypot(*(xy[later] - xy[earlier]).T) <= SPEED_MPS * DT_S * (later - earlier)
 
 
 def _check_map(recording: Recording) -> Finding:

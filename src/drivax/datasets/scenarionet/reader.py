@@ -25,7 +25,7 @@ from drivax.datasets.scenarionet.map import RoadMap, road_map
 from drivax.datasets.scenarionet.pickles import SKIP, Names, count_rows, floats, items, mapping, text, whole
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
-from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, is_even
 from drivax.scenario.schema import CURRENT_STEP, DT_S, LANE_KINDS, AgentKind, Flag, LightState
 
 Array = np.ndarray[Any, Any]
@@ -95,6 +95,7 @@ class ScenarioNet:
         facts = (
             (not any(f.successors for f in lanes), "no lane graph: lanes are joined where they touch"),
             (not recording.lights, "no traffic lights"),
+            (not is_even(recording.timestamps_s), parsing.UNEVEN),
             (Flag.DIFFERENTIATED_VELOCITY in recording.flags, "velocities are taken from the positions"),
         )
         return Description(

@@ -14,7 +14,7 @@ from drivax.datasets.reader import BadRecord
 from drivax.datasets.womd.messages import Features, parse
 from drivax.datasets.womd.tfrecord import count_records, looks_framed, read_records
 from drivax.errors import DataError, DrivaxError, UsageError
-from drivax.scenario.recording import Recording
+from drivax.scenario.recording import Recording, is_even
 from drivax.scenario.schema import AgentKind
 
 DATASET = "womd"
@@ -141,4 +141,6 @@ def notes_of(recording: Recording) -> tuple[str, ...]:
         notes.append("no future (test split): stored, but refused for training and evaluation")
     if not recording.lights:
         notes.append("no traffic lights in the first record")
+    if not is_even(recording.timestamps_s):
+        notes.append(parsing.UNEVEN)
     return tuple(notes)

@@ -22,7 +22,7 @@ from drivax.scenario.schema import DT_S, Scenario
 from drivax.scenario.store import ScenarioSet
 
 #: Findings of the audit that make a log unclean, and their words in the list.
-_FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red"}
+_FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red", "log_reverses": "drives backwards"}
 
 
 def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ()) -> list[Scenario]:

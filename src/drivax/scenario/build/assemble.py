@@ -43,7 +43,7 @@ from drivax.scenario.build.tracks import (
     local_tracks,
     place,
 )
-from drivax.scenario.recording import Recording, check, step_seconds
+from drivax.scenario.recording import Recording, check, plausible, step_seconds
 from drivax.scenario.schema import (
     CAPACITIES,
     CAR_LANE_KINDS,
@@ -140,6 +140,7 @@ def assemble(
 
 
 def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Scenario:
+    recording = _without_jumps(recording)
     now, ego = recording.current_step, recording.ego
     origin = np.append(recording.tracks.xy[ego, now], recording.tracks.z[ego, now]).astype(np.float64)
     tracks = local_tracks(recording.tracks, ego, origin)
@@ -156,7 +157,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     on_route = on_route[on_route >= 0]
     inside = inside_box(segments.middle, path, MARGIN_M)
     inside |= np.isin(segments.feature, whole.feature[on_route])
-    grid = arrange(segments.take(inside), path, capacity)
+    grid = arrange(segments.take(inside), path, MARGIN_M, capacity)
     keep, lost_lanes = _kept_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
     graph = select(whole, keep)
     polylines, lost_features = _kept_polylines(roads, grid, path, capacity.features)
@@ -175,8 +176,8 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
         roads=roads,
         polylines=polylines,
         rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),
-        lights=place_lights(recording.lights, on_stored, origin, path, capacity.lights),
-        stops=place_stops(recording.features, graph, origin, path, capacity.stops),
+        lights=place_lights(recording.lights, on_stored, origin, path, MARGIN_M, capacity.lights),
+        stops=place_stops(recording.features, graph, origin, path, MARGIN_M, capacity.stops),
     )
     lost = Counter({name: int(count) for name, count in recording.lost.items()})
     lost += Counter({**whole.lost, **unknown})
@@ -190,6 +191,15 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
         overflow=overflow,
         tags=scenario_tags(recording, tracks, graph, parts.routes, parts.lights, flags, style),
     )
+
+
+def _without_jumps(recording: Recording) -> Recording:
+    """The recording without the steps of tracks that are not plausible; counts tracks that lose some."""
+    tracks = recording.tracks
+    valid = np.stack([plausible(recording, track) for track in range(len(tracks.kind))])
+    jumping = int((valid != tracks.valid).any(axis=1).sum())
+    lost = {**recording.lost, "jumping_tracks": jumping} if jumping else recording.lost
+    return replace(recording, tracks=replace(tracks, valid=valid), lost=lost)
 
 
 def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
@@ -257,17 +267,19 @@ def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict
         counts |= part.overflow
     counts["lane_links"] = parts.graph.dropped_links
     counts["events"] = len(recording.events) - capacity.events
-    counts["event_actors"] = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in recording.events)
+    stored = recording.events[: capacity.events]
+    counts["event_actors"] = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in stored)
     return dict(+Counter(counts))
 
 
 def _flags(recording: Recording, parts: Parts, capacity: Capacity) -> Flag:
-    """Flags of the reader, with those that are measured here."""
-    heights = parts.roads.lines.points[:, 2]
+    """Flags of the reader, with those that are measured here, on what is stored."""
+    stored, segments = parts.placement, parts.grid.segments
+    heights = np.concatenate((segments.a[:, 2], segments.b[:, 2]))
     facts = (
         (Flag.LIGHTS, len(parts.lights.z) > 0),
         (Flag.NO_FUTURE, len(recording.timestamps_s) < capacity.steps),
-        (Flag.DEFAULT_SIZES, parts.tracks.defaulted > 0),
+        (Flag.DEFAULT_SIZES, parts.tracks.defaulted[np.append(stored.moving, stored.parked)].any()),
         (Flag.CLOSED_EDGES, parts.roads.rings_closed),
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
         (Flag.ROUTE, parts.routes.on_lanes),

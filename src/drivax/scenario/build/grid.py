@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int8, Int32
 
 from drivax.errors import DataError
-from drivax.scenario.build.segments import Segments, path_distance
+from drivax.scenario.build.segments import Segments, inside_box, path_distance
 from drivax.scenario.schema import Capacity
 
 #: Nearer to an edge than this the edge itself decides (``scenario.bank.queries.EDGE_CUTOFF_M``), m.
@@ -102,19 +102,24 @@ class GridSegments:
     overflow: dict[str, int]
 
 
-def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity) -> GridSegments:
+def arrange(
+    segments: Segments, path: Float[Array, "step 2"], margin_m: float, capacity: Capacity
+) -> GridSegments:
     """Sort segments into the grid; drop those that do not fit the square, the table or the runs of a query.
 
     Those farthest from ``path``, the log of the ego, are dropped first; dropped road edges near it raise DataError.
+    Lanes of routes may leave the square: what is also outside the box of ``path`` widened by ``margin_m`` is not
+    counted.
     """
     middle = segments.middle
     grid = Grid.around(middle, path, capacity)
     far = path_distance(middle, path)
     keep = grid.contains(middle)
+    counted = keep | inside_box(middle, path, margin_m)
     if keep.sum() > capacity.segments:
         inside = np.flatnonzero(keep)
         keep[inside[np.argsort(far[inside], kind="stable")[capacity.segments :]]] = False
-    overflow = Counter(segments=int((~keep).sum()))
+    overflow = Counter(segments=int((counted & ~keep).sum()))
     block = segments.block
     for name, number in (("edge_run", EDGE_BLOCK), ("lane_run", LANE_BLOCK)):
         rows = np.flatnonzero(keep & (block == number))

@@ -19,7 +19,7 @@ from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, a
 
 Array = np.ndarray[Any, Any]
 
-#: Links stored per lane and direction.
+#: Links that a record stores per lane and direction.
 LINKS = 4
 #: Largest gap and turn between lanes that are chained because their source has no graph.
 CHAIN_GAP_M, CHAIN_HEADING_RAD = 0.5, np.deg2rad(20.0)
@@ -56,7 +56,7 @@ class LaneGraph:
         left, right: Neighbours in the same direction, -1 none.
         left_shift, right_shift: Arc length on the neighbour at arc length s, minus s, metres.
         chained: Whether the links were made from geometry.
-        dropped_links: Links beyond the four that are stored.
+        dropped_links: Links between these lanes that ``select`` left out, beyond four per lane and direction.
         lost: Numbers of ``dangling_links`` (successors and predecessors) and ``dangling_neighbours`` of the source.
     """
 
@@ -67,15 +67,15 @@ class LaneGraph:
     width: Float[Array, " lane"]
     limit: Float[Array, " lane"]
     interpolating: Bool[Array, " lane"]
-    successor: Int[Array, "lane 4"]
-    predecessor: Int[Array, "lane 4"]
+    successor: Int[Array, "lane link"]
+    predecessor: Int[Array, "lane back_link"]
     left: Int[Array, " lane"]
     right: Int[Array, " lane"]
     left_shift: Float[Array, " lane"]
     right_shift: Float[Array, " lane"]
     chained: bool
-    dropped_links: int
     lost: Mapping[str, int]
+    dropped_links: int = 0
 
     @property
     def count(self) -> int:
@@ -119,8 +119,6 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     has_links = any(f.successors or f.predecessors for f in lanes)
     if not has_links:
         pairs = _chained_pairs(lines, begin, end, kind)
-    successor, lost = _link_table(pairs, end, begin)
-    predecessor, lost_back = _link_table([(b, a) for a, b in pairs], begin, end)
     samples = _samples(lines)
     left, left_shift, left_gap = _adjacent(lanes, index, samples, lines.length, "left_neighbours")
     right, right_shift, right_gap = _adjacent(lanes, index, samples, lines.length, "right_neighbours")
@@ -133,9 +131,10 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
         width=_widths(lanes, np.fmin(left_gap, right_gap)),
         limit=np.array([known_limit(lane) for lane in lanes], dtype=np.float64),
         interpolating=np.array([lane.interpolating for lane in lanes], dtype=bool),
-        successor=successor, predecessor=predecessor, left=left, right=right,
-        left_shift=left_shift, right_shift=right_shift,
-        chained=not has_links, dropped_links=lost + lost_back, lost=dangling,
+        successor=_link_table(pairs, end, begin),
+        predecessor=_link_table([(b, a) for a, b in pairs], begin, end),
+        left=left, right=right, left_shift=left_shift, right_shift=right_shift,
+        chained=not has_links, lost=dangling,
     )  # fmt: skip
 
 
@@ -183,17 +182,16 @@ def _chained_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) -> l
 
 def _link_table(
     pairs: Sequence[tuple[int, int]], out_heading: Array, in_heading: Array
-) -> tuple[Int[Array, "lane 4"], int]:
-    """Up to four links per lane, the straightest first, and the number of links that did not fit."""
-    table = np.full((len(out_heading), LINKS), -1, dtype=np.int64)
-    used = np.zeros(len(out_heading), dtype=np.int64)
+) -> Int[Array, "lane link"]:
+    """Links of every lane, the straightest first, -1 padded to at least four."""
     a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    most = np.bincount(a).max(initial=LINKS)
+    table = np.full((len(out_heading), most), -1, dtype=np.int64)
     bend = np.abs(wrap(in_heading[b] - out_heading[a]))
-    for i in np.lexsort((np.arange(len(a)), np.round(bend, 3), a)):
-        if used[a[i]] < LINKS:
-            table[a[i], used[a[i]]] = b[i]
-        used[a[i]] += 1
-    return table, int(np.maximum(used - LINKS, 0).sum())
+    order = np.lexsort((np.arange(len(a)), np.round(bend, 3), a))
+    place = np.arange(len(a)) - np.searchsorted(a[order], a[order])
+    table[a[order], place] = b[order]
+    return table
 
 
 def _samples(lines: Polylines) -> Float[Array, "lane sample 2"]:
@@ -247,23 +245,28 @@ def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tupl
 
 
 def select(graph: LaneGraph, rows: Int[Array, " kept"]) -> LaneGraph:
-    """Return the graph of these lanes with new dense indices; links to other lanes are dropped."""
+    """Return the graph of these lanes with new dense indices and at most four links per lane and direction.
+
+    Links to other lanes go uncounted: they lead out of the map that is kept.
+    """
     new = np.full(graph.count + 1, -1)
     new[rows] = np.arange(len(rows))
     lines = [graph.lines.line(i) for i in rows]
+    successor, predecessor = (_compact(new[links[rows]]) for links in (graph.successor, graph.predecessor))
     per_lane = ("feature", "lane_id", "kind", "width", "limit", "interpolating", "left_shift", "right_shift")
     return replace(
         graph,
         lines=Polylines.of(lines),
-        successor=_compact(new[graph.successor[rows]]),
-        predecessor=_compact(new[graph.predecessor[rows]]),
+        successor=successor[:, :LINKS],
+        predecessor=predecessor[:, :LINKS],
+        dropped_links=int((successor[:, LINKS:] >= 0).sum() + (predecessor[:, LINKS:] >= 0).sum()),
         left=new[graph.left[rows]],
         right=new[graph.right[rows]],
         **{name: getattr(graph, name)[rows] for name in per_lane},
     )
 
 
-def _compact(links: Int[Array, "lane 4"]) -> Int[Array, "lane 4"]:
+def _compact(links: Int[Array, "lane link"]) -> Int[Array, "lane link"]:
     """Move missing links to the end of each row."""
     return np.take_along_axis(links, np.argsort(links < 0, axis=1, kind="stable"), axis=1)
 
@@ -363,9 +366,14 @@ def place_lights(
     on: LaneSegments,
     origin: Float[Array, "3"],
     path: Float[Array, "step 2"],
+    margin_m: float,
     most: int,
 ) -> Lights:
-    """Place stop lines across the lanes at the stop points; keep the ``most`` lights nearest to ``path``."""
+    """Place stop lines across the lanes at the stop points; keep the ``most`` lights nearest to ``path``.
+
+    Lights near no lane have no direction and are left out. They are counted in the box of ``path`` widened by
+    ``margin_m``: elsewhere the lanes are cropped too.
+    """
     graph, steps = on.graph, len(lights[0].states) if lights else 0
     stop = np.array([light.stop_point for light in lights], dtype=np.float64).reshape(-1, 3) - origin
     index = graph.index()
@@ -381,8 +389,8 @@ def place_lights(
     half = np.where(width > 0, width / 2, HALF_WIDTH_M)
     directed = np.flatnonzero(~np.isnan(heading))
     rows = directed[np.argsort(path_distance(stop[directed, :2], path), kind="stable")]
-    overflow = +Counter(lights=len(rows) - most, lights_without_lane=len(lights) - len(directed))
-    rows = rows[:most]
+    undirected = int((np.isnan(heading) & inside_box(stop[:, :2], path, margin_m)).sum())
+    overflow, rows = +Counter(lights=len(rows) - most, lights_without_lane=undirected), rows[:most]
     left = half[rows, None] * left_normals(heading[rows])
     states = [np.asarray(lights[i].states, dtype=np.int8) for i in rows]
     return Lights(
@@ -429,17 +437,23 @@ class Stops:
 
 def place_stops(
     features: Sequence[MapFeature], graph: LaneGraph, origin: Float[Array, "3"], path: Float[Array, "step 2"],
-    most: int,
+    margin_m: float, most: int,
 ) -> Stops:  # fmt: skip
-    """Place stop signs with the lanes that they control; keep the ``most`` signs nearest to ``path``."""
+    """Place stop signs with the lanes that they control; keep the ``most`` signs nearest to ``path``.
+
+    Signs of these lanes, and those in the box of ``path`` widened by ``margin_m``, come first; only they are counted.
+    """
     signs = [f for f in features if f.kind == RoadKind.STOP_SIGN and len(f.points)]
     xy = np.array([f.points[0] for f in signs], dtype=np.float64).reshape(-1, 3)[:, :2] - origin[:2]
     index = graph.index()
     lane = np.full((len(signs), LANES_PER_STOP), -1)
-    lost = 0
+    excess = np.zeros(len(signs), dtype=np.int64)
     for i, sign in enumerate(signs):
         known = [index[number] for number in sign.lanes if number in index]
         lane[i, : min(len(known), LANES_PER_STOP)] = known[:LANES_PER_STOP]
-        lost += max(len(known) - LANES_PER_STOP, 0)
-    rows = np.argsort(path_distance(xy, path), kind="stable")
-    return Stops(xy[rows[:most]], lane[rows[:most]], +Counter(stops=len(rows) - most, stop_lanes=lost))
+        excess[i] = max(len(known) - LANES_PER_STOP, 0)
+    near, far = inside_box(xy, path, margin_m) | (lane[:, 0] >= 0), path_distance(xy, path)
+    rows = np.lexsort((far, ~near))[:most]
+    rows = rows[np.argsort(far[rows], kind="stable")]
+    overflow = +Counter(stops=int(near.sum()) - most, stop_lanes=int(excess[rows].sum()))
+    return Stops(xy[rows], lane[rows], overflow)

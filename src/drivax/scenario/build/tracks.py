@@ -40,8 +40,7 @@ MOST_SIZE_M = 100.0  # larger measurements are ignored
 class LocalTracks:
     """Tracks in the local frame, float64: box centres, headings in [-pi, pi), m/s; zeros where not valid.
 
-    ``size`` is the median length, width and height over the valid steps, metres; ``defaulted`` counts tracks that have
-    a default size.
+    ``size`` is the median length, width and height over the valid steps, metres; ``defaulted`` masks default sizes.
     """
 
     xyz: Float[Array, "track time 3"]
@@ -52,7 +51,7 @@ class LocalTracks:
     kind: Int[Array, " track"]
     track_id: Int[Array, " track"]
     ego: int
-    defaulted: int
+    defaulted: Bool[Array, " track"]
 
 
 def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTracks:
@@ -69,15 +68,15 @@ def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTr
     return LocalTracks(xyz, heading, velocity, size, valid, kind, track_id, ego, defaulted)
 
 
-def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], int]:
-    """Median box size of every track, and the number of tracks with a default size."""
+def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], Bool[Array, " track"]]:
+    """Median box size of every track, and the mask of those with a default size."""
     plain = np.nan_to_num(tracks.size)
     measured = tracks.valid[..., None] & (plain > 0.0) & (plain <= MOST_SIZE_M)
     size = masked_median(np.swapaxes(tracks.size, 1, 2), np.swapaxes(measured, 1, 2))
     default = np.array([DEFAULT_SIZES[AgentKind(kind)] for kind in tracks.kind]).reshape(-1, 3)
     default[ego] = DEFAULT_EGO_SIZE
     missing = ~np.any(measured, axis=1)
-    return np.where(missing, default, size), int((missing.any(axis=1) & tracks.valid.any(axis=1)).sum())
+    return np.where(missing, default, size), missing.any(axis=1)
 
 
 def masked_median(values: Float[Array, "*row time"], valid: Bool[Array, "*row time"]) -> Float[Array, "*row"]:

@@ -68,6 +68,11 @@ FINDINGS: Mapping[str, Quantity] = {
     "log_left_map": Quantity("truth", "the log leaves the mapped area"),
     "log_runs_red": Quantity("truth", "the log runs a red light"),
     "distance_m": Quantity("number", "distance that the log drives after the current step"),
+    "reverse_m": Quantity("number", "distance of it that the log drives backwards"),
+    "log_reverses": Quantity(
+        "truth", "that is more than 20 m: no manoeuvre, but headings that are wrong by pi"
+    ),
+    "agents_reversing": Quantity("number", "other vehicles and cyclists that drive more than 20 m backwards"),
     "route_deviation_mean_m": Quantity("number", "mean distance of the log to the route"),
     "route_deviation_max_m": Quantity("number", "largest distance of the log to the route"),
     "route_reaches_goal": Quantity("truth", "the route ends within 3 m of where the log ends"),
@@ -80,7 +85,7 @@ FINDINGS: Mapping[str, Quantity] = {
     "default_sizes": Quantity("truth", "some box sizes are those of the class"),
     "velocity": Quantity("word", "where velocities come from", ("measured", "differentiated")),
     "dt_jitter": Quantity("truth", "some step differs from the median step by more than 2 ms"),
-    "clean": Quantity("truth", "no collision, never off the road, no red light run"),
+    "clean": Quantity("truth", "no collision, never off the road, no red light run, at most 20 m backwards"),
 }
 
 
