@@ -17,7 +17,7 @@ import numpy as np
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd.messages import SKIP, Features, features_of
+from drivax.datasets.womd.messages import SKIP, ExampleFeatures, features_of
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -68,7 +68,9 @@ def decode(payload: bytes) -> Recording:
     return recording(table, payload, used, womd.DATASET, womd.EXAMPLE_FORMAT)
 
 
-def recording(table: Features, payload: bytes, used: Array, dataset: str, source_format: str) -> Recording:
+def recording(
+    table: ExampleFeatures, payload: bytes, used: Array, dataset: str, source_format: str
+) -> Recording:
     """The recording in the rows used.
 
     Invalid entries (-1 in the file) become zeros, headings are wrapped. Lights are keyed by lane because the 16 slots
@@ -97,7 +99,7 @@ def recording(table: Features, payload: bytes, used: Array, dataset: str, source
     )
 
 
-def _track_ids(features: Features, used: Array) -> Array:
+def _track_ids(features: ExampleFeatures, used: Array) -> Array:
     """Ids of the rows used: stored as floats, but WOMD's are far below 2**24."""
     ids = features.numbers("state/id")[used]
     if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
@@ -107,7 +109,7 @@ def _track_ids(features: Features, used: Array) -> Array:
     return ids.astype(np.int64)
 
 
-def _tracks(features: Features, used: Array) -> Tracks:
+def _tracks(features: ExampleFeatures, used: Array) -> Tracks:
     """The tracks in the rows used."""
     track_id = _track_ids(features, used)
     valid = features.over_time("valid", used) == 1
@@ -130,13 +132,13 @@ def _tracks(features: Features, used: Array) -> Tracks:
     )
 
 
-def _timestamps(features: Features, used: Array, valid: Array) -> Array:
+def _timestamps(features: ExampleFeatures, used: Array, valid: Array) -> Array:
     """Seconds of every step; where no valid state has a time, 10 Hz from the nearest step that has one."""
     micros = np.where(valid, features.over_time("timestamp_micros", used), -1).max(axis=0, initial=-1)
     return parsing.seconds(np.where(micros >= 0, micros * 1e-6, np.nan))
 
 
-def _ego_row(features: Features, used: Array) -> int:
+def _ego_row(features: ExampleFeatures, used: Array) -> int:
     """The ego's row among the rows used."""
     ego = features.marked("state/is_sdc", used)
     if len(ego) != 1:
@@ -144,7 +146,7 @@ def _ego_row(features: Features, used: Array) -> int:
     return ego[0]
 
 
-def _lights(features: Features) -> tuple[Light, ...]:
+def _lights(features: ExampleFeatures) -> tuple[Light, ...]:
     """Lights by lane."""
     collector = parsing.Lights(sum(features.spans.values()))
     start = 0
@@ -164,7 +166,7 @@ def _lights(features: Features) -> tuple[Light, ...]:
     return collector.collected()
 
 
-def _map_features(features: Features) -> tuple[tuple[MapFeature, ...], bool]:
+def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bool]:
     """Map features in order of first appearance, and whether the list of points is full, so probably cut off."""
     base = "roadgraph_samples/"
     if not features.has(base + "id"):
@@ -192,7 +194,7 @@ def _groups(ids: Array, keep: Array) -> list[Array]:
     return sorted(groups, key=lambda group: group[0]) if keep.size else []
 
 
-def _limits(features: Features, count: int) -> Array:
+def _limits(features: ExampleFeatures, count: int) -> Array:
     """Speed limits of map points in mph, 0 if unknown: only ScenarioMax writes them."""
     name = "roadgraph_samples/speed_limit"
     if not features.has(name):
@@ -212,7 +214,7 @@ def _is_coarse(mapped: Sequence[MapFeature]) -> bool:
     return (parsing.spacing_m(mapped) or 0.5) > 0.75
 
 
-def _paths(features: Features) -> int:
+def _paths(features: ExampleFeatures) -> int:
     """How many paths of the ego the file holds."""
     if not (features.has("path_samples/valid") and features.has("path_samples/on_route")):
         return 0

@@ -191,15 +191,15 @@ STATES = Numbers(
 POINTS = Numbers("MapPoint", (("x", "y", "z"),))
 
 
-def features_of(payload: bytes) -> Features:
+def features_of(payload: bytes) -> ExampleFeatures:
     """The features in a serialised tf.Example."""
     message = parse("Example", payload)
     if message is None or not message.features.feature:
         raise DataError("the payload is not a tf.Example", cure=SKIP)
-    return Features(message)
+    return ExampleFeatures(message)
 
 
-class Features:
+class ExampleFeatures:
     """The features of one tf.Example by name; float lists (float32 in the file) become float64, int64 lists int64."""
 
     def __init__(self, message: Any) -> None:
