@@ -186,7 +186,153 @@ def test_kinds_of_agents(tree):
     assert decode(tree).tracks.kind.tolist() == [AgentKind.STATIC, AgentKind.OTHER, AgentKind.VEHICLE]
 
 
+def first_form(tree: dict[str, Any]) -> dict[str, Any]:
+    """The scene as MetaDrive 0.3.0.1 wrote it: sizes in one field, outlines as polylines, lights in numbers."""
+    for track in tree["tracks"].values():
+        state = track["state"]
+        state["size"] = np.stack([state.pop(name) for name in ("length", "width", "height")], axis=1)
+        state["valid"] = state["valid"].astype(np.uint8)
+    for body in tree["map_features"].values():
+        if "polygon" in body:
+            body["polyline"] = body.pop("polygon")
+            body["type"] = body["type"].replace("CROSSWALK", "CROSS_WALK")
+    words = {None: 0, "LANE_STATE_STOP": 4, "LANE_STATE_GO": 6}
+    for key, body in tree["dynamic_map_states"].items():
+        seen = np.array([state is not None for state in body["state"]["object_state"]])
+        body["state"] = {
+            "object_state": np.array([words[state] for state in body["state"]["object_state"]], np.int32),
+            "lane": np.where(seen, int(key), 0),
+            "stop_point": np.where(seen[:, None], body.pop("stop_point"), 0.0).astype(np.float32),
+        }
+        del body["lane"]
+    return tree
+
+
+def test_first_form_reads_as_the_present_one(tree):
+    present, first = decode(copy.deepcopy(tree)), decode(first_form(tree))
+    for name in ("xy", "z", "heading", "velocity", "size", "valid"):
+        np.testing.assert_array_equal(getattr(first.tracks, name), getattr(present.tracks, name))
+    kinds = [f.kind for f in present.features if f.kind != RoadKind.STOP_SIGN]
+    assert [f.kind for f in first.features if f.kind != RoadKind.STOP_SIGN] == kinds
+    for a, b in zip(first.features, present.features, strict=True):
+        np.testing.assert_array_equal(a.points, b.points)
+    (a,), (b,) = first.lights, present.lights
+    np.testing.assert_array_equal(a.states, b.states)
+    np.testing.assert_allclose(a.stop_point, b.stop_point)
+    assert dict(first.lost) == dict(present.lost)
+
+
+def test_unknown_and_unobserved_lights_of_the_first_form_differ(tree):
+    """State 0 with a stop point is unknown; without one nothing was observed."""
+    state = first_form(tree)["dynamic_map_states"]["2"]["state"]
+    state["object_state"][0], state["object_state"][1] = 0, 9
+    recording = decode(tree)
+    assert recording.lights[0].states[[0, 1, 2, 30]].tolist() == [0, 0, 4, -1]
+    assert recording.lost["unknown_light_states"] == 1
+
+
+def test_stop_points_of_zeros_are_none(tree):
+    tree["dynamic_map_states"]["2"]["stop_point"] = np.zeros(3, np.float32)
+    (light,) = decode(tree).lights
+    np.testing.assert_array_equal(light.stop_point, by_id(decode(tree))[2].points[0])
+
+
+def test_stop_points_without_height_lie_on_their_lane(tree):
+    tree["dynamic_map_states"]["2"]["stop_point"] = (sample.X + 19.0, sample.Y)
+    (light,) = decode(tree).lights
+    np.testing.assert_allclose(light.stop_point, [sample.X + 19.0, sample.Y, sample.Z])
+
+
+def test_round_objects_of_metadrive_have_a_radius(tree):
+    state = tree["tracks"]["17"]["state"]
+    del state["length"], state["width"]
+    state["radius"] = np.full((sample.STEPS, 1), 0.25)
+    height = decode(tree).tracks.size[0, 0, 2]
+    np.testing.assert_allclose(decode(tree).tracks.size[0, 0], [0.5, 0.5, height])
+
+
+def test_fields_of_unknown_names_are_counted(tree):
+    tree["tracks"]["17"]["state"] |= {"bbox": np.zeros(sample.STEPS), "steering": np.zeros(sample.STEPS)}
+    tree["map_features"]["1"] |= {"slope": 3.0, "left_boundaries": []}
+    tree["map_features"]["2"] |= {"slope": 3.0}
+    lost = decode(tree).lost
+    assert (lost["unknown_track_states"], lost["unknown_feature_fields"]) == (1, 1)
+    assert not {"unknown_track_states", "unknown_feature_fields"} & decode(sample.scenario()).lost.keys()
+
+
+# --- The frame.
+
+
+def recentred(tree: dict[str, Any], origin: tuple[float, float]) -> dict[str, Any]:
+    """The scene with another origin, as converters and MetaDrive move it: zeros of invalid states move too."""
+    shift = np.array([*origin, 0.0])
+    for track in tree["tracks"].values():
+        track["state"]["position"] = track["state"]["position"].astype(np.float64) - shift
+    for body in tree["map_features"].values():
+        for name in {"polyline", "polygon", "position"} & body.keys():
+            points = np.asarray(body[name], np.float64)
+            body[name] = points - shift[: points.shape[-1]]
+    for body in tree["dynamic_map_states"].values():
+        body["stop_point"] = np.asarray(body["stop_point"]) - shift
+    return tree
+
+
+def assert_same_places(found: Recording, expected: Recording) -> None:
+    np.testing.assert_allclose(found.tracks.xy, expected.tracks.xy, atol=1e-6)
+    for a, b in zip((*found.features, *found.lights), (*expected.features, *expected.lights), strict=True):
+        name = "points" if isinstance(a, MapFeature) else "stop_point"
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-6)
+
+
+def test_origin_that_metadrive_moved_is_moved_back(tree):
+    expected = decode(copy.deepcopy(tree))
+    recentred(tree, (8300.0, 8900.0))["metadata"]["old_origin_in_current_coordinate"] = np.array(
+        [-8300.0, -8900.0]
+    )
+    assert_same_places(decode(tree), expected)
+
+
+@pytest.mark.parametrize("value", [[np.nan, 0.0], [1e9, 0.0], [0.0], "here", {}])
+def test_origins_that_are_no_position_are_refused(tree, value):
+    tree["metadata"]["old_origin_in_current_coordinate"] = value
+    with pytest.raises(DataError, match="old_origin_in_current_coordinate"):
+        decode(tree)
+
+
+def test_origin_of_nuscenes_is_told_by_its_invalid_states(tree):
+    """They were zeros before the converter took the first position of the ego from all positions."""
+    state = tree["tracks"]["17"]["state"]
+    state["valid"][50:], state["position"][50:] = False, 0.0
+    expected = decode(copy.deepcopy(nuscenes(copy.deepcopy(tree))))
+    moved = recentred(nuscenes(tree), (8300.0, 8900.0))
+    assert_same_places(decode(moved), expected)
+    moved["tracks"]["17"]["state"]["position"][60] += 1.0  # they disagree: the file's frame stays
+    np.testing.assert_allclose(
+        decode(moved).tracks.xy[1], expected.tracks.xy[1] - [8300.0, 8900.0], atol=1e-6
+    )
+
+
 # --- nuScenes' flavour.
+
+
+TOKENS = "_" + "0123456789abcdef" * 2 + "_" + "fedcba9876543210" * 2
+
+
+@pytest.mark.parametrize(
+    ("identity", "segment"),
+    [
+        ("scene-0103", "scene-0103"),
+        ("scene-0103" + TOKENS[:33], "scene-0103"),
+        ("scene-0103" + TOKENS, "scene-0103"),
+        ("scene-0103_0", "scene-0103_0"),
+        ("a" + TOKENS, "a" + TOKENS),
+    ],
+)
+def test_windows_of_a_nuscenes_scene_share_its_segment(tree, identity, segment):
+    nuscenes(tree)["id"] = identity
+    assert (decode(tree).scenario_id, decode(tree).segment) == (identity, segment)
+    tree["metadata"]["dataset"], tree["version"] = "own", ""
+    assert decode(tree).segment == identity
 
 
 def nuscenes(tree: dict[str, Any]) -> dict[str, Any]:
@@ -517,6 +663,41 @@ REAL = {
     "0.pkl": (201, 30, 0, 192, 151),
     "sd_nuscenes_v1.0-mini_scene-1100.pkl": (196, 33, 0, 233, 153),
 }
+
+
+def test_real_first_form(real_data):
+    (recording,) = ScenarioNet().read(real_data / "scenarionet_first" / "0.pkl")
+    assert isinstance(recording, Recording)
+    tracks, kinds = recording.tracks, [f.kind for f in recording.features]
+    assert tracks.valid.shape == (75, 197)
+    own = tracks.size[recording.ego][tracks.valid[recording.ego]]
+    np.testing.assert_allclose(own, [[5.286, 2.332, 2.33]] * len(own), atol=1e-6)
+    assert (tracks.size[tracks.valid] > 0).all()
+    assert (kinds.count(RoadKind.CROSSWALK), kinds.count(RoadKind.SPEED_BUMP)) == (7, 4)
+    # Observed at one step of 197 only: 7 green, 8 red, 4 red arrows.
+    states = np.stack([light.states for light in recording.lights])
+    assert [(states == state).sum() for state in (-1, 0, 1, 4, 6)] == [19 * 196, 0, 4, 8, 7]
+    starts = {f.feature_id: f.points[0] for f in recording.features}
+    for light in recording.lights:
+        np.testing.assert_allclose(light.stop_point, starts[light.lane_id], atol=1e-3)
+
+
+def test_real_windows_of_one_scene_share_segment_and_frame(real_data):
+    """Map features are told by their positions: files number them each in its own order."""
+    first, second, other = (
+        next(iter(ScenarioNet().read(path)))
+        for path in sorted((real_data / "scenarionet_unitraj").glob("*.pkl"))
+    )
+    assert len(first.scenario_id) == 76 and first.segment == second.segment == "scene-0103"
+    assert other.segment == "scene-0916"
+    crossings = [
+        {tuple(np.round(f.points.ravel(), 3)) for f in r.features if f.kind == RoadKind.CROSSWALK}
+        for r in (first, second)
+    ]
+    assert crossings[0] == crossings[1] and len(crossings[0]) == 9
+    # The ego of one window drives where the other window's ego does, at some other step.
+    apart = np.hypot(*np.moveaxis(first.tracks.xy[first.ego][:, None] - second.tracks.xy[second.ego], -1, 0))
+    assert np.median(apart.min(axis=1)) < 0.2
 
 
 @pytest.fixture(scope="module", params=list(REAL))

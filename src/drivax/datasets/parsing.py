@@ -16,7 +16,7 @@ from drivax.errors import DataError, missing_package
 from drivax.geometry.polylines import Polylines, cut_counts
 from drivax.scenario.arrays import differentiate as differentiate
 from drivax.scenario.build.tracks import DEFAULT_SIZES
-from drivax.scenario.recording import STRIDE, Light, MapFeature, Tracks
+from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
 
 Array = np.ndarray[Any, Any]
@@ -106,6 +106,19 @@ def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " t
         return steps * 0.1
     nearest = known[np.maximum(np.searchsorted(known, steps, side="right") - 1, 0)]
     return timestamps[nearest] + (steps - nearest) * 0.1
+
+
+def shifted(recording: Recording, offset: Float[np.ndarray, "3"]) -> Recording:
+    """The recording in a map frame in which its present origin lies at ``offset`` (x, y, z), metres."""
+    if not offset.any():
+        return recording
+    tracks = recording.tracks
+    xy = np.where(tracks.valid[..., None], tracks.xy + offset[:2], 0.0)
+    z = np.where(tracks.valid, tracks.z + offset[2], 0.0)
+    lights = (replace(light, stop_point=light.stop_point + offset) for light in recording.lights)
+    features = (replace(feature, points=feature.points + offset) for feature in recording.features)
+    tracks = replace(tracks, xy=xy, z=z)
+    return replace(recording, tracks=tracks, lights=tuple(lights), features=tuple(features))
 
 
 def box_centre(

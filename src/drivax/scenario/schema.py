@@ -8,6 +8,7 @@ by :class:`Capacity`, map segments, grid and routes. This module needs no JAX.
 from __future__ import annotations
 
 import enum
+import hashlib
 from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Any
@@ -205,6 +206,20 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
     }  # fmt: skip
 
 
+#: Names of a scenario. The manifest holds them in full.
+NAMES = ("scenario_id", "dataset", "segment")
+_DIGEST = 16
+
+
+def stored_name(text: str, size: int) -> bytes:
+    """Return a name as its field of ``size`` bytes holds it: longer ones end in ``~`` and digits of their SHA-256."""
+    name = text.encode()
+    if len(name) <= size:
+        return name
+    begin = name[: size - _DIGEST - 1].decode(errors="ignore").encode()  # no half characters
+    return begin + b"~" + hashlib.sha256(name).hexdigest()[:_DIGEST].encode()
+
+
 def record_dtype(capacity: Capacity) -> np.dtype[Any]:
     """Return the dtype of a stored scenario: 64-byte aligned fields, item size a multiple of 4096."""
     fields = scenario_fields(capacity)
@@ -243,6 +258,7 @@ class Scenario:
         overflow: Nonzero numbers of agents, segments, ... that did not fit, by name.
         audit: Findings of the audit, by name (``evaluation.audit``).
         tags: Words for filters and strata.
+        names: The :data:`NAMES` in full; fields of the record hold long ones shortened (:func:`stored_name`).
     """
 
     record: np.ndarray[Any, Any]
@@ -251,6 +267,7 @@ class Scenario:
     overflow: dict[str, int] = field(default_factory=dict)
     audit: dict[str, float | int | bool | None] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name in _OWN_FIELDS:
@@ -266,8 +283,8 @@ class Scenario:
         return self.text("scenario_id")
 
     def text(self, name: str) -> str:
-        """Return a field of bytes (``scenario_id``, ``dataset``, ``segment``) as text."""
-        return bytes(self.record[name][()]).rstrip(b"\0").decode()
+        """Return ``scenario_id``, ``dataset`` or ``segment`` as the source has it."""
+        return self.names.get(name) or bytes(self.record[name][()]).rstrip(b"\0").decode()
 
     @property
     def has(self) -> Flag:

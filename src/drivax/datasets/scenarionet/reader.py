@@ -75,6 +75,7 @@ _COLUMNS = {
     "velocity": ((2, 3), 1e3),
     **dict.fromkeys(("length", "width", "height"), ((1,), 1e3)),
     "size": ((3,), 1e3),  # length, width, height in the first form of the files
+    "radius": ((1,), 1e3),  # of round objects of MetaDrive, without length and width
     "valid": ((1,), np.inf),
 }
 #: States of tracks and lights that are not needed: what MetaDrive's own vehicles add.
@@ -205,7 +206,7 @@ def decode(tree: Any) -> Recording:
         flags=flags,
         split_gap_m=_WOMD_GAP_M if dataset == "womd" else None,
     )
-    return _shifted(recording, _offset(metadata, table, dataset))
+    return parsing.shifted(recording, np.append(_offset(metadata, table, dataset), 0.0))
 
 
 def _segment(identity: str, dataset: str) -> str:
@@ -233,17 +234,6 @@ def _offset(metadata: Mapping[Any, Any], table: Mapping[str, Any], dataset: str)
     if origin.shape not in ((2,), (3,)) or not (np.abs(origin) < _FARTHEST_M).all():
         raise DataError(f"old_origin_in_current_coordinate is {origin.tolist()}", cure=SKIP)
     return -origin[:2]
-
-
-def _shifted(recording: Recording, offset: Array) -> Recording:
-    """The recording with its origin (x, y) moved; it stays the same where the offset is zero."""
-    if not offset.any():
-        return recording
-    tracks, shift = recording.tracks, np.append(offset, 0.0)
-    xy = np.where(tracks.valid[..., None], tracks.xy + offset, 0.0)
-    lights = (replace(light, stop_point=light.stop_point + shift) for light in recording.lights)
-    features = (replace(feature, points=feature.points + shift) for feature in recording.features)
-    return replace(recording, tracks=replace(tracks, xy=xy), lights=tuple(lights), features=tuple(features))
 
 
 def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
@@ -298,6 +288,8 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Track
         parsing.check_within(limit, stacked[name])
     size = np.concatenate([stacked[name] for name in ("length", "width", "height")], axis=-1)
     size = np.where(size.any(axis=(1, 2), keepdims=True), size, stacked["size"])
+    missing = ~size[..., :2].any(axis=(1, 2), keepdims=True)
+    size[..., :2] += np.where(missing, 2.0 * stacked["radius"], 0.0)
     longest, widest, _ = size[ego].max(axis=0)
     if longest < widest:  # nuScenes files have a car 1.73 m long and 4.08 m wide
         size[ego] = size[ego][:, [1, 0, 2]]
@@ -417,7 +409,9 @@ def _lights(
         points = _stop_points(light, steps, what)
         # The stop points of nuPlan's lights are 8 m behind the line.
         stops = points[points.any(axis=1)] if dataset != "nuplan" else points[:0]
-        place = stops[0] if len(stops) else starts[lane]
+        place = starts[lane].copy()
+        if len(stops):
+            place[: stops.shape[1]] = stops[0]
         for step, state in enumerate(states):
             # The first form of the files fills all with zeros where nothing is observed.
             if state is None or (len(points) == steps > 1 and state == 0 and not points[step].any()):
@@ -429,10 +423,10 @@ def _lights(
 
 
 def _stop_points(light: Mapping[Any, Any], steps: int, what: str) -> Array:
-    """Stop points (x, y, z): one for the light, or one per step in its ``state`` in the first form of the files."""
+    """Stop points (x, y and maybe z): one, or one per step in the light's ``state`` in the first form of the files."""
     named = light.get("stop_point", light["state"].get("stop_point"))
     points = np.zeros((0, 3)) if named is None else np.atleast_2d(floats(named, f"{what}: stop_point"))
-    usable = points.shape in ((1, 3), (steps, 3)) and (np.abs(points) < _FARTHEST_M).all()
+    usable = len(points) in (1, steps) and points.shape[1] in (2, 3) and (np.abs(points) < _FARTHEST_M).all()
     return points if usable else np.zeros((0, 3))
 
 

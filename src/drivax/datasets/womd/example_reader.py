@@ -80,7 +80,7 @@ def recording(
     tracks = _tracks(table, used)
     features, truncated = _map_features(table)
     scenario_id = table.scenario_id(payload)
-    return Recording(
+    read = Recording(
         scenario_id=scenario_id,
         dataset=dataset,
         segment=scenario_id,
@@ -97,6 +97,7 @@ def recording(
         flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
         split_gap_m=2.0 if _is_coarse(features) else 1.0,  # twice the nominal spacing of points
     )
+    return parsing.shifted(read, table.origin())
 
 
 def _track_ids(features: ExampleFeatures, used: Array) -> Array:

@@ -20,8 +20,11 @@ from jaxtyping import Float64
 from drivax.datasets.parsing import import_extra
 from drivax.errors import DataError
 
+#: Feature of drivax' own examples: where the origin of their coordinates lies in the source's map frame.
+ORIGIN = "scenario/origin"
 SKIP = "skip this record, or download the file again"
 _Array = np.ndarray[Any, Any]
+_FARTHEST_M = 1e8
 #: (name, number, type): ``*`` marks a repeated field, ``?`` a member of the message's one-of ``kind``.
 _Field = tuple[str, int, str]
 
@@ -249,6 +252,18 @@ class ExampleFeatures:
         value = self._values.get("scenario/id")
         text = "" if value is None else b"".join(value.bytes_list.value[:1]).decode("ascii", "replace")
         return text or hashlib.sha256(payload).hexdigest()[:16]
+
+    def origin(self) -> Float64[np.ndarray, "3"]:
+        """The origin of the coordinates in the source's map frame, which only drivax' own examples name; else zeros."""
+        if ORIGIN not in self._values:
+            return np.zeros(3)
+        try:
+            origin = np.array(b"".join(self._values[ORIGIN].bytes_list.value[:1]).split(), np.float64)
+        except ValueError:
+            origin = np.zeros(0)
+        if origin.shape != (3,) or not (np.abs(origin) < _FARTHEST_M).all():
+            raise DataError(f"{ORIGIN} is no position", cure=SKIP)
+        return origin
 
     @cached_property
     def spans(self) -> dict[str, int]:
