@@ -70,8 +70,8 @@ def tf_example(
     """Return the features of a scenario and counts of what did not fit, both by name.
 
     Coordinates are the source's (float32, as in the data set) where all are below 16,384 m, else relative to ego at the
-    current step: UTM coordinates would be rounded to half a metre. That position is then in ``scenario/origin``, as text
-    (Waymax and V-Max skip it). Ids that their type cannot hold exactly (agents: float32, map: int32) are replaced by
+    current step: UTM coordinates would be rounded to half a metre. That position is then ``scenario/origin``, a text,
+    which Waymax and V-Max skip. Ids that their type cannot hold exactly (agents: float32, map: int32) are replaced by
     running numbers.
     """
     recording = restore(scenario)

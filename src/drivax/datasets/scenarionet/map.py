@@ -179,9 +179,7 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
         raise DataError(f"a map of {numbers} numbers", cure=SKIP)
     reading = _Reading(dataset, around, Names(list(named), bits=62), Counter(), set())
     reading.lost["broken_features"] += len(table) - len(named)
-    reading.lost["unknown_feature_fields"] += len(
-        {str(key) for body in named.values() for key in body} - _FIELDS
-    )
+    reading.lost["unknown_fields"] += len({str(key) for body in named.values() for key in body} - _FIELDS)
     read = {name: f for name, body in named.items() if (f := _feature(name, body, reading)) is not None}
     features = list(read.values())
     total = sum(float(np.hypot(*np.diff(f.points[:, :2], axis=0).T).sum()) for f in features)

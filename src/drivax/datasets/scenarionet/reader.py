@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import pickletools
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -80,8 +79,6 @@ _COLUMNS = {
 }
 #: States of tracks and lights that are not needed: what MetaDrive's own vehicles add.
 _NOT_NEEDED = ("angular_velocity", "steering", "throttle_brake", "action")
-#: Scenes of nuScenes; windows of one are named after it: ``scene-0103_<token>``, ``scene-0103_<token>_<token>``.
-_SCENE = re.compile(r"(scene-\d+)(_[0-9a-f]{32}){0,2}")
 #: A longer last step is motion.
 _MOVED_M = 0.05
 #: A scenario file names its dictionaries within this many bytes.
@@ -192,7 +189,7 @@ def decode(tree: Any) -> Recording:
     recording = Recording(
         scenario_id=identity,
         dataset=dataset,
-        segment=as_text(metadata.get("log_name")) or _segment(identity, dataset),
+        segment=as_text(metadata.get("log_name")) or parsing.segment_of(identity),
         timestamps_s=_timestamps(metadata, steps),
         current_step=_current_step(metadata, steps),
         ego=ego,
@@ -206,34 +203,31 @@ def decode(tree: Any) -> Recording:
         flags=flags,
         split_gap_m=_WOMD_GAP_M if dataset == "womd" else None,
     )
-    return parsing.shifted(recording, np.append(_offset(metadata, table, dataset), 0.0))
-
-
-def _segment(identity: str, dataset: str) -> str:
-    """The scene of nuScenes of which a file may be one of several windows; else the scenario's own id."""
-    scene = _SCENE.fullmatch(identity) if dataset == "nuscenes" else None
-    return identity if scene is None else scene[1]
+    return parsing.shifted(recording, _offset(metadata, table, dataset))
 
 
 def _offset(metadata: Mapping[Any, Any], table: Mapping[str, Any], dataset: str) -> Array:
-    """Position (x, y) of the file's origin in the original map frame; zeros where the file does not tell it.
+    """Position (x, y, 0) of the file's origin in the original map frame; zeros where the file does not tell it.
 
-    MetaDrive notes the old origin in the new frame. ScenarioNet's nuScenes converter also shifts the zeros of steps
-    without an observation, which then all hold the old origin.
+    ScenarioNet notes the centre that it takes from all positions, MetaDrive the old origin in its new frame. Older
+    nuScenes files tell the centre by steps without an observation: their zeros were moved as well.
     """
-    named = metadata.get("old_origin_in_current_coordinate")
-    if named is not None:
-        origin = floats(named, "old_origin_in_current_coordinate")
-    elif dataset == "nuscenes":
+    centre = _position(metadata, "map_center") - _position(metadata, "old_origin_in_current_coordinate")
+    if not centre.any() and dataset == "nuscenes":
         states = [body["state"] for body in table.values() if body["state"].get("valid") is not None]
         unseen = [floats(s["position"], "")[floats(s["valid"], "").reshape(-1) < 0.5, :2] for s in states]
         places = np.unique(np.concatenate([np.zeros((0, 2)), *unseen]), axis=0)
-        origin = places[0] if len(places) == 1 else np.zeros(2)
-    else:
-        origin = np.zeros(2)
-    if origin.shape not in ((2,), (3,)) or not (np.abs(origin) < _FARTHEST_M).all():
-        raise DataError(f"old_origin_in_current_coordinate is {origin.tolist()}", cure=SKIP)
-    return -origin[:2]
+        centre = -places[0] if len(places) == 1 else centre
+    return np.append(centre, 0.0)
+
+
+def _position(metadata: Mapping[Any, Any], name: str) -> Array:
+    """A position (x, y) in the metadata; zeros where there is none."""
+    value = metadata.get(name)
+    position = np.zeros(2) if value is None else floats(value, name)
+    if position.shape not in ((2,), (3,)) or not (np.abs(position) < _FARTHEST_M).all():
+        raise DataError(f"{name} is no position", cure=SKIP)
+    return position[:2]
 
 
 def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
@@ -306,7 +300,7 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Track
         track_id=np.array([names.get(name) for name in table], np.int64),
     )
     unknown = {str(name) for state in states for name in state} - {*_COLUMNS, *_NOT_NEEDED}
-    return tracks, Counter(unknown_track_states=len(unknown))
+    return tracks, Counter(unknown_fields=len(unknown))
 
 
 def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array | None:
@@ -419,7 +413,7 @@ def _lights(
             known = _state(state)
             lost["unknown_light_states"] += known is None
             lights.observe(step, lane, LightState.UNKNOWN if known is None else known, place.tolist())
-    return lights.collected()
+    return lights.collected(roads.features)[0]
 
 
 def _stop_points(light: Mapping[Any, Any], steps: int, what: str) -> Array:

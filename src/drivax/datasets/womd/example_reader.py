@@ -79,21 +79,27 @@ def recording(
     """
     tracks = _tracks(table, used)
     features, truncated = _map_features(table)
+    lights, unplaced = _lights(table, features)
     scenario_id = table.scenario_id(payload)
     read = Recording(
         scenario_id=scenario_id,
         dataset=dataset,
-        segment=scenario_id,
+        segment=parsing.segment_of(scenario_id),
         timestamps_s=_timestamps(table, used, tracks.valid),
         current_step=table.spans["past"],
         ego=_ego_row(table, used),
         tracks=tracks,
         features=features,
-        lights=_lights(table),
+        lights=lights,
         to_predict=table.marked("state/tracks_to_predict", used),
         of_interest=table.marked("state/objects_of_interest", used),
         tags={"source_format": source_format},
-        lost=parsing.nonzero(paths=_paths(table), one_point_features=parsing.one_point_features(features)),
+        lost=parsing.nonzero(
+            paths=_paths(table),
+            one_point_features=parsing.one_point_features(features),
+            lights_without_place=unplaced,
+            unknown_fields=table.unknown(),
+        ),
         flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
         split_gap_m=2.0 if _is_coarse(features) else 1.0,  # twice the nominal spacing of points
     )
@@ -147,8 +153,8 @@ def _ego_row(features: ExampleFeatures, used: Array) -> int:
     return ego[0]
 
 
-def _lights(features: ExampleFeatures) -> tuple[Light, ...]:
-    """Lights by lane."""
+def _lights(features: ExampleFeatures, mapped: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
+    """Lights by lane, and the number of those without a place."""
     collector = parsing.Lights(sum(features.spans.values()))
     start = 0
     for span, steps in features.spans.items():
@@ -164,7 +170,7 @@ def _lights(features: ExampleFeatures) -> tuple[Light, ...]:
                     start + step, int(lanes[step, slot]), int(states[step, slot]), points[step, slot].tolist()
                 )
         start += steps
-    return collector.collected()
+    return collector.collected(mapped)
 
 
 def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bool]:
