@@ -186,30 +186,8 @@ def test_kinds_of_agents(tree):
     assert decode(tree).tracks.kind.tolist() == [AgentKind.STATIC, AgentKind.OTHER, AgentKind.VEHICLE]
 
 
-def first_form(tree: dict[str, Any]) -> dict[str, Any]:
-    """The scene as MetaDrive 0.3.0.1 wrote it: sizes in one field, outlines as polylines, lights in numbers."""
-    for track in tree["tracks"].values():
-        state = track["state"]
-        state["size"] = np.stack([state.pop(name) for name in ("length", "width", "height")], axis=1)
-        state["valid"] = state["valid"].astype(np.uint8)
-    for body in tree["map_features"].values():
-        if "polygon" in body:
-            body["polyline"] = body.pop("polygon")
-            body["type"] = body["type"].replace("CROSSWALK", "CROSS_WALK")
-    words = {None: 0, "LANE_STATE_STOP": 4, "LANE_STATE_GO": 6}
-    for key, body in tree["dynamic_map_states"].items():
-        seen = np.array([state is not None for state in body["state"]["object_state"]])
-        body["state"] = {
-            "object_state": np.array([words[state] for state in body["state"]["object_state"]], np.int32),
-            "lane": np.where(seen, int(key), 0),
-            "stop_point": np.where(seen[:, None], body.pop("stop_point"), 0.0).astype(np.float32),
-        }
-        del body["lane"]
-    return tree
-
-
 def test_first_form_reads_as_the_present_one(tree):
-    present, first = decode(copy.deepcopy(tree)), decode(first_form(tree))
+    present, first = decode(copy.deepcopy(tree)), decode(sample.first_form(tree))
     for name in ("xy", "z", "heading", "velocity", "size", "valid"):
         np.testing.assert_array_equal(getattr(first.tracks, name), getattr(present.tracks, name))
     kinds = [f.kind for f in present.features if f.kind != RoadKind.STOP_SIGN]
@@ -224,7 +202,7 @@ def test_first_form_reads_as_the_present_one(tree):
 
 def test_unknown_and_unobserved_lights_of_the_first_form_differ(tree):
     """State 0 with a stop point is unknown; without one nothing was observed."""
-    state = first_form(tree)["dynamic_map_states"]["2"]["state"]
+    state = sample.first_form(tree)["dynamic_map_states"]["2"]["state"]
     state["object_state"][0], state["object_state"][1] = 0, 9
     recording = decode(tree)
     assert recording.lights[0].states[[0, 1, 2, 30]].tolist() == [0, 0, 4, -1]
@@ -262,20 +240,6 @@ def test_fields_of_unknown_names_are_counted(tree):
 # --- The frame.
 
 
-def recentred(tree: dict[str, Any], origin: tuple[float, float]) -> dict[str, Any]:
-    """The scene with another origin, as converters and MetaDrive move it: zeros of invalid states move too."""
-    shift = np.array([*origin, 0.0])
-    for track in tree["tracks"].values():
-        track["state"]["position"] = track["state"]["position"].astype(np.float64) - shift
-    for body in tree["map_features"].values():
-        for name in {"polyline", "polygon", "position"} & body.keys():
-            points = np.asarray(body[name], np.float64)
-            body[name] = points - shift[: points.shape[-1]]
-    for body in tree["dynamic_map_states"].values():
-        body["stop_point"] = np.asarray(body["stop_point"]) - shift
-    return tree
-
-
 def assert_same_places(found: Recording, expected: Recording) -> None:
     np.testing.assert_allclose(found.tracks.xy, expected.tracks.xy, atol=1e-6)
     for a, b in zip((*found.features, *found.lights), (*expected.features, *expected.lights), strict=True):
@@ -285,7 +249,7 @@ def assert_same_places(found: Recording, expected: Recording) -> None:
 
 def test_origin_that_metadrive_moved_is_moved_back(tree):
     expected = decode(copy.deepcopy(tree))
-    recentred(tree, (8300.0, 8900.0))["metadata"]["old_origin_in_current_coordinate"] = np.array(
+    sample.recentred(tree, (8300.0, 8900.0))["metadata"]["old_origin_in_current_coordinate"] = np.array(
         [-8300.0, -8900.0]
     )
     assert_same_places(decode(tree), expected)
@@ -303,8 +267,8 @@ def test_origin_of_nuscenes_is_told_by_its_invalid_states(tree):
     """They were zeros before the converter took the first position of the ego from all positions."""
     state = tree["tracks"]["17"]["state"]
     state["valid"][50:], state["position"][50:] = False, 0.0
-    expected = decode(copy.deepcopy(nuscenes(copy.deepcopy(tree))))
-    moved = recentred(nuscenes(tree), (8300.0, 8900.0))
+    expected = decode(copy.deepcopy(sample.nuscenes(copy.deepcopy(tree))))
+    moved = sample.recentred(sample.nuscenes(tree), (8300.0, 8900.0))
     assert_same_places(decode(moved), expected)
     moved["tracks"]["17"]["state"]["position"][60] += 1.0  # they disagree: the file's frame stays
     np.testing.assert_allclose(
@@ -315,58 +279,23 @@ def test_origin_of_nuscenes_is_told_by_its_invalid_states(tree):
 # --- nuScenes' flavour.
 
 
-TOKENS = "_" + "0123456789abcdef" * 2 + "_" + "fedcba9876543210" * 2
-
-
 @pytest.mark.parametrize(
     ("identity", "segment"),
     [
         ("scene-0103", "scene-0103"),
-        ("scene-0103" + TOKENS[:33], "scene-0103"),
-        ("scene-0103" + TOKENS, "scene-0103"),
+        ("scene-0103" + sample.TOKENS[:33], "scene-0103"),
+        ("scene-0103" + sample.TOKENS, "scene-0103"),
         ("scene-0103_0", "scene-0103_0"),
-        ("a" + TOKENS, "a" + TOKENS),
+        ("a" + sample.TOKENS, "a" + sample.TOKENS),
     ],
 )
 def test_windows_of_a_nuscenes_scene_share_its_segment(tree, identity, segment):
-    nuscenes(tree)["id"] = identity
+    sample.nuscenes(tree)["id"] = identity
     assert (decode(tree).scenario_id, decode(tree).segment) == (identity, segment)
 
 
-def nuscenes(tree: dict[str, Any]) -> dict[str, Any]:
-    """The scene as ScenarioNet's converter of nuScenes writes it: flat, yaw as height, outlines as markings."""
-    tree["version"] = "nuscenesv1.0-mini"
-    tree["metadata"] |= {"dataset": "nuscenes", "map": "boston-seaport", "sdc_id": "ego"}
-    del tree["metadata"]["current_time_index"]
-    tree["tracks"]["ego"] = tree["tracks"].pop("2406")
-    tree["tracks"]["ego"]["state"]["position"][:, 2] = 0.0
-    state = tree["tracks"]["ego"]["state"]
-    state["length"], state["width"] = state["width"], state["length"]
-    for track in tree["tracks"].values():
-        track["state"]["velocity"][-1] = 0.0
-    tree["dynamic_map_states"] = {}
-    features = tree["map_features"]
-    for name in ("9", "10", "11", "12"):
-        del features[name]
-    for body in features.values():
-        if "LANE" in body["type"]:
-            step = np.diff(body["polyline"][:, :2].astype(np.float64), axis=0)
-            yaw = np.arctan2(step[:, 1], step[:, 0])
-            body["polyline"] = [
-                (*xy, a) for xy, a in zip(body["polyline"][:, :2].tolist(), [*yaw, yaw[-1]], strict=True)
-            ]
-            body["entry_lanes"], body["exit_lanes"] = [], []
-        else:
-            body["polyline"] = body["polyline"][:, :2].astype(np.float64)
-    ring = features.pop("7")["polyline"]
-    island = sample.line((50, 1.5), (60, 1.5), (60, 2), (50, 2), (50, 1.5))[:, :2].astype(np.float64)
-    features["boundary_0"] = {"type": "ROAD_LINE_SOLID_SINGLE_WHITE", "polyline": ring[::-1]}
-    features["boundary_1"] = {"type": "ROAD_LINE_SOLID_SINGLE_WHITE", "polyline": island}
-    return tree
-
-
 def test_14_yaw_in_the_third_column_is_not_a_height(tree):
-    recording = decode(nuscenes(tree))
+    recording = decode(sample.nuscenes(tree))
     assert all((f.points[:, 2] == 0).all() for f in recording.features)
     # Agents stand on the plane, whatever heights they had.
     np.testing.assert_allclose(recording.tracks.z[:, 0], [0.8, 0.9, 1.0], atol=1e-6)
@@ -384,7 +313,7 @@ def test_14_heights_are_no_yaw():
 
 
 def test_17_velocity_is_recomputed_where_it_was_zeroed(tree):
-    recording = decode(nuscenes(tree))
+    recording = decode(sample.nuscenes(tree))
     assert Flag.DIFFERENTIATED_VELOCITY in recording.flags
     np.testing.assert_allclose(recording.tracks.velocity[0], [[9.0, 0.0]] * sample.STEPS, atol=0.01)
     np.testing.assert_allclose(recording.tracks.velocity[2], [[10.0, 0.0]] * sample.STEPS, atol=0.01)
@@ -399,7 +328,7 @@ def test_17_measured_velocity_is_kept(tree):
 
 def test_ego_of_nuscenes_has_a_cars_size_and_box_centre(tree):
     """The converter swaps its length and width, and its poses are of the rear axle, 1.385 m behind the centre."""
-    state = nuscenes(tree)["tracks"]["ego"]["state"]
+    state = sample.nuscenes(tree)["tracks"]["ego"]["state"]
     axle = state["position"][:, :2].astype(np.float64)
     recording = decode(tree)
     np.testing.assert_allclose(recording.tracks.size[2, 0], [5.3, 2.3, 2.0], atol=1e-6)
@@ -407,7 +336,7 @@ def test_ego_of_nuscenes_has_a_cars_size_and_box_centre(tree):
 
 
 def test_7_outlines_of_nuscenes_become_edges_with_the_road_on_the_left(tree):
-    recording = decode(nuscenes(tree))
+    recording = decode(sample.nuscenes(tree))
     edges = [f for f in recording.features if f.kind in EDGE_KINDS]
     assert len(edges) == 2 and {f.kind for f in edges} == {RoadKind.EDGE_BOUNDARY}
     assert on_left(np.array([[sample.X, sample.Y], [sample.X + 55, sample.Y]]), edges).tolist() == [
@@ -422,7 +351,7 @@ def test_7_outlines_of_nuscenes_become_edges_with_the_road_on_the_left(tree):
 
 
 def test_place_and_current_step(tree):
-    recording = decode(nuscenes(tree))
+    recording = decode(sample.nuscenes(tree))
     assert recording.tags["place"] == "boston" and recording.current_step == 10
     tree["metadata"] |= {"map": "sg-one-north", "log_name": "2021.08.17.log"}
     assert decode(tree).tags["location"] == "sg-one-north"
@@ -544,7 +473,7 @@ def test_reader_recognises_counts_reads_and_describes(tree, tmp_path):
 
 
 def test_description_names_what_is_missing(tree, tmp_path):
-    described = ScenarioNet().describe(written(nuscenes(tree), tmp_path))
+    described = ScenarioNet().describe(written(sample.nuscenes(tree), tmp_path))
     assert described.dataset == "nuScenes, by ScenarioNet"
     assert [note.split(":")[0] for note in described.notes] == [
         "no lane graph", "no traffic lights", "velocities are taken from the positions"

@@ -25,6 +25,7 @@ from drivax.datasets.scenarionet.map import RoadMap, road_map
 from drivax.datasets.scenarionet.pickles import (
     SKIP,
     Names,
+    as_float,
     as_int,
     as_list,
     as_text,
@@ -407,10 +408,11 @@ def _lights(
         if len(stops):
             place[: stops.shape[1]] = stops[0]
         for step, state in enumerate(states):
-            # The first form of the files fills all with zeros where nothing is observed.
-            if state is None or (len(points) == steps > 1 and state == 0 and not points[step].any()):
-                continue
             known = _state(state)
+            # The first form of the files fills all with zeros where nothing is observed.
+            unseen = known == LightState.UNKNOWN and len(points) == steps > 1 and not points[step].any()
+            if state is None or unseen:
+                continue
             lost["unknown_light_states"] += known is None
             lights.observe(step, lane, LightState.UNKNOWN if known is None else known, place.tolist())
     return lights.collected(roads.features)[0]
@@ -428,4 +430,5 @@ def _state(state: Any) -> LightState | None:
     """The state by its name or WOMD's number; None for any other."""
     if isinstance(state, str):
         return _STATES.get(state)
-    return LightState(int(state)) if state in range(9) else None
+    number = as_float(state)
+    return LightState(int(number)) if number is not None and number in range(9) else None
