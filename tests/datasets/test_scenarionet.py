@@ -263,7 +263,7 @@ def test_origins_that_are_no_position_are_refused(tree, name, value):
         decode(tree)
 
 
-def test_origin_of_nuscenes_is_told_by_its_invalid_states(tree):
+def test_origin_of_nuscenes_shows_in_its_invalid_states(tree):
     """They were zeros before the converter took the first position of the ego from all positions."""
     state = tree["tracks"]["17"]["state"]
     state["valid"][50:], state["position"][50:] = False, 0.0
@@ -610,7 +610,7 @@ def test_real_first_form(real_data):
 
 
 def test_real_windows_of_one_scene_share_segment_and_frame(real_data):
-    """Map features are told by their positions: files number them each in its own order."""
+    """Map features are compared by their positions: files number them each in its own order."""
     first, second, other = (
         next(iter(ScenarioNet().read(path)))
         for path in sorted((real_data / "scenarionet_unitraj").glob("*.pkl"))
