@@ -159,6 +159,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
     k, r, o, lt, st = c.routes, c.route_points, c.road_rows, c.lights, c.stops
     cells = c.grid * c.grid
     return {
+        # Longer names are shortened (stored_name); the manifest has them in full.
         "scenario_id": ("S64", ()), "dataset": ("S16", ()), "segment": ("S64", ()), "origin": ("f8", (3,)),
         "dt_s": ("f4", ()), "current_step": ("i2", ()), "steps": ("i2", ()), "flags": ("u4", ()),
         # Agents that move (slot 0 is ego), local frame, time-major; zeros where not valid.
