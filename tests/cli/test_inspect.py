@@ -159,7 +159,7 @@ def test_observations(sets, inspect, tmp_path):
     out = inspect(*words, "--draw", tmp_path / "seen.png")
     assert max(map(len, out.splitlines())) <= COLUMNS
     assert out.startswith(
-        "32 states of 4 episodes driven by constant_velocity, 0 with a collision; every number is f"
+        "32 states of 4 episodes of constant_velocity, 0 with a collision; every number is f"
     )
     assert "\nagents" in out and "\n  velocity ahead " in out
     assert (tmp_path / "seen.png").read_bytes().startswith(b"\x89PNG")

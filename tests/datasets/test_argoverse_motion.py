@@ -180,6 +180,14 @@ def without(name):
     return lambda table: {key: values for key, values in table.items() if key != name}
 
 
+def test_older_files_name_no_slice(rewritten):
+    """The public serializer leaves the columns map_id and slice_id out where they are unknown."""
+    path = rewritten(lambda table: without("slice_id")(without("map_id")(table)))
+    (recording,) = READER.read(path)
+    assert recording.segment == recording.scenario_id == av2_motion.SCENARIO
+    assert READER.describe(path).recordings == 1
+
+
 BROKEN = {
     "has no column heading": without("heading"),
     "has no track AV": lambda t: t | {"track_id": ["AW" if i == "AV" else i for i in t["track_id"]]},

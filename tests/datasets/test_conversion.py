@@ -648,9 +648,11 @@ def test_inspect_json_has_the_documented_fields(folder, tmp_path, capsys):
     assert len(scenarios) == 4
     assert set(scenarios[0]) == {
         "scenario_id", "dataset", "segment", "steps", "tracks", "tracks_valid_now", "map_features", "map_points",
-        "lights", "segments", "overflow", "flags", "audit", "lost",
+        "lights", "lost", "segments", "overflow", "flags", "audit", "origin",
     }  # fmt: skip
     assert scenarios[1]["scenario_id"] == "a1" and scenarios[1]["tracks_valid_now"] == 2
+    stored = ScenarioSet.open(tmp_path / "set")
+    assert [row["origin"] for row in scenarios] == [scenario.origin.tolist() for scenario in stored]
 
 
 def test_inspect_tables_fit_a_hundred_columns(folder, tmp_path, capsys):

@@ -15,7 +15,9 @@ from drivax.datasets.export.tfexample import PATHS, tf_example
 from drivax.datasets.womd import example_reader as womd_example
 from drivax.datasets.womd import records as womd
 from drivax.datasets.womd import scenario_reader as protos
+from drivax.datasets.womd.messages import ORIGIN
 from drivax.datasets.womd.tfrecord import example
+from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAPACITIES, AgentKind, Flag, RoadKind
@@ -91,6 +93,7 @@ def table(scenario, paths: str = "vmax", lost: dict | None = None) -> dict[str, 
         lost |= missing
     shapes = layout(*((10, 300) if paths == "vmax" else (10, 500)))
     found = decode(example(features))
+    found.pop(ORIGIN, None)
     assert {name: kind for name, (kind, _) in found.items()} == {
         name: kind for name, (kind, _) in shapes.items()
     }
@@ -367,6 +370,12 @@ def test_coordinates_beyond_float32_become_local():
     np.testing.assert_allclose(x, driving()[:, 0], atol=1e-3)
     path = found["path_samples/xyz"][0, : int(found["path_samples/valid"][0].sum())]
     assert np.abs(path).max() < 500
+    _, back = round_trip(moved(make_recording(), FAR))  # drivax' reader goes back to the source's frame
+    np.testing.assert_allclose(back.tracks.xy[0], driving() + FAR[:2], atol=1e-3)
+    for text in (b"1 2", b"1 2 nan", b"x y z"):
+        features = tf_example(assemble(make_recording()))[0] | {ORIGIN: text}
+        with pytest.raises(DataError, match=f"{ORIGIN} is no position"):
+            womd_example.decode(example(features))
     near = table(assemble(moved(make_recording(), np.array([8000.0, -9000.0, 12.0]))))
     np.testing.assert_allclose(over_time(near, "x")[0], driving()[:, 0] + 8000.0, atol=1e-3)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 
@@ -148,6 +149,36 @@ def test_lights_as_the_converter_writes_them(scene):
     assert light.states[[0, 1, 5, 6]].tolist() == [
         LightState.STOP, LightState.UNOBSERVED, LightState.ARROW_GO, LightState.UNKNOWN
     ]  # fmt: skip
+
+
+def test_lights_at_zeros_stand_where_their_lane_begins(scene):
+    lane = next(road["id"] for road in scene["roads"] if road["type"] == "lane")
+    seen = {"state": ["stop"], "time_index": [0], **{axis: [0.0] for axis in "xyz"}}
+    scene["tl_states"] = {str(lane): seen, "99999": seen}
+    recording = decode(scene)
+    (light,) = recording.lights
+    (start,) = (f.points[0] for f in recording.features if f.feature_id == lane)
+    np.testing.assert_array_equal(light.stop_point, start)
+    assert recording.lost["lights_without_place"] == 1
+
+
+def test_heights_may_be_missing_and_unknown_fields_are_counted(scene):
+    """Converters of flat data sets leave out z and the height of boxes."""
+    before = decode(copy.deepcopy(scene))
+    for row in scene["objects"]:
+        del row["height"]
+        row["yaw_rate"] = [0.0] * 91
+        for point in row["position"]:
+            point.pop("z", None)  # points may be shared
+    for road in scene["roads"]:
+        for point in road["geometry"]:
+            point.pop("z", None)  # points may be shared
+    after = decode(scene)
+    np.testing.assert_array_equal(after.tracks.xy, before.tracks.xy)
+    np.testing.assert_array_equal(after.tracks.size[..., :2], before.tracks.size[..., :2])
+    assert not after.tracks.size[..., 2].any() and not after.tracks.z.any()
+    assert not any(feature.points[:, 2].any() for feature in after.features)
+    assert after.lost == before.lost | {"unknown_fields": 1}
 
 
 def test_ids_are_numbered_where_the_file_has_none(scene):

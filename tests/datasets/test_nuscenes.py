@@ -76,6 +76,18 @@ def test_maps_are_read_from_where_they_are_unpacked(tmp_path, folder):
     assert f"{folder}/*.json" in NuScenes().companions
 
 
+@pytest.mark.parametrize("name", ["arcline_path_3", "connectivity"])
+def test_old_maps_without_centre_lines_name_the_version_to_download(tmp_path, name):
+    path = sample.write(tmp_path)
+    file = tmp_path / "maps" / "expansion" / f"{sample.CITY}.json"
+    content = json.loads(file.read_text())
+    del content[name]
+    file.write_text(json.dumps(content))
+    (bad,) = NuScenes().read(path)
+    assert isinstance(bad, BadRecord)
+    assert f"{file}" in str(bad.error()) and "map expansion v1.3" in str(bad.error())
+
+
 def test_the_test_split_has_no_annotations_and_is_refused(tmp_path):
     """Its tables are there, but empty: a scenario of the ego alone would look sound."""
     path = sample.write(tmp_path)

@@ -187,43 +187,116 @@ def test_kinds_of_agents(tree):
     assert decode(tree).tracks.kind.tolist() == [AgentKind.STATIC, AgentKind.OTHER, AgentKind.VEHICLE]
 
 
+def test_first_form_reads_as_the_present_one(tree):
+    present, first = decode(copy.deepcopy(tree)), decode(sample.first_form(tree))
+    for name in ("xy", "z", "heading", "velocity", "size", "valid"):
+        np.testing.assert_array_equal(getattr(first.tracks, name), getattr(present.tracks, name))
+    kinds = [f.kind for f in present.features if f.kind != RoadKind.STOP_SIGN]
+    assert [f.kind for f in first.features if f.kind != RoadKind.STOP_SIGN] == kinds
+    for a, b in zip(first.features, present.features, strict=True):
+        np.testing.assert_array_equal(a.points, b.points)
+    (a,), (b,) = first.lights, present.lights
+    np.testing.assert_array_equal(a.states, b.states)
+    np.testing.assert_allclose(a.stop_point, b.stop_point)
+    assert dict(first.lost) == dict(present.lost)
+
+
+def test_unknown_and_unobserved_lights_of_the_first_form_differ(tree):
+    """State 0 with a stop point is unknown; without one nothing was observed."""
+    state = sample.first_form(tree)["dynamic_map_states"]["2"]["state"]
+    state["object_state"][0], state["object_state"][1] = 0, 9
+    recording = decode(tree)
+    assert recording.lights[0].states[[0, 1, 2, 30]].tolist() == [0, 0, 4, -1]
+    assert recording.lost["unknown_light_states"] == 1
+
+
+def test_stop_points_of_zeros_are_none(tree):
+    tree["dynamic_map_states"]["2"]["stop_point"] = np.zeros(3, np.float32)
+    (light,) = decode(tree).lights
+    np.testing.assert_array_equal(light.stop_point, by_id(decode(tree))[2].points[0])
+
+
+def test_stop_points_without_height_lie_on_their_lane(tree):
+    tree["dynamic_map_states"]["2"]["stop_point"] = (sample.X + 19.0, sample.Y)
+    (light,) = decode(tree).lights
+    np.testing.assert_allclose(light.stop_point, [sample.X + 19.0, sample.Y, sample.Z])
+
+
+def test_round_objects_of_metadrive_have_a_radius(tree):
+    state = tree["tracks"]["17"]["state"]
+    del state["length"], state["width"]
+    state["radius"] = np.full((sample.STEPS, 1), 0.25)
+    height = decode(tree).tracks.size[0, 0, 2]
+    np.testing.assert_allclose(decode(tree).tracks.size[0, 0], [0.5, 0.5, height])
+
+
+def test_fields_of_unknown_names_are_counted(tree):
+    tree["tracks"]["17"]["state"] |= {"bbox": np.zeros(sample.STEPS), "steering": np.zeros(sample.STEPS)}
+    tree["map_features"]["1"] |= {"slope": 3.0, "left_boundaries": []}
+    tree["map_features"]["2"] |= {"slope": 3.0}
+    lost = decode(tree).lost
+    assert lost["unknown_fields"] == 2 and "unknown_fields" not in decode(sample.scenario()).lost
+
+
+# --- The frame.
+
+
+def assert_same_places(found: Recording, expected: Recording) -> None:
+    np.testing.assert_allclose(found.tracks.xy, expected.tracks.xy, atol=1e-6)
+    for a, b in zip((*found.features, *found.lights), (*expected.features, *expected.lights), strict=True):
+        name = "points" if isinstance(a, MapFeature) else "stop_point"
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-6)
+
+
+def test_origin_that_metadrive_moved_is_moved_back(tree):
+    expected = decode(copy.deepcopy(tree))
+    sample.recentred(tree, (8300.0, 8900.0))["metadata"]["old_origin_in_current_coordinate"] = np.array(
+        [-8300.0, -8900.0]
+    )
+    assert_same_places(decode(tree), expected)
+
+
+@pytest.mark.parametrize("name", ["old_origin_in_current_coordinate", "map_center"])
+@pytest.mark.parametrize("value", [[np.nan, 0.0], [1e9, 0.0], [0.0], "here", {}])
+def test_origins_that_are_no_position_are_refused(tree, name, value):
+    tree["metadata"][name] = value
+    with pytest.raises(DataError, match=name):
+        decode(tree)
+
+
+def test_origin_of_nuscenes_shows_in_its_invalid_states(tree):
+    """They were zeros before the converter took the first position of the ego from all positions."""
+    state = tree["tracks"]["17"]["state"]
+    state["valid"][50:], state["position"][50:] = False, 0.0
+    expected = decode(copy.deepcopy(sample.nuscenes(copy.deepcopy(tree))))
+    moved = sample.recentred(sample.nuscenes(tree), (8300.0, 8900.0))
+    assert_same_places(decode(moved), expected)
+    moved["tracks"]["17"]["state"]["position"][60] += 1.0  # they disagree: the file's frame stays
+    np.testing.assert_allclose(
+        decode(moved).tracks.xy[1], expected.tracks.xy[1] - [8300.0, 8900.0], atol=1e-6
+    )
+
+
 # --- nuScenes' flavour.
 
 
-def nuscenes(tree: dict[str, Any]) -> dict[str, Any]:
-    """The scene as ScenarioNet's converter of nuScenes writes it: flat, yaw as height, outlines as markings."""
-    tree["version"] = "nuscenesv1.0-mini"
-    tree["metadata"] |= {"dataset": "nuscenes", "map": "boston-seaport", "sdc_id": "ego"}
-    del tree["metadata"]["current_time_index"]
-    tree["tracks"]["ego"] = tree["tracks"].pop("2406")
-    tree["tracks"]["ego"]["state"]["position"][:, 2] = 0.0
-    state = tree["tracks"]["ego"]["state"]
-    state["length"], state["width"] = state["width"], state["length"]
-    for track in tree["tracks"].values():
-        track["state"]["velocity"][-1] = 0.0
-    tree["dynamic_map_states"] = {}
-    features = tree["map_features"]
-    for name in ("9", "10", "11", "12"):
-        del features[name]
-    for body in features.values():
-        if "LANE" in body["type"]:
-            step = np.diff(body["polyline"][:, :2].astype(np.float64), axis=0)
-            yaw = np.arctan2(step[:, 1], step[:, 0])
-            body["polyline"] = [
-                (*xy, a) for xy, a in zip(body["polyline"][:, :2].tolist(), [*yaw, yaw[-1]], strict=True)
-            ]
-            body["entry_lanes"], body["exit_lanes"] = [], []
-        else:
-            body["polyline"] = body["polyline"][:, :2].astype(np.float64)
-    ring = features.pop("7")["polyline"]
-    island = sample.line((50, 1.5), (60, 1.5), (60, 2), (50, 2), (50, 1.5))[:, :2].astype(np.float64)
-    features["boundary_0"] = {"type": "ROAD_LINE_SOLID_SINGLE_WHITE", "polyline": ring[::-1]}
-    features["boundary_1"] = {"type": "ROAD_LINE_SOLID_SINGLE_WHITE", "polyline": island}
-    return tree
+@pytest.mark.parametrize(
+    ("identity", "segment"),
+    [
+        ("scene-0103", "scene-0103"),
+        ("scene-0103" + sample.TOKENS[:33], "scene-0103"),
+        ("scene-0103" + sample.TOKENS, "scene-0103"),
+        ("scene-0103_0", "scene-0103_0"),
+        ("a" + sample.TOKENS, "a" + sample.TOKENS),
+    ],
+)
+def test_windows_of_a_nuscenes_scene_share_its_segment(tree, identity, segment):
+    sample.nuscenes(tree)["id"] = identity
+    assert (decode(tree).scenario_id, decode(tree).segment) == (identity, segment)
 
 
 def test_14_yaw_in_the_third_column_is_not_a_height(tree):
-    recording = decode(nuscenes(tree))
+    recording = decode(sample.nuscenes(tree))
     assert all((f.points[:, 2] == 0).all() for f in recording.features)
     # Agents stand on the plane, whatever heights they had.
     np.testing.assert_allclose(recording.tracks.z[:, 0], [0.8, 0.9, 1.0], atol=1e-6)
@@ -241,7 +314,7 @@ def test_14_heights_are_no_yaw():
 
 
 def test_17_velocity_is_recomputed_where_it_was_zeroed(tree):
-    recording = decode(nuscenes(tree))
+    recording = decode(sample.nuscenes(tree))
     assert Flag.DIFFERENTIATED_VELOCITY in recording.flags
     np.testing.assert_allclose(recording.tracks.velocity[0], [[9.0, 0.0]] * sample.STEPS, atol=0.01)
     np.testing.assert_allclose(recording.tracks.velocity[2], [[10.0, 0.0]] * sample.STEPS, atol=0.01)
@@ -256,7 +329,7 @@ def test_17_measured_velocity_is_kept(tree):
 
 def test_ego_of_nuscenes_has_a_cars_size_and_box_centre(tree):
     """The converter swaps its length and width, and its poses are of the rear axle, 1.385 m behind the centre."""
-    state = nuscenes(tree)["tracks"]["ego"]["state"]
+    state = sample.nuscenes(tree)["tracks"]["ego"]["state"]
     axle = state["position"][:, :2].astype(np.float64)
     recording = decode(tree)
     np.testing.assert_allclose(recording.tracks.size[2, 0], [5.3, 2.3, 2.0], atol=1e-6)
@@ -264,7 +337,7 @@ def test_ego_of_nuscenes_has_a_cars_size_and_box_centre(tree):
 
 
 def test_7_outlines_of_nuscenes_become_edges_with_the_road_on_the_left(tree):
-    recording = decode(nuscenes(tree))
+    recording = decode(sample.nuscenes(tree))
     edges = [f for f in recording.features if f.kind in EDGE_KINDS]
     assert len(edges) == 2 and {f.kind for f in edges} == {RoadKind.EDGE_BOUNDARY}
     assert on_left(np.array([[sample.X, sample.Y], [sample.X + 55, sample.Y]]), edges).tolist() == [
@@ -279,7 +352,7 @@ def test_7_outlines_of_nuscenes_become_edges_with_the_road_on_the_left(tree):
 
 
 def test_place_and_current_step(tree):
-    recording = decode(nuscenes(tree))
+    recording = decode(sample.nuscenes(tree))
     assert recording.tags["place"] == "boston" and recording.current_step == 10
     tree["metadata"] |= {"map": "sg-one-north", "log_name": "2021.08.17.log"}
     assert decode(tree).tags["location"] == "sg-one-north"
@@ -401,7 +474,7 @@ def test_reader_recognises_counts_reads_and_describes(tree, tmp_path):
 
 
 def test_description_names_what_is_missing(tree, tmp_path):
-    described = ScenarioNet().describe(written(nuscenes(tree), tmp_path))
+    described = ScenarioNet().describe(written(sample.nuscenes(tree), tmp_path))
     assert described.dataset == "nuScenes, by ScenarioNet"
     assert [note.split(":")[0] for note in described.notes] == [
         "no lane graph", "no traffic lights", "velocities are taken from the positions"
@@ -526,6 +599,41 @@ REAL = {
     "0.pkl": (201, 30, 0, 192, 151),
     "sd_nuscenes_v1.0-mini_scene-1100.pkl": (196, 33, 0, 233, 153),
 }
+
+
+def test_real_first_form(real_data):
+    (recording,) = ScenarioNet().read(real_data / "scenarionet_first" / "0.pkl")
+    assert isinstance(recording, Recording)
+    tracks, kinds = recording.tracks, [f.kind for f in recording.features]
+    assert tracks.valid.shape == (75, 197)
+    own = tracks.size[recording.ego][tracks.valid[recording.ego]]
+    np.testing.assert_allclose(own, [[5.286, 2.332, 2.33]] * len(own), atol=1e-6)
+    assert (tracks.size[tracks.valid] > 0).all()
+    assert (kinds.count(RoadKind.CROSSWALK), kinds.count(RoadKind.SPEED_BUMP)) == (7, 4)
+    # Observed at one step of 197 only: 7 green, 8 red, 4 red arrows.
+    states = np.stack([light.states for light in recording.lights])
+    assert [(states == state).sum() for state in (-1, 0, 1, 4, 6)] == [19 * 196, 0, 4, 8, 7]
+    starts = {f.feature_id: f.points[0] for f in recording.features}
+    for light in recording.lights:
+        np.testing.assert_allclose(light.stop_point, starts[light.lane_id], atol=1e-3)
+
+
+def test_real_windows_of_one_scene_share_segment_and_frame(real_data):
+    """Map features are compared by their positions: files number them each in its own order."""
+    first, second, other = (
+        next(iter(ScenarioNet().read(path)))
+        for path in sorted((real_data / "scenarionet_unitraj").glob("*.pkl"))
+    )
+    assert len(first.scenario_id) == 76 and first.segment == second.segment == "scene-0103"
+    assert other.segment == "scene-0916"
+    crossings = [
+        {tuple(np.round(f.points.ravel(), 3)) for f in r.features if f.kind == RoadKind.CROSSWALK}
+        for r in (first, second)
+    ]
+    assert crossings[0] == crossings[1] and len(crossings[0]) == 9
+    # The ego of one window drives where the other window's ego does, at some other step.
+    apart = np.hypot(*np.moveaxis(first.tracks.xy[first.ego][:, None] - second.tracks.xy[second.ego], -1, 0))
+    assert np.median(apart.min(axis=1)) < 0.2
 
 
 @pytest.fixture(scope="module", params=list(REAL))

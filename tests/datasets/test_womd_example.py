@@ -103,6 +103,18 @@ def test_paths_are_counted_not_used(recording):
     assert recording.lost == {"paths": 2} and recording.route_lanes == ()
 
 
+def test_features_of_unknown_names_are_counted(wire):
+    table = {"state/current/yaw": wire.floats([0.0]), "state/is_context": wire.floats([0.0])}
+    assert decode(wire.example(**table)).lost == {"paths": 2, "unknown_fields": 1}
+
+
+def test_windows_of_one_recording_share_its_segment(wire):
+    """Exported windows come back with their ids alone, which name the recording and the first step."""
+    names = ("drive@0", "drive@40#7", "drive#7", "drive", "me@home")
+    segments = [decode(wire.example(name)).segment for name in names]
+    assert segments == ["drive"] * 4 + ["me@home"]
+
+
 def test_limits_of_points_are_read_if_a_writer_adds_them(wire):
     count = len(wire.example_points())
     table = {"roadgraph_samples/speed_limit": wire.floats([25.0] * count + [-1.0] * 7)}

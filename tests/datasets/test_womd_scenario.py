@@ -135,6 +135,18 @@ def test_two_states_for_one_lane_keep_the_known_one(wire):
     assert [light.states[0] for light in lights] == [6, 0]  # a code of a later version is unknown
 
 
+def test_lights_without_a_stop_point_stand_where_their_lane_begins(wire):
+    """A missing point and a point of zeros are the same; without the lane there is no place."""
+    bare = b"".join(wire.blob(1, wire.whole(1, lane) + wire.whole(2, 4)) for lane in (2, 999))
+    zeros = wire.blob(1, wire.whole(1, 4) + wire.whole(2, 6) + wire.blob(3, wire.point(0.0, 0.0, 0.0)))
+    recording = decode(wire.scenario(lights=wire.blob(7, bare + zeros)))
+    starts = {f.feature_id: f.points[0] for f in recording.features}
+    assert [light.lane_id for light in recording.lights] == [2, 4]
+    assert recording.lost["lights_without_place"] == 1
+    for light in recording.lights:
+        np.testing.assert_array_equal(light.stop_point, starts[light.lane_id])
+
+
 def test_20_test_split_has_no_future(wire):
     """Check-list 20: the test split has 11 steps; stored, the rest masked, with the flag."""
     recording = decode(wire.scenario(steps=11))

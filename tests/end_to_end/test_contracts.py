@@ -42,7 +42,8 @@ INSPECT = exactly(
             scenario_id={"type": "string"}, dataset={"type": "string"}, segment={"type": "string"}, steps=WHOLE,
             tracks=WHOLE, tracks_valid_now=WHOLE, map_features=exactly(**dict.fromkeys(KINDS, WHOLE)),
             map_points=WHOLE, lights=WHOLE, segments=WHOLE, overflow={"type": "object"},
-            flags={"type": "array", "items": {"type": "string"}}, audit={"type": "object"},
+            flags={"type": "array", "items": {"type": "string"}}, audit={"type": "object"}, lost={"type": "object"},
+            origin={"type": "array", "items": NUMBER, "minItems": 3, "maxItems": 3},
         ),
     }
 )  # fmt: skip

@@ -117,6 +117,12 @@ def limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
+def _sample(write: Callable[[Path], Path], scratch: Path) -> tuple[Path, Path]:
+    """A folder with a sample, and the place of its file therein."""
+    folder = Path(tempfile.mkdtemp(dir=scratch))
+    return folder, write(folder).relative_to(folder)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the files of one format."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -131,17 +137,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     ends: Counter[str] = Counter()
     wrong: list[str] = []
     with tempfile.TemporaryDirectory() as scratch:
-        whole = Path(scratch) / "whole"
-        whole.mkdir()
-        path = sample.write(whole).relative_to(whole)
-        kind, problem = outcome(whole / path, args.format)  # imports what it needs before memory is limited
-        if kind != "scenario" or problem:
-            print(f"the sample itself: {kind} {problem}")
-            return 1
+        samples = [_sample(write, Path(scratch)) for write in (sample.write, *getattr(sample, "FORMS", ()))]
+        for whole, path in samples:  # imports what it needs before memory is limited
+            kind, problem = outcome(whole / path, args.format)
+            if kind != "scenario" or problem:
+                print(f"the sample itself: {kind} {problem}")
+                return 1
         limit_memory()
         for number in range(args.files) if args.only is None else (args.only,):
             rng = random.Random(f"{args.seed} {number}")
             folder = Path(scratch) / "damaged"
+            whole, path = samples[number % len(samples)]
             shutil.copytree(whole, folder)
             done = damage(folder, rng)
             begin = time.monotonic()

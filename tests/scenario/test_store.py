@@ -8,14 +8,25 @@ import pickle
 import subprocess
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from drivax.datasets.export.writer import write_part
 from drivax.errors import DataError, UsageError
 from drivax.files import can_resume
-from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Flag, Scenario, SourceCounts, record_dtype
+from drivax.scenario.schema import (
+    SCHEMA_VERSION,
+    Capacity,
+    Flag,
+    Scenario,
+    SourceCounts,
+    record_dtype,
+    stored_name,
+)
+from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
 SMALL = Capacity(
@@ -148,6 +159,59 @@ def test_sets_are_reproducible_and_their_hash_follows_the_data(tmp_path: Path, s
         assert file.read_bytes() == (same.path / file.name).read_bytes(), file.name
     assert same.hash == ScenarioSet.open(scenario_set).hash
     assert write("other", [1, 0, 2, 3, 4, 5, 6]).hash != same.hash
+
+
+def named(scenario: Scenario, **names: str) -> Scenario:
+    """The scenario under other names, as ``assemble`` stores them."""
+    record = scenario.record.copy()
+    for name, text in names.items():
+        record[name] = stored_name(text, record.dtype[name].itemsize)
+    return replace(scenario, record=record, names=names)
+
+
+LONG = "scene-0103_" + "0123456789abcdef" * 2 + "_" + "fedcba9876543210" * 2
+
+
+def test_names_longer_than_their_fields_are_kept_in_full(tmp_path: Path):
+    """Two ids and segments that differ in their last character only, beyond the 64 bytes of a field."""
+    with ScenarioWriter(tmp_path / "set", SMALL, shares=(50, 0, 50)) as writer:
+        for end in "ab":
+            writer.add(named(make_scenario(0), scenario_id=LONG + end, segment=LONG + end + "é" * 99))
+        assert ("synthetic", LONG + "a") in writer and ("synthetic", LONG) not in writer
+        with pytest.raises(DataError, match=LONG + "b"):
+            writer.add(named(make_scenario(0), scenario_id=LONG + "b"))
+    opened = ScenarioSet.open(tmp_path / "set")
+    assert (
+        [entry["scenario_id"] for entry in opened.entries]
+        == [s.id for s in opened]
+        == [LONG + "a", LONG + "b"]
+    )
+    assert [s.text("segment") for s in opened] == [entry["segment"] for entry in opened.entries]
+    assert opened[1].text("segment") == LONG + "b" + "é" * 99 and opened[1].text("dataset") == "synthetic"
+    assert (
+        select_scenarios(opened, (), (LONG + "b",))
+        == select_scenarios(opened, (f"scenario_id={LONG}b",))
+        == [1]
+    )
+    lines = "".join(file.read_text() for file in (tmp_path / "set" / "splits").iterdir()).splitlines()
+    assert sorted(lines) == [f"synthetic\t{LONG}a", f"synthetic\t{LONG}b"]
+    again = write_part(opened, [1, 0], tmp_path / "part")
+    assert [s.id for s in ScenarioSet.open(again.path)] == [LONG + "b", LONG + "a"]
+    fields = [bytes(record["scenario_id"]).decode() for record in opened.records([0, 1])]
+    assert len(set(fields)) == 2 and all(field.startswith("scene-0103_") for field in fields)
+
+
+@pytest.mark.parametrize("text", ["x" * 64, "é" * 32, "a"])
+def test_names_that_fit_their_fields_are_stored_as_they_are(text: str):
+    assert stored_name(text, 64).decode() == text
+
+
+@pytest.mark.parametrize("text", ["x" * 65, "é" * 33, "€" * 4000])
+def test_longer_names_end_in_their_digest(text: str):
+    field = stored_name(text, 64)
+    begin, _, digest = field.decode().partition("~")
+    assert len(field) <= 64 and text.startswith(begin)
+    assert digest == hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def test_records_are_batches_in_the_order_of_the_indices(scenario_set: Path):

@@ -59,7 +59,7 @@ class Inspect:
 def run(args: Inspect) -> int:
     """Verify the sets, then print tables or JSON, or write a page."""
     from drivax.errors import UsageError
-    from drivax.report.inspection import Inspection, described
+    from drivax.report.inspection import Inspection
     from drivax.scenario.select.selection import Selection
 
     if not args.sets:
@@ -72,7 +72,7 @@ def run(args: Inspect) -> int:
     if args.observations:
         _observe(args, opened[0])
     elif args.json:
-        sets = [{"scenarios": [described(entry) for entry in inspection.entries]} for inspection in opened]
+        sets = [{"scenarios": inspection.described()} for inspection in opened]
         named = [{"set": str(path), **content} for path, content in zip(args.sets, sets, strict=True)]
         json.dump(sets[0] if len(sets) == 1 else named, sys.stdout, indent=1)
         print()

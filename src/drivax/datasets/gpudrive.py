@@ -57,6 +57,11 @@ _ROADS = {
     "stop_sign": RoadKind.STOP_SIGN,
     "driveway": RoadKind.DRIVEWAY,
 }
+#: Fields of objects and roads that are read, or need not be.
+_FIELDS = {
+    "position", "heading", "velocity", "valid", "length", "width", "height", "type", "id", "geometry", "map_element_id",
+    "goalPosition", "mark_as_expert", "is_sdc",
+}  # fmt: skip
 _AGENT_TYPES = {kind: name for name, kind in _AGENTS.items()}
 _ROAD_TYPES = {
     **dict.fromkeys(LANE_KINDS, "lane"),
@@ -67,6 +72,8 @@ _ROAD_TYPES = {
 _KINDS = {int(kind): kind for kind in RoadKind}
 #: Points of the published files are 0.5 m apart; twice that is a jump where the map was clipped.
 _SPLIT_GAP_M, _DENSE_M = 1.0, 0.75
+#: What other converters to this form leave out: heights of the map, of agents and of boxes.
+_ABSENT = ("z", "height")
 #: Written decimals: a tenth of a millimetre.
 _DIGITS = 4
 
@@ -152,6 +159,7 @@ def decode(scene: Any) -> Recording:
     if tracks.kind[ego] != AgentKind.VEHICLE:
         raise DataError(f"sdc_track_index names object {ego}, which is no vehicle", cure=_SKIP)
     features, unknown = _features(roads)
+    lights, unplaced = _lights(scene.get("tl_states"), steps, features)
     spacing = parsing.spacing_m(features)
     rows = {int(track): row for row, track in enumerate(tracks.track_id)}
     interest = [_whole(track, "objects_of_interest") for track in _listed(metadata, "objects_of_interest")]
@@ -162,18 +170,23 @@ def decode(scene: Any) -> Recording:
     return Recording(
         scenario_id=scenario_id,
         dataset="womd",
-        segment=scenario_id,
+        segment=parsing.segment_of(scenario_id),
         timestamps_s=np.arange(steps) * DT_S,
         current_step=CURRENT_STEP,
         ego=ego,
         tracks=tracks,
         features=features,
-        lights=_lights(scene.get("tl_states"), steps),
+        lights=lights,
         to_predict=_row_numbers(predicted, count, "tracks_to_predict"),
         # These are ids, tracks_to_predict are rows.
         of_interest=tuple(rows[track] for track in interest if track in rows),
         tags={"source_format": "gpudrive"},
-        lost=parsing.nonzero(unknown_roads=unknown, one_point_features=parsing.one_point_features(features)),
+        lost=parsing.nonzero(
+            unknown_roads=unknown,
+            one_point_features=parsing.one_point_features(features),
+            lights_without_place=unplaced,
+            unknown_fields=len({str(key) for row in (*objects, *roads) for key in row} - _FIELDS),
+        ),
         # In files whose points were thinned a jump looks like any other gap.
         split_gap_m=_SPLIT_GAP_M if spacing is not None and spacing <= _DENSE_M else None,
     )
@@ -204,14 +217,17 @@ def _row_numbers(values: Sequence[Any], count: int, what: str) -> tuple[int, ...
 
 
 def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
-    """Numbers of a list of dictionaries, ``[row, key]``."""
+    """Numbers of a list of dictionaries, ``[row, key]``; zeros where the first lacks a key that may be absent."""
     try:
-        table = np.array([[row[key] for key in keys] for row in rows], np.float64)
-        if table.size and table.shape != (len(rows), len(keys)):
+        here = [key for key in keys if key not in _ABSENT or key in rows[0]] if rows else keys
+        values = np.array([[row[key] for key in here] for row in rows], np.float64)
+        if values.size and values.shape != (len(rows), len(here)):
             raise ValueError("values are lists")
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise DataError(f"{what} is no list of numbers {', '.join(keys)}", cure=_SKIP) from error
-    return table.reshape(-1, len(keys))
+    table = np.zeros((len(rows), len(keys)))
+    table[:, [keys.index(key) for key in here]] = values.reshape(-1, len(here))
+    return table
 
 
 def _columns(row: Any, names: Sequence[str], what: str) -> list[list[Any]]:
@@ -298,10 +314,10 @@ def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...
     return tuple(features), unknown
 
 
-def _lights(states: Any, steps: int) -> tuple[Light, ...]:
-    """Lights by lane, from a dictionary of lists with one entry per observation."""
+def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
+    """Lights by lane, from lists with one entry per observation, and the number of those without a place."""
     if not states:
-        return ()
+        return (), 0
     if not isinstance(states, Mapping):
         raise DataError("tl_states is no dictionary of lanes", cure=_SKIP)
     lights = parsing.Lights(steps)
@@ -317,7 +333,7 @@ def _lights(states: Any, steps: int) -> tuple[Light, ...]:
             raise DataError(f"{what} is not at a finite place", cure=_SKIP)
         for step, state, point in zip(when, seen_states, points.tolist(), strict=True):
             lights.observe(step, int(lane), _light_state(state), point)
-    return lights.collected()
+    return lights.collected(features)
 
 
 def _light_state(state: Any) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +17,8 @@ from drivax.errors import DataError, missing_package
 from drivax.geometry.polylines import Polylines, cut_counts
 from drivax.scenario.arrays import differentiate as differentiate
 from drivax.scenario.build.tracks import DEFAULT_SIZES
-from drivax.scenario.recording import STRIDE, Light, MapFeature, Tracks
-from drivax.scenario.schema import POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
+from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
 
 Array = np.ndarray[Any, Any]
 
@@ -60,6 +61,16 @@ def import_extra(package: str) -> Any:
         raise missing_package(error) or error from error
 
 
+#: Names of windows of a drive: of nuScenes' scenes by tokens, drivax' own by their first step and another ego.
+_WINDOW = re.compile(r"(scene-\d+)(?:_[0-9a-f]{32}){1,2}|(.+)(?:@\d+(?:#\d+)?|#\d+)")
+
+
+def segment_of(scenario_id: str) -> str:
+    """The drive of which a scenario is one of several windows, by its id; the id itself where it tells none."""
+    window = _WINDOW.fullmatch(scenario_id)
+    return scenario_id if window is None else segment_of(window[1] or window[2])
+
+
 class Lights:
     """Collects light states by lane over some steps; slots and list positions move between steps, lanes do not."""
 
@@ -70,18 +81,25 @@ class Lights:
 
     def observe(self, step: int, lane: int, state: int, stop_point: Sequence[float]) -> None:
         """Note one observation; of several for one lane and step the first that is not UNKNOWN counts."""
-        if lane not in self._lights:
-            self._lights[lane] = tuple(stop_point), [_UNOBSERVED] * self._steps
-        states = self._lights[lane][1]
+        known, states = self._lights.get(lane, ((), [_UNOBSERVED] * self._steps))
+        self._lights[lane] = known if any(known) else tuple(stop_point), states
         if states[step] <= _UNKNOWN:
             states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
-    def collected(self) -> tuple[Light, ...]:
-        """The lights in order of first observation, with state -1 where they are not observed."""
-        return tuple(
+    def collected(self, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
+        """The lights in order of first observation, and the number of those without a place, which are left out.
+
+        States are -1 where a light is not observed. A stop point of zeros is none: the light then stands where its lane
+        begins.
+        """
+        starts = {f.feature_id: f.points[0] for f in features if f.kind in LANE_KINDS}
+        placed = [(lane, p if any(p) else starts.get(lane), s) for lane, (p, s) in self._lights.items()]
+        lights = tuple(
             Light(lane, np.array(point, np.float64), np.array(states, np.int8))
-            for lane, (point, states) in self._lights.items()
+            for lane, point, states in placed
+            if point is not None
         )
+        return lights, len(placed) - len(lights)
 
 
 def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
@@ -106,6 +124,19 @@ def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " t
         return steps * 0.1
     nearest = known[np.maximum(np.searchsorted(known, steps, side="right") - 1, 0)]
     return timestamps[nearest] + (steps - nearest) * 0.1
+
+
+def shifted(recording: Recording, offset: Float[np.ndarray, "3"]) -> Recording:
+    """The recording in a map frame in which its present origin lies at ``offset`` (x, y, z), metres."""
+    if not offset.any():
+        return recording
+    tracks = recording.tracks
+    xy = np.where(tracks.valid[..., None], tracks.xy + offset[:2], 0.0)
+    z = np.where(tracks.valid, tracks.z + offset[2], 0.0)
+    lights = (replace(light, stop_point=light.stop_point + offset) for light in recording.lights)
+    features = (replace(feature, points=feature.points + offset) for feature in recording.features)
+    tracks = replace(tracks, xy=xy, z=z)
+    return replace(recording, tracks=tracks, lights=tuple(lights), features=tuple(features))
 
 
 def box_centre(

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from drivax.errors import DataError
 from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
 from drivax.report.charts import short
-from drivax.scenario.schema import DT_S, Scenario
+from drivax.scenario.schema import DT_S, NAMES, Scenario
 from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
 from drivax.table import MISSING, Cell, Column, Table
@@ -26,19 +26,9 @@ from drivax.table import MISSING, Cell, Column, Table
 Array = np.ndarray[Any, Any]
 Entry = Mapping[str, Any]
 
-_SOURCE = ("steps", "tracks", "tracks_valid_now", "map_features", "map_points", "lights")
+_SOURCE = ("steps", "tracks", "tracks_valid_now", "map_features", "map_points", "lights", "lost")
 #: Scenarios with records that are read; the manifest describes the rest.
 SAMPLE = 1000
-
-
-def described(entry: Entry) -> dict[str, Any]:
-    """Return one scenario as ``inspect --json`` prints it: a stable contract."""
-    return {
-        **{name: entry[name] for name in ("scenario_id", "dataset", "segment")},
-        **{name: entry["source"][name] for name in _SOURCE},
-        **{name: entry[name] for name in ("segments", "overflow", "flags", "audit")},
-        "lost": entry["source"].get("lost", {}),
-    }
 
 
 @dataclass(frozen=True)
@@ -81,6 +71,21 @@ class Inspection:
     def entries(self) -> list[Entry]:
         """The manifest entries of the selected scenarios."""
         return [self.scenarios.entries[row] for row in self.rows]
+
+    def described(self) -> list[dict[str, Any]]:
+        """Return the selected scenarios as ``inspect --json`` prints them: a stable contract.
+
+        ``origin`` is the origin of its coordinates in the source's map frame: x, y, z in metres.
+        """
+        return [
+            {
+                **{name: entry[name] for name in NAMES},
+                **{name: entry["source"][name] for name in _SOURCE},
+                **{name: entry[name] for name in ("segments", "overflow", "flags", "audit")},
+                "origin": self.scenarios[row].origin.tolist(),
+            }
+            for row, entry in zip(self.rows, self.entries, strict=True)
+        ]
 
     @property
     def source(self) -> Mapping[str, Any]:

@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float, Float64, Int8, Int64
 
 from drivax.errors import DataError, UsageError
 from drivax.geometry.vectors import wrap
-from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, AgentKind, Capacity, Flag, RoadKind
+from drivax.scenario.schema import CURRENT_STEP, DT_S, NAMES, STEPS, AgentKind, Capacity, Flag, RoadKind
 
 Array = np.ndarray[Any, Any]
 STEP_TOLERANCE_S = 0.005
 #: A recording with steps that differ more from the median is resampled; longer ones (in median steps) are gaps.
 LATE_S, GAP_STEPS = 0.02, 2.5
-TEXT_BYTES = {"scenario_id": 64, "segment": 64, "dataset": 16}
+DATASET_BYTES = 16
 #: Largest distance from the ego and largest speed; beyond them a track or file is damaged or its unit is not the metre.
 EXTENT_M, SPEED_MPS = 100_000.0, 100.0
 #: Steps between the starts of two windows.
@@ -294,10 +294,16 @@ def is_even(timestamps_s: Float[Array, " time"]) -> bool:
 
 
 def _check_names(recording: Recording) -> Finding:
-    for name, size in TEXT_BYTES.items():
+    for name in NAMES:
         text = getattr(recording, name)
-        if not text or len(text.encode()) > size or "\0" in text:
-            return f"{name} {text[:80]!r} is empty or longer than {size} bytes", f"shorten the {name}"
+        if not text or any(character < " " for character in text):
+            return (
+                f"{name} {text[:80]!r} is empty or holds control characters",
+                f"name the {name} in the reader",
+            )
+    if len(recording.dataset.encode()) > DATASET_BYTES:
+        problem = f"dataset {recording.dataset[:80]!r} is longer than {DATASET_BYTES} bytes"
+        return problem, "shorten it in the reader"
     return None
 
 

@@ -8,6 +8,7 @@ by :class:`Capacity`, map segments, grid and routes. This module needs no JAX.
 from __future__ import annotations
 
 import enum
+import hashlib
 from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Any
@@ -158,6 +159,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
     k, r, o, lt, st = c.routes, c.route_points, c.road_rows, c.lights, c.stops
     cells = c.grid * c.grid
     return {
+        # Longer names are shortened (stored_name); the manifest has them in full.
         "scenario_id": ("S64", ()), "dataset": ("S16", ()), "segment": ("S64", ()), "origin": ("f8", (3,)),
         "dt_s": ("f4", ()), "current_step": ("i2", ()), "steps": ("i2", ()), "flags": ("u4", ()),
         # Agents that move (slot 0 is ego), local frame, time-major; zeros where not valid.
@@ -205,6 +207,20 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
     }  # fmt: skip
 
 
+#: Names of a scenario. The manifest holds them in full.
+NAMES = ("scenario_id", "dataset", "segment")
+_DIGEST = 16
+
+
+def stored_name(text: str, size: int) -> bytes:
+    """Return a name as its field of ``size`` bytes holds it: longer ones end in ``~`` and digits of their SHA-256."""
+    name = text.encode()
+    if len(name) <= size:
+        return name
+    begin = name[: size - _DIGEST - 1].decode(errors="ignore").encode()  # no half characters
+    return begin + b"~" + hashlib.sha256(name).hexdigest()[:_DIGEST].encode()
+
+
 def record_dtype(capacity: Capacity) -> np.dtype[Any]:
     """Return the dtype of a stored scenario: 64-byte aligned fields, item size a multiple of 4096."""
     fields = scenario_fields(capacity)
@@ -243,6 +259,7 @@ class Scenario:
         overflow: Nonzero numbers of agents, segments, ... that did not fit, by name.
         audit: Findings of the audit, by name (``evaluation.audit``).
         tags: Words for filters and strata.
+        names: The :data:`NAMES` in full; fields of the record hold long ones shortened (:func:`stored_name`).
     """
 
     record: np.ndarray[Any, Any]
@@ -251,6 +268,7 @@ class Scenario:
     overflow: dict[str, int] = field(default_factory=dict)
     audit: dict[str, float | int | bool | None] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name in _OWN_FIELDS:
@@ -266,8 +284,8 @@ class Scenario:
         return self.text("scenario_id")
 
     def text(self, name: str) -> str:
-        """Return a field of bytes (``scenario_id``, ``dataset``, ``segment``) as text."""
-        return bytes(self.record[name][()]).rstrip(b"\0").decode()
+        """Return ``scenario_id``, ``dataset`` or ``segment`` as the source has it."""
+        return self.names.get(name) or bytes(self.record[name][()]).rstrip(b"\0").decode()
 
     @property
     def has(self) -> Flag:

@@ -38,7 +38,7 @@ from drivax.files import (
     sync_and_close,
     write_json,
 )
-from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
+from drivax.scenario.schema import NAMES, SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
 from drivax.scenario.select.splits import Shares, write_splits
 
 MANIFEST = "manifest.json"
@@ -255,7 +255,8 @@ class ScenarioSet(Sequence[Scenario]):
         record = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
         findings = {name: dict(entry[name]) for name in ("overflow", "audit", "tags")}
         stored = record.view(self._dtype).reshape(())
-        return Scenario(stored, self.capacity, SourceCounts(**entry["source"]), **findings)
+        names = {name: str(entry[name]) for name in NAMES}
+        return Scenario(stored, self.capacity, SourceCounts(**entry["source"]), **findings, names=names)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return ScenarioSet.open, (self.path, self.verify)  # Each process maps the files itself.
@@ -368,9 +369,7 @@ def _key(entry: Mapping[str, Any]) -> tuple[str, str]:
 def manifest_entry(scenario: Scenario) -> dict[str, Any]:
     """Return the manifest entry of a scenario."""
     return {
-        "scenario_id": scenario.id,
-        "dataset": scenario.text("dataset"),
-        "segment": scenario.text("segment"),
+        **{name: scenario.text(name) for name in NAMES},
         "flags": [str(flag.name) for flag in scenario.has],
         "segments": int(scenario.record["segment_blocks"][3]),
         "source": plain(dataclasses.asdict(scenario.source)),
@@ -416,7 +415,7 @@ def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
         for shard in manifest["shards"]:
             itemgetter("file", "count", "sha256")(shard)
         for entry in manifest["scenarios"]:
-            itemgetter("scenario_id", "dataset", "segment", "flags", "overflow", "audit", "tags")(entry)
+            itemgetter(*NAMES, "flags", "overflow", "audit", "tags")(entry)
             SourceCounts(**entry["source"])
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"manifest is damaged ({error!r})", file=file, cure=AGAIN) from error

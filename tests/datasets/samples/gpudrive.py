@@ -102,3 +102,18 @@ def write(folder: Path, **changes) -> Path:
     path = folder / "tfrecord-00000-of-01000_1.json"
     path.write_text(json.dumps(scene(**changes)))
     return path
+
+
+def _write_flat(folder: Path) -> Path:
+    """A scene without heights, with a light whose stop point is missing."""
+    agents, elements = objects(), roads()
+    for row in agents:
+        del row["height"]
+    for point in (p for row in (*agents, *elements) for p in row.get("position", row.get("geometry"))):
+        point.pop("z", None)
+    lane = next(row["id"] for row in elements if row["type"] == "lane")
+    light = {"state": ["stop"], "time_index": [0], **{axis: [0.0] for axis in "xyz"}}
+    return write(folder, objects=agents, roads=elements, tl_states={str(lane): light})
+
+
+FORMS = (_write_flat,)

@@ -104,8 +104,96 @@ def scenario() -> dict[str, Any]:
     }  # fmt: skip
 
 
+#: What nuScenes' prediction samples add to the name of a scene: tokens of an agent and a keyframe.
+TOKENS = "_" + "0123456789abcdef" * 2 + "_" + "fedcba9876543210" * 2
+
+
+def first_form(tree: dict[str, Any]) -> dict[str, Any]:
+    """The scene as MetaDrive 0.3.0.1 wrote it: sizes in one field, outlines as polylines, lights in numbers."""
+    for track in tree["tracks"].values():
+        state = track["state"]
+        state["size"] = np.stack([state.pop(name) for name in ("length", "width", "height")], axis=1)
+        state["valid"] = state["valid"].astype(np.uint8)
+    for body in tree["map_features"].values():
+        if "polygon" in body:
+            body["polyline"] = body.pop("polygon")
+            body["type"] = body["type"].replace("CROSSWALK", "CROSS_WALK")
+    words = {None: 0, "LANE_STATE_STOP": 4, "LANE_STATE_GO": 6}
+    for key, body in tree["dynamic_map_states"].items():
+        seen = np.array([state is not None for state in body["state"]["object_state"]])
+        body["state"] = {
+            "object_state": np.array([words[state] for state in body["state"]["object_state"]], np.int32),
+            "lane": np.where(seen, int(key), 0),
+            "stop_point": np.where(seen[:, None], body.pop("stop_point"), 0.0).astype(np.float32),
+        }
+        del body["lane"]
+    return tree
+
+
+def nuscenes(tree: dict[str, Any]) -> dict[str, Any]:
+    """The scene as ScenarioNet's converter of nuScenes writes it: flat, yaw as height, outlines as markings."""
+    tree["version"] = "nuscenesv1.0-mini"
+    tree["metadata"] |= {"dataset": "nuscenes", "map": "boston-seaport", "sdc_id": "ego"}
+    del tree["metadata"]["current_time_index"]
+    tree["tracks"]["ego"] = tree["tracks"].pop("2406")
+    tree["tracks"]["ego"]["state"]["position"][:, 2] = 0.0
+    state = tree["tracks"]["ego"]["state"]
+    state["length"], state["width"] = state["width"], state["length"]
+    for track in tree["tracks"].values():
+        track["state"]["velocity"][-1] = 0.0
+    tree["dynamic_map_states"] = {}
+    features = tree["map_features"]
+    for name in ("9", "10", "11", "12"):
+        del features[name]
+    for body in features.values():
+        if "LANE" in body["type"]:
+            step = np.diff(body["polyline"][:, :2].astype(np.float64), axis=0)
+            yaw = np.arctan2(step[:, 1], step[:, 0])
+            body["polyline"] = [
+                (*xy, a) for xy, a in zip(body["polyline"][:, :2].tolist(), [*yaw, yaw[-1]], strict=True)
+            ]
+            body["entry_lanes"], body["exit_lanes"] = [], []
+        else:
+            body["polyline"] = body["polyline"][:, :2].astype(np.float64)
+    ring = features.pop("7")["polyline"]
+    island = line((50, 1.5), (60, 1.5), (60, 2), (50, 2), (50, 1.5))[:, :2].astype(np.float64)
+    features["boundary_0"] = {"type": "ROAD_LINE_SOLID_SINGLE_WHITE", "polyline": ring[::-1]}
+    features["boundary_1"] = {"type": "ROAD_LINE_SOLID_SINGLE_WHITE", "polyline": island}
+    return tree
+
+
+def recentred(tree: dict[str, Any], origin: tuple[float, float]) -> dict[str, Any]:
+    """The scene with another origin, as converters and MetaDrive move it: zeros of invalid states move too."""
+    shift = np.array([*origin, 0.0])
+    for track in tree["tracks"].values():
+        track["state"]["position"] = track["state"]["position"].astype(np.float64) - shift
+    for body in tree["map_features"].values():
+        for name in {"polyline", "polygon", "position"} & body.keys():
+            points = np.asarray(body[name], np.float64)
+            body[name] = points - shift[: points.shape[-1]]
+    for body in tree["dynamic_map_states"].values():
+        body["stop_point"] = np.asarray(body["stop_point"]) - shift
+    return tree
+
+
+def window() -> dict[str, Any]:
+    """One of several windows of a nuScenes scene, with its origin where the ego begins."""
+    tree = scenario() | {"id": "scene-0103" + TOKENS}
+    tree["tracks"]["17"]["state"]["valid"][50:] = False
+    tree["tracks"]["17"]["state"]["position"][50:] = 0.0
+    return recentred(nuscenes(tree), (X - 50.0, Y))
+
+
+def _dump(folder: Path, tree: dict[str, Any]) -> Path:
+    path = folder / "sd_waymo_v1.2_0123456789abcdef.pkl"
+    path.write_bytes(pickle.dumps(tree, protocol=4))
+    return path
+
+
 def write(folder: Path) -> Path:
     """Writes one scenario file and returns its path."""
-    path = folder / "sd_waymo_v1.2_0123456789abcdef.pkl"
-    path.write_bytes(pickle.dumps(scenario(), protocol=4))
-    return path
+    return _dump(folder, scenario())
+
+
+#: Writers of further forms, which are damaged in turn (fuzz.run).
+FORMS = (lambda folder: _dump(folder, first_form(scenario())), lambda folder: _dump(folder, window()))

@@ -111,3 +111,15 @@ def write(folder: Path) -> Path:
     path = folder / "sample.tfrecord"
     path.write_bytes(frame(example()))
     return path
+
+
+def _write_local(folder: Path) -> Path:
+    """One record of drivax' own, whose coordinates are relative to the ego."""
+    path = folder / "sample.tfrecord"
+    path.write_bytes(
+        frame(example("drive@40", **{"scenario/origin": blob(1, blob(1, b"664430.1 3996721.9 12.5"))}))
+    )
+    return path
+
+
+FORMS = (_write_local,)

@@ -64,7 +64,7 @@ class ArgoverseMotion:
 
     def describe(self, path: Path) -> Description:
         """Tracks, steps and city of one scenario."""
-        table = read_table(path, _COLUMNS)
+        table = read_table(path, _COLUMNS, optional=("slice_id",))
         steps = 1 + int(table.numbers["timestep"].max())
         map_path = _map_path(path)
         return Description(
@@ -101,7 +101,7 @@ def decode(path: Path) -> Recording:
     In the city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; heights are
     those of the map, sizes those of the class, velocities as the source smoothed them.
     """
-    table = read_table(path, _COLUMNS)
+    table = read_table(path, _COLUMNS, optional=("slice_id",))
     local_map = read_map(_map_path(path))
     try:
         tracks, ego = _tracks(table)
@@ -114,7 +114,7 @@ def decode(path: Path) -> Recording:
     return Recording(
         scenario_id=scenario_id,
         dataset=tables.DATASET,
-        segment=table.texts["slice_id"].text(0) or scenario_id,
+        segment=(table.texts["slice_id"].text(0) if "slice_id" in table.texts else "") or scenario_id,
         timestamps_s=_timestamps(table, steps),
         current_step=min(CURRENT_STEP, steps - 1),
         ego=ego,

@@ -65,15 +65,19 @@ def has_magic(path: Path, magic: bytes) -> bool:
         return False
 
 
-def read_table(path: Path, columns: Mapping[str, Kind]) -> Table:
-    """Read columns of a parquet or feather file, by name and kind: any number, whole numbers, or text."""
+def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
+    """Read columns of a parquet or feather file, by name and kind: any number, whole numbers, or text.
+
+    Columns that not every version of the format has are left out where they are missing.
+    """
     pa = import_extra("pyarrow")
     try:
-        table = _load(path, list(columns))
+        table = _load(path, list(columns), optional)
         if table.num_rows == 0:
             raise DataError("holds no rows", file=path, cure=_AGAIN)
-        texts = {name: _words(table.column(name)) for name, kind in columns.items() if kind == "text"}
-        others = [(name, kind) for name, kind in columns.items() if kind != "text"]
+        kinds = [(name, columns[name]) for name in table.column_names]
+        texts = {name: _words(table.column(name)) for name, kind in kinds if kind == "text"}
+        others = [(name, kind) for name, kind in kinds if kind != "text"]
         numbers = {name: _numbers(table.column(name), kind == "whole", name) for name, kind in others}
     except FileNotFoundError as error:
         raise DataError("is missing", file=path, cure=_AGAIN) from error
@@ -84,7 +88,7 @@ def read_table(path: Path, columns: Mapping[str, Kind]) -> Table:
     return Table(table.num_rows, numbers, texts)
 
 
-def _load(path: Path, columns: Sequence[str]) -> Any:
+def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> Any:
     """The columns as an Arrow table, validated: string offsets of damaged files may point anywhere."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -92,6 +96,7 @@ def _load(path: Path, columns: Sequence[str]) -> Any:
     with pa.OSFile(str(path)) as source:
         if has_magic(path, PARQUET_MAGIC):
             file = pq.ParquetFile(source)
+            columns = [name for name in columns if name in file.schema_arrow.names or name not in optional]
             _check(file.schema_arrow.names, columns, file.metadata.num_rows)
             table = file.read(columns=list(columns), use_threads=False)
         else:

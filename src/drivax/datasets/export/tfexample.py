@@ -16,6 +16,7 @@ from jaxtyping import Int
 
 from drivax.datasets.export.recording import restore
 from drivax.datasets.parsing import MPS_PER_MPH
+from drivax.datasets.womd.messages import ORIGIN
 from drivax.geometry.polylines import project, resample
 from drivax.scenario.recording import MapFeature, Recording, Tracks
 from drivax.scenario.schema import (
@@ -69,8 +70,9 @@ def tf_example(
     """Return the features of a scenario and counts of what did not fit, both by name.
 
     Coordinates are the source's (float32, as in the data set) where all are below 16,384 m, else relative to ego at the
-    current step: UTM coordinates would be rounded to half a metre. Ids that their type cannot hold exactly (agents:
-    float32, map: int32) are replaced by running numbers.
+    current step: UTM coordinates would be rounded to half a metre. That position is then ``scenario/origin``, a text,
+    which Waymax and V-Max skip. Ids that their type cannot hold exactly (agents: float32, map: int32) are replaced by
+    running numbers.
     """
     recording = restore(scenario)
     tracks, lost = _over_time(recording)
@@ -79,7 +81,8 @@ def tf_example(
     lost["agents"] += max(len(order) - AGENTS, 0)
     micros = np.round(np.arange(STEPS) * float(scenario.dt_s) * 1e6).astype(np.int64)
     numbers = _numbers(recording)
-    features = {"scenario/id": recording.scenario_id.encode()}
+    features: dict[str, bytes | _Array] = {"scenario/id": recording.scenario_id.encode()}
+    features |= {ORIGIN: " ".join(map(repr, origin.tolist())).encode()} if origin.any() else {}
     features |= _states(tracks, order[:AGENTS], micros, origin) | _marks(tracks, recording, order[:AGENTS])
     features |= _lights(recording, numbers, micros, origin, lost)
     features |= _map(recording.features, numbers, origin)

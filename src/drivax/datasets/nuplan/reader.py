@@ -403,4 +403,4 @@ def _lights(
             lights.observe(step, lane, _LIGHT_STATES.get(status, LightState.UNKNOWN), starts[lane])
         elif lane not in city.lanes:
             unknown.add(connector)
-    return lights.collected(), len(unknown)
+    return lights.collected(features)[0], len(unknown)

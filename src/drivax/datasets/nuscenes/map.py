@@ -88,10 +88,12 @@ class City:
 
 @lru_cache(maxsize=4)
 def city(path: Path) -> City:
-    """The map in a file of the map expansion (v1.0 to v1.3)."""
+    """The map in a file of the map expansion (v1.2 or later)."""
     content = load_json(path)
     try:
         return _Layers(content).city()
+    except DataError as error:
+        raise DataError(error.problem, file=path, cure=error.cure) from error
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
         raise DataError(f"the map is damaged ({error!r})", file=path, cure=_AGAIN) from error
 
@@ -142,6 +144,8 @@ class _Layers:
 
     def _lanes(self) -> list[MapFeature]:
         """Lanes and lane connectors along their arc lines, with links and neighbours."""
+        if not {"arcline_path_3", "connectivity"} <= self._content.keys():
+            raise DataError("holds no centre lines of lanes", cure="download the map expansion v1.3")
         paths, links = self._content["arcline_path_3"], self._content["connectivity"]
         rows = [(row, name) for name in ("lane", "lane_connector") for row in self._layer(name)]
         lines = {row["token"]: arc_line(paths[row["token"]]) for row, _ in rows if row["token"] in paths}

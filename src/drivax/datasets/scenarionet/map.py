@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from drivax.datasets import parsing
-from drivax.datasets.scenarionet.pickles import MOST_NUMBERS, SKIP, Names, extent, floats, items, number, text
+from drivax.datasets.scenarionet.pickles import (
+    MOST_NUMBERS,
+    SKIP,
+    Names,
+    as_float,
+    as_list,
+    as_text,
+    extent,
+    floats,
+)
 from drivax.errors import DataError
 from drivax.geometry.polylines import point_to_segment
 from drivax.geometry.vectors import wrap
@@ -42,12 +51,20 @@ _KINDS = {
     "LANE_BIKE_LANE": RoadKind.LANE_BIKE,
     "UNKNOWN_LINE": RoadKind.LINE_UNKNOWN,
     **{f"ROAD_{kind.name}": kind for kind in RoadKind if kind.name.startswith("LINE_")},
+    # The first forms of the files.
+    "BROKEN_SINGLE_YELLOW": RoadKind.LINE_BROKEN_SINGLE_YELLOW,
+    "CROSS_WALK": RoadKind.CROSSWALK,
     "UNKNOWN": RoadKind.EDGE_UNKNOWN,
     "ROAD_EDGE_BOUNDARY": RoadKind.EDGE_BOUNDARY,
     "ROAD_EDGE_MEDIAN": RoadKind.EDGE_MEDIAN,
     "GUARDRAIL": RoadKind.EDGE_BOUNDARY,
     **{name: RoadKind[name] for name in ("LANE_FREEWAY", "STOP_SIGN", "CROSSWALK", "SPEED_BUMP", "DRIVEWAY")},
 }
+#: Fields of features that are read, or need not be.
+_FIELDS = frozenset((
+    "type", "polyline", "polygon", "position", "lane", "interpolating", "width", "speed_limit_mph", "speed_limit_kmh",
+    "entry_lanes", "exit_lanes", "left_neighbor", "right_neighbor", "left_boundaries", "right_boundaries",
+))  # fmt: skip
 #: Prefix of outlines of drivable space, which converters store as markings.
 _OUTLINE = "boundary_"
 #: The third column of lanes is a heading if its median difference from the points' direction is below this.
@@ -156,12 +173,13 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
     Raises:
         DataError: The map is too large.
     """
-    named = {name: body for key, body in table.items() if (name := text(key)) and isinstance(body, dict)}
+    named = {name: body for key, body in table.items() if (name := as_text(key)) and isinstance(body, dict)}
     numbers = sum(extent(value) for body in named.values() for value in body.values())
     if numbers > MOST_NUMBERS:
         raise DataError(f"a map of {numbers} numbers", cure=SKIP)
     reading = _Reading(dataset, around, Names(list(named), bits=62), Counter(), set())
     reading.lost["broken_features"] += len(table) - len(named)
+    reading.lost["unknown_fields"] += len({str(key) for body in named.values() for key in body} - _FIELDS)
     read = {name: f for name, body in named.items() if (f := _feature(name, body, reading)) is not None}
     features = list(read.values())
     total = sum(float(np.hypot(*np.diff(f.points[:, :2], axis=0).T).sum()) for f in features)
@@ -216,9 +234,14 @@ def _feature(name: str, body: Mapping[Any, Any], reading: _Reading) -> MapFeatur
 
 
 def _points(name: str, kind: RoadKind, body: Mapping[Any, Any]) -> Array | None:
-    """The points as the file has them; None where there are none."""
-    part = "polygon" if kind in POLYGON_KINDS else "position" if kind == RoadKind.STOP_SIGN else "polyline"
-    if body.get(part) is None:
+    """The points as the file has them; None where there are none.
+
+    The outlines of crosswalks and speed bumps are called ``polyline`` in the first form of the files.
+    """
+    parts = ("position",) if kind == RoadKind.STOP_SIGN else ("polyline",)
+    parts = ("polygon", *parts) if kind in POLYGON_KINDS else parts
+    part = next((part for part in parts if body.get(part) is not None), None)
+    if part is None:
         return None
     points = floats(body[part], f"map_features {name[:40]!r}: {part}")
     points = points[None] if kind == RoadKind.STOP_SIGN and points.ndim == 1 else points
@@ -233,7 +256,7 @@ def _limit(body: Mapping[Any, Any], reading: _Reading) -> float | None:
     """The speed limit in m/s; 0 in the file means unknown."""
     given = ((body.get("speed_limit_mph"), parsing.MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
     for value, unit in given:
-        limit = number(value)
+        limit = as_float(value)
         if limit is not None and limit > 0:
             if reading.dataset in _MADE_UP_LIMITS or limit * unit > _FASTEST_MPS:
                 reading.lost["made_up_speed_limits"] += 1
@@ -259,7 +282,7 @@ def _width(body: Mapping[Any, Any]) -> float | None:
 
 def _links(value: Any, reading: _Reading) -> tuple[int, ...]:
     """Numbers of linked features, which files name by number, text or a dictionary with ``feature_id``."""
-    names = [item.get("feature_id") if isinstance(item, dict) else item for item in items(value)]
+    names = [item.get("feature_id") if isinstance(item, dict) else item for item in as_list(value)]
     links = tuple(link for name in names if (link := reading.names.get(name)) is not None)
     if len(links) < len(names):
         reading.lost["dangling_links"] += len(names) - len(links)

@@ -161,7 +161,7 @@ class _Machine:
 
 
 def _fill(container: dict[Any, Any], items: Sequence[Any]) -> dict[Any, Any]:
-    container.update((_key(key), value) for key, value in zip(items[::2], items[1::2], strict=True))
+    container.update((_hashable(key), value) for key, value in zip(items[::2], items[1::2], strict=True))
     return container
 
 
@@ -175,13 +175,13 @@ _MAKES: dict[str, tuple[int | None, Callable[[list[Any]], Any]]] = {
     "NONE": (0, lambda items: None), "NEWTRUE": (0, lambda items: True), "NEWFALSE": (0, lambda items: False),
     "EMPTY_LIST": (0, list), "EMPTY_TUPLE": (0, tuple), "EMPTY_DICT": (0, dict), "EMPTY_SET": (0, set),
     "TUPLE1": (1, tuple), "TUPLE2": (2, tuple), "TUPLE3": (3, tuple), "TUPLE": (None, tuple), "LIST": (None, list),
-    "DICT": (None, lambda items: _fill({}, items)), "FROZENSET": (None, lambda items: frozenset(map(_key, items))),
+    "DICT": (None, lambda items: _fill({}, items)), "FROZENSET": (None, lambda items: frozenset(map(_hashable, items))),
 }  # fmt: skip
 #: Operations that add items to a container of a type.
 _ADDS: dict[str, tuple[int | None, type[Any], Callable[[Any, list[Any]], Any]]] = {
     "APPEND": (1, list, list.extend), "APPENDS": (None, list, list.extend),
     "SETITEM": (2, dict, _fill), "SETITEMS": (None, dict, _fill),
-    "ADDITEMS": (None, set, lambda members, items: members.update(map(_key, items))),
+    "ADDITEMS": (None, set, lambda members, items: members.update(map(_hashable, items))),
 }  # fmt: skip
 _OPERATIONS: dict[str, Callable[[_Machine, Any], Any]] = {
     "MARK": _Machine._mark, "POP": _Machine._pop, "POP_MARK": lambda machine, _: machine._take(None),
@@ -193,7 +193,7 @@ _OPERATIONS: dict[str, Callable[[_Machine, Any], Any]] = {
 _SKIPPED = frozenset(("PROTO", "FRAME", "STOP"))
 
 
-def _key(key: Any) -> Any:
+def _hashable(key: Any) -> Any:
     """A key or a member of a set: a plain value, or a flat tuple of them. Hashing deep tuples ends the process."""
     plain = (str, int, float, bytes, type(None))
     if isinstance(key, plain) or (type(key) is tuple and all(isinstance(part, plain) for part in key)):
@@ -210,7 +210,7 @@ def _members(items: Any = ()) -> list[Any]:
 def _new_dictionary(*arguments: Any) -> dict[Any, Any]:
     """An ordered dictionary, or a default dictionary, whose first argument makes defaults."""
     pairs = [argument for argument in arguments if not isinstance(argument, _Global) and argument is not None]
-    return {_key(key): value for items in pairs for key, value in _members(items)}
+    return {_hashable(key): value for items in pairs for key, value in _members(items)}
 
 
 def _encoded(text: Any, encoding: Any = "latin1") -> bytes:
@@ -287,8 +287,8 @@ _CALLED: dict[str, Callable[..., Any]] = {
     "numpy.dtype": _type,
     "collections.defaultdict": _new_dictionary,
     "collections.OrderedDict": _new_dictionary,
-    "builtins.set": lambda items=(): set(map(_key, _members(items))),
-    "builtins.frozenset": lambda items=(): frozenset(map(_key, _members(items))),
+    "builtins.set": lambda items=(): set(map(_hashable, _members(items))),
+    "builtins.frozenset": lambda items=(): frozenset(map(_hashable, _members(items))),
     "builtins.bytearray": lambda content=b"", encoding="latin1": _content(content),
     "builtins.bytes": lambda content=b"": _content(content),
     "_codecs.encode": _encoded,
@@ -312,7 +312,7 @@ def mapping(parent: Any, name: str, what: str = "the file") -> Mapping[Any, Any]
     return value
 
 
-def text(value: Any) -> str | None:
+def as_text(value: Any) -> str | None:
     """Return a text that can be written as UTF-8, also of a whole number; None for anything else."""
     if not isinstance(value, bool) and isinstance(value, str | int):
         with contextlib.suppress(ValueError):  # a lone surrogate, or an integer of thousands of digits
@@ -320,20 +320,20 @@ def text(value: Any) -> str | None:
     return None
 
 
-def whole(value: Any) -> int | None:
+def as_int(value: Any) -> int | None:
     """Return a whole number, also from a text; None for anything else."""
-    written = text(value)
+    written = as_text(value)
     return int(written) if written and written.isascii() and written.isdigit() and len(written) < 19 else None
 
 
-def number(value: Any) -> float | None:
+def as_float(value: Any) -> float | None:
     """Return a number of at most 1e15; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, _NUMBER) or abs(value) > 1e15 or value != value:
         return None
     return float(value)
 
 
-def items(value: Any) -> Sequence[Any]:
+def as_list(value: Any) -> Sequence[Any]:
     """Return the items of a list, tuple, set or one-dimensional array; none for anything else."""
     if isinstance(value, np.ndarray):
         return value.tolist() if value.ndim == 1 else []
@@ -385,12 +385,12 @@ class Names:
     """
 
     def __init__(self, names: Sequence[str], bits: int) -> None:
-        own = [whole(name) for name in names]
+        own = [as_int(name) for name in names]
         kept = [number for number in own if number is not None and number < 1 << bits]
         numbers = kept if len(kept) == len(names) and len(set(kept)) == len(kept) else range(len(names))
         self._numbers = dict(zip(names, numbers, strict=True))
 
     def get(self, value: Any) -> int | None:
         """Return the number of a name; None where the file has no such name."""
-        name = text(value)
+        name = as_text(value)
         return None if name is None else self._numbers.get(name)

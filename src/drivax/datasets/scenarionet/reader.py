@@ -22,7 +22,17 @@ from drivax.datasets.parsing import flatten, lift
 from drivax.datasets.reader import BadRecord, Description
 from drivax.datasets.scenarionet import pickles
 from drivax.datasets.scenarionet.map import RoadMap, road_map
-from drivax.datasets.scenarionet.pickles import SKIP, Names, count_rows, floats, items, mapping, text, whole
+from drivax.datasets.scenarionet.pickles import (
+    SKIP,
+    Names,
+    as_float,
+    as_int,
+    as_list,
+    as_text,
+    count_rows,
+    floats,
+    mapping,
+)
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, is_even
@@ -51,6 +61,7 @@ _STATES = {
 }
 _MOST_LIGHT_STATES = 2_000_000
 _MOST_TRACK_STATES = 1_000_000
+_FARTHEST_M = 1e7
 _AGENTS = {
     "VEHICLE": AgentKind.VEHICLE,
     "PEDESTRIAN": AgentKind.PEDESTRIAN,
@@ -59,12 +70,16 @@ _AGENTS = {
 }
 #: Possible numbers of columns of each state, and its largest plausible value: metres, radians, m/s.
 _COLUMNS = {
-    "position": ((2, 3), 1e7),
+    "position": ((2, 3), _FARTHEST_M),
     "heading": ((1,), 1e4),
     "velocity": ((2, 3), 1e3),
     **dict.fromkeys(("length", "width", "height"), ((1,), 1e3)),
+    "size": ((3,), 1e3),  # length, width, height in the first form of the files
+    "radius": ((1,), 1e3),  # of round objects of MetaDrive, without length and width
     "valid": ((1,), np.inf),
 }
+#: States of tracks and lights that are not needed: what MetaDrive's own vehicles add.
+_NOT_NEEDED = ("angular_velocity", "steering", "throttle_brake", "action")
 #: A longer last step is motion.
 _MOVED_M = 0.05
 #: A scenario file names its dictionaries within this many bytes.
@@ -101,7 +116,7 @@ class ScenarioNet:
         return Description(
             dataset=f"{_TITLES.get(recording.dataset, recording.dataset)}, by ScenarioNet",
             flavour="ScenarioNet pickle",
-            version=text(tree.get("version")),
+            version=as_text(tree.get("version")),
             recordings=1,
             notes=tuple(note for holds, note in facts if holds),
         )
@@ -150,28 +165,33 @@ def _named_length(head: bytes) -> int | None:
 
 
 def decode(tree: Any) -> Recording:
-    """Return the recording in a ScenarioNet dictionary, in the file's map frame, metres, float64.
+    """Return the recording in a ScenarioNet dictionary, in the map frame of the original data, metres, float64.
+
+    A shift of the origin is undone where the file tells it (:func:`_offset`); else the frame is the file's.
 
     Raises:
         DataError: The dictionary is damaged.
     """
     metadata = mapping(tree, "metadata")
-    table = {name: body for key, body in mapping(tree, "tracks").items() if (name := text(key)) is not None}
+    table = {
+        name: body for key, body in mapping(tree, "tracks").items() if (name := as_text(key)) is not None
+    }
     rows = {name: row for row, name in enumerate(table)}
     dataset, identity, ego = _dataset(tree, metadata), _identity(tree, metadata), _ego(metadata, rows)
-    tracks, flags = _motion(read_tracks(table, Names(list(table), bits=31), ego), metadata, dataset, ego)
+    tracks, lost = read_tracks(table, Names(list(table), bits=31), ego)
+    tracks, flags = _motion(tracks, metadata, dataset, ego)
     around = tracks.xy[ego, int(np.argmax(tracks.valid[ego]))]
     roads = road_map(mapping(tree, "map_features"), dataset, around)
     steps = tracks.valid.shape[1]
-    lost = Counter({**roads.lost, "one_point_features": parsing.one_point_features(roads.features)})
+    lost += Counter({**roads.lost, "one_point_features": parsing.one_point_features(roads.features)})
     lights = _lights(mapping(tree, "dynamic_map_states"), steps, dataset, roads, lost)
     tracks, features = _with_heights(tracks, roads)
-    tags = {"source_format": _NAME} | parsing.place_tags(text(metadata.get("map")))
-    kind = text(metadata.get("scenario_type")) or None
-    return Recording(
+    tags = {"source_format": _NAME} | parsing.place_tags(as_text(metadata.get("map")))
+    kind = as_text(metadata.get("scenario_type")) or None
+    recording = Recording(
         scenario_id=identity,
         dataset=dataset,
-        segment=text(metadata.get("log_name")) or identity,
+        segment=as_text(metadata.get("log_name")) or parsing.segment_of(identity),
         timestamps_s=_timestamps(metadata, steps),
         current_step=_current_step(metadata, steps),
         ego=ego,
@@ -185,19 +205,44 @@ def decode(tree: Any) -> Recording:
         flags=flags,
         split_gap_m=_WOMD_GAP_M if dataset == "womd" else None,
     )
+    return parsing.shifted(recording, _offset(metadata, table, dataset))
+
+
+def _offset(metadata: Mapping[Any, Any], table: Mapping[str, Any], dataset: str) -> Array:
+    """Position (x, y, 0) of the file's origin in the original map frame; zeros where the file does not tell it.
+
+    ScenarioNet notes the centre that it takes from all positions, MetaDrive the old origin in its new frame. Older
+    nuScenes files tell the centre by steps without an observation: their zeros were moved as well.
+    """
+    centre = _position(metadata, "map_center") - _position(metadata, "old_origin_in_current_coordinate")
+    if not centre.any() and dataset == "nuscenes":
+        states = [body["state"] for body in table.values() if body["state"].get("valid") is not None]
+        unseen = [floats(s["position"], "")[floats(s["valid"], "").reshape(-1) < 0.5, :2] for s in states]
+        places = np.unique(np.concatenate([np.zeros((0, 2)), *unseen]), axis=0)
+        centre = -places[0] if len(places) == 1 else centre
+    return np.append(centre, 0.0)
+
+
+def _position(metadata: Mapping[Any, Any], name: str) -> Array:
+    """A position (x, y) in the metadata; zeros where there is none."""
+    value = metadata.get(name)
+    position = np.zeros(2) if value is None else floats(value, name)
+    if position.shape not in ((2,), (3,)) or not (np.abs(position) < _FARTHEST_M).all():
+        raise DataError(f"{name} is no position", cure=SKIP)
+    return position[:2]
 
 
 def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
     for value in (tree.get("id"), metadata.get("scenario_id"), metadata.get("id")):
-        if identity := text(value):
+        if identity := as_text(value):
             return identity
     raise DataError("the scenario has no id", cure=SKIP)
 
 
 def _dataset(tree: Any, metadata: Mapping[Any, Any]) -> str:
     """The origin of the data in drivax' words."""
-    given = text(metadata.get("dataset")) or text(metadata.get("coordinate")) or ""
-    version = text(tree.get("version")) or ""
+    given = as_text(metadata.get("dataset")) or as_text(metadata.get("coordinate")) or ""
+    version = as_text(tree.get("version")) or ""
     # Early files name the data set in their version only.
     word = next((word for word in ("nuscenes", "nuplan") if version.startswith(word)), given.lower())
     word = _DATASETS.get(word, word)
@@ -205,15 +250,18 @@ def _dataset(tree: Any, metadata: Mapping[Any, Any]) -> str:
 
 
 def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
-    named = text(metadata.get("sdc_id"))
+    named = as_text(metadata.get("sdc_id"))
     row = rows.get("ego" if named is None else named)
     if row is not None:
         return row
     raise DataError(f"the ego {(named or 'is not named')[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
 
 
-def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> Tracks:
-    """Read ``tracks``. Invalid states become zeros; a velocity that the file lacks is zero."""
+def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Tracks, Counter[str]]:
+    """Read ``tracks``, and count states of unknown names.
+
+    Invalid states become zeros; a velocity that the file lacks is zero.
+    """
     titles = [f"track {name[:40]!r}" for name in table]
     bodies = [mapping({"": body}, "", f"tracks[{name[:40]!r}]") for name, body in table.items()]
     states = [mapping(body, "state", title) for title, body in zip(titles, bodies, strict=True)]
@@ -235,10 +283,13 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> Tracks:
         stacked[name][~valid] = 0.0
         parsing.check_within(limit, stacked[name])
     size = np.concatenate([stacked[name] for name in ("length", "width", "height")], axis=-1)
+    size = np.where(size.any(axis=(1, 2), keepdims=True), size, stacked["size"])
+    missing = ~size[..., :2].any(axis=(1, 2), keepdims=True)
+    size[..., :2] += np.where(missing, 2.0 * stacked["radius"], 0.0)
     longest, widest, _ = size[ego].max(axis=0)
     if longest < widest:  # nuScenes files have a car 1.73 m long and 4.08 m wide
         size[ego] = size[ego][:, [1, 0, 2]]
-    return Tracks(
+    tracks = Tracks(
         xy=stacked["position"][..., :2].copy(),
         z=stacked["position"][..., 2].copy(),
         heading=np.where(valid, wrap(stacked["heading"][..., 0]), 0.0),
@@ -246,10 +297,12 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> Tracks:
         size=size,
         valid=valid,
         kind=np.array(
-            [_AGENTS.get(text(body.get("type")) or "", AgentKind.OTHER) for body in bodies], np.int8
+            [_AGENTS.get(as_text(body.get("type")) or "", AgentKind.OTHER) for body in bodies], np.int8
         ),
         track_id=np.array([names.get(name) for name in table], np.int64),
     )
+    unknown = {str(name) for state in states for name in state} - {*_COLUMNS, *_NOT_NEEDED}
+    return tracks, Counter(unknown_fields=len(unknown))
 
 
 def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array | None:
@@ -316,7 +369,7 @@ def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
 
 def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
     """The current step; files of long recordings name none, or the first."""
-    named = whole(metadata.get("current_time_index"))
+    named = as_int(metadata.get("current_time_index"))
     if named is None:
         return min(CURRENT_STEP, steps - 1)
     if named >= steps:
@@ -326,8 +379,8 @@ def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
 
 def _named_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
     """Rows of the tracks in a list of names or a dictionary by name; unknown names are left out."""
-    names = list(value) if isinstance(value, dict) else items(value)
-    numbers = (rows.get(name) for item in names if (name := text(item)) is not None)
+    names = list(value) if isinstance(value, dict) else as_list(value)
+    numbers = (rows.get(name) for item in names if (name := as_text(item)) is not None)
     return tuple(row for row in numbers if row is not None)
 
 
@@ -340,31 +393,43 @@ def _lights(
     starts = {f.feature_id: f.points[0] for f in roads.features if f.kind in LANE_KINDS}
     lights = parsing.Lights(steps)
     for key, body in table.items():
-        what = f"light {(text(key) or '')[:40]!r}"
+        what = f"light {(as_text(key) or '')[:40]!r}"
         light = mapping({"": body}, "", what)
         lane = roads.names.get(light.get("lane", key))
-        states = items(mapping(light, "state", what).get("object_state"))
+        states = as_list(mapping(light, "state", what).get("object_state"))
         if len(states) != steps:
             raise DataError(f"{what} has {len(states)} states, {steps} steps", cure=SKIP)
         if lane is None or lane not in starts:
             lost["lights_without_lane"] += 1
             continue
+        points = _stop_points(light, steps, what)
         # The stop points of nuPlan's lights are 8 m behind the line.
-        stop = None if dataset == "nuplan" else _stop_point(light.get("stop_point"), what)
-        place = starts[lane] if stop is None else stop
+        stops = points[points.any(axis=1)] if dataset != "nuplan" else points[:0]
+        place = starts[lane].copy()
+        if len(stops):
+            place[: stops.shape[1]] = stops[0]
         for step, state in enumerate(states):
-            if state is not None:
-                lights.observe(step, lane, _state(state), place.tolist())
-    return lights.collected()
+            known = _state(state)
+            # The first form of the files fills all with zeros where nothing is observed.
+            unseen = known == LightState.UNKNOWN and len(points) == steps > 1 and not points[step].any()
+            if state is None or unseen:
+                continue
+            lost["unknown_light_states"] += known is None
+            lights.observe(step, lane, LightState.UNKNOWN if known is None else known, place.tolist())
+    return lights.collected(roads.features)[0]
 
 
-def _stop_point(value: Any, what: str) -> Array | None:
-    """A point with a height; None where the file has none."""
-    point = None if value is None else floats(value, f"{what}: stop_point")
-    return point if point is not None and point.shape == (3,) and (np.abs(point) < 1e7).all() else None
+def _stop_points(light: Mapping[Any, Any], steps: int, what: str) -> Array:
+    """Stop points (x, y and maybe z): one, or one per step in the light's ``state`` in the first form of the files."""
+    named = light.get("stop_point", light["state"].get("stop_point"))
+    points = np.zeros((0, 3)) if named is None else np.atleast_2d(floats(named, f"{what}: stop_point"))
+    usable = len(points) in (1, steps) and points.shape[1] in (2, 3) and (np.abs(points) < _FARTHEST_M).all()
+    return points if usable else np.zeros((0, 3))
 
 
-def _state(state: Any) -> LightState:
+def _state(state: Any) -> LightState | None:
+    """The state by its name or WOMD's number; None for any other."""
     if isinstance(state, str):
-        return _STATES.get(state, LightState.UNKNOWN)
-    return LightState(state) if type(state) is int and state in range(9) else LightState.UNKNOWN
+        return _STATES.get(state)
+    number = as_float(state)
+    return LightState(int(number)) if number is not None and number in range(9) else None

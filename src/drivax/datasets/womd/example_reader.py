@@ -17,7 +17,7 @@ import numpy as np
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd.messages import SKIP, Features, features_of
+from drivax.datasets.womd.messages import SKIP, ExampleFeatures, features_of
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -68,7 +68,9 @@ def decode(payload: bytes) -> Recording:
     return recording(table, payload, used, womd.DATASET, womd.EXAMPLE_FORMAT)
 
 
-def recording(table: Features, payload: bytes, used: Array, dataset: str, source_format: str) -> Recording:
+def recording(
+    table: ExampleFeatures, payload: bytes, used: Array, dataset: str, source_format: str
+) -> Recording:
     """The recording in the rows used.
 
     Invalid entries (-1 in the file) become zeros, headings are wrapped. Lights are keyed by lane because the 16 slots
@@ -77,27 +79,34 @@ def recording(table: Features, payload: bytes, used: Array, dataset: str, source
     """
     tracks = _tracks(table, used)
     features, truncated = _map_features(table)
+    lights, unplaced = _lights(table, features)
     scenario_id = table.scenario_id(payload)
-    return Recording(
+    read = Recording(
         scenario_id=scenario_id,
         dataset=dataset,
-        segment=scenario_id,
+        segment=parsing.segment_of(scenario_id),
         timestamps_s=_timestamps(table, used, tracks.valid),
         current_step=table.spans["past"],
         ego=_ego_row(table, used),
         tracks=tracks,
         features=features,
-        lights=_lights(table),
+        lights=lights,
         to_predict=table.marked("state/tracks_to_predict", used),
         of_interest=table.marked("state/objects_of_interest", used),
         tags={"source_format": source_format},
-        lost=parsing.nonzero(paths=_paths(table), one_point_features=parsing.one_point_features(features)),
+        lost=parsing.nonzero(
+            paths=_paths(table),
+            one_point_features=parsing.one_point_features(features),
+            lights_without_place=unplaced,
+            unknown_fields=table.unknown(),
+        ),
         flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
         split_gap_m=2.0 if _is_coarse(features) else 1.0,  # twice the nominal spacing of points
     )
+    return parsing.shifted(read, table.origin())
 
 
-def _track_ids(features: Features, used: Array) -> Array:
+def _track_ids(features: ExampleFeatures, used: Array) -> Array:
     """Ids of the rows used: stored as floats, but WOMD's are far below 2**24."""
     ids = features.numbers("state/id")[used]
     if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
@@ -107,7 +116,7 @@ def _track_ids(features: Features, used: Array) -> Array:
     return ids.astype(np.int64)
 
 
-def _tracks(features: Features, used: Array) -> Tracks:
+def _tracks(features: ExampleFeatures, used: Array) -> Tracks:
     """The tracks in the rows used."""
     track_id = _track_ids(features, used)
     valid = features.over_time("valid", used) == 1
@@ -130,13 +139,13 @@ def _tracks(features: Features, used: Array) -> Tracks:
     )
 
 
-def _timestamps(features: Features, used: Array, valid: Array) -> Array:
+def _timestamps(features: ExampleFeatures, used: Array, valid: Array) -> Array:
     """Seconds of every step; where no valid state has a time, 10 Hz from the nearest step that has one."""
     micros = np.where(valid, features.over_time("timestamp_micros", used), -1).max(axis=0, initial=-1)
     return parsing.seconds(np.where(micros >= 0, micros * 1e-6, np.nan))
 
 
-def _ego_row(features: Features, used: Array) -> int:
+def _ego_row(features: ExampleFeatures, used: Array) -> int:
     """The ego's row among the rows used."""
     ego = features.marked("state/is_sdc", used)
     if len(ego) != 1:
@@ -144,8 +153,8 @@ def _ego_row(features: Features, used: Array) -> int:
     return ego[0]
 
 
-def _lights(features: Features) -> tuple[Light, ...]:
-    """Lights by lane."""
+def _lights(features: ExampleFeatures, mapped: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
+    """Lights by lane, and the number of those without a place."""
     collector = parsing.Lights(sum(features.spans.values()))
     start = 0
     for span, steps in features.spans.items():
@@ -161,10 +170,10 @@ def _lights(features: Features) -> tuple[Light, ...]:
                     start + step, int(lanes[step, slot]), int(states[step, slot]), points[step, slot].tolist()
                 )
         start += steps
-    return collector.collected()
+    return collector.collected(mapped)
 
 
-def _map_features(features: Features) -> tuple[tuple[MapFeature, ...], bool]:
+def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bool]:
     """Map features in order of first appearance, and whether the list of points is full, so probably cut off."""
     base = "roadgraph_samples/"
     if not features.has(base + "id"):
@@ -192,7 +201,7 @@ def _groups(ids: Array, keep: Array) -> list[Array]:
     return sorted(groups, key=lambda group: group[0]) if keep.size else []
 
 
-def _limits(features: Features, count: int) -> Array:
+def _limits(features: ExampleFeatures, count: int) -> Array:
     """Speed limits of map points in mph, 0 if unknown: only ScenarioMax writes them."""
     name = "roadgraph_samples/speed_limit"
     if not features.has(name):
@@ -212,7 +221,7 @@ def _is_coarse(mapped: Sequence[MapFeature]) -> bool:
     return (parsing.spacing_m(mapped) or 0.5) > 0.75
 
 
-def _paths(features: Features) -> int:
+def _paths(features: ExampleFeatures) -> int:
     """How many paths of the ego the file holds."""
     if not (features.has("path_samples/valid") and features.has("path_samples/on_route")):
         return 0

@@ -9,6 +9,7 @@ in a descriptor pool of their own and so never clash with an installed ``waymo-o
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -20,8 +21,19 @@ from jaxtyping import Float64
 from drivax.datasets.parsing import import_extra
 from drivax.errors import DataError
 
+#: Feature of drivax' own examples: where the origin of their coordinates lies in the source's map frame.
+ORIGIN = "scenario/origin"
+_STATE = "x|y|z|bbox_yaw|length|width|height|speed|vel_yaw|velocity_x|velocity_y|valid|timestamp_micros"
+_MARK = "id|type|is_sdc|is_context|tracks_to_predict|objects_of_interest|difficulty_level"
+#: Names of features, also of those that are not needed.
+_KNOWN = re.compile(
+    rf"scenario/(id|origin)|state/({_MARK})|state/(past|current|future)/({_STATE})|"
+    r"traffic_light_state/(past|current|future)/(state|id|valid|x|y|z|timestamp_micros)|"
+    r"roadgraph_samples/(xyz|dir|id|type|valid|speed_limit)|path_samples/(xyz|id|valid|arc_length|on_route)"
+)
 SKIP = "skip this record, or download the file again"
 _Array = np.ndarray[Any, Any]
+_FARTHEST_M = 1e8
 #: (name, number, type): ``*`` marks a repeated field, ``?`` a member of the message's one-of ``kind``.
 _Field = tuple[str, int, str]
 
@@ -191,15 +203,15 @@ STATES = Numbers(
 POINTS = Numbers("MapPoint", (("x", "y", "z"),))
 
 
-def features_of(payload: bytes) -> Features:
+def features_of(payload: bytes) -> ExampleFeatures:
     """The features in a serialised tf.Example."""
     message = parse("Example", payload)
     if message is None or not message.features.feature:
         raise DataError("the payload is not a tf.Example", cure=SKIP)
-    return Features(message)
+    return ExampleFeatures(message)
 
 
-class Features:
+class ExampleFeatures:
     """The features of one tf.Example by name; float lists (float32 in the file) become float64, int64 lists int64."""
 
     def __init__(self, message: Any) -> None:
@@ -249,6 +261,22 @@ class Features:
         value = self._values.get("scenario/id")
         text = "" if value is None else b"".join(value.bytes_list.value[:1]).decode("ascii", "replace")
         return text or hashlib.sha256(payload).hexdigest()[:16]
+
+    def unknown(self) -> int:
+        """How many features have names that neither the data set nor ScenarioMax use: a renamed one may be needed."""
+        return sum(_KNOWN.fullmatch(str(name)) is None for name in self._values)
+
+    def origin(self) -> Float64[np.ndarray, "3"]:
+        """The origin of the coordinates in the source's map frame, which only drivax' own examples name; else zeros."""
+        if ORIGIN not in self._values:
+            return np.zeros(3)
+        try:
+            origin = np.array(b"".join(self._values[ORIGIN].bytes_list.value[:1]).split(), np.float64)
+        except ValueError:
+            origin = np.zeros(0)
+        if origin.shape != (3,) or not (np.abs(origin) < _FARTHEST_M).all():
+            raise DataError(f"{ORIGIN} is no position", cure=SKIP)
+        return origin
 
     @cached_property
     def spans(self) -> dict[str, int]:

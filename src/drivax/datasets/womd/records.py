@@ -11,7 +11,7 @@ import numpy as np
 
 from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord
-from drivax.datasets.womd.messages import Features, parse
+from drivax.datasets.womd.messages import ExampleFeatures, parse
 from drivax.datasets.womd.tfrecord import count_records, looks_framed, read_records
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.recording import Recording, is_even
@@ -35,14 +35,14 @@ def flavour(payload: bytes) -> str | None:
     """The format of a record's payload by its content, None if it is no known motion data."""
     example = parse("Example", payload)
     if example is not None and any(entry.key == "state/current/x" for entry in example.features.feature):
-        return SCENARIOMAX_FORMAT if scenariomax_signs(Features(example)) >= _SIGNS else EXAMPLE_FORMAT
+        return SCENARIOMAX_FORMAT if scenariomax_signs(ExampleFeatures(example)) >= _SIGNS else EXAMPLE_FORMAT
     scenario = parse("Scenario", payload)
     if scenario is not None and scenario.scenario_id and scenario.tracks:
         return SCENARIO_FORMAT
     return None
 
 
-def scenariomax_signs(features: Features) -> int:
+def scenariomax_signs(features: ExampleFeatures) -> int:
     """How many of ScenarioMax's three signs an example shows; WOMD's examples show none.
 
     The prediction difficulty is missing; tracks are numbered 0, 1, 2, ... with the ego first; all times are -1.

@@ -62,6 +62,7 @@ def decode(payload: bytes) -> Recording:
     steps = len(message.timestamps_seconds)
     _check(message, steps)
     features, lost = _features(message.map_features)
+    lights, unplaced = _lights(message.dynamic_map_states, steps, features)
     rows = {track.id: row for row, track in enumerate(message.tracks)}
     return Recording(
         scenario_id=message.scenario_id,
@@ -72,14 +73,14 @@ def decode(payload: bytes) -> Recording:
         ego=message.sdc_track_index,
         tracks=_tracks(message.tracks, steps),
         features=features,
-        lights=_lights(message.dynamic_map_states, steps),
+        lights=lights,
         to_predict=parsing.rows_within(
             [track.track_index for track in message.tracks_to_predict], len(rows), "tracks_to_predict"
         ),
         # These are track ids, tracks_to_predict are rows.
         of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
         tags={"source_format": womd.SCENARIO_FORMAT},
-        lost=lost,
+        lost=lost | parsing.nonzero(lights_without_place=unplaced),
         split_gap_m=_SPLIT_GAP_M,
     )
 
@@ -121,13 +122,13 @@ def _tracks(tracks: Any, steps: int) -> Tracks:
     )
 
 
-def _lights(states: Any, steps: int) -> tuple[Light, ...]:
+def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
     lights = parsing.Lights(steps)
     for step, state in enumerate(states):
         for lane in state.lane_states:
             point = lane.stop_point
             lights.observe(step, lane.lane, lane.state, (point.x, point.y, point.z))
-    return lights.collected()
+    return lights.collected(features)
 
 
 def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:

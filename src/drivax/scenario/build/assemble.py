@@ -50,6 +50,7 @@ from drivax.scenario.schema import (
     EDGE_KINDS,
     LANE_KINDS,
     LINE_KINDS,
+    NAMES,
     Capacity,
     Flag,
     RoadKind,
@@ -57,6 +58,7 @@ from drivax.scenario.schema import (
     SourceCounts,
     among,
     record_dtype,
+    stored_name,
 )
 from drivax.scenario.select.tags import scenario_tags
 
@@ -190,6 +192,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
         source=replace(count_source(recording), lost=dict(lost)),
         overflow=overflow,
         tags=scenario_tags(recording, tracks, graph, parts.routes, parts.lights, flags, style),
+        names={name: getattr(recording, name) for name in NAMES},
     )
 
 
@@ -297,8 +300,8 @@ def fill(
 ) -> Record:
     """Return the record of a scenario: a zero-dimensional structured array of ``record_dtype(capacity)``."""
     record = blank(capacity)
-    for name in ("scenario_id", "dataset", "segment"):
-        record[name] = getattr(recording, name).encode()
+    for name in NAMES:
+        record[name] = stored_name(getattr(recording, name), record.dtype[name].itemsize)
     # Rounded to a micrometre: the last bits of generated recordings depend on the processor.
     record["origin"] = np.round(origin, 6) + 0.0
     record["dt_s"] = step_seconds(recording.timestamps_s)[0]
