@@ -15,8 +15,8 @@ from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
-from drivax.stats.seeds import Crossed
-from drivax.stats.significance import holm
+from drivax.stats.seeds import CrossedEffect
+from drivax.stats.significance import holm_adjust
 from drivax.studies import study as runner
 from drivax.studies.definition import Study, StudyConfig, StudyDefinition, StudySets, load_study
 from drivax.studies.verdicts import (
@@ -125,18 +125,18 @@ def test_p_values_are_adjusted_within_their_group():
     found = list(verdicts(EVEN | {"heuristic": 0.14}).values())
     for group in {one.claim.group for one in found}:
         ps = [one.tested.p for one in found if one.claim.group == group]
-        assert [one.adjusted for one in found if one.claim.group == group] == holm(ps)
+        assert [one.adjusted for one in found if one.claim.group == group] == holm_adjust(ps)
     claimed = [(c.arm, c.reference, c.metric, c.rows, c.change) for c in LONGTAIL.claims]
     assert len(claimed) == len(set(claimed)) == 54
 
 
 def test_what_is_undecided_says_what_would_decide():
-    few = Crossed(0.02, (4e-5, 4e-5), 1e-5, (5, 5), 400)
+    few = CrossedEffect(0.02, (4e-5, 4e-5), 1e-5, (5, 5), 400)
     seeds = int(needed(few, 1).split()[0])
     assert 10 <= seeds <= 13  # by a normal distribution 4e-4 / ((0.02 / 2.8016)^2 - 1e-5) = 9.75
     assert int(needed(few, 20).split()[0]) > seeds
     assert needed(replace(few, difference=1e-6), 1).startswith("neither seeds nor recordings")
-    assert "test recordings" in needed(Crossed(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400), 1)
+    assert "test recordings" in needed(CrossedEffect(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400), 1)
 
 
 def test_what_can_be_found_is_known_before_the_others_learn():

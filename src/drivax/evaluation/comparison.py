@@ -21,10 +21,10 @@ from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interva
 from drivax.evaluation.pairing import Pairs, Split
 from drivax.evaluation.plan import ComparisonPlan, Decision, MetricComparison, Sensitivity, decide
 from drivax.stats import effects, significance
-from drivax.stats.clusters import defined, design_effect
+from drivax.stats.clusters import design_effect, drop_undefined
 from drivax.stats.intervals import Interval, interquartile_bootstrap, paired_bootstrap, split_bootstrap
-from drivax.stats.seeds import Crossed, difference_interval, seeds_interval
-from drivax.stats.significance import Evidence
+from drivax.stats.seeds import CrossedEffect, difference_interval, seeds_interval
+from drivax.stats.significance import SignificanceResult
 
 #: Smallest difference that matters by default, as a share of the standard deviation.
 _SMALL_EFFECT = 0.1
@@ -152,7 +152,7 @@ def compare(
     first, *others = (_compared(plan, metric, sides, split) for metric in (plan.primary, *plan.secondary))
     if min(first.a.n, first.b.n) == 0:
         raise pairing.undefined_metric(plan.primary, (*a, *b))
-    adjusted = significance.holm([metric.evidence.p for metric in others])
+    adjusted = significance.holm_adjust([metric.evidence.p for metric in others])
     secondary = tuple(metric.with_winner(plan, p) for metric, p in zip(others, adjusted, strict=True))
     primary = first.with_winner(plan, first.evidence.p)
     sensitivity = _sensitivity(plan, sides, split)
@@ -213,7 +213,7 @@ def _compared(
     else:
         difference, crossed = _of_seeds(plan, metric, sides)
         p, units = (None, 0) if crossed is None else (crossed.p, crossed.clusters)
-        evidence = Evidence("t", p, units, exact=False)
+        evidence = SignificanceResult("t", p, units, exact=False)
     size = {"d": effects.cohens_d(x, y)} if split else asdict(effects.cohens_d_paired(x, y))
     a, b = (side.interval(plan, metric, both) for side in sides)
     column = sides[0].tables[0].metric(metric)
@@ -225,7 +225,7 @@ def _compared(
 
 def _of_seeds(
     plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side]
-) -> tuple[Interval, Crossed | None]:
+) -> tuple[Interval, CrossedEffect | None]:
     """Return a difference whose interval covers other seeds and other recordings."""
     x, y = (side.by_seed(metric) for side in sides)
     return difference_interval(x, y, sides[0].pairs.clusters, plan.confidence)
@@ -233,13 +233,13 @@ def _of_seeds(
 
 def _paired_test(
     plan: ComparisonPlan, metric: str, x: Values, y: Values, clusters: Sequence[str]
-) -> Evidence:
+) -> SignificanceResult:
     """Apply McNemar's test to rates in independent pairs; else the plan's test of means, by recordings."""
-    _, labels = defined(x, clusters)
+    _, labels = drop_undefined(x, clusters)
     independent = labels.size == 0 or int(labels.max()) + 1 == labels.size
     known = np.concatenate((x, y))
     if metric in RATES and independent and np.isin(known[~np.isnan(known)], (0.0, 1.0)).all():
-        return significance.mcnemar(x, y)
+        return significance.mcnemar_test(x, y)
     permutation = plan.test == "permutation"
     test = significance.paired_permutation if permutation else significance.paired_bootstrap_test
     return test(x, y, clusters, plan.resamples, seed=plan.seed)
@@ -249,11 +249,11 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
     """Return what the primary metric could have shown."""
     x, y = (side.values(plan.primary) for side in sides)
     if split is None:
-        apart, labels = defined(x - y, sides[0].pairs.clusters)
+        apart, labels = drop_undefined(x - y, sides[0].pairs.clusters)
         share, deviation = None, float(apart.std(ddof=1)) if apart.size > 1 else 0.0
     else:
         residuals = np.where(split.first, x - np.nanmean(x), y - np.nanmean(y))
-        apart, labels = defined(residuals, sides[0].pairs.clusters)
+        apart, labels = drop_undefined(residuals, sides[0].pairs.clusters)
         a, b = x[~np.isnan(x)], y[~np.isnan(y)]
         share = a.size / apart.size
         deviation = effects.pooled_deviation(a, b) if apart.size > 2 else 0.0
@@ -267,7 +267,7 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
     if deviation <= effects.ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
         return None
     effect, n = smallest / deviation, apart.size / inflation
-    seen = effects.detectable(n, plan.power, plan.confidence, share)
+    seen = effects.detectable_effect(n, plan.power, plan.confidence, share)
     return Sensitivity(
         deviation=deviation,
         design_effect=inflation,
@@ -279,7 +279,12 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
 
 
 def _sensitivity_of_seeds(
-    plan: ComparisonPlan, effect: Crossed | None, n: int, deviation: float, inflation: float, smallest: float
+    plan: ComparisonPlan,
+    effect: CrossedEffect | None,
+    n: int,
+    deviation: float,
+    inflation: float,
+    smallest: float,
 ) -> Sensitivity | None:
     """Return the sensitivity where seeds vary too, which more scenarios do not change."""
     if effect is None or effect.error == 0.0:

@@ -13,12 +13,12 @@ from jaxtyping import Bool, Float64, Int64
 
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.episode_table import NOT_SUMMARISED, EpisodeTable, ScenarioKey
-from drivax.stats.clusters import dense, stratum_of_clusters
+from drivax.stats.clusters import cluster_strata, dense_labels
 
 #: Settings of an evaluation that must agree between paired episodes.
 _STARTS = ("noisy_start", "start_step")
 #: Strata of fewer recordings are merged.
-_LEAST = 10
+_MIN_CLUSTERS = 10
 
 
 @dataclass(frozen=True)
@@ -155,31 +155,31 @@ def assign(clusters: Sequence[str], strata: Sequence[str] | None, ratio: float, 
     """Assign whole clusters to two arms at random, in each stratum (None: in all) a share of ``ratio`` to the first.
 
     A cluster belongs to the most frequent stratum of its scenarios (the first by name among equals). Strata of fewer
-    than ten clusters are merged. Rounding in one stratum is made up for in the next.
+    than ten clusters are merged. The rounding error of a stratum carries over to the next.
 
     Raises:
         UsageError: An arm is empty.
     """
-    labels = dense(clusters, len(clusters), "cluster")
+    labels = dense_labels(clusters, len(clusters), "cluster")
     count = int(labels.max()) + 1
-    of = np.zeros(count, np.int64)
+    stratum_of = np.zeros(count, np.int64)
     if strata is not None:
-        of = stratum_of_clusters(_most_frequent(labels, strata), labels, _LEAST)
-    rng, first, seen, assigned = np.random.default_rng(seed), np.zeros(count, bool), 0, 0
-    for stratum in range(int(of.max()) + 1):
-        inside = rng.permutation(np.flatnonzero(of == stratum))
-        seen += inside.size
-        count_here = round(ratio * seen) - assigned
-        first[inside[:count_here]] = True
-        assigned += count_here
+        stratum_of = cluster_strata(_most_frequent(labels, strata), labels, _MIN_CLUSTERS)
+    rng, first, available, assigned = np.random.default_rng(seed), np.zeros(count, bool), 0, 0
+    for stratum in range(int(stratum_of.max()) + 1):
+        members = rng.permutation(np.flatnonzero(stratum_of == stratum))
+        available += members.size
+        quota = round(ratio * available) - assigned
+        first[members[:quota]] = True
+        assigned += quota
     if not first.any() or first.all():
         problem = f"{count} recordings at a ratio of {ratio} leave an arm empty"
         raise UsageError(problem, cure="use split: paired, or evaluate more scenarios")
-    return Split(first[labels], of[labels])
+    return Split(first[labels], stratum_of[labels])
 
 
 def _most_frequent(labels: Int64[np.ndarray, " n"], strata: Sequence[str]) -> list[str]:
-    """Return for each scenario the stratum that its cluster belongs to."""
+    """Return the stratum of each scenario's cluster."""
     votes: dict[int, Counter[str]] = {}
     for label, stratum in zip(labels, strata, strict=True):
         votes.setdefault(int(label), Counter())[stratum] += 1

@@ -9,7 +9,7 @@ from typing import Literal
 
 from drivax.errors import UsageError
 from drivax.stats.intervals import Interval
-from drivax.stats.significance import Evidence
+from drivax.stats.significance import SignificanceResult
 
 Arm = Literal["A", "B"]
 
@@ -119,7 +119,7 @@ class MetricComparison:
     b: Interval
     difference: Interval
     effects: Mapping[str, float | None]
-    evidence: Evidence
+    evidence: SignificanceResult
     p_adjusted: float | None
     winner: Arm | None
     seeds: int

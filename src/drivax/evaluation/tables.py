@@ -17,7 +17,7 @@ from drivax.metrics.catalogue import METRICS
 from drivax.metrics.catalogue import headline as headline_metrics
 from drivax.scenario.select.tags import TAGS
 from drivax.simulator.contact import CollisionType
-from drivax.stats.intervals import NOTHING, Interval, paired_bootstrap, rate
+from drivax.stats.intervals import UNDEFINED, Interval, paired_bootstrap, rate
 from drivax.table import Cell, Column, Table, interval_cell
 
 CONFIDENCE = 0.95
@@ -104,7 +104,7 @@ def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interv
     It is empty where the evaluation lacks the metric.
     """
     if metric not in run.metrics:
-        return NOTHING
+        return UNDEFINED
     return interval_of(metric, run.metrics[metric][rows], np.array(run.clusters)[rows])
 
 

@@ -16,8 +16,8 @@ from drivax.curation.subset import top_rows
 from drivax.evaluation.episode_table import SHARES
 from drivax.metrics.catalogue import METRICS
 from drivax.stats.ranking import correlation_interval, rank_correlation
-from drivax.stats.seeds import Crossed, crossed_difference, crossed_mean, log_ratio, seeds_interval
-from drivax.stats.significance import holm
+from drivax.stats.seeds import CrossedEffect, crossed_difference, crossed_mean, log_ratio, seeds_interval
+from drivax.stats.significance import holm_adjust
 from drivax.studies.definition import Claim, Stratum
 
 #: Rankings are unrelated if their correlation's interval is within ±UNRELATED, related if it is beyond ±RELATED.
@@ -126,8 +126,8 @@ class ClaimResult:
     """
 
     claim: Claim
-    tested: Crossed | None
-    difference: Crossed | None
+    tested: CrossedEffect | None
+    difference: CrossedEffect | None
     change: tuple[float, float, float] | None
     adjusted: float | None
     verdict: Verdict = "undecided"
@@ -163,7 +163,7 @@ def decide_claims(
     for group in set(groups):
         members = [index for index, name in enumerate(groups) if name == group]
         tested = [results[index].tested for index in members]
-        adjusted = holm([None if effect is None else effect.p for effect in tested])
+        adjusted = holm_adjust([None if effect is None else effect.p for effect in tested])
         for index, p in zip(members, adjusted, strict=True):
             results[index] = _decided(replace(results[index], adjusted=p), len(members))
     return results
@@ -197,7 +197,7 @@ def _decided(result: ClaimResult, claims: int) -> ClaimResult:
     return replace(result, verdict="supported" if better else "contradicted")
 
 
-def needed(effect: Crossed, claims: int) -> str:
+def needed(effect: CrossedEffect, claims: int) -> str:
     """Return in words how many seeds or recordings would decide.
 
     Args:
@@ -238,8 +238,8 @@ def detectable(
     for name in metrics:
         if strata.is_comparable(np.concatenate([first[name], second[name]]), weights):
             effect = crossed_difference(first[name], second[name], strata.recordings, weights)
-            (seeds, _), (both, _) = effect.seeds, effect.both
-            equal = replace(effect, seeds=(seeds, seeds), both=(both, both))
+            (seeds, _), (interaction, _) = effect.seeds, effect.interaction
+            equal = replace(effect, seeds=(seeds, seeds), interaction=(interaction, interaction))
             smallest[name] = equal.detectable(confidence=level(claims))
     return smallest
 
