@@ -83,10 +83,10 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
 
     def run(part: Callable[..., Any]) -> Callable[[], Any]:
         compiled = jax.jit(part)
-        state = program.first_state()
+        state = program.initial_state()
         return lambda: compiled(program.data, state)
 
-    state = [program.first_state()]
+    state = [program.initial_state()]
 
     def whole() -> Any:
         state[0], logs = program.step(state[0])

@@ -9,7 +9,14 @@ import pytest
 import scipy.stats
 
 from drivax.errors import UsageError
-from drivax.stats.effects import PairedEffect, cohens_d, cohens_d_paired, detectable_effect, power, scenarios_needed
+from drivax.stats.effects import (
+    PairedEffect,
+    cohens_d,
+    cohens_d_paired,
+    detectable_effect,
+    power,
+    scenarios_needed,
+)
 
 
 def test_effect_sizes_by_hand():

@@ -79,7 +79,7 @@ def test_clusters_count_once():
 
 
 @pytest.mark.parametrize(
-    "effects", [{"agent": 1.0}, {"agent": 0.3, "interaction": 1.0}, {"scenario": 3.0, "both": 1.0}]
+    "effects", [{"agent": 1.0}, {"agent": 0.3, "interaction": 1.0}, {"scenario": 3.0, "interaction": 1.0}]
 )
 def test_false_positives_keep_their_level(effects):
     """Of comparisons without a difference at most 5 % are called one; by scenarios alone far more would be."""

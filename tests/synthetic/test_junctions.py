@@ -159,18 +159,18 @@ def _intersection(axis, curve):
 def test_sidewalks_follow_the_edge_outside_the_road(family, style, seed):
     network = built(family, style, seed)
     ring = np.concatenate([network.edges[0].xy, network.edges[0].xy[:1]])
-    for walk in network.walks:
-        points = walk.xy[::10]
+    for sidewalk in network.sidewalks:
+        points = sidewalk.xy[::10]
         gap = distance_to_polyline(points, ring)
         assert gap.min() > 0.95 and gap.max() < 2.6
-        assert np.hypot(*np.diff(walk.xy, axis=0).T).max() < 0.7
+        assert np.hypot(*np.diff(sidewalk.xy, axis=0).T).max() < 0.7
         assert all(winding_number(p, ring[:-1]) == 0 for p in points[::3])
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_most_streets_have_sidewalks_and_some_have_none(style):
-    walks = [bool(built(f, style, seed).walks) for f in JUNCTIONS[:3] for seed in range(10)]
-    assert np.mean(walks) == pytest.approx(STYLES[style].walk_share, abs=0.25)
+    sidewalks = [bool(built(f, style, seed).sidewalks) for f in JUNCTIONS[:3] for seed in range(10)]
+    assert np.mean(sidewalks) == pytest.approx(STYLES[style].sidewalk_share, abs=0.25)
 
 
 @pytest.mark.parametrize(("family", "style", "seed"), CASES)

@@ -130,7 +130,7 @@ def test_vehicles_brake_for_a_pedestrian_in_the_lane():
     times = np.arange(steps) / 10
     # Walks from the right over the lane at x = 120 at 1.5 m/s from second 4 on, waiting on the lane.
     y = np.clip(-5.0 + 1.5 * np.maximum(times - 4.0, 0.0), -5.0, 0.0)
-    walker = Scripted(
+    pedestrian = Scripted(
         kind=AgentKind.PEDESTRIAN,
         size_m=(0.6, 0.6, 1.75),
         xy=np.stack([np.full(steps, 120.0), y], axis=-1),
@@ -139,7 +139,7 @@ def test_vehicles_brake_for_a_pedestrian_in_the_lane():
         valid=np.ones(steps, bool),
     )
     table = drivers(1, speed_factor=0.8)
-    motion = run(street(), [(0,)], table, [20.0], [11.0], 15.0, Staging(extras=(walker,)))
+    motion = run(street(), [(0,)], table, [20.0], [11.0], 15.0, Staging(extras=(pedestrian,)))
     assert not touches(motion, 0, 1)
     assert motion.speed[0, -1] < 0.1 and motion.xy[0, -1, 0] < 120.0
     assert motion.kind.tolist() == [AgentKind.VEHICLE, AgentKind.PEDESTRIAN]

@@ -30,7 +30,7 @@ from drivax.synthetic.world import WorldConfig, generate_recording
 from .oracles import box_corners, shared_area, winding_number
 from .staged_scenes import CAR, TIMES, WIDTH, crossed, road, scene, user
 
-PERSON = (0.6, 0.6, 1.75)
+PEDESTRIAN = (0.6, 0.6, 1.75)
 
 
 def cause(roles, motion, staging=None, hardest=4.0, first_step=0):
@@ -171,11 +171,11 @@ def test_collisions_of_ego_and_of_others():
     assert cause(roles, motion) == "others_collide"
     roles, motion = scene(road(), 12.0, [user((60.0, WIDTH)), user((62.0, WIDTH))])
     assert cause(roles, motion) == ""  # both were put there and never move
-    people = [
-        user((60.0, WIDTH), size=PERSON, kind=AgentKind.PEDESTRIAN, velocity=(1.0, 0.0)),
-        user((61.0, WIDTH), size=PERSON, kind=AgentKind.PEDESTRIAN),
+    pedestrians = [
+        user((60.0, WIDTH), size=PEDESTRIAN, kind=AgentKind.PEDESTRIAN, velocity=(1.0, 0.0)),
+        user((61.0, WIDTH), size=PEDESTRIAN, kind=AgentKind.PEDESTRIAN),
     ]
-    roles, motion = scene(road(), 12.0, people)
+    roles, motion = scene(road(), 12.0, pedestrians)
     assert cause(roles, motion) == ""
     roles, motion = scene(road(), 12.0, [user((80.0, 0.0))])
     violation = find_violation(roles, motion, TIMES, 0, Staging(), 4.0)

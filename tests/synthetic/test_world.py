@@ -59,11 +59,14 @@ def test_no_users_overlap(index):
         corners = {
             i: box_corners(tracks.xy[i, t], tracks.heading[i, t], *tracks.size[i, t, :2]) for i in present
         }
-        person = tracks.kind == AgentKind.PEDESTRIAN
+        is_pedestrian = tracks.kind == AgentKind.PEDESTRIAN
         for i in present:
             for j in present[present > i]:
-                # People pass each other as they like.
-                if not (person[i] and person[j]) and np.hypot(*(tracks.xy[i, t] - tracks.xy[j, t])) < 11.0:
+                # Pedestrians pass each other as they like.
+                if (
+                    not (is_pedestrian[i] and is_pedestrian[j])
+                    and np.hypot(*(tracks.xy[i, t] - tracks.xy[j, t])) < 11.0
+                ):
                     assert shared_area(corners[i], corners[j]) == 0.0, (i, j, t)
 
 

@@ -38,7 +38,7 @@ def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
     return speed_mps / gain_mps2 + (distance_m - ramp) / speed_mps
 
 
-def walk(
+def gait(
     distance_m: float, speed_mps: float, rates_mps2: tuple[float, float], times_s: Times
 ) -> tuple[Times, Times] | None:
     """Distance and speed of a walk from rest at time 0 to rest; None where it is too short to reach its speed.

@@ -27,7 +27,7 @@ _RETURN_M = 30.0
 #: Hard margin at ego's bumpers and sides, m; the final check uses 0.1 m.
 HARD_M = (0.35, 0.2)
 #: Preferred margin, m, for vehicles and for pedestrians and cyclists.
-NEAR_M, NEAR_PEOPLE_M = (1.2, 0.5), (2.0, 1.2)
+NEAR_M, NEAR_VULNERABLE_M = (1.2, 0.5), (2.0, 1.2)
 #: Stride of the coarse pass over path samples.
 _STRIDE = 4
 #: Ego avoids passing a light that turns red sooner than this, s.
@@ -164,10 +164,14 @@ class StopLine:
 
 
 def find_conflicts(
-    candidate: CandidatePath, size_m: _Size, others: _Boxes, valid: _Exists, people: Bool[np.ndarray, " user"]
+    candidate: CandidatePath,
+    size_m: _Size,
+    others: _Boxes,
+    valid: _Exists,
+    vulnerable: Bool[np.ndarray, " user"],
 ) -> Conflicts:
-    """Find conflicts of ego's box along a path with boxes of others, of which ``people`` walk or cycle."""
-    margin = np.where(people[:, None], NEAR_PEOPLE_M, NEAR_M)
+    """Find conflicts of ego's box along a path with boxes of others, of which ``vulnerable`` walk or cycle."""
+    margin = np.where(vulnerable[:, None], NEAR_VULNERABLE_M, NEAR_M)
     still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
     ego = candidate_boxes(candidate, size_m)
     moving = _box_conflicts(ego, others, valid & ~still[:, None], margin)

@@ -39,7 +39,7 @@ _LEAVING, _ASIDE, _AGAINST = 8.0, 2.0, 6.0
 #: Cost of passing a line when the light is about to turn red or ego must give way.
 _LATE = 30.0
 #: Factor on proximity costs for pedestrians and cyclists.
-_PEOPLE = 12.0
+_VULNERABLE = 12.0
 #: Steps by which motion is extrapolated.
 _BEYOND_STEPS = 20
 #: Lateral gap to what ego passes, m, and lateral acceleration of the shift, m/s2: preferred and tightest.
@@ -64,7 +64,7 @@ class _State:
         acceleration: Ego's acceleration in the step before.
         others, valid: Boxes of the other users, and when they exist.
         passed_m: Ego's distance along the path at each step of the last run.
-        people: Mask of pedestrians and cyclists among the others.
+        vulnerable: Mask of pedestrians and cyclists among the others.
         unreactive: Mask of others that do not react to ego.
     """
 
@@ -79,7 +79,7 @@ class _State:
     valid: Bool[np.ndarray, "user time"]
     passed_m: _Series
     lines: list[StopLine]
-    people: Bool[np.ndarray, " user"]
+    vulnerable: Bool[np.ndarray, " user"]
     unreactive: Bool[np.ndarray, " user"]
 
     def candidate(self, shift: Shift) -> CandidatePath:
@@ -139,7 +139,7 @@ def _state(
         valid=valid,
         passed_m=np.zeros(boxes.shape[1]),
         lines=[],
-        people=np.isin(motion.kind[1:], (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)),
+        vulnerable=np.isin(motion.kind[1:], (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)),
         unreactive=(rows >= motion.vehicles) | np.isin(rows, sorted(unreactive)),
     )
     candidate = state.candidate(Shift())
@@ -200,7 +200,7 @@ def _best_candidate(state: _State) -> tuple[CandidatePath, SpeedProfile]:
 
 def _conflicts(state: _State, candidate: CandidatePath) -> Conflicts:
     """Return conflicts along a candidate, without those of vehicles that follow ego and will react."""
-    conflicts = find_conflicts(candidate, state.size_m, state.others, state.valid, state.people)
+    conflicts = find_conflicts(candidate, state.size_m, state.others, state.valid, state.vulnerable)
     follows = np.zeros(len(state.others), bool)
     order = np.lexsort((-conflicts.point, conflicts.step, conflicts.user))
     users, first = np.unique(conflicts.user[order], return_index=True)
@@ -227,7 +227,7 @@ def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
     """Return the occupancy of a candidate by others, stop lines, and the end of the map."""
     shape = (state.others.shape[1], len(candidate.xy))
     hard, near = np.zeros(shape, bool), np.zeros(shape)
-    weight = np.where(state.people[conflicts.user], _PEOPLE, 1.0)
+    weight = np.where(state.vulnerable[conflicts.user], _VULNERABLE, 1.0)
     np.maximum.at(near, (conflicts.step, conflicts.point), weight)
     hard[conflicts.step[conflicts.hard], conflicts.point[conflicts.hard]] = True
     thick = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + state.speed) + 0.5) / SPACING_M))

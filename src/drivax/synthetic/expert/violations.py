@@ -104,9 +104,9 @@ def is_staged(staging: Staging) -> bool:
 
 def _tested(motion: Motion) -> _UserPairs:
     """Mask of pairs that must not overlap: not two pedestrians, not two static users."""
-    person = motion.kind == AgentKind.PEDESTRIAN
+    is_pedestrian = motion.kind == AgentKind.PEDESTRIAN
     moves = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
-    return (moves[:, None] | moves) & ~(person[:, None] & person)
+    return (moves[:, None] | moves) & ~(is_pedestrian[:, None] & is_pedestrian)
 
 
 def touching(

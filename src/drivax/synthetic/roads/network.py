@@ -116,7 +116,7 @@ class RoadNetwork:
 
     Attributes:
         edges: Closed rings without the repeated point: the outer boundary counter-clockwise, islands clockwise.
-        walks: Sidewalks outside the edges.
+        sidewalks: Sidewalks outside the edges.
         busy: Lanes with denser traffic.
     """
 
@@ -128,7 +128,7 @@ class RoadNetwork:
     signals: SignalPlan | None = None
     starts: tuple[Start, ...] = ()
     crossings: tuple[Crossing, ...] = ()
-    walks: tuple[Curve, ...] = ()
+    sidewalks: tuple[Curve, ...] = ()
     bays: tuple[Bay, ...] = ()
     busy: tuple[int, ...] = ()
 
@@ -178,7 +178,7 @@ class Draft:
     markings: list[Line] = field(default_factory=list)
     crosswalks: list[Line] = field(default_factory=list)
     crossings: list[Crossing] = field(default_factory=list)
-    walks: list[Curve] = field(default_factory=list)
+    sidewalks: list[Curve] = field(default_factory=list)
     bays: list[Bay] = field(default_factory=list)
 
     def lane(self, curve: Curve, width_m: float, limit_mps: float, **more: Any) -> int:

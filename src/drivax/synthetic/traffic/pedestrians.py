@@ -16,11 +16,11 @@ from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes
 from drivax.synthetic.traffic.path_arrays import PerVehicle, VehicleMask
-from drivax.synthetic.traffic.roles import Walker
+from drivax.synthetic.traffic.roles import Pedestrian
 
-#: Distances from the kerb, m: where people wait, from where on they occupy the crossing, and look for a gap.
+#: Distances from the kerb, m: where pedestrians wait, from where on they occupy the crossing, and look for a gap.
 _WAIT_M, _CLAIM_M, _LOOK_M = 0.4, 1.0, 1.8
-#: Acceleration of walkers, m/s2.
+#: Acceleration of pedestrians, m/s2.
 _ACCELERATION_MPS2 = 1.5
 #: Drivers that need less braking than this yield at a crosswalk, m/s2; distance at which they stop before it, m.
 _YIELDING_MPS2, _STOP_SHORT_M = 2.5, 2.0
@@ -30,14 +30,14 @@ _STANDING_MPS = 0.3
 _MARGIN_S, _GAP_MARGIN_S = 1.0, 1.5
 #: Vehicles that see the crossing at a larger angle, or head elsewhere, do not approach it.
 _BEARING, _ASIDE = math.radians(75.0), math.radians(80.0)
-#: Distance that people keep from vehicles, m.
+#: Distance that pedestrians keep from vehicles, m.
 _BERTH_M = 0.4
 #: Steps between looks at vehicles.
 _LOOK_STEPS = 2
 #: Connectors next to lanes that begin or end this close to a crossing control it, m.
 _NEAR_JUNCTION_M = 25.0
 
-#: A number and a flag per walker.
+#: A number and a flag per pedestrian.
 _Values = Float64[np.ndarray, " w"]
 _Mask = Bool[np.ndarray, " w"]
 _Point = Float64[np.ndarray, " 2"]
@@ -45,7 +45,7 @@ _Point = Float64[np.ndarray, " 2"]
 
 @dataclass(frozen=True)
 class _CrossingConflicts:
-    """Intersections of crossings and lanes, and a mask of the connectors whose light must be red while people cross."""
+    """Intersections of crossings and lanes, and a mask of the connectors whose light must be red while pedestrians cross."""
 
     xy: Float64[np.ndarray, "conflict 2"]
     heading: Float64[np.ndarray, " conflict"]
@@ -67,7 +67,7 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
     axes = np.array([crossing.axis for crossing in network.crossings]).reshape(-1, 2, 2)
     across = axes[:, 1] - axes[:, 0]
     length = np.hypot(*across.T)
-    # People walk in the middle of the crosswalk: a vehicle on its rim does not block it.
+    # Pedestrians walk in the middle of the crosswalk: a vehicle on its rim does not block it.
     strip = np.column_stack([axes.mean(axis=1), across / length[:, None], length, np.ones(len(axes))])
     red = [_must_be_red(network, crossing) for crossing in network.crossings]
     return _CrossingConflicts(
@@ -103,15 +103,15 @@ def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, "
     return result
 
 
-class Walkers:
+class Pedestrians:
     """Pedestrians, moved step by step."""
 
     def __init__(
-        self, network: RoadNetwork, walkers: tuple[Walker, ...], times_s: Float64[np.ndarray, " time"]
+        self, network: RoadNetwork, pedestrians: tuple[Pedestrian, ...], times_s: Float64[np.ndarray, " time"]
     ) -> None:
         self._conflicts = _crossing_conflicts(network)
         self._red_left_s = _red_left(network, self._conflicts.red, times_s)
-        curves = [resample(walker.curve, STEP_M) for walker in walkers]
+        curves = [resample(pedestrian.curve, STEP_M) for pedestrian in pedestrians]
         self._last = np.array([len(curve.xy) - 1 for curve in curves], int)
         self._table = np.zeros((len(curves), max([*self._last, 0]) + 1, 3))
         self._begin = np.arange(len(curves)) * self._table.shape[1]
@@ -119,16 +119,16 @@ class Walkers:
             row[: len(curve.xy)] = np.column_stack([curve.xy, curve.heading])
             row[len(curve.xy) :] = row[len(curve.xy) - 1]
         self._step_m = np.array([float(curve.arc_m[-1]) / (len(curve.xy) - 1) for curve in curves])
-        numbers = [[w.start_m, w.speed_mps, w.kerb_m, w.across_m] for w in walkers]
+        numbers = [[w.start_m, w.speed_mps, w.kerb_m, w.across_m] for w in pedestrians]
         self._at, self._free_speed, self._kerb, self._across = (
             np.array(numbers, float).reshape(-1, 4).T.copy()
         )
-        self._size_m = np.array([walker.size_m[:2] for walker in walkers], float).reshape(-1, 2)
+        self._size_m = np.array([pedestrian.size_m[:2] for pedestrian in pedestrians], float).reshape(-1, 2)
         self._speed = self._free_speed.copy()
-        self._crossing = np.array([walker.crossing for walker in walkers], int)
+        self._crossing = np.array([pedestrian.crossing for pedestrian in pedestrians], int)
         self._crosses = self._crossing >= 0
         self._any_crosses = bool(self._crosses.any())
-        # At lights and unmarked crossings drivers need not yield to people at the kerb.
+        # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
         asking = self._conflicts.marked & ~self._conflicts.red.any(axis=1)
         self._asking = asking[self._crossing] if len(asking) else np.zeros(len(curves), bool)
         self._released, self._into = np.zeros((2, len(curves)), bool)
@@ -136,9 +136,9 @@ class Walkers:
     def step(
         self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
-        """Return all walkers at step ``t``, then advance them; steps come in order.
+        """Return all pedestrians at step ``t``, then advance them; steps come in order.
 
-        Also return a mask of the crossings that drivers must keep free: a walker is on it or, where drivers must yield,
+        Also return a mask of the crossings that drivers must keep free: a pedestrian is on it or, where drivers must yield,
         about to step on it.
         """
         place = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
@@ -161,7 +161,7 @@ class Walkers:
     def _release(
         self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
     ) -> None:
-        """Let walkers at the kerb go where the crossing is safe for long enough."""
+        """Let pedestrians at the kerb go where the crossing is safe for long enough."""
         before = self._kerb - self._at
         asks = self._crosses & ~self._released & (before >= 0) & (before < _LOOK_M)
         if not np.count_nonzero(asks):
@@ -183,7 +183,7 @@ class Walkers:
         self._released[asks] = gap & free[crossing] & red[crossing] & lasting
 
     def _advance(self) -> None:
-        """Advance by one step; walkers stop at the kerb unless released, and before vehicles."""
+        """Advance by one step; pedestrians stop at the kerb unless released, and before vehicles."""
         room = self._last * self._step_m - self._at
         if self._any_crosses:
             waits = self._crosses & ~self._released & (self._at <= self._kerb)
@@ -206,7 +206,7 @@ def _red_left(
     left = np.full((len(times_s), len(red)), math.inf)
     if network.signals is None or not red.any():
         return left
-    # People know the cycle: the colours are continued by one cycle beyond the last step.
+    # Pedestrians know the cycle: the colours are continued by one cycle beyond the last step.
     beyond = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
     colour, _ = network.signals.colours(np.concatenate([times_s, beyond]), len(network.lanes))
     for crossing in np.flatnonzero(red.any(axis=1)):
@@ -241,7 +241,7 @@ def _arrivals(
 
 
 def _walks_into(pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask) -> _Mask:
-    """Mask of walkers that are about to come too close to a vehicle and are not close to one yet."""
+    """Mask of pedestrians that are about to come too close to a vehicle and are not close to one yet."""
     x, y, angle = pose.T
     into = _within(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
     if np.count_nonzero(into):
@@ -250,7 +250,7 @@ def _walks_into(pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: Vehic
 
 
 def _within(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Mask:
-    """Mask of points in a vehicle's box grown by the distance that people keep."""
+    """Mask of points in a vehicle's box grown by the distance that pedestrians keep."""
     cos, sin = vehicles.direction
     half = vehicles.size_m / 2 + _BERTH_M
     dx, dy = x[:, None] - vehicles.xy[:, 0], y[:, None] - vehicles.xy[:, 1]
@@ -262,25 +262,25 @@ def _within(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Ma
     return np.logical_or.reduce(inside, axis=1)
 
 
-def place_walkers(
+def place_pedestrians(
     network: RoadNetwork, per_100m: float, rng: np.random.Generator, times_s: Float64[np.ndarray, " time"]
-) -> tuple[Walker, ...]:
-    """Draw walkers along the sidewalks in both directions, and half as many at each crossing as per 100 m.
+) -> tuple[Pedestrian, ...]:
+    """Draw pedestrians along the sidewalks in both directions, and half as many at each crossing as per 100 m.
 
     They reach the kerbs between 4 s before and 8 s after time 0.
     """
-    people = []
-    for walk in network.walks:
-        length = float(walk.arc_m[-1])
+    pedestrians = []
+    for sidewalk in network.sidewalks:
+        length = float(sidewalk.arc_m[-1])
         for _ in range(int(rng.poisson(per_100m * length / 100.0))):
-            curve = walk if rng.random() < 0.5 else walk.reversed()
-            # People keep to the right of each other.
+            curve = sidewalk if rng.random() < 0.5 else sidewalk.reversed()
+            # Pedestrians keep to the right of each other.
             curve = curve.shifted(-float(rng.uniform(0.1, 0.6)))
-            people.append(Walker(curve, float(rng.uniform(0.0, length)), _pace(rng)))
+            pedestrians.append(Pedestrian(curve, float(rng.uniform(0.0, length)), _pace(rng)))
     for index, crossing in enumerate(network.crossings):
         for _ in range(int(rng.poisson(per_100m / 2))):
-            people.append(_crosser(network, index, crossing, float(times_s[0]), rng))
-    return tuple(people)
+            pedestrians.append(_crosser(network, index, crossing, float(times_s[0]), rng))
+    return tuple(pedestrians)
 
 
 def _pace(rng: np.random.Generator) -> float:
@@ -290,36 +290,36 @@ def _pace(rng: np.random.Generator) -> float:
 
 def _crosser(
     network: RoadNetwork, index: int, crossing: Crossing, begin_s: float, rng: np.random.Generator
-) -> Walker:
-    """Draw a walker that comes along the sidewalk, crosses, and continues on the other side."""
+) -> Pedestrian:
+    """Draw a pedestrian that comes along the sidewalk, crosses, and continues on the other side."""
     near, far = crossing.axis if rng.random() < 0.5 else crossing.axis[::-1]
     aside = rng.uniform(-0.3, 0.3) * crossing.width_m
     ahead = (far - near) / np.hypot(*(far - near))
     shift = aside * np.array([-ahead[1], ahead[0]])
     near, far = near + shift, far + shift
-    before, after = _along_walk(network, near, -ahead, rng), _along_walk(network, far, ahead, rng)
+    before, after = _along_sidewalk(network, near, -ahead, rng), _along_sidewalk(network, far, ahead, rng)
     points = np.concatenate([before[::-1], [near, far], after])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     kerb, across = float(arc[len(before)]), float(arc[len(before) + 1])
     pace = _pace(rng)
     start = max(0.0, kerb - pace * (rng.uniform(-4.0, 8.0) - begin_s))
-    return Walker(_polyline(points), start, pace, index, kerb, across)
+    return Pedestrian(_polyline(points), start, pace, index, kerb, across)
 
 
-def _along_walk(
+def _along_sidewalk(
     network: RoadNetwork, kerb: _Point, out: _Point, rng: np.random.Generator
 ) -> Float64[np.ndarray, "point 2"]:
     """Continue from a kerb: along a nearby sidewalk, in either direction, or straight off the road."""
     best: tuple[float, Curve, int] | None = None
-    for walk in network.walks:
-        gap = np.hypot(*(walk.xy - kerb).T)
+    for sidewalk in network.sidewalks:
+        gap = np.hypot(*(sidewalk.xy - kerb).T)
         place = int(np.argmin(gap))
         if gap[place] < 6.0 and (best is None or gap[place] < best[0]):
-            best = float(gap[place]), walk, place
+            best = float(gap[place]), sidewalk, place
     if best is None:
         return kerb + np.outer([2.0, 20.0], out)
-    _, walk, place = best
-    pieces = [piece for piece in (walk.xy[place:], walk.xy[place::-1]) if len(piece) > 4]
+    _, sidewalk, place = best
+    pieces = [piece for piece in (sidewalk.xy[place:], sidewalk.xy[place::-1]) if len(piece) > 4]
     piece = pieces[int(rng.integers(len(pieces)))]
     return piece[1:81]
 

@@ -1,4 +1,4 @@
-"""Draw the roles of a scenario: ego's route, other vehicles and drivers, walkers, parked cars, lights."""
+"""Draw the roles of a scenario: ego's route, other vehicles and drivers, pedestrians, parked cars, lights."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import SignalPlan
 from drivax.synthetic.traffic.path_arrays import driver_profile
 from drivax.synthetic.traffic.paths import Path, random_lanes
-from drivax.synthetic.traffic.pedestrians import place_walkers
+from drivax.synthetic.traffic.pedestrians import place_pedestrians
 from drivax.synthetic.traffic.population import draw_drivers, driven_path, join_drivers, parked_cars, placed
 from drivax.synthetic.traffic.roles import Drivers, Roles
 
@@ -122,7 +122,7 @@ def assign_roles(
         distance_m=distance,
         speed_mps=_first_speeds(network, paths, drivers, distance, rng),
         route=lanes,
-        walkers=place_walkers(network, float(rng.uniform(*domain.walkers)), rng, times_s),
+        pedestrians=place_pedestrians(network, float(rng.uniform(*domain.pedestrians)), rng, times_s),
         parked=parked,
     )
 

@@ -74,7 +74,7 @@ class Drivers:
 
 
 @dataclass(frozen=True)
-class Walker:
+class Pedestrian:
     """A pedestrian: walks along a curve and waits at kerbs.
 
     Attributes:
@@ -137,7 +137,7 @@ class Roles:
     distance_m: Float64[np.ndarray, " vehicle"]
     speed_mps: Float64[np.ndarray, " vehicle"]
     route: tuple[int, ...]
-    walkers: tuple[Walker, ...] = ()
+    pedestrians: tuple[Pedestrian, ...] = ()
     parked: tuple[Scripted, ...] = ()
 
 
@@ -181,7 +181,7 @@ class EgoPlan:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of all users, in this order: vehicles and cyclists (ego first), walkers, parked, extras.
+    """Motion of all users, in this order: vehicles and cyclists (ego first), pedestrians, parked, extras.
 
     Attributes:
         xy, heading, speed: Pose of the box centre and signed speed along the heading.

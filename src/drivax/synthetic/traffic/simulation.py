@@ -28,7 +28,7 @@ from drivax.synthetic.traffic.lateral import (
 from drivax.synthetic.traffic.obstacles import Boxes, Standing, nearest_obstacles
 from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows
 from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, onward
-from drivax.synthetic.traffic.pedestrians import Walkers
+from drivax.synthetic.traffic.pedestrians import Pedestrians
 from drivax.synthetic.traffic.right_of_way import RightOfWay, TrafficState
 from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Scripted, Staging
 
@@ -68,31 +68,31 @@ def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
 
 @dataclass(frozen=True)
 class _Log:
-    """What a run records of its vehicles (x, y, heading) and walkers (x, y, heading, speed)."""
+    """What a run records of its vehicles (x, y, heading) and pedestrians (x, y, heading, speed)."""
 
     pose: Float64[np.ndarray, "v time 3"]
     speed: Float64[np.ndarray, "v time"]
     valid: Bool[np.ndarray, "v time"]
     at_m: Float64[np.ndarray, "v time"]
     acceleration: Float64[np.ndarray, "v time"]
-    walked: Float64[np.ndarray, "walker time 4"]
+    pedestrian_poses: Float64[np.ndarray, "pedestrian time 4"]
 
     def motion(self, roles: Roles, staging: Staging, paths: list[Path]) -> Motion:
         """Return the motion of all users, the scripted ones included."""
         scripted, steps = (*roles.parked, *staging.extras), self.speed.shape[1]
-        users = [*roles.walkers, *scripted]
-        kinds = [AgentKind.PEDESTRIAN] * len(roles.walkers) + [user.kind for user in scripted]
+        users = [*roles.pedestrians, *scripted]
+        kinds = [AgentKind.PEDESTRIAN] * len(roles.pedestrians) + [user.kind for user in scripted]
 
-        def joined(vehicles: np.ndarray, walkers: np.ndarray, name: str) -> np.ndarray:
-            return np.concatenate([vehicles, walkers, *(vars(s)[name][None, :steps] for s in scripted)])
+        def joined(vehicles: np.ndarray, pedestrians: np.ndarray, name: str) -> np.ndarray:
+            return np.concatenate([vehicles, pedestrians, *(vars(s)[name][None, :steps] for s in scripted)])
 
         return Motion(
             kind=np.concatenate([roles.drivers.kind, np.array(kinds, np.int8)]),
             size_m=np.concatenate([roles.drivers.size_m, np.array([u.size_m for u in users]).reshape(-1, 3)]),
-            xy=joined(self.pose[..., :2], self.walked[..., :2], "xy"),
-            heading=joined(self.pose[..., 2], self.walked[..., 2], "heading"),
-            speed=joined(self.speed, self.walked[..., 3], "speed"),
-            valid=joined(self.valid, np.ones(self.walked.shape[:2], bool), "valid"),
+            xy=joined(self.pose[..., :2], self.pedestrian_poses[..., :2], "xy"),
+            heading=joined(self.pose[..., 2], self.pedestrian_poses[..., 2], "heading"),
+            speed=joined(self.speed, self.pedestrian_poses[..., 3], "speed"),
+            valid=joined(self.valid, np.ones(self.pedestrian_poses.shape[:2], bool), "valid"),
             distance_m=self.at_m,
             acceleration=self.acceleration,
             paths=paths,
@@ -197,7 +197,9 @@ class _Run:
         self._right_of_way = traffic.right_of_way
         self._right_of_way.reset()
         self._changes = LaneChanges(self._network, roles.drivers, boxes)
-        self._walkers = Walkers(self._network, roles.walkers, traffic.times_s) if roles.walkers else None
+        self._pedestrians = (
+            Pedestrians(self._network, roles.pedestrians, traffic.times_s) if roles.pedestrians else None
+        )
         self._occupied_crossings = np.zeros(len(self._network.crossings), bool)
         self._halting = np.zeros((0, 0), bool)  # per vehicle and crossing on its path
         self._delay = np.rint(roles.drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
@@ -213,11 +215,13 @@ class _Run:
         # Gap to and speed of the next leader, line and obstacle.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
         self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
-        self._people = self._vehicles = boxes_at((), 0)
+        self._moving_users = self._vehicles = boxes_at((), 0)
         shape = (count, len(traffic.times_s))
         speed, at, acceleration = np.zeros((3, *shape))
-        walked = np.zeros((len(roles.walkers), shape[1], 4))
-        self._log = _Log(np.zeros((*shape, 3)), speed, np.zeros(shape, bool), at, acceleration, walked)
+        pedestrian_poses = np.zeros((len(roles.pedestrians), shape[1], 4))
+        self._log = _Log(
+            np.zeros((*shape, 3)), speed, np.zeros(shape, bool), at, acceleration, pedestrian_poses
+        )
 
     def finish(self) -> Motion:
         """Run all steps and collect the motion."""
@@ -242,7 +246,7 @@ class _Run:
             active[0] = True
             pose[0] = (*self._ego.xy[k], self._ego.heading[k])
         self._vehicles = Boxes(pose[:, :2], pose[:, 2], self._speed, self._drivers.size_m[:, :2])
-        self._walk(t, active)
+        self._advance_pedestrians(t, active)
         log.pose[:, t], log.speed[:, t], log.at_m[:, t], log.valid[:, t] = pose, self._speed, self._at, active
         preferred = self._preferred_acceleration(t, fastest, fastest_soon, active)
         if t % _DECIDE_EVERY == 0:
@@ -262,13 +266,13 @@ class _Run:
         self._right_of_way.swapped(row, self._tables, at + self._half_m[row])
         self._busy_m[row], self._rest[row] = end_m, t + _REST_STEPS
 
-    def _walk(self, t: int, active: VehicleMask) -> None:
-        """Advance the walkers and gather scripted users."""
-        people, colour = boxes_at((), 0), self._fixed.colour[t]
-        if self._walkers is not None:
-            people, self._occupied_crossings = self._walkers.step(t, self._vehicles, active, colour)
-            self._log.walked[:, t] = np.column_stack([people.xy, people.heading, people.speed])
-        self._people = people.joined(boxes_at(tuple(user for user in self._movers if user.valid[t]), t))
+    def _advance_pedestrians(self, t: int, active: VehicleMask) -> None:
+        """Advance the pedestrians and gather scripted users."""
+        users, colour = boxes_at((), 0), self._fixed.colour[t]
+        if self._pedestrians is not None:
+            users, self._occupied_crossings = self._pedestrians.step(t, self._vehicles, active, colour)
+            self._log.pedestrian_poses[:, t] = np.column_stack([users.xy, users.heading, users.speed])
+        self._moving_users = users.joined(boxes_at(tuple(user for user in self._movers if user.valid[t]), t))
 
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_soon: PerVehicle, active: VehicleMask
@@ -284,7 +288,7 @@ class _Run:
             gaps[1] -= self._speed * DT_S
         if t % 2 == 0:
             gaps[2], leads[2] = nearest_obstacles(
-                self._tables, self._vehicles, self._at, active, self._people
+                self._tables, self._vehicles, self._at, active, self._moving_users
             )
         else:
             gaps[2] += (leads[2] - self._speed) * DT_S
@@ -409,7 +413,7 @@ class _Run:
 
     def _pass(self, t: int, calm: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
-        halted = self._people.chosen(np.abs(self._people.speed) < 0.05)
+        halted = self._moving_users.chosen(np.abs(self._moving_users.speed) < 0.05)
         stuck = np.zeros(len(self._rows), bool)
         for override in self._staging.overrides:
             now = override.first_step <= t <= override.last_step
@@ -431,7 +435,7 @@ class _Run:
     def _pass_by(self, t: int, row: int, standing: Boxes, stuck: VehicleMask) -> None:
         """Start a detour around an obstacle ahead, if there is one."""
         others = self._vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
-        moving = others.joined(self._people.chosen(np.abs(self._people.speed) >= 0.05))
+        moving = others.joined(self._moving_users.chosen(np.abs(self._moving_users.speed) >= 0.05))
         at, size = float(self._at[row]), (float(2 * self._half_m[row]), float(self._width_m[row]))
         request = detour_request(self._network, self._tables, row, (at, self._speed[row]), size)
         detour = self._fixed.detours.find(request, standing, moving)

@@ -166,13 +166,13 @@ class Geometry:
     Attributes:
         skew, offset_m: Largest deviation of an arm from its direction, rad, and from the centre.
         corner_m: Radius of the corners' kerbs, low and high.
-        walk_m: Distance of sidewalks from the edge, low and high.
+        sidewalk_m: Distance of sidewalks from the edge, low and high.
     """
 
     skew: float = math.radians(6.0)
     offset_m: float = 0.8
     corner_m: tuple[float, float] = (6.0, 12.0)
-    walk_m: tuple[float, float] = (1.0, 2.5)
+    sidewalk_m: tuple[float, float] = (1.0, 2.5)
     reach: Reach = field(default_factory=Reach)
 
     def arms(
@@ -337,9 +337,9 @@ def finish_sites(
         kerb, at = _kerb_between_ends(sites, links, at)
         kerbs.append(kerb)
     draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*kerbs)))
-    walk_m = float(rng.uniform(*geometry.walk_m))
-    if rng.random() < style.walk_share:
-        draft.walks += [kerb.shifted(-walk_m) for kerb in kerbs]
+    sidewalk_m = float(rng.uniform(*geometry.sidewalk_m))
+    if rng.random() < style.sidewalk_share:
+        draft.sidewalks += [kerb.shifted(-sidewalk_m) for kerb in kerbs]
     for number, site in enumerate(sites):
         for i, approach in enumerate(site.approaches):
             if links.get((number, i), (number, i)) >= (number, i):

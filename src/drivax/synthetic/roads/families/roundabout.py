@@ -116,8 +116,8 @@ class Roundabout:
         arms = [self._arm(rng, draft, plan, heading) for heading in self._headings(rng, plan)]
         chains = _go_round(draft, plan, arms, self.circle_mps)
         _set_priorities(draft)
-        walk_m = float(rng.uniform(1.2, 2.0)) if rng.random() < style.walk_share else None
-        _add_boundary(draft, plan, chains, walk_m)
+        sidewalk_m = float(rng.uniform(1.2, 2.0)) if rng.random() < style.sidewalk_share else None
+        _add_boundary(draft, plan, chains, sidewalk_m)
         _add_islands(draft, plan, arms)
         marked = bool(rng.random() < self.marked_share)
         for arm in arms:
@@ -236,7 +236,7 @@ def _set_priorities(draft: Draft) -> None:
             draft.change(i, control=Control.YIELD, yields_to=yields_to)
 
 
-def _add_boundary(draft: Draft, plan: _Plan, chains: list[list[Curve]], walk_m: float | None) -> None:
+def _add_boundary(draft: Draft, plan: _Plan, chains: list[list[Curve]], sidewalk_m: float | None) -> None:
     """Add the outer boundary and the sidewalks."""
     sides = []
     for chain in chains:
@@ -246,8 +246,8 @@ def _add_boundary(draft: Draft, plan: _Plan, chains: list[list[Curve]], walk_m: 
         wide -= smooth_step((line.arc_m - ends[2]) / (ends[3] - ends[2]))
         reach = plan.width_m / 2 + plan.shoulder_m + wide * (plan.circle_m - plan.width_m) / 2
         sides.append(line.displaced(-reach))
-        if walk_m is not None:
-            draft.walks.append(line.displaced(-reach - walk_m))
+        if sidewalk_m is not None:
+            draft.sidewalks.append(line.displaced(-reach - sidewalk_m))
     draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*sides)))
 
 

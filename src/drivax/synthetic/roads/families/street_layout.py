@@ -204,11 +204,11 @@ class Street:
         for line in lines:
             self.draft.mark(kind, line)
 
-    def walk(self, rng: np.random.Generator) -> None:
+    def add_sidewalks(self, rng: np.random.Generator) -> None:
         """Add a sidewalk on both sides, 1.2 to 2.5 m outside the edges."""
         right, left = self.edge_m
         away = float(rng.uniform(1.2, 2.5))
-        self.draft.walks += [self.middle.displaced(-right - away), self.middle.displaced(left + away)]
+        self.draft.sidewalks += [self.middle.displaced(-right - away), self.middle.displaced(left + away)]
 
     def cross(self, at: int, marked: bool) -> None:
         """Add a crossing at a sample of the middle line, with a crosswalk where it is marked."""

@@ -56,8 +56,8 @@ class CurvedRoad(StreetFamily):
             rows_m=(row, row if back else 0.0),
         )
         street.build()
-        if rng.random() < style.walk_share:
-            street.walk(rng)
+        if rng.random() < style.sidewalk_share:
+            street.add_sidewalks(rng)
         street.park(20.0, rng)
         return street.network(self.name)
 
@@ -100,8 +100,8 @@ class LaneDrop(StreetFamily):
             taper_m=float(rng.uniform(*self.taper_m)),
         )
         street.build()
-        if rng.random() < style.walk_share:
-            street.walk(rng)
+        if rng.random() < style.sidewalk_share:
+            street.add_sidewalks(rng)
         return street.network(self.name)
 
     def _strips(self, rng: np.random.Generator, sections: int) -> tuple[Strip, ...]:
@@ -151,7 +151,7 @@ class MidblockCrosswalk(StreetFamily):
             rows_m=(row, row if back else 0.0),
         )
         street.build()
-        street.walk(rng)
+        street.add_sidewalks(rng)
         at = float(rng.uniform(*self.crossing_m))
         stations = [at, at + float(rng.uniform(*self.apart_m))] if rng.random() < self.second_share else [at]
         for station in stations:
@@ -192,7 +192,7 @@ class ParkedStreet(StreetFamily):
             rows_m=(row * sides[0], row * sides[1]),
         )
         street.build()
-        street.walk(rng)
+        street.add_sidewalks(rng)
         if rng.random() < self.crossing_share:
             at = round(float(rng.uniform(170.0, 250.0)) / STEP_M)
             street.cross(at, marked=bool(rng.random() < 0.5))
