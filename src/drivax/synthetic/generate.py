@@ -240,7 +240,7 @@ def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> list[_
 
 def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, None, None]:
     """Draw all scenarios in order."""
-    spans = [(at, min(at + _CHUNK, scenarios)) for at in range(0, scenarios, _CHUNK)]
+    spans = [(start, min(start + _CHUNK, scenarios)) for start in range(0, scenarios, _CHUNK)]
     if options.workers == 0:
         for first, last in spans:
             yield from _draw_chunk(first, last, seed, options)
@@ -328,9 +328,9 @@ def generate_benchmark(
         notes = {"benchmark": BENCHMARK_VERSION, "split": name}
         done = sum(counts[earlier] for earlier in sets)
 
-        def report(here: int, _: int, done: int = done) -> None:
+        def report(current: int, _: int, done: int = done) -> None:
             if progress is not None:
-                progress(done + here, sum(counts.values()))
+                progress(done + current, sum(counts.values()))
 
         own = dataclasses.replace(options, world=world)
         sets[name] = write_set(Path(out) / name, counts[name], split.seed, own, notes, report, audit)

@@ -145,8 +145,8 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
     rejected: Counter[tuple[str, str]] = Counter()
     for attempt in range(_ATTEMPTS):
         event = events[attempt // _PER_KIND % len(events)]
-        place = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
-        family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *place))
+        sample = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
+        family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *sample))
         rng = np.random.default_rng([seed, 2, index, attempt])
         places = destinations_for(event, network, attempt > 0) if event else ()
         result = _attempt(_Draw(network, places, event, severity), domain, config, rng)
@@ -157,7 +157,7 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
         recording = replace(
             result,
             scenario_id=f"{name}-{index:06d}-{family.name}",
-            segment=f"{name}-{'r' if event else 'm'}{place[0]:06d}.{place[1]}",
+            segment=f"{name}-{'r' if event else 'm'}{sample[0]:06d}.{sample[1]}",
             tags={"family": family.name, "domain": config.domain, **result.tags},
         )
         return Generated(recording, family.name, config.domain, dict(rejected))
@@ -302,8 +302,8 @@ def _lights(network: RoadNetwork, motion: Motion, times_s: Float64[np.ndarray, "
 def _tracks(motion: Motion, actors: tuple[int, ...]) -> Tracks:
     """Return tracks of ego, an event's actors and the nearest others, with zeros where invalid."""
     valid = motion.valid
-    apart = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
-    nearest = np.where(valid, apart, np.inf).min(axis=1)
+    separation = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
+    nearest = np.where(valid, separation, np.inf).min(axis=1)
     nearest[[0, *actors]] = -1.0
     rows = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
     rows = rows[np.isfinite(nearest[rows])]

@@ -51,8 +51,8 @@ def gait(
         return None
     slows = travel_s(distance_m - stopping, speed_mps, gain)
     gone, up = speed_change(0.0, speed_mps, gain, np.minimum(times_s, slows))
-    more, down = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
-    return gone + more, np.where(times_s < slows, up, down)
+    extra, down = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
+    return gone + extra, np.where(times_s < slows, up, down)
 
 
 def along_track(
@@ -109,8 +109,10 @@ def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> S
     arc = Curve(user.xy, user.heading).arc_m
     times = DT_S * (np.arange(len(arc)) - step)
     gone, slower = speed_change(float(user.speed[step]), 0.0, braking_mps2, times)
-    at = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
+    position = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
     grows = np.concatenate([[True], np.diff(arc) > 1e-6])
-    heading = np.interp(at, arc[grows], np.unwrap(user.heading)[grows])
+    heading = np.interp(position, arc[grows], np.unwrap(user.heading)[grows])
     speed = np.where(times < 0, user.speed, np.minimum(slower, user.speed))
-    return replace(user, xy=curves.interpolate(at, arc[grows], user.xy[grows]), heading=heading, speed=speed)
+    return replace(
+        user, xy=curves.interpolate(position, arc[grows], user.xy[grows]), heading=heading, speed=speed
+    )

@@ -51,8 +51,8 @@ def required_deceleration(
     some = (time_s > 0) & (speed_mps * time_s > room_m)
     room, time = room_m[some], time_s[some]
     rolling = 2 * (speed_mps * time - room) / time**2
-    rest = speed_mps**2 / (2 * room)
-    return float(np.max(np.where(room >= speed_mps * time / 2, rolling, rest), initial=0.0))
+    remainder = speed_mps**2 / (2 * room)
+    return float(np.max(np.where(room >= speed_mps * time / 2, rolling, remainder), initial=0.0))
 
 
 def waiting_room(speed_mps: float, deceleration_mps2: float, time_s: float) -> float:
@@ -85,10 +85,10 @@ def first_blocked(view: EgoView, adversary: Scripted, step: int) -> Float64[np.n
     ego = boxes(xy, track.heading[begin:], size)
     reach = (math.hypot(*size) + math.hypot(*adversary.size_m[:2])) / 2
     gap = (box[:, None, 0] - xy[:, 0]) ** 2 + (box[:, None, 1] - xy[:, 1]) ** 2
-    time, place = np.nonzero((gap < reach**2) & adversary.valid[step : last + 1, None])
-    hit = overlap(ego[place], box[time])
+    time, index = np.nonzero((gap < reach**2) & adversary.valid[step : last + 1, None])
+    hit = overlap(ego[index], box[time])
     result = np.full(len(box), math.inf)
-    np.minimum.at(result, time[hit], station[place[hit]])
+    np.minimum.at(result, time[hit], station[index[hit]])
     return result
 
 
@@ -173,11 +173,11 @@ def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
     rows, moves = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
     moves = moves[moves <= last]
     gap = np.sum((motion.xy[rows][:, moves] - extra.xy[moves]) ** 2, axis=-1)
-    turned = motion.heading[rows][:, moves]
-    crosses = np.abs(np.cos(turned - extra.heading[moves])) < 0.7
+    relative_heading = motion.heading[rows][:, moves]
+    crosses = np.abs(np.cos(relative_heading - extra.heading[moves])) < 0.7
     row, step = np.nonzero(motion.valid[rows][:, moves] & crosses & (gap < _NEAR_M**2))
     size = motion.size_m[rows[row], :2] + _CROSSED_M
-    other = boxes(motion.xy[rows[row], moves[step]], turned[row, step], size)
+    other = boxes(motion.xy[rows[row], moves[step]], relative_heading[row, step], size)
     hit = overlap(actor_boxes(extra)[moves[step]], other)
     return tuple(np.unique(rows[row[hit]]).tolist())
 
@@ -208,8 +208,8 @@ def enter_when_clear(view: EgoView, extra: Scripted, until: int, removed: tuple[
     if appears >= last or not extra.valid[appears]:
         return None
     seen = appears > view.first_step and np.hypot(*(extra.xy[appears] - motion.xy[0, appears])) < _VIEW_M
-    now = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
-    if seen or not _is_clear(*now):
+    state = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
+    if seen or not _is_clear(*state):
         return None
     return replace(extra, valid=extra.valid & (np.arange(len(extra.valid)) >= appears))
 

@@ -75,11 +75,13 @@ def _chain(
 ) -> list[int]:
     """Draw successive lanes before (-1) or after (1) a lane up to a total length."""
     result: list[int] = []
-    total, at = 0.0, first
-    while total < length_m and (links := lanes[at].successors if direction > 0 else lanes[at].predecessors):
-        at = int(rng.choice(links))
-        result.append(at)
-        total += lanes[at].length_m
+    total, position = 0.0, first
+    while total < length_m and (
+        links := lanes[position].successors if direction > 0 else lanes[position].predecessors
+    ):
+        position = int(rng.choice(links))
+        result.append(position)
+        total += lanes[position].length_m
     return result
 
 

@@ -88,7 +88,7 @@ class LeadBrakes(EventScript):
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
         """See :class:`EventScript`: fast roads only."""
         places = open_road(network, _LEAST_MPS)
-        return tuple(replace(place, followed=True) for place in places) if self.tailgater else places
+        return tuple(replace(index, followed=True) for index in places) if self.tailgater else places
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
@@ -112,12 +112,12 @@ class LeadBrakes(EventScript):
         if gap[leader] > self.within_s * speed:
             return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
         lead = float(motion.speed[leader, step])
-        drawn = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
-        last = view.last_step if drawn is None else step + _stands_until(speed, drawn[1])
-        if drawn is None or last > view.last_step:
+        draw = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
+        last = view.last_step if draw is None else step + _stands_until(speed, draw[1])
+        if draw is None or last > view.last_step:
             return None
-        staging = Staging(overrides=(Override(leader, step, last, -drawn[0]),), tailgates=tailgates)
-        adversary = brake_to_halt(motion, leader, step, drawn[0])
+        staging = Staging(overrides=(Override(leader, step, last, -draw[0]),), tailgates=tailgates)
+        adversary = brake_to_halt(motion, leader, step, draw[0])
         required = severity(view, adversary, step + NOTICED)
         return Proposal(staging, required, adversary, step, last, leader, followers)
 
@@ -164,12 +164,12 @@ def _propose_leader(
     appears = view.first_step - _BEFORE
     after = view.behind(cruising - CAR_M[0] / 2, appears)
     speed, gap = float(after.motion.speed[0, step]), float(cruising[step] - after.track.at[step]) - lengths
-    drawn = draw_braking(speed, gap, lead, rng)
-    if drawn is None:
+    draw = draw_braking(speed, gap, lead, rng)
+    if draw is None:
         return None
     times = DT_S * (np.arange(view.steps) - step)
-    gone, _ = speed_change(lead, 0.0, drawn[0], times)
-    last = view.last_step if drives_on is None else step + _stands_until(speed, drawn[1])
+    gone, _ = speed_change(lead, 0.0, draw[0], times)
+    last = view.last_step if drives_on is None else step + _stands_until(speed, draw[1])
     onward, _ = speed_change(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
     station = np.where(times < 0, cruising, cruising[step] + gone + onward)
     if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
@@ -211,8 +211,8 @@ class CutIn(EventScript):
                 if neighbour >= 0 and not (lanes[neighbour].ends or lanes[neighbour].exit_only):
                     curve = lanes[neighbour].curve
                     nearest = int(np.argmin(np.hypot(*(curve.xy - lane.curve.xy[-1]).T)))
-                    at = float(curve.arc_m[nearest])
-                    places.append(Destination(neighbour, (at, at), self.end_after_s))
+                    position = float(curve.arc_m[nearest])
+                    places.append(Destination(neighbour, (position, position), self.end_after_s))
         return tuple(places)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
@@ -243,8 +243,8 @@ class CutIn(EventScript):
         adjacent = self._adjacent_lane(view, station, start, finish, side)
         if adjacent is None or view.meets_junction(start, float(station[view.last_step])):
             return None
-        aside, valid = adjacent
-        left = side * aside * (1.0 - smooth_step(times / lasts))
+        lateral, valid = adjacent
+        left = side * lateral * (1.0 - smooth_step(times / lasts))
         adversary = along_track(view.track, station, left, AgentKind.VEHICLE, CAR_M, valid)
         if not adversary.valid[view.first_step : step + 1].all():
             return None
@@ -271,11 +271,11 @@ class CutIn(EventScript):
         """Lateral offset of the actor's lane, and the steps at which it exists next to ego's; None without one."""
         lanes, lane, reach = view.roles.network.lanes, -1, finish
         low = max(0.0, float(station.min()))
-        for place in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():
-            neighbour = view.neighbour(place, side)
+        for index in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():
+            neighbour = view.neighbour(index, side)
             if neighbour < 0:
                 break
-            reach = place
+            reach = index
             lane = neighbour if lane < 0 else lane
         if lane < 0 or reach > start - _EVERY_M:
             return None
@@ -285,6 +285,6 @@ class CutIn(EventScript):
             end, _ = view.track.project(lanes[lane].curve.xy[-1:])
             if not finish <= float(end[0]) <= finish + self.before_end_m:
                 return None
-        here = view.track.place(start)[0]
-        apart = float(np.min(np.hypot(*(lanes[view.neighbour(start, side)].curve.xy - here).T)))
-        return (apart, station >= reach) if 2.3 < apart < 5.0 else None
+        current = view.track.place(start)[0]
+        separation = float(np.min(np.hypot(*(lanes[view.neighbour(start, side)].curve.xy - current).T)))
+        return (separation, station >= reach) if 2.3 < separation < 5.0 else None

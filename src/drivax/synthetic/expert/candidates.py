@@ -92,18 +92,18 @@ def shifted_path(
     ahead = np.arange(0.0, min(span_m[1], path.length_m - begin - 1e-6), SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
     base = interpolated(path.curve, grid, begin + ahead)
-    aside = quintic_step(ahead, (0.0, left, math.tan(wrap(pose.heading - direction))), _RETURN_M)
+    lateral = quintic_step(ahead, (0.0, left, math.tan(wrap(pose.heading - direction))), _RETURN_M)
     there, back = shift.there_m - shift.begin_m, shift.end_m - shift.back_m
-    aside += shift.aside_m * quintic_step(ahead, (shift.back_m, 1.0, 0.0), back)
-    aside -= shift.aside_m * quintic_step(ahead, (shift.begin_m, 1.0, 0.0), there)
+    lateral += shift.aside_m * quintic_step(ahead, (shift.back_m, 1.0, 0.0), back)
+    lateral -= shift.aside_m * quintic_step(ahead, (shift.begin_m, 1.0, 0.0), there)
     normal = np.stack([-np.sin(base.heading), np.cos(base.heading)], axis=-1)
-    stretch = np.maximum(1.0 - aside * np.interp(begin + ahead, grid, path.curvature), 0.2)
-    turned = np.arctan2(np.gradient(aside, SPACING_M), stretch)
-    curve = Curve(base.xy + aside[:, None] * normal, base.heading + turned)
+    stretch = np.maximum(1.0 - lateral * np.interp(begin + ahead, grid, path.curvature), 0.2)
+    relative_heading = np.arctan2(np.gradient(lateral, SPACING_M), stretch)
+    curve = Curve(base.xy + lateral[:, None] * normal, base.heading + relative_heading)
     arc = curve.arc_m
-    at = np.arange(0.0, float(arc[-1]), SPACING_M)
+    position = np.arange(0.0, float(arc[-1]), SPACING_M)
     return _with_speeds(
-        path, drivers, interpolated(curve, arc, at), (begin, np.interp(at, arc, ahead)), shift
+        path, drivers, interpolated(curve, arc, position), (begin, np.interp(position, arc, ahead)), shift
     )
 
 
@@ -195,8 +195,8 @@ def _box_conflicts(
     reach += _STRIDE * SPACING_M / 2
     user, step = np.nonzero(valid & _around(others, ego, reach))
     coarse = ego[::_STRIDE, :2]
-    at = others[user, step, :2]
-    gap = (at[:, None, 0] - coarse[:, 0]) ** 2 + (at[:, None, 1] - coarse[:, 1]) ** 2
+    xy = others[user, step, :2]
+    gap = (xy[:, None, 0] - coarse[:, 0]) ** 2 + (xy[:, None, 1] - coarse[:, 1]) ** 2
     row, block = np.nonzero(gap < reach[user, None] ** 2)
     point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
     row = np.repeat(row, _STRIDE)
@@ -271,10 +271,10 @@ def arrivals(
     for vehicle in range(1, len(paths)):
         for span in paths[vehicle].spans:
             if span.lane in watched:
-                at, half = distance_m[vehicle], half_m[vehicle]
+                position, half = distance_m[vehicle], half_m[vehicle]
                 end = span.begin_m + span.scale * network.lanes[span.lane].length_m
-                here = (at + half > span.begin_m) & (at - half < end) & valid[vehicle]
+                current = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
                 early = round(_YIELD_S / 0.1)
-                coming = np.convolve(here[::-1], np.ones(early + 1), mode="full")[: len(here)][::-1] > 0
-                result[span.lane] = result.get(span.lane, np.zeros(len(here), bool)) | coming
+                coming = np.convolve(current[::-1], np.ones(early + 1), mode="full")[: len(current)][::-1] > 0
+                result[span.lane] = result.get(span.lane, np.zeros(len(current), bool)) | coming
     return result

@@ -65,9 +65,9 @@ def expert_lanes(
 
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
     """Adjacent lanes of a lane that is long enough for a change."""
-    this = network.lanes[lane]
-    neighbour = [other for other in (this.left, this.right) if other >= 0]
-    return [] if this.connector or not 70.0 < this.length_m < 100.0 else neighbour
+    current = network.lanes[lane]
+    neighbour = [other for other in (current.left, current.right) if other >= 0]
+    return [] if current.connector or not 70.0 < current.length_m < 100.0 else neighbour
 
 
 def expert_path(

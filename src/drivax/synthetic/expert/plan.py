@@ -162,8 +162,8 @@ def _continued(
     longer = np.repeat(box[:, -1:], _BEYOND_STEPS, axis=1)
     travelled = motion.speed[1:, -1:] * DT_S * np.arange(1, _BEYOND_STEPS + 1)
     longer[..., :2] += travelled[..., None] * longer[..., 2:4]
-    more = np.repeat(valid[:, -1:], _BEYOND_STEPS, axis=1)
-    return np.concatenate([box, longer], axis=1), np.concatenate([valid, more], axis=1)
+    extra = np.repeat(valid[:, -1:], _BEYOND_STEPS, axis=1)
+    return np.concatenate([box, longer], axis=1), np.concatenate([valid, extra], axis=1)
 
 
 def _lines(motion: Motion, times_s: _Series, state: _State) -> list[StopLine]:
@@ -218,8 +218,8 @@ def _option(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _O
     cost = speeds.cost
     if candidate.shift.aside_m:
         wrong = against_traffic(state.roles.network, candidate.xy[::4], candidate.heading[::4])
-        wrong_m, aside = float(wrong.sum() * 4 * SPACING_M), abs(candidate.shift.aside_m)
-        cost += _LEAVING + _ASIDE * aside + _AGAINST * wrong_m / max(state.speed, 4.0)
+        wrong_m, lateral = float(wrong.sum() * 4 * SPACING_M), abs(candidate.shift.aside_m)
+        cost += _LEAVING + _ASIDE * lateral + _AGAINST * wrong_m / max(state.speed, 4.0)
     return _Option(candidate, occupancy, speeds, cost)
 
 
@@ -233,9 +233,9 @@ def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
     thick = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + state.speed) + 0.5) / SPACING_M))
     for line in state.lines:
         if line.base_m < candidate.base_m[-1]:
-            place = int(np.searchsorted(candidate.base_m, line.base_m))
-            hard[line.closed, place : place + thick] = True
-            near[line.late, place : place + thick] = _LATE
+            index = int(np.searchsorted(candidate.base_m, line.base_m))
+            hard[line.closed, index : index + thick] = True
+            near[line.late, index : index + thick] = _LATE
     room = state.path.length_m - state.from_m - state.size_m[0] / 2 - 0.5
     hard[:, candidate.base_m > room] = True
     return Occupancy(SPACING_M, hard, near)
@@ -243,23 +243,23 @@ def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
 
 def _smooth(state: _State, option: _Option) -> SpeedProfile:
     """Smooth an option's speeds within the tightest feasible bounds."""
-    at, speed = option.speeds.fine(state.others.shape[1])
+    position, speed = option.speeds.fine(state.others.shape[1])
     speed[0] = state.speed
     hard = option.occupancy.hard[1:]
-    place = np.arange(hard.shape[1])
-    own = np.clip(np.rint(at[1:] / SPACING_M).astype(int), 0, len(place) - 1)
-    below = np.where(hard & (place < own[:, None]), place, -1).max(axis=1)
-    above = np.where(hard & (place > own[:, None]), place, len(place)).min(axis=1)
+    index = np.arange(hard.shape[1])
+    own = np.clip(np.rint(position[1:] / SPACING_M).astype(int), 0, len(index) - 1)
+    below = np.where(hard & (index < own[:, None]), index, -1).max(axis=1)
+    above = np.where(hard & (index > own[:, None]), index, len(index)).min(axis=1)
     # Steps at which even the best speeds touch something are unbounded.
     lost = hard[np.arange(len(hard)), own]
     low = np.where((below >= 0) & ~lost, (below + 1) * SPACING_M, -np.inf)
     high = np.where(lost, np.inf, (above - 1) * SPACING_M)
-    around = np.clip(own[:, None] + np.arange(-4, 5), 0, len(place) - 1)
+    around = np.clip(own[:, None] + np.arange(-4, 5), 0, len(index) - 1)
     top = np.maximum(option.candidate.limit_mps[around].min(axis=1), speed[1:])
     drive = None
     for acceleration, jerk in _BOUNDS:
         bounds = Bounds(low, np.maximum(high, low), top, acceleration, jerk)
-        drive = smoothed(at, speed, state.acceleration, bounds)
+        drive = smoothed(position, speed, state.acceleration, bounds)
         if drive.excess <= _TOLERANCE:
             break
     assert drive is not None
@@ -290,14 +290,14 @@ def _passing_options(state: _State, candidate: CandidatePath, conflicts: Conflic
 
 def _first_hit(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Hit | None:
     """Return user, step and path sample of the first collision at the preferred speeds."""
-    at, speed, places = 0.0, state.speed, []
+    position, speed, places = 0.0, state.speed, []
     for _ in range(state.others.shape[1]):
-        places.append(at)
-        index = min(int(at / SPACING_M), len(candidate.xy) - 1)
+        places.append(position)
+        index = min(int(position / SPACING_M), len(candidate.xy) - 1)
         speed = min(speed + 1.5 * DT_S, max(float(candidate.preferred_mps[index]), speed - 2.0 * DT_S))
-        at += speed * DT_S
-    apart = np.abs(conflicts.point * SPACING_M - np.array(places)[conflicts.step])
-    touch = conflicts.hard & (apart < 0.3 + 0.05 * state.speed)
+        position += speed * DT_S
+    separation = np.abs(conflicts.point * SPACING_M - np.array(places)[conflicts.step])
+    touch = conflicts.hard & (separation < 0.3 + 0.05 * state.speed)
     if not touch.any():
         return None
     first = int(np.flatnonzero(touch)[np.argmin(conflicts.step[touch])])
@@ -324,21 +324,21 @@ def _shift(
     ]
     for user in sorted(standing, key=lambda u: int(conflicts.point[conflicts.user == u].min())):
         mine = conflicts.hard & (conflicts.user == user)
-        place = int(conflicts.point[mine].min())
-        if user not in seen and begin < place * SPACING_M < end + 20.0:
-            more = _extent(state, candidate, (user, int(conflicts.step[mine].min()), place), side)
-            end, edge = max(end, more[1]), max(edge, more[2])
+        index = int(conflicts.point[mine].min())
+        if user not in seen and begin < index * SPACING_M < end + 20.0:
+            extra = _extent(state, candidate, (user, int(conflicts.step[mine].min()), index), side)
+            end, edge = max(end, extra[1]), max(edge, extra[2])
             seen.add(user)
-    aside = edge + half_w + room_m
-    if not 0.15 < aside < _FURTHEST_M:
+    lateral = edge + half_w + room_m
+    if not 0.15 < lateral < _FURTHEST_M:
         return None
     speed = max(state.speed, float(candidate.preferred_mps[hit[2]]) * 0.7)
-    length = max(speed * float(np.sqrt(5.77 * aside / step_mps2)), 3.0 * aside, 8.0)
-    gentle = max(length, speed * float(np.sqrt(5.77 * aside / _STEP_MPS2[0])))
+    length = max(speed * float(np.sqrt(5.77 * lateral / step_mps2)), 3.0 * lateral, 8.0)
+    gentle = max(length, speed * float(np.sqrt(5.77 * lateral / _STEP_MPS2[0])))
     out = max(0.0, begin - half_l - length)
     there = out + length
     back = max(end + half_l, there)
-    return Shift(side * aside, out, there, back, back + gentle)
+    return Shift(side * lateral, out, there, back, back + gentle)
 
 
 def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> tuple[float, float, float]:
@@ -351,6 +351,10 @@ def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> 
     # Moving users are passed over a longer stretch.
     later = min(step + 10, len(state.others[user]) - 1)
     moved = (state.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
-    at = point * SPACING_M
+    position = point * SPACING_M
     ahead, behind = max(3.0 * moved, 0.7 * -moved, 0.0), max(0.7 * abs(moved), 0.0)
-    return at + float(along.min()) - behind, at + float(along.max()) + ahead, float((side * left).max())
+    return (
+        position + float(along.min()) - behind,
+        position + float(along.max()) + ahead,
+        float((side * left).max()),
+    )

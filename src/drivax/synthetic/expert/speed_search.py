@@ -52,8 +52,8 @@ class SpeedPlan:
 
     def fine(self, steps: int) -> tuple[Float64[np.ndarray, " time"], Float64[np.ndarray, " time"]]:
         """Distance and speed at every step of the recording."""
-        at = np.arange(steps) / COARSE
-        speed = np.interp(at, np.arange(len(self.speed)), self.speed)
+        position = np.arange(steps) / COARSE
+        speed = np.interp(position, np.arange(len(self.speed)), self.speed)
         travelled = np.cumsum((speed[1:] + speed[:-1]) * DT_S / 2)
         return np.concatenate([[0.0], travelled]), speed
 

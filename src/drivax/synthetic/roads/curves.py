@@ -133,8 +133,10 @@ def from_curvature(curvature: Float64[np.ndarray, " point"], step_m: float, star
 def straight(start: Pose, length_m: float) -> Curve:
     """Straight line."""
     count = max(2, math.ceil(length_m / STEP_M) + 1)
-    at = np.linspace(0.0, length_m, count)
-    xy = np.column_stack([start.x + at * math.cos(start.heading), start.y + at * math.sin(start.heading)])
+    position = np.linspace(0.0, length_m, count)
+    xy = np.column_stack(
+        [start.x + position * math.cos(start.heading), start.y + position * math.sin(start.heading)]
+    )
     return Curve(xy, np.full(count, start.heading))
 
 
@@ -237,8 +239,8 @@ def winding(
         sign = -np.sign(values[-1]) if rng.random() < 2 / 3 and values[-1] else rng.choice([-1.0, 1.0])
         values.append(float(sign) * max_curvature * float(rng.uniform(0.15, 1.0)))
     count = math.ceil(length_m / STEP_M) + 1
-    at = np.arange(count) * STEP_M
-    curvature = np.interp(at, knots, values)
-    turned = np.concatenate([[0.0], np.cumsum((curvature[1:] + curvature[:-1]) * STEP_M / 2)])
-    excess = float(np.ptp(turned)) / max_turn
+    position = np.arange(count) * STEP_M
+    curvature = np.interp(position, knots, values)
+    relative_heading = np.concatenate([[0.0], np.cumsum((curvature[1:] + curvature[:-1]) * STEP_M / 2)])
+    excess = float(np.ptp(relative_heading)) / max_turn
     return from_curvature(curvature / max(1.0, excess), STEP_M, start)

@@ -151,17 +151,19 @@ def conflicting(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
     low = np.array([lanes[i].curve.xy.min(axis=0) for i in connectors]).reshape(-1, 2)
     high = np.array([lanes[i].curve.xy.max(axis=0) for i in connectors]).reshape(-1, 2)
     # Bounding boxes exclude most pairs of a network with several junctions.
-    apart = (low[:, None] - high).max(axis=-1) > CLEARANCE_M
+    separation = (low[:, None] - high).max(axis=-1) > CLEARANCE_M
     for (i, a), (k, b) in combinations(enumerate(connectors), 2):
-        if not (apart[i, k] or apart[k, i] or set(lanes[a].predecessors) & set(lanes[b].predecessors)):
+        if not (
+            separation[i, k] or separation[k, i] or set(lanes[a].predecessors) & set(lanes[b].predecessors)
+        ):
             gaps = _distances(lanes[a].curve.xy[::2], lanes[b].curve.xy[::2])
             result[a, b] = result[b, a] = gaps.min() < CLEARANCE_M
     return result
 
 
 def _shared_length(a: Curve, b: Curve) -> float:
-    apart = _distances(a.xy, b.xy).min(axis=1) > CLEARANCE_M
-    return float(a.arc_m[int(np.argmax(apart)) if apart.any() else -1])
+    separation = _distances(a.xy, b.xy).min(axis=1) > CLEARANCE_M
+    return float(a.arc_m[int(np.argmax(separation)) if separation.any() else -1])
 
 
 def _distances(a: Float64[np.ndarray, "a 2"], b: Float64[np.ndarray, "b 2"]) -> Float64[np.ndarray, "a b"]:
@@ -181,9 +183,9 @@ class Draft:
     sidewalks: list[Curve] = field(default_factory=list)
     bays: list[Bay] = field(default_factory=list)
 
-    def lane(self, curve: Curve, width_m: float, limit_mps: float, **more: Any) -> int:
+    def lane(self, curve: Curve, width_m: float, limit_mps: float, **extra: Any) -> int:
         """Add a lane with further attributes of :class:`Lane` and return its index."""
-        self.lanes.append(Lane(curve, width_m, limit_mps, **more))
+        self.lanes.append(Lane(curve, width_m, limit_mps, **extra))
         return len(self.lanes) - 1
 
     def change(self, lane: int, **attributes: Any) -> None:

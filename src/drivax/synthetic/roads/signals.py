@@ -55,10 +55,10 @@ class SignalPlan:
         starts = [0.0] * len(self.phases)
         programs = self._programs
         for program, lag in zip(programs, self.lags_s or (0.0,) * len(programs), strict=True):
-            at = lag
+            position = lag
             for phase in program:
-                starts[phase] = at
-                at += self.green_s[phase] + self.yellow_s + self.all_red_s
+                starts[phase] = position
+                position += self.green_s[phase] + self.yellow_s + self.all_red_s
         return tuple(starts)
 
     @property

@@ -104,24 +104,24 @@ def lane_path(
     network: RoadNetwork, lanes: tuple[int, ...], sway: Sway, change: LaneChange | None = None
 ) -> Path:
     """Build the path along consecutive lanes; with a lane change the new lane comes after the old one."""
-    pieces, spans, at = [], [], 0.0
-    for place, lane in enumerate(lanes):
-        if change is not None and place == change.section + 1:
+    pieces, spans, position = [], [], 0.0
+    for index, lane in enumerate(lanes):
+        if change is not None and index == change.section + 1:
             continue
         curve = network.lanes[lane].curve
-        if change is not None and place == change.section:
-            curve, crossing = _changed(curve, network.lanes[lanes[place + 1]].curve, change)
+        if change is not None and index == change.section:
+            curve, crossing = _changed(curve, network.lanes[lanes[index + 1]].curve, change)
             length = float(curve.arc_m[-1])
             spans += [
-                _span(network, lane, at, length, until_m=at + crossing[1]),
-                _span(network, lanes[place + 1], at, length, from_m=at + crossing[0]),
+                _span(network, lane, position, length, until_m=position + crossing[1]),
+                _span(network, lanes[index + 1], position, length, from_m=position + crossing[0]),
             ]
         else:
             length = network.lanes[lane].length_m
-            spans.append(LaneSpan(lane, at, 1.0, end_m=at + length))
+            spans.append(LaneSpan(lane, position, 1.0, end_m=position + length))
         pieces.append(curve)
-        at += length
-    return _finished(network, resample(sway.applied(join_curves(*pieces)), STEP_M), at, spans)
+        position += length
+    return _finished(network, resample(sway.applied(join_curves(*pieces)), STEP_M), position, spans)
 
 
 def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
@@ -136,8 +136,8 @@ def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float
     weight = smooth_step((arc - change.begin_m) / change.length_m)[:, None]
     xy = a.xy + weight * (b.xy - a.xy)
     rate = np.gradient(xy, axis=0)
-    turned = np.arctan2(rate[:, 1], rate[:, 0]) - a.heading
-    heading = a.heading + ((turned + math.pi) % (2 * math.pi) - math.pi)
+    relative_heading = np.arctan2(rate[:, 1], rate[:, 0]) - a.heading
+    heading = a.heading + ((relative_heading + math.pi) % (2 * math.pi) - math.pi)
     # The ends are exactly those of the lanes: a one-sided difference would bend the joint.
     whole_turns = round((a.heading[-1] - b.heading[-1]) / (2 * math.pi))
     heading[0], heading[-1] = a.heading[0], b.heading[-1] + 2 * math.pi * whole_turns
@@ -150,20 +150,20 @@ def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[Lan
     stretch = float(curve.arc_m[-1]) / length
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
     spans = [span.stretched(stretch) for span in spans]
-    at = step * np.arange(len(curve.xy))
-    lane = np.full((len(at), SLOTS), -1)
-    lane_m = np.zeros((len(at), SLOTS))
-    used = np.zeros(len(at), int)
-    limit = np.full(len(at), math.inf)
+    position = step * np.arange(len(curve.xy))
+    lane = np.full((len(position), SLOTS), -1)
+    lane_m = np.zeros((len(position), SLOTS))
+    used = np.zeros(len(position), int)
+    limit = np.full(len(position), math.inf)
     for span in spans:
         size = span.scale * network.lanes[span.lane].length_m
         # Samples beyond the last lane's end by rounding still belong to it.
-        first, last = np.searchsorted(at, [span.begin_m - 1e-6, span.begin_m + size - 1e-6])
-        samples = slice(int(first), len(at) if span is spans[-1] else int(last))
+        first, last = np.searchsorted(position, [span.begin_m - 1e-6, span.begin_m + size - 1e-6])
+        samples = slice(int(first), len(position) if span is spans[-1] else int(last))
         limit[samples] = np.minimum(limit[samples], network.lanes[span.lane].limit_mps)
-        here = at[samples]
-        inside = (here >= span.from_m) & (here <= span.until_m)
-        along = np.maximum(here - span.begin_m, 0.0) / span.scale
+        current = position[samples]
+        inside = (current >= span.from_m) & (current <= span.until_m)
+        along = np.maximum(current - span.begin_m, 0.0) / span.scale
         for shared_lane, shared in _sharing(network, span.lane, along):
             chosen = np.flatnonzero(inside & shared & (used[samples] < SLOTS))
             slot = used[samples][chosen]
@@ -226,11 +226,11 @@ class Sway:
         """Return the curve that is driven; its heading is its tangent (to first order in the deviation)."""
         if not self.amplitude_m:
             return curve
-        aside, slope = np.zeros((2, len(curve.xy)))
+        lateral, slope = np.zeros((2, len(curve.xy)))
         for amplitude, wave, phase in zip(self.amplitude_m, self.wave_per_m, self.phase, strict=True):
             angle = wave * curve.arc_m + phase
-            aside += amplitude * np.sin(angle)
+            lateral += amplitude * np.sin(angle)
             slope += amplitude * wave * np.cos(angle)
         normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
-        stretch = 1.0 - aside * np.gradient(curve.heading, np.maximum(curve.arc_m, 1e-9))
-        return Curve(curve.xy + aside[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
+        stretch = 1.0 - lateral * np.gradient(curve.heading, np.maximum(curve.arc_m, 1e-9))
+        return Curve(curve.xy + lateral[:, None] * normal, curve.heading + np.arctan2(slope, stretch))

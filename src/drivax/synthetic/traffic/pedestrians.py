@@ -60,8 +60,8 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
     for index, crossing in enumerate(network.crossings):
         for lane, along in crossing.lanes:
             curve = network.lanes[lane].curve
-            place = min(int(np.searchsorted(curve.arc_m, along)), len(curve.xy) - 1)
-            poses.append([*curve.xy[place], curve.heading[place]])
+            sample = min(int(np.searchsorted(curve.arc_m, along)), len(curve.xy) - 1)
+            poses.append([*curve.xy[sample], curve.heading[sample]])
             owner.append(index)
     pose = np.array(poses, float).reshape(-1, 3)
     axes = np.array([crossing.axis for crossing in network.crossings]).reshape(-1, 2, 2)
@@ -87,14 +87,14 @@ def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, "
         return result
     arrows = {lane for group in network.signals.groups if group.arrow for lane in group.lanes}
     for lane, along in crossing.lanes:
-        this = network.lanes[lane]
+        current = network.lanes[lane]
         entering, leaving = (), ()
-        if this.connector:
-            entering, leaving = ((lane,), ()) if along < this.length_m / 2 else ((), (lane,))
-        elif this.length_m - along < _NEAR_JUNCTION_M:
-            entering = this.successors
+        if current.connector:
+            entering, leaving = ((lane,), ()) if along < current.length_m / 2 else ((), (lane,))
+        elif current.length_m - along < _NEAR_JUNCTION_M:
+            entering = current.successors
         elif along < _NEAR_JUNCTION_M:
-            leaving = this.predecessors
+            leaving = current.predecessors
         for connector in (*entering, *leaving):
             curve = network.lanes[connector].curve
             straight = abs(float(curve.heading[-1] - curve.heading[0])) < math.radians(45.0)
@@ -141,11 +141,11 @@ class Pedestrians:
         Also return a mask of the crossings that drivers must keep free: a pedestrian is on it or, where drivers must yield,
         about to step on it.
         """
-        place = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
-        index = np.minimum(place.astype(int), self._last - 1)
+        sample = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
+        index = np.minimum(sample.astype(int), self._last - 1)
         flat, rows = self._table.reshape(-1, 3), index + self._begin
         low = flat.take(rows, axis=0)
-        pose = low + (place - index)[:, None] * (flat.take(rows + 1, axis=0) - low)
+        pose = low + (sample - index)[:, None] * (flat.take(rows + 1, axis=0) - low)
         occupied = np.zeros(len(self._conflicts.marked), bool)
         if t % _LOOK_STEPS == 0:
             self._into = _walks_into(pose, vehicles, active)
@@ -227,12 +227,12 @@ def _arrivals(
     rel = conflicts.xy[:, None] - boxes[None, :, :2]
     cos, sin = boxes[:, 2], boxes[:, 3]
     ahead = rel[..., 0] * cos + rel[..., 1] * sin
-    aside = np.abs(rel[..., 1] * cos - rel[..., 0] * sin)
+    lateral = np.abs(rel[..., 1] * cos - rel[..., 0] * sin)
     same = np.cos(conflicts.heading)[:, None] * cos + np.sin(conflicts.heading)[:, None] * sin
     same = same > math.cos(_ASIDE)
-    coming = (ahead > -1.0) & (aside < 2.0 + math.tan(_BEARING) * np.maximum(ahead, 0.0))
+    coming = (ahead > -1.0) & (lateral < 2.0 + math.tan(_BEARING) * np.maximum(ahead, 0.0))
     coming &= same & (speed > _STANDING_MPS)
-    distance = np.maximum(np.hypot(ahead, aside) - boxes[:, 4] / 2, 0.0)
+    distance = np.maximum(np.hypot(ahead, lateral) - boxes[:, 4] / 2, 0.0)
     time = np.where(coming, distance / np.maximum(speed, _STANDING_MPS), math.inf)
     braking = speed**2 / (2 * np.maximum(distance - _STOP_SHORT_M, 0.05))
     np.minimum.at(any_s, conflicts.crossing, time.min(axis=1))
@@ -293,9 +293,9 @@ def _crosser(
 ) -> Pedestrian:
     """Draw a pedestrian that comes along the sidewalk, crosses, and continues on the other side."""
     near, far = crossing.axis if rng.random() < 0.5 else crossing.axis[::-1]
-    aside = rng.uniform(-0.3, 0.3) * crossing.width_m
+    lateral = rng.uniform(-0.3, 0.3) * crossing.width_m
     ahead = (far - near) / np.hypot(*(far - near))
-    shift = aside * np.array([-ahead[1], ahead[0]])
+    shift = lateral * np.array([-ahead[1], ahead[0]])
     near, far = near + shift, far + shift
     before, after = _along_sidewalk(network, near, -ahead, rng), _along_sidewalk(network, far, ahead, rng)
     points = np.concatenate([before[::-1], [near, far], after])
@@ -313,13 +313,13 @@ def _along_sidewalk(
     best: tuple[float, Curve, int] | None = None
     for sidewalk in network.sidewalks:
         gap = np.hypot(*(sidewalk.xy - kerb).T)
-        place = int(np.argmin(gap))
-        if gap[place] < 6.0 and (best is None or gap[place] < best[0]):
-            best = float(gap[place]), sidewalk, place
+        index = int(np.argmin(gap))
+        if gap[index] < 6.0 and (best is None or gap[index] < best[0]):
+            best = float(gap[index]), sidewalk, index
     if best is None:
         return kerb + np.outer([2.0, 20.0], out)
-    _, sidewalk, place = best
-    pieces = [piece for piece in (sidewalk.xy[place:], sidewalk.xy[place::-1]) if len(piece) > 4]
+    _, sidewalk, index = best
+    pieces = [piece for piece in (sidewalk.xy[index:], sidewalk.xy[index::-1]) if len(piece) > 4]
     piece = pieces[int(rng.integers(len(pieces)))]
     return piece[1:81]
 

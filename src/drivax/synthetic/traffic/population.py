@@ -64,17 +64,17 @@ def parked_cars(
     for bay in network.bays:
         # All values are drawn for every bay, so that the share does not change other cars.
         size = _size(rng, bay.length_m)
-        along, aside = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
+        along, lateral = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
         turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
         occupied = rng.random() < share
         if occupied and size[0] < bay.length_m:
             play = (bay.length_m - size[0]) / 2
             pose = bay.pose.ahead(float(np.clip(along, -play, play)))
-            pose = replace(pose.aside(float(np.clip(aside, -0.15, 0.15))), heading=pose.heading + turn)
+            pose = replace(pose.aside(float(np.clip(lateral, -0.15, 0.15))), heading=pose.heading + turn)
             result.append(Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
     doubled, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
-    for place in rng.permutation(len(network.bays)).tolist() if doubled else ():
-        bay, size = network.bays[place], _size(rng, network.bays[place].length_m)
+    for index in rng.permutation(len(network.bays)).tolist() if doubled else ():
+        bay, size = network.bays[index], _size(rng, network.bays[index].length_m)
         if _passable(network, bay, size[1], gap_m):
             pose = _double_parked_pose(network, bay, size[1], gap_m)
             return (*result, Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
@@ -109,12 +109,12 @@ def _passable(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> b
 
 def _oncoming(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
     """Whether a lane of the other direction is adjacent."""
-    here = _pose_at(lane, along_m)
+    current = _pose_at(lane, along_m)
     for other in network.lanes:
-        gap = np.hypot(other.curve.xy[:, 0] - here.x, other.curve.xy[:, 1] - here.y)
-        place = int(np.argmin(gap))
-        apart = (lane.width_m + other.width_m) / 2 + 0.5
-        if gap[place] < apart and math.cos(other.curve.heading[place] - here.heading) < -0.9:
+        gap = np.hypot(other.curve.xy[:, 0] - current.x, other.curve.xy[:, 1] - current.y)
+        index = int(np.argmin(gap))
+        separation = (lane.width_m + other.width_m) / 2 + 0.5
+        if gap[index] < separation and math.cos(other.curve.heading[index] - current.heading) < -0.9:
             return True
     return False
 
@@ -176,20 +176,20 @@ def placed(
     for index, lane in enumerate(network.lanes):
         if lane.connector:
             continue
-        least = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
+        minimum = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
         occupied = [along for where, along in vehicles if where == index]
         occupied += [ego_along_m] if index == ego_lane else []
         mean = spacing * (_BUSY if index in network.busy or index in busy else 1.0)
-        at = rng.uniform(6.0, 6.0 + mean)
-        while at < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
-            if all(abs(at - other) > least for other in occupied):
-                vehicles.append((index, float(at)))
-                occupied.append(float(at))
-            at += least + rng.exponential(mean)
-    vehicles = [place for place in vehicles if not _blocked(network, *place, parked)]
+        position = rng.uniform(6.0, 6.0 + mean)
+        while position < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
+            if all(abs(position - other) > minimum for other in occupied):
+                vehicles.append((index, float(position)))
+                occupied.append(float(position))
+            position += minimum + rng.exponential(mean)
+    vehicles = [sample for sample in vehicles if not _blocked(network, *sample, parked)]
     vehicles = _apart_at_joints(network, vehicles, (ego_lane, ego_along_m))
-    here = network.lanes[ego_lane].curve
-    ego_xy = here.xy[np.searchsorted(here.arc_m, ego_along_m).clip(max=len(here.xy) - 1)]
+    current = network.lanes[ego_lane].curve
+    ego_xy = current.xy[np.searchsorted(current.arc_m, ego_along_m).clip(max=len(current.xy) - 1)]
     vehicles.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
     vehicles = _apart_in_space(network, vehicles, (ego_lane, ego_along_m))[: density.vehicles]
     return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
@@ -197,53 +197,53 @@ def placed(
 
 def _apart_in_space(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
     """Drop vehicles that share space with an earlier one on another lane, as where lanes fork or merge."""
-    kept: list[tuple[float, float]] = []
+    remaining: list[tuple[float, float]] = []
     result = []
-    for place in [ego, *vehicles]:
-        lane, along = network.lanes[place[0]], place[1]
-        x, y = _point(network, *place)
+    for index in [ego, *vehicles]:
+        lane, along = network.lanes[index[0]], index[1]
+        x, y = _point(network, *index)
         heading = float(np.interp(along, lane.curve.arc_m, lane.curve.heading))
         cos, sin = np.cos(heading), np.sin(heading)
         near = (
             abs((x - a) * cos + (y - b) * sin) < _APART_M and abs((y - b) * cos - (x - a) * sin) < _WIDEST_M
-            for a, b in kept
+            for a, b in remaining
         )
         if not any(near):
-            kept.append((float(x), float(y)))
-            result.append(place)
+            remaining.append((float(x), float(y)))
+            result.append(index)
     return result[1:]
 
 
 def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
     """Whether a parked car is in the lane at or close to a position."""
     curve = network.lanes[lane].curve
-    place = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
-    cos, sin = np.cos(curve.heading[place]), np.sin(curve.heading[place])
+    index = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
+    cos, sin = np.cos(curve.heading[index]), np.sin(curve.heading[index])
     for other in parked:
-        dx, dy = other.xy[0] - curve.xy[place]
-        ahead, aside = dx * cos + dy * sin, abs(dy * cos - dx * sin)
-        if -_BEHIND_M < ahead < _BEFORE_M and aside < (_WIDEST_M + other.size_m[1]) / 2:
+        dx, dy = other.xy[0] - curve.xy[index]
+        ahead, lateral = dx * cos + dy * sin, abs(dy * cos - dx * sin)
+        if -_BEHIND_M < ahead < _BEFORE_M and lateral < (_WIDEST_M + other.size_m[1]) / 2:
             return True
     return False
 
 
 def _apart_at_joints(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
     """Drop vehicles that are too close behind the first vehicle of the next lane."""
-    kept = []
+    remaining = []
     first: dict[int, float] = {}
     last: dict[int, float] = {}
     for lane, along in [*vehicles, ego]:
         first[lane], last[lane] = min(along, first.get(lane, np.inf)), max(along, last.get(lane, 0.0))
     for lane, along in vehicles:
-        this = network.lanes[lane]
-        least = 10.0 + _GAP_M + _GAP_S * this.limit_mps
-        after = min((first.get(b, np.inf) for b in this.successors), default=np.inf)
+        current = network.lanes[lane]
+        minimum = 10.0 + _GAP_M + _GAP_S * current.limit_mps
+        after = min((first.get(b, np.inf) for b in current.successors), default=np.inf)
         # Only the last vehicle of a lane can be too close to the next lane's first one. Ego always stays.
         before_ego = network.lanes[ego[0]].length_m - ego[1] + along
-        gap_to_ego = before_ego if ego[0] in this.predecessors else np.inf
-        if (along < last[lane] or this.length_m - along + after > least) and gap_to_ego > least:
-            kept.append((lane, along))
-    return kept
+        gap_to_ego = before_ego if ego[0] in current.predecessors else np.inf
+        if (along < last[lane] or current.length_m - along + after > minimum) and gap_to_ego > minimum:
+            remaining.append((lane, along))
+    return remaining
 
 
 def _point(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray, " 2"]:
@@ -259,9 +259,9 @@ def draw_drivers(
     With the first lane of each, there are no cyclists on fast roads, and only cyclists on bicycle lanes.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
-    drawn = np.searchsorted(shares, rng.random(count), side="right")
+    draw = np.searchsorted(shares, rng.random(count), side="right")
     # The types in the order of the shares; the rest are cars.
-    kind = (drawn + 1) % (len(shares) + 1)
+    kind = (draw + 1) % (len(shares) + 1)
     if lanes is not None:
         fast = np.array([lane.limit_mps > _CYCLED_MPS for lane in lanes], bool)
         kind[(kind == _CYCLIST) & fast] = _CAR

@@ -174,16 +174,16 @@ class RightOfWay:
         if state.committed >= 0:
             self._granted[0] = max(state.committed, entered[0])
         near = state.speed**2 / (2 * _ASK_MPS2) + _ASK_S * state.speed + _ASK_M
-        place = np.minimum(self._granted, connectors - 1)
+        index = np.minimum(self._granted, connectors - 1)
         # Without a connector ahead the distance is infinite.
-        distance = begin.ravel().take(place + connectors * self._rows) - state.front_m
-        requests = (distance >= 0) & (distance <= near) & state.active & (halts > place)
+        distance = begin.ravel().take(index + connectors * self._rows) - state.front_m
+        requests = (distance >= 0) & (distance <= near) & state.active & (halts > index)
         if state.committed >= 0:
             requests[0], stop[0] = False, np.inf
         self._denied &= requests
         rows = requests.nonzero()[0]
         if len(rows):
-            self._decide(state, rows, place, stop)
+            self._decide(state, rows, index, stop)
         return stop
 
     def _lights(self, state: TrafficState) -> tuple[PerVehicle, VehicleRows]:
@@ -251,9 +251,15 @@ class RightOfWay:
         for k in np.flatnonzero(all_way & np.isfinite(stood)):
             # Of vehicles that arrived simultaneously the one without another to its right goes first.
             tied = all_way & (np.abs(stood - stood[k]) < _TIE_S)
-            here = self._lanes[connectors[k]].curve.heading[0]
-            turned = np.array([wrap(self._lanes[w].curve.heading[0] - here) for w in connectors[tied]])
-            key[k] += 0.5 * _TIE_S * bool(np.any((turned > math.pi / 4) & (turned < 3 * math.pi / 4)))
+            current = self._lanes[connectors[k]].curve.heading[0]
+            relative_heading = np.array(
+                [wrap(self._lanes[w].curve.heading[0] - current) for w in connectors[tied]]
+            )
+            key[k] += (
+                0.5
+                * _TIE_S
+                * bool(np.any((relative_heading > math.pi / 4) & (relative_heading < 3 * math.pi / 4)))
+            )
         return np.lexsort((rows, key)).tolist()
 
     def _may_enter(

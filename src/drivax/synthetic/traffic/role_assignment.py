@@ -70,8 +70,8 @@ def with_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
         lane, away = ahead.pop()
         if lane not in result and away < _BACK_M:
             result.add(lane)
-            this = network.lanes[lane]
-            ahead += [(before, away + this.length_m) for before in this.predecessors]
+            current = network.lanes[lane]
+            ahead += [(before, away + current.length_m) for before in current.predecessors]
     return frozenset(result)
 
 
@@ -98,23 +98,25 @@ def assign_roles(
         critical: Ego must give way to dense traffic, if the roads allow it.
     """
     driver = expert.draw_expert(rng)
-    aimed = draw_route(network, giving_way(network) if critical else destinations, rng)
-    first_s, tries = float(times_s[0]), _ROUTES if critical and aimed is None else 0
-    lanes, path, at = _draw_route(network, driver, first_s, lane_change_share, rng, aimed, tries)
+    destination_route = draw_route(network, giving_way(network) if critical else destinations, rng)
+    first_s, tries = float(times_s[0]), _ROUTES if critical and destination_route is None else 0
+    lanes, path, position = _draw_route(
+        network, driver, first_s, lane_change_share, rng, destination_route, tries
+    )
     rivals = with_feeders(network, conflicts_on(network, path)) if critical else frozenset()
-    network = replace(network, signals=_lights(network, lanes, timing, aimed, rng))
-    here = max((span for span in path.spans if span.begin_m <= at), key=lambda span: span.begin_m)
+    network = replace(network, signals=_lights(network, lanes, timing, destination_route, rng))
+    current = max((span for span in path.spans if span.begin_m <= position), key=lambda span: span.begin_m)
     density, share = domain.density, float(rng.uniform(*domain.parked_share))
     parked = parked_cars(network, share, domain.double_share, rng, len(times_s))
-    others = placed(network, here.lane, at - here.begin_m, density, rng, parked, rivals)
-    if aimed is not None:
-        others = rearrange(others, aimed, (here.lane, at - here.begin_m), rng)
+    others = placed(network, current.lane, position - current.begin_m, density, rng, parked, rivals)
+    if destination_route is not None:
+        others = rearrange(others, destination_route, (current.lane, position - current.begin_m), rng)
     begin = [network.lanes[lane] for lane in others.lane]
     drivers = join_drivers(driver, draw_drivers(len(begin), density, rng, begin))
     paths = [path]
     for lane, cyclist in zip(others.lane, drivers.cyclist[1:], strict=True):
         paths.append(driven_path(network, random_lanes(network, lane, rng, rivals), bool(cyclist), rng))
-    distance = np.array([at, *others.along_m])
+    distance = np.array([position, *others.along_m])
     return Roles(
         network=network,
         paths=paths,
@@ -133,37 +135,37 @@ def _draw_route(
     first_s: float,
     lane_change_share: float,
     rng: np.random.Generator,
-    aimed: DestinationRoute | None,
+    destination_route: DestinationRoute | None,
     tries: int = 0,
 ) -> tuple[tuple[int, ...], Path, float]:
     """Draw ego's lanes, path and position before the warm-up; draw again, up to ``tries`` times, without conflicts."""
-    if aimed is None:
+    if destination_route is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
         lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
     else:
-        start, lanes, change = aimed.start, aimed.lanes, None
+        start, lanes, change = destination_route.start, destination_route.lanes, None
     path = expert.expert_path(network, lanes, change, rng)
     cruise = 0.9 * float(driver.speed_factor[0]) * network.lanes[start.lane].limit_mps
     first = next(span for span in path.spans if span.lane == start.lane)
-    at = max(_LEAST_M, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + first_s * cruise))
+    position = max(_LEAST_M, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + first_s * cruise))
     if tries and not conflicts_on(network, path):
-        return _draw_route(network, driver, first_s, lane_change_share, rng, aimed, tries - 1)
-    return lanes, path, at
+        return _draw_route(network, driver, first_s, lane_change_share, rng, destination_route, tries - 1)
+    return lanes, path, position
 
 
 def _lights(
     network: RoadNetwork,
     lanes: tuple[int, ...],
     timing: SignalTiming,
-    aimed: DestinationRoute | None,
+    destination_route: DestinationRoute | None,
     rng: np.random.Generator,
 ) -> SignalPlan | None:
     """Set the clock so that ego's next light is green, turns green or turns yellow when the recording begins."""
-    plan, ahead = network.signals, lanes if aimed is None else lanes[aimed.place :]
+    plan, ahead = network.signals, lanes if destination_route is None else lanes[destination_route.place :]
     lit = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
     if plan is None or not lit:
         return plan
-    if aimed is not None and aimed.alone:
+    if destination_route is not None and destination_route.alone:
         return green_on_arrival(plan, lit[0])
     phase = plan.phase_of(lit[0])
     case = int(rng.choice(3, p=timing))

@@ -217,10 +217,10 @@ class _Run:
         self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
         self._moving_users = self._vehicles = boxes_at((), 0)
         shape = (count, len(traffic.times_s))
-        speed, at, acceleration = np.zeros((3, *shape))
+        speed, position, acceleration = np.zeros((3, *shape))
         pedestrian_poses = np.zeros((len(roles.pedestrians), shape[1], 4))
         self._log = _Log(
-            np.zeros((*shape, 3)), speed, np.zeros(shape, bool), at, acceleration, pedestrian_poses
+            np.zeros((*shape, 3)), speed, np.zeros(shape, bool), position, acceleration, pedestrian_poses
         )
 
     def finish(self) -> Motion:
@@ -322,7 +322,7 @@ class _Run:
         if k >= 0:
             then = min(k + _FORESEEN, len(self._plan_at) - 1)
             committed = int(np.sum(p.connector_begin[0] < self._plan_at[then] + self._half_m[0]))
-        now = TrafficState(
+        state = TrafficState(
             tables=p,
             step=t,
             colour=self._fixed.colour[t],
@@ -336,7 +336,7 @@ class _Run:
             leader_speed=self._leads[0],
             committed=committed,
         )
-        room = self._right_of_way.lines(now) + 2.0 - _STOP_SHORT_M
+        room = self._right_of_way.lines(state) + 2.0 - _STOP_SHORT_M
         if np.count_nonzero(self._occupied_crossings):
             room = np.minimum(room, self._crossings(front) + 2.0 - _STOP_SHORT_M)
         room = np.minimum(room, p.stop_m - front - _END_M)
@@ -388,8 +388,8 @@ class _Run:
             calm[override.vehicle] &= t < override.first_step
         free = calm.copy()
         free[0] = False
-        now = Situation(self._at, self._speed, active, free, fastest, preferred)
-        changes, self._helped = self._changes.decide(now, self._tables)
+        state = Situation(self._at, self._speed, active, free, fastest, preferred)
+        changes, self._helped = self._changes.decide(state, self._tables)
         for change in changes:
             self._change(t, change)
             calm[change.vehicle] = False
@@ -403,21 +403,21 @@ class _Run:
         ahead = {span.lane for span in present.spans}
         while self._network.lanes[lanes[-1]].successors:
             after = onward(self._network, lanes)
-            kept = [lane for lane in after if lane in ahead]
+            remaining = [lane for lane in after if lane in ahead]
             # Elsewhere branches take turns: no random number is drawn here.
-            lanes.append(kept[0] if kept else after[(row + len(lanes)) % len(after)])
+            lanes.append(remaining[0] if remaining else after[(row + len(lanes)) % len(after)])
         sway = Sway((0.08,), (0.07,), (float(row),))
         target = lane_path(self._network, tuple(lanes), sway)
-        path, at = change_onto(target, present, self._at[row], change.length_m)
-        self._swap(t, row, path, at, at + change.length_m)
+        path, position = change_onto(target, present, self._at[row], change.length_m)
+        self._swap(t, row, path, position, position + change.length_m)
 
     def _pass(self, t: int, calm: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
         halted = self._moving_users.chosen(np.abs(self._moving_users.speed) < 0.05)
         stuck = np.zeros(len(self._rows), bool)
         for override in self._staging.overrides:
-            now = override.first_step <= t <= override.last_step
-            stuck[override.vehicle] |= now and self._speed[override.vehicle] < 0.05
+            state = override.first_step <= t <= override.last_step
+            stuck[override.vehicle] |= state and self._speed[override.vehicle] < 0.05
         big = halted.chosen(halted.size_m[:, 0] > 1.2)
         any_halted = bool(stuck.any()) or len(big) > 0
         standing = self._standing.boxes.joined(self._vehicles.chosen(stuck)).joined(big)
@@ -436,8 +436,8 @@ class _Run:
         """Start a detour around an obstacle ahead, if there is one."""
         others = self._vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
         moving = others.joined(self._moving_users.chosen(np.abs(self._moving_users.speed) >= 0.05))
-        at, size = float(self._at[row]), (float(2 * self._half_m[row]), float(self._width_m[row]))
-        request = detour_request(self._network, self._tables, row, (at, self._speed[row]), size)
+        position, size = float(self._at[row]), (float(2 * self._half_m[row]), float(self._width_m[row]))
+        request = detour_request(self._network, self._tables, row, (position, self._speed[row]), size)
         detour = self._fixed.detours.find(request, standing, moving)
         if detour is not None:
-            self._swap(t, row, detour[0], at, detour[1])
+            self._swap(t, row, detour[0], position, detour[1])

@@ -181,9 +181,11 @@ class Geometry:
         """Draw arms in about these directions, each centred on its lanes."""
         arms = []
         for heading, street in zip(headings, streets, strict=True):
-            at = Pose(0.0, 0.0, heading + float(rng.uniform(-self.skew, self.skew)))
+            position = Pose(0.0, 0.0, heading + float(rng.uniform(-self.skew, self.skew)))
             centred = (street.outward - street.inward) * street.width_m / 2
-            arms.append(Arm(at.aside(centred + float(rng.uniform(-self.offset_m, self.offset_m))), street))
+            arms.append(
+                Arm(position.aside(centred + float(rng.uniform(-self.offset_m, self.offset_m))), street)
+            )
         return arms
 
     def mouths(self, rng: np.random.Generator, arms: Sequence[Arm]) -> list[float]:
@@ -332,9 +334,9 @@ def finish_sites(
     ``links`` pairs the approaches at the two ends of a street, in both directions; linked sites form a tree.
     """
     first = next((0, i) for i in range(len(sites[0].approaches)) if (0, i) not in links)
-    kerbs, at = [], first
-    while not kerbs or at != first:
-        kerb, at = _kerb_between_ends(sites, links, at)
+    kerbs, position = [], first
+    while not kerbs or position != first:
+        kerb, position = _kerb_between_ends(sites, links, position)
         kerbs.append(kerb)
     draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*kerbs)))
     sidewalk_m = float(rng.uniform(*geometry.sidewalk_m))
@@ -354,14 +356,14 @@ def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: 
         return sites[place[0]].approaches[place[1]]
 
     pieces = [approach(begin).side.shifted(approach(begin).arm.street.left_m).reversed()]
-    here = begin
+    current = begin
     while True:
-        after = (here[0], (here[1] + 1) % len(sites[here[0]].approaches))
+        after = (current[0], (current[1] + 1) % len(sites[current[0]].approaches))
         side = approach(after).side.shifted(-approach(after).arm.street.right_m)
         pieces += [connect_poses(pieces[-1].end, side.start), side]
         if after not in links:
             return join_curves(*pieces), after
-        here = links[after]
+        current = links[after]
 
 
 def _paint(draft: Draft, street: CrossSection, middle: Curve) -> None:

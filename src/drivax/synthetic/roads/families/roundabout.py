@@ -162,27 +162,27 @@ class Roundabout:
         spread = plan.spread_m(middle)
         inward, outward = [], []
         for j in range(len(plan.radius_m)):
-            aside = spread + (j + 0.5) * plan.width_m
-            inward.append(draft.lane(middle.displaced(aside).reversed(), plan.width_m, plan.limit_mps))
-            outward.append(draft.lane(middle.displaced(-aside), plan.width_m, plan.limit_mps))
+            lateral = spread + (j + 0.5) * plan.width_m
+            inward.append(draft.lane(middle.displaced(lateral).reversed(), plan.width_m, plan.limit_mps))
+            outward.append(draft.lane(middle.displaced(-lateral), plan.width_m, plan.limit_mps))
         for lanes in (inward, outward):
             if len(lanes) == 2:
                 draft.link_neighbours(*lanes)
         return _Arm(heading, middle, inward, outward)
 
 
-def _join(radius: float, aside: float) -> tuple[float, float]:
+def _join(radius: float, lateral: float) -> tuple[float, float]:
     """Angle from an arm at which its lane joins the circle, and distance from the centre at which the bend begins.
 
-    The arm's lane (at a distance ``aside`` from the arm) and the circle's tangent at angle d intersect at a distance
+    The arm's lane (at a distance ``lateral`` from the arm) and the circle's tangent at angle d intersect at a distance
     ``t = (r sin d - aside) / cos d`` from the circle; a fillet with that tangent has the radius ``t / tan(45 - d/2)``.
     """
     angles = np.linspace(math.radians(24.0), math.pi / 4 - _ARC_M / radius / 2, 40)
-    tangents = (radius * np.sin(angles) - aside) / np.cos(angles)
+    tangents = (radius * np.sin(angles) - lateral) / np.cos(angles)
     wide = tangents / np.tan(math.pi / 4 - angles / 2) >= _FILLET_M
     chosen = int(np.argmax(wide)) if wide.any() else -1
     angle, tangent = float(angles[chosen]), float(tangents[chosen])
-    return angle, (radius - aside * math.sin(angle)) / math.cos(angle) + tangent
+    return angle, (radius - lateral * math.sin(angle)) / math.cos(angle) + tangent
 
 
 def _on_circle(radius: float, angle: float) -> Pose:
@@ -258,9 +258,9 @@ def _add_islands(draft: Draft, plan: _Plan, arms: list[_Arm]) -> None:
     islands = [radius * np.stack([np.cos(angles), -np.sin(angles)], axis=-1)]
     for arm in arms:
         half = plan.spread_m(arm.middle) - _KERB_M
-        here = arm.middle.piece(0, int(np.argmax(half < 0.15)) - 1)
-        half = half[: len(here.xy)]
-        islands.append(ring(here.displaced(half), here.displaced(-half).reversed()))
+        current = arm.middle.piece(0, int(np.argmax(half < 0.15)) - 1)
+        half = half[: len(current.xy)]
+        islands.append(ring(current.displaced(half), current.displaced(-half).reversed()))
     draft.edges += [Line(RoadKind.EDGE_MEDIAN, island) for island in islands]
 
 
@@ -276,12 +276,12 @@ def _paint(draft: Draft, plan: _Plan, arm: _Arm) -> None:
 def _cross(draft: Draft, plan: _Plan, arm: _Arm, marked: bool) -> None:
     """Add the crossing of an arm, a car's length before the yield line."""
     half = plan.gap_m / 2 + len(arm.inward) * plan.width_m + plan.shoulder_m
-    here = arm.middle.start
-    at = here.ahead(_CROSSING_M)
+    current = arm.middle.start
+    position = current.ahead(_CROSSING_M)
     lanes = [(lane, draft.lanes[lane].length_m - _CROSSING_M) for lane in arm.inward]
     lanes += [(lane, _CROSSING_M) for lane in arm.outward]
-    axis = points(at.aside(-half), at.aside(half))
+    axis = points(position.aside(-half), position.aside(half))
     draft.crossings.append(Crossing(axis, CROSSWALK_M, tuple(lanes), marked))
     if marked:
-        near, far = (here.ahead(_CROSSING_M + sign * CROSSWALK_M / 2) for sign in (-1.0, 1.0))
+        near, far = (current.ahead(_CROSSING_M + sign * CROSSWALK_M / 2) for sign in (-1.0, 1.0))
         draft.crosswalk(near.aside(half), far.aside(half), far.aside(-half), near.aside(-half))

@@ -111,9 +111,9 @@ class LaneDrop(StreetFamily):
         gains, left = rng.random() < self.gain_share, rng.random() < self.left_share
         if left and not both_ways and not gains:
             return (Strip(1, True, 0, where, ends=True), *strips(lanes - 1, 0, sections))
-        *rest, outer = strips(lanes, 0, sections)
+        *remainder, outer = strips(lanes, 0, sections)
         outer = replace(outer, first=where, fork=True) if gains else replace(outer, last=where, ends=True)
-        return (*rest, outer, *strips(0, int(both_ways), sections))
+        return (*remainder, outer, *strips(0, int(both_ways), sections))
 
 
 @dataclass(frozen=True)
@@ -152,8 +152,12 @@ class MidblockCrosswalk(StreetFamily):
         )
         street.build()
         street.add_sidewalks(rng)
-        at = float(rng.uniform(*self.crossing_m))
-        stations = [at, at + float(rng.uniform(*self.apart_m))] if rng.random() < self.second_share else [at]
+        position = float(rng.uniform(*self.crossing_m))
+        stations = (
+            [position, position + float(rng.uniform(*self.apart_m))]
+            if rng.random() < self.second_share
+            else [position]
+        )
         for station in stations:
             street.cross(round(station / STEP_M), marked=bool(rng.random() < self.marked_share))
         street.park(20.0, rng)
@@ -194,8 +198,8 @@ class ParkedStreet(StreetFamily):
         street.build()
         street.add_sidewalks(rng)
         if rng.random() < self.crossing_share:
-            at = round(float(rng.uniform(170.0, 250.0)) / STEP_M)
-            street.cross(at, marked=bool(rng.random() < 0.5))
+            sample = round(float(rng.uniform(170.0, 250.0)) / STEP_M)
+            street.cross(sample, marked=bool(rng.random() < 0.5))
         street.park(15.0, rng)
         return street.network(self.name)
 
@@ -272,22 +276,22 @@ class Highway(StreetFamily):
     def _extra(self, rng: np.random.Generator, lanes: int) -> Strip:
         """Draw the auxiliary lane: for entering, for leaving, or for both."""
         purpose = rng.choice(3, p=self.shares)
-        place, length = -lanes - 1, int(rng.integers(2, 4))
+        index, length = -lanes - 1, int(rng.integers(2, 4))
         if purpose == 0:
-            return Strip(place, True, 3, 3 + length, ends=True)
+            return Strip(index, True, 3, 3 + length, ends=True)
         if purpose == 1:
-            return Strip(place, True, 4, 3 + length, fork=True, exit_only=True)
-        return Strip(place, True, 3, 3 + length, exit_only=True)
+            return Strip(index, True, 4, 3 + length, fork=True, exit_only=True)
+        return Strip(index, True, 3, 3 + length, exit_only=True)
 
     def _ramp(self, rng: np.random.Generator, street: Street, extra: Strip, away: int) -> _Ramp:
         """Add a ramp at the beginning of the auxiliary lane (``away`` -1) or at its end (1)."""
         auxiliary = street.lanes[extra.place, extra.first if away < 0 else extra.last - 1]
-        at = street.cuts[extra.first if away < 0 else extra.last]
+        sample = street.cuts[extra.first if away < 0 else extra.last]
         length = self.ramp_m[0 if away < 0 else 1]
         line = street.draft.lanes[auxiliary].curve
         gore = line.start.turned() if away < 0 else line.end
         # Seen from the highway, an on-ramp bends to the left and an off-ramp to the right.
-        side = np.gradient(street.middle.heading, STEP_M)[at::away][: round(length / STEP_M) + 1] * away
+        side = np.gradient(street.middle.heading, STEP_M)[sample::away][: round(length / STEP_M) + 1] * away
         bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
         outward = from_curvature(side - away * bend, STEP_M, gore)
         curve = outward if away > 0 else outward.reversed()
@@ -306,9 +310,9 @@ def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray,
     """Curvature that rises to 1 / radius, holds, and falls, and integrates to an angle."""
     hold = max(0.0, angle * radius_m - _EASING_M)
     knots = np.cumsum([0.0, _EASING_M, hold, _EASING_M])
-    at = STEP_M * np.arange(round(length_m / STEP_M) + 1)
+    position = STEP_M * np.arange(round(length_m / STEP_M) + 1)
     peak = angle / (hold + _EASING_M)
-    return np.interp(at, knots, [0.0, peak, peak, 0.0])
+    return np.interp(position, knots, [0.0, peak, peak, 0.0])
 
 
 def _main_edge(street: Street, extra: Strip) -> Curve:
@@ -327,8 +331,8 @@ def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
     window = edge.xy[first : gore + span]
     near = first + np.argmin(np.sum((points[:, None] - window[None]) ** 2, axis=-1), axis=1)
     to = points - edge.xy[near]
-    aside = -to[:, 0] * np.sin(edge.heading[near]) + to[:, 1] * np.cos(edge.heading[near])
-    sample = int(np.argmax(aside < -0.05))
+    lateral = -to[:, 0] * np.sin(edge.heading[near]) + to[:, 1] * np.cos(edge.heading[near])
+    sample = int(np.argmax(lateral < -0.05))
     return sample, int(near[sample])
 
 
