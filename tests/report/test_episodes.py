@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.pairing import comparable, mismatch
-from drivax.evaluation.tables import difference, headline, metric_label, ordered, summarise
+from drivax.evaluation.result_tables import difference, headline_names, metric_label, sort_metrics, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.report.episodes import choose, outcome
 from drivax.report.runs import read_runs
@@ -114,8 +114,8 @@ def test_metric_labels_and_order():
     assert metric_label("max_jerk").text == "max jerk [m/s³]"
     assert metric_label("my_metric").text == "my metric" and metric_label("my_metric").better == "-"
     assert metric_label("success").heading == "success ↑" and metric_label("offroad").heading == "off-road ↓"
-    assert headline(["mine", "offroad", "success"]) == ["success", "offroad"]
-    assert ordered(["mine", "steps", "offroad", "yours", "success"]) == [
+    assert headline_names(["mine", "offroad", "success"]) == ["success", "offroad"]
+    assert sort_metrics(["mine", "steps", "offroad", "yours", "success"]) == [
         "success",
         "offroad",
         "mine",

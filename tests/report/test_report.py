@@ -14,7 +14,7 @@ import pytest
 from browser import acted, browse, needs_browser
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.tables import metric_label
+from drivax.evaluation.result_tables import metric_label
 from drivax.metrics.catalogue import METRICS
 from drivax.report.pages.report import write_report
 from drivax.report.pictures.palette import LIGHT

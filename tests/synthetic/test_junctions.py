@@ -19,7 +19,7 @@ from drivax.synthetic.roads.families.junctions import (
 from drivax.synthetic.roads.network import CLEARANCE_M, Control, map_features
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.roads.style import GRID, RING
-from drivax.synthetic.traffic.population import Density, placed
+from drivax.synthetic.traffic.placement import Density, place_vehicles
 
 from .oracles import distance_to_polyline, winding_number
 
@@ -273,7 +273,7 @@ def test_busy_lanes_have_more_vehicles():
     counts = np.zeros(len(network.lanes))
     for seed in range(30):
         density = Density(spacing_m=(60.0, 60.0), vehicles=1000, leader_share=0.0)
-        drawn = placed(network, quiet[0], 100.0, density, np.random.default_rng(seed))
+        drawn = place_vehicles(network, quiet[0], 100.0, density, np.random.default_rng(seed))
         np.add.at(counts, list(drawn.lane), 1)
     per_m = counts / np.array([lane.length_m for lane in network.lanes])
     assert per_m[list(network.busy)].mean() > 1.3 * per_m[quiet].mean()

@@ -6,7 +6,7 @@ import shapely
 
 from drivax.geometry.boxes import corners
 from drivax.scenario.recording import Tracks
-from drivax.synthetic.expert.violations import touching
+from drivax.synthetic.expert.violations import first_overlap_step
 from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, visible
 
 SENSOR = SensorConfig()
@@ -212,7 +212,10 @@ def test_noise_never_makes_a_user_overlap_a_free_ego(length, width):
     for k in range(count):
         for _ in range(30):
             middle = (near[k] + far[k]) / 2
-            touches = touching(np.stack([ego, box(middle, k)])[:, None], one, np.ones((2, 2), bool)).min() < 1
+            touches = (
+                first_overlap_step(np.stack([ego, box(middle, k)])[:, None], one, np.ones((2, 2), bool)).min()
+                < 1
+            )
             near[k], far[k] = (middle, far[k]) if touches else (near[k], middle)
     plain = tracks(count + 1, 4)
     plain.valid[:] = True

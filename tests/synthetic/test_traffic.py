@@ -12,7 +12,7 @@ from drivax.synthetic.roads.network import Crossing, Draft, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Sway, lane_path, random_lanes
-from drivax.synthetic.traffic.population import Density, draw_drivers, driven_path, placed
+from drivax.synthetic.traffic.placement import Density, draw_drivers, draw_path, place_vehicles
 from drivax.synthetic.traffic.roles import EgoPlan, Override, Pedestrian, Roles, Scripted, Staging
 from drivax.synthetic.traffic.simulation import Traffic
 
@@ -250,7 +250,7 @@ def test_repeated_runs_are_equal_and_users_keep_their_order():
     for name in ("xy", "heading", "speed", "valid", "distance_m", "acceleration", "size_m"):
         assert np.array_equal(getattr(first, name), getattr(again, name)), name
     assert not np.array_equal(first.xy[0], calm.xy[0])
-    later = first.since(20)
+    later = first.from_step(20)
     assert np.array_equal(later.xy, first.xy[:, 20:]) and later.acceleration.shape == (2, steps - 20)
 
 
@@ -261,11 +261,11 @@ def test_dense_traffic_has_no_overlaps(family, seed):
     network = family.build(rng)
     start = network.starts[int(rng.integers(len(network.starts)))]
     along = float(rng.uniform(start.low_m, start.high_m))
-    where = placed(network, start.lane, along, Density(spacing_m=(12.0, 40.0)), rng)
+    where = place_vehicles(network, start.lane, along, Density(spacing_m=(12.0, 40.0)), rng)
     first = [start.lane, *where.lane]
     table = draw_drivers(len(first), Density(), rng, [network.lanes[lane] for lane in first])
     paths = [
-        driven_path(network, random_lanes(network, lane, rng), bool(cyclist), rng)
+        draw_path(network, random_lanes(network, lane, rng), bool(cyclist), rng)
         for lane, cyclist in zip(first, table.cyclist, strict=True)
     ]
     at = np.array([along, *where.along_m])

@@ -11,12 +11,12 @@ from drivax.scenario.schema import AgentKind
 from drivax.synthetic.expert.violations import (
     against_traffic,
     find_violation,
+    first_overlap_step,
     goes_against_traffic,
     inside,
     last_stop,
     leaves_road,
     passes,
-    touching,
     user_boxes,
 )
 from drivax.synthetic.roads.families import CurvedRoad, SignalisedJunction
@@ -70,7 +70,7 @@ def test_touching_agrees_with_clipped_polygons():
     cos, sin = np.cos(heading)[..., None], np.sin(heading)[..., None]
     tested = ~np.eye(12, dtype=bool)
     tested[3, 7] = tested[7, 3] = False
-    got = touching(np.concatenate([xy, cos, sin, skinless], axis=-1), valid, tested)
+    got = first_overlap_step(np.concatenate([xy, cos, sin, skinless], axis=-1), valid, tested)
     for i in range(12):
         for j in range(i + 1, 12):
             steps = [
@@ -217,7 +217,7 @@ def test_lights_of_other_lanes_apply_off_the_route(aside_m, counts):
     beside = [
         replace(
             lane,
-            curve=lane.curve.shifted(WIDTH),
+            curve=lane.curve.parallel(WIDTH),
             successors=tuple(k + 3 for k in lane.successors),
             predecessors=tuple(k + 3 for k in lane.predecessors),
         )

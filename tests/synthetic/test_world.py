@@ -291,7 +291,7 @@ def test_critical_recording_is_a_window_of_the_traffic(monkeypatch):
         kept.setdefault("motion", result := original(traffic, *args, **more))
         return result
 
-    def chosen(network, motion, colour, steps):
+    def select(network, motion, colour, steps):
         kept["found"] = steps[critical_steps(network, motion, colour, steps)].tolist()
         return critical_steps(network, motion, colour, steps)
 

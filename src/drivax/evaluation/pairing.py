@@ -16,7 +16,7 @@ from drivax.evaluation.episode_table import NOT_SUMMARISED, EpisodeTable, Scenar
 from drivax.stats.clusters import cluster_strata, dense_labels
 
 #: Settings of an evaluation that must agree between paired episodes.
-_STARTS = ("noisy_start", "start_step")
+_START_SETTINGS = ("noisy_start", "start_step")
 #: Strata of fewer recordings are merged.
 _MIN_CLUSTERS = 10
 
@@ -43,7 +43,7 @@ class Pairs:
 
 
 def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
-    """Why the episodes of two runs cannot be paired, worded to follow their names, and what to do; None if they can.
+    """Return problem and cure if the episodes of two runs cannot be paired; None if they can.
 
     Pairs need the same scenario set, traffic and starts.
     """
@@ -54,7 +54,7 @@ def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
     if a.traffic != b.traffic:
         traffic = f"{a.traffic} and {b.traffic}"
         return f"differ in traffic ({traffic})", "evaluate both with the same --traffic"
-    for name in _STARTS:
+    for name in _START_SETTINGS:
         values = [run.settings.get(name) for run in (a, b)]
         if None not in values and values[0] != values[1]:
             return f"differ in {name} ({values[0]} and {values[1]})", "evaluate both with the same"
@@ -67,7 +67,7 @@ def comparable(a: EpisodeTable, b: EpisodeTable) -> bool:
 
 
 def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
-    """Refuse evaluations of A and B, one per training seed, whose episodes cannot be paired.
+    """Check that the evaluations of A and B, one per training seed, can be paired.
 
     Raises:
         UsageError: A run is named twice, a side holds several planners, or sets, traffic or starts differ.
@@ -90,7 +90,7 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
 
 
 def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) -> None:
-    """Refuse a metric that a comparison cannot use.
+    """Check that a comparison can use a metric.
 
     Raises:
         UsageError: An evaluation lacks it, it has no meaningful mean, or it is primary without a direction.
@@ -115,18 +115,18 @@ def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
     partial = [table.metrics.get(f"{metric}_partial", np.full(1, np.nan)) for table in tables]
     if any(not np.isnan(values).all() for values in partial):
         problem = f"every {metric} is partial: one of its inputs is undefined in these scenarios"
-        return UsageError(problem, cure="choose another primary metric, as success or accuracy")
+        return UsageError(problem, cure="choose another primary metric, for example success or accuracy")
     problem = f"{metric} is defined for A and B in no common scenario"
     return UsageError(problem, cure="choose another primary metric")
 
 
 @dataclass(frozen=True)
 class Split:
-    """Which scenario is in which arm; the scenarios of a recording are in the same one.
+    """Assignment of scenarios to two arms; all scenarios of a recording are in the same arm.
 
     Attributes:
-        first: Which scenarios are in the first arm.
-        strata: Number of the stratum of each scenario; all 0 where the split is random.
+        first: Mask of the first arm.
+        strata: Stratum of each scenario; all 0 in a random split.
     """
 
     first: Bool[np.ndarray, " n"]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.evaluation.episode_table import SHARES, EpisodeTable
-from drivax.evaluation.tables import metric_label
+from drivax.evaluation.result_tables import metric_label
 from drivax.geometry.vectors import wrap
 from drivax.metrics import comfort
 from drivax.metrics.comfort import WINDOW, savgol_matrix

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation import tables
+from drivax.evaluation import result_tables
 from drivax.evaluation.episode_table import ADDED, EpisodeTable, Tags
 from drivax.evaluation.pairing import comparable
 from drivax.files import check_output, write_text
@@ -55,25 +55,25 @@ def exported_metrics(runs: Sequence[EpisodeTable], more: Sequence[str] = ()) -> 
     Raises:
         UsageError: No run has such a column.
     """
-    names = tables.ordered(tables.metric_names(runs))
+    names = result_tables.sort_metrics(result_tables.metric_names(runs))
     requested = {"progress"}
     for entry in more:
         if entry not in SETS and entry not in names:
             raise UsageError(f"no run has a mean of {entry!r}", cure=did_you_mean(entry, names))
         requested.update(SETS.get(entry, (entry,)))
-    first = tables.headline(names)
+    first = result_tables.headline_names(names)
     rest = [name for name in names if name in requested or name not in (*METRICS, *ADDED)]
     return [*first, *(name for name in rest if name not in first)] or names
 
 
 def _tables(runs: Sequence[EpisodeTable], data: Path | None, more: Sequence[str]) -> list[Table]:
     usual, metrics = exported_metrics(runs), exported_metrics(runs, more)
-    results = [tables.results_table(runs, metrics)]
+    results = [result_tables.results_table(runs, metrics)]
     if len(runs) > 1:
         others = [run for run in runs[:-1] if comparable(runs[-1], run)]
-        results.append(tables.differences_table(runs[-1], others, metrics))
+        results.append(result_tables.differences_table(runs[-1], others, metrics))
     if any("collision_type" in run.metrics for run in runs):
-        results.append(tables.collisions_table(runs))
+        results.append(result_tables.collisions_table(runs))
     added = [name for name in metrics if name not in usual]
     results += strata_tables(runs, EvaluatedSet(runs[-1], data).tags(), added)
     return results + transfer_tables(runs)
@@ -85,12 +85,16 @@ def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, more: Sequence[str] 
     known = {name for values in tags.values() for name in values}
     names = dict.fromkeys((*KEY_METRICS, *more))
     metrics = [name for name in names if any(name in run.metrics for run in evaluated)]
-    return [tables.strata_table(evaluated, tags, tag, metrics) for tag in tables.STRATA if tag in known]
+    return [
+        result_tables.strata_table(evaluated, tags, tag, metrics)
+        for tag in result_tables.STRATA
+        if tag in known
+    ]
 
 
 def transfer_tables(runs: Sequence[EpisodeTable]) -> list[Table]:
     """Return a matrix of training and evaluation data for each metric; none where all runs share one set."""
-    if len({tables.set_key(run.data) for run in runs}) < 2:
+    if len({result_tables.set_key(run.data) for run in runs}) < 2:
         return []
-    known = [name for name in TRANSFERRED if any(tables.summarise(run, name).n for run in runs)]
-    return [tables.transfer_table(runs, name) for name in known]
+    known = [name for name in TRANSFERRED if any(result_tables.summarise(run, name).n for run in runs)]
+    return [result_tables.transfer_table(runs, name) for name in known]

@@ -11,8 +11,8 @@ from typing import Any
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
+from drivax.evaluation.result_tables import paired_differences
 from drivax.evaluation.runner import EvaluationConfig, format_summary, run_evaluation
-from drivax.evaluation.tables import paired_differences
 from drivax.files import write_json
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivax.synthetic.roads.families import FAMILIES, RoadFamily
 from drivax.synthetic.roads.style import GRID, RING, RoadStyle
-from drivax.synthetic.traffic.population import Density
+from drivax.synthetic.traffic.placement import Density
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from drivax.synthetic.roads.families import RoadFamily
 from drivax.synthetic.roads.network import RoadNetwork, feature_id, map_features
 from drivax.synthetic.roads.signals import light_states
 from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, sight
-from drivax.synthetic.traffic.population import LONGEST_M
+from drivax.synthetic.traffic.placement import LARGEST_VEHICLE_M
 from drivax.synthetic.traffic.role_assignment import SignalTiming, assign_roles, conflicts_on
 from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 from drivax.synthetic.traffic.simulation import Traffic
@@ -106,7 +106,7 @@ class WorldConfig:
         self.sensor.check()
         if self.scenarios_per_map < 1:
             raise UsageError(f"scenarios_per_map is {self.scenarios_per_map}", cure="use 1 or more")
-        if largest_shift_m(self.noise, *LONGEST_M) > EGO_SKIN_M:
+        if largest_shift_m(self.noise, *LARGEST_VEHICLE_M) > EGO_SKIN_M:
             raise UsageError(
                 f"noise.level {self.noise.level} could make a recorded vehicle touch ego that did not",
                 cure="use a smaller one",
@@ -115,7 +115,7 @@ class WorldConfig:
 
 
 @dataclass(frozen=True)
-class Generated:
+class GeneratedRecording:
     """A recording with its road family and domain, and the numbers of rejected draws by family and cause."""
 
     recording: Recording
@@ -129,7 +129,7 @@ def generate_recording(seed: int, index: int, config: WorldConfig | None = None)
     return generate_one(seed, index, config or WorldConfig()).recording
 
 
-def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
+def generate_one(seed: int, index: int, config: WorldConfig) -> GeneratedRecording:
     """Generate a recording with its family and rejected attempts.
 
     The kind of event is drawn first, so that kinds whose draws fail more often are not rarer. A rare scenario has roads
@@ -160,7 +160,7 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
             segment=f"{name}-{'r' if event else 'm'}{sample[0]:06d}.{sample[1]}",
             tags={"family": family.name, "domain": config.domain, **result.tags},
         )
-        return Generated(recording, family.name, config.domain, dict(rejected))
+        return GeneratedRecording(recording, family.name, config.domain, dict(rejected))
     causes = ", ".join(f"{cause} in {family} {n}" for (family, cause), n in sorted(rejected.items()))
     raise UsageError(
         f"no clean expert in {_ATTEMPTS} attempts for seed {seed}, index {index}: {causes}",
@@ -220,7 +220,7 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
         if critical:
             first = _critical_step(traffic, motion, rng)
         begin, tags = first or _WARM_UP, {} if first is None else {"critical": "yes"}
-        traffic, motion = traffic.until(begin + STEPS), motion.until(begin + STEPS)
+        traffic, motion = traffic.before_step(begin + STEPS), motion.before_step(begin + STEPS)
         motion, cause = expert.drive_ego(
             roles, traffic.times_s, Staging(), begin, traffic.run, unplanned=motion
         )
@@ -257,7 +257,7 @@ def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -
 
 def _recorded(roles: Roles, motion: Motion, first: int, staged: StagedEvent | None) -> Recording:
     """Return the recording from a step on, without id and segment."""
-    network, motion = roles.network, motion.since(first)
+    network, motion = roles.network, motion.from_step(first)
     times = np.arange(STEPS) * DT_S
     events, tags = (), {}
     if staged is not None:

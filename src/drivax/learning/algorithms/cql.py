@@ -29,7 +29,7 @@ class CqlConfig(OfflineConfig):
     """CQL(H), with ``imitation`` above 0 also a behaviour cloning term in the policy's loss.
 
     Attributes:
-        penalty: Weight of the conservative penalty relative to half the squared TD error; with a ``gap``, its initial value.
+        penalty: Weight of the conservative penalty relative to half the squared TD error; initial with a ``gap``.
         gap: Target penalty of a Lagrange multiplier that replaces the weight; None: constant weight.
         penalty_rate: Learning rate of the multiplier.
         actions: Number of actions that the penalty samples from each distribution: uniform, and the current policy.

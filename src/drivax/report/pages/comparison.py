@@ -11,7 +11,7 @@ from pathlib import Path
 from drivax import settings
 from drivax.evaluation.comparison import Comparison
 from drivax.evaluation.plan import MetricComparison
-from drivax.evaluation.tables import MetricLabel, metric_label
+from drivax.evaluation.result_tables import MetricLabel, metric_label
 from drivax.files import check_output, write_text
 from drivax.report.pages.page import asset, facts_html, page, section
 from drivax.table import MISSING, Cell, Column, Table, bounds, interval_cell, number, suffix

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation import tables
+from drivax.evaluation import result_tables
 from drivax.evaluation.episode_table import RATES, EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable, mismatch
 from drivax.files import check_output, write_text
@@ -89,7 +89,7 @@ def _page(runs: Sequence[EpisodeTable], trainings: Sequence[Training], packed: P
     if trainings:
         sections.append(section("Learning curves", curve_sections(trainings)))
     if runs:
-        meanings = explanations(tables.ordered(tables.metric_names(runs)), runs)
+        meanings = explanations(result_tables.sort_metrics(result_tables.metric_names(runs)), runs)
         sections.append(section("What the metrics mean", meanings))
     sections.append(_origin([*runs, *trainings]))
     title = f"{runs[-1].name}: evaluation report" if runs else "training report"
@@ -103,7 +103,7 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
     path = Path(str(policy.data.get("path", "its scenario set")))
     name, where = escape(policy.name), escape(str(policy.data.get("name") or path.name))
     for metric, words in (("success", "succeeds in"), ("accuracy", "drives without failure in")):
-        interval = tables.summarise(policy, metric)
+        interval = result_tables.summarise(policy, metric)
         if interval.mean is not None:
             share = number(interval.mean, "rate") + suffix("rate")
             return (
@@ -114,13 +114,13 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
 
 
 def _results(runs: Sequence[EpisodeTable]) -> str:
-    names = tables.metric_names(runs)
+    names = result_tables.metric_names(runs)
     first = _first(runs, names)
-    rest = [name for name in tables.ordered(names) if name not in first]
-    table = tables.planners_table(runs, first).html() if first else ""
-    more = f"<summary>{len(rest)} more metrics</summary>{tables.planners_table(runs, rest).html()}"
+    rest = [name for name in result_tables.sort_metrics(names) if name not in first]
+    table = result_tables.planners_table(runs, first).html() if first else ""
+    more = f"<summary>{len(rest)} more metrics</summary>{result_tables.planners_table(runs, rest).html()}"
     note = (
-        f"Mean, {tables.CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; "
+        f"Mean, {result_tables.CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; "
         "undefined episodes are left out. The best mean is underlined, whether or not it is clearly best. Click a "
         "mean for its episodes. Intervals: Wilson's for rates (with the effective number of episodes where some share "
         "a recording), a bootstrap over recordings otherwise."
@@ -132,7 +132,7 @@ def _results(runs: Sequence[EpisodeTable]) -> str:
 def _first(runs: Sequence[EpisodeTable], names: Sequence[str]) -> list[str]:
     """Return the metrics of the first table: the headline, after crashes where there were any."""
     crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
-    return [*(["crashed"] if crashed and "crashed" in names else []), *tables.headline(names)]
+    return [*(["crashed"] if crashed and "crashed" in names else []), *result_tables.headline_names(names)]
 
 
 def _warning(runs: Sequence[EpisodeTable]) -> str:
@@ -152,23 +152,23 @@ def _warning(runs: Sequence[EpisodeTable]) -> str:
 
 def _differences(runs: Sequence[EpisodeTable]) -> str:
     policy, others = runs[-1], runs[:-1]
-    names = _first(runs, list(policy.metrics)) or tables.ordered(list(policy.metrics))
+    names = _first(runs, list(policy.metrics)) or result_tables.sort_metrics(list(policy.metrics))
     if not others or not names:
         return ""
     note = (
         "Mean of the differences, scenario by scenario, over those where both are defined (n pairs), with a "
-        f"{tables.CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval excludes "
-        "zero; it is not widened for the number of comparisons. “All equal”: no pair differs from the next, so that a "
-        "bootstrap has no width."
+        f"{result_tables.CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval "
+        "excludes zero; it is not widened for the number of comparisons. “All equal”: no pair differs from the next, so "
+        "that a bootstrap has no width."
     )
-    table = tables.differences_table(policy, others, names).html()
+    table = result_tables.differences_table(policy, others, names).html()
     return section(f"{escape(policy.name)} against the others", table, note=note)
 
 
 def _transfer(runs: Sequence[EpisodeTable]) -> str:
     """Return the results by training and evaluation data; empty where all runs share one set."""
     parts = "".join(
-        f"<h3>{escape(tables.metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
+        f"<h3>{escape(result_tables.metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
         for table in transfer_tables(runs)
     )
     note = (
@@ -180,10 +180,10 @@ def _transfer(runs: Sequence[EpisodeTable]) -> str:
 
 def _collisions(runs: Sequence[EpisodeTable]) -> str:
     """Return the kinds of the first collision with their meanings; empty without collisions of a known kind."""
-    table = tables.collisions_table(runs)
+    table = result_tables.collisions_table(runs)
     if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
         return ""
-    kinds = tables.COLLISION_KINDS.values()
+    kinds = result_tables.COLLISION_KINDS.values()
     meanings = definitions((name, f"{meaning[:1].upper()}{meaning[1:]}.") for name, meaning in kinds)
     counted = [(run, run.metrics["collision_type"] > 0) for run in runs if "collision_type" in run.metrics]
     total = ", ".join(f"{escape(run.name)} {int(hit.sum())} of {len(run)}" for run, hit in counted)
@@ -239,7 +239,7 @@ def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
 
 def explanations(metrics: Sequence[str], runs: Sequence[EpisodeTable]) -> str:
     """Return a list that explains each known metric in one line."""
-    labels = [label for metric in metrics if (label := tables.metric_label(metric, runs)).explanation]
+    labels = [label for metric in metrics if (label := result_tables.metric_label(metric, runs)).explanation]
     return definitions((label.heading, label.explanation) for label in labels)
 
 
@@ -283,8 +283,8 @@ def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[Scena
     the error of a crash; ``tags`` holds for each tag its values and for each scenario the index of its value, which is
     ``unknown`` where it has none.
     """
-    names = tables.ordered(tables.metric_names(runs))
-    names += [name for name in tables.metric_names(runs) if name in tables.CODES]
+    names = result_tables.sort_metrics(result_tables.metric_names(runs))
+    names += [name for name in result_tables.metric_names(runs) if name in result_tables.CODES]
     keys = list(dict.fromkeys(key for run in runs for key in run.scenarios))
     place = {key: number for number, key in enumerate(keys)}
     return data_element(
@@ -301,7 +301,7 @@ def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[Scena
 
 
 def _metric(name: str, runs: Sequence[EpisodeTable]) -> dict[str, Any]:
-    label = tables.metric_label(name, runs)
+    label = result_tables.metric_label(name, runs)
     bad = {"high": 0, "low": 1, "-": None}[label.better] if name in RATES else None
     return {"name": name, "label": label.text, "better": label.better, "unit": label.unit, "bad": bad}
 
@@ -341,7 +341,7 @@ def _rounded(value: float) -> float:
 def _tags(tagged: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     columns = []
     for name in dict.fromkeys(name for tags in tagged for name in tags):
-        values = [tags.get(name, tables.UNKNOWN) for tags in tagged]
+        values = [tags.get(name, result_tables.UNKNOWN) for tags in tagged]
         distinct = sorted(set(values))
         if 1 < len(distinct) <= MOST_VALUES:
             number = {value: place for place, value in enumerate(distinct)}

@@ -51,8 +51,8 @@ def required_deceleration(
     some = (time_s > 0) & (speed_mps * time_s > room_m)
     room, time = room_m[some], time_s[some]
     rolling = 2 * (speed_mps * time - room) / time**2
-    remainder = speed_mps**2 / (2 * room)
-    return float(np.max(np.where(room >= speed_mps * time / 2, rolling, remainder), initial=0.0))
+    stopping = speed_mps**2 / (2 * room)
+    return float(np.max(np.where(room >= speed_mps * time / 2, rolling, stopping), initial=0.0))
 
 
 def waiting_room(speed_mps: float, deceleration_mps2: float, time_s: float) -> float:
@@ -75,7 +75,7 @@ def actor_boxes(actor: Scripted) -> Float64[np.ndarray, "time 6"]:
     return boxes(actor.xy, actor.heading, actor.size_m[:2])
 
 
-def first_blocked(view: EgoView, adversary: Scripted, step: int) -> Float64[np.ndarray, " time"]:
+def first_blocked_station(view: EgoView, adversary: Scripted, step: int) -> Float64[np.ndarray, " time"]:
     """First station ahead at which ego would touch the actor, for each step from ``step`` on, m (infinite: none)."""
     track, last = view.track, view.last_step
     box = actor_boxes(adversary)[step : last + 1]
@@ -94,7 +94,7 @@ def first_blocked(view: EgoView, adversary: Scripted, step: int) -> Float64[np.n
 
 def severity(view: EgoView, adversary: Scripted, step: int) -> float:
     """Constant deceleration from a step on with which ego just avoids the actor, m/s2."""
-    room = first_blocked(view, adversary, step) - view.track.at[step]
+    room = first_blocked_station(view, adversary, step) - view.track.at[step]
     return required_by_samples(float(view.motion.speed[0, step]), room)
 
 
@@ -173,11 +173,11 @@ def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
     rows, moves = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
     moves = moves[moves <= last]
     gap = np.sum((motion.xy[rows][:, moves] - extra.xy[moves]) ** 2, axis=-1)
-    relative_heading = motion.heading[rows][:, moves]
-    crosses = np.abs(np.cos(relative_heading - extra.heading[moves])) < 0.7
+    headings = motion.heading[rows][:, moves]
+    crosses = np.abs(np.cos(headings - extra.heading[moves])) < 0.7
     row, step = np.nonzero(motion.valid[rows][:, moves] & crosses & (gap < _NEAR_M**2))
     size = motion.size_m[rows[row], :2] + _CROSSED_M
-    other = boxes(motion.xy[rows[row], moves[step]], relative_heading[row, step], size)
+    other = boxes(motion.xy[rows[row], moves[step]], headings[row, step], size)
     hit = overlap(actor_boxes(extra)[moves[step]], other)
     return tuple(np.unique(rows[row[hit]]).tolist())
 
@@ -208,8 +208,8 @@ def enter_when_clear(view: EgoView, extra: Scripted, until: int, removed: tuple[
     if appears >= last or not extra.valid[appears]:
         return None
     seen = appears > view.first_step and np.hypot(*(extra.xy[appears] - motion.xy[0, appears])) < _VIEW_M
-    state = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
-    if seen or not _is_clear(*state):
+    scene = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
+    if seen or not _is_clear(*scene):
         return None
     return replace(extra, valid=extra.valid & (np.arange(len(extra.valid)) >= appears))
 

@@ -9,7 +9,7 @@ import numpy as np
 from drivax.synthetic.events.adversary import (
     comes_close,
     enter_when_clear,
-    first_blocked,
+    first_blocked_station,
     severity,
     vehicles_that_cross,
 )
@@ -96,7 +96,7 @@ def _check(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
     low, high = SEVERITY_MPS2
     if not low <= required <= high or abs(required - proposal.severity_mps2) > _NEAR_MPS2:
         return None
-    blocked = np.isfinite(first_blocked(view, adversary, begin))
+    blocked = np.isfinite(first_blocked_station(view, adversary, begin))
     entered = begin + int(np.argmax(blocked))
     if (
         not blocked.any()

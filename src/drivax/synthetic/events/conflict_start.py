@@ -57,7 +57,7 @@ def critical_steps(
 
     The driver takes over from row 0 of the motion ``CURRENT_STEP`` later.
     """
-    path, motion = motion.paths[0], motion.every(_STRIDE)
+    path, motion = motion.paths[0], motion.every_nth(_STRIDE)
     others, colour, size_m = _project_others(path, motion), colour[::_STRIDE], motion.size_m[0, :2]
     step = (np.asarray(steps) + CURRENT_STEP) // _STRIDE
     position, speed = motion.distance_m[0, step], motion.speed[0, step]

@@ -11,7 +11,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.actors import CAR_M, Times, along_curve
 from drivax.synthetic.events.adversary import (
     comes_close,
-    first_blocked,
+    first_blocked_station,
     required_by_samples,
     vehicles_in_lane,
 )
@@ -75,13 +75,13 @@ def _chain(
 ) -> list[int]:
     """Draw successive lanes before (-1) or after (1) a lane up to a total length."""
     result: list[int] = []
-    total, position = 0.0, first
+    total, lane = 0.0, first
     while total < length_m and (
-        links := lanes[position].successors if direction > 0 else lanes[position].predecessors
+        links := lanes[lane].successors if direction > 0 else lanes[lane].predecessors
     ):
-        position = int(rng.choice(links))
-        result.append(position)
-        total += lanes[position].length_m
+        lane = int(rng.choice(links))
+        result.append(lane)
+        total += lanes[lane].length_m
     return result
 
 
@@ -128,7 +128,7 @@ class CrossTraffic(EventScript):
         if scheduled is None:
             return None
         entry, adversary, required = scheduled
-        leaves = int(np.argmax(~np.isfinite(first_blocked(view, adversary, entry))[8:])) + 8 + entry
+        leaves = int(np.argmax(~np.isfinite(first_blocked_station(view, adversary, entry))[8:])) + 8 + entry
         # A queue at its light would block the actor.
         removed = vehicles_in_lane(view, adversary, entry + 5)
         last = min(max(leaves, entry + 10), view.last_step)
@@ -168,7 +168,7 @@ class CrossTraffic(EventScript):
         if first > last:
             return None
         # The blocked stations are the same for all entry steps, shifted in time.
-        blocked = first_blocked(view, entering(first), first - decides)
+        blocked = first_blocked_station(view, entering(first), first - decides)
         requires = np.zeros(last + 1)
         for entry in range(first, last + 1):
             begin = entry - decides + NOTICED

@@ -10,8 +10,8 @@ import numpy as np
 from drivax.scenario.schema import RoadKind
 from drivax.synthetic.roads.network import Control, RoadNetwork, Start
 from drivax.synthetic.roads.signals import SignalPlan
-from drivax.synthetic.traffic.paths import onward
-from drivax.synthetic.traffic.population import Placement
+from drivax.synthetic.traffic.paths import next_lanes
+from drivax.synthetic.traffic.placement import Placement
 
 #: Free speed of ego as a share of the limit.
 _PACE = 0.88
@@ -106,7 +106,7 @@ def route_past(
         room += network.lanes[lanes[0]].length_m
     index = len(lanes) - 1
     while network.lanes[lanes[-1]].successors:
-        following = onward(network, lanes)
+        following = next_lanes(network, lanes)
         if not following:
             return None
         lanes.append(int(rng.choice(following)))

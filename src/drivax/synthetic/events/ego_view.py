@@ -71,24 +71,24 @@ def ego_track(motion: Motion) -> Track:
     arc = Curve(xy, heading).arc_m
     moved = np.concatenate([[True], np.diff(arc) > 1e-3])
     # Rounding must not move an ego at rest.
-    points, relative_heading, along = xy[moved], heading[moved], arc[moved]
+    points, headings, along = xy[moved], heading[moved], arc[moved]
     if motion.paths:
         curve = motion.paths[0].curve
         index = int(np.argmin(np.hypot(*(curve.xy - xy[-1]).T))) + 2
         remainder, turn = curve.xy[index:], curve.heading[index:]
         gaps = np.hypot(*np.diff(np.concatenate([points[-1:], remainder]), axis=0).T)
         points = np.concatenate([points, remainder])
-        shift = 2 * math.pi * np.round((relative_heading[-1] - turn[:1]) / (2 * math.pi))
-        relative_heading = np.concatenate([relative_heading, turn + shift])
+        shift = 2 * math.pi * np.round((headings[-1] - turn[:1]) / (2 * math.pi))
+        headings = np.concatenate([headings, turn + shift])
         along = np.concatenate([along, along[-1] + np.cumsum(gaps)])
-    out = np.array([np.cos(relative_heading[-1]), np.sin(relative_heading[-1])])
+    out = np.array([np.cos(headings[-1]), np.sin(headings[-1])])
     points = np.concatenate([points, [points[-1] + 300.0 * out]])
-    relative_heading, along = (
-        np.append(relative_heading, relative_heading[-1]),
+    headings, along = (
+        np.append(headings, headings[-1]),
         np.append(along, along[-1] + 300.0),
     )
     station = np.arange(0.0, arc[-1] + _BEYOND_M, STEP_M)
-    return Track(interpolate(station, along, points), np.interp(station, along, relative_heading), arc)
+    return Track(interpolate(station, along, points), np.interp(station, along, headings), arc)
 
 
 @dataclass(frozen=True)
@@ -142,9 +142,9 @@ class EgoView:
     def lane_at(self, station: float) -> int:
         """Lane of ego at a station (-1: none), the route's where several coincide."""
         xy, heading = self.track.place(station)
-        points, relative_heading, lane = self._lane_points
+        points, headings, lane = self._lane_points
         gap = np.hypot(*(points - xy).T)
-        near = (gap < 2.0) & (np.cos(relative_heading - heading) > 0.8)
+        near = (gap < 2.0) & (np.cos(headings - heading) > 0.8)
         if not near.any():
             return -1
         on_route = near & np.isin(lane, self.roles.route)

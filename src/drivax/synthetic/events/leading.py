@@ -88,7 +88,9 @@ class LeadBrakes(EventScript):
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
         """See :class:`EventScript`: fast roads only."""
         places = open_road(network, _LEAST_MPS)
-        return tuple(replace(index, followed=True) for index in places) if self.tailgater else places
+        return (
+            tuple(replace(destination, followed=True) for destination in places) if self.tailgater else places
+        )
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
@@ -170,8 +172,8 @@ def _propose_leader(
     times = DT_S * (np.arange(view.steps) - step)
     gone, _ = speed_change(lead, 0.0, draw[0], times)
     last = view.last_step if drives_on is None else step + _stands_until(speed, draw[1])
-    onward, _ = speed_change(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
-    station = np.where(times < 0, cruising, cruising[step] + gone + onward)
+    next_lanes, _ = speed_change(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
+    station = np.where(times < 0, cruising, cruising[step] + gone + next_lanes)
     if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
         return None
     valid, left = np.arange(view.steps) >= appears, np.zeros(view.steps)
@@ -271,11 +273,11 @@ class CutIn(EventScript):
         """Lateral offset of the actor's lane, and the steps at which it exists next to ego's; None without one."""
         lanes, lane, reach = view.roles.network.lanes, -1, finish
         low = max(0.0, float(station.min()))
-        for index in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():
-            neighbour = view.neighbour(index, side)
+        for candidate in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():
+            neighbour = view.neighbour(candidate, side)
             if neighbour < 0:
                 break
-            reach = index
+            reach = candidate
             lane = neighbour if lane < 0 else lane
         if lane < 0 or reach > start - _EVERY_M:
             return None

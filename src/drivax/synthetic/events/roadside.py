@@ -161,7 +161,7 @@ class LaneBlocked(EventScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
-        pace, remainder = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
+        pace, deviation = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
         out = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
@@ -170,7 +170,7 @@ class LaneBlocked(EventScript):
         half = (view.ego_size_m[1] + _OBJECT_M[1]) / 2
         if not offset < 9.0 or not view.plain_road(station):
             return None
-        profile = _entry(view, step, offset - remainder, pace, (_ROLLING_MPS2, 3.0))
+        profile = _entry(view, step, offset - deviation, pace, (_ROLLING_MPS2, 3.0))
         if profile is None or travel_s(offset - half, pace, _ROLLING_MPS2) > arrival_s - 0.05:
             return None
         left = side * (offset - profile[0])

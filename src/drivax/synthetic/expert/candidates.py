@@ -13,9 +13,9 @@ from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import Curve, Pose
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
-from drivax.synthetic.traffic.lateral import located, quintic_step
+from drivax.synthetic.traffic.lateral import project_on_path, quintic_step
 from drivax.synthetic.traffic.path_arrays import speed_profile
-from drivax.synthetic.traffic.paths import Path, interpolated, smoothed_curvature
+from drivax.synthetic.traffic.paths import Path, interpolate_curve, mean_curvature
 from drivax.synthetic.traffic.roles import Drivers
 
 #: Distance between the samples of a candidate, m.
@@ -77,7 +77,7 @@ class CandidatePath:
     ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
         """Position and heading at distances from ego."""
         arc = SPACING_M * np.arange(len(self.xy))
-        curve = interpolated(Curve(self.xy, self.heading), arc, at_m)
+        curve = interpolate_curve(Curve(self.xy, self.heading), arc, at_m)
         return curve.xy, curve.heading
 
 
@@ -88,10 +88,10 @@ def shifted_path(
 
     ``span_m`` is the approximate position of ego on the path, and the reach of the result, m.
     """
-    begin, left, direction = located(path, np.array([pose.x, pose.y]), span_m[0])
+    begin, left, direction = project_on_path(path, np.array([pose.x, pose.y]), span_m[0])
     ahead = np.arange(0.0, min(span_m[1], path.length_m - begin - 1e-6), SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
-    base = interpolated(path.curve, grid, begin + ahead)
+    base = interpolate_curve(path.curve, grid, begin + ahead)
     lateral = quintic_step(ahead, (0.0, left, math.tan(wrap(pose.heading - direction))), _RETURN_M)
     there, back = shift.there_m - shift.begin_m, shift.end_m - shift.back_m
     lateral += shift.aside_m * quintic_step(ahead, (shift.back_m, 1.0, 0.0), back)
@@ -103,7 +103,11 @@ def shifted_path(
     arc = curve.arc_m
     position = np.arange(0.0, float(arc[-1]), SPACING_M)
     return _with_speeds(
-        path, drivers, interpolated(curve, arc, position), (begin, np.interp(position, arc, ahead)), shift
+        path,
+        drivers,
+        interpolate_curve(curve, arc, position),
+        (begin, np.interp(position, arc, ahead)),
+        shift,
     )
 
 
@@ -111,7 +115,7 @@ def _with_speeds(
     path: Path, drivers: Drivers, curve: Curve, base_m: tuple[float, _Points], shift: Shift
 ) -> CandidatePath:
     """Add the speeds; ``base_m`` is ego's position and the samples' distances along the path."""
-    curvature = smoothed_curvature(curve, SPACING_M)
+    curvature = mean_curvature(curve, SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
     limit = np.interp(base_m[0] + base_m[1], grid, path.limit_mps)
     none = np.full((len(limit), 1), -1)
@@ -273,8 +277,8 @@ def arrivals(
             if span.lane in watched:
                 position, half = distance_m[vehicle], half_m[vehicle]
                 end = span.begin_m + span.scale * network.lanes[span.lane].length_m
-                current = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
+                on_lane = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
                 early = round(_YIELD_S / 0.1)
-                coming = np.convolve(current[::-1], np.ones(early + 1), mode="full")[: len(current)][::-1] > 0
-                result[span.lane] = result.get(span.lane, np.zeros(len(current), bool)) | coming
+                coming = np.convolve(on_lane[::-1], np.ones(early + 1), mode="full")[: len(on_lane)][::-1] > 0
+                result[span.lane] = result.get(span.lane, np.zeros(len(on_lane), bool)) | coming
     return result

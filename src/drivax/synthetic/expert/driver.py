@@ -74,7 +74,7 @@ def expert_path(
     network: RoadNetwork, lanes: tuple[int, ...], change: LaneChange | None, rng: np.random.Generator
 ) -> Path:
     """Return ego's path, close to the centres of its lanes."""
-    return lane_path(network, lanes, Sway.drawn(rng, 0.12), change)
+    return lane_path(network, lanes, Sway.draw(rng, 0.12), change)
 
 
 def drive_ego(

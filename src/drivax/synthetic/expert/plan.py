@@ -22,11 +22,11 @@ from drivax.synthetic.expert.candidates import (
     shifted_path,
     stop_lines,
 )
-from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smoothed
+from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smooth_speeds
 from drivax.synthetic.expert.speed_search import TOUCH, Occupancy, SpeedPlan, search
 from drivax.synthetic.expert.violations import against_traffic, inside, user_boxes
 from drivax.synthetic.roads.curves import Pose
-from drivax.synthetic.traffic.lateral import located
+from drivax.synthetic.traffic.lateral import project_on_path
 from drivax.synthetic.traffic.paths import Path
 from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 
@@ -124,7 +124,7 @@ def _state(
     x, y = motion.xy[0, first_step]
     pose = Pose(float(x), float(y), float(motion.heading[0, first_step]))
     paths = motion.paths or roles.paths
-    from_m = located(paths[0], motion.xy[0, first_step], float(motion.distance_m[0, first_step]))[0]
+    from_m = project_on_path(paths[0], motion.xy[0, first_step], float(motion.distance_m[0, first_step]))[0]
     boxes, valid = _continued(motion, first_step)
     rows = np.arange(1, len(motion.kind))
     state = _State(
@@ -259,7 +259,7 @@ def _smooth(state: _State, option: _Option) -> SpeedProfile:
     drive = None
     for acceleration, jerk in _BOUNDS:
         bounds = Bounds(low, np.maximum(high, low), top, acceleration, jerk)
-        drive = smoothed(position, speed, state.acceleration, bounds)
+        drive = smooth_speeds(position, speed, state.acceleration, bounds)
         if drive.excess <= _TOLERANCE:
             break
     assert drive is not None

@@ -75,7 +75,7 @@ def _times(rows: _Matrix, values: _Knots) -> _Rows:
     return np.einsum("ij,j->i", rows, values)
 
 
-def smoothed(at_m: _Series, speed: _Series, acceleration_mps2: float, bounds: Bounds) -> SpeedProfile:
+def smooth_speeds(at_m: _Series, speed: _Series, acceleration_mps2: float, bounds: Bounds) -> SpeedProfile:
     """Return the smoothest speed profile near a coarse plan (distances from 0, speeds; the first speed is kept).
 
     ``acceleration_mps2`` is the acceleration just before the first step.

@@ -80,7 +80,7 @@ def find_violation(
     if not motion.valid[0, window].all():
         return Violation("ego_leaves_map")
     box = user_boxes(motion)[:, window]
-    pairs = touching(box, motion.valid[:, window], _tested(motion))
+    pairs = first_overlap_step(box, motion.valid[:, window], _tested(motion))
     touched = np.flatnonzero(pairs[0] < box.shape[1])
     if len(touched):
         return Violation("ego_collides", tuple(touched.tolist()), first_step + int(pairs[0].min()))
@@ -109,7 +109,7 @@ def _tested(motion: Motion) -> _UserPairs:
     return (moves[:, None] | moves) & ~(is_pedestrian[:, None] & is_pedestrian)
 
 
-def touching(
+def first_overlap_step(
     box: Float64[np.ndarray, "user time 6"], valid: Bool[np.ndarray, "user time"], tested: _UserPairs
 ) -> Int64[np.ndarray, "user user"]:
     """Return the step at which tested pairs first overlap (the number of steps: never); ego has a margin of 10 cm."""
@@ -117,10 +117,10 @@ def touching(
     box[0, :, 4:] += 2 * EGO_SKIN_M
     reach = np.hypot(box[:, 0, 4], box[:, 0, 5]) / 2
     # Broad phase: bounding rectangles of the trajectories.
-    position = np.where(valid[..., None], box[..., :2], np.nan)
+    xy = np.where(valid[..., None], box[..., :2], np.nan)
     with np.errstate(all="ignore"):
-        low = np.where(valid[..., None], position, np.inf).min(axis=1) - reach[:, None]
-        high = np.where(valid[..., None], position, -np.inf).max(axis=1) + reach[:, None]
+        low = np.where(valid[..., None], xy, np.inf).min(axis=1) - reach[:, None]
+        high = np.where(valid[..., None], xy, -np.inf).max(axis=1) + reach[:, None]
     meet = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=-1)
     first, second = np.nonzero(np.triu(tested & meet, 1))
     gap = np.sum((box[first, :, :2] - box[second, :, :2]) ** 2, axis=-1)
@@ -245,13 +245,13 @@ def against_traffic(
 
     Where lanes cross, a lane that is hardly further away and not against the heading decides.
     """
-    position = np.concatenate([lane.curve.xy[::2] for lane in network.lanes])
+    points = np.concatenate([lane.curve.xy[::2] for lane in network.lanes])
     course = np.concatenate([lane.curve.heading[::2] for lane in network.lanes])
-    near = ((position >= xy.min(axis=0) - 6.0) & (position <= xy.max(axis=0) + 6.0)).all(axis=1)
-    position, course = position[near], course[near]
-    if not len(position):
+    near = ((points >= xy.min(axis=0) - 6.0) & (points <= xy.max(axis=0) + 6.0)).all(axis=1)
+    points, course = points[near], course[near]
+    if not len(points):
         return np.zeros(len(xy), bool)
-    gap = np.hypot(xy[:, None, 0] - position[:, 0], xy[:, None, 1] - position[:, 1])
+    gap = np.hypot(xy[:, None, 0] - points[:, 0], xy[:, None, 1] - points[:, 1])
     against = np.cos(heading[:, None] - course) < math.cos(math.radians(135.0))
     opposed = np.where(against, gap, np.inf).min(axis=1)
     return opposed < np.where(against, np.inf, gap).min(axis=1) - _DOUBT_M

@@ -135,7 +135,7 @@ class RoadNetwork:
     @cached_property
     def conflicts(self) -> Bool[np.ndarray, "lane lane"]:
         """Pairs of connectors that come closer than ``CLEARANCE_M`` and begin at different lanes."""
-        return conflicting(self.lanes)
+        return conflict_matrix(self.lanes)
 
     @cached_property
     def shared_m(self) -> dict[tuple[int, int], float]:
@@ -144,7 +144,7 @@ class RoadNetwork:
         return {(a, b): _shared_length(self.lanes[a].curve, self.lanes[b].curve) for a, b in pairs}
 
 
-def conflicting(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
+def conflict_matrix(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
     """See :attr:`RoadNetwork.conflicts`."""
     result = np.zeros((len(lanes), len(lanes)), bool)
     connectors = [i for i, lane in enumerate(lanes) if lane.connector]

@@ -13,7 +13,7 @@ from drivax.synthetic.roads.curves import STEP_M, Curve
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.obstacles import Boxes, Extents, extents
 from drivax.synthetic.traffic.path_arrays import PathTables
-from drivax.synthetic.traffic.paths import SLOTS, LaneSpan, Path, interpolated, smoothed_curvature
+from drivax.synthetic.traffic.paths import SLOTS, LaneSpan, Path, interpolate_curve, mean_curvature
 
 #: Distance at which drivers begin to look for a detour around an obstacle, m.
 LOOK_M = 45.0
@@ -34,7 +34,9 @@ _Samples = Float64[np.ndarray, " point"]
 _Point = Float64[np.ndarray, " 2"]
 
 
-def displaced(path: Path, aside_m: _Samples, occupied: tuple[LaneSpan, ...] = ()) -> tuple[Path, _Samples]:
+def displace_path(
+    path: Path, aside_m: _Samples, occupied: tuple[LaneSpan, ...] = ()
+) -> tuple[Path, _Samples]:
     """Displace a path to the left by a smooth offset at each sample.
 
     ``occupied`` are further lanes that the vehicle occupies, in positions of the old path. Returns the new path, and
@@ -55,9 +57,9 @@ def displaced(path: Path, aside_m: _Samples, occupied: tuple[LaneSpan, ...] = ()
     lane_m = path.lane_m[index] + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
     for span in occupied:
         _occupy(span, source, lane, lane_m)
-    moved, step = interpolated(moved_curve, new, position), float(new[-1]) / (count - 1)
+    moved, step = interpolate_curve(moved_curve, new, position), float(new[-1]) / (count - 1)
     spans = _moved_spans(path, occupied, old, new)
-    curvature = smoothed_curvature(moved, step)
+    curvature = mean_curvature(moved, step)
     return Path(moved, step, curvature, path.limit_mps[index], spans, lane, lane_m), new
 
 
@@ -112,7 +114,7 @@ def quintic_step(at: _Samples, begin: tuple[float, float, float], length_m: floa
     return np.where(at < start_m, offset + slope * before, offset * value + rate * tangent)
 
 
-def located(path: Path, xy: _Point, near_m: float | None = None) -> tuple[float, float, float]:
+def project_on_path(path: Path, xy: _Point, near_m: float | None = None) -> tuple[float, float, float]:
     """Project a point onto a path, if given only within 30 m of a position.
 
     Returns:
@@ -134,7 +136,7 @@ def followed(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np.ndarra
     """Positions along a path of a moving point, m."""
     result, near = np.zeros(len(xy)), None
     for k, point in enumerate(xy):
-        near = located(path, point, near)[0]
+        near = project_on_path(path, point, near)[0]
         result[k] = near
     return result
 
@@ -148,7 +150,7 @@ def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tu
     index, share = int(sample), sample - int(sample)
     xy = present.curve.xy[index] * (1 - share) + present.curve.xy[index + 1] * share
     heading = float(present.curve.heading[index] * (1 - share) + present.curve.heading[index + 1] * share)
-    along, lateral, direction = located(target, xy)
+    along, lateral, direction = project_on_path(target, xy)
     relative_heading = float(np.clip(wrap(heading - direction), -0.6, 0.6))
     old = target.step_m * np.arange(len(target.curve.xy))
     offset = quintic_step(old, (along, lateral, math.tan(relative_heading)), length_m)
@@ -161,7 +163,7 @@ def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tu
         for s in present.spans
         if s.lane not in own and s.end_m > at_m - 3.0 and s.begin_m < at_m + length_m and s.until_m > at_m
     )
-    path, new = displaced(target, offset, occupied)
+    path, new = displace_path(target, offset, occupied)
     return path, float(np.interp(along, old, new))
 
 
@@ -175,7 +177,7 @@ def around(
     old = path.step_m * np.arange(len(path.curve.xy))
     out = 1.0 - quintic_step(old, (at_m[0], 1.0, 0.0), at_m[1] - at_m[0])
     back = quintic_step(old, (at_m[2], 1.0, 0.0), at_m[3] - at_m[2])
-    return displaced(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUDES_M else ())[0]
+    return displace_path(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUDES_M else ())[0]
 
 
 @dataclass(frozen=True)
@@ -296,6 +298,6 @@ def _extents(
     """Extents along the path of the boxes within a radius of a position on it, and these boxes."""
     path = request.path
     centre = path.curve.xy[min(int(max(at_m, 0.0) / path.step_m), len(path.curve.xy) - 1)]
-    near = boxes.chosen(np.sum((boxes.xy - centre) ** 2, axis=1) < radius_m**2)
+    near = boxes.select(np.sum((boxes.xy - centre) ** 2, axis=1) < radius_m**2)
     seen, which = extents(path, near, within_m)
-    return seen, near.chosen(which)
+    return seen, near.select(which)

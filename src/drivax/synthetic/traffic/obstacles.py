@@ -50,11 +50,11 @@ class Boxes:
         """Cosine and sine of the headings."""
         return np.cos(self.heading), np.sin(self.heading)
 
-    def chosen(self, which: np.ndarray) -> Boxes:
+    def select(self, which: np.ndarray) -> Boxes:
         """Return the boxes of some rows."""
         return Boxes(self.xy[which], self.heading[which], self.speed[which], self.size_m[which])
 
-    def joined(self, other: Boxes) -> Boxes:
+    def concatenate(self, other: Boxes) -> Boxes:
         """Return these boxes and others."""
         if not len(other):
             return self
@@ -80,12 +80,12 @@ def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, 
     near, rough = np.zeros(0, int), np.zeros(0, int)
     for first in range(0, len(inside), _BATCH):
         batch = inside[first : first + _BATCH]
-        gap = _squared(boxes.xy[batch, None], coarse)
+        gap = _squared_distance(boxes.xy[batch, None], coarse)
         best = gap.argmin(axis=1)
         close = gap[np.arange(len(batch)), best] < within_m**2
         near, rough = np.append(near, batch[close]), np.append(rough, 8 * best[close])
     window = np.clip(rough[:, None] + np.arange(-8, 9), 0, len(path.curve.xy) - 1)
-    fine = _squared(boxes.xy[near, None], path.curve.xy[window])
+    fine = _squared_distance(boxes.xy[near, None], path.curve.xy[window])
     index = window[np.arange(len(near)), fine.argmin(axis=1)]
     position, lateral, relative_heading = _relative(
         boxes, near, path.curve.xy[index], path.curve.heading[index]
@@ -95,7 +95,7 @@ def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, 
     return Extents(position - length, position + length, lateral - width, lateral + width), near
 
 
-def _squared(
+def _squared_distance(
     a: Float64[np.ndarray, "*#batch 2"], b: Float64[np.ndarray, "*#batch 2"]
 ) -> Float64[np.ndarray, "..."]:
     """Squared distances."""
@@ -121,7 +121,7 @@ def _reach(size_m: Float64[np.ndarray, "k 2"], relative_heading: _Values) -> tup
     return cos * size_m[:, 0] + sin * size_m[:, 1], sin * size_m[:, 0] + cos * size_m[:, 1]
 
 
-class Standing:
+class StaticObstacles:
     """Static obstacles, in the coordinates of every vehicle's path."""
 
     def __init__(self, boxes: Boxes, tables: PathTables, width_m: PerVehicle) -> None:
@@ -162,9 +162,9 @@ def nearest_obstacles(
     tables: PathTables, vehicles: Boxes, at_m: PerVehicle, active: VehicleMask, others: Boxes
 ) -> tuple[PerVehicle, PerVehicle]:
     """Gap from each front bumper to the nearest obstacle in the corridor of the own path, and its speed along it."""
-    count, users = len(vehicles), vehicles.joined(others)
+    count, users = len(vehicles), vehicles.concatenate(others)
     gap, speed = np.full(count, np.inf), np.zeros(count)
-    viewer, user = _close(vehicles, users, active)
+    viewer, user = _nearby_pairs(vehicles, users, active)
     if not len(viewer):
         return gap, speed
     pose, place_m, apart2 = _nearest(tables, at_m, viewer, users.xy[user])
@@ -174,27 +174,29 @@ def nearest_obstacles(
     vehicle = user < count
     width = np.where(vehicle, np.minimum(width, _MIDDLE_M), width)
     drift = users.speed[user] * np.sin(relative_heading)
-    soon = left + drift * _FORESEEN_S
+    left_soon = left + drift * _FORESEEN_S
     size = vehicles.size_m[viewer]
     half = size[:, 1] / 2 + np.where(vehicle, _VEHICLES_M, _MARGIN_M)
-    inside = (np.minimum(left, soon) - width < half) & (np.maximum(left, soon) + width > -half)
+    inside = (np.minimum(left, left_soon) - width < half) & (np.maximum(left, left_soon) + width > -half)
     # Beyond the last sample of the path, or next to the vehicle: no obstacle.
     inside &= (position > at_m[viewer] + 0.3 * size[:, 0]) & (apart2 < 64.0)
-    k = inside.nonzero()[0]
-    if not len(k):
+    rows = inside.nonzero()[0]
+    if not len(rows):
         return gap, speed
-    viewer, user, left, drift = viewer[k], user[k], left[k], drift[k]
-    room = position[k] - length[k] - at_m[viewer] - size[k, 0] / 2
-    stays = ~_gone(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[viewer], 1.0))
+    viewer, user, left, drift = viewer[rows], user[rows], left[rows], drift[rows]
+    room = position[rows] - length[rows] - at_m[viewer] - size[rows, 0] / 2
+    stays = ~_leaves_corridor(
+        left, drift, half[rows] + width[rows], room / np.maximum(vehicles.speed[viewer], 1.0)
+    )
     # Of several obstacles of a vehicle the nearest is entered last.
     order = np.argsort(-room, kind="stable")
     order = order[stays[order]]
     gap[viewer[order]] = room[order]
-    speed[viewer[order]] = np.maximum(users.speed[user] * np.cos(relative_heading[k]), 0.0)[order]
+    speed[viewer[order]] = np.maximum(users.speed[user] * np.cos(relative_heading[rows]), 0.0)[order]
     return gap, speed
 
 
-def _close(vehicles: Boxes, users: Boxes, active: VehicleMask) -> tuple[_Indices, _Indices]:
+def _nearby_pairs(vehicles: Boxes, users: Boxes, active: VehicleMask) -> tuple[_Indices, _Indices]:
     """Pairs of a vehicle and a user (vehicles first) in a wedge ahead of it."""
     count = len(vehicles)
     dx, dy = users.xy[:, 0] - vehicles.xy[:, 0, None], users.xy[:, 1] - vehicles.xy[:, 1, None]
@@ -231,7 +233,9 @@ def _nearest(
     return points[pair], index[pair] * step, separation[pair]
 
 
-def _gone(left: _Values, drift: _Values, reach: _Values, seconds: _Values) -> Bool[np.ndarray, " k"]:
+def _leaves_corridor(
+    left: _Values, drift: _Values, reach: _Values, seconds: _Values
+) -> Bool[np.ndarray, " k"]:
     """Mask of crossing users that leave the corridor well before the vehicle arrives."""
-    then = left + drift * np.maximum(seconds - _WELL_S, 0.0)
-    return (seconds > 2 * _WELL_S) & (np.abs(then) > reach) & (then * drift > 0)
+    left_at_arrival = left + drift * np.maximum(seconds - _WELL_S, 0.0)
+    return (seconds > 2 * _WELL_S) & (np.abs(left_at_arrival) > reach) & (left_at_arrival * drift > 0)

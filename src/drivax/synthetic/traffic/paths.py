@@ -35,7 +35,7 @@ class LaneSpan:
     until_m: float = math.inf
     end_m: float = math.inf
 
-    def stretched(self, by: float) -> LaneSpan:
+    def stretch(self, by: float) -> LaneSpan:
         """Return the span on a path that is longer by a factor."""
         metres = {
             name: getattr(self, name) * by for name in ("begin_m", "scale", "from_m", "until_m", "end_m")
@@ -79,7 +79,7 @@ class LaneChange:
     length_m: float
 
 
-def onward(network: RoadNetwork, lanes: list[int]) -> list[int]:
+def next_lanes(network: RoadNetwork, lanes: list[int]) -> list[int]:
     """Return successors that keep a path free of repeated lanes and full roundabout turns."""
     seen = set(lanes)
     return [
@@ -95,7 +95,7 @@ def random_lanes(
     """Draw lanes to the end of the map, uniformly at forks, among preferred successors if there are any."""
     lanes = [first]
     while network.lanes[lanes[-1]].successors:
-        options = onward(network, lanes)
+        options = next_lanes(network, lanes)
         lanes.append(int(rng.choice([lane for lane in options if lane in preferred] or options)))
     return tuple(lanes)
 
@@ -110,7 +110,7 @@ def lane_path(
             continue
         curve = network.lanes[lane].curve
         if change is not None and index == change.section:
-            curve, crossing = _changed(curve, network.lanes[lanes[index + 1]].curve, change)
+            curve, crossing = _lane_change_curve(curve, network.lanes[lanes[index + 1]].curve, change)
             length = float(curve.arc_m[-1])
             spans += [
                 _span(network, lane, position, length, until_m=position + crossing[1]),
@@ -121,14 +121,14 @@ def lane_path(
             spans.append(LaneSpan(lane, position, 1.0, end_m=position + length))
         pieces.append(curve)
         position += length
-    return _finished(network, resample(sway.applied(join_curves(*pieces)), STEP_M), position, spans)
+    return _build_path(network, resample(sway.apply(join_curves(*pieces)), STEP_M), position, spans)
 
 
 def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
     return LaneSpan(lane, at, length / network.lanes[lane].length_m, end_m=at + length, **when)
 
 
-def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float, float]]:
+def _lane_change_curve(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float, float]]:
     """Change from curve ``a`` to the parallel ``b``; also where the new lane is occupied from and the old one until."""
     count = max(len(a.xy), len(b.xy))
     a, b = (resample(c, float(c.arc_m[-1]) / (count - 1)) for c in (a, b))
@@ -145,11 +145,11 @@ def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float
     return Curve(xy, heading), (max(0.0, change.begin_m - 15.0), end - 0.3 * change.length_m)
 
 
-def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[LaneSpan]) -> Path:
+def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[LaneSpan]) -> Path:
     """Add curvature, limits and lane slots; spans are stretched to the length of the swaying curve."""
     stretch = float(curve.arc_m[-1]) / length
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
-    spans = [span.stretched(stretch) for span in spans]
+    spans = [span.stretch(stretch) for span in spans]
     position = step * np.arange(len(curve.xy))
     lane = np.full((len(position), SLOTS), -1)
     lane_m = np.zeros((len(position), SLOTS))
@@ -164,16 +164,16 @@ def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[Lan
         current = position[samples]
         inside = (current >= span.from_m) & (current <= span.until_m)
         along = np.maximum(current - span.begin_m, 0.0) / span.scale
-        for shared_lane, shared in _sharing(network, span.lane, along):
+        for shared_lane, shared in _lanes_sharing_space(network, span.lane, along):
             chosen = np.flatnonzero(inside & shared & (used[samples] < SLOTS))
             slot = used[samples][chosen]
             lane[samples][chosen, slot] = shared_lane
             lane_m[samples][chosen, slot] = along[chosen]
             used[samples][chosen] += 1
-    return Path(curve, step, smoothed_curvature(curve, step), limit, tuple(spans), lane, lane_m)
+    return Path(curve, step, mean_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 
 
-def interpolated(
+def interpolate_curve(
     curve: Curve, arc_m: Float64[np.ndarray, " point"], at_m: Float64[np.ndarray, " n"]
 ) -> Curve:
     """Interpolate a curve, whose samples lie at ``arc_m``, linearly at positions."""
@@ -181,7 +181,7 @@ def interpolated(
     return Curve(xy, np.interp(at_m, arc_m, curve.heading))
 
 
-def smoothed_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]:
+def mean_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]:
     """Curvature of an equally sampled curve, 1/m, averaged over 3 m."""
     window = max(1, round(_CURVATURE_WINDOW_M / step_m))
     rate = np.gradient(curve.heading, step_m)
@@ -190,7 +190,7 @@ def smoothed_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " poi
     return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
 
 
-def _sharing(
+def _lanes_sharing_space(
     network: RoadNetwork, lane: int, along: Float64[np.ndarray, " point"]
 ) -> list[tuple[int, np.ndarray]]:
     """Masks of where a vehicle on a lane occupies it, and lanes that branch off the same lane and are still close."""
@@ -212,7 +212,7 @@ class Sway:
     phase: tuple[float, ...] = ()
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, largest_m: float, aside_m: float = 0.0) -> Sway:
+    def draw(cls, rng: np.random.Generator, largest_m: float, aside_m: float = 0.0) -> Sway:
         """Draw two waves 60 to 160 m long with amplitudes of at most ``largest_m`` in sum, about a constant offset."""
         share = rng.uniform(0.2, 0.5, size=2) * largest_m
         waves = 2 * math.pi / rng.uniform(60.0, 160.0, size=2)
@@ -222,7 +222,7 @@ class Sway:
         drawn = (values.tolist() for values in (share, waves, phases))
         return cls(*(tuple(values + constant) for values, constant in zip(drawn, offset, strict=True)))
 
-    def applied(self, curve: Curve) -> Curve:
+    def apply(self, curve: Curve) -> Curve:
         """Return the curve that is driven; its heading is its tangent (to first order in the deviation)."""
         if not self.amplitude_m:
             return curve

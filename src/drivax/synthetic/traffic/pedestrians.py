@@ -1,4 +1,4 @@
-"""Pedestrians: they walk along sidewalks, wait at kerbs until it is safe to cross, and cross."""
+"""Pedestrians, who walk along sidewalks, wait at kerbs until it is safe to cross, and cross."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from drivax.synthetic.traffic.obstacles import Boxes
 from drivax.synthetic.traffic.path_arrays import PerVehicle, VehicleMask
 from drivax.synthetic.traffic.roles import Pedestrian
 
-#: Distances from the kerb, m: where pedestrians wait, from where on they occupy the crossing, and look for a gap.
-_WAIT_M, _CLAIM_M, _LOOK_M = 0.4, 1.0, 1.8
+#: Distances from the kerb, m, at which pedestrians wait, occupy the crossing, and start to look for a gap.
+_WAIT_M, _OCCUPY_M, _GAP_SEARCH_M = 0.4, 1.0, 1.8
 #: Acceleration of pedestrians, m/s2.
 _ACCELERATION_MPS2 = 1.5
 #: Drivers that need less braking than this yield at a crosswalk, m/s2; distance at which they stop before it, m.
 _YIELDING_MPS2, _STOP_SHORT_M = 2.5, 2.0
 #: Slower vehicles count as standing, m/s.
 _STANDING_MPS = 0.3
-#: Time gap to the next vehicle beyond the crossing time, s: where drivers yield, and where they do not.
+#: Accepted gap minus the crossing time, s, where drivers yield and where they do not.
 _MARGIN_S, _GAP_MARGIN_S = 1.0, 1.5
-#: Vehicles that see the crossing at a larger angle, or head elsewhere, do not approach it.
-_BEARING, _ASIDE = math.radians(75.0), math.radians(80.0)
+#: Largest bearing of a crossing from an approaching vehicle, and largest angle between their headings, rad.
+_MAX_BEARING, _MAX_HEADING_DIFFERENCE = math.radians(75.0), math.radians(80.0)
 #: Distance that pedestrians keep from vehicles, m.
-_BERTH_M = 0.4
-#: Steps between looks at vehicles.
-_LOOK_STEPS = 2
+_CLEARANCE_M = 0.4
+#: Steps between two decisions.
+_DECISION_STEPS = 2
 #: Connectors next to lanes that begin or end this close to a crossing control it, m.
 _NEAR_JUNCTION_M = 25.0
 
@@ -45,7 +45,7 @@ _Point = Float64[np.ndarray, " 2"]
 
 @dataclass(frozen=True)
 class _CrossingConflicts:
-    """Intersections of crossings and lanes, and a mask of the connectors whose light must be red while pedestrians cross."""
+    """Intersections of crossings and lanes, and a mask of connectors that must be red while pedestrians cross."""
 
     xy: Float64[np.ndarray, "conflict 2"]
     heading: Float64[np.ndarray, " conflict"]
@@ -67,7 +67,7 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
     axes = np.array([crossing.axis for crossing in network.crossings]).reshape(-1, 2, 2)
     across = axes[:, 1] - axes[:, 0]
     length = np.hypot(*across.T)
-    # Pedestrians walk in the middle of the crosswalk: a vehicle on its rim does not block it.
+    # Pedestrians walk in the middle of the crosswalk, so a vehicle at its edge does not block it.
     strip = np.column_stack([axes.mean(axis=1), across / length[:, None], length, np.ones(len(axes))])
     red = [_must_be_red(network, crossing) for crossing in network.crossings]
     return _CrossingConflicts(
@@ -81,7 +81,7 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
 
 
 def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, " lane"]:
-    """Mask of connectors with lights over a crossing, but for turns into the crossed road, which yield."""
+    """Mask of signalised connectors over a crossing, except turns into the crossed road, which yield."""
     result = np.zeros(len(network.lanes), bool)
     if network.signals is None:
         return result
@@ -98,8 +98,8 @@ def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, "
         for connector in (*entering, *leaving):
             curve = network.lanes[connector].curve
             straight = abs(float(curve.heading[-1] - curve.heading[0])) < math.radians(45.0)
-            held = connector in entering or straight or connector in arrows
-            result[connector] |= held and network.lanes[connector].control == Control.SIGNAL
+            conflicts = connector in entering or straight or connector in arrows
+            result[connector] |= conflicts and network.lanes[connector].control == Control.SIGNAL
     return result
 
 
@@ -110,7 +110,7 @@ class Pedestrians:
         self, network: RoadNetwork, pedestrians: tuple[Pedestrian, ...], times_s: Float64[np.ndarray, " time"]
     ) -> None:
         self._conflicts = _crossing_conflicts(network)
-        self._red_left_s = _red_left(network, self._conflicts.red, times_s)
+        self._remaining_red = _remaining_red_s(network, self._conflicts.red, times_s)
         curves = [resample(pedestrian.curve, STEP_M) for pedestrian in pedestrians]
         self._last = np.array([len(curve.xy) - 1 for curve in curves], int)
         self._table = np.zeros((len(curves), max([*self._last, 0]) + 1, 3))
@@ -129,17 +129,18 @@ class Pedestrians:
         self._crosses = self._crossing >= 0
         self._any_crosses = bool(self._crosses.any())
         # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
-        asking = self._conflicts.marked & ~self._conflicts.red.any(axis=1)
-        self._asking = asking[self._crossing] if len(asking) else np.zeros(len(curves), bool)
-        self._released, self._into = np.zeros((2, len(curves)), bool)
+        has_priority = self._conflicts.marked & ~self._conflicts.red.any(axis=1)
+        self._has_priority = (
+            has_priority[self._crossing] if len(has_priority) else np.zeros(len(curves), bool)
+        )
+        self._released, self._is_blocked = np.zeros((2, len(curves)), bool)
 
     def step(
         self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
-        """Return all pedestrians at step ``t``, then advance them; steps come in order.
+        """Return all pedestrians at step ``t`` and the occupied crossings, then advance; call it step by step.
 
-        Also return a mask of the crossings that drivers must keep free: a pedestrian is on it or, where drivers must yield,
-        about to step on it.
+        A crossing is occupied if a pedestrian is on it or, where drivers must yield, about to step on it.
         """
         sample = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
         index = np.minimum(sample.astype(int), self._last - 1)
@@ -147,12 +148,12 @@ class Pedestrians:
         low = flat.take(rows, axis=0)
         pose = low + (sample - index)[:, None] * (flat.take(rows + 1, axis=0) - low)
         occupied = np.zeros(len(self._conflicts.marked), bool)
-        if t % _LOOK_STEPS == 0:
-            self._into = _walks_into(pose, vehicles, active)
+        if t % _DECISION_STEPS == 0:
+            self._is_blocked = _is_blocked_by_vehicle(pose, vehicles, active)
             self._release(t, vehicles, active, colour)
         if self._any_crosses:
-            users = self._crosses & (self._at < self._across) & (self._at > self._kerb - _CLAIM_M)
-            users &= self._released | self._asking | (self._at > self._kerb)
+            users = self._crosses & (self._at < self._across) & (self._at > self._kerb - _OCCUPY_M)
+            users &= self._released | self._has_priority | (self._at > self._kerb)
             occupied[self._crossing[users]] = True
         result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)
         self._advance()
@@ -161,29 +162,31 @@ class Pedestrians:
     def _release(
         self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
     ) -> None:
-        """Let pedestrians at the kerb go where the crossing is safe for long enough."""
-        before = self._kerb - self._at
-        asks = self._crosses & ~self._released & (before >= 0) & (before < _LOOK_M)
-        if not np.count_nonzero(asks):
+        """Release pedestrians at the kerb if the crossing stays safe for long enough."""
+        to_kerb = self._kerb - self._at
+        waiting = self._crosses & ~self._released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
+        if not np.count_nonzero(waiting):
             return
-        conflicts, crossing = self._conflicts, self._crossing[asks]
+        conflicts, crossing = self._conflicts, self._crossing[waiting]
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])[active]
         any_s, hard_s = _arrivals(conflicts, boxes, vehicles.speed[active])
         # Starting from standstill takes v / (2 a) longer.
         start_s = self._free_speed / (2 * _ACCELERATION_MPS2)
-        needed = ((self._across - self._at) / self._free_speed + start_s)[asks]
+        needed = ((self._across - self._at) / self._free_speed + start_s)[waiting]
         # A standing queue blocks the crossing.
         free = ~overlap(conflicts.strip[:, None], boxes[None]).any(axis=1)
         red = ~(conflicts.red & (colour != Colour.RED)).any(axis=1)
-        yielded = conflicts.marked | conflicts.red.any(axis=1)
+        drivers_yield = conflicts.marked | conflicts.red.any(axis=1)
         gap = np.where(
-            yielded[crossing], hard_s[crossing] > needed + _MARGIN_S, any_s[crossing] > needed + _GAP_MARGIN_S
+            drivers_yield[crossing],
+            hard_s[crossing] > needed + _MARGIN_S,
+            any_s[crossing] > needed + _GAP_MARGIN_S,
         )
-        lasting = self._red_left_s[t, crossing] >= needed
-        self._released[asks] = gap & free[crossing] & red[crossing] & lasting
+        red_lasts = self._remaining_red[t, crossing] >= needed
+        self._released[waiting] = gap & free[crossing] & red[crossing] & red_lasts
 
     def _advance(self) -> None:
-        """Advance by one step; pedestrians stop at the kerb unless released, and before vehicles."""
+        """Advance by one step; pedestrians stop before vehicles, and at the kerb unless released."""
         room = self._last * self._step_m - self._at
         if self._any_crosses:
             waits = self._crosses & ~self._released & (self._at <= self._kerb)
@@ -191,68 +194,68 @@ class Pedestrians:
             room = np.minimum(np.maximum(kerb, 0.0), room)
         # The stopping distance is v^2 / (2 a), counted from the end of the step.
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
-        after = np.minimum(self._free_speed, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
-        after = np.maximum(after, 0.0)
-        moved = np.minimum((self._speed + after) / 2 * DT_S, np.maximum(room, 0.0))
-        after[self._into], moved[self._into] = 0.0, 0.0
+        speed = np.minimum(self._free_speed, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
+        speed = np.maximum(speed, 0.0)
+        moved = np.minimum((self._speed + speed) / 2 * DT_S, np.maximum(room, 0.0))
+        speed[self._is_blocked], moved[self._is_blocked] = 0.0, 0.0
         self._at = self._at + moved
-        self._speed = after
+        self._speed = speed
 
 
-def _red_left(
+def _remaining_red_s(
     network: RoadNetwork, red: Bool[np.ndarray, "crossing lane"], times_s: Float64[np.ndarray, " time"]
 ) -> Float64[np.ndarray, "time crossing"]:
-    """Remaining time for which the lights hold back all conflicting vehicles, s (infinite: no lights)."""
-    left = np.full((len(times_s), len(red)), math.inf)
+    """Time until a conflicting light turns green, s, by step and crossing (infinite: no lights)."""
+    remaining = np.full((len(times_s), len(red)), math.inf)
     if network.signals is None or not red.any():
-        return left
-    # Pedestrians know the cycle: the colours are continued by one cycle beyond the last step.
-    beyond = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
-    colour, _ = network.signals.colours(np.concatenate([times_s, beyond]), len(network.lanes))
+        return remaining
+    # Extended by one cycle beyond the last step, because pedestrians know the cycle.
+    next_cycle_s = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
+    colour, _ = network.signals.colours(np.concatenate([times_s, next_cycle_s]), len(network.lanes))
     for crossing in np.flatnonzero(red.any(axis=1)):
-        go = (colour[:, red[crossing]] != Colour.RED).any(axis=1)
-        steps = np.where(go, np.arange(len(go)), len(go))
-        following = np.minimum.accumulate(steps[::-1])[::-1]
-        left[:, crossing] = ((following - np.arange(len(go))) * DT_S)[: len(times_s)]
-    return left
+        is_green = (colour[:, red[crossing]] != Colour.RED).any(axis=1)
+        steps = np.where(is_green, np.arange(len(is_green)), len(is_green))
+        next_green = np.minimum.accumulate(steps[::-1])[::-1]
+        remaining[:, crossing] = ((next_green - np.arange(len(is_green))) * DT_S)[: len(times_s)]
+    return remaining
 
 
 def _arrivals(
     conflicts: _CrossingConflicts, boxes: Float64[np.ndarray, "v 6"], speed: PerVehicle
 ) -> tuple[Float64[np.ndarray, " crossing"], Float64[np.ndarray, " crossing"]]:
-    """Arrival time of the next moving vehicle at each crossing, s: of all, and of those that cannot yield."""
+    """Time until the next vehicle arrives at each crossing, s, among all and among those that cannot yield."""
     any_s, hard_s = np.full((2, len(conflicts.marked)), math.inf)
     if not len(boxes):
         return any_s, hard_s
-    rel = conflicts.xy[:, None] - boxes[None, :, :2]
+    offset = conflicts.xy[:, None] - boxes[None, :, :2]
     cos, sin = boxes[:, 2], boxes[:, 3]
-    ahead = rel[..., 0] * cos + rel[..., 1] * sin
-    lateral = np.abs(rel[..., 1] * cos - rel[..., 0] * sin)
-    same = np.cos(conflicts.heading)[:, None] * cos + np.sin(conflicts.heading)[:, None] * sin
-    same = same > math.cos(_ASIDE)
-    coming = (ahead > -1.0) & (lateral < 2.0 + math.tan(_BEARING) * np.maximum(ahead, 0.0))
-    coming &= same & (speed > _STANDING_MPS)
+    ahead = offset[..., 0] * cos + offset[..., 1] * sin
+    lateral = np.abs(offset[..., 1] * cos - offset[..., 0] * sin)
+    same_direction = np.cos(conflicts.heading)[:, None] * cos + np.sin(conflicts.heading)[:, None] * sin
+    same_direction = same_direction > math.cos(_MAX_HEADING_DIFFERENCE)
+    approaching = (ahead > -1.0) & (lateral < 2.0 + math.tan(_MAX_BEARING) * np.maximum(ahead, 0.0))
+    approaching &= same_direction & (speed > _STANDING_MPS)
     distance = np.maximum(np.hypot(ahead, lateral) - boxes[:, 4] / 2, 0.0)
-    time = np.where(coming, distance / np.maximum(speed, _STANDING_MPS), math.inf)
+    time = np.where(approaching, distance / np.maximum(speed, _STANDING_MPS), math.inf)
     braking = speed**2 / (2 * np.maximum(distance - _STOP_SHORT_M, 0.05))
     np.minimum.at(any_s, conflicts.crossing, time.min(axis=1))
     np.minimum.at(hard_s, conflicts.crossing, np.where(braking > _YIELDING_MPS2, time, math.inf).min(axis=1))
     return any_s, hard_s
 
 
-def _walks_into(pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask) -> _Mask:
-    """Mask of pedestrians that are about to come too close to a vehicle and are not close to one yet."""
+def _is_blocked_by_vehicle(pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask) -> _Mask:
+    """Mask of pedestrians that would come too close to a vehicle and are not close to one yet."""
     x, y, angle = pose.T
-    into = _within(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
-    if np.count_nonzero(into):
-        into &= ~_within(x, y, vehicles, active)
-    return into
+    blocked = _is_near_vehicle(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
+    if np.count_nonzero(blocked):
+        blocked &= ~_is_near_vehicle(x, y, vehicles, active)
+    return blocked
 
 
-def _within(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Mask:
-    """Mask of points in a vehicle's box grown by the distance that pedestrians keep."""
+def _is_near_vehicle(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Mask:
+    """Mask of points in a vehicle's box grown by the pedestrians' clearance."""
     cos, sin = vehicles.direction
-    half = vehicles.size_m / 2 + _BERTH_M
+    half = vehicles.size_m / 2 + _CLEARANCE_M
     dx, dy = x[:, None] - vehicles.xy[:, 0], y[:, None] - vehicles.xy[:, 1]
     along = np.abs(dx * cos + dy * sin)
     dy *= cos
@@ -265,7 +268,7 @@ def _within(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Ma
 def place_pedestrians(
     network: RoadNetwork, per_100m: float, rng: np.random.Generator, times_s: Float64[np.ndarray, " time"]
 ) -> tuple[Pedestrian, ...]:
-    """Draw pedestrians along the sidewalks in both directions, and half as many at each crossing as per 100 m.
+    """Draw pedestrians along sidewalks, in both directions, and at crossings, ``per_100m / 2`` on average at each.
 
     They reach the kerbs between 4 s before and 8 s after time 0.
     """
@@ -274,36 +277,39 @@ def place_pedestrians(
         length = float(sidewalk.arc_m[-1])
         for _ in range(int(rng.poisson(per_100m * length / 100.0))):
             curve = sidewalk if rng.random() < 0.5 else sidewalk.reversed()
-            # Pedestrians keep to the right of each other.
-            curve = curve.shifted(-float(rng.uniform(0.1, 0.6)))
-            pedestrians.append(Pedestrian(curve, float(rng.uniform(0.0, length)), _pace(rng)))
+            # Pedestrians keep to the right.
+            curve = curve.parallel(-float(rng.uniform(0.1, 0.6)))
+            pedestrians.append(Pedestrian(curve, float(rng.uniform(0.0, length)), _draw_speed(rng)))
     for index, crossing in enumerate(network.crossings):
         for _ in range(int(rng.poisson(per_100m / 2))):
-            pedestrians.append(_crosser(network, index, crossing, float(times_s[0]), rng))
+            pedestrians.append(_draw_crossing_pedestrian(network, index, crossing, float(times_s[0]), rng))
     return tuple(pedestrians)
 
 
-def _pace(rng: np.random.Generator) -> float:
-    """Free walking speed: 1.34 m/s on average with a deviation of 0.26 (Weidmann 1993)."""
+def _draw_speed(rng: np.random.Generator) -> float:
+    """Draw a free walking speed, 1.34 m/s with a standard deviation of 0.26 m/s (Weidmann 1993)."""
     return float(np.clip(rng.normal(1.34, 0.26), 0.7, 2.0))
 
 
-def _crosser(
+def _draw_crossing_pedestrian(
     network: RoadNetwork, index: int, crossing: Crossing, begin_s: float, rng: np.random.Generator
 ) -> Pedestrian:
     """Draw a pedestrian that comes along the sidewalk, crosses, and continues on the other side."""
-    near, far = crossing.axis if rng.random() < 0.5 else crossing.axis[::-1]
+    near_kerb, far_kerb = crossing.axis if rng.random() < 0.5 else crossing.axis[::-1]
     lateral = rng.uniform(-0.3, 0.3) * crossing.width_m
-    ahead = (far - near) / np.hypot(*(far - near))
-    shift = lateral * np.array([-ahead[1], ahead[0]])
-    near, far = near + shift, far + shift
-    before, after = _along_sidewalk(network, near, -ahead, rng), _along_sidewalk(network, far, ahead, rng)
-    points = np.concatenate([before[::-1], [near, far], after])
+    direction = (far_kerb - near_kerb) / np.hypot(*(far_kerb - near_kerb))
+    shift = lateral * np.array([-direction[1], direction[0]])
+    near_kerb, far_kerb = near_kerb + shift, far_kerb + shift
+    before, after = (
+        _along_sidewalk(network, near_kerb, -direction, rng),
+        _along_sidewalk(network, far_kerb, direction, rng),
+    )
+    points = np.concatenate([before[::-1], [near_kerb, far_kerb], after])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    kerb, across = float(arc[len(before)]), float(arc[len(before) + 1])
-    pace = _pace(rng)
-    start = max(0.0, kerb - pace * (rng.uniform(-4.0, 8.0) - begin_s))
-    return Pedestrian(_polyline(points), start, pace, index, kerb, across)
+    kerb_m, across_m = float(arc[len(before)]), float(arc[len(before) + 1])
+    speed = _draw_speed(rng)
+    start = max(0.0, kerb_m - speed * (rng.uniform(-4.0, 8.0) - begin_s))
+    return Pedestrian(_polyline(points), start, speed, index, kerb_m, across_m)
 
 
 def _along_sidewalk(

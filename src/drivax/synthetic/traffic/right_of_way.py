@@ -128,7 +128,7 @@ class _Request:
         return cls(row, connector, place, line, distance, float(state.speed[row]))
 
     @property
-    def needed_mps2(self) -> float:
+    def required_mps2(self) -> float:
         """Braking that it takes to stop at the line."""
         return self.speed**2 / (2 * max(self.distance_m, 0.05))
 
@@ -158,7 +158,7 @@ class RightOfWay:
         self._requested = np.full(count, -1)
         self._denied = np.zeros(count, bool)
 
-    def swapped(self, row: int, tables: PathTables, front_m: float) -> None:
+    def reset_vehicle(self, row: int, tables: PathTables, front_m: float) -> None:
         """Reset a vehicle that has changed to another path: it keeps only the connectors that it has entered."""
         self._granted[row] = int(np.sum(tables.connector_begin[row] < front_m))
         self._stood[row], self._requested[row] = np.inf, -1
@@ -225,7 +225,7 @@ class RightOfWay:
         for k in self._order(requests):
             request = requests[k]
             i, connector = request.row, request.connector
-            hard = request.needed_mps2 > _HARDEST_MPS2
+            hard = request.required_mps2 > _HARDEST_MPS2
             ok = self._free[connector] or (hard and state.speed[i] > 2.0)
             ok = ok or self._may_enter(state, request, holders, waiting)
             if not ok and self._clears_in_time(state, request, holders):
@@ -298,7 +298,7 @@ class RightOfWay:
         """Whether a driver with priority need not brake yet because all blockers move and will have cleared."""
         connector, blockers = request.connector, self._blockers(state, request, holders)
         yields = {other for _, other, _ in blockers} & set(self._yields[connector].tolist())
-        gentle = request.needed_mps2 < _LATEST_MPS2
+        gentle = request.required_mps2 < _LATEST_MPS2
         if not blockers or not gentle or self._control[connector] >= _STOP or yields:
             return False
         for j, other, left in blockers:

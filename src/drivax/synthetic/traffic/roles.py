@@ -62,7 +62,7 @@ class Drivers:
         """Mask of cyclists."""
         return self.kind == AgentKind.CYCLIST
 
-    def chosen(self, rows: np.ndarray) -> Drivers:
+    def select(self, rows: np.ndarray) -> Drivers:
         """Return the drivers of some rows (indices or a mask), in that order."""
         return Drivers(**{name: value[rows] for name, value in vars(self).items()})
 
@@ -205,15 +205,15 @@ class Motion:
         """Number of vehicles and cyclists on paths."""
         return len(self.distance_m)
 
-    def since(self, step: int) -> Motion:
+    def from_step(self, step: int) -> Motion:
         """Return the motion from a step on."""
         return self._at(slice(step, None))
 
-    def until(self, step: int) -> Motion:
+    def before_step(self, step: int) -> Motion:
         """Return the motion before a step."""
         return self._at(slice(step))
 
-    def every(self, stride: int) -> Motion:
+    def every_nth(self, stride: int) -> Motion:
         """Return the motion at every n-th step."""
         return self._at(slice(None, None, stride))
 

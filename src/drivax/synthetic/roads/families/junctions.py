@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool
 
-from drivax.synthetic.roads.curves import Curve, Pose, join_curves, straight, winding
+from drivax.synthetic.roads.curves import Curve, Pose, draw_winding_curve, join_curves, straight
 from drivax.synthetic.roads.families.junction_layout import (
     Approach,
     Arm,
@@ -33,7 +33,7 @@ from drivax.synthetic.roads.families.junction_layout import (
     open_site,
     starts,
 )
-from drivax.synthetic.roads.network import Control, Draft, RoadNetwork, conflicting
+from drivax.synthetic.roads.network import Control, Draft, RoadNetwork, conflict_matrix
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan, combine_plans, yellow_time_s
 from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
@@ -58,7 +58,7 @@ Conflicts = Bool[np.ndarray, "lane lane"]
 
 def set_priorities(draft: Draft, site: Site, major: Sequence[int], sign: Control) -> None:
     """Set the rules of a priority road: other approaches have a sign, left turns yield to oncoming traffic."""
-    conflicts = conflicting(draft.lanes)
+    conflicts = conflict_matrix(draft.lanes)
     for move in site.moves:
         yields_to = _yields_to(move, site.moves, conflicts, major)
         unsigned = Control.YIELD if yields_to else Control.NONE
@@ -84,7 +84,7 @@ def set_lights(
 
     ``lefts`` has the left turns of both pairs of approaches, ``green_s`` the least and the largest green time.
     """
-    green, conflicts = [float(g) for g in rng.uniform(*green_s, size=4)], conflicting(draft.lanes)
+    green, conflicts = [float(g) for g in rng.uniform(*green_s, size=4)], conflict_matrix(draft.lanes)
     groups: list[LightGroup] = []
     phases: list[tuple[int, ...]] = []
 
@@ -377,7 +377,7 @@ class Corridor:
     def _between(self, rng: np.random.Generator, gate: Pose) -> Curve:
         near, length = straight(gate, _STRAIGHT_M), float(rng.uniform(*self.between_m)) - 2 * _STRAIGHT_M
         shape = {"max_curvature": 1.0 / self.geometry.reach.tightest_m, "max_turn": math.radians(8.0)}
-        bent = winding(rng, length, start=near.end, **shape)
+        bent = draw_winding_curve(rng, length, start=near.end, **shape)
         return join_curves(near, bent, straight(bent.end, _STRAIGHT_M))
 
     def _sites(
@@ -421,5 +421,5 @@ class Corridor:
             return first or second
         cycle = max(first.cycle_s, second.cycle_s)
         if rng.random() < self.coordinated_share:
-            return combine_plans(first.stretched(cycle), second.stretched(cycle), travel_s)
+            return combine_plans(first.stretch(cycle), second.stretch(cycle), travel_s)
         return combine_plans(first, second, float(rng.uniform(0.0, cycle)))

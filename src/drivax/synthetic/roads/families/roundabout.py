@@ -32,7 +32,7 @@ from drivax.synthetic.roads.network import (
     Line,
     RoadNetwork,
     Start,
-    conflicting,
+    conflict_matrix,
     points,
     ring,
 )
@@ -163,8 +163,8 @@ class Roundabout:
         inward, outward = [], []
         for j in range(len(plan.radius_m)):
             lateral = spread + (j + 0.5) * plan.width_m
-            inward.append(draft.lane(middle.displaced(lateral).reversed(), plan.width_m, plan.limit_mps))
-            outward.append(draft.lane(middle.displaced(-lateral), plan.width_m, plan.limit_mps))
+            inward.append(draft.lane(middle.offset_by(lateral).reversed(), plan.width_m, plan.limit_mps))
+            outward.append(draft.lane(middle.offset_by(-lateral), plan.width_m, plan.limit_mps))
         for lanes in (inward, outward):
             if len(lanes) == 2:
                 draft.link_neighbours(*lanes)
@@ -227,7 +227,7 @@ def _go_round(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> list
 
 def _set_priorities(draft: Draft) -> None:
     """Give circulating traffic right of way over entries, and over exits across the outer circle."""
-    lanes, conflicts = draft.lanes, conflicting(draft.lanes)
+    lanes, conflicts = draft.lanes, conflict_matrix(draft.lanes)
     arcs = {i for i, lane in enumerate(lanes) if len(lane.predecessors) == 2}
     passes = {i for i, lane in enumerate(lanes) if {*lane.predecessors, *lane.successors} <= arcs}
     for i in range(len(lanes)):
@@ -245,9 +245,9 @@ def _add_boundary(draft: Draft, plan: _Plan, chains: list[list[Curve]], sidewalk
         wide = smooth_step((line.arc_m - ends[0]) / (ends[1] - ends[0]))
         wide -= smooth_step((line.arc_m - ends[2]) / (ends[3] - ends[2]))
         reach = plan.width_m / 2 + plan.shoulder_m + wide * (plan.circle_m - plan.width_m) / 2
-        sides.append(line.displaced(-reach))
+        sides.append(line.offset_by(-reach))
         if sidewalk_m is not None:
-            draft.sidewalks.append(line.displaced(-reach - sidewalk_m))
+            draft.sidewalks.append(line.offset_by(-reach - sidewalk_m))
     draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*sides)))
 
 
@@ -258,30 +258,30 @@ def _add_islands(draft: Draft, plan: _Plan, arms: list[_Arm]) -> None:
     islands = [radius * np.stack([np.cos(angles), -np.sin(angles)], axis=-1)]
     for arm in arms:
         half = plan.spread_m(arm.middle) - _KERB_M
-        current = arm.middle.piece(0, int(np.argmax(half < 0.15)) - 1)
-        half = half[: len(current.xy)]
-        islands.append(ring(current.displaced(half), current.displaced(-half).reversed()))
+        axis_piece = arm.middle.piece(0, int(np.argmax(half < 0.15)) - 1)
+        half = half[: len(axis_piece.xy)]
+        islands.append(ring(axis_piece.offset_by(half), axis_piece.offset_by(-half).reversed()))
     draft.edges += [Line(RoadKind.EDGE_MEDIAN, island) for island in islands]
 
 
 def _paint(draft: Draft, plan: _Plan, arm: _Arm) -> None:
     spread, lanes = plan.spread_m(arm.middle), len(arm.inward)
     for side in (-1.0, 1.0):
-        draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, arm.middle.displaced(side * (spread + 0.08)))
+        draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, arm.middle.offset_by(side * (spread + 0.08)))
         for j in range(1, lanes + 1):
             kind = RoadKind.LINE_SOLID_SINGLE_WHITE if j == lanes else RoadKind.LINE_BROKEN_SINGLE_WHITE
-            draft.mark(kind, arm.middle.displaced(side * (spread + j * plan.width_m)))
+            draft.mark(kind, arm.middle.offset_by(side * (spread + j * plan.width_m)))
 
 
 def _cross(draft: Draft, plan: _Plan, arm: _Arm, marked: bool) -> None:
     """Add the crossing of an arm, a car's length before the yield line."""
     half = plan.gap_m / 2 + len(arm.inward) * plan.width_m + plan.shoulder_m
-    current = arm.middle.start
-    position = current.ahead(_CROSSING_M)
+    mouth = arm.middle.start
+    position = mouth.ahead(_CROSSING_M)
     lanes = [(lane, draft.lanes[lane].length_m - _CROSSING_M) for lane in arm.inward]
     lanes += [(lane, _CROSSING_M) for lane in arm.outward]
     axis = points(position.aside(-half), position.aside(half))
     draft.crossings.append(Crossing(axis, CROSSWALK_M, tuple(lanes), marked))
     if marked:
-        near, far = (current.ahead(_CROSSING_M + sign * CROSSWALK_M / 2) for sign in (-1.0, 1.0))
+        near, far = (mouth.ahead(_CROSSING_M + sign * CROSSWALK_M / 2) for sign in (-1.0, 1.0))
         draft.crosswalk(near.aside(half), far.aside(half), far.aside(-half), near.aside(-half))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import RoadKind
-from drivax.synthetic.roads.curves import STEP_M, Curve, Pose, smooth_step, winding
+from drivax.synthetic.roads.curves import STEP_M, Curve, Pose, draw_winding_curve, smooth_step
 from drivax.synthetic.roads.network import Bay, Crossing, Draft, Line, RoadNetwork, Start, points, ring
 
 #: Width of a crosswalk, m.
@@ -97,8 +97,8 @@ class Street:
     def presence(self, strip: Strip) -> Float64[np.ndarray, " point"]:
         """Share of a strip's width at every sample: it grows along a fork and shrinks on a taper."""
         index = np.arange(len(self.middle.xy))
-        current = (index >= self.cuts[strip.first]) & (index <= self.cuts[strip.last])
-        present = current.astype(float)
+        inside = (index >= self.cuts[strip.first]) & (index <= self.cuts[strip.last])
+        present = inside.astype(float)
         if strip.fork:
             begin, end = self.cuts[strip.first - 1], self.cuts[strip.first]
             present = np.where(index < end, smooth_step((index - begin) / (end - begin)), present)
@@ -111,18 +111,18 @@ class Street:
         """Add the lanes, the edges and the markings."""
         self.lay()
         right, left = self.edge_m
-        outer = ring(self.middle.displaced(-right), self.middle.displaced(left).reversed())
+        outer = ring(self.middle.offset_by(-right), self.middle.offset_by(left).reversed())
         self.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, outer))
         self.divide()
         for side, reach in zip((-1.0, 1.0), self.reach_m, strict=True):
             if reach[0] > self.median_m / 2:
-                self.draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, self.middle.displaced(side * reach))
+                self.draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, self.middle.offset_by(side * reach))
         self.paint_inside()
 
     def lay(self) -> None:
         """Add all lanes with their links."""
         for strip in self.strips:
-            line = self.middle.shifted(self.offset_m(strip.place))
+            line = self.middle.parallel(self.offset_m(strip.place))
             for k in range(strip.first, strip.last):
                 piece = line.piece(self.cuts[k], self.cuts[k + 1])
                 self.lanes[strip.place, k] = self.draft.lane(
@@ -164,7 +164,7 @@ class Street:
         k, offset = strip.first - 1, self.offset_m(inner)
         piece = self.middle.piece(self.cuts[k], self.cuts[k + 1])
         share = smooth_step(np.linspace(0.0, 1.0, len(piece.xy)))
-        curve = piece.displaced(offset + share * (self.offset_m(strip.place) - offset))
+        curve = piece.offset_by(offset + share * (self.offset_m(strip.place) - offset))
         lane = self.draft.lane(curve, self.width_m, self.limit_mps, exit_only=strip.exit_only, kind=self.kind)
         self.draft.link(self.lanes[inner, k - 1], lane)
         self.draft.link(lane, self.lanes[strip.place, strip.first])
@@ -175,7 +175,7 @@ class Street:
         if self.median_m:
             half, end = self.median_m / 2 - _KERB_M, round(2 / STEP_M)
             inner = self.middle.piece(end, len(self.middle.xy) - 1 - end)
-            island = ring(inner.shifted(half), inner.shifted(-half).reversed())
+            island = ring(inner.parallel(half), inner.parallel(-half).reversed())
             self.draft.edges.append(Line(RoadKind.EDGE_MEDIAN, island))
 
     def paint_inside(self) -> None:
@@ -184,7 +184,7 @@ class Street:
             inner = strip.place - int(np.sign(strip.place))
             if inner:
                 lateral = self.offset_m(strip.place) + (0.5 if inner < 0 else -0.5) * self.width_m
-                line = self.middle.piece(self.cuts[strip.first], self.cuts[strip.last]).shifted(lateral)
+                line = self.middle.piece(self.cuts[strip.first], self.cuts[strip.last]).parallel(lateral)
                 self.draft.mark(RoadKind.LINE_BROKEN_SINGLE_WHITE, line)
         self._paint_middle()
 
@@ -197,7 +197,7 @@ class Street:
             first, last = max(s.first for s in left), max(s.last for s in left)
             lines = [self.middle.piece(self.cuts[first], self.cuts[last])]
         elif self.median_m and not one_way:
-            lines = [self.middle.shifted(side * self.median_m / 2) for side in (-1, 1)]
+            lines = [self.middle.parallel(side * self.median_m / 2) for side in (-1, 1)]
         elif not one_way:
             broken = len(self.strips) == 2
             kind = RoadKind.LINE_BROKEN_SINGLE_YELLOW if broken else RoadKind.LINE_SOLID_DOUBLE_YELLOW
@@ -208,7 +208,7 @@ class Street:
         """Add a sidewalk on both sides, 1.2 to 2.5 m outside the edges."""
         right, left = self.edge_m
         away = float(rng.uniform(1.2, 2.5))
-        self.draft.sidewalks += [self.middle.displaced(-right - away), self.middle.displaced(left + away)]
+        self.draft.sidewalks += [self.middle.offset_by(-right - away), self.middle.offset_by(left + away)]
 
     def cross(self, at: int, marked: bool) -> None:
         """Add a crossing at a sample of the middle line, with a crosswalk where it is marked."""
@@ -261,9 +261,7 @@ class Street:
         to = [crossing.axis.mean(axis=0) - [pose.x, pose.y] for crossing in self.draft.crossings]
         if not any(np.hypot(*d) < 30.0 and abs(d @ along) < _BAY_CLEAR_M for d in to):
             pose = pose if self._forward(place) else pose.turned()
-            self.draft.bays.append(
-                Bay(pose, length_m, *self._on_lane(place, self._section(sample), sample))
-            )
+            self.draft.bays.append(Bay(pose, length_m, *self._on_lane(place, self._section(sample), sample)))
 
 
 @dataclass(frozen=True)
@@ -291,7 +289,7 @@ class StreetFamily:
 
     def draw_middle(self, rng: np.random.Generator, curvature: float = 1.0) -> Curve:
         """Draw the reference line; ``curvature`` is the style's factor on the tightest bend."""
-        return winding(
+        return draw_winding_curve(
             rng,
             self.length_m,
             max_curvature=curvature / float(rng.uniform(*self.tightest_m)),

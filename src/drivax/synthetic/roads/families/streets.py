@@ -299,7 +299,7 @@ class Highway(StreetFamily):
         lane = street.draft.lane(curve, street.width_m, limit, kind=street.kind, exit_only=away > 0)
         street.draft.link(*((lane, auxiliary) if away < 0 else (auxiliary, lane)))
         half = street.width_m / 2
-        left, right = curve.shifted(half + _RAMP_SHOULDER_M), curve.shifted(-half - street.shoulder_m)
+        left, right = curve.parallel(half + _RAMP_SHOULDER_M), curve.parallel(-half - street.shoulder_m)
         nose, sample = _nose(street, extra, left if away > 0 else left.reversed())
         last = len(left.xy) - 1
         left = left.piece(nose, last) if away > 0 else left.piece(0, last - nose)
@@ -318,7 +318,7 @@ def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray,
 def _main_edge(street: Street, extra: Strip) -> Curve:
     """Right edge of the highway without its auxiliary lane."""
     reach = street.reach_m[0] - street.width_m * street.presence(extra) + street.shoulder_m
-    return street.middle.displaced(-reach)
+    return street.middle.offset_by(-reach)
 
 
 def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
@@ -339,7 +339,7 @@ def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
 def _edges(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) -> None:
     """Add the boundary, counter-clockwise: along the right edge with the ramps, and back along the left edge."""
     right, left = street.edge_m
-    main, full, last = _main_edge(street, extra), street.middle.displaced(-right), len(right) - 1
+    main, full, last = _main_edge(street, extra), street.middle.offset_by(-right), len(right) - 1
     parts, begin = [], 0
     if on is not None:
         begin = street.cuts[extra.first]
@@ -348,7 +348,7 @@ def _edges(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) ->
     parts.append(full.piece(begin, end))
     if off is not None:
         parts += [off.right, off.left.reversed(), main.piece(off.nose + 2, last)]
-    parts.append(street.middle.displaced(left).reversed())
+    parts.append(street.middle.offset_by(left).reversed())
     street.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*parts)))
     street.divide()
 
@@ -361,13 +361,13 @@ def _paint(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) ->
     begin = 0 if on is None else street.cuts[extra.first]
     end = last if off is None else street.cuts[extra.last]
     lines = [] if on is None else [main.piece(0, on.nose)]
-    lines.append(street.middle.displaced(-right).piece(begin, end))
+    lines.append(street.middle.offset_by(-right).piece(begin, end))
     if off is not None:
         lines.append(main.piece(off.nose, last))
     if any(strip.place > 0 for strip in street.strips):
-        lines.append(street.middle.displaced(left))
+        lines.append(street.middle.offset_by(left))
     for ramp in (on, off):
         if ramp is not None:
-            lines += [ramp.left.shifted(-_RAMP_SHOULDER_M), ramp.right.shifted(street.shoulder_m)]
+            lines += [ramp.left.parallel(-_RAMP_SHOULDER_M), ramp.right.parallel(street.shoulder_m)]
     for line in lines:
         street.draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, line)
