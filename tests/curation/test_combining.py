@@ -54,8 +54,8 @@ def test_components_have_their_own_aggregators():
     [
         (({"a": -1.0},), "weight of 'a' is -1.0"),
         (({"a": float("nan")},), "weight of 'a' is nan"),
-        (({"a": 0.0},), "no component has a weight"),
-        (({},), "no component has a weight"),
+        (({"a": 0.0},), "all weights are 0"),
+        (({},), "all weights are 0"),
         (({"a": 1.0}, "median"), "unknown aggregator 'median'; use max, mean"),
         (({"a": 1.0}, "p101"), "unknown aggregator 'p101'"),
         (({"a": 1.0}, "top0"), "unknown aggregator 'top0'"),

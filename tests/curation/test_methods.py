@@ -173,4 +173,4 @@ def test_tables_with_other_settings_are_refused(data, tables, tmp_path):
         check_current(table, KinematicConfig(urgent_s=2.0))
     for other in (replace(table.combination, scenario="max"), Combination({"urgency": 1.0}, "top10")):
         with pytest.raises(DataError, match="scores of 'kinematic' with combination"):
-            check_current(table.combined(other))
+            check_current(table.recombine(other))

@@ -120,7 +120,7 @@ def test_mixture_against_scipy():
     shares = special.softmax(np.asarray(MIXTURE.logits, float))
     parts = [
         gaussian_density(action, np.asarray(loc, float), np.asarray(scale, float)).prod(axis=-1)
-        for loc, scale in zip(MIXTURE.parts.loc, MIXTURE.parts.scale, strict=True)
+        for loc, scale in zip(MIXTURE.components.loc, MIXTURE.parts.scale, strict=True)
     ]
     raw_action = MIXTURE.raw_action(jnp.asarray(action))
     np.testing.assert_allclose(
@@ -204,7 +204,7 @@ def test_first_parameters_are_centred_with_the_requested_scale():
         jax.nn.softmax(grid.logits), np.outer(*(w / w.sum() for w in weights)).ravel(), atol=1e-6
     )
     mixture = distribution("mixture", jnp.asarray(initial_parameters("mixture", actions, 0.3)), actions)
-    np.testing.assert_allclose(mixture.parts.scale, 0.3, rtol=1e-5)
+    np.testing.assert_allclose(mixture.components.scale, 0.3, rtol=1e-5)
     assert parameter_count("mixture", actions) == len(initial_parameters("mixture", actions, 0.3))
     for one in (gaussian, beta, grid, mixture):
         np.testing.assert_allclose(one.mean_action(), 0.0, atol=1e-6)

@@ -297,7 +297,7 @@ def test_critical_recording_is_a_window_of_the_traffic(monkeypatch):
 
     original = world.Traffic.run
     monkeypatch.setattr(world.Traffic, "run", run)
-    monkeypatch.setattr(world, "critical_steps", chosen)
+    monkeypatch.setattr(world, "critical_steps", select)
     config = dataclasses.replace(EXACT, rare_rate=0.0, critical_share=1.0)
     begins, lit = set(), 0
     for index in range(0, 60, 2):

@@ -108,7 +108,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
         if table.method != args.method:
             raise UsageError(f"{args.again} is a table of {table.method}", cure=f"use curate {table.method}")
     if changes:
-        table = table.combined(replace(table.combination, **changes))
+        table = table.recombine(replace(table.combination, **changes))
     write_scores(table, args.out, args.overwrite)
     _print_statistics(table, args.out)
     if args.export is not None:

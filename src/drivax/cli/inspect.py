@@ -59,7 +59,7 @@ class Inspect:
 def run(args: Inspect) -> int:
     """Verify the sets, then print tables or JSON, or write a page."""
     from drivax.errors import UsageError
-    from drivax.report.inspection import Inspection, described
+    from drivax.report.inspection import Inspection, scenario_entry
     from drivax.scenario.select.selection import Selection
 
     if not args.sets:
@@ -72,7 +72,9 @@ def run(args: Inspect) -> int:
     if args.observations:
         _observe(args, opened[0])
     elif args.json:
-        sets = [{"scenarios": [described(entry) for entry in inspection.entries]} for inspection in opened]
+        sets = [
+            {"scenarios": [scenario_entry(entry) for entry in inspection.entries]} for inspection in opened
+        ]
         named = [{"set": str(path), **content} for path, content in zip(args.sets, sets, strict=True)]
         json.dump(sets[0] if len(sets) == 1 else named, sys.stdout, indent=1)
         print()
@@ -101,9 +103,9 @@ def _print(opened: list[Inspection]) -> None:
     audit = tables.audit_table(inspection)
     console.print("audit: not done" if audit is None else audit.rich())
     console.print()
-    console.print(tables.listing(inspection).rich())
-    if len(inspection) > tables.LISTED:
-        console.print(f"{len(inspection) - tables.LISTED:,} more; --json lists all")
+    console.print(tables.scenarios_table(inspection).rich())
+    if len(inspection) > tables.MAX_LISTED:
+        console.print(f"{len(inspection) - tables.MAX_LISTED:,} more; --json lists all")
 
 
 def _console() -> Console:

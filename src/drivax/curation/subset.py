@@ -51,12 +51,12 @@ def subset_of_table(table: ScoreTable, indices: Sequence[int], subset: ScenarioS
 
     ``indices`` are the scenarios of the whole set in the order of the subset.
     """
-    chosen = list(indices)
+    rows = list(indices)
     source = subset.manifest["source"]["part_of"]
     source = {name: value for name, value in source.items() if name not in ("method", "config")}
-    ids = tuple(table.scenario_ids[index] for index in chosen)
-    scores = {name: getattr(table, name)[chosen] for name in ("valid", "steps", "scenarios")}
-    components = {name: component[chosen] for name, component in table.components.items()}
+    ids = tuple(table.scenario_ids[index] for index in rows)
+    scores = {name: getattr(table, name)[rows] for name in ("valid", "steps", "scenarios")}
+    components = {name: component[rows] for name, component in table.components.items()}
     config = {**table.config, "part_of": source}
     return replace(
         table, config=config, set_hash=subset.hash, scenario_ids=ids, components=components, **scores

@@ -13,9 +13,9 @@ from drivax.report.inspection import (
     Counts,
     Inspection,
     content_table,
-    of_all,
     speeds,
     true_findings,
+    with_sizes,
 )
 from drivax.report.pages.page import asset, definitions, page, section
 from drivax.report.pictures.palette import stroke
@@ -88,12 +88,12 @@ def _shares(inspections: Sequence[Inspection]) -> str:
     tagged = [inspection.tags() for inspection in inspections]
     sizes = [len(inspection) for inspection in inspections]
     groups = {
-        name: of_all([tags.get(name, {}) for tags in tagged], sizes)
+        name: with_sizes([tags.get(name, {}) for tags in tagged], sizes)
         for name in dict.fromkeys(name for tags in tagged for name in tags)
     }
-    flags = [inspection.words(lambda entry: entry["flags"]) for inspection in inspections]
+    flags = [inspection.value_counts(lambda entry: entry["flags"]) for inspection in inspections]
     bars = [_bars(name, counts) for name, counts in groups.items() if len(counts) <= _MOST_VALUES]
-    bars += [_bars("flags", of_all(flags, sizes)), _bars("audit", true_findings(inspections))]
+    bars += [_bars("flags", with_sizes(flags, sizes)), _bars("audit", true_findings(inspections))]
     return section("Tags, flags, audit", _legend(inspections), f"<div class=bars>{''.join(bars)}</div>")
 
 

@@ -19,7 +19,7 @@ from jaxtyping import UInt8
 from drivax.errors import UsageError, did_you_mean, missing_package
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import atomic_write, check_output
-from drivax.report.episodes import EpisodeGroup, EvaluatedSet, ranked, rollouts_of
+from drivax.report.episodes import EpisodeGroup, EvaluatedSet, rank_scenarios, rollouts_of
 from drivax.report.pictures.drawing import (
     EVENT_WORDS,
     LIGHTS,
@@ -82,7 +82,7 @@ def write_videos(
 
 def _selected(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
     """Return the requested episodes, worst first."""
-    groups = ranked(runs)
+    groups = rank_scenarios(runs)
     if which == "all":
         return groups
     if which.startswith("worst:"):
