@@ -123,7 +123,7 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
         ),
         (replace(onward, begin_from=str(tmp_path / "run")), "holds 2 seeds; name one"),
         (replace(onward, begin_from=str(tmp_path)), "is no run folder"),
-        (replace(onward, begin_from=f"{former}@7"), "there is no checkpoint of step 7"),
+        (replace(onward, begin_from=f"{former}@7"), "no checkpoint of step 7"),
         (replace(onward, begin_from="zoo:aggressive"), "is an exported policy, which cannot be fine-tuned"),
     ):
         with pytest.raises(DrivaxError, match=words):

@@ -120,7 +120,7 @@ def test_mixture_against_scipy():
     shares = special.softmax(np.asarray(MIXTURE.logits, float))
     parts = [
         gaussian_density(action, np.asarray(loc, float), np.asarray(scale, float)).prod(axis=-1)
-        for loc, scale in zip(MIXTURE.components.loc, MIXTURE.parts.scale, strict=True)
+        for loc, scale in zip(MIXTURE.components.loc, MIXTURE.components.scale, strict=True)
     ]
     raw_action = MIXTURE.raw_action(jnp.asarray(action))
     np.testing.assert_allclose(

@@ -54,7 +54,7 @@ def test_masked_rows_have_no_effect_and_batches_agree(rows):
 
     def run(parameters, single, batch):
         network = nnx.merge(graph, parameters)
-        return network.policy_and_value(single), network.both(batch)
+        return network.policy_and_value(single), network.policy_and_value(batch)
 
     single, batch = quick(run, parameters, one, stacked(one, noisy, other, nobody))
     for alone, together in zip(jax.tree.leaves(single), jax.tree.leaves(batch), strict=True):

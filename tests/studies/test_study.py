@@ -352,9 +352,9 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
 
 def test_invalid_studies_are_refused(data, tmp_path):
     given = StudySets(data.path, data.path, (data.path,))
-    with pytest.raises(UsageError, match="a study without bc"):
+    with pytest.raises(UsageError, match="baseline 'bc' is missing"):
         Study(LONGTAIL, StudyConfig(arms=("baseline",)), given, tmp_path)
-    with pytest.raises(UsageError, match="there is no arm 'heuristics'"):
+    with pytest.raises(UsageError, match="unknown arm 'heuristics'"):
         Study(LONGTAIL, StudyConfig(arms=("baseline", "bc", "heuristics")), given, tmp_path)
     with pytest.raises(UsageError, match=r"no preset or file 'studies/longtial'.*longtail"):
         load_study("longtial")
@@ -368,7 +368,7 @@ def test_invalid_studies_are_refused(data, tmp_path):
         settings.load(StudyDefinition, own)
     with pytest.raises(UsageError, match="needs scenarios to train, to validate and to test on"):
         StudySets.of(data.path, None, ())
-    with pytest.raises(UsageError, match="none: does not exist"):
+    with pytest.raises(UsageError, match="none: scenario set not found"):
         StudySets.of(tmp_path / "none", None, ())
     # Before anything is scored or trained, and with the arms that need no labels.
     with ScenarioWriter(tmp_path / "recorded", SMALL) as writer:

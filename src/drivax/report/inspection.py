@@ -282,7 +282,7 @@ def finding_text(values: Sequence[Any]) -> str:
 def scenarios_table(inspection: Inspection) -> Table:
     """Return the first scenarios with the counts of their source."""
     names = ("steps", "tracks", "now", "lanes", "lines", "edges", "others", "points", "lights", "segments")
-    columns = (Column("scenario", label=True, most=24), *map(Column, names))
+    columns = (Column("scenario", label=True, max_width=24), *map(Column, names))
     listed = inspection.entries[:MAX_LISTED]
     rows = ((entry["scenario_id"], *(f"{count:,}" for count in _counts(entry))) for entry in listed)
     return Table("scenarios", columns, tuple(tuple(map(Cell, row)) for row in rows))
@@ -301,7 +301,7 @@ def comparison(inspections: Sequence[Inspection]) -> list[Table]:
     groups = [
         inspections[first : first + SETS_PER_TABLE] for first in range(0, len(inspections), SETS_PER_TABLE)
     ]
-    return [content_table(group, _share_rows(group), most=24) for group in groups]
+    return [content_table(group, _share_rows(group), max_width=24) for group in groups]
 
 
 def content_table(inspections: Sequence[Inspection], extra: Sequence[Row] = (), **columns: Any) -> Table:

@@ -77,11 +77,13 @@ class Progress:
 
     def line(self, note: str = "") -> str:
         """Return the progress so far as one line."""
-        rate, count, left = self.rate(), f"{self.done:,} {self.unit}", ""
+        rate, count, remaining = self.rate(), f"{self.done:,} {self.unit}", ""
         if self.total:
             count = f"{self.done:,} of {self.total:,} {self.unit} ({100 * self.done / self.total:.0f} %)"
-            left = f"{duration((self.total - self.done) / rate)} left" if rate > 0 else ""
-        return ", ".join(part for part in (f"{self.what}: {count}", f"{_number(rate)}/s", left, note) if part)
+            remaining = f"{duration((self.total - self.done) / rate)} left" if rate > 0 else ""
+        return ", ".join(
+            part for part in (f"{self.what}: {count}", f"{_number(rate)}/s", remaining, note) if part
+        )
 
     def summary(self) -> str:
         """Return the whole as one line."""
@@ -110,9 +112,9 @@ def duration(seconds: float) -> str:
     """Format seconds as ``4.2 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
+    rounded = round(seconds)
+    if rounded < 3600:
+        return f"{rounded // 60} min {rounded % 60} s"
     minutes = round(seconds / 60)
     return f"{minutes // 60} h {minutes % 60} min"
 
