@@ -276,7 +276,7 @@ def test_incomparable_evaluations_are_refused(change, words):
         ({"primary": "vmaxscore"}, "has no metric 'vmaxscore'; did you mean 'vmax_score'?"),
         ({"secondary": ("steps",)}, "steps is a code or count without a mean"),
         ({"primary": "vmax_score_partial"}, "combines different inputs"),
-        ({"primary": "ade"}, "neither better high nor low"),
+        ({"primary": "ade"}, "has no better direction"),
         ({"split": "stratified"}, "--data"),
         ({"split": "random", "ratio": 0.999}, "leave an arm empty"),
     ],

@@ -119,7 +119,7 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
     for wrong, words in (
         (
             wide,
-            r"parameters is float32\[3\] in the checkpoint, not float32\[4\]; begin from a run with the same net",
+            r"parameters is float32\[3\] in the checkpoint, not float32\[4\]; start from a run with the same net",
         ),
         (replace(onward, begin_from=str(tmp_path / "run")), "holds 2 seeds; name one"),
         (replace(onward, begin_from=str(tmp_path)), "is no run folder"),

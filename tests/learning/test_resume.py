@@ -127,7 +127,7 @@ def test_networks_transfer_to_another_run(tmp_path):
         Checkpoints(tmp_path / "checkpoints").save(number, former)
         origin = PretrainedRun(tmp_path, number, [])
         if name == "ppo":
-            with pytest.raises(DataError, match=r"no \.parameters.*; begin from a run with the same network"):
+            with pytest.raises(DataError, match=r"no \.parameters.*; start from a run with the same network"):
                 origin.networks(fresh)
             continue
         found = origin.networks(jax.eval_shape(lambda: fresh))

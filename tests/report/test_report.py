@@ -197,7 +197,7 @@ def test_other_set_is_refused(runs, tmp_path):
     with pytest.raises(DataError, match=r"record hand-0[1-7]: is not in the scenario set"):
         write_report(runs, tmp_path / "report.html")
     (runs[2] / "run.json").write_text(json.dumps(about | {"data": {}}))
-    with pytest.raises(DataError, match="names no scenario set"):
+    with pytest.raises(DataError, match="no scenario set recorded"):
         write_report(runs, tmp_path / "report.html")
 
 

@@ -366,7 +366,7 @@ def test_invalid_studies_are_refused(data, tmp_path):
     own.write_text(settings.dump(declared))
     with pytest.raises(UsageError, match=r"own\.yaml: .*names 'heuristics', which the study lacks"):
         settings.load(StudyDefinition, own)
-    with pytest.raises(UsageError, match="needs scenarios to train, to validate and to test on"):
+    with pytest.raises(UsageError, match="no validation or test set"):
         StudySets.of(data.path, None, ())
     with pytest.raises(UsageError, match="none: scenario set not found"):
         StudySets.of(tmp_path / "none", None, ())
@@ -382,11 +382,11 @@ def test_invalid_studies_are_refused(data, tmp_path):
 
 def test_changed_claims_are_refused_when_a_study_resumes(data, tmp_path):
     sets = StudySets(data.path, data.path, (data.path,))
-    runner._open(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
-    runner._open(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
+    runner._open_folder(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
+    runner._open_folder(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
     fewer = replace(LONGTAIL, claims=LONGTAIL.claims[:-1])
     with pytest.raises(UsageError, match="holds a study with other arms or claims"):
-        runner._open(Study(fewer, StudyConfig(), sets, tmp_path / "study"))
+        runner._open_folder(Study(fewer, StudyConfig(), sets, tmp_path / "study"))
 
 
 def test_evaluated_run_without_checkpoints_is_not_trained_again(data, tmp_path):

@@ -252,7 +252,7 @@ class EpisodeTable:
         run_path = self.data.get("path")
         if data is None and run_path is None:
             file = None if self.folder is None else self.folder / "run.json"
-            raise DataError("names no scenario set", file=file, cure="pass it with --data SET")
+            raise DataError("no scenario set recorded", file=file, cure="pass it with --data SET")
         path = data if data is not None else Path(str(run_path))
         if data is None and not path.exists():
             cure = "pass its new path with --data SET"

@@ -93,13 +93,13 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
     """Check that a comparison can use a metric.
 
     Raises:
-        UsageError: An evaluation lacks it, it has no meaningful mean, or it is primary without a direction.
+        UsageError: An evaluation lacks it, its mean has no meaning, or it is primary without a better direction.
     """
     for table in tables:
         if metric not in table.metrics:
-            known = [name for name in table.metrics if all(name in other.metrics for other in tables)]
+            available = [name for name in table.metrics if all(name in other.metrics for other in tables)]
             problem = f"{table.folder or table.name} has no metric {metric!r}"
-            raise UsageError(problem, cure=did_you_mean(metric, known))
+            raise UsageError(problem, cure=did_you_mean(metric, available))
     if metric in NOT_SUMMARISED:
         raise UsageError(f"{metric} is a code or count without a mean", cure="choose another metric")
     if metric.endswith("_partial"):
@@ -107,7 +107,7 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
         raise UsageError(problem, cure=f"choose {metric.removesuffix('_partial')}, or one of its inputs")
     info = tables[0].metric(metric)
     if primary and (info is None or info.better == "-"):
-        raise UsageError(f"{metric} is neither better high nor low", cure="choose another primary metric")
+        raise UsageError(f"{metric} has no better direction", cure="choose another primary metric")
 
 
 def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:

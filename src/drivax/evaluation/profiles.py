@@ -77,8 +77,8 @@ def devkit_rows(
 ) -> list[ProfileRow]:
     """Evaluate every episode of a table by the devkit's rules.
 
-    Our maps hold lane centre lines and road edges: lanes are strips of their width, the drivable area ends at the
-    edges, and connectors stand for intersections. Agents on another level of the road are left out.
+    drivax maps hold lane centre lines and road edges, so lanes are strips of constant width, the drivable area ends at
+    the edges, and connectors stand for intersections. Agents on another level of the road are left out.
 
     Args:
         table: Episodes with trajectories.

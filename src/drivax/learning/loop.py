@@ -213,14 +213,14 @@ def _learn(run: _Run) -> None:
             values = jax.device_get(values)
             rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
             # Read once, so that all seeds write a checkpoint of the same iteration.
-            stops = stop.received and iteration < config.iterations
-            logged = (mean_logs(program.seeds.member(values, number)) for number in range(len(run.logs)))
-            rows = [row | {"steps_per_second": rate} for row in logged]
-            _record(run, iteration, state, rows, stops)
+            preempted = stop.received and iteration < config.iterations
+            means = (mean_logs(program.seeds.member(values, number)) for number in range(len(run.logs)))
+            rows = [row | {"steps_per_second": rate} for row in means]
+            _record(run, iteration, state, rows, preempted)
             success = [row["rollout/success"] for row in rows if "rollout/success" in row]
-            text = f"success {sum(success) / len(success):.2f}" if success else ""
-            progress.update(run.steps(iteration), text)
-            if stops:
+            note = f"success {sum(success) / len(success):.2f}" if success else ""
+            progress.update(run.steps(iteration), note)
+            if preempted:
                 problem = f"SIGTERM stopped the training after {run.steps(iteration):,} steps"
                 raise Preempted(problem, cure="continue it with --resume")
 
@@ -250,7 +250,7 @@ def _start(run: _Run) -> tuple[int, Any]:
 
 
 def _record(
-    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], stops: bool
+    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], preempted: bool
 ) -> None:
     """Log, validate and save one iteration of every seed that has not stopped."""
     config, steps = run.config, run.steps(iteration)
@@ -263,7 +263,7 @@ def _record(
         if evaluates and run.validation is not None:
             row |= _validation(run, run.validation, state, number)
         rank = log.write(steps, row)
-        if last or evaluates or stops or iteration % config.checkpoint_every == 0:
+        if last or evaluates or preempted or iteration % config.checkpoint_every == 0:
             log.checkpoints.save(steps, run.program.seeds.member(state, number), rank)
         if log.stopped and not last:
             seed, patience = run.program.seeds.seeds[number], config.patience
@@ -326,7 +326,7 @@ class PretrainedRun:
         networks = _networks(state)
         sources = {path: source for path in networks if (source := _source(path, stored))}
         templates = {source: networks[path] for path, source in sources.items()}
-        cure = "begin from a run with the same network, observation and actions"
+        cure = "start from a run with the same network, observation and actions"
         restored = checkpoints.restore_parts(templates, self.step, cure)
         return {path: restored[source] for path, source in sources.items()}
 

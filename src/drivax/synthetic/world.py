@@ -47,7 +47,7 @@ WORLD_VERSION = 2
 _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
 #: Candidate first steps of a critical recording: earliest, latest delay, stride.
-_EARLIEST, _LATER, _EVERY = 28, 16, 4
+_EARLIEST_STEP, _MAX_DELAY_STEPS, _CRITICAL_STRIDE = 28, 16, 4
 #: Ego may react to an event this many steps before it begins.
 _FORESEEN = 8
 #: Lights are recorded within this distance of ego's log, m: a scenario's map reaches a little further.
@@ -203,7 +203,7 @@ class _Draw:
 def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Generator) -> Recording | str:
     """Return the recording of one draw, or the cause of its rejection."""
     critical = not draw.event and rng.random() < config.critical_share
-    times = (np.arange(_WARM_UP + STEPS + _LATER * critical) - _WARM_UP) * DT_S
+    times = (np.arange(_WARM_UP + STEPS + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
     roles = assign_roles(
         draw.network,
         domain,
@@ -224,7 +224,9 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
         motion, cause = expert.drive_ego(
             roles, traffic.times_s, Staging(), begin, traffic.run, unplanned=motion
         )
-        return cause or _perceived(replace(_recorded(roles, motion, begin, None), tags=tags), config, rng)
+        return cause or _add_perception(
+            replace(_to_recording(roles, motion, begin, None), tags=tags), config, rng
+        )
     view, cause = EgoView(roles, traffic.run(), _WARM_UP), UNSUITED[0]
     for _ in range(_STAGINGS):
         staged = stage(draw.event, view, draw.severity_mps2, rng)
@@ -233,12 +235,12 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
         aware = staged.first_step - _FORESEEN
         motion, cause = expert.drive_ego(roles, times, staged.staging, _WARM_UP, traffic.run, aware)
         if not cause and endangers_ego(view, motion, staged):
-            return _perceived(_recorded(roles, motion, _WARM_UP, staged), config, rng)
+            return _add_perception(_to_recording(roles, motion, _WARM_UP, staged), config, rng)
         cause = cause or UNSUITED[1]
     return cause
 
 
-def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
+def _add_perception(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
     """Add perception noise and the visibility mask."""
     tracks, ego = recording.tracks, recording.ego
     seen = sight(tracks, ego, config.sensor)
@@ -250,12 +252,12 @@ def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -
     network = traffic.roles.network
     if not conflicts_on(network, motion.paths[0]):
         return None
-    steps = np.arange(_EARLIEST, _WARM_UP + _LATER + 1, _EVERY)
+    steps = np.arange(_EARLIEST_STEP, _WARM_UP + _MAX_DELAY_STEPS + 1, _CRITICAL_STRIDE)
     candidates = np.flatnonzero(critical_steps(network, motion, traffic.colour, steps))
     return int(steps[rng.choice(candidates)]) if len(candidates) else None
 
 
-def _recorded(roles: Roles, motion: Motion, first: int, staged: StagedEvent | None) -> Recording:
+def _to_recording(roles: Roles, motion: Motion, first: int, staged: StagedEvent | None) -> Recording:
     """Return the recording from a step on, without id and segment."""
     network, motion = roles.network, motion.from_step(first)
     times = np.arange(STEPS) * DT_S

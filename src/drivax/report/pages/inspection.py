@@ -62,9 +62,9 @@ def _quantities(inspections: Sequence[Inspection]) -> str:
     for quantity in QUANTITIES:
         values = [inspection.values(quantity.read) for inspection in inspections]
         series.append((quantity.label, quantity.unit or "per scenario", values))
-    sampled = [speeds(inspection) for inspection in inspections]
-    series.append(("speed of ego", "m/s", [sample.ego for sample in sampled]))
-    series.append(("speed of other vehicles now", "m/s", [sample.vehicles for sample in sampled]))
+    samples = [speeds(inspection) for inspection in inspections]
+    series.append(("speed of ego", "m/s", [sample.ego for sample in samples]))
+    series.append(("speed of other vehicles now", "m/s", [sample.vehicles for sample in samples]))
     charts = "".join(
         histogram(title, dict(zip(names, values, strict=True)), unit)
         for title, unit, values in series
@@ -72,7 +72,7 @@ def _quantities(inspections: Sequence[Inspection]) -> str:
     )
     counts = [
         f"{sample.scenarios:,} of {len(inspection):,} scenarios of {inspection.name}"
-        for sample, inspection in zip(sampled, inspections, strict=True)
+        for sample, inspection in zip(samples, inspections, strict=True)
         if sample.scenarios < len(inspection)
     ]
     note = f"Speeds: {escape('; '.join(counts))}, evenly spread." if counts else ""

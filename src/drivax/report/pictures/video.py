@@ -64,7 +64,7 @@ def write_videos(
         UsageError: A file exists, there is no such scenario, or a package for videos is not installed.
     """
     evaluations = read_evaluations(runs)
-    groups = _selected(evaluations, which)
+    groups = _select_episodes(evaluations, which)
     if not side_by_side:
         evaluations = evaluations[-1:]
         groups = [replace(group, rows=group.rows[-1:]) for group in groups]
@@ -80,7 +80,7 @@ def write_videos(
     return files
 
 
-def _selected(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
+def _select_episodes(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
     """Return the requested episodes, worst first."""
     groups = rank_scenarios(runs)
     if which == "all":
@@ -124,10 +124,10 @@ def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light"
         panes = [draw_frame(scenery, rollout, step, dt_s) for scenery, rollout in drawn]
         for pane in panes if across > 1 else ():
             pane[:, -1, :3] = rgb(THEMES[theme]["lane"])
-        yield np.concatenate((_tiled(panes, across), legend))
+        yield np.concatenate((_tile(panes, across), legend))
 
 
-def _tiled(panes: Sequence[Picture], across: int) -> Picture:
+def _tile(panes: Sequence[Picture], across: int) -> Picture:
     """Return pictures of one size in rows, the last row filled with empty ones."""
     missing = -len(panes) % across
     filled = [*panes, *(np.full_like(panes[0], panes[0][-1, -1]) for _ in range(missing))]

@@ -110,13 +110,15 @@ class CrossTraffic(EventScript):
         return tuple(
             Destination(index, (0.0, 0.0), self.arrival_s)
             for index, lane in enumerate(network.lanes)
-            if lane.connector and lane.predecessors and self._conflicting(network, index)
+            if lane.connector and lane.predecessors and self._lower_priority_conflicts(network, index)
         )
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         network, share = view.roles.network, float(rng.uniform(*self.speed_share))
-        connectors = sorted({other for mine in view.connectors for other in self._conflicting(network, mine)})
+        connectors = sorted(
+            {other for mine in view.connectors for other in self._lower_priority_conflicts(network, mine)}
+        )
         if not connectors:
             return None
         lane = int(rng.choice(connectors))
@@ -135,7 +137,7 @@ class CrossTraffic(EventScript):
         staging = Staging(extras=(adversary,), removed=removed)
         return Proposal(staging, required, adversary, entry - decides, last)
 
-    def _conflicting(self, network: RoadNetwork, mine: int) -> list[int]:
+    def _lower_priority_conflicts(self, network: RoadNetwork, mine: int) -> list[int]:
         """Connectors that cross a straight one and have to give way to it."""
         lane = network.lanes[mine]
         if not _straight_on(lane):

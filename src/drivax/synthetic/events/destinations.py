@@ -90,7 +90,7 @@ def route_past(
     lane, lanes = destination.lane, [destination.lane]
     while position < time * _pace(network, lane):
         time -= position / _pace(network, lane)
-        before = _before(network, lanes)
+        before = _feeding_lanes(network, lanes)
         if not before or (lane != destination.lane and network.lanes[lane].control != Control.NONE):
             return None
         lane = int(rng.choice(before))
@@ -101,7 +101,7 @@ def route_past(
         return None
     position = min(position - time * _pace(network, lane), current.length_m - _FROM_END_M)
     start, room = Start(lane, position, position), position
-    while room < _BEFORE_S * _pace(network, lane) + _BEHIND_M and (before := _before(network, lanes)):
+    while room < _BEFORE_S * _pace(network, lane) + _BEHIND_M and (before := _feeding_lanes(network, lanes)):
         lanes.insert(0, int(rng.choice(before)))
         room += network.lanes[lanes[0]].length_m
     index = len(lanes) - 1
@@ -143,7 +143,7 @@ def _pace(network: RoadNetwork, lane: int) -> float:
     return _PACE * network.lanes[lane].limit_mps
 
 
-def _before(network: RoadNetwork, lanes: list[int]) -> list[int]:
+def _feeding_lanes(network: RoadNetwork, lanes: list[int]) -> list[int]:
     """Predecessors of the first lane that are not part of the route."""
     before = network.lanes[lanes[0]].predecessors
     return [k for k in before if k not in lanes and network.lanes[k].kind != RoadKind.LANE_BIKE]

@@ -158,29 +158,32 @@ def _propose_leader(
     ``headway_s`` is its time gap to an ego in free traffic; it drives on later, with this further staging, or stays
     (None).
     """
-    track, lead = view.track, float(view.motion.speed[0, step])
+    track, ego_speed = view.track, float(view.motion.speed[0, step])
     lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
-    cruising = track.at + headway_s * lead + lengths
+    cruising = track.at + headway_s * ego_speed + lengths
     if view.meets_junction(float(cruising[view.first_step]), float(cruising[step])):
         return None
-    appears = view.first_step - _BEFORE
-    after = view.behind(cruising - CAR_M[0] / 2, appears)
-    speed, gap = float(after.motion.speed[0, step]), float(cruising[step] - after.track.at[step]) - lengths
-    draw = draw_braking(speed, gap, lead, rng)
+    first_valid = view.first_step - _BEFORE
+    view_after = view.behind(cruising - CAR_M[0] / 2, first_valid)
+    speed, gap = (
+        float(view_after.motion.speed[0, step]),
+        float(cruising[step] - view_after.track.at[step]) - lengths,
+    )
+    draw = draw_braking(speed, gap, ego_speed, rng)
     if draw is None:
         return None
     times = DT_S * (np.arange(view.steps) - step)
-    gone, _ = speed_change(lead, 0.0, draw[0], times)
+    braked_m, _ = speed_change(ego_speed, 0.0, draw[0], times)
     last = view.last_step if drives_on is None else step + _stands_until(speed, draw[1])
-    next_lanes, _ = speed_change(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
-    station = np.where(times < 0, cruising, cruising[step] + gone + next_lanes)
+    next_lanes, _ = speed_change(0.0, ego_speed, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
+    station = np.where(times < 0, cruising, cruising[step] + braked_m + next_lanes)
     if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
         return None
-    valid, left = np.arange(view.steps) >= appears, np.zeros(view.steps)
+    valid, left = np.arange(view.steps) >= first_valid, np.zeros(view.steps)
     adversary = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid)
     staging = replace(drives_on or Staging(), extras=(adversary,))
-    required = severity(after, adversary, step + NOTICED)
-    return Proposal(staging, required, adversary, step, last, None, others, after)
+    required = severity(view_after, adversary, step + NOTICED)
+    return Proposal(staging, required, adversary, step, last, None, others, view_after)
 
 
 @dataclass(frozen=True)
@@ -221,7 +224,7 @@ class CutIn(EventScript):
         """See :class:`EventScript`."""
         step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
         if self.late_merge:
-            step, side = self._before_an_end(view, rng)
+            step, side = self._draw_lane_end(view, rng)
         shares = rng.uniform(*self.speed_share), rng.uniform(*self.slower_share)
         braking, lasts = float(rng.uniform(*self.braking_mps2)), float(rng.uniform(*self.lasts_s))
         if step is None:
@@ -254,7 +257,7 @@ class CutIn(EventScript):
         last = min(step + round(max(lasts, (before - after) / braking) / DT_S), view.last_step)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, max(last, step + 1))
 
-    def _before_an_end(self, view: EgoView, rng: np.random.Generator) -> tuple[int | None, int]:
+    def _draw_lane_end(self, view: EgoView, rng: np.random.Generator) -> tuple[int | None, int]:
         """Draw a step at which ego is shortly before the end of an adjacent lane, and the side of that lane."""
         ends = view.lane_ends
         if not ends:

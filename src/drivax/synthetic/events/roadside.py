@@ -74,7 +74,9 @@ class Jaywalker(_StreetScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         pace = float(rng.uniform(*self.speed_mps))
-        origin = (self._behind_parked if self.hidden else self._from_kerb)(view, severity_mps2, pace, rng)
+        origin = (self._emerge_from_behind_parked if self.hidden else self._from_kerb)(
+            view, severity_mps2, pace, rng
+        )
         if origin is None:
             return None
         step, station, offset = origin
@@ -125,7 +127,7 @@ class Jaywalker(_StreetScript):
             station = front + room
         return step, station, side * offset
 
-    def _behind_parked(
+    def _emerge_from_behind_parked(
         self, view: EgoView, requested: float, pace: float, rng: np.random.Generator
     ) -> tuple[int, float, float] | None:
         if not view.roles.parked:
@@ -141,9 +143,9 @@ class Jaywalker(_StreetScript):
             front = view.track.at[steps] + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
             rooms = [self._required_room(view, offset, float(v), pace, requested) for v in speed]
             rooms = [math.inf if room is None else room for room in rooms]
-            off = np.where(speed > 4.0, rooms, math.inf) - (line - front)
-            best = int(np.argmin(np.abs(off)))
-            if abs(off[best]) < 0.08 * speed[best]:
+            error = np.where(speed > 4.0, rooms, math.inf) - (line - front)
+            best = int(np.argmin(np.abs(error)))
+            if abs(error[best]) < 0.08 * speed[best]:
                 return int(steps[best]), line, offset
         return None
 
@@ -238,7 +240,7 @@ class WrongWayCyclist(_StreetScript):
         times = DT_S * (np.arange(view.steps) - step)
         # Share of the swing back after which ego's lane is clear.
         share = (half + outer) / (outer - inner) if outer < inner else 1.0
-        begin_back = clear - _time_of_share(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
+        begin_back = clear - _inverse_smooth_step(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
         swing = smooth_step(times / self.swing_s) - smooth_step((times - begin_back) / self.swing_s)
         if begin_back < self.swing_s * 0.6:
             return None
@@ -249,7 +251,7 @@ class WrongWayCyclist(_StreetScript):
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
 
-def _time_of_share(share: float) -> float:
+def _inverse_smooth_step(share: float) -> float:
     """Inverse of the smooth step: the share of its duration at which it reaches a share."""
     t = np.linspace(0.0, 1.0, 201)
     return float(np.interp(share, smooth_step(t), t))

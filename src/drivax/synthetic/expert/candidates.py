@@ -197,7 +197,7 @@ def _box_conflicts(
     """Find conflicts of boxes: circles at every fourth sample first, then exact overlap."""
     reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + margin_m).T)
     reach += _STRIDE * SPACING_M / 2
-    user, step = np.nonzero(valid & _around(others, ego, reach))
+    user, step = np.nonzero(valid & _is_near_path(others, ego, reach))
     coarse = ego[::_STRIDE, :2]
     xy = others[user, step, :2]
     gap = (xy[:, None, 0] - coarse[:, 0]) ** 2 + (xy[:, None, 1] - coarse[:, 1]) ** 2
@@ -207,19 +207,21 @@ def _box_conflicts(
     inside = (point >= 0) & (point < len(ego))
     row, point = row[inside], point[inside]
     other, mine = others[user[row], step[row]], ego[point]
-    close = overlap(_wider(mine, margin_m[user[row]]), other)
+    close = overlap(_grow_boxes(mine, margin_m[user[row]]), other)
     row, point, other, mine = row[close], point[close], other[close], mine[close]
-    hard = overlap(_wider(mine, np.array(HARD_M)), other)
+    hard = overlap(_grow_boxes(mine, np.array(HARD_M)), other)
     return Conflicts(user[row], step[row], point, hard)
 
 
-def _wider(box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "n 6"]:
+def _grow_boxes(
+    box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]
+) -> Float64[np.ndarray, "n 6"]:
     """Grow boxes at each end and each side."""
     size = box[:, 4:] + 2 * by_m
     return np.concatenate([box[:, :4], size], axis=1)
 
 
-def _around(others: _Boxes, ego: _PathBoxes, reach: Float64[np.ndarray, " user"]) -> _Exists:
+def _is_near_path(others: _Boxes, ego: _PathBoxes, reach: Float64[np.ndarray, " user"]) -> _Exists:
     """Mask of users near the bounding rectangle of the path."""
     low, high = ego[:, :2].min(axis=0), ego[:, :2].max(axis=0)
     outside = np.maximum(low - others[..., :2], others[..., :2] - high).max(axis=-1)

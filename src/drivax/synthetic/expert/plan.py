@@ -33,7 +33,7 @@ from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 #: Bounds of acceleration (m/s2) and jerk (m/s3), tried in this order.
 _BOUNDS = (((-3.4, 2.0), 2.6), ((-4.0, 2.3), 4.1), ((-5.9, 2.3), 25.0))
 #: Cost below which the original path needs no alternatives.
-_CHEAP = 12.0
+_GOOD_COST = 12.0
 #: Costs of a shift: constant, per m of offset, per second against traffic.
 _LEAVING, _ASIDE, _AGAINST = 8.0, 2.0, 6.0
 #: Cost of passing a line when the light is about to turn red or ego must give way.
@@ -125,7 +125,7 @@ def _state(
     pose = Pose(float(x), float(y), float(motion.heading[0, first_step]))
     paths = motion.paths or roles.paths
     from_m = project_on_path(paths[0], motion.xy[0, first_step], float(motion.distance_m[0, first_step]))[0]
-    boxes, valid = _continued(motion, first_step)
+    boxes, valid = _extrapolate(motion, first_step)
     rows = np.arange(1, len(motion.kind))
     state = _State(
         roles=roles,
@@ -145,16 +145,16 @@ def _state(
     candidate = state.candidate(Shift())
     gap = candidate.xy[:, None] - motion.xy[0, first_step:]
     passed_m = candidate.base_m[np.argmin(np.sum(gap**2, axis=-1), axis=0)]
-    state = replace(state, passed_m=_longer(passed_m))
+    state = replace(state, passed_m=_repeat_last_step(passed_m))
     return replace(state, lines=_lines(motion, times_s[first_step:], state))
 
 
-def _longer(values: np.ndarray) -> np.ndarray:
+def _repeat_last_step(values: np.ndarray) -> np.ndarray:
     """Repeat the last value."""
     return np.append(values, np.repeat(values[-1:], _BEYOND_STEPS))
 
 
-def _continued(
+def _extrapolate(
     motion: Motion, first_step: int
 ) -> tuple[Float64[np.ndarray, "user time 6"], Bool[np.ndarray, "user time"]]:
     """Boxes of the others from a step on, extrapolated at constant velocity."""
@@ -172,7 +172,7 @@ def _lines(motion: Motion, times_s: _Series, state: _State) -> list[StopLine]:
     roles = state.roles
     distance, valid = motion.distance_m[:, -steps:], motion.valid[: motion.vehicles, -steps:]
     coming = arrivals(roles.network, motion.paths or roles.paths, distance, valid, half)
-    first = {lane: _longer(taken) for lane, taken in coming.items()}
+    first = {lane: _repeat_last_step(taken) for lane, taken in coming.items()}
     longer = np.append(times_s, times_s[-1] + DT_S * np.arange(1, _BEYOND_STEPS + 1))
     ego, passed = (state.from_m, float(half[0])), state.from_m + state.passed_m
     return stop_lines(roles.network, state.path, ego, longer, passed, first)
@@ -183,19 +183,19 @@ def _best_candidate(state: _State) -> tuple[CandidatePath, SpeedProfile]:
     candidate = state.candidate(Shift())
     conflicts = _conflicts(state, candidate)
     options = [_option(state, candidate, conflicts)]
-    drives: list[tuple[float, CandidatePath, SpeedProfile]] = []
-    if options[0].cost < _CHEAP:
-        drive = _smooth(state, options[0])
-        if drive.excess <= _TOLERANCE:
-            return candidate, drive
+    infeasible: list[tuple[float, CandidatePath, SpeedProfile]] = []
+    if options[0].cost < _GOOD_COST:
+        profile = _smooth(state, options[0])
+        if profile.excess <= _TOLERANCE:
+            return candidate, profile
     options += _passing_options(state, candidate, conflicts)
     for option in sorted(options, key=lambda option: option.cost):
-        drive = _smooth(state, option)
-        if drive.excess <= _TOLERANCE and not option.speeds.touches:
-            return option.candidate, drive
-        drives.append((drive.excess + 100.0 * option.speeds.touches, option.candidate, drive))
-    _, candidate, drive = min(drives, key=lambda entry: entry[0])
-    return candidate, drive
+        profile = _smooth(state, option)
+        if profile.excess <= _TOLERANCE and not option.speeds.touches:
+            return option.candidate, profile
+        infeasible.append((profile.excess + 100.0 * option.speeds.touches, option.candidate, profile))
+    _, candidate, profile = min(infeasible, key=lambda entry: entry[0])
+    return candidate, profile
 
 
 def _conflicts(state: _State, candidate: CandidatePath) -> Conflicts:

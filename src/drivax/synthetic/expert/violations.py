@@ -80,7 +80,7 @@ def find_violation(
     if not motion.valid[0, window].all():
         return Violation("ego_leaves_map")
     box = user_boxes(motion)[:, window]
-    pairs = first_overlap_step(box, motion.valid[:, window], _tested(motion))
+    pairs = first_overlap_step(box, motion.valid[:, window], _tested_pairs(motion))
     touched = np.flatnonzero(pairs[0] < box.shape[1])
     if len(touched):
         return Violation("ego_collides", tuple(touched.tolist()), first_step + int(pairs[0].min()))
@@ -88,7 +88,7 @@ def find_violation(
         return Violation("ego_brakes_hard")
     if leaves_road(roles.network, box[0]):
         return Violation("ego_leaves_road")
-    cause = _rules_broken(roles, motion, times_s, first_step)
+    cause = _find_rule_violation(roles, motion, times_s, first_step)
     if cause:
         return Violation(cause)
     against = goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, window])
@@ -102,7 +102,7 @@ def is_staged(staging: Staging) -> bool:
     return any(vars(staging).values())
 
 
-def _tested(motion: Motion) -> _UserPairs:
+def _tested_pairs(motion: Motion) -> _UserPairs:
     """Mask of pairs that must not overlap: not two pedestrians, not two static users."""
     is_pedestrian = motion.kind == AgentKind.PEDESTRIAN
     moves = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
@@ -167,7 +167,7 @@ def passes(lane: Lane, front: _Points, heading: _Series) -> _Steps:
     return (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & within[1:]
 
 
-def _rules_broken(roles: Roles, motion: Motion, times_s: _Series, first_step: int) -> str:
+def _find_rule_violation(roles: Roles, motion: Motion, times_s: _Series, first_step: int) -> str:
     """Return ``ego_runs_red``, ``other_runs_red``, ``ego_runs_stop_sign``, or an empty string."""
     network, window = roles.network, slice(first_step, None)
     red = np.zeros((len(times_s) - first_step, len(network.lanes)), bool)
@@ -185,7 +185,7 @@ def _rules_broken(roles: Roles, motion: Motion, times_s: _Series, first_step: in
             passed = passes(lane, front, heading) & valid[:-1] & valid[1:]
             if np.any(passed & red_steps[:, span.lane]):
                 return "ego_runs_red" if i == 0 else "other_runs_red"
-            if stop and not _stood(lane, motion, first_step, front, passed):
+            if stop and not _stopped_before_line(lane, motion, first_step, front, passed):
                 return "ego_runs_stop_sign"
         if i == 0 and _passes_red_off_route(network, path, motion.xy[0, window], front, heading, red_steps):
             return "ego_runs_red"
@@ -225,7 +225,7 @@ def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
     return result
 
 
-def _stood(lane: Lane, motion: Motion, first_step: int, front: _Points, passed: _Steps) -> bool:
+def _stopped_before_line(lane: Lane, motion: Motion, first_step: int, front: _Points, passed: _Steps) -> bool:
     """Whether ego stopped before each passing of a line."""
     for step in np.flatnonzero(passed):
         # The stop may lie before the recording.
@@ -294,16 +294,16 @@ def quantities(heading: _Series, speed: _Series) -> dict[str, Float64[np.ndarray
     course = np.cumsum(relative_heading)
     jerk = {"window": 15, "order": 2, "derivative": 1}
     return {
-        "longitudinal_mps2": _smoothed(along, 8, 2),
-        "lateral_mps2": _smoothed(lateral, 8, 2),
-        "jerk_mps3": _smoothed(along, **jerk),
-        "jerk_magnitude_mps3": _smoothed(np.hypot(along, lateral), **jerk),
-        "yaw_rate_rps": _smoothed(course, **jerk),
-        "yaw_acceleration_rps2": _smoothed(course, 15, 3, 2),
+        "longitudinal_mps2": _savgol_filter(along, 8, 2),
+        "lateral_mps2": _savgol_filter(lateral, 8, 2),
+        "jerk_mps3": _savgol_filter(along, **jerk),
+        "jerk_magnitude_mps3": _savgol_filter(np.hypot(along, lateral), **jerk),
+        "yaw_rate_rps": _savgol_filter(course, **jerk),
+        "yaw_acceleration_rps2": _savgol_filter(course, 15, 3, 2),
     }
 
 
-def _smoothed(
+def _savgol_filter(
     values: Float64[np.ndarray, " n"], window: int, order: int, derivative: int = 0
 ) -> Float64[np.ndarray, " n"]:
     # The last bits of BLAS would depend on the number of threads.

@@ -238,22 +238,22 @@ def feature_id(lane: int) -> int:
 def map_features(network: RoadNetwork) -> tuple[MapFeature, ...]:
     """Convert a network to map features: lanes first (ids 1, 2, ...), then edges, markings, crosswalks, stop signs."""
     features = [_lane_feature(index, lane) for index, lane in enumerate(network.lanes)]
-    closed = [Line(line.kind, np.concatenate([line.xy, line.xy[:1]])) for line in network.edges]
-    for line in (*closed, *network.markings, *network.crosswalks):
+    edges = [Line(line.kind, np.concatenate([line.xy, line.xy[:1]])) for line in network.edges]
+    for line in (*edges, *network.markings, *network.crosswalks):
         features.append(MapFeature(feature_id=len(features) + 1, kind=line.kind, points=_flat(line.xy)))
-    for before, connectors in _signed(network).items():
+    for stop_lane, connectors in _stop_controlled_lanes(network).items():
         features.append(
             MapFeature(
                 feature_id=len(features) + 1,
                 kind=RoadKind.STOP_SIGN,
-                points=_flat(network.lanes[before].curve.xy[-1:]),
+                points=_flat(network.lanes[stop_lane].curve.xy[-1:]),
                 lanes=tuple(map(feature_id, connectors)),
             )
         )
     return tuple(features)
 
 
-def _signed(network: RoadNetwork) -> dict[int, list[int]]:
+def _stop_controlled_lanes(network: RoadNetwork) -> dict[int, list[int]]:
     """Lanes that end at a stop sign, each with the connectors to which it applies."""
     signs: dict[int, list[int]] = {}
     for index, lane in enumerate(network.lanes):

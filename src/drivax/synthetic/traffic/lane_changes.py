@@ -209,25 +209,27 @@ class LaneChanges:
         new_leader, new_follower = self._neighbours(now, vehicles, o.there, occupied)
         _, ahead_gap, ahead_speed = new_leader
         behind, behind_gap, _ = new_follower
-        mine = self._follow(vehicles, speed, o.limit_mps, ahead_gap, ahead_speed)
+        own_acceleration = self._follow(vehicles, speed, o.limit_mps, ahead_gap, ahead_speed)
         # After the change the new follower follows the vehicle, and the old follower the vehicle's old leader.
-        new_then, new_today = self._followed(now, vehicles, new_follower, new_leader)
+        new_after, new_before = self._follower_accelerations(now, vehicles, new_follower, new_leader)
         old_leader, old_follower = self._neighbours(now, vehicles, o.here, occupied)
-        old_today, old_then = self._followed(now, vehicles, old_follower, old_leader)
-        others = new_then - new_today + old_then - old_today
-        gain = mine - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
+        old_before, old_after = self._follower_accelerations(now, vehicles, old_follower, old_leader)
+        others_gain = new_after - new_before + old_after - old_before
+        gain = (
+            own_acceleration - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others_gain
+        )
         urgency = np.where(o.mandatory, 1.0 - np.clip(o.left_m / _LEAVE_M, 0.0, 1.0), 0.0)
         safe = _SAFE_MPS2 + urgency * (_URGENT_MPS2 - _SAFE_MPS2)
         follower_speed = np.where(behind >= 0, now.speed[np.maximum(behind, 0)], 0.0)
-        ok = o.possible & (new_then > -safe) & (mine > -safe)
-        ok &= ahead_gap > _ROOM_M + _ROOM_S * np.maximum(speed - ahead_speed, 0.0) * 4
-        ok &= behind_gap > _ROOM_M + _ROOM_S * follower_speed * (1 - 0.6 * urgency)
-        ok &= o.mandatory | (gain > _THRESHOLD_MPS2)
-        changes = self._without_contest(now, options, ok, gain)
-        moved = {change.vehicle for change in changes}
-        return changes, _helped(now, options, moved, new_leader, new_follower)
+        accepted = o.possible & (new_after > -safe) & (own_acceleration > -safe)
+        accepted &= ahead_gap > _ROOM_M + _ROOM_S * np.maximum(speed - ahead_speed, 0.0) * 4
+        accepted &= behind_gap > _ROOM_M + _ROOM_S * follower_speed * (1 - 0.6 * urgency)
+        accepted &= o.mandatory | (gain > _THRESHOLD_MPS2)
+        changes = self._drop_contested(now, options, accepted, gain)
+        changing = {change.vehicle for change in changes}
+        return changes, _help_accelerations(now, options, changing, new_leader, new_follower)
 
-    def _followed(
+    def _follower_accelerations(
         self, now: Situation, vehicles: _Indices, follower: _Neighbour, leader: _Neighbour
     ) -> tuple[_Values, _Values]:
         """Return followers' accelerations behind the vehicle and behind its leader; 0 without a follower."""
@@ -274,7 +276,7 @@ class LaneChanges:
         half = self._half[vehicles]
         return (row, nearest - half, speed), (behind, behind_gap - half, behind_speed)
 
-    def _without_contest(self, now: Situation, options: _Options, ok: _Mask, gain: _Values) -> list[Change]:
+    def _drop_contested(self, now: Situation, options: _Options, ok: _Mask, gain: _Values) -> list[Change]:
         """Return the best option of each vehicle; only one vehicle enters a gap at a time."""
         changes: dict[int, Change] = {}
         taken: list[tuple[int, float]] = []
@@ -292,7 +294,7 @@ class LaneChanges:
         return list(changes.values())
 
 
-def _helped(
+def _help_accelerations(
     now: Situation, options: _Options, moved: set[int], leader: _Neighbour, follower: _Neighbour
 ) -> Helped:
     """Pairs that adjust to each other because a mandatory change has found no room yet."""

@@ -363,13 +363,13 @@ class Corridor:
     def _plot(self, rng: np.random.Generator, style: RoadStyle, main: CrossSection) -> _Plot:
         kind = list(_KINDS)[rng.choice(len(_KINDS), p=list(_KINDS.values()))]
         marked = kind == _LIGHTS or bool(rng.random() < 0.4)
-        slower = min(main.limit_mps, float(rng.choice(style.limits_mps)))
-        side = draw_street(rng, style, (1, 1), slower, kind == _LIGHTS or bool(rng.random() < 0.6))
+        side_limit_mps = min(main.limit_mps, float(rng.choice(style.limits_mps)))
+        side = draw_street(rng, style, (1, 1), side_limit_mps, kind == _LIGHTS or bool(rng.random() < 0.6))
         main = replace(main, marked=marked)
         streets, headings = [main, side, main, side], [k * math.pi / 2 for k in range(4)]
         if kind == _SIDE_ROAD:
-            closed = int(rng.choice([1, 3]))
-            del streets[closed], headings[closed]
+            missing_arm = int(rng.choice([1, 3]))
+            del streets[missing_arm], headings[missing_arm]
         arms = self.geometry.arms(rng, headings, streets)
         left_only = kind == _LIGHTS and main.inward > 1 and bool(rng.random() < self.left_lane_share)
         return _Plot(kind, arms, self.geometry.mouths(rng, arms), left_only)
