@@ -160,7 +160,7 @@ class Table:
         return stream.getvalue()
 
     def html(self) -> str:
-        """Return HTML that scrolls sideways by itself on narrow screens."""
+        """Return HTML that scrolls horizontally on narrow screens."""
         headings = "".join(
             f"<th scope=col{_attribute('title', column.title)}>{escape(column.heading)}</th>"
             for column in self.columns

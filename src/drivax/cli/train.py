@@ -117,7 +117,7 @@ def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:
-    """Refuse another training than the arm's, and flags that the arm would ignore."""
+    """Raise UsageError for another training than that of the arm, or for flags that the arm ignores."""
     own, expected = (_algorithm(each) for each in (config, settings.load(TrainConfig, arm.preset)))
     if own != expected:
         raise UsageError(f"arm {args.arm} is trained by {expected}, not {own}", cure=f"use {arm.preset}")

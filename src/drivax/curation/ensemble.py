@@ -239,7 +239,7 @@ def _check_memory(config: EnsembleConfig, data: ScenarioSet, count: int, free: i
     if free is None:
         return
     size = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)).nbytes
-    # A bank exists twice while it is made.
+    # Building a bank takes twice its memory.
     if 2 * size * count > free:
         fitting = free // (4 * size)
         problem = (

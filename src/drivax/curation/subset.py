@@ -18,7 +18,7 @@ from drivax.stats.clusters import recordings_of
 def check_top(
     data: ScenarioSet, out: Path, count: int, overwrite: bool = False, all_windows: bool = False
 ) -> None:
-    """Refuse a subset that cannot be written, before any work is done.
+    """Check, before any work, that a subset can be written.
 
     Raises:
         UsageError: There are fewer recordings (with ``all_windows``: scenarios), ``out`` exists, or is the set itself.

@@ -18,7 +18,7 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class WeightConfig:
-    """How a score becomes a weight, over all steps of a set that can be drawn.
+    """Settings that convert scores to sampling weights, over all drawable steps of a set.
 
     For the score s of a step, or of its scenario:
 

@@ -75,7 +75,7 @@ class EgoMotion:
 
     @cached_property
     def boxes(self) -> Float64[np.ndarray, "t 6"]:
-        """The box as ``geometry.boxes`` takes it."""
+        """The box in the format of ``geometry.boxes``."""
         return _boxes(self.xy, self.heading, np.array(self.size_m))
 
     @cached_property
@@ -284,19 +284,19 @@ def comfort_series(ego: EgoMotion) -> Comfort:
     samples = len(ego.heading)
     along = ego.acceleration + ego.rear_axle_m * (ego.yaw_rate**2 + ego.yaw_acceleration)
 
-    def filtered(values: Float64[np.ndarray, " t"], window: tuple[int, int, int]) -> Any:
+    def apply_filter(values: Float64[np.ndarray, " t"], window: tuple[int, int, int]) -> Any:
         width, order, derivative = window
         matrix = savgol_matrix(samples, min(width, samples), order, derivative)
         return np.round(matrix @ values / ego.dt_s**derivative, 8)
 
-    heading, smooth = np.unwrap(ego.heading), filtered(along, SMOOTH)
+    heading, smooth = np.unwrap(ego.heading), apply_filter(along, SMOOTH)
     series = {
         "lon": smooth,
         "lat": np.zeros(samples),
-        "lonjerk": filtered(smooth, JERK),
-        "jerk": filtered(filtered(np.abs(ego.acceleration), SMOOTH), JERK),
-        "yaw": filtered(heading, YAW_RATE),
-        "yawacc": filtered(heading, YAW_ACCELERATION),
+        "lonjerk": apply_filter(smooth, JERK),
+        "jerk": apply_filter(apply_filter(np.abs(ego.acceleration), SMOOTH), JERK),
+        "yaw": apply_filter(heading, YAW_RATE),
+        "yawacc": apply_filter(heading, YAW_ACCELERATION),
     }
     limits = (LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS2)
     bounds = (LONGITUDINAL_MPS2, *((-limit, limit) for limit in limits))

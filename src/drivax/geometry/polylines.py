@@ -130,7 +130,7 @@ def _to_chords(offset: Sequence[Array], along: Sequence[Array]) -> tuple[Array, 
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
-    """Mask of points to keep so that no dropped point is further than the tolerance from the rest.
+    """Mask of points to keep, within the tolerance of all dropped points.
 
     Douglas and Peucker, Cartographica 10(2), 1973, run on all polylines at once and level by level: every interval
     between kept points whose farthest point exceeds the tolerance is split there. Distance is to the chord as a

@@ -47,7 +47,7 @@ class Replay:
     """Contents of the buffer ``[row, environment]``.
 
     Attributes:
-        stored: States, or observations in bfloat16, as ``store`` says.
+        stored: States, or observations in bfloat16, according to ``store``.
         action: Actions in [-1, 1].
         reward: Rewards.
         terminated: Whether the episode ended by a failure.

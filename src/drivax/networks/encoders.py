@@ -281,9 +281,9 @@ class NormalisedEncoder(nnx.Module):
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch."""
-        return self.encoder(dict(groups) | {name: self._scaled(name, groups[name]) for name in self.mean})
+        return self.encoder(dict(groups) | {name: self._normalise(name, groups[name]) for name in self.mean})
 
-    def _scaled(self, name: str, value: Array) -> Array:
+    def _normalise(self, name: str, value: Array) -> Array:
         mean, deviation = (jax.lax.stop_gradient(values[name][...]) for values in (self.mean, self.deviation))
         return jnp.clip(
             (value - mean) / jnp.maximum(deviation, _MIN_DEVIATION), -_MAX_DEVIATIONS, _MAX_DEVIATIONS

@@ -157,7 +157,7 @@ class MtrConfig(TransformerConfig):
 
 @dataclass(frozen=True)
 class Fusion:
-    """How a :class:`LatentEncoder` combines groups.
+    """Depth of the stages of a :class:`LatentEncoder`.
 
     Attributes:
         group_layers: Depth of the latents of each group; 0: none.

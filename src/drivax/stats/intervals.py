@@ -48,7 +48,7 @@ class Interval:
     n: int
 
     def as_dict(self) -> dict[str, float | int | None]:
-        """Return the four numbers by name, as ``summary.json`` stores them."""
+        """Return the four numbers by name, in the format of ``summary.json``."""
         return asdict(self)
 
 

@@ -142,7 +142,7 @@ class StudyDefinition:
         ):  # fmt: skip
             for name in names:
                 if name not in available:
-                    raise ValueError(f"there is no {kind} {name!r}; {did_you_mean(name, list(available))}")
+                    raise ValueError(f"unknown {kind} {name!r}; {did_you_mean(name, list(available))}")
         for claim in self.claims:
             for name, available in (
                 (claim.arm, self.arms), (claim.reference, self.arms), (claim.group, self.groups),

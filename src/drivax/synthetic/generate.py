@@ -95,7 +95,7 @@ class Generation:
             raise UsageError(f"workers is {self.workers}", cure="use 0 or more")
         if self.capacity not in CAPACITIES:
             raise UsageError(
-                f"there is no capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
+                f"unknown capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
             )
         self.world.check()
 

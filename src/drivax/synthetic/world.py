@@ -94,7 +94,7 @@ class WorldConfig:
             UsageError: The first wrong setting.
         """
         if self.domain not in DOMAINS:
-            raise UsageError(f"there is no domain {self.domain!r}", cure=f"use one of {', '.join(DOMAINS)}")
+            raise UsageError(f"unknown domain {self.domain!r}", cure=f"use one of {', '.join(DOMAINS)}")
         for name in ("rare_rate", "critical_share", "lane_change_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure="use a share from 0 to 1")

@@ -212,7 +212,7 @@ def _distributions(runs: Sequence[EpisodeTable]) -> str:
 def _episodes(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     note = "▶ marks those that play below." if packed else "Rollouts and tags were left out of this page."
     text = (
-        "<p>All episodes, worst first: the gravest kind of failure, then the lowest score. Click a number in the "
+        "<p>All episodes, worst first: by the severity of failures, then by the lowest score. Click a number in the "
         f"tables above for its episodes. {note}</p>"
     )
     episode_list = asset("episode_list.html").rstrip()

@@ -72,10 +72,10 @@ def write_player(
 
 def findings(scenario: Scenario) -> str:
     """Return the violations that the audit found in a log, as text."""
-    words = [words for name, words in _FINDINGS.items() if scenario.audit.get(name)]
+    names = [names for name, names in _FINDINGS.items() if scenario.audit.get(name)]
     if (share := scenario.audit.get("log_offroad_fraction")) is not None and share > 0:
-        words.append("off-road")
-    return ", ".join(words)
+        names.append("off-road")
+    return ", ".join(names)
 
 
 def criticality_html(table: ScoreTable, row: int) -> str:

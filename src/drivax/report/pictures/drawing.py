@@ -158,7 +158,7 @@ class Drawing:
         return cls(
             road_lines(scenario, box), signs[_within(signs, box)], route[_within(route, box)],
             goal[_within(goal, box)], line[near], state[:, near],
-            _agents(scenario, box), _parked(scenario, box), _box_of(scenario, slice(0, 1), None),
+            _agents(scenario, box), _parked_boxes(scenario, box), _box_of(scenario, slice(0, 1), None),
         )  # fmt: skip
 
     def ground(self) -> Iterator[Shape]:
@@ -267,7 +267,7 @@ def _agents(scenario: Scenario, box: Box) -> Boxes:
     return _box_of(scenario, rows, near[:, rows])
 
 
-def _parked(scenario: Scenario, box: Box) -> Boxes:
+def _parked_boxes(scenario: Scenario, box: Box) -> Boxes:
     steps = int(scenario.steps)
     rows = np.flatnonzero(scenario.parked_valid[:steps].any(axis=0) & _within(scenario.parked_xy, box))
     colours = [agent_colour(int(kind)) for kind in scenario.parked_kind[rows]]

@@ -133,8 +133,13 @@ def _extent(groups: ObservationGroups) -> tuple[Values, Values]:
 def _draw(axes: Axes, config: ObservationConfig, groups: ObservationGroups) -> None:
     if config.road:
         _draw_reach(axes, config)
-    drawn = (("road", _draw_road), ("route", _draw_route), ("lights", _draw_lights), ("agents", _draw_agents))
-    for group, draw in drawn:
+    draw_functions = (
+        ("road", _draw_road),
+        ("route", _draw_route),
+        ("lights", _draw_lights),
+        ("agents", _draw_agents),
+    )
+    for group, draw in draw_functions:
         if groups.has(group, "position"):
             draw(axes, groups)
     _draw_ego(axes, groups)

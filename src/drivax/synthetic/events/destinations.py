@@ -62,7 +62,7 @@ class DestinationRoute:
 def open_road(
     network: RoadNetwork, lowest_limit_mps: float = 0.0, has_neighbour: bool = False
 ) -> tuple[Destination, ...]:
-    """Places on ordinary lanes, with at least this speed limit and with neighbours if needed, away from their ends."""
+    """Return places away from the ends of ordinary lanes with a minimum speed limit, and with neighbours if needed."""
     return tuple(
         Destination(index, (_BEFORE_M, lane.length_m - _AFTER_M), _MIDWAY_S, alone=False)
         for index, lane in enumerate(network.lanes)

@@ -93,7 +93,7 @@ class LeadBrakes(EventScript):
         )
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
+        """See :class:`EventScript`; the severity is drawn from the possible range instead."""
         step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         tailgating = float(rng.uniform(*self.tailgating_s))
         if step is None:
@@ -135,7 +135,7 @@ class StalledVehicle(EventScript):
         return open_road(network, _LEAST_MPS)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
+        """See :class:`EventScript`; the severity is drawn from the possible range instead."""
         step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         return None if step is None else _propose_leader(view, step, headway, rng, None, ())
 

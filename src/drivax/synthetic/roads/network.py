@@ -139,7 +139,7 @@ class RoadNetwork:
 
     @cached_property
     def shared_m(self) -> dict[tuple[int, int], float]:
-        """For successors of the same lane: distance along the first one over which both share space, m."""
+        """Distance along one of two successors of a lane over which they share space, m."""
         pairs = (pair for lane in self.lanes for pair in permutations(lane.successors, 2))
         return {(a, b): _shared_length(self.lanes[a].curve, self.lanes[b].curve) for a, b in pairs}
 

@@ -68,22 +68,26 @@ def _moved_spans(
 ) -> tuple[LaneSpan, ...]:
     """Lane spans of a displaced path, whose samples moved from the old to the new positions."""
 
-    def moved(metres: float) -> float:
+    def map_position(metres: float) -> float:
         if not math.isfinite(metres) or metres < 0.0:
             return metres
         return float(np.interp(metres, old, new)) + max(metres - float(old[-1]), 0.0)
 
     # A span is anchored at its end: what lies ahead of the displacement stays in place.
-    shifts = [moved(span.end_m) - span.end_m for span in path.spans]
+    shifts = [map_position(span.end_m) - span.end_m for span in path.spans]
     spans = [
         replace(
-            s, begin_m=s.begin_m + by, end_m=s.end_m + by, from_m=moved(s.from_m), until_m=moved(s.until_m)
+            s,
+            begin_m=s.begin_m + by,
+            end_m=s.end_m + by,
+            from_m=map_position(s.from_m),
+            until_m=map_position(s.until_m),
         )
         for s, by in zip(path.spans, shifts, strict=True)
     ]
     for s in occupied:
-        end = moved(s.until_m)
-        spans.append(LaneSpan(s.lane, s.begin_m + end - s.until_m, s.scale, moved(s.from_m), end, end))
+        end = map_position(s.until_m)
+        spans.append(LaneSpan(s.lane, s.begin_m + end - s.until_m, s.scale, map_position(s.from_m), end, end))
     return tuple(spans)
 
 
@@ -132,7 +136,7 @@ def project_on_path(path: Path, xy: _Point, near_m: float | None = None) -> tupl
     return index * path.step_m + float(along), float(dy * math.cos(heading) - dx * math.sin(heading)), heading
 
 
-def followed(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np.ndarray, " time"]:
+def positions_along(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np.ndarray, " time"]:
     """Positions along a path of a moving point, m."""
     result, near = np.zeros(len(xy)), None
     for k, point in enumerate(xy):

@@ -22,7 +22,7 @@ class Drivers:
         kind: ``AgentKind``: VEHICLE or CYCLIST.
         size_m: Length, width and height.
         speed_factor: Preferred speed as a multiple of the limit.
-        top_speed_mps: Largest speed whatever the limit.
+        top_speed_mps: Maximum speed, independent of the limit.
         lateral_mps2: Largest lateral acceleration in bends.
         slowing_mps2: Deceleration towards slower stretches.
         yellow_mps2: Largest deceleration to stop at yellow.

@@ -23,7 +23,7 @@ from drivax.synthetic.traffic.lateral import (
     Detours,
     change_onto,
     detour_request,
-    followed,
+    positions_along,
 )
 from drivax.synthetic.traffic.obstacles import Boxes, StaticObstacles, nearest_obstacles
 from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows
@@ -68,7 +68,7 @@ def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
 
 @dataclass(frozen=True)
 class _Log:
-    """What a run records of its vehicles (x, y, heading) and pedestrians (x, y, heading, speed)."""
+    """Recorded motion of vehicles (x, y, heading) and pedestrians (x, y, heading, speed)."""
 
     pose: Float64[np.ndarray, "v time 3"]
     speed: Float64[np.ndarray, "v time"]
@@ -216,7 +216,7 @@ class _Run:
         self._leaders = Leaders(self._network, self._drivers)
         # Gap to and speed of the next leader, line and obstacle.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
-        self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
+        self._plan_at = positions_along(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
         self._moving_users = self._vehicles = boxes_at((), 0)
         shape = (count, len(traffic.times_s))
         speed, position, acceleration = np.zeros((3, *shape))

@@ -299,7 +299,7 @@ class _Plot:
         """Beginning of the road to the other junction, looking outwards."""
         return self.arms[0].base.ahead(self.mouths[0] + self.arms[0].street.stop_line_m)
 
-    def moved(self, gate: Pose) -> _Plot:
+    def move_to(self, gate: Pose) -> _Plot:
         """Move the junction so that its gate is at a pose."""
         angle = gate.heading - self.gate.heading
         cos, sin = math.cos(angle), math.sin(angle)
@@ -343,9 +343,9 @@ class Corridor:
         """Draw a network; ego starts before either junction, most often on the main road."""
         lanes = 2 if rng.random() < self.two_lane_share else 1
         main = draw_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
-        first = self._plot(rng, style, main).moved(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
+        first = self._plot(rng, style, main).move_to(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
         middle = self._between(rng, first.gate)
-        second = self._plot(rng, style, main).moved(middle.end.turned())
+        second = self._plot(rng, style, main).move_to(middle.end.turned())
         draft = Draft()
         sites = self._sites(rng, draft, (first, second), middle)
         finish_sites(rng, style, draft, sites, {(0, 0): (1, 0), (1, 0): (0, 0)}, self.geometry)
