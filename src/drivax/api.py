@@ -58,12 +58,9 @@ class Loaded:
 
 
 def load(
-    data: str | Path | Sequence[Scenario],
-    limit: int | None = None,
-    *,
-    filters: Sequence[str] = (),
+    data: str | Path | Sequence[Scenario], limit: int | None = None, *, filters: Sequence[str] = (),
     scenarios: Sequence[str | Path] = (),
-) -> Loaded:
+) -> Loaded:  # fmt: skip
     """Load scenarios of a set, or your own scenarios, for simulation.
 
     Args:
@@ -195,12 +192,9 @@ def convert(src: str | Path, out: str | Path, **options: Any) -> Converted:
 
 
 def compare(
-    a: str | Path,
-    b: str | Path,
-    plan: ComparisonPlan | None = None,
-    data: Path | None = None,
+    a: str | Path, b: str | Path, plan: ComparisonPlan | None = None, data: Path | None = None,
     **settings: Any,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare two evaluations.
 
     Args:

@@ -93,12 +93,12 @@ class Table:
         """Return a table for a terminal, with other tables of as many columns below it in the same widths."""
         from rich.table import Table as RichTable
 
-        visible = [index for index, column in enumerate(self.columns) if not column.picture]
-        has_headings = any(self.columns[index].heading for index in visible)
+        visible = [i for i, column in enumerate(self.columns) if not column.picture]
+        has_headings = any(self.columns[i].heading for i in visible)
         grid = RichTable(
             box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0), show_header=has_headings
         )
-        for column in (self.columns[index] for index in visible):
+        for column in (self.columns[i] for i in visible):
             grid.add_column(
                 column.heading, justify="left" if column.label or column.left else "right", no_wrap=column.label,
                 max_width=column.max_width, overflow="ellipsis" if column.label else "fold",
@@ -107,9 +107,9 @@ class Table:
         for table in (self, *below):
             if table is not self:
                 grid.add_row()
-                grid.add_row(*(table.columns[index].heading for index in visible), style="bold")
+                grid.add_row(*(table.columns[i].heading for i in visible), style="bold")
             for row in table.rows:
-                lines = ("\n".join(filter(None, (row[index].text, row[index].bounds))) for index in visible)
+                lines = ("\n".join(filter(None, (row[i].text, row[i].bounds))) for i in visible)
                 grid.add_row(*lines, style="bold" if row[0].style == "group" else "")
         return grid
 
@@ -144,16 +144,14 @@ class Table:
         """Return one line per number: labels, metric, mean, low, high, n; undefined numbers are empty."""
         stream = io.StringIO()
         lines = csv.writer(stream, lineterminator="\n")
-        labels = [
-            index for index, column in enumerate(self.columns) if column.label and column.key != "metric"
-        ]
-        keys = [self.columns[index].key or self.columns[index].heading for index in labels]
+        labels = [i for i, column in enumerate(self.columns) if column.label and column.key != "metric"]
+        keys = [self.columns[i].key or self.columns[i].heading for i in labels]
         across = [] if self.across == "metric" else [self.across]
         lines.writerow([*(key.replace(" ", "_") for key in (*keys, *across)), *_INTERVAL_COLUMNS])
         for row in self.rows:
             for column, cell in zip(self.columns, row, strict=True):
                 if (interval := cell.interval) is not None:
-                    row_labels = [*(row[index].text for index in labels), *([column.key] if across else [])]
+                    row_labels = [*(row[i].text for i in labels), *([column.key] if across else [])]
                     numbers = (interval.mean, interval.low, interval.high)
                     digits = ("" if value is None else repr(value) for value in numbers)
                     lines.writerow([*row_labels, cell.metric, *digits, interval.n])

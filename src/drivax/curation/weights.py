@@ -77,10 +77,10 @@ def sampling_weights(
         weights[drawable] = _weights(table.steps[drawable], np.ones(int(drawable.sum())), config)
     else:
         has_steps = drawable.any(axis=1)
-        scenario_weights = _weights(
+        weight = _weights(
             table.scenarios[has_steps], drawable[has_steps].sum(axis=1).astype(np.float64), config
         )
-        weights[has_steps] = np.where(drawable[has_steps], scenario_weights[:, None], 0.0)
+        weights[has_steps] = np.where(drawable[has_steps], weight[:, None], 0.0)
     if not weights.any():
         raise UsageError("every score is 0, so all weights are 0", cure="set floor, or normalise: quantile")
     return weights / weights[drawable].mean()

@@ -125,11 +125,9 @@ class _Side:
 
 
 def compare(
-    plan: ComparisonPlan,
-    a: Sequence[EpisodeTable],
-    b: Sequence[EpisodeTable],
+    plan: ComparisonPlan, a: Sequence[EpisodeTable], b: Sequence[EpisodeTable],
     entries: Sequence[Mapping[str, Any]] = (),
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare two planners by a plan, each with an evaluation per seed.
 
     Manifest ``entries`` of the scenarios are for a stratified split.
@@ -281,13 +279,9 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
 
 
 def _seed_sensitivity(
-    plan: ComparisonPlan,
-    effect: CrossedEffect | None,
-    n: int,
-    deviation: float,
-    inflation: float,
+    plan: ComparisonPlan, effect: CrossedEffect | None, n: int, deviation: float, inflation: float,
     smallest: float,
-) -> Sensitivity | None:
+) -> Sensitivity | None:  # fmt: skip
     """Return the sensitivity of a comparison over seeds, whose variance more scenarios do not reduce."""
     if effect is None or effect.error == 0.0:
         return None

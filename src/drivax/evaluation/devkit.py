@@ -43,7 +43,7 @@ _TTC_STEP_S, _TTC_HORIZON_S, _MIN_TTC_S = 0.1, 3.0, 0.95
 _OUTSIDE_M, _OVERSPEED_MPS, _MIN_PROGRESS_M = 0.3, 2.23, 2.0
 _WRONG_WAY_M, _FAR_WRONG_WAY_M, _DIRECTION_S = 2.0, 6.0, 1.0
 #: Largest distance to a connector that ego has just left, and is still assigned to, m.
-_MAX_EXIT_DISTANCE_M = 5.0
+_MAX_EXIT_M = 5.0
 _EGO_STOPPED, _TRACK_STOPPED, _FRONT, _REAR, _LATERAL = range(5)
 
 
@@ -408,12 +408,9 @@ def _fault_score(collisions: Sequence[Collision], tracks: Tracks) -> float:
 
 
 def _time_to_collision(
-    ego: EgoMotion,
-    tracks: Tracks,
-    road: Road,
-    in_lane: Bool[np.ndarray, " t"],
+    ego: EgoMotion, tracks: Tracks, road: Road, in_lane: Bool[np.ndarray, " t"],
     collisions: Sequence[Collision],
-) -> Float64[np.ndarray, " t"]:
+) -> Float64[np.ndarray, " t"]:  # fmt: skip
     """Return the time to collision of every sample at constant velocities (``time_to_collision_within_bound``)."""
     times = np.full(len(ego.xy), np.inf)
     faults = {each.sample for each in collisions if each.at_fault}
@@ -482,9 +479,7 @@ def _route(road: Road, points: Points) -> list[list[int]]:
             last = route[-1] if sample > 1 else []
             if last and road.objects[last[0]].connector and (connects or (not current and crossing[sample])):
                 point = shapely.points(points[sample])
-                near = [
-                    n for n in last if shapely.distance(road.objects[n].polygon, point) < _MAX_EXIT_DISTANCE_M
-                ]
+                near = [n for n in last if shapely.distance(road.objects[n].polygon, point) < _MAX_EXIT_M]
                 current = near or current
         route.append(current)
     return _drop_extra_connectors(road, route)
@@ -513,7 +508,7 @@ def _wrong_way_distance(road: Road, driven: Sequence[Sequence[int]], ego: EgoMot
         if not objects:
             continue
         if objects[0] == last_object:
-            position = _position_on_line(road.objects[objects[0]].line, ego.xy[sample])
+            position = _locate(road.objects[objects[0]].line, ego.xy[sample])
             # As in the devkit: a position at the very start of a line counts as no progress.
             progress[sample] = position - last_position if last_position is not None and position else 0.0
             last_position = position
@@ -524,7 +519,7 @@ def _wrong_way_distance(road: Road, driven: Sequence[Sequence[int]], ego: EgoMot
     return -abs(float(min(sums)))
 
 
-def _position_on_line(line: Any, point: Float64[np.ndarray, " 2"]) -> float:
+def _locate(line: Any, point: Float64[np.ndarray, " 2"]) -> float:
     return float(shapely.line_locate_point(line, shapely.points(point)))
 
 
@@ -542,33 +537,24 @@ def _progress(road: Road, expert_xy: Points, ego_xy: Points) -> tuple[float, flo
 def _block_progress(road: Road, pairs: Sequence[tuple[int, Any]], points: Points) -> float:
     """Return the progress along the base lines of a chain of roadblocks (``ego_progress_along_expert_route``)."""
     index, total = 0, 0.0
-    last_position = _position_on_line(pairs[0][1], points[0])
+    last_m = _locate(pairs[0][1], points[0])
     for x, y in points[1:]:
-        next_index = index
+        after = index
         skipped = 0.0
-        while next_index < len(pairs) and not shapely.contains_xy(road.blocks[pairs[next_index][0]], x, y):
-            next_index += 1
-            if index + 1 < next_index < len(pairs):
-                line, previous, following = (
-                    pairs[number][1] for number in (next_index - 1, next_index - 2, next_index)
-                )
-                skipped += _position_on_line(line, _end(following, 0)) - _position_on_line(
-                    line, _end(previous, -1)
-                )
-        if next_index == len(pairs):
+        while after < len(pairs) and not shapely.contains_xy(road.blocks[pairs[after][0]], x, y):
+            after += 1
+            if index + 1 < after < len(pairs):
+                line, previous, following = (pairs[number][1] for number in (after - 1, after - 2, after))
+                skipped += _locate(line, _end(following, 0)) - _locate(line, _end(previous, -1))
+        if after == len(pairs):
             continue
-        position = _position_on_line(pairs[next_index][1], np.array([x, y]))
-        if next_index == index:
-            total += position - last_position
+        here_m = _locate(pairs[after][1], np.array([x, y]))
+        if after == index:
+            total += here_m - last_m
         else:
-            remaining_m = shapely.length(pairs[index][1]) - last_position
-            total += (
-                remaining_m
-                + skipped
-                + position
-                - _position_on_line(pairs[next_index][1], _end(pairs[index][1], -1))
-            )
-        index, last_position = next_index, position
+            rest_m = shapely.length(pairs[index][1]) - last_m
+            total += rest_m + skipped + here_m - _locate(pairs[after][1], _end(pairs[index][1], -1))
+        index, last_m = after, here_m
     return float(total)
 
 

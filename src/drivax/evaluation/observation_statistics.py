@@ -140,11 +140,9 @@ def observation_statistics(
     if permute:
         rows = np.unique(np.linspace(0, hit.size - 1, min(PERMUTED, hit.size)).round().astype(int))
         states, permuted = (samples.state, samples.carry, samples.key, samples.observation), len(rows)
-        *rest, permuted_observation = jax.tree.map(
-            lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], states
-        )
+        *rest, inputs = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], states)
         act = partial(_actions, simulator, planner, bank, *rest)
-        columns, groups = importances(act, jax.device_get(permuted_observation), seed)
+        columns, groups = importances(act, jax.device_get(inputs), seed)
     features = column_statistics(task.observation.features, observations, hit, collides, columns)
     return ObservationStatistics(
         planner.name, len(collides), int(collides.sum()), hit.size, permuted, features, groups
@@ -167,10 +165,8 @@ def column_statistics(
             valid = observation.get(f"{group}_mask", np.ones(values.shape, bool))
             before = valid & ~hit.reshape(*hit.shape, *(1,) * (valid.ndim - hit.ndim))
             correlation = collision_correlation(values, before, collides)
-            importance_value = importance.get((group, column), math.nan)
-            statistics.append(
-                FeatureStatistics(group, name, *_moments(values, valid), correlation, importance_value)
-            )
+            change = importance.get((group, column), math.nan)
+            statistics.append(FeatureStatistics(group, name, *_moments(values, valid), correlation, change))
     return tuple(statistics)
 
 
@@ -238,16 +234,16 @@ def _actions(
 def _moments(values: Values, valid: Values) -> tuple[int, int, float, float, float, float]:
     """Return count, broken, mean, std, low and high of :class:`FeatureStatistics`."""
     finite = np.isfinite(values)
-    entries, broken = values[valid & finite].astype(np.float64), int((~finite).sum())
-    if not entries.size:
+    x, broken = values[valid & finite].astype(np.float64), int((~finite).sum())
+    if not x.size:
         return 0, broken, math.nan, math.nan, math.nan, math.nan
     return (
-        entries.size,
+        x.size,
         broken,
-        float(entries.mean()),
-        float(entries.std()),
-        float(entries.min()),
-        float(entries.max()),
+        float(x.mean()),
+        float(x.std()),
+        float(x.min()),
+        float(x.max()),
     )
 
 
@@ -293,10 +289,8 @@ def importances(
     def change(changed: dict[str, Values]) -> float:
         if not varies.any():
             return math.nan
-        difference = (np.asarray(act(dict(observation) | changed), np.float64) - actions)[:, varies] / std[
-            varies
-        ]
-        return float(np.sqrt(np.mean(difference**2)))
+        shift = (np.asarray(act(dict(observation) | changed), np.float64) - actions)[:, varies] / std[varies]
+        return float(np.sqrt(np.mean(shift**2)))
 
     columns, groups = {}, {}
     for group, values in observation.items():

@@ -152,11 +152,9 @@ class Decision:
 
 
 def decide(
-    plan: ComparisonPlan,
-    primary: MetricComparison,
-    secondary: Sequence[MetricComparison],
+    plan: ComparisonPlan, primary: MetricComparison, secondary: Sequence[MetricComparison],
     sensitivity: Sensitivity | None,
-) -> Decision:
+) -> Decision:  # fmt: skip
     """Decide by the rule: enough scenarios, then the test, then the power to conclude "no difference".
 
     With fewer scenarios than the plan's minimum nothing is decided. A test that rejects gives the better planner. One

@@ -210,11 +210,9 @@ def project(
 
 
 def project_monotone(
-    points: Float[Array, "point dim"],
-    xy: Float[Array, "query 2"],
-    window_m: Float[Array, " query"],
+    points: Float[Array, "point dim"], xy: Float[Array, "query 2"], window_m: Float[Array, " query"],
     first_window_m: float = np.inf,
-) -> Float[Array, " query"]:
+) -> Float[Array, " query"]:  # fmt: skip
     """Non-decreasing arc lengths of successive positions along a polyline, without jumps to another branch.
 
     ``s[k]`` is the arc length in ``[s[k-1], s[k-1] + window[k]]`` whose point is nearest to ``xy[k]``; the first

@@ -131,12 +131,9 @@ Store = Literal["state", "observation"]
 
 
 def transition(
-    environment: Environment,
-    now: Environments,
-    sampled: Sampled,
-    outcome: Outcome,
+    environment: Environment, now: Environments, sampled: Sampled, outcome: Outcome,
     keep: Store = "observation",
-) -> Rollout:
+) -> Rollout:  # fmt: skip
     """Return one row of a rollout, given the environments before the step, the sampled actions, and the outcome."""
     raw_action, _, extra = sampled
     return Rollout(
@@ -152,14 +149,9 @@ def transition(
 
 
 def collect(
-    environment: Environment,
-    data: Any,
-    environments: Environments,
-    actor: Actor,
-    key: Array,
-    steps: int,
+    environment: Environment, data: Any, environments: Environments, actor: Actor, key: Array, steps: int,
     keep: Store = "observation",
-) -> tuple[Environments, Rollout, dict[str, Array]]:
+) -> tuple[Environments, Rollout, dict[str, Array]]:  # fmt: skip
     """Unroll ``steps`` steps in every environment.
 
     Returns:

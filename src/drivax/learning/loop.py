@@ -51,16 +51,10 @@ def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
 
 
 def train(
-    config: TrainConfig,
-    data: ScenarioSet | WeightedSet,
-    out: str | Path,
-    *,
-    validation: ScenarioSet | None = None,
-    resume: bool = False,
-    overwrite: bool = False,
-    seeds: int = 1,
+    config: TrainConfig, data: ScenarioSet | WeightedSet, out: str | Path, *,
+    validation: ScenarioSet | None = None, resume: bool = False, overwrite: bool = False, seeds: int = 1,
     log: Callable[[str], None] = lambda line: None,
-) -> RunFolder:
+) -> RunFolder:  # fmt: skip
     """Train a policy and write the run folder: configuration, metrics, checkpoints of the full state.
 
     Args:
@@ -160,10 +154,7 @@ def _create_folders(
         return [RunFolder.create(out, config, [data], overwrite, kind="training", **notes)]
     RunFolder.create(out, config, [data], overwrite, kind="seeds", seeds=len(seeds), **notes)
     configs = {out / f"seed-{seed}": replace(config, seed=seed) for seed in seeds}
-    return [
-        RunFolder.create(path, seed_config, [data], kind="training", **notes)
-        for path, seed_config in configs.items()
-    ]
+    return [RunFolder.create(path, own, [data], kind="training", **notes) for path, own in configs.items()]
 
 
 def _resumed_folders(

@@ -154,11 +154,9 @@ def dense(
 
 
 def max_pool(
-    activation: Activation,
-    layers: Layers,
-    rows: Float[Array, "*batch row inputs"],
+    activation: Activation, layers: Layers, rows: Float[Array, "*batch row inputs"],
     valid: Bool[Array, "*batch row"],
-) -> Float[Array, "*batch outputs"]:
+) -> Float[Array, "*batch outputs"]:  # fmt: skip
     """Return the maximum of zero and the valid rows after the layers."""
     if recomputes_maxima(rows.shape[-2], [rows.shape[-1], *(bias.shape[0] for _, bias in layers)]):
         return _encode_and_max(activation, tuple(layers), rows, valid)
@@ -198,11 +196,9 @@ _max_over_rows.defvjp(_max_over_rows_forward, _max_over_rows_backward)
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _encode_and_max(
-    activation: Activation,
-    layers: Layers,
-    rows: Float[Array, "*batch row inputs"],
+    activation: Activation, layers: Layers, rows: Float[Array, "*batch row inputs"],
     valid: Bool[Array, "*batch row"],
-) -> Float[Array, "*batch outputs"]:
+) -> Float[Array, "*batch outputs"]:  # fmt: skip
     return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=valid[..., None])
 
 

@@ -26,7 +26,7 @@ Points = Float[np.ndarray[Any, Any], "point 2"]
 #: Maximum number of points of a line; longer lines are averaged into bins.
 _MAX_POINTS = 150
 #: Groups of quantities with visible curves; the others are collapsed.
-_VISIBLE_GROUPS = ("validation", "evaluation", "rollout")
+_VISIBLE = ("validation", "evaluation", "rollout")
 
 
 def curve_sections(runs: Sequence[Training]) -> str:
@@ -35,9 +35,7 @@ def curve_sections(runs: Sequence[Training]) -> str:
     drawable = [name for name in names if any(len(run.curves.get(name, ())) > 1 for run in runs)]
     if not drawable:
         return "<p>No quantity was logged more than once.</p>"
-    visible = [
-        name for group in _VISIBLE_GROUPS for name in drawable if name.split("/")[0] == group
-    ] or drawable[:6]
+    visible = [name for group in _VISIBLE for name in drawable if name.split("/")[0] == group] or drawable[:6]
     hidden = [name for name in drawable if name not in visible]
     details = f"<details><summary>{len(hidden)} more curves</summary>{_charts(hidden, runs)}</details>"
     return series_legend([run.name for run in runs]) + _charts(visible, runs) + (details if hidden else "")
@@ -267,7 +265,7 @@ def _outline(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
 
 Array = np.ndarray[Any, Any]
 #: Curvature is undefined below this speed, at which headings jitter more than the car moves.
-_MIN_CURVATURE_SPEED_MPS = 0.5
+_MIN_SPEED_MPS = 0.5
 
 
 @dataclass(frozen=True)
@@ -317,17 +315,17 @@ def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
         return values
     path, steps = np.asarray(ego[first:end], np.float64), slice(first + 1, end)
     heading_changes = np.asarray(wrap(np.diff(path[:, 2])))
-    along, mean_speed = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
+    along, speed = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
     samples = end - first - 1
     smooth = savgol_matrix(samples, *comfort.SMOOTH)
     rate = savgol_matrix(samples, *comfort.YAW_RATE) @ np.cumsum(heading_changes) / DT_S
     values["acceleration"][steps] = smooth @ along
-    values["lateral"][steps] = smooth @ (mean_speed * heading_changes / DT_S)
+    values["lateral"][steps] = smooth @ (speed * heading_changes / DT_S)
     values["jerk"][steps] = savgol_matrix(samples, *comfort.JERK) @ smooth @ along / DT_S
     values["yaw_rate"][steps] = rate
     values["curvature"][steps] = np.where(
-        mean_speed >= _MIN_CURVATURE_SPEED_MPS,
-        rate / np.maximum(mean_speed, _MIN_CURVATURE_SPEED_MPS),
+        speed >= _MIN_SPEED_MPS,
+        rate / np.maximum(speed, _MIN_SPEED_MPS),
         np.nan,
     )
     return values

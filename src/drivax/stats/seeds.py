@@ -167,13 +167,9 @@ def repeat_single_seed(values: Values) -> Others:
 
 
 def seeds_interval(
-    values: Values,
-    clusters: Any = None,
-    weights: Weights | None = None,
-    confidence: float = _CONFIDENCE,
-    *,
+    values: Values, clusters: Any = None, weights: Weights | None = None, confidence: float = _CONFIDENCE, *,
     share: bool = False,
-) -> Interval:
+) -> Interval:  # fmt: skip
     """Return the mean of one policy with the interval of :func:`crossed_mean`; no bounds with fewer than two clusters.
 
     A ``share`` lies within 0 and 1; if all values are 0, or all are 1, the interval is Wilson's with one trial per

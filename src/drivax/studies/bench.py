@@ -88,10 +88,8 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
     states = _states(simulator, bank, config.batch)
     parts = _parts(simulator)
     times_us = {name: _time_part(config, part, bank, states) for name, part in parts.items()}
-    bank_without_grid = without_grid(bank)
-    brute_force_us = sum(
-        _time_part(config, parts[name], bank_without_grid, states) for name in ("edges", "lanes")
-    )
+    no_grid = without_grid(bank)
+    brute_force = sum(_time_part(config, parts[name], no_grid, states) for name in ("edges", "lanes"))
     return {
         "environment_steps_per_second": round(steps_per_second([program], config.repeats)[0]),
         "batch": config.batch,
@@ -101,7 +99,7 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
         "state_bytes": program.state_bytes,
         "bank_bytes_per_scenario": bank.nbytes // len(bank),
         "compile_seconds": round(program.compile_seconds, 2),
-        "brute_force_ratio": round(brute_force_us / (times_us["edges"] + times_us["lanes"]), 2),
+        "brute_force_ratio": round(brute_force / (times_us["edges"] + times_us["lanes"]), 2),
         "by_part": {name: round(value, 3) for name, value in times_us.items()},
         "cost_by_part": {name: _cost(part, bank, states) for name, part in parts.items()},
         "versions": versions(),
@@ -378,12 +376,10 @@ def _repeat_part(config: BenchConfig, part: Part) -> Any:
     return _shard_states(run)
 
 
-def _shift(state: SimState, distance: Array) -> SimState:
+def _shift(state: SimState, by_m: Array) -> SimState:
     """Return the state moved by a negligible distance."""
     context = state.context
-    moved = replace(
-        context, history=context.history + distance, index=context.index + distance.astype(jnp.int32)
-    )
+    moved = replace(context, history=context.history + by_m, index=context.index + by_m.astype(jnp.int32))
     return replace(state, context=moved)
 
 

@@ -50,13 +50,9 @@ class Arm:
     weights: WeightConfig | None = None
 
     def weighted(
-        self,
-        data: ScenarioSet,
-        tables: Tables,
-        config: WeightConfig,
-        usable: np.ndarray | None = None,
+        self, data: ScenarioSet, tables: Tables, config: WeightConfig, usable: np.ndarray | None = None,
         seed: int = 0,
-    ) -> WeightedSet:
+    ) -> WeightedSet:  # fmt: skip
         """Return a set with the sampling weights of this arm.
 
         Args:

@@ -30,7 +30,7 @@ from drivax.tracking.run_folder import describe_run
 #: Planners that the trained policy is compared with.
 REFERENCES = ("expert", "constant_velocity", "idm")
 #: Metrics of the paired comparison.
-_COMPARED_METRICS = ("success", "vmax_score")
+_METRICS = ("success", "vmax_score")
 #: Training and held-out sets draw their maps from different seeds.
 _TRAINING_SEED, _HELD_OUT_SEED = 0, 1_000_000
 
@@ -80,12 +80,9 @@ class Demo:
 
 
 def run_demo(
-    out: Path,
-    config: DemoConfig | None = None,
-    log: Callable[[str], None] = lambda _: None,
-    *,
+    out: Path, config: DemoConfig | None = None, log: Callable[[str], None] = lambda _: None, *,
     overwrite: bool = False,
-) -> Demo:
+) -> Demo:  # fmt: skip
     """Generate both sets, train, evaluate all planners and write the report.
 
     Args:
@@ -123,10 +120,7 @@ def run_demo(
     report = write_report([run, *runs], out / "report.html", overwrite=True)
     policy = results["policy"]
     differences = {
-        name: {
-            metric: paired_differences(policy, results[name], metric).as_dict()
-            for metric in _COMPARED_METRICS
-        }
+        name: {metric: paired_differences(policy, results[name], metric).as_dict() for metric in _METRICS}
         for name in REFERENCES
     }
     demo = Demo(report, [result.summary() for result in results.values()], differences)

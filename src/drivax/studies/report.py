@@ -39,12 +39,9 @@ Results = Mapping[str, Any]
 
 
 def write_report(
-    definition: StudyDefinition,
-    results: Results,
-    tables: Mapping[str, ScoreTable],
-    actions: Float[np.ndarray, "n 2"],
-    out: Path,
-) -> None:
+    definition: StudyDefinition, results: Results, tables: Mapping[str, ScoreTable],
+    actions: Float[np.ndarray, "n 2"], out: Path,
+) -> None:  # fmt: skip
     """Write the report of a study.
 
     Args:

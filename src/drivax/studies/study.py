@@ -56,7 +56,7 @@ from drivax.tracking.workers import one_core_each
 
 _PROGRESS = "validation/progress_ratio"
 #: Methods whose most critical scenarios the player shows, and the number of each.
-_PLAYER_METHODS, _PLAYER_SCENARIOS = ("kinematic", "ensemble", "action_rarity"), 3
+_PLAYER_METHODS, _PLAYER_TOP = ("kinematic", "ensemble", "action_rarity"), 3
 Log = Callable[[str], None]
 
 
@@ -114,13 +114,10 @@ def run_study(
     baseline_conditions, strata = _conditions(study, definition.baselines), _strata(study, test)
     in_first_group = [claim for claim in study.claims if claim.group == next(iter(definition.groups))]
     first, second = (_episodes(study, name) for name in definition.baselines[:2])
-    smallest_differences = detectable(first, second, strata, definition.metrics, max(len(in_first_group), 1))
+    smallest = detectable(first, second, strata, definition.metrics, max(len(in_first_group), 1))
     for condition in baseline_conditions:
         log(str(condition))
-    log(
-        "smallest detectable difference: "
-        + ", ".join(f"{name} {x:.3f}" for name, x in smallest_differences.items())
-    )
+    log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in smallest.items()))
     if not all(condition.met for condition in baseline_conditions) and not anyway:
         raise UsageError(
             "the baseline does not drive well enough for a comparison",
@@ -130,7 +127,7 @@ def run_study(
     _train_and_evaluate(jobs, cores, log)
     results = _results(study, test, strata, tables, usable) | {
         "conditions": [asdict(condition) for condition in _conditions(study, config.arms)],
-        "detectable": smallest_differences,
+        "detectable": smallest,
     }
     write_json(study.results, results)
     _write_pages(study, data, results, tables)
@@ -149,7 +146,7 @@ def _write_pages(
         row: tables[name]
         for name in _PLAYER_METHODS
         if name in tables
-        for row in top_rows(tables[name], _PLAYER_SCENARIOS)
+        for row in top_rows(tables[name], _PLAYER_TOP)
     }
     write_player(
         [data[row] for row in tops],
@@ -373,12 +370,9 @@ def _episodes(study: Study, name: str) -> Episodes:
 
 
 def _results(
-    study: Study,
-    test: ScenarioSet,
-    strata: Strata,
-    tables: Mapping[str, ScoreTable],
+    study: Study, test: ScenarioSet, strata: Strata, tables: Mapping[str, ScoreTable],
     usable: Bool[np.ndarray, "N T"],
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     definition, metrics, data = study.definition, study.definition.metrics, ScenarioSet.open(study.sets.train)
     episodes = {}
     for name in definition.planners:

@@ -254,12 +254,10 @@ def rates(
     means: dict[Stratum, dict[str, dict[str, float | int | None]]] = {}
     for stratum in ("ordinary", "common", "rare"):
         weights = strata.weights(stratum)
-        comparable = {
-            name: episodes[name] for name in metrics if strata.is_comparable(episodes[name], weights)
-        }
-        if comparable:
+        known = {name: episodes[name] for name in metrics if strata.is_comparable(episodes[name], weights)}
+        if known:
             means[stratum] = {
-                name: _rate(values, strata, weights, name in _SHARES) for name, values in comparable.items()
+                name: _rate(values, strata, weights, name in _SHARES) for name, values in known.items()
             }
     return means
 

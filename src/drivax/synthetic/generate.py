@@ -170,13 +170,9 @@ class _Counts:
 
 
 def generate(
-    out: str | Path,
-    scenarios: int,
-    seed: int = 0,
-    options: Generation | None = None,
-    progress: Progress | None = None,
-    audit: Audit | None = None,
-) -> GeneratedSet:
+    out: str | Path, scenarios: int, seed: int = 0, options: Generation | None = None,
+    progress: Progress | None = None, audit: Audit | None = None,
+) -> GeneratedSet:  # fmt: skip
     """Generate a scenario set.
 
     Args:
@@ -200,14 +196,9 @@ def generate(
 
 
 def write_set(
-    out: str | Path,
-    scenarios: int,
-    seed: int,
-    options: Generation,
-    notes: Mapping[str, Any],
-    progress: Progress | None,
-    audit: Audit | None,
-) -> GeneratedSet:
+    out: str | Path, scenarios: int, seed: int, options: Generation, notes: Mapping[str, Any],
+    progress: Progress | None, audit: Audit | None,
+) -> GeneratedSet:  # fmt: skip
     """:func:`generate` without checks; ``notes`` go into the manifest's source."""
     begin = time.monotonic()
     source = {"command": "generate", "world": WORLD_VERSION, "seed": seed, "scenarios": scenarios, **notes}
@@ -295,12 +286,9 @@ def sizes(train: int | None = None) -> dict[str, int]:
 
 
 def generate_benchmark(
-    out: str | Path,
-    options: Generation | None = None,
-    train: int | None = None,
-    progress: Progress | None = None,
-    audit: Audit | None = None,
-) -> dict[str, GeneratedSet]:
+    out: str | Path, options: Generation | None = None, train: int | None = None,
+    progress: Progress | None = None, audit: Audit | None = None,
+) -> dict[str, GeneratedSet]:  # fmt: skip
     """Write ``OUT/train``, ``OUT/validation``, ``OUT/test`` and ``OUT/test-rare``.
 
     Args:

@@ -166,12 +166,10 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Looks, step: _Looks) ->
 
 
 def _cuts(
-    eye: Float64[np.ndarray, "pair 2"],
-    points: Float64[np.ndarray, "pair point 2"],
-    heights_m: tuple[float, Float64[np.ndarray, " pair"]],
-    box: Float64[np.ndarray, "pair 6"],
+    eye: Float64[np.ndarray, "pair 2"], points: Float64[np.ndarray, "pair point 2"],
+    heights_m: tuple[float, Float64[np.ndarray, " pair"]], box: Float64[np.ndarray, "pair 6"],
     top_m: Float64[np.ndarray, " pair"],
-) -> Bool[np.ndarray, "pair point"]:
+) -> Bool[np.ndarray, "pair point"]:  # fmt: skip
     """Whether rays from an eye to points, at two heights, pass through upright boxes (slab test)."""
     enters, leaves = passage(eye[:, None], points, box[:, None])
     high, low = heights_m[0], heights_m[1][:, None]

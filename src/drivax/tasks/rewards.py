@@ -99,12 +99,8 @@ def discomfort(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 
     Causal differences over 0.5 s, so that the reward never depends on future steps.
     """
-    longitudinal = jnp.where(
-        now.acceleration_mps2 < 0, now.acceleration_mps2 / 4.05, now.acceleration_mps2 / 2.40
-    )
-    ratios = jnp.stack(
-        [longitudinal, now.lateral_acceleration_mps2 / _LATERAL_MPS2, now.jerk_mps3 / _JERK_MPS3]
-    )
+    along = jnp.where(now.acceleration_mps2 < 0, now.acceleration_mps2 / 4.05, now.acceleration_mps2 / 2.40)
+    ratios = jnp.stack([along, now.lateral_acceleration_mps2 / _LATERAL_MPS2, now.jerk_mps3 / _JERK_MPS3])
     return jnp.clip(jnp.max(ratios * ratios), 0.0, 1.0)
 
 
@@ -256,12 +252,12 @@ class RewardConfig(_Weights):
 
     def __post_init__(self) -> None:
         check_unique("rewards.own", [term.name for term in self.own], tuple(TERMS))
-        upper_bounds = {
+        bounds = {
             "collision_margin_m": FARTHEST_GAP_M,
             "ttc_s": TTC_HORIZON_S,
             "close_m": FARTHEST_GAP_M,
         }
-        for name, bound in upper_bounds.items():
+        for name, bound in bounds.items():
             if not 0.0 <= getattr(self, name) <= bound:
                 raise ValueError(f"{name} is {getattr(self, name)}; choose 0 to {bound:g}")
         if not 0.0 < self.scale < math.inf:

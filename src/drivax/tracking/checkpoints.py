@@ -208,17 +208,15 @@ def _type_name(leaf: Any) -> str:
 
 
 def _compare(path: Path, stored: list[dict[str, Any]], requested: list[tuple[str, Any]], cure: str) -> None:
-    available = {leaf["name"]: (leaf["type"], tuple(leaf["shape"])) for leaf in stored}
-    required = {name: (_type_name(leaf), tuple(np.shape(leaf))) for name, leaf in requested}
-    for name in [*required, *available]:
-        if name not in available:
+    have = {leaf["name"]: (leaf["type"], tuple(leaf["shape"])) for leaf in stored}
+    need = {name: (_type_name(leaf), tuple(np.shape(leaf))) for name, leaf in requested}
+    for name in [*need, *have]:
+        if name not in have:
             raise DataError(f"the checkpoint has no {name}", file=path, cure=cure)
-        if name not in required:
+        if name not in need:
             raise DataError(f"the checkpoint holds {name}, which the template lacks", file=path, cure=cure)
-        if available[name] != required[name]:
-            stored_as, requested_as = (
-                f"{kind}{list(shape)}" for kind, shape in (available[name], required[name])
-            )
+        if have[name] != need[name]:
+            stored_as, requested_as = (f"{kind}{list(shape)}" for kind, shape in (have[name], need[name]))
             raise DataError(
                 f"{name} is {stored_as} in the checkpoint, not {requested_as}", file=path, cure=cure
             )

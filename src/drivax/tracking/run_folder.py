@@ -46,13 +46,9 @@ class RunFolder:
 
     @classmethod
     def create(
-        cls,
-        path: str | Path,
-        config: Any,
-        data: Sequence[ScenarioSet] = (),
-        overwrite: bool = False,
+        cls, path: str | Path, config: Any, data: Sequence[ScenarioSet] = (), overwrite: bool = False,
         **info: Any,
-    ) -> RunFolder:
+    ) -> RunFolder:  # fmt: skip
         """Create a folder with ``config.yaml`` and ``run.json`` atomically.
 
         Args:

@@ -73,11 +73,9 @@ class FittedQ:
     gamma: float
 
     def value(
-        self,
-        data: Experience,
-        act: Callable[[dict[str, Array]], Float[Array, "B D"]],
+        self, data: Experience, act: Callable[[dict[str, Array]], Float[Array, "B D"]],
         statistics: Statistics = MappingProxyType({}),
-    ) -> Float[Array, ""]:
+    ) -> Float[Array, ""]:  # fmt: skip
         """Return the estimated discounted return of a policy from the start of episodes.
 
         The critic learns ``Q(s, a) = r + gamma (1 - terminated) Q'(s', pi(s'))`` from logged steps; the result is the

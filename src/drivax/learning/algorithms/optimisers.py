@@ -12,14 +12,9 @@ from drivax.errors import UsageError
 
 
 def clipped_adam(
-    rate: float,
-    norm: float | None,
-    *,
-    updates: int = 0,
-    last: float = 0.1,
-    eps: float = 1e-8,
+    rate: float, norm: float | None, *, updates: int = 0, last: float = 0.1, eps: float = 1e-8,
     per_network: bool = False,
-) -> optax.GradientTransformation:
+) -> optax.GradientTransformation:  # fmt: skip
     """Return Adam (Kingma and Ba 2015) with gradient clipping.
 
     Args:

@@ -237,13 +237,9 @@ class Sac(OffPolicy[SacConfig]):
         return after, losses
 
     def loss(
-        self,
-        trained: SacParameters,
-        target: Any,
-        batch: Transitions,
-        key: Array,
+        self, trained: SacParameters, target: Any, batch: Transitions, key: Array,
         auxiliary_loss: AuxiliaryLoss | None,
-    ) -> tuple[Array, dict[str, Array]]:
+    ) -> tuple[Array, dict[str, Array]]:  # fmt: skip
         """Return the sum of the losses of critics, policy and temperature."""
         next_key, key, auxiliary_key = jax.random.split(key, 3)
         next_policy = self.distribution(trained.policy, batch.next_observation)

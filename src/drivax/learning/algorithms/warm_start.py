@@ -42,7 +42,7 @@ class WarmStart:
         if min(self.iterations, self.settle, self.half_life) < 0 or self.weight < 0.0:
             raise UsageError("a setting of warm_start is negative", cure="use 0 or more")
 
-    def remaining_iterations(self, iterations: int) -> int:
+    def online_iterations(self, iterations: int) -> int:
         """Return the iterations of a run after pretraining; raises UsageError if none are left."""
         if iterations <= self.iterations:
             cure = "raise total_steps, or lower warm_start.iterations"
@@ -55,7 +55,7 @@ class WarmStart:
         """Return the learner of a run of ``iterations``."""
         check_loss(self.cloning, config.network)
         return WarmStartLearner(
-            self, config.build(environment, data, self.remaining_iterations(iterations)), environment
+            self, config.build(environment, data, self.online_iterations(iterations)), environment
         )
 
     def weight_at(self, iteration: Int[Array, ""]) -> Float[Array, ""]:

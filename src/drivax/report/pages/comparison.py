@@ -161,10 +161,8 @@ def _test_sentence(comparison: Comparison) -> str:
     direction = "higher" if metric.difference.mean > 0 else "lower"
     if metric.winner is None:
         return f"{label.text} is {size} {direction} with A ({test}): it may be chance."
-    test_winner = (
-        f" The test alone favours {metric.winner}." if comparison.decision.because == "minimum" else ""
-    )
-    return f"{label.text} is {size} {direction} with A ({test}).{test_winner}"
+    note = f" The test alone favours {metric.winner}." if comparison.decision.because == "minimum" else ""
+    return f"{label.text} is {size} {direction} with A ({test}).{note}"
 
 
 def _power_sentences(comparison: Comparison) -> list[str]:
@@ -175,14 +173,12 @@ def _power_sentences(comparison: Comparison) -> list[str]:
     unit = _label(comparison.primary).unit
     sentences = []
     if sensitivity.detectable is not None:
-        difference = number(sensitivity.detectable, unit) + suffix(unit, signed=True)
+        size = number(sensitivity.detectable, unit) + suffix(unit, signed=True)
         power = f"{100 * comparison.plan.power:.0f} %"
-        sentences.append(f"A difference of {difference} would be detected in {power} of such comparisons.")
+        sentences.append(f"A difference of {size} would be detected in {power} of such comparisons.")
     if needed is not None:
-        difference = number(sensitivity.smallest, unit) + suffix(unit, signed=True)
-        sentences.append(
-            f"{needed:,} scenarios are needed; the smallest difference that matters is {difference}."
-        )
+        size = number(sensitivity.smallest, unit) + suffix(unit, signed=True)
+        sentences.append(f"{needed:,} scenarios are needed; the smallest difference that matters is {size}.")
     return sentences
 
 

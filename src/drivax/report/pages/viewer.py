@@ -38,10 +38,8 @@ def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ())
         row_of.setdefault(entry["scenario_id"], row)
     for name in ids:
         if name not in row_of:
-            suggestion = did_you_mean(name, row_of)
-            cure = (
-                suggestion if suggestion.startswith("did") else "list them with `drivax inspect SET --json`"
-            )
+            hint = did_you_mean(name, row_of)
+            cure = hint if hint.startswith("did") else "list them with `drivax inspect SET --json`"
             raise UsageError("is not in the set", file=data.path, record=name, cure=cure)
     rows = [row_of[name] for name in ids] if ids else range(len(data))
     return [data[row] for row in rows[:limit]]

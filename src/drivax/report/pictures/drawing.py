@@ -66,13 +66,13 @@ def with_traffic_of(rollout: Rollout, scenario: Scenario) -> Scenario:
     pose = rollout.others[rollout.start :]
     steps, slots = slice(rollout.start, rollout.start + len(pose)), slice(1, pose.shape[1])
     present = np.asarray(np.isfinite(pose[:, slots]).all(axis=-1))
-    pose_or_zero = np.where(present[..., None], pose[:, slots], 0.0)
+    poses = np.where(present[..., None], pose[:, slots], 0.0)
     record = scenario.record.copy()
     record["agent_valid"][steps, 1:] = False
     record["agent_valid"][steps, slots] = present
     record["agent_xy"][steps, slots], record["agent_heading"][steps, slots] = (
-        pose_or_zero[..., :2],
-        pose_or_zero[..., 2],
+        poses[..., :2],
+        poses[..., 2],
     )
     return replace(scenario, record=record)
 
@@ -119,9 +119,9 @@ class Boxes:
         """Yield the agents at a step, one shape per colour."""
         rows: list[int] = np.flatnonzero(self.valid[step]).tolist()
         for colour in dict.fromkeys(self.colour[row] for row in rows):
-            members = [row for row in rows if self.colour[row] == colour]
+            group = [row for row in rows if self.colour[row] == colour]
             outlines = [
-                _outline(self.xy[step, row], self.heading[step, row], self.size[row]) for row in members
+                _outline(self.xy[step, row], self.heading[step, row], self.size[row]) for row in group
             ]
             yield Shape(outlines, "outline", colour, level=4)
 

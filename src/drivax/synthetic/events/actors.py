@@ -56,13 +56,9 @@ def gait(
 
 
 def along_track(
-    track: Track,
-    station: Times,
-    left_m: Times,
-    kind: AgentKind,
-    size_m: Size,
+    track: Track, station: Times, left_m: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
-) -> Scripted:
+) -> Scripted:  # fmt: skip
     """Actor at stations and lateral offsets of ego's path, headed along its motion."""
     valid = valid & (station >= 0.0) & (station <= track.length_m - 1.0)
     xy, heading = track.pose(station, left_m)
@@ -70,12 +66,9 @@ def along_track(
 
 
 def scripted_motion(
-    xy: Float64[np.ndarray, "time 2"],
-    heading: Times,
-    kind: AgentKind,
-    size_m: Size,
+    xy: Float64[np.ndarray, "time 2"], heading: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
-) -> Scripted:
+) -> Scripted:  # fmt: skip
     """Actor at positions, headed along its motion; at rest it keeps its last heading, or the given one."""
     step = np.gradient(xy, DT_S, axis=0)
     speed = np.hypot(step[:, 0], step[:, 1])

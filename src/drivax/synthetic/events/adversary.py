@@ -215,11 +215,9 @@ def enter_when_clear(view: EgoView, extra: Scripted, until: int, removed: tuple[
 
 
 def _is_clear(
-    box: Float64[np.ndarray, " 6"],
-    other: Float64[np.ndarray, "user 6"],
-    valid: Bool[np.ndarray, " user"],
+    box: Float64[np.ndarray, " 6"], other: Float64[np.ndarray, "user 6"], valid: Bool[np.ndarray, " user"],
     speed: Float64[np.ndarray, " user"],
-) -> bool:
+) -> bool:  # fmt: skip
     """Whether a new box is clear of all others, each extended by its travel of the next 0.8 s."""
     longer = other.copy()
     longer[:, 4] += _BEHIND_S * speed

@@ -134,13 +134,9 @@ def _stop_line_m(
 
 
 def _hits(
-    others: _Others,
-    now: _Steps,
-    path: Path,
-    at: _Floats,
-    size_m: Float64[np.ndarray, " 2"],
+    others: _Others, now: _Steps, path: Path, at: _Floats, size_m: Float64[np.ndarray, " 2"],
     behind: Bool[np.ndarray, "user start"],
-) -> Bool[np.ndarray, " start"]:
+) -> Bool[np.ndarray, " start"]:  # fmt: skip
     """Whether an agent overlaps ego and did not come from behind; adds agents that did to ``behind``."""
     half, side = size_m / 2
     near, far, right, left = others.extent[..., now]

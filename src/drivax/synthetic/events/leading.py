@@ -146,44 +146,40 @@ def _stands_until(speed_mps: float, severity_mps2: float) -> int:
 
 
 def _propose_leader(
-    view: EgoView,
-    step: int,
-    headway_s: float,
-    rng: np.random.Generator,
-    drives_on: Staging | None,
+    view: EgoView, step: int, headway_s: float, rng: np.random.Generator, drives_on: Staging | None,
     others: tuple[int, ...],
-) -> Proposal | None:
+) -> Proposal | None:  # fmt: skip
     """Propose a new leader at ego's speed that brakes to a halt; None near junctions, or where it requires too little.
 
     ``headway_s`` is its time gap to an ego in free traffic; it drives on later, with this further staging, or stays
     (None).
     """
-    track, ego_speed = view.track, float(view.motion.speed[0, step])
+    track, ego_mps = view.track, float(view.motion.speed[0, step])
     lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
-    cruising = track.at + headway_s * ego_speed + lengths
+    cruising = track.at + headway_s * ego_mps + lengths
     if view.meets_junction(float(cruising[view.first_step]), float(cruising[step])):
         return None
     first_valid = view.first_step - _BEFORE
-    view_after = view.behind(cruising - CAR_M[0] / 2, first_valid)
+    behind = view.behind(cruising - CAR_M[0] / 2, first_valid)
     speed, gap = (
-        float(view_after.motion.speed[0, step]),
-        float(cruising[step] - view_after.track.at[step]) - lengths,
+        float(behind.motion.speed[0, step]),
+        float(cruising[step] - behind.track.at[step]) - lengths,
     )
-    draw = draw_braking(speed, gap, ego_speed, rng)
+    draw = draw_braking(speed, gap, ego_mps, rng)
     if draw is None:
         return None
     times = DT_S * (np.arange(view.steps) - step)
-    braked_m, _ = speed_change(ego_speed, 0.0, draw[0], times)
+    braked_m, _ = speed_change(ego_mps, 0.0, draw[0], times)
     last = view.last_step if drives_on is None else step + _stands_until(speed, draw[1])
-    next_lanes, _ = speed_change(0.0, ego_speed, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
+    next_lanes, _ = speed_change(0.0, ego_mps, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
     station = np.where(times < 0, cruising, cruising[step] + braked_m + next_lanes)
     if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
         return None
     valid, left = np.arange(view.steps) >= first_valid, np.zeros(view.steps)
     adversary = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid)
     staging = replace(drives_on or Staging(), extras=(adversary,))
-    required = severity(view_after, adversary, step + NOTICED)
-    return Proposal(staging, required, adversary, step, last, None, others, view_after)
+    required = severity(behind, adversary, step + NOTICED)
+    return Proposal(staging, required, adversary, step, last, None, others, behind)
 
 
 @dataclass(frozen=True)

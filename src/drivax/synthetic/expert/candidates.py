@@ -168,12 +168,9 @@ class StopLine:
 
 
 def find_conflicts(
-    candidate: CandidatePath,
-    size_m: _Size,
-    others: _Boxes,
-    valid: _Exists,
+    candidate: CandidatePath, size_m: _Size, others: _Boxes, valid: _Exists,
     vulnerable: Bool[np.ndarray, " user"],
-) -> Conflicts:
+) -> Conflicts:  # fmt: skip
     """Find conflicts of ego's box along a path with boxes of others, of which ``vulnerable`` walk or cycle."""
     margin = np.where(vulnerable[:, None], NEAR_VULNERABLE_M, NEAR_M)
     still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
@@ -229,13 +226,9 @@ def _is_near_path(others: _Boxes, ego: _PathBoxes, reach: Float64[np.ndarray, " 
 
 
 def stop_lines(
-    network: RoadNetwork,
-    path: Path,
-    ego_m: tuple[float, float],
-    times_s: _Series,
-    passed: _Series,
+    network: RoadNetwork, path: Path, ego_m: tuple[float, float], times_s: _Series, passed: _Series,
     arrivals: dict[int, _Steps],
-) -> list[StopLine]:
+) -> list[StopLine]:  # fmt: skip
     """Return the stop lines ahead of ego (path position of its centre, half length).
 
     ``passed`` is the path position of ego's centre at each time (on the clock of the lights) in the last run.
@@ -265,12 +258,9 @@ def stop_lines(
 
 
 def arrivals(
-    network: RoadNetwork,
-    paths: list[Path],
-    distance_m: Float64[np.ndarray, "vehicle time"],
-    valid: Bool[np.ndarray, "vehicle time"],
-    half_m: Float64[np.ndarray, " vehicle"],
-) -> dict[int, _Steps]:
+    network: RoadNetwork, paths: list[Path], distance_m: Float64[np.ndarray, "vehicle time"],
+    valid: Bool[np.ndarray, "vehicle time"], half_m: Float64[np.ndarray, " vehicle"],
+) -> dict[int, _Steps]:  # fmt: skip
     """Steps at which a vehicle other than ego is on, or about to enter, each connector to which another yields."""
     watched = {first for lane in network.lanes for first in lane.yields_to}
     result: dict[int, _Steps] = {}

@@ -78,14 +78,9 @@ def expert_path(
 
 
 def drive_ego(
-    roles: Roles,
-    times_s: Float64[np.ndarray, " time"],
-    staging: Staging,
-    first_step: int,
-    traffic_run: TrafficRun,
-    aware_step: int = 0,
-    unplanned: Motion | None = None,
-) -> tuple[Motion, str]:
+    roles: Roles, times_s: Float64[np.ndarray, " time"], staging: Staging, first_step: int,
+    traffic_run: TrafficRun, aware_step: int = 0, unplanned: Motion | None = None,
+) -> tuple[Motion, str]:  # fmt: skip
     """Drive ego like other traffic if that is acceptable, else along a plan that knows the others' motion.
 
     Others react to a plan, so each plan is simulated and checked, and replaced where it fails.

@@ -305,13 +305,9 @@ def _first_hit(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
 
 
 def _shift(
-    state: _State,
-    candidate: CandidatePath,
-    conflicts: Conflicts,
-    hit: _Hit,
-    side: float,
+    state: _State, candidate: CandidatePath, conflicts: Conflicts, hit: _Hit, side: float,
     margins: tuple[float, float],
-) -> Shift | None:
+) -> Shift | None:  # fmt: skip
     """Return the shift that passes a user, and standing users close behind it, on one side (1: left, -1: right)."""
     room_m, step_mps2 = margins
     begin, end, edge = _extent(state, candidate, hit, side)

@@ -90,11 +90,9 @@ def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]
 
 
 def search(
-    occupancy: Occupancy,
-    preferred_mps: Float64[np.ndarray, " place"],
-    limit_mps: Float64[np.ndarray, " place"],
-    speed_mps: float,
-) -> SpeedPlan:
+    occupancy: Occupancy, preferred_mps: Float64[np.ndarray, " place"],
+    limit_mps: Float64[np.ndarray, " place"], speed_mps: float,
+) -> SpeedPlan:  # fmt: skip
     """Return the cheapest speeds from the present one, with preferred and largest speeds at the places of a path."""
     steps = -(-(len(occupancy.hard) - 1) // COARSE)
     reach = occupancy.spacing_m * (occupancy.hard.shape[1] - 1)

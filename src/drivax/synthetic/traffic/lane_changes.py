@@ -209,19 +209,17 @@ class LaneChanges:
         new_leader, new_follower = self._neighbours(now, vehicles, o.there, occupied)
         _, ahead_gap, ahead_speed = new_leader
         behind, behind_gap, _ = new_follower
-        own_acceleration = self._follow(vehicles, speed, o.limit_mps, ahead_gap, ahead_speed)
+        own = self._follow(vehicles, speed, o.limit_mps, ahead_gap, ahead_speed)
         # After the change the new follower follows the vehicle, and the old follower the vehicle's old leader.
         new_after, new_before = self._follower_accelerations(now, vehicles, new_follower, new_leader)
         old_leader, old_follower = self._neighbours(now, vehicles, o.here, occupied)
         old_before, old_after = self._follower_accelerations(now, vehicles, old_follower, old_leader)
-        others_gain = new_after - new_before + old_after - old_before
-        gain = (
-            own_acceleration - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others_gain
-        )
+        others = new_after - new_before + old_after - old_before
+        gain = own - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
         urgency = np.where(o.mandatory, 1.0 - np.clip(o.left_m / _LEAVE_M, 0.0, 1.0), 0.0)
         safe = _SAFE_MPS2 + urgency * (_URGENT_MPS2 - _SAFE_MPS2)
         follower_speed = np.where(behind >= 0, now.speed[np.maximum(behind, 0)], 0.0)
-        accepted = o.possible & (new_after > -safe) & (own_acceleration > -safe)
+        accepted = o.possible & (new_after > -safe) & (own > -safe)
         accepted &= ahead_gap > _ROOM_M + _ROOM_S * np.maximum(speed - ahead_speed, 0.0) * 4
         accepted &= behind_gap > _ROOM_M + _ROOM_S * follower_speed * (1 - 0.6 * urgency)
         accepted &= o.mandatory | (gain > _THRESHOLD_MPS2)

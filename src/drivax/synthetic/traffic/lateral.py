@@ -68,26 +68,26 @@ def _moved_spans(
 ) -> tuple[LaneSpan, ...]:
     """Lane spans of a displaced path, whose samples moved from the old to the new positions."""
 
-    def map_position(metres: float) -> float:
+    def to_new(metres: float) -> float:
         if not math.isfinite(metres) or metres < 0.0:
             return metres
         return float(np.interp(metres, old, new)) + max(metres - float(old[-1]), 0.0)
 
     # A span is anchored at its end: what lies ahead of the displacement stays in place.
-    shifts = [map_position(span.end_m) - span.end_m for span in path.spans]
+    shifts = [to_new(span.end_m) - span.end_m for span in path.spans]
     spans = [
         replace(
             s,
             begin_m=s.begin_m + by,
             end_m=s.end_m + by,
-            from_m=map_position(s.from_m),
-            until_m=map_position(s.until_m),
+            from_m=to_new(s.from_m),
+            until_m=to_new(s.until_m),
         )
         for s, by in zip(path.spans, shifts, strict=True)
     ]
     for s in occupied:
-        end = map_position(s.until_m)
-        spans.append(LaneSpan(s.lane, s.begin_m + end - s.until_m, s.scale, map_position(s.from_m), end, end))
+        end = to_new(s.until_m)
+        spans.append(LaneSpan(s.lane, s.begin_m + end - s.until_m, s.scale, to_new(s.from_m), end, end))
     return tuple(spans)
 
 

@@ -87,10 +87,8 @@ def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, 
     window = np.clip(rough[:, None] + np.arange(-8, 9), 0, len(path.curve.xy) - 1)
     fine = _squared_distance(boxes.xy[near, None], path.curve.xy[window])
     index = window[np.arange(len(near)), fine.argmin(axis=1)]
-    position, lateral, relative_heading = _relative(
-        boxes, near, path.curve.xy[index], path.curve.heading[index]
-    )
-    length, width = _reach(boxes.size_m[near], relative_heading)
+    position, lateral, angle = _relative(boxes, near, path.curve.xy[index], path.curve.heading[index])
+    length, width = _reach(boxes.size_m[near], angle)
     position = position + index * path.step_m
     return Extents(position - length, position + length, lateral - width, lateral + width), near
 
@@ -180,19 +178,17 @@ def nearest_obstacles(
     inside = (np.minimum(left, left_soon) - width < half) & (np.maximum(left, left_soon) + width > -half)
     # Beyond the last sample of the path, or next to the vehicle: no obstacle.
     inside &= (position > at_m[viewer] + 0.3 * size[:, 0]) & (apart2 < 64.0)
-    rows = inside.nonzero()[0]
-    if not len(rows):
+    k = inside.nonzero()[0]
+    if not len(k):
         return gap, speed
-    viewer, user, left, drift = viewer[rows], user[rows], left[rows], drift[rows]
-    room = position[rows] - length[rows] - at_m[viewer] - size[rows, 0] / 2
-    stays = ~_leaves_corridor(
-        left, drift, half[rows] + width[rows], room / np.maximum(vehicles.speed[viewer], 1.0)
-    )
+    viewer, user, left, drift = viewer[k], user[k], left[k], drift[k]
+    room = position[k] - length[k] - at_m[viewer] - size[k, 0] / 2
+    stays = ~_leaves_corridor(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[viewer], 1.0))
     # Of several obstacles of a vehicle the nearest is entered last.
     order = np.argsort(-room, kind="stable")
     order = order[stays[order]]
     gap[viewer[order]] = room[order]
-    speed[viewer[order]] = np.maximum(users.speed[user] * np.cos(relative_heading[rows]), 0.0)[order]
+    speed[viewer[order]] = np.maximum(users.speed[user] * np.cos(relative_heading[k]), 0.0)[order]
     return gap, speed
 
 

@@ -176,9 +176,9 @@ class Pedestrians:
         # A standing queue blocks the crossing.
         free = ~overlap(conflicts.strip[:, None], boxes[None]).any(axis=1)
         red = ~(conflicts.red & (colour != Colour.RED)).any(axis=1)
-        drivers_yield = conflicts.marked | conflicts.red.any(axis=1)
+        yielding = conflicts.marked | conflicts.red.any(axis=1)
         gap = np.where(
-            drivers_yield[crossing],
+            yielding[crossing],
             hard_s[crossing] > needed + _MARGIN_S,
             any_s[crossing] > needed + _GAP_MARGIN_S,
         )
@@ -295,16 +295,16 @@ def _draw_crossing_pedestrian(
     network: RoadNetwork, index: int, crossing: Crossing, begin_s: float, rng: np.random.Generator
 ) -> Pedestrian:
     """Draw a pedestrian that comes along the sidewalk, crosses, and continues on the other side."""
-    near_kerb, far_kerb = crossing.axis if rng.random() < 0.5 else crossing.axis[::-1]
+    near, far = crossing.axis if rng.random() < 0.5 else crossing.axis[::-1]
     lateral = rng.uniform(-0.3, 0.3) * crossing.width_m
-    direction = (far_kerb - near_kerb) / np.hypot(*(far_kerb - near_kerb))
-    shift = lateral * np.array([-direction[1], direction[0]])
-    near_kerb, far_kerb = near_kerb + shift, far_kerb + shift
+    ahead = (far - near) / np.hypot(*(far - near))
+    shift = lateral * np.array([-ahead[1], ahead[0]])
+    near, far = near + shift, far + shift
     before, after = (
-        _along_sidewalk(network, near_kerb, -direction, rng),
-        _along_sidewalk(network, far_kerb, direction, rng),
+        _along_sidewalk(network, near, -ahead, rng),
+        _along_sidewalk(network, far, ahead, rng),
     )
-    points = np.concatenate([before[::-1], [near_kerb, far_kerb], after])
+    points = np.concatenate([before[::-1], [near, far], after])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     kerb_m, across_m = float(arc[len(before)]), float(arc[len(before) + 1])
     speed = _draw_speed(rng)

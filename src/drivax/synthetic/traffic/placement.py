@@ -155,14 +155,9 @@ class Placement:
 
 
 def place_vehicles(
-    network: RoadNetwork,
-    ego_lane: int,
-    ego_along_m: float,
-    density: Density,
-    rng: np.random.Generator,
-    parked: tuple[Scripted, ...] = (),
-    busy: Collection[int] = (),
-) -> Placement:
+    network: RoadNetwork, ego_lane: int, ego_along_m: float, density: Density, rng: np.random.Generator,
+    parked: tuple[Scripted, ...] = (), busy: Collection[int] = (),
+) -> Placement:  # fmt: skip
     """Draw initial positions off connectors, with safe gaps to ego, other vehicles and parked cars.
 
     Lanes in ``busy`` are as dense as the network's busy ones.

@@ -251,15 +251,9 @@ class RightOfWay:
         for k in np.flatnonzero(all_way & np.isfinite(stood)):
             # Of vehicles that arrived simultaneously the one without another to its right goes first.
             tied = all_way & (np.abs(stood - stood[k]) < _TIE_S)
-            current = self._lanes[connectors[k]].curve.heading[0]
-            relative_heading = np.array(
-                [wrap(self._lanes[w].curve.heading[0] - current) for w in connectors[tied]]
-            )
-            key[k] += (
-                0.5
-                * _TIE_S
-                * bool(np.any((relative_heading > math.pi / 4) & (relative_heading < 3 * math.pi / 4)))
-            )
+            heading = self._lanes[connectors[k]].curve.heading[0]
+            angle = np.array([wrap(self._lanes[w].curve.heading[0] - heading) for w in connectors[tied]])
+            key[k] += 0.5 * _TIE_S * bool(np.any((angle > math.pi / 4) & (angle < 3 * math.pi / 4)))
         return np.lexsort((rows, key)).tolist()
 
     def _may_enter(

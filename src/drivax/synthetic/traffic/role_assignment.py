@@ -82,15 +82,9 @@ def add_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
 
 
 def assign_roles(
-    network: RoadNetwork,
-    domain: Domain,
-    times_s: _Values,
-    lane_change_share: float,
-    timing: SignalTiming,
-    rng: np.random.Generator,
-    destinations: Sequence[Destination] = (),
-    critical: bool = False,
-) -> Roles:
+    network: RoadNetwork, domain: Domain, times_s: _Values, lane_change_share: float, timing: SignalTiming,
+    rng: np.random.Generator, destinations: Sequence[Destination] = (), critical: bool = False,
+) -> Roles:  # fmt: skip
     """Draw ego, its route and lights, then the others.
 
     Args:
@@ -136,14 +130,9 @@ def assign_roles(
 
 
 def _draw_route(
-    network: RoadNetwork,
-    driver: Drivers,
-    first_s: float,
-    lane_change_share: float,
-    rng: np.random.Generator,
-    destination_route: DestinationRoute | None,
-    attempts: int = 0,
-) -> tuple[tuple[int, ...], Path, float]:
+    network: RoadNetwork, driver: Drivers, first_s: float, lane_change_share: float, rng: np.random.Generator,
+    destination_route: DestinationRoute | None, attempts: int = 0,
+) -> tuple[tuple[int, ...], Path, float]:  # fmt: skip
     """Draw ego's lanes, path and position before the warm-up; redraw a route without conflicts ``attempts`` times."""
     if destination_route is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
@@ -162,12 +151,9 @@ def _draw_route(
 
 
 def _lights(
-    network: RoadNetwork,
-    lanes: tuple[int, ...],
-    timing: SignalTiming,
-    destination_route: DestinationRoute | None,
-    rng: np.random.Generator,
-) -> SignalPlan | None:
+    network: RoadNetwork, lanes: tuple[int, ...], timing: SignalTiming,
+    destination_route: DestinationRoute | None, rng: np.random.Generator,
+) -> SignalPlan | None:  # fmt: skip
     """Set the clock so that ego's next light is green, turns green or turns yellow when the recording begins."""
     plan, ahead = network.signals, lanes if destination_route is None else lanes[destination_route.place :]
     signalised = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]

@@ -320,13 +320,9 @@ Place = tuple[int, int]
 
 
 def finish_sites(
-    rng: np.random.Generator,
-    style: RoadStyle,
-    draft: Draft,
-    sites: Sequence[Site],
-    links: dict[Place, Place],
-    geometry: Geometry,
-) -> None:
+    rng: np.random.Generator, style: RoadStyle, draft: Draft, sites: Sequence[Site],
+    links: dict[Place, Place], geometry: Geometry,
+) -> None:  # fmt: skip
     """Add the boundary around all sites, counter-clockwise, sidewalks along it, markings and crossings.
 
     ``links`` pairs the approaches at the two ends of a street, in both directions; linked sites form a tree.
