@@ -324,8 +324,6 @@ def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
     values["jerk"][steps] = savgol_matrix(samples, *comfort.JERK) @ smooth @ along / DT_S
     values["yaw_rate"][steps] = rate
     values["curvature"][steps] = np.where(
-        speed >= _MIN_SPEED_MPS,
-        rate / np.maximum(speed, _MIN_SPEED_MPS),
-        np.nan,
+        speed >= _MIN_SPEED_MPS, rate / np.maximum(speed, _MIN_SPEED_MPS), np.nan
     )
     return values

@@ -281,9 +281,7 @@ def is_evaluated(study: Study, arm: str, seed: int) -> bool:
         )
         if evaluated < trained:
             raise UsageError(
-                "is older than the run that it evaluates",
-                file=folder,
-                cure="remove it; it is made again",
+                "is older than the run that it evaluates", file=folder, cure="remove it; it is made again"
             )
     return all(folder.is_dir() for folder in evaluations)
 

@@ -252,11 +252,7 @@ class RewardConfig(_Weights):
 
     def __post_init__(self) -> None:
         check_unique("rewards.own", [term.name for term in self.own], tuple(TERMS))
-        bounds = {
-            "collision_margin_m": FARTHEST_GAP_M,
-            "ttc_s": TTC_HORIZON_S,
-            "close_m": FARTHEST_GAP_M,
-        }
+        bounds = {"collision_margin_m": FARTHEST_GAP_M, "ttc_s": TTC_HORIZON_S, "close_m": FARTHEST_GAP_M}
         for name, bound in bounds.items():
             if not 0.0 <= getattr(self, name) <= bound:
                 raise ValueError(f"{name} is {getattr(self, name)}; choose 0 to {bound:g}")

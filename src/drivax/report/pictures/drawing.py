@@ -70,10 +70,7 @@ def with_traffic_of(rollout: Rollout, scenario: Scenario) -> Scenario:
     record = scenario.record.copy()
     record["agent_valid"][steps, 1:] = False
     record["agent_valid"][steps, slots] = present
-    record["agent_xy"][steps, slots], record["agent_heading"][steps, slots] = (
-        poses[..., :2],
-        poses[..., 2],
-    )
+    record["agent_xy"][steps, slots], record["agent_heading"][steps, slots] = (poses[..., :2], poses[..., 2])
     return replace(scenario, record=record)
 
 

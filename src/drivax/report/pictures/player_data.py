@@ -87,10 +87,7 @@ def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) ->
         "goal": _encode(scale.points(drawing.goal)),
         "agents": _boxes(scale, drawing.agents, _poses(scale, drawing.agents).swapaxes(0, 1)),
         "parked": _parked_entries(scale, drawing.parked),
-        "lights": {
-            "line": _encode(scale.points(drawing.light_line)),
-            "state": _encode(drawing.light_state),
-        },
+        "lights": {"line": _encode(scale.points(drawing.light_line)), "state": _encode(drawing.light_state)},
         "log": _encode(_poses(scale, drawing.log)[:, 0]),
         "size": [round(float(length), 2) for length in drawing.log.size[0]],
         "rollouts": [_rollout(rollout, scale, int(scenario.steps)) for rollout in rollouts],

@@ -83,10 +83,7 @@ def ego_track(motion: Motion) -> Track:
         along = np.concatenate([along, along[-1] + np.cumsum(gaps)])
     out = np.array([np.cos(headings[-1]), np.sin(headings[-1])])
     points = np.concatenate([points, [points[-1] + 300.0 * out]])
-    headings, along = (
-        np.append(headings, headings[-1]),
-        np.append(along, along[-1] + 300.0),
-    )
+    headings, along = (np.append(headings, headings[-1]), np.append(along, along[-1] + 300.0))
     station = np.arange(0.0, arc[-1] + _BEYOND_M, STEP_M)
     return Track(interpolate(station, along, points), np.interp(station, along, headings), arc)
 

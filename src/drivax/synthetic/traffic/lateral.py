@@ -77,11 +77,7 @@ def _moved_spans(
     shifts = [to_new(span.end_m) - span.end_m for span in path.spans]
     spans = [
         replace(
-            s,
-            begin_m=s.begin_m + by,
-            end_m=s.end_m + by,
-            from_m=to_new(s.from_m),
-            until_m=to_new(s.until_m),
+            s, begin_m=s.begin_m + by, end_m=s.end_m + by, from_m=to_new(s.from_m), until_m=to_new(s.until_m)
         )
         for s, by in zip(path.spans, shifts, strict=True)
     ]

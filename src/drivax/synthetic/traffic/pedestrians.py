@@ -300,10 +300,7 @@ def _draw_crossing_pedestrian(
     ahead = (far - near) / np.hypot(*(far - near))
     shift = lateral * np.array([-ahead[1], ahead[0]])
     near, far = near + shift, far + shift
-    before, after = (
-        _along_sidewalk(network, near, -ahead, rng),
-        _along_sidewalk(network, far, ahead, rng),
-    )
+    before, after = (_along_sidewalk(network, near, -ahead, rng), _along_sidewalk(network, far, ahead, rng))
     points = np.concatenate([before[::-1], [near, far], after])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     kerb_m, across_m = float(arc[len(before)]), float(arc[len(before) + 1])
