@@ -6,7 +6,7 @@ import types
 import numpy as np
 import pytest
 
-from drivax.stats.significance import holm
+from drivax.stats.significance import holm_adjust
 from drivax.studies.definition import load_study
 from experiment_scripts import load_script
 
@@ -173,7 +173,7 @@ def test_longtail_rates_follow_from_collision_counts(found):
 def test_longtail_verdicts_hold_under_joint_adjustment(found):
     """As its page says."""
     claims = found["claims"]
-    together = holm([one["p"] for one in claims])
+    together = holm_adjust([one["p"] for one in claims])
     assert [p < 0.05 for p in together] == [one["verdict"] != "undecided" for one in claims]
 
 

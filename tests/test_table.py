@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivax.stats.intervals import NOTHING, Interval
+from drivax.stats.intervals import UNDEFINED, Interval
 from drivax.table import Cell, Column, Table, bounds, escape_latex, interval_cell, number
 
 
@@ -26,7 +26,7 @@ def test_bounds_are_words_where_there_is_no_interval():
     assert bounds(Interval(-0.5, -0.75, 0.25, 4), "rate", signed=True) == "−75.0 to +25.0"
     assert bounds(Interval(-1.0, -2.0, 1.5, 4), "m") == "−2.00 to 1.50"
     assert bounds(Interval(1.0, None, None, 1), "m") == "no interval"
-    assert bounds(Interval(1.0, 1.0, 1.0, 9), "m") == "all equal" and bounds(NOTHING, "m") == ""
+    assert bounds(Interval(1.0, 1.0, 1.0, 9), "m") == "all equal" and bounds(UNDEFINED, "m") == ""
 
 
 def test_latex_escapes_special_characters():
@@ -45,7 +45,7 @@ TABLE = Table(
         (
             Cell("success ↑"),
             interval_cell(Interval(0.5, 0.25, 0.75, 4), "rate", "success", link={"run": "a"}),
-            interval_cell(NOTHING, "rate", "success"),
+            interval_cell(UNDEFINED, "rate", "success"),
         ),
         (Cell("speed [m/s]"), interval_cell(Interval(1.5, 1.5, 1.5, 2), "m/s", "speed"), Cell()),
     ),

@@ -31,9 +31,9 @@ import numpy as np
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import EpisodeTable, interval_of
+from drivax.evaluation.result_tables import paired_differences
 from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.evaluation.runner import evaluate
-from drivax.evaluation.tables import paired_differences
 from drivax.learning.policies import export_policy, find_traffic, load_policy, policy_traffic
 from drivax.planners.catalogue import make_planner
 from drivax.planners.planner import Planner

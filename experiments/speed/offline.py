@@ -62,7 +62,7 @@ def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any],
     made = jax.block_until_ready(training_data(config.algorithm, environment, bank, weights))
     prepared = time.perf_counter() - began
     program = Program(Seeds(learner, (0,)), made, 1)
-    state = [program.first_state()]
+    state = [program.initial_state()]
     trained = state[0].parameters, getattr(state[0], "rest", ())
     size = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(trained))
 

@@ -32,8 +32,8 @@ from drivax.studies.bench import (
     BenchConfig,
     bench,
     bench_metrics,
-    compiled,
-    spread,
+    compile_program,
+    replicate,
     steps_per_second,
     use_all_cores,
 )
@@ -71,9 +71,9 @@ SCENARIOS, MANY = 1024, 4096
 def speeds(bank: ScenarioBank, config: BenchConfig) -> dict[str, Any]:
     """Time both tasks in both kinds of traffic alternately, each at its best batch size."""
     kinds = [(name, traffic, batch) for name in TASKS for traffic in ("log", "idm") for batch in BATCHES]
-    bank = spread(prepare_bank(IdmTraffic(), bank))
+    bank = replicate(prepare_bank(IdmTraffic(), bank))
     programs = [
-        compiled(bank, replace(config, task=TASKS[name], traffic=traffic, batch=batch))
+        compile_program(bank, replace(config, task=TASKS[name], traffic=traffic, batch=batch))
         for name, traffic, batch in kinds
     ]
     found = dict(zip(kinds, steps_per_second(programs, config.repeats), strict=True))
@@ -113,7 +113,7 @@ def again(folder: Path, repeats: int) -> dict[str, Any]:
     """Time the speeds again, alternately, at the best batch sizes of the stored result."""
     use_all_cores()
     stored = ScenarioSet.open(folder)
-    bank = spread(
+    bank = replicate(
         prepare_bank(IdmTraffic(), ScenarioBank.from_scenarios([stored[i] for i in range(SCENARIOS)]))
     )
     best = {name: one["batch"] for name, one in json.loads(RESULT.read_text())["speed"].items()}
@@ -121,7 +121,7 @@ def again(folder: Path, repeats: int) -> dict[str, Any]:
     for name, batch in best.items():
         task, traffic = name.split(", ")
         config = BenchConfig(batch=batch, repeats=repeats, task=TASKS[task], traffic=traffic)
-        programs.append(compiled(bank, config))
+        programs.append(compile_program(bank, config))
     before = machine_ms()
     speeds = dict(zip(best, map(round, steps_per_second(programs, repeats)), strict=True))
     when = datetime.now(UTC).isoformat(timespec="minutes")
@@ -178,7 +178,8 @@ def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
 
 def growth(small: ScenarioBank, large: ScenarioBank, config: BenchConfig) -> float:
     """Ratio of the time per step of a large and a small bank, measured alternately."""
-    one, other = steps_per_second([compiled(small, config), compiled(large, config)], config.repeats)
+    programs = [compile_program(bank, config) for bank in (small, large)]
+    one, other = steps_per_second(programs, config.repeats)
     return round(one / other, 3)
 
 

@@ -64,7 +64,7 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
         network = learner.network(state.parameters)
 
         def actor(seen: Mapping[str, Array], key: Array) -> tuple[Array, Array, dict[str, Array]]:
-            policy, value = network.both(seen)
+            policy, value = network.policy_and_value(seen)
             raw_action = policy.sample(key)
             return (
                 raw_action,
@@ -83,10 +83,10 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
 
     def run(part: Callable[..., Any]) -> Callable[[], Any]:
         compiled = jax.jit(part)
-        state = program.first_state()
+        state = program.initial_state()
         return lambda: compiled(program.data, state)
 
-    state = [program.first_state()]
+    state = [program.initial_state()]
 
     def whole() -> Any:
         state[0], logs = program.step(state[0])

@@ -39,11 +39,11 @@ from drivax.tracking.run_folder import is_policy, run_and_step, zoo
 
 @dataclass(frozen=True)
 class Loaded:
-    """Scenarios as they are stored and as a bank on the device.
+    """Stored scenarios, and the same scenarios as a bank on the device.
 
     Attributes:
         scenarios: The stored scenarios.
-        bank: The same, stacked on the device; an argument of everything that simulates.
+        bank: The scenarios stacked on the device, an argument of all simulation functions.
         names: ``dataset``, ``scenario_id`` and ``segment`` of each.
         sizes: Bank sizes of the whole set, so that a subset gives the same results bit for bit.
     """
@@ -58,18 +58,15 @@ class Loaded:
 
 
 def load(
-    data: str | Path | Sequence[Scenario],
-    limit: int | None = None,
-    *,
-    filters: Sequence[str] = (),
+    data: str | Path | Sequence[Scenario], limit: int | None = None, *, filters: Sequence[str] = (),
     scenarios: Sequence[str | Path] = (),
-) -> Loaded:
-    """Load scenarios of a set, or scenarios of your own, ready to simulate.
+) -> Loaded:  # fmt: skip
+    """Load scenarios of a set, or your own scenarios, for simulation.
 
     Args:
         data: Folder of a scenario set, or scenarios.
-        limit: Only the first ``limit`` of those that the other options leave.
-        filters: Conditions that scenarios of a set must meet, as ``type=turn_left`` (``scenario.select.selection``).
+        limit: Maximum number of scenarios, after the other options.
+        filters: Conditions on scenarios of a set, for example ``type=turn_left`` (``scenario.select.selection``).
         scenarios: Ids of scenarios of a set, or files with one id per line.
 
     Raises:
@@ -77,15 +74,15 @@ def load(
         UsageError: A filter or the limit is impossible.
     """
     if isinstance(data, str | Path):
-        stored = ScenarioSet.open(data)
-        kept = [stored[row] for row in select_scenarios(stored, filters, scenarios, limit)]
-        # The scenarios that are loaded have been verified; of the others only the sizes are read.
+        scenario_set = ScenarioSet.open(data)
+        loaded = [scenario_set[row] for row in select_scenarios(scenario_set, filters, scenarios, limit)]
+        # Loaded scenarios have been verified; only the sizes of all others are read.
         sizes = Sizes.used(ScenarioSet.open(data, verify=False))
     elif filters or scenarios:
         raise UsageError("only a scenario set can be filtered", cure="leave out filters= and scenarios=")
     else:
-        kept, sizes = list(data[:limit]), Sizes.used(data)
-    return Loaded(kept, ScenarioBank.from_scenarios(kept), scenario_names(kept), sizes)
+        loaded, sizes = list(data[:limit]), Sizes.used(data)
+    return Loaded(loaded, ScenarioBank.from_scenarios(loaded), scenario_names(loaded), sizes)
 
 
 def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> Simulator:
@@ -195,20 +192,17 @@ def convert(src: str | Path, out: str | Path, **options: Any) -> Converted:
 
 
 def compare(
-    a: str | Path,
-    b: str | Path,
-    plan: ComparisonPlan | None = None,
-    data: Path | None = None,
+    a: str | Path, b: str | Path, plan: ComparisonPlan | None = None, data: Path | None = None,
     **settings: Any,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare two evaluations.
 
     Args:
         a: Run folder of ``drivax evaluate``, or a folder with one such run per seed.
-        b: The other.
+        b: The other run.
         plan: Metrics and decision rule.
         data: The evaluated set, for a stratified split, if it has moved.
-        settings: Fields of the plan to change, as ``primary="success"``.
+        settings: Fields of the plan to change, for example ``primary="success"``.
 
     Raises:
         DataError: A run folder is missing or damaged.
@@ -224,7 +218,7 @@ def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> Score
     """Score how critical each step and scenario of a set is.
 
     Args:
-        method: Name of a method, as ``kinematic``.
+        method: Name of a method, for example ``kinematic``.
         data: The set, or its folder.
         options: Fields of :class:`drivax.curation.Request`: ``config``, ``seed``, ``like``, ``progress``.
 

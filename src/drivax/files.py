@@ -1,4 +1,4 @@
-"""Output files and folders: checked before the work, written under a hidden name, published by a rename.
+"""Output files and folders: checked before any work, written under a hidden name, and published by a rename.
 
 While the folder ``sets/a`` is being written, ``sets/.a.partial`` holds::
 
@@ -46,11 +46,10 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
-    """Refuse an output that exists, before any work is done.
+    """Check, before any work, that an output can be written.
 
     Raises:
-        UsageError: The output exists and ``overwrite`` is false, or it is a folder where a file is to be written, or
-            the other way round.
+        UsageError: The output exists and ``overwrite`` is false, or is not of the kind (file or folder) to write.
     """
     if not path.exists():
         return
@@ -136,7 +135,7 @@ def write_json(path: Path, value: Any) -> None:
 @contextlib.contextmanager
 def replace_folder(path: Path) -> Iterator[Path]:
     """Yield a new folder that replaces ``path`` when the block ends; an error leaves ``path`` unchanged."""
-    partial = _hidden(path, f"partial-{os.getpid()}")
+    partial = _hidden_path(path, f"partial-{os.getpid()}")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
@@ -148,17 +147,17 @@ def replace_folder(path: Path) -> Iterator[Path]:
 
 
 class PartialFolder:
-    """A hidden folder whose content becomes ``path``; it can be resumed by a later process.
+    """A hidden folder whose content becomes ``path``, and that a later process can resume.
 
     Args:
         path: Final name of the content.
-        identity: What is being written, as JSON values by name. Without it nothing is kept after a failure.
+        identity: Description of the content as JSON values by name; without it, nothing is kept after a failure.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any] | None = None) -> None:
         self.path = path
         self.identity = None if identity is None else json.loads(json.dumps(identity))
-        self.root = _hidden(path, "partial" if identity is not None else f"partial-{os.getpid()}")
+        self.root = _hidden_path(path, "partial" if identity is not None else f"partial-{os.getpid()}")
         self.content = self.root / "content"
         self._lock: IO[bytes] | None = None
 
@@ -198,10 +197,10 @@ class PartialFolder:
         _publish(self.content, self.path)
 
     def close(self) -> None:
-        """Release the lock; keep finished parts for a process that resumes, remove the rest."""
-        kept = ("content", "progress", "identity.json", "lock")
+        """Release the lock; keep finished parts for a process that resumes, remove everything else."""
+        names = ("content", "progress", "identity.json", "lock")
         finished = self.content.is_dir() and any((self.root / "progress").glob("*.json"))
-        self._clear(kept if finished else ("lock",))
+        self._clear(names if finished else ("lock",))
         if not finished:  # The lock goes last: another process must not start while files are being removed.
             (self.root / "lock").unlink(missing_ok=True)
             with contextlib.suppress(OSError):
@@ -211,16 +210,16 @@ class PartialFolder:
     def _notes(self, restart: bool) -> list[dict[str, Any]]:
         if self.identity is None:
             return []
-        earlier = _read_json(self.root / "identity.json")
-        if isinstance(earlier, dict) and earlier != self.identity and not restart:
-            differ = [name for name in self.identity if earlier.get(name) != self.identity[name]]
+        stored = _read_json(self.root / "identity.json")
+        if isinstance(stored, dict) and stored != self.identity and not restart:
+            different = [name for name in self.identity if stored.get(name) != self.identity[name]]
             raise UsageError(
-                f"an unfinished output was started with other data or other options ({', '.join(differ)})",
+                f"an unfinished output was started with other data or other options ({', '.join(different)})",
                 file=self.path,
                 cure="finish it with the same options, or pass --overwrite to start again",
             )
         notes: list[dict[str, Any]] = []
-        while earlier == self.identity and self.content.is_dir():
+        while stored == self.identity and self.content.is_dir():
             note = _read_json(self.root / "progress" / f"{len(notes):05d}.json")
             if note is None:
                 break
@@ -234,9 +233,9 @@ class PartialFolder:
             (self.root / "progress").mkdir()
             write_json(self.root / "identity.json", self.identity)
 
-    def _clear(self, kept: tuple[str, ...]) -> None:
+    def _clear(self, names: tuple[str, ...]) -> None:
         for entry in self.root.iterdir():
-            if entry.name in kept:
+            if entry.name in names:
                 continue
             if entry.is_dir():
                 shutil.rmtree(entry, ignore_errors=True)
@@ -252,7 +251,7 @@ class PartialFolder:
                 continue
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                held = os.fstat(file.fileno()).st_ino == (self.root / "lock").stat().st_ino
+                is_current = os.fstat(file.fileno()).st_ino == (self.root / "lock").stat().st_ino
             except BlockingIOError as error:
                 file.close()
                 raise UsageError(
@@ -261,8 +260,8 @@ class PartialFolder:
                     cure="wait for it, or choose another name",
                 ) from error
             except FileNotFoundError:
-                held = False
-            if held:
+                is_current = False
+            if is_current:
                 self._lock = file
             else:
                 file.close()
@@ -275,17 +274,17 @@ class PartialFolder:
 
 def can_resume(path: Path) -> bool:
     """Return whether ``path`` has finished parts that a later process can continue."""
-    return any((_hidden(path, "partial") / "progress").glob("*.json"))
+    return any((_hidden_path(path, "partial") / "progress").glob("*.json"))
 
 
-def _hidden(path: Path, suffix: str) -> Path:
+def _hidden_path(path: Path, suffix: str) -> Path:
     return path.parent / f".{path.name}.{suffix}"
 
 
 def _publish(content: Path, path: Path) -> None:
-    """Rename a complete folder to ``path``; remove what it replaces, and what a killed process left."""
+    """Rename a complete folder to ``path``; remove the folder that it replaces, and leftovers of killed processes."""
     if path.exists():
-        path.rename(_hidden(path, f"old-{os.getpid()}"))
+        path.rename(_hidden_path(path, f"old-{os.getpid()}"))
     content.rename(path)
     sync_folder(path.parent)
     for old in path.parent.glob(f".{glob.escape(path.name)}.old-*"):

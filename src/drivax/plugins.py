@@ -1,4 +1,4 @@
-"""Users' own classes and functions by dotted name, ``package.module:name``, as configuration files write them."""
+"""User-defined classes and functions by dotted name, ``package.module:name``, as in configuration files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def is_dotted(value: Any) -> bool:
 
 
 def find_named(name: str) -> Any:
-    """Import a module and return the object that a dotted name stands for.
+    """Import the object with a dotted name.
 
     Modules are searched on Python's path first, then in the current folder.
 
@@ -83,7 +83,7 @@ def dotted_name(thing: Any) -> str:
 
 
 def check_arguments(function: Any, name: str, arguments: tuple[Any, ...]) -> None:
-    """Refuse a callable that cannot take these positional arguments.
+    """Check that a callable accepts these positional arguments.
 
     Raises:
         ValueError: Its signature differs.
@@ -100,7 +100,7 @@ def check_arguments(function: Any, name: str, arguments: tuple[Any, ...]) -> Non
 
 
 def check_protocol(thing: Any, name: str, protocol: Any) -> None:
-    """Refuse an object that lacks a member of a protocol.
+    """Check that an object has all members of a protocol.
 
     Raises:
         ValueError: Names the first missing member.
@@ -115,6 +115,6 @@ def protocol_members(protocol: Any) -> list[str]:
     names: list[str] = []
     for cls in reversed(protocol.__mro__):
         if getattr(cls, "_is_protocol", False) and cls.__name__ not in ("Protocol", "Generic"):
-            own = [*vars(cls).get("__annotations__", {}), *vars(cls)]
-            names += [n for n in own if not n.startswith("_") and n not in names]
+            members = [*vars(cls).get("__annotations__", {}), *vars(cls)]
+            names += [n for n in members if not n.startswith("_") and n not in names]
     return names

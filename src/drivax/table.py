@@ -1,4 +1,4 @@
-"""One table for every output: text for a terminal, Markdown, HTML, LaTeX, and CSV with all digits."""
+"""Tables with a renderer for each output: terminal, Markdown, HTML, LaTeX, and CSV with all digits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 #: Stands for a missing number.
 MISSING = "–"
 #: Columns of an interval in a CSV file.
-_NUMBERS = ("metric", "mean", "low", "high", "n")
+_INTERVAL_COLUMNS = ("metric", "mean", "low", "high", "n")
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Column:
         label: Whether its cells are row headings, which are never wrapped.
         left: Whether text is aligned left; labels always are.
         title: Tooltip in HTML.
-        most: Maximum width in a terminal, characters.
+        max_width: Maximum width in a terminal, characters.
         picture: Whether its cells are pictures, which only HTML shows.
     """
 
@@ -42,7 +42,7 @@ class Column:
     label: bool = False
     left: bool = False
     title: str = ""
-    most: int | None = None
+    max_width: int | None = None
     picture: bool = False
 
 
@@ -51,7 +51,7 @@ class Cell:
     """A cell.
 
     Attributes:
-        text, bounds, note: Text, its interval in words, and small print (not in a terminal).
+        text, bounds, note: Text, its formatted interval, and a note in small print (not in a terminal).
         interval, metric: The number behind the text with its metric, for CSV files.
         mark: A verdict next to the text, in HTML.
         style: CSS class; ``group`` makes a bold row in a terminal.
@@ -80,7 +80,7 @@ class Table:
         name: Name of its file, and CSS class.
         rows: One cell per column in each row.
         caption: One line about the numbers.
-        across: What the columns of numbers stand for in a CSV file: ``metric``, ``planner``, ...
+        across: Quantity that distinguishes the columns of numbers in a CSV file: ``metric``, ``planner``, ...
     """
 
     name: str
@@ -93,23 +93,23 @@ class Table:
         """Return a table for a terminal, with other tables of as many columns below it in the same widths."""
         from rich.table import Table as RichTable
 
-        shown = [at for at, column in enumerate(self.columns) if not column.picture]
-        headed = any(self.columns[at].heading for at in shown)
+        visible = [i for i, column in enumerate(self.columns) if not column.picture]
+        has_headings = any(self.columns[i].heading for i in visible)
         grid = RichTable(
-            box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0), show_header=headed
+            box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0), show_header=has_headings
         )
-        for column in (self.columns[at] for at in shown):
+        for column in (self.columns[i] for i in visible):
             grid.add_column(
                 column.heading, justify="left" if column.label or column.left else "right", no_wrap=column.label,
-                max_width=column.most, overflow="ellipsis" if column.label else "fold",
-                style="bold" if column.label and not headed else "",
+                max_width=column.max_width, overflow="ellipsis" if column.label else "fold",
+                style="bold" if column.label and not has_headings else "",
             )  # fmt: skip
         for table in (self, *below):
             if table is not self:
                 grid.add_row()
-                grid.add_row(*(table.columns[at].heading for at in shown), style="bold")
+                grid.add_row(*(table.columns[i].heading for i in visible), style="bold")
             for row in table.rows:
-                lines = ("\n".join(filter(None, (row[at].text, row[at].bounds))) for at in shown)
+                lines = ("\n".join(filter(None, (row[i].text, row[i].bounds))) for i in visible)
                 grid.add_row(*lines, style="bold" if row[0].style == "group" else "")
         return grid
 
@@ -126,44 +126,44 @@ class Table:
         lines = [
             _markdown_row([column.heading for column in self.columns]),
             _markdown_row(["---" if column.label else "---:" for column in self.columns]),
-            *(_markdown_row([" ".join(_words(cell)) for cell in row]) for row in self.rows),
+            *(_markdown_row([" ".join(_cell_texts(cell)) for cell in row]) for row in self.rows),
         ]
         return f"{_escape_markdown(self.caption)}.\n\n" + "\n".join(lines) + "\n"
 
     def latex(self) -> str:
         r"""Return a ``tabular`` to ``\input``; it needs no package."""
         align = "".join("l" if column.label else "r" for column in self.columns)
-        heads = " & ".join(escape_latex(column.heading) for column in self.columns)
-        rows = (" & ".join(_latex_cell(_words(cell)) for cell in row) for row in self.rows)
+        headings = " & ".join(escape_latex(column.heading) for column in self.columns)
+        rows = (" & ".join(_latex_cell(_cell_texts(cell)) for cell in row) for row in self.rows)
         caption = f"% {re.sub(r'[^ -~]', '-', self.caption)}"
-        above = [caption, rf"\begin{{tabular}}{{{align}}}", r"\hline", rf"{heads} \\", r"\hline"]
-        lines = [*above, *(rf"{row} \\" for row in rows), r"\hline", r"\end{tabular}"]
+        header = [caption, rf"\begin{{tabular}}{{{align}}}", r"\hline", rf"{headings} \\", r"\hline"]
+        lines = [*header, *(rf"{row} \\" for row in rows), r"\hline", r"\end{tabular}"]
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
         """Return one line per number: labels, metric, mean, low, high, n; undefined numbers are empty."""
         stream = io.StringIO()
         lines = csv.writer(stream, lineterminator="\n")
-        labels = [at for at, column in enumerate(self.columns) if column.label and column.key != "metric"]
-        keys = [self.columns[at].key or self.columns[at].heading for at in labels]
+        labels = [i for i, column in enumerate(self.columns) if column.label and column.key != "metric"]
+        keys = [self.columns[i].key or self.columns[i].heading for i in labels]
         across = [] if self.across == "metric" else [self.across]
-        lines.writerow([*(key.replace(" ", "_") for key in (*keys, *across)), *_NUMBERS])
+        lines.writerow([*(key.replace(" ", "_") for key in (*keys, *across)), *_INTERVAL_COLUMNS])
         for row in self.rows:
             for column, cell in zip(self.columns, row, strict=True):
                 if (interval := cell.interval) is not None:
-                    place = [*(row[at].text for at in labels), *([column.key] if across else [])]
+                    row_labels = [*(row[i].text for i in labels), *([column.key] if across else [])]
                     numbers = (interval.mean, interval.low, interval.high)
                     digits = ("" if value is None else repr(value) for value in numbers)
-                    lines.writerow([*place, cell.metric, *digits, interval.n])
+                    lines.writerow([*row_labels, cell.metric, *digits, interval.n])
         return stream.getvalue()
 
     def html(self) -> str:
-        """Return HTML that scrolls sideways by itself on narrow screens."""
-        heads = "".join(
+        """Return HTML that scrolls horizontally on narrow screens."""
+        headings = "".join(
             f"<th scope=col{_attribute('title', column.title)}>{escape(column.heading)}</th>"
             for column in self.columns
         )
-        head = f"<thead><tr>{heads}</tr></thead>" if any(column.heading for column in self.columns) else ""
+        head = f"<thead><tr>{headings}</tr></thead>" if any(column.heading for column in self.columns) else ""
         rows = "".join(f"<tr>{''.join(map(_html_cell, self.columns, row))}</tr>" for row in self.rows)
         return (
             f'<div class=scroll tabindex=0 role=region aria-label="{escape(self.name)}"><table class="'
@@ -171,17 +171,19 @@ class Table:
         )
 
 
-def interval_cell(interval: Interval, unit: str, metric: str = "", signed: bool = False, **more: Any) -> Cell:
-    """Return the cell of an estimate: mean, interval and n; ``signed`` for a difference, ``more`` for other fields."""
+def interval_cell(
+    interval: Interval, unit: str, metric: str = "", signed: bool = False, **fields: Any
+) -> Cell:
+    """Return the cell of an estimate: mean, interval and n; ``signed`` for a difference."""
     if interval.mean is None:
-        more = {"style": "undefined", "title": "undefined in every episode"} | more
-        return Cell(note="n 0", interval=interval, metric=metric, **more)
+        fields = {"style": "undefined", "title": "undefined in every episode"} | fields
+        return Cell(note="n 0", interval=interval, metric=metric, **fields)
     mean = number(interval.mean, unit, signed) + suffix(unit, signed)
-    return Cell(mean, bounds(interval, unit, signed), f"n {interval.n}", interval, metric, **more)
+    return Cell(mean, bounds(interval, unit, signed), f"n {interval.n}", interval, metric, **fields)
 
 
 def number(value: float | None, unit: str, signed: bool = False) -> str:
-    """Return a number as tables print it; ``signed`` writes a plus sign, too.
+    """Format a number for tables, with a plus sign if ``signed``.
 
     The unit is ``rate`` (percent, one digit), ``share`` (three digits), or a physical unit (three figures).
     """
@@ -201,12 +203,12 @@ def number(value: float | None, unit: str, signed: bool = False) -> str:
 
 
 def suffix(unit: str, signed: bool = False) -> str:
-    """Return what follows a number: percent for rates, points for differences of rates."""
+    """Return the unit after a number: percent for rates, points for differences of rates."""
     return "" if unit != "rate" else " points" if signed else " %"
 
 
 def bounds(interval: Interval, unit: str, signed: bool = False) -> str:
-    """Return an interval in words: ``low–high``, or ``low to high`` where signs would be confused with the dash."""
+    """Format an interval as ``low–high``, or as ``low to high`` if the dash could be read as a sign."""
     if interval.low is None or interval.high is None:
         return "no interval" if interval.n else ""
     if interval.low == interval.high:
@@ -216,8 +218,8 @@ def bounds(interval: Interval, unit: str, signed: bool = False) -> str:
     return f"{low}{between}{high}"
 
 
-def _words(cell: Cell) -> list[str]:
-    """Return the texts of a cell on paper, the interval in brackets."""
+def _cell_texts(cell: Cell) -> list[str]:
+    """Return the texts of a cell for Markdown and LaTeX, the interval in brackets."""
     if cell.interval is None:
         return [cell.text]
     return [cell.text, *([] if cell.interval.mean is None else [f"({cell.bounds})"]), cell.note]
@@ -246,12 +248,12 @@ def _markdown_row(cells: Sequence[str]) -> str:
 
 
 def _escape_markdown(text: str) -> str:
-    """Return plain text as a cell of Markdown: nothing in it is markup, an HTML element or the end of the cell."""
+    """Escape plain text for a cell of a Markdown table."""
     return re.sub(r"([\\`*_~\[\]<|])", r"\\\1", text.replace("\n", " ").replace("&", "&amp;"))
 
 
-def _latex_cell(words: Sequence[str]) -> str:
-    first, *rest = map(escape_latex, words)
+def _latex_cell(texts: Sequence[str]) -> str:
+    first, *rest = map(escape_latex, texts)
     lines = r" \\ ".join([first, *(rf"\scriptsize {text}" for text in rest)])
     return rf"\shortstack[r]{{{lines}}}" if rest else first
 
@@ -268,10 +270,10 @@ _LATEX: Mapping[str, str] = MappingProxyType(
 
 
 def escape_latex(text: str) -> str:
-    """Return plain text as LaTeX; a character that its fonts lack is named by its number."""
+    """Escape plain text for LaTeX; characters that its fonts lack become code points."""
     # The letters of Latin-1 are in every font of LaTeX; control characters, emoji and other scripts are not.
-    known = re.compile("[ -~À-ÖØ-öø-ÿ]")
+    latin = re.compile("[ -~À-ÖØ-öø-ÿ]")
     return "".join(
-        _LATEX.get(letter) or (letter if known.match(letter) else rf"\texttt{{U+{ord(letter):04X}}}")
+        _LATEX.get(letter) or (letter if latin.match(letter) else rf"\texttt{{U+{ord(letter):04X}}}")
         for letter in text
     )

@@ -54,12 +54,12 @@ def test_components_have_their_own_aggregators():
     [
         (({"a": -1.0},), "weight of 'a' is -1.0"),
         (({"a": float("nan")},), "weight of 'a' is nan"),
-        (({"a": 0.0},), "no component has a weight"),
-        (({},), "no component has a weight"),
+        (({"a": 0.0},), "all weights are 0"),
+        (({},), "all weights are 0"),
         (({"a": 1.0}, "median"), "unknown aggregator 'median'; use max, mean"),
         (({"a": 1.0}, "p101"), "unknown aggregator 'p101'"),
         (({"a": 1.0}, "top0"), "unknown aggregator 'top0'"),
-        (({"a": 1.0, "b": 1.0}, {"a": "max"}), "no aggregator for 'b'"),
+        (({"a": 1.0, "b": 1.0}, {"a": "max"}), "missing aggregator for 'b'"),
         (({"a": 1.0}, {"a": "best"}), "unknown aggregator 'best'"),
     ],
 )

@@ -143,9 +143,7 @@ def test_stacked_and_sequential_updates_agree(ensemble, data):
     environment, bank = Driving(Simulator(TINY.task)), ScenarioBank.from_scenarios(data)
     experience, _ = experience_of(TINY, environment, bank)
     learner = TINY.cloning.build(environment, bank, TINY.iterations)
-    one, other = (
-        fit(TINY, learner, experience, ensemble.fold, together=together) for together in (True, False)
-    )
+    one, other = (fit(TINY, learner, experience, ensemble.fold, batched=batched) for batched in (True, False))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), one, other)
 
 

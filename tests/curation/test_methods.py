@@ -121,7 +121,7 @@ def test_invalid_arguments_are_refused(data, tmp_path):
     for name, like in (("random_matched", None), ("uniform", tmp_path / "x.npz")):
         with pytest.raises(UsageError, match="random_matched needs --like"):
             curate(name, Request(data, like))
-    with pytest.raises(UsageError, match="no method 'kinematics'; did you mean 'kinematic'"):
+    with pytest.raises(UsageError, match="unknown method 'kinematics'; did you mean 'kinematic'"):
         curate("kinematics", Request(data))
     with pytest.raises(DataError, match="score table not found"):
         curate("random_matched", Request(data, tmp_path / "none.npz"))
@@ -173,4 +173,4 @@ def test_tables_with_other_settings_are_refused(data, tables, tmp_path):
         check_current(table, KinematicConfig(urgent_s=2.0))
     for other in (replace(table.combination, scenario="max"), Combination({"urgency": 1.0}, "top10")):
         with pytest.raises(DataError, match="scores of 'kinematic' with combination"):
-            check_current(table.combined(other))
+            check_current(table.recombine(other))

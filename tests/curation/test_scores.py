@@ -43,7 +43,7 @@ def table(data):
     blank = np.zeros((2, 91))
     return ScoreTable(
         "kinematic", {"urgent_s": 0.95}, data.hash, ("drive-0", "drive-1"), valid, blank, blank[:, 0], parts
-    ).combined(PARTS)
+    ).recombine(PARTS)
 
 
 def test_tables_round_trip(data, table, tmp_path):
@@ -72,15 +72,15 @@ def test_tables_round_trip(data, table, tmp_path):
 def test_components_can_be_combined_again(data, table, tmp_path):
     write_scores(table, tmp_path / "scores.npz")
     found = read_scores(tmp_path / "scores.npz", data)
-    again = found.combined(Combination({"braking": 0.25, "urgency": 0.75}, "mean"))
+    again = found.recombine(Combination({"braking": 0.25, "urgency": 0.75}, "mean"))
     parts = 0.25 * found.components["braking"] + 0.75 * found.components["urgency"]
     wanted = np.where(found.valid, parts, 0.0)
     np.testing.assert_allclose(again.steps, wanted, rtol=1e-6)
     np.testing.assert_allclose(again.scenarios, [wanted[0].mean(), wanted[1, :80].mean()], rtol=1e-6)
     assert again.config["combination"]["weights"] == {"braking": 0.25, "urgency": 0.75}
     assert again.config["combination"]["scenario"] == "mean"
-    with pytest.raises(UsageError, match="there is no component 'brakes'; did you mean 'braking'"):
-        found.combined(Combination({"brakes": 1.0}))
+    with pytest.raises(UsageError, match="unknown component 'brakes'; did you mean 'braking'"):
+        found.recombine(Combination({"brakes": 1.0}))
 
 
 def test_older_versions_are_refused(data, table, tmp_path, monkeypatch):
@@ -237,9 +237,12 @@ def test_the_command(data, tmp_path, capsys):
     assert other.combination.scenario == {"urgency": "max", "braking": "mean"}
     capsys.readouterr()
     for wrong, words in (
-        (["--weights", "urgencies", "1"], "there is no component 'urgencies'; did you mean 'urgency'"),
+        (["--weights", "urgencies", "1"], "unknown component 'urgencies'; did you mean 'urgency'"),
         (["--scenario", "p101"], "unknown aggregator 'p101'"),
-        ([*weights, "--scenario", "urgency", "max"], "no aggregator for 'braking'; name one for each comp"),
+        (
+            [*weights, "--scenario", "urgency", "max"],
+            "missing aggregator for 'braking'; name one for each comp",
+        ),
         ([*weights, "--scenario", *apart, "densty", "max"], "'densty'; did you mean 'density'"),
         ([*weights, "--scenario", "urgency", "max", "braking", "most"], "unknown aggregator 'most'"),
         (["--scenario", "urgency=max", "braking=p95"], "unknown aggregator 'braking=p95'"),
@@ -252,9 +255,9 @@ def test_the_command(data, tmp_path, capsys):
     for wrong, words in (
         (["kinematic", "--weights", "urgency", "-1"], "the weight of 'urgency' is -1.0; use 0 or more"),
         (["kinematic", "--scenario", "p101"], "unknown aggregator 'p101'"),
-        (["kinematic", "--scenario", "urgency", "max"], "there is no aggregator for 'braking'"),
+        (["kinematic", "--scenario", "urgency", "max"], "missing aggregator for 'braking'"),
         (["ensemble", "--weights", "actoin_0", "1"], "no component 'actoin_0'; did you mean 'action_0'"),
-        (["ensemble", *mixture, "--weights", "action_0", "1"], "there is no component 'action_0'"),
+        (["ensemble", *mixture, "--weights", "action_0", "1"], "unknown component 'action_0'"),
     ):
         assert main(["curate", *wrong[:1], *begin, *wrong[1:]]) == 2
         told = capsys.readouterr().err

@@ -144,7 +144,7 @@ def test_command_prints_the_most_critical(data, tmp_path, capsys):
     command = ["curate", "kinematic", "--data", str(data.path), "--export", str(top), "3"]
     for lost in (top, top / "scores.npz"):
         assert main([*command, "--out", str(lost)]) == 2
-        assert "lies where --export writes; choose another --out" in capsys.readouterr().err
+        assert "output is inside the --export folder; choose another --out" in capsys.readouterr().err
         assert not list(tmp_path.iterdir())
     assert main([*command, "--out", str(out)]) == 0
     lines = capsys.readouterr().out.replace(str(tmp_path), "").splitlines()

@@ -17,7 +17,7 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.plan import ComparisonPlan
 from drivax.stats.effects import power, scenarios_needed
 from drivax.stats.intervals import paired_bootstrap, rate
-from drivax.stats.significance import holm, mcnemar, paired_permutation
+from drivax.stats.significance import holm_adjust, mcnemar_test, paired_permutation
 
 N = 60
 PLAN = ComparisonPlan(minimum_scenarios=10, resamples=400, secondary=("collision", "comfortable"))
@@ -57,9 +57,9 @@ def test_paired_comparison_equals_hand_computed_values():
     assert (found.scenarios, found.recordings, found.strata) == ((N, N), (N, N), 1)
     assert one.winner == "A" and found.decision.recommendation == "A" and found.decision.because == "test"
     rates = found.secondary
-    assert rates[0].evidence == mcnemar(a.metrics["collision"], b.metrics["collision"])
+    assert rates[0].evidence == mcnemar_test(a.metrics["collision"], b.metrics["collision"])
     assert rates[0].a == rate(a.metrics["collision"])
-    assert [r.p_adjusted for r in rates] == holm([r.evidence.p for r in rates])
+    assert [r.p_adjusted for r in rates] == holm_adjust([r.evidence.p for r in rates])
 
 
 def test_exchanging_planners_negates_the_difference():
@@ -276,7 +276,7 @@ def test_incomparable_evaluations_are_refused(change, words):
         ({"primary": "vmaxscore"}, "has no metric 'vmaxscore'; did you mean 'vmax_score'?"),
         ({"secondary": ("steps",)}, "steps is a code or count without a mean"),
         ({"primary": "vmax_score_partial"}, "combines different inputs"),
-        ({"primary": "ade"}, "neither better high nor low"),
+        ({"primary": "ade"}, "has no better direction"),
         ({"split": "stratified"}, "--data"),
         ({"split": "random", "ratio": 0.999}, "leave an arm empty"),
     ],

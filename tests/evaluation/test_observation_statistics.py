@@ -15,8 +15,8 @@ from drivax.evaluation.observation_statistics import (
     collision_correlation,
     column_statistics,
     importances,
-    look_at,
     observation_statistics,
+    sample_states,
 )
 from drivax.evaluation.rollout import evaluation_task
 from drivax.planners.planner import Memoryless
@@ -76,11 +76,11 @@ def column(found, group, name):
 
 @pytest.mark.slow
 def test_states_are_sampled_before_and_after_the_collision(bank):
-    looks = look_at(Simulator(evaluation_task(TASK)), Shy(), bank, every=10)
-    assert looks.state.context.step.tolist() == [[*range(10, 81, 10)]] * 3
+    samples = sample_states(Simulator(evaluation_task(TASK)), Shy(), bank, every=10)
+    assert samples.state.context.step.tolist() == [[*range(10, 81, 10)]] * 3
     # 30 m less a car's length at 9 m/s: they touch after 2.8 s, at step 38.
-    assert looks.hit.tolist() == [[step > 38 for step in range(10, 81, 10)], [False] * 8, [False] * 8]
-    assert looks.collides.tolist() == [True, False, False]
+    assert samples.hit.tolist() == [[step > 38 for step in range(10, 81, 10)], [False] * 8, [False] * 8]
+    assert samples.collides.tolist() == [True, False, False]
 
 
 @pytest.mark.slow

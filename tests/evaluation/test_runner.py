@@ -12,8 +12,8 @@ from drivax.api import load
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.episode_table import ADDED, FAILED, KEYS, Crash, EpisodeTable, fail_crashed
+from drivax.evaluation.result_tables import paired_difference, paired_differences, summarise
 from drivax.evaluation.runner import evaluate, format_crashes
-from drivax.evaluation.tables import paired_difference, paired_differences, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
 from drivax.scenario.bank.scenario_bank import ScenarioBank

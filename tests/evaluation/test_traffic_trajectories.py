@@ -11,7 +11,7 @@ from shapely import affinity
 import drivax
 from drivax.cli import main
 from drivax.evaluation.rollout import pack_poses, unpack_poses
-from drivax.report.episodes import EvaluatedSet, ranked, rollouts_of
+from drivax.report.episodes import EvaluatedSet, rank_scenarios, rollouts_of
 from drivax.report.pictures.drawing import with_traffic_of
 from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioSet
@@ -65,7 +65,7 @@ def test_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
     assert main([*call, "--out", str(tmp_path / "run")]) == 0
     evaluations, _ = read_runs([tmp_path / "run"])
     driven, gaps, missed = EvaluatedSet(evaluations[0]), [], []
-    for choice in ranked(evaluations):
+    for choice in rank_scenarios(evaluations):
         scenario = driven.scenario((choice.dataset, choice.scenario_id))
         (drive,) = rollouts_of(evaluations, choice, scenario)
         seen = with_traffic_of(drive, scenario)

@@ -48,7 +48,7 @@ def run(learner, data, seeds, devices):
     """Parameters and logs after three iterations; shapes of what each device holds; bytes by part."""
     program = Program(Seeds(learner, seeds), data, devices)
     assert len(program.devices) == (devices or 4), program.devices
-    state = program.first_state()
+    state = program.initial_state()
     for _ in range(3):
         state, logs = program.step(state)
     inner = getattr(state, "learner", state)

@@ -97,7 +97,7 @@ def test_discrete_policy_takes_levels(bank):
     learner = ON_LEVELS[0].build(environment, bank, 2)
     state, logs = jax.jit(learner.iterate)(bank, learner.init(bank, jax.random.key(0)))
     assert all(np.isfinite(value).all() for value in jax.tree.leaves(logs))
-    policy, _ = learner.network(state.parameters).both(
+    policy, _ = learner.network(state.parameters).policy_and_value(
         environment.start(bank, jax.random.key(1), 6).observation
     )
     taken = policy.action(policy.sample(jax.random.key(2)))

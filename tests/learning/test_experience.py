@@ -12,7 +12,7 @@ from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
-from drivax.learning.experience import ExperienceConfig, Recorded, transitions
+from drivax.learning.experience import ExperienceConfig, LoggedEnvironment, transitions
 from drivax.learning.loop import usable_steps
 from drivax.planners.simple import Expert, logged_motion
 from drivax.scenario.bank.columns import AgentColumn
@@ -89,7 +89,7 @@ def test_transitions_equal_a_simulated_expert(bank, experience):
 
 def test_steps_after_an_end_or_without_expert_are_unusable(experience):
     expert = jax.device_get(experience.expert)
-    assert isinstance(DRIVING, Recorded)
+    assert isinstance(DRIVING, LoggedEnvironment)
     end = int(np.argmax(expert.terminated[0]))
     assert 10 <= end < 16 and expert.terminated[0, end]
     np.testing.assert_array_equal(np.nonzero(expert.usable[0])[0], np.arange(10, end + 1))
@@ -146,7 +146,7 @@ def test_unusable_experience_is_refused(bank):
     ):
         with pytest.raises(UsageError, match=words):
             ExperienceConfig().of(DRIVING, bank, weights)
-    with pytest.raises(DataError, match="no step has any weight"):
+    with pytest.raises(DataError, match="all weights are 0"):
         ExperienceConfig().of(DRIVING, bank, np.zeros(shape))
     with pytest.raises(UsageError, match="Pendulum has no logged episodes"):
         ExperienceConfig().of(Pendulum(), ())

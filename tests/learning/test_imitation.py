@@ -108,8 +108,8 @@ def test_imitation_weight_decays():
     with pytest.raises(UsageError, match="use 0 or more"):
         WarmStart(weight=-1.0)
     with pytest.raises(UsageError, match="raise total_steps"):
-        WarmStart(iterations=5).remaining(5)
-    assert WarmStart(iterations=5).remaining(8) == 3
+        WarmStart(iterations=5).online_iterations(5)
+    assert WarmStart(iterations=5).online_iterations(8) == 3
 
 
 @pytest.mark.slow

@@ -97,7 +97,7 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
     lines = []
     onward = replace(config, total_steps=10, begin_from=f"{former}@40")
     run = train(onward, data, tmp_path / "run", seeds=2, log=lines.append)
-    assert lines[1:] == [f"begins with parameters of {former}@40"]
+    assert lines[1:] == [f"starts from parameters of {former}@40"]
     began = Checkpoints(former / "checkpoints").restore(jax.eval_shape(Toy(ToyConfig()).init, None, KEY), 40)
     pairs = list(zip(seed_folders(run.path), seed_folders(plain), strict=True))
     for path, fresh in pairs:
@@ -119,11 +119,11 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
     for wrong, words in (
         (
             wide,
-            r"parameters is float32\[3\] in the checkpoint, not float32\[4\]; begin from a run with the same net",
+            r"parameters is float32\[3\] in the checkpoint, not float32\[4\]; start from a run with the same net",
         ),
         (replace(onward, begin_from=str(tmp_path / "run")), "holds 2 seeds; name one"),
         (replace(onward, begin_from=str(tmp_path)), "is no run folder"),
-        (replace(onward, begin_from=f"{former}@7"), "there is no checkpoint of step 7"),
+        (replace(onward, begin_from=f"{former}@7"), "no checkpoint of step 7"),
         (replace(onward, begin_from="zoo:aggressive"), "is an exported policy, which cannot be fine-tuned"),
     ):
         with pytest.raises(DrivaxError, match=words):
@@ -202,7 +202,7 @@ def test_command_trains_several_seeds(data, tmp_path, capsys):
     assert "wrote" in told.out and "memory: " in told.err and (out / "seed-5" / "metrics.jsonl").is_file()
     more = ["--from", str(out / "seed-4"), "--total_steps", "10"]
     assert main([*arguments[:-1], str(tmp_path / "onward"), *more]) == 0
-    assert f"begins with parameters of {out / 'seed-4'}@20" in capsys.readouterr().err
+    assert f"starts from parameters of {out / 'seed-4'}@20" in capsys.readouterr().err
     assert main([*arguments, "--resume", *more[:2]]) == 2
     assert "a resumed run keeps its configuration; leave out --from" in capsys.readouterr().err
     assert main([*arguments[:1], "demo", *arguments[2:], "--seeds", "0", "--overwrite"]) == 2

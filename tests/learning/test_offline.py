@@ -361,7 +361,7 @@ def test_impossible_settings_are_refused():
             config(network=grid)
     assert IqlConfig(network=grid).loss == "likelihood"
     for config, words in (
-        (partial(IqlConfig, expectile=1.0), "an expectile of 1"),
+        (partial(IqlConfig, expectile=1.0), "expectile is 1"),
         (partial(IqlConfig, inverse_temperature=-1.0), "inverse_temperature or largest_weight"),
         (partial(CqlConfig, actions=0), "too small"),
         (partial(CqlConfig, backup_actions=0), "too small"),

@@ -56,7 +56,7 @@ def test_loss_against_numpy():
         "target": jax.random.normal(keys[3], (32,)),
         "alive": alive,
     }
-    policy, value = learner.network(parameters).both(part["observation"])
+    policy, value = learner.network(parameters).policy_and_value(part["observation"])
     now = policy.log_prob(part["raw_action"])
     part["log_prob"] = now + 0.3 * jax.random.normal(keys[4], (32,))
     total, logs = learner._loss(

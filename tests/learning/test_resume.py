@@ -13,7 +13,7 @@ from drivax.learning.algorithms.behaviour_cloning import BcConfig, Cloning
 from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig, WarmStart
-from drivax.learning.loop import Pretrained, mean_logs, with_networks
+from drivax.learning.loop import PretrainedRun, mean_logs, replace_networks
 from drivax.learning.replay import ReplayConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
@@ -125,14 +125,14 @@ def test_networks_transfer_to_another_run(tmp_path):
     for number, (name, wanted) in enumerate(TAKEN.items()):
         former = jax.jit(ALGORITHMS[name].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(6))
         Checkpoints(tmp_path / "checkpoints").save(number, former)
-        origin = Pretrained(tmp_path, number, [])
+        origin = PretrainedRun(tmp_path, number, [])
         if name == "ppo":
-            with pytest.raises(DataError, match=r"no \.parameters.*; begin from a run with the same network"):
+            with pytest.raises(DataError, match=r"no \.parameters.*; start from a run with the same network"):
                 origin.networks(fresh)
             continue
         found = origin.networks(jax.eval_shape(lambda: fresh))
         assert list(found) == wanted
-        state = with_networks(fresh, found)
+        state = replace_networks(fresh, found)
         inner = former.learner if name == "bc_sac" else former
         same = {"parameters": former.parameters} | {
             path: getattr(inner, path) for path in ("critic", "target") if f".{path}" in wanted
@@ -144,10 +144,10 @@ def test_networks_transfer_to_another_run(tmp_path):
         assert float(state.log_temperature) == pytest.approx(np.log(0.5))
     # And back into a warm start, where they lie one level deeper.
     both = jax.jit(ALGORITHMS["bc_sac"].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(7))
-    found = Pretrained(tmp_path, list(TAKEN).index("sac"), []).networks(both)
+    found = PretrainedRun(tmp_path, list(TAKEN).index("sac"), []).networks(both)
     assert list(found) == [".parameters", ".learner.critic", ".learner.target"]
     jax.tree.map(
-        np.testing.assert_array_equal, with_networks(both, found).learner.critic, found[".learner.critic"]
+        np.testing.assert_array_equal, replace_networks(both, found).learner.critic, found[".learner.critic"]
     )
 
 

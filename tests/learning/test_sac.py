@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.learning.algorithms.sac import SacConfig, Trained
+from drivax.learning.algorithms.sac import SacConfig, SacParameters
 from drivax.learning.replay import ReplayConfig, Transitions
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
@@ -30,7 +30,7 @@ def sac():
         terminated=jax.random.bernoulli(keys[3], 0.3, (16,)),
         next_observation={"pendulum": jax.random.normal(keys[4], (16, 3))},
     )
-    trained = Trained(state.parameters, state.critic, jnp.log(0.2))
+    trained = SacParameters(state.parameters, state.critic, jnp.log(0.2))
     return learner, trained, target, batch
 
 

@@ -15,8 +15,8 @@ from drivax.networks.distributions import (
     Mixture,
     SquashedGaussian,
     distribution,
-    first_parameters,
-    parameters_of,
+    initial_parameters,
+    parameter_count,
 )
 from quick import quick
 
@@ -120,7 +120,7 @@ def test_mixture_against_scipy():
     shares = special.softmax(np.asarray(MIXTURE.logits, float))
     parts = [
         gaussian_density(action, np.asarray(loc, float), np.asarray(scale, float)).prod(axis=-1)
-        for loc, scale in zip(MIXTURE.parts.loc, MIXTURE.parts.scale, strict=True)
+        for loc, scale in zip(MIXTURE.components.loc, MIXTURE.components.scale, strict=True)
     ]
     raw_action = MIXTURE.raw_action(jnp.asarray(action))
     np.testing.assert_allclose(
@@ -174,7 +174,7 @@ def test_samples_are_differentiable_in_the_parameters(kind):
 @pytest.mark.parametrize("kind", ALL)
 def test_policy_gradients_are_finite_at_saturation(kind):
     actions = Actions(2, LEVELS)
-    count = parameters_of(kind, actions)
+    count = parameter_count(kind, actions)
     raw = jnp.array([0.0, 30.0, -30.0])[:, None] * jnp.sign(jnp.arange(count) % 2 - 0.5)
     bounds = jnp.array([[1.0, -1.0], [-1.0, 1.0], [0.0, 0.0]])
 
@@ -194,18 +194,18 @@ def test_policy_gradients_are_finite_at_saturation(kind):
 
 def test_first_parameters_are_centred_with_the_requested_scale():
     actions = Actions(2, LEVELS)
-    gaussian = distribution("gaussian", jnp.asarray(first_parameters("gaussian", actions, 0.3)), actions)
+    gaussian = distribution("gaussian", jnp.asarray(initial_parameters("gaussian", actions, 0.3)), actions)
     np.testing.assert_allclose(gaussian.scale, 0.3, rtol=1e-5)
-    beta = distribution("beta", jnp.asarray(first_parameters("beta", actions, 0.3)), actions)
+    beta = distribution("beta", jnp.asarray(initial_parameters("beta", actions, 0.3)), actions)
     np.testing.assert_allclose(beta.action(draws(beta)).std(0), 0.3, rtol=0.02)
-    grid = distribution("grid", jnp.asarray(first_parameters("grid", actions, 0.3)), actions)
+    grid = distribution("grid", jnp.asarray(initial_parameters("grid", actions, 0.3)), actions)
     weights = [stats.norm.pdf(np.array(axis), 0, 0.3) for axis in LEVELS]
     np.testing.assert_allclose(
         jax.nn.softmax(grid.logits), np.outer(*(w / w.sum() for w in weights)).ravel(), atol=1e-6
     )
-    mixture = distribution("mixture", jnp.asarray(first_parameters("mixture", actions, 0.3)), actions)
-    np.testing.assert_allclose(mixture.parts.scale, 0.3, rtol=1e-5)
-    assert parameters_of("mixture", actions) == len(first_parameters("mixture", actions, 0.3))
+    mixture = distribution("mixture", jnp.asarray(initial_parameters("mixture", actions, 0.3)), actions)
+    np.testing.assert_allclose(mixture.components.scale, 0.3, rtol=1e-5)
+    assert parameter_count("mixture", actions) == len(initial_parameters("mixture", actions, 0.3))
     for one in (gaussian, beta, grid, mixture):
         np.testing.assert_allclose(one.mean_action(), 0.0, atol=1e-6)
         np.testing.assert_allclose(one.mode(), 0.0, atol=1e-6)
@@ -213,8 +213,8 @@ def test_first_parameters_are_centred_with_the_requested_scale():
 
 def test_mistakes_are_named():
     with pytest.raises(UsageError, match="the grid needs actions with levels; choose the action space"):
-        parameters_of("grid", Actions(2))
+        parameter_count("grid", Actions(2))
     with pytest.raises(UsageError, match=r"a Beta of first_scale 0\.6 has no peak; use less"):
-        first_parameters("beta", Actions(2), 0.6)
+        initial_parameters("beta", Actions(2), 0.6)
     with pytest.raises(ValueError, match="levels of 1 numbers for actions of 2"):
         Actions(2, ((0.0,),))

@@ -54,7 +54,7 @@ def test_masked_rows_have_no_effect_and_batches_agree(rows):
 
     def run(parameters, single, batch):
         network = nnx.merge(graph, parameters)
-        return network.both(single), network.both(batch)
+        return network.policy_and_value(single), network.policy_and_value(batch)
 
     single, batch = quick(run, parameters, one, stacked(one, noisy, other, nobody))
     for alone, together in zip(jax.tree.leaves(single), jax.tree.leaves(batch), strict=True):
@@ -103,7 +103,7 @@ def test_shared_encoder_runs_once_for_policy_and_value(shared):
     def run(parameters, groups):
         network = nnx.merge(graph, parameters)
         alone, weights = nnx.split(network.policy)
-        policy, value = network.both(groups)
+        policy, value = network.policy_and_value(groups)
         apart = network.policy(groups).loc, network.value(groups), nnx.merge(alone, weights)(groups).loc
         return (policy.loc, value, policy.loc), apart
 

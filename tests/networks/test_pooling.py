@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.networks.encoders import dense, largest, only_winners
+from drivax.networks.encoders import dense, max_pool, recomputes_maxima
 
 
 def plain(activation, layers, rows, there):
@@ -28,7 +28,7 @@ def case(rows, sizes, seed=0):
 @pytest.mark.parametrize("activation", ["relu", "tanh", "gelu", "silu"])
 @pytest.mark.parametrize(("rows", "sizes"), [(40, (3, 5, 4)), (3, (3, 5, 4)), (9, (2, 3))])
 def test_values_and_gradients_are_those_of_the_plain_maximum(activation, rows, sizes):
-    assert only_winners(rows, sizes) == (rows > 3)
+    assert recomputes_maxima(rows, sizes) == (rows > 3)
     arguments = case(rows, sizes)
     weights = np.random.default_rng(1).normal(size=(2, 3, sizes[-1])).astype(np.float32)
 
@@ -40,7 +40,7 @@ def test_values_and_gradients_are_those_of_the_plain_maximum(activation, rows, s
 
             return jax.value_and_grad(of, argnums=(0, 1), has_aux=True)(layers, x)
 
-        return total(largest), total(plain), largest(activation, layers, x, there)
+        return total(max_pool), total(plain), max_pool(activation, layers, x, there)
 
     found, wanted, undifferentiated = jax.jit(both)(*arguments)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, wanted)
@@ -58,4 +58,4 @@ def test_gradients_of_many_rows_take_a_fraction_of_the_work():
         return jax.jit(jax.grad(loss)).lower(layers).compile().cost_analysis()["flops"]
 
     # A third is the forward pass; of the rest, 16 of 64 rows and the first layer only.
-    assert operations(largest) < 0.6 * operations(plain)
+    assert operations(max_pool) < 0.6 * operations(plain)

@@ -10,7 +10,7 @@ from flax import nnx
 
 import encoder_oracle as oracle
 from drivax.errors import UsageError
-from drivax.networks.attention import Attention, forms
+from drivax.networks.attention import Attention, group_shapes
 from drivax.networks.encoders import MlpConfig
 from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
@@ -199,12 +199,14 @@ def test_parameter_counts():
 
 
 def test_groups_are_classified_by_masks_and_axes():
-    found = {name: (f.masked, f.rows, f.times, f.features, f.series) for name, f in forms(SPEC).items()}
+    found = {
+        name: (f.masked, f.rows, f.times, f.features, f.series) for name, f in group_shapes(SPEC).items()
+    }
     assert found == {
         "agents": (True, 3, 2, 4, True), "ego": (False, 1, 2, 3, True), "ego_static": (False, 1, 1, 2, False),
         "lights": (True, 2, 1, 3, False), "route": (True, 4, 1, 2, False),
     }  # fmt: skip
-    one = forms({"agents": (3, 1, 4), "agents_mask": (3, 1), "ego": (1, 3)})
+    one = group_shapes({"agents": (3, 1, 4), "agents_mask": (3, 1), "ego": (1, 3)})
     assert one["agents"].series and one["ego"].series
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from browser import acted, browse, needs_browser
-from drivax.report.episodes import FAILURES, outcome, ranked, worst_first
+from drivax.report.episodes import FAILURES, outcome, rank_scenarios, sort_worst_first
 from drivax.report.pages.report import write_report
 from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
@@ -57,16 +57,16 @@ def test_list_holds_every_episode_of_every_run(page, runs):
 def test_episodes_are_ranked_by_failure_score_and_other_planners(runs):
     policy = read_runs(runs)[0][-1]
     order = [FAILURES.index(next(f for f in FAILURES if f[0] == words)) if words != "success" else 99
-             for words in (outcome(policy, row) for row in worst_first(policy))]  # fmt: skip
+             for words in (outcome(policy, row) for row in sort_worst_first(policy))]  # fmt: skip
     assert order == sorted(order) and order[-1] == 99 and order[0] < 99
-    ids = [policy.keys["scenario_id"][row] for row in worst_first(policy)]
+    ids = [policy.keys["scenario_id"][row] for row in sort_worst_first(policy)]
     assert ids[:4] == ["hand-01", "hand-05", "hand-03", "hand-04"]
     assert ids[4:] == ["hand-06", "hand-07", "hand-02", "hand-00"], "the worst score first among the rest"
     # Of two equally bad ones that comes first which another planner drove well.
     evaluations = read_runs(runs)[0]
     evaluations[1].metrics["collision"][1] = 1
     evaluations[1].metrics["offroad"][5] = 0
-    assert [choice.scenario_id for choice in ranked(evaluations)][:2] == ["hand-05", "hand-01"]
+    assert [choice.scenario_id for choice in rank_scenarios(evaluations)][:2] == ["hand-05", "hand-01"]
 
 
 def test_page_without_rollouts_says_so(runs, tmp_path):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.pairing import comparable, mismatch
-from drivax.evaluation.tables import difference, headline, metric_label, ordered, summarise
+from drivax.evaluation.result_tables import difference, headline_names, metric_label, sort_metrics, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.report.episodes import choose, outcome
 from drivax.report.runs import read_runs
-from drivax.stats.intervals import NOTHING, Interval, bootstrap_mean, rate
+from drivax.stats.intervals import UNDEFINED, Interval, bootstrap_mean, rate
 
 SEGMENTS = [f"hand/road-{number // 2}" for number in range(8)]
 
@@ -28,7 +28,7 @@ def test_rates_have_wilson_intervals_and_other_means_a_bootstrap(evaluations):
     assert (progress.mean, progress.n) == (expected.mean, expected.n)
     assert (progress.low, progress.high) == pytest.approx((expected.low, expected.high), abs=0.01)
     assert summarise(policy, "red_light").n == 5, "three of eight are undefined"
-    assert summarise(policy, "min_ttc") == NOTHING == summarise(policy, "not_there")
+    assert summarise(policy, "min_ttc") == UNDEFINED == summarise(policy, "not_there")
 
 
 def test_differences_are_paired_by_scenario(evaluations):
@@ -114,8 +114,8 @@ def test_metric_labels_and_order():
     assert metric_label("max_jerk").text == "max jerk [m/s³]"
     assert metric_label("my_metric").text == "my metric" and metric_label("my_metric").better == "-"
     assert metric_label("success").heading == "success ↑" and metric_label("offroad").heading == "off-road ↓"
-    assert headline(["mine", "offroad", "success"]) == ["success", "offroad"]
-    assert ordered(["mine", "steps", "offroad", "yours", "success"]) == [
+    assert headline_names(["mine", "offroad", "success"]) == ["success", "offroad"]
+    assert sort_metrics(["mine", "steps", "offroad", "yours", "success"]) == [
         "success",
         "offroad",
         "mine",

@@ -14,7 +14,7 @@ import pytest
 from browser import acted, browse, needs_browser
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.tables import metric_label
+from drivax.evaluation.result_tables import metric_label
 from drivax.metrics.catalogue import METRICS
 from drivax.report.pages.report import write_report
 from drivax.report.pictures.palette import LIGHT
@@ -197,7 +197,7 @@ def test_other_set_is_refused(runs, tmp_path):
     with pytest.raises(DataError, match=r"record hand-0[1-7]: is not in the scenario set"):
         write_report(runs, tmp_path / "report.html")
     (runs[2] / "run.json").write_text(json.dumps(about | {"data": {}}))
-    with pytest.raises(DataError, match="names no scenario set"):
+    with pytest.raises(DataError, match="no scenario set recorded"):
         write_report(runs, tmp_path / "report.html")
 
 

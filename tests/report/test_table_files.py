@@ -154,7 +154,7 @@ def test_existing_files_and_wrong_arguments_are_refused(runs, tmp_path, hand_set
     assert "one at a time" in capsys.readouterr().err
     assert main(["report", str(runs[0]), "--metrics", "ade"]) == 2
     assert "pass --tables" in capsys.readouterr().err
-    with pytest.raises(UsageError, match="no evaluation"):
+    with pytest.raises(UsageError, match="no run folder is an evaluation"):
         write_tables(runs[3:], tmp_path / "none")
     about = json.loads((runs[2] / "run.json").read_text())
     (runs[2] / "run.json").write_text(json.dumps(about | {"data": {"path": str(tmp_path / "gone")}}))

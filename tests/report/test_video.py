@@ -153,7 +153,7 @@ def test_wrong_selections_and_existing_files_are_refused(runs, tmp_path, capsys)
     ):
         assert main(["report", *map(str, runs), "--video", which, "--out", str(out)]) == 2
         assert words in capsys.readouterr().err
-    with pytest.raises(UsageError, match="no evaluation"):
+    with pytest.raises(UsageError, match="no run folder is an evaluation"):
         write_videos(runs[3:], out, "all")
     out.mkdir()
     (out / "hand-03.mp4").write_bytes(b"mine")

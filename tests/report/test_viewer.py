@@ -94,7 +94,7 @@ def test_existing_page_and_empty_selection_are_refused(page, data, tmp_path):
         write_player(list(data)[:1], page)
     with pytest.raises(UsageError, match="name a file to write"):
         write_player(list(data), tmp_path, overwrite=True)
-    with pytest.raises(UsageError, match="there is no scenario to show"):
+    with pytest.raises(UsageError, match="no scenarios to show"):
         write_player([], tmp_path / "none.html")
     assert page.read_bytes() == before
     write_player(list(data)[:1], page, overwrite=True)
@@ -127,7 +127,7 @@ def test_critical_scenarios_come_first_with_their_components(data, tmp_path, cap
         urgency[:, 0],
         {"urgency": urgency},
     )
-    write_scores(blank.combined(Combination({"urgency": 1.0})), tmp_path / "scores.npz")
+    write_scores(blank.recombine(Combination({"urgency": 1.0})), tmp_path / "scores.npz")
     out = tmp_path / "critical.html"
     arguments = ["view", str(data.path), "--scores", str(tmp_path / "scores.npz"), "--out", str(out)]
     assert main([*arguments, "--limit", "2"]) == 0

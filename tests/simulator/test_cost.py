@@ -15,7 +15,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.override import OverrideTraffic, with_override
 from drivax.simulator.traffic.reactive import make_traffic
-from drivax.studies.bench import BenchConfig, _parts, _repeated
+from drivax.studies.bench import BenchConfig, _parts, _repeat_part
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
@@ -163,5 +163,5 @@ def test_components_are_timed_on_unmodified_states(part):
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
     simulator, config = Simulator(Task(observation=GLIMPSE)), BenchConfig(batch=2, steps=3)
     states = jax.jit(jax.vmap(simulator.reset, (None, 0)))(bank, jnp.zeros(2, jnp.int32))
-    shift = _repeated(config, _parts(simulator)[part])(bank, states, None)
+    shift = _repeat_part(config, _parts(simulator)[part])(bank, states, None)
     assert (jnp.abs(shift) < 1e-9).all()

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.pairing import assign
-from drivax.stats.seeds import certain, crossed_difference
+from drivax.stats.seeds import crossed_difference, repeat_single_seed
 from drivax.stats.significance import (
-    holm,
-    mcnemar,
+    holm_adjust,
+    mcnemar_test,
     paired_bootstrap_test,
     paired_permutation,
     split_permutation,
@@ -62,7 +62,7 @@ def test_mcnemars_mid_p():
 
     def p(rng, mid):
         hard = rng.random(400)
-        return mcnemar(rng.random(400) < hard, rng.random(400) < hard, mid=mid).p
+        return mcnemar_test(rng.random(400) < hard, rng.random(400) < hard, mid=mid).p
 
     assert rejected(lambda rng, _: p(rng, True)) == pytest.approx(0.05, abs=0.01)
     assert rejected(lambda rng, _: p(rng, False)) <= 0.06
@@ -94,7 +94,7 @@ def test_holm_keeps_the_whole_family_at_its_level():
             ).p
             for _ in range(3)
         ]
-        return min(holm(ps))
+        return min(holm_adjust(ps))
 
     assert 0.02 <= rejected(p) <= 0.06
 
@@ -113,7 +113,7 @@ def test_seeds_that_differ_are_no_difference(seeds, others, spread):
 
         def kind(number):
             means = spread * rng.normal(size=(number, 1)) * (number > 1)
-            return certain(scene + means + np.stack([noise(rng) for _ in range(number)]))
+            return repeat_single_seed(scene + means + np.stack([noise(rng) for _ in range(number)]))
 
         return crossed_difference(kind(seeds), kind(others), CLUSTERS).p
 

@@ -9,7 +9,14 @@ import pytest
 import scipy.stats
 
 from drivax.errors import UsageError
-from drivax.stats.effects import PairedEffect, cohens_d, cohens_d_paired, detectable, power, scenarios_needed
+from drivax.stats.effects import (
+    PairedEffect,
+    cohens_d,
+    cohens_d_paired,
+    detectable_effect,
+    power,
+    scenarios_needed,
+)
 
 
 def test_effect_sizes_by_hand():
@@ -30,7 +37,7 @@ def test_textbook_numbers():
     # Minus one: not enough.
     assert power(0.5, 33) < 0.8 <= power(0.5, 34)
     # 1,000 pairs, as the published experiment asks for, find an effect of nine hundredths.
-    assert detectable(1000) == pytest.approx(0.0887, abs=1e-4)
+    assert detectable_effect(1000) == pytest.approx(0.0887, abs=1e-4)
 
 
 @pytest.mark.parametrize(("effect", "n"), [(0.3, 20), (0.05, 2500), (0.0887, 1000), (1.2, 8), (0.0, 50)])
@@ -53,9 +60,9 @@ def test_power_at_its_ends():
     assert scenarios_needed(1e-3) == pytest.approx(
         (scipy.stats.norm.ppf([0.975, 0.8]).sum() / 1e-3) ** 2, rel=1e-4
     )
-    assert detectable(1) is None
+    assert detectable_effect(1) is None
     for share in (None, 0.3):
-        least = detectable(200, 0.9, 0.99, share)
+        least = detectable_effect(200, 0.9, 0.99, share)
         assert power(least, 200, 0.99, share) == pytest.approx(0.9, abs=1e-9)
     # An uneven split needs more.
     assert scenarios_needed(0.3, share=0.2) > scenarios_needed(0.3, share=0.5)

@@ -74,7 +74,7 @@ def test_invalid_arguments_are_refused():
     for measure in (roc_auc, precision_at_base_rate):
         with pytest.raises(UsageError, match="all true or all false"):
             measure(SCORES, np.zeros(150, bool))
-    with pytest.raises(UsageError, match="two of either kind"):
+    with pytest.raises(UsageError, match="two positives and two negatives"):
         auc_interval(SCORES, np.arange(150) == 0)
 
 

@@ -11,8 +11,8 @@ import scipy.stats
 
 from drivax.errors import UsageError
 from drivax.stats.significance import (
-    holm,
-    mcnemar,
+    holm_adjust,
+    mcnemar_test,
     paired_bootstrap_test,
     paired_permutation,
     split_permutation,
@@ -31,20 +31,20 @@ def test_mcnemar_is_scipys_sign_test(more, fewer):
     a, b = pairs_of(more, fewer)
     n, k = more + fewer, min(more, fewer)
     exact = scipy.stats.binomtest(more, n, 0.5).pvalue if n else 1.0
-    assert mcnemar(a, b, mid=False).p == pytest.approx(exact)
+    assert mcnemar_test(a, b, mid=False).p == pytest.approx(exact)
     expected = min(1.0, 2 * scipy.stats.binom.cdf(k, n, 0.5) - scipy.stats.binom.pmf(k, n, 0.5)) if n else 1.0
-    found = mcnemar(a, b)
+    found = mcnemar_test(a, b)
     assert found.p == pytest.approx(expected) and found.units == n and found.exact
 
 
 def test_mcnemar_by_hand():
     # One against nine: 2 (1 + 10) / 1024 exactly, and 10 / 1024 less for the mid-p value.
     a, b = pairs_of(1, 9)
-    assert mcnemar(a, b, mid=False).p == pytest.approx(22 / 1024)
-    assert mcnemar(a, b).p == pytest.approx(12 / 1024)
+    assert mcnemar_test(a, b, mid=False).p == pytest.approx(22 / 1024)
+    assert mcnemar_test(a, b).p == pytest.approx(12 / 1024)
     # Undefined on either side leaves the pair out; nothing defined has no p.
-    assert mcnemar([*a, 1, None], [*b, None, 0]) == mcnemar(a, b)
-    assert mcnemar([None], [1]).p is None
+    assert mcnemar_test([*a, 1, None], [*b, None, 0]) == mcnemar_test(a, b)
+    assert mcnemar_test([None], [1]).p is None
 
 
 def test_permutation_of_pairs_is_scipys():
@@ -72,7 +72,7 @@ def test_permutation_of_clusters_flips_whole_clusters():
 def test_permutation_of_rates_is_mcnemars_exact_test():
     a, b = pairs_of(8, 2, same=40)
     found = paired_permutation(a, b, seed=0)
-    assert found.p == pytest.approx(mcnemar(a, b, mid=False).p) and found.units == 10
+    assert found.p == pytest.approx(mcnemar_test(a, b, mid=False).p) and found.units == 10
 
 
 def test_permutation_where_nothing_differs_or_everything_does():
@@ -141,15 +141,17 @@ def test_permutation_of_arms_keeps_to_strata():
 
 def test_holm_by_hand():
     # Sorted 0.01, 0.02, 0.03, 0.5 of four: 0.04, 0.06, 0.06, 0.5; None counts for nothing.
-    assert holm([0.03, 0.01, None, 0.5, 0.02]) == pytest.approx([0.06, 0.04, None, 0.5, 0.06], abs=1e-12)
-    assert holm([0.7, 0.6]) == [1.0, 1.0] and holm([]) == [] and holm([0.2]) == [0.2]
+    assert holm_adjust([0.03, 0.01, None, 0.5, 0.02]) == pytest.approx(
+        [0.06, 0.04, None, 0.5, 0.06], abs=1e-12
+    )
+    assert holm_adjust([0.7, 0.6]) == [1.0, 1.0] and holm_adjust([]) == [] and holm_adjust([0.2]) == [0.2]
 
 
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: mcnemar([0.5], [1.0]),
-        lambda: mcnemar([1.0], [1.0, 0.0]),
+        lambda: mcnemar_test([0.5], [1.0]),
+        lambda: mcnemar_test([1.0], [1.0, 0.0]),
         lambda: paired_permutation([1.0], [1.0, 2.0], seed=0),
         lambda: paired_permutation([1.0], [0.0], resamples=0, seed=0),
         lambda: split_permutation([1.0, 2.0], np.array([True, False]), ["a", "a"], seed=0),

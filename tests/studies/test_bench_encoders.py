@@ -54,7 +54,7 @@ def test_sizes_take_no_computation():
 
 
 def test_mistakes_are_named():
-    with pytest.raises(UsageError, match="there is no encoder 'lq smal'; did you mean 'lq small'"):
+    with pytest.raises(UsageError, match="unknown encoder 'lq smal'; did you mean 'lq small'"):
         EncoderBench(only=("lq smal",))
     with pytest.raises(UsageError, match="use at least one"):
         EncoderBench(batches=())

@@ -15,8 +15,8 @@ from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
-from drivax.stats.seeds import Crossed
-from drivax.stats.significance import holm
+from drivax.stats.seeds import CrossedEffect
+from drivax.stats.significance import holm_adjust
 from drivax.studies import study as runner
 from drivax.studies.definition import Study, StudyConfig, StudyDefinition, StudySets, load_study
 from drivax.studies.verdicts import (
@@ -125,18 +125,18 @@ def test_p_values_are_adjusted_within_their_group():
     found = list(verdicts(EVEN | {"heuristic": 0.14}).values())
     for group in {one.claim.group for one in found}:
         ps = [one.tested.p for one in found if one.claim.group == group]
-        assert [one.adjusted for one in found if one.claim.group == group] == holm(ps)
+        assert [one.adjusted for one in found if one.claim.group == group] == holm_adjust(ps)
     claimed = [(c.arm, c.reference, c.metric, c.rows, c.change) for c in LONGTAIL.claims]
     assert len(claimed) == len(set(claimed)) == 54
 
 
 def test_what_is_undecided_says_what_would_decide():
-    few = Crossed(0.02, (4e-5, 4e-5), 1e-5, (5, 5), 400)
+    few = CrossedEffect(0.02, (4e-5, 4e-5), 1e-5, (5, 5), 400)
     seeds = int(needed(few, 1).split()[0])
     assert 10 <= seeds <= 13  # by a normal distribution 4e-4 / ((0.02 / 2.8016)^2 - 1e-5) = 9.75
     assert int(needed(few, 20).split()[0]) > seeds
     assert needed(replace(few, difference=1e-6), 1).startswith("neither seeds nor recordings")
-    assert "test recordings" in needed(Crossed(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400), 1)
+    assert "test recordings" in needed(CrossedEffect(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400), 1)
 
 
 def test_what_can_be_found_is_known_before_the_others_learn():
@@ -352,9 +352,9 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
 
 def test_invalid_studies_are_refused(data, tmp_path):
     given = StudySets(data.path, data.path, (data.path,))
-    with pytest.raises(UsageError, match="a study without bc"):
+    with pytest.raises(UsageError, match="baseline 'bc' is missing"):
         Study(LONGTAIL, StudyConfig(arms=("baseline",)), given, tmp_path)
-    with pytest.raises(UsageError, match="there is no arm 'heuristics'"):
+    with pytest.raises(UsageError, match="unknown arm 'heuristics'"):
         Study(LONGTAIL, StudyConfig(arms=("baseline", "bc", "heuristics")), given, tmp_path)
     with pytest.raises(UsageError, match=r"no preset or file 'studies/longtial'.*longtail"):
         load_study("longtial")
@@ -366,9 +366,9 @@ def test_invalid_studies_are_refused(data, tmp_path):
     own.write_text(settings.dump(declared))
     with pytest.raises(UsageError, match=r"own\.yaml: .*names 'heuristics', which the study lacks"):
         settings.load(StudyDefinition, own)
-    with pytest.raises(UsageError, match="needs scenarios to train, to validate and to test on"):
+    with pytest.raises(UsageError, match="no validation or test set"):
         StudySets.of(data.path, None, ())
-    with pytest.raises(UsageError, match="none: does not exist"):
+    with pytest.raises(UsageError, match="none: scenario set not found"):
         StudySets.of(tmp_path / "none", None, ())
     # Before anything is scored or trained, and with the arms that need no labels.
     with ScenarioWriter(tmp_path / "recorded", SMALL) as writer:
@@ -382,11 +382,11 @@ def test_invalid_studies_are_refused(data, tmp_path):
 
 def test_changed_claims_are_refused_when_a_study_resumes(data, tmp_path):
     sets = StudySets(data.path, data.path, (data.path,))
-    runner._open(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
-    runner._open(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
+    runner._open_folder(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
+    runner._open_folder(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
     fewer = replace(LONGTAIL, claims=LONGTAIL.claims[:-1])
     with pytest.raises(UsageError, match="holds a study with other arms or claims"):
-        runner._open(Study(fewer, StudyConfig(), sets, tmp_path / "study"))
+        runner._open_folder(Study(fewer, StudyConfig(), sets, tmp_path / "study"))
 
 
 def test_evaluated_run_without_checkpoints_is_not_trained_again(data, tmp_path):

@@ -10,6 +10,7 @@ from drivax.synthetic.roads.curves import (
     Curve,
     Pose,
     connect_poses,
+    draw_winding_curve,
     from_curvature,
     join_curves,
     quintic,
@@ -17,7 +18,6 @@ from drivax.synthetic.roads.curves import (
     smooth_step,
     straight,
     turn,
-    winding,
 )
 
 
@@ -86,7 +86,7 @@ def test_joined_curves_share_points_and_unwrap_headings():
 
 def test_shifted_and_reversed_curves():
     curve = from_curvature(np.full(101, 0.02), 0.5, Pose(0.0, 0.0, 0.0))
-    left = curve.shifted(3.0)
+    left = curve.parallel(3.0)
     assert np.hypot(*(left.xy - curve.xy).T) == pytest.approx(3.0)
     assert left.arc_m[-1] == pytest.approx(50.0 * (1 - 3 * 0.02), rel=1e-3)
     back = left.reversed()
@@ -103,7 +103,7 @@ def test_resampled_curves_keep_ends_and_spacing():
 @pytest.mark.parametrize("seed", range(5))
 def test_winding_roads_keep_curvature_and_turn_limits(seed):
     rng = np.random.default_rng(seed)
-    curve = winding(rng, 400.0, max_curvature=1 / 35, max_turn=2.0, start=Pose(0.0, 0.0, 0.0))
+    curve = draw_winding_curve(rng, 400.0, max_curvature=1 / 35, max_turn=2.0, start=Pose(0.0, 0.0, 0.0))
     assert np.ptp(curve.heading) <= 2.0 + 1e-9
     assert np.abs(np.diff(curve.heading)).max() <= STEP_M / 35 + 1e-9
     assert curve.arc_m[-1] == pytest.approx(400.0, abs=0.6)
@@ -115,11 +115,11 @@ def test_displaced_curve_has_exact_distance_and_tangent():
     # On a circle of radius 40 m a displacement of 3 m to the left of a left turn gives a circle of 37 m.
     angle = np.linspace(0.0, 1.5, 241)
     circle = Curve(40.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1), angle + math.pi / 2)
-    inner = circle.displaced(np.full(len(angle), 3.0))
+    inner = circle.offset_by(np.full(len(angle), 3.0))
     assert np.hypot(*inner.xy.T) == pytest.approx(37.0)
     assert inner.heading == pytest.approx(circle.heading)
     # A growing displacement turns the heading: it is the direction of the chords, and left stays left.
-    bent = circle.displaced(3.5 * smooth_step(np.linspace(0.0, 1.0, len(angle))))
+    bent = circle.offset_by(3.5 * smooth_step(np.linspace(0.0, 1.0, len(angle))))
     chords = np.diff(bent.xy, axis=0)
     middle = (bent.heading[1:] + bent.heading[:-1]) / 2
     assert np.unwrap(np.arctan2(chords[:, 1], chords[:, 0])) == pytest.approx(middle, abs=2e-3)

@@ -19,7 +19,7 @@ from drivax.synthetic.events.destinations import (
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Control, Draft, RoadNetwork, Start
 from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
-from drivax.synthetic.traffic.population import Placement
+from drivax.synthetic.traffic.placement import Placement
 
 LIMIT = 10.0
 

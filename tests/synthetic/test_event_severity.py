@@ -111,9 +111,11 @@ def test_only_vehicles_that_would_hit_a_crossing_actor_cross_it():
     y = np.clip(-2.0 + 1.5 * (t - 8.0), -2.0, 6.0)
     xy = np.stack([np.full(STEPS, 160.0), y], axis=-1)
     speed = np.gradient(y, 0.1)
-    walker = Scripted(AgentKind.PEDESTRIAN, (0.5, 0.6, 1.7), xy, np.full(STEPS, math.pi / 2), speed, t >= 0.0)
-    assert vehicles_that_cross(EgoView(roles, motion, FIRST), walker) == (1,)
-    along = dataclasses.replace(walker, heading=np.zeros(STEPS))
+    pedestrian = Scripted(
+        AgentKind.PEDESTRIAN, (0.5, 0.6, 1.7), xy, np.full(STEPS, math.pi / 2), speed, t >= 0.0
+    )
+    assert vehicles_that_cross(EgoView(roles, motion, FIRST), pedestrian) == (1,)
+    along = dataclasses.replace(pedestrian, heading=np.zeros(STEPS))
     assert vehicles_that_cross(EgoView(roles, motion, FIRST), along) == ()
 
 

@@ -11,7 +11,7 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.synthetic.events import SCRIPTS, SEVERITY_MPS2, EgoView, EventKind, draw_severity, stage
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.population import Density, draw_drivers
+from drivax.synthetic.traffic.placement import Density, draw_drivers
 from drivax.synthetic.traffic.roles import Override, Roles, Scripted, Staging, Tailgate
 from drivax.synthetic.traffic.simulation import Traffic
 

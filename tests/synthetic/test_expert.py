@@ -7,7 +7,7 @@ import pytest
 
 from drivax.synthetic.expert import driver as expert
 from drivax.synthetic.expert.driver import draw_expert, drive_ego, expert_lanes, expert_path
-from drivax.synthetic.expert.violations import touching, user_boxes
+from drivax.synthetic.expert.violations import first_overlap_step, user_boxes
 from drivax.synthetic.roads.families import CurvedRoad
 from drivax.synthetic.roads.network import Control
 from drivax.synthetic.roads.style import GRID
@@ -48,7 +48,7 @@ def test_planning_avoids_a_collision():
     assert [plan.first_step for plan in runs.plans] == [10]
     assert np.array_equal(got.xy[0, :11], motion.xy[0, :11])
     box = user_boxes(got)
-    assert (touching(box, got.valid, ~np.eye(2, dtype=bool)) == len(TIMES)).all()
+    assert (first_overlap_step(box, got.valid, ~np.eye(2, dtype=bool)) == len(TIMES)).all()
 
 
 @pytest.mark.parametrize(("aware", "begins"), [(15, [15]), (32, [32, 16])])

@@ -15,7 +15,7 @@ from drivax.synthetic.traffic.roles import Override, Staging
 
 from .staged_scenes import CAR, TIMES, WIDTH, crossed, driven, road, scene, user
 
-PERSON = (0.6, 0.6, 1.75)
+PEDESTRIAN = (0.6, 0.6, 1.75)
 #: As wide as the whole road: nobody goes around it.
 BARRIER = (1.0, 20.0, 1.5)
 
@@ -33,10 +33,10 @@ def braking(plan):
     return -float(np.diff(plan.speed).min()) / 0.1
 
 
-def walker(ahead_m, side_m, speed, from_s=0.0):
+def pedestrian(ahead_m, side_m, speed, from_s=0.0):
     """A user that walks across the road, so far ahead of ego's front."""
-    x = 30.0 + CAR[0] / 2 + ahead_m + PERSON[0] / 2
-    return user((x, side_m), np.pi / 2, PERSON, AgentKind.PEDESTRIAN, (0.0, speed), from_s)
+    x = 30.0 + CAR[0] / 2 + ahead_m + PEDESTRIAN[0] / 2
+    return user((x, side_m), np.pi / 2, PEDESTRIAN, AgentKind.PEDESTRIAN, (0.0, speed), from_s)
 
 
 def test_free_road_is_driven_at_constant_speed():
@@ -96,7 +96,7 @@ def test_cut_in_requires_some_braking():
 
 @pytest.mark.parametrize("ahead_m", [30.0, 22.0])
 def test_ego_lets_a_pedestrian_cross(ahead_m):
-    plan, cause = planned(road((1,)), 12.0, [walker(ahead_m, -3.0, 1.0)])
+    plan, cause = planned(road((1,)), 12.0, [pedestrian(ahead_m, -3.0, 1.0)])
     assert cause == ""
     assert np.abs(plan.xy[:, 1]).max() < 1.0
     assert plan.speed.min() < 9.0

@@ -189,8 +189,8 @@ def test_crossings_span_the_road_over_their_lanes(family, seed):
 def test_sidewalks_are_outside_the_road(family, seed):
     inside = ground(family, seed)
     whole = shapely.Polygon(inside.exterior)
-    for walk in built(family, seed).walks:
-        assert 0.8 < whole.distance(shapely.LineString(walk.xy)) < 3.0
+    for sidewalk in built(family, seed).sidewalks:
+        assert 0.8 < whole.distance(shapely.LineString(sidewalk.xy)) < 3.0
 
 
 @pytest.mark.parametrize(("family", "seed"), CASES)
@@ -312,8 +312,8 @@ def test_roundabout_entries_yield_to_circulating_traffic():
 def test_streets_have_the_features_of_their_family():
     for seed in range(8):
         parked, midblock = built(NAMED["parked_street"], seed), built(NAMED["midblock_crosswalk"], seed)
-        assert len(parked.bays) > 20 and len(parked.walks) == 2
-        assert midblock.crossings and len(midblock.walks) == 2
+        assert len(parked.bays) > 20 and len(parked.sidewalks) == 2
+        assert midblock.crossings and len(midblock.sidewalks) == 2
     marks = [c.marked for seed in range(20) for c in built(NAMED["midblock_crosswalk"], seed).crossings]
     assert 0.5 < np.mean(marks) < 0.95
     assert all(lane.kind in CAR_LANE_KINDS for lane in parked.lanes)

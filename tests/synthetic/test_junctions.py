@@ -19,7 +19,7 @@ from drivax.synthetic.roads.families.junctions import (
 from drivax.synthetic.roads.network import CLEARANCE_M, Control, map_features
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.roads.style import GRID, RING
-from drivax.synthetic.traffic.population import Density, placed
+from drivax.synthetic.traffic.placement import Density, place_vehicles
 
 from .oracles import distance_to_polyline, winding_number
 
@@ -159,18 +159,18 @@ def _intersection(axis, curve):
 def test_sidewalks_follow_the_edge_outside_the_road(family, style, seed):
     network = built(family, style, seed)
     ring = np.concatenate([network.edges[0].xy, network.edges[0].xy[:1]])
-    for walk in network.walks:
-        points = walk.xy[::10]
+    for sidewalk in network.sidewalks:
+        points = sidewalk.xy[::10]
         gap = distance_to_polyline(points, ring)
         assert gap.min() > 0.95 and gap.max() < 2.6
-        assert np.hypot(*np.diff(walk.xy, axis=0).T).max() < 0.7
+        assert np.hypot(*np.diff(sidewalk.xy, axis=0).T).max() < 0.7
         assert all(winding_number(p, ring[:-1]) == 0 for p in points[::3])
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_most_streets_have_sidewalks_and_some_have_none(style):
-    walks = [bool(built(f, style, seed).walks) for f in JUNCTIONS[:3] for seed in range(10)]
-    assert np.mean(walks) == pytest.approx(STYLES[style].walk_share, abs=0.25)
+    sidewalks = [bool(built(f, style, seed).sidewalks) for f in JUNCTIONS[:3] for seed in range(10)]
+    assert np.mean(sidewalks) == pytest.approx(STYLES[style].sidewalk_share, abs=0.25)
 
 
 @pytest.mark.parametrize(("family", "style", "seed"), CASES)
@@ -273,7 +273,7 @@ def test_busy_lanes_have_more_vehicles():
     counts = np.zeros(len(network.lanes))
     for seed in range(30):
         density = Density(spacing_m=(60.0, 60.0), vehicles=1000, leader_share=0.0)
-        drawn = placed(network, quiet[0], 100.0, density, np.random.default_rng(seed))
+        drawn = place_vehicles(network, quiet[0], 100.0, density, np.random.default_rng(seed))
         np.add.at(counts, list(drawn.lane), 1)
     per_m = counts / np.array([lane.length_m for lane in network.lanes])
     assert per_m[list(network.busy)].mean() > 1.3 * per_m[quiet].mean()

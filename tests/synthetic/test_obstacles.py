@@ -9,8 +9,8 @@ import pytest
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Line, RoadKind, RoadNetwork
-from drivax.synthetic.traffic.lateral import around, change_onto, displaced, quintic_step
-from drivax.synthetic.traffic.obstacles import Boxes, Standing, extents
+from drivax.synthetic.traffic.lateral import around, change_onto, displace_path, quintic_step
+from drivax.synthetic.traffic.obstacles import Boxes, StaticObstacles, extents
 from drivax.synthetic.traffic.path_arrays import PathTables
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.roles import Scripted, Staging
@@ -114,7 +114,7 @@ def test_detours_yield_to_oncoming_traffic():
 def test_obstacles_in_the_band_ahead_are_detected(x, y, meets):
     path = lane_path(street(), (0,), Sway())
     tables = PathTables(street(), [path], drivers(1))
-    standing = Standing(boxes_at((parked(x, y, 1),), 0), tables, np.array([1.9]))
+    standing = StaticObstacles(boxes_at((parked(x, y, 1),), 0), tables, np.array([1.9]))
     assert standing.meets(0, 22.0, 1.2, 45.0) == meets
 
 
@@ -130,7 +130,7 @@ def test_vehicles_brake_for_a_pedestrian_in_the_lane():
     times = np.arange(steps) / 10
     # Walks from the right over the lane at x = 120 at 1.5 m/s from second 4 on, waiting on the lane.
     y = np.clip(-5.0 + 1.5 * np.maximum(times - 4.0, 0.0), -5.0, 0.0)
-    walker = Scripted(
+    pedestrian = Scripted(
         kind=AgentKind.PEDESTRIAN,
         size_m=(0.6, 0.6, 1.75),
         xy=np.stack([np.full(steps, 120.0), y], axis=-1),
@@ -139,7 +139,7 @@ def test_vehicles_brake_for_a_pedestrian_in_the_lane():
         valid=np.ones(steps, bool),
     )
     table = drivers(1, speed_factor=0.8)
-    motion = run(street(), [(0,)], table, [20.0], [11.0], 15.0, Staging(extras=(walker,)))
+    motion = run(street(), [(0,)], table, [20.0], [11.0], 15.0, Staging(extras=(pedestrian,)))
     assert not touches(motion, 0, 1)
     assert motion.speed[0, -1] < 0.1 and motion.xy[0, -1, 0] < 120.0
     assert motion.kind.tolist() == [AgentKind.VEHICLE, AgentKind.PEDESTRIAN]
@@ -169,7 +169,7 @@ def test_displaced_path_keeps_its_offset():
     assert last.begin_m + last.scale * 200.0 == pytest.approx(shifted.length_m, abs=0.01)
     chord = np.arctan2(*np.diff(shifted.curve.xy, axis=0).T[::-1])
     assert np.abs(chord - (shifted.curve.heading[1:] + shifted.curve.heading[:-1]) / 2).max() < 0.01
-    same, moved = displaced(path, np.zeros(len(path.curve.xy)))
+    same, moved = displace_path(path, np.zeros(len(path.curve.xy)))
     assert np.allclose(same.curve.xy, path.curve.xy) and np.allclose(
         moved, path.step_m * np.arange(len(moved))
     )

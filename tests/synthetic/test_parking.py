@@ -8,7 +8,7 @@ import pytest
 
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Bay, Draft, RoadNetwork
-from drivax.synthetic.traffic.population import parked_cars
+from drivax.synthetic.traffic.placement import parked_cars
 
 
 def street(width=3.5, oncoming=True):

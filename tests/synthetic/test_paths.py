@@ -44,7 +44,7 @@ def test_sway_is_small_and_consistent_with_heading(seed):
     network = CurvedRoad().build(rng)
     lanes = random_lanes(network, 0, rng)
     centre = lane_path(network, lanes, Sway())
-    sway = Sway.drawn(rng, 0.2)
+    sway = Sway.draw(rng, 0.2)
     path = lane_path(network, lanes, sway)
     gap = distance_to_polyline(path.curve.xy[::9], centre.curve.xy)
     assert 0.02 < gap.max() < 0.21

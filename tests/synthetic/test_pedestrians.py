@@ -9,8 +9,8 @@ from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Control, Crossing, Draft, RoadNetwork
 from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
 from drivax.synthetic.traffic.obstacles import Boxes
-from drivax.synthetic.traffic.pedestrians import Walkers, place_walkers
-from drivax.synthetic.traffic.roles import Walker
+from drivax.synthetic.traffic.pedestrians import Pedestrians, place_pedestrians
+from drivax.synthetic.traffic.roles import Pedestrian
 
 TIMES = (np.arange(151) - 60) * 0.1
 CAR = np.array([[4.6, 1.9, 1.6]])
@@ -33,18 +33,20 @@ def street(marked=True, green_s=None):
     if green_s is not None:
         groups = (LightGroup(tuple(lanes), False), LightGroup((), False))
         signals = SignalPlan(groups, ((0,), (1,)), (green_s, 20.0), offset_s=-6.0)
-    walks = (straight(Pose(0.0, -6.0, 0.0), 100.0), straight(Pose(0.0, 6.0, 0.0), 100.0))
-    return RoadNetwork("test", tuple(draft.lanes), (), crossings=(crossing,), walks=walks, signals=signals)
+    sidewalks = (straight(Pose(0.0, -6.0, 0.0), 100.0), straight(Pose(0.0, 6.0, 0.0), 100.0))
+    return RoadNetwork(
+        "test", tuple(draft.lanes), (), crossings=(crossing,), sidewalks=sidewalks, signals=signals
+    )
 
 
 def over(speed=1.4, before=6.0):
-    """A walker from 10 m south of the road straight over it, with kerbs at 6 m and 14 m."""
-    return Walker(straight(Pose(50.0, -10.0, math.pi / 2), 20.0), 6.0 - before, speed, 0, 6.0, 14.0)
+    """A pedestrian from 10 m south of the road straight over it, with kerbs at 6 m and 14 m."""
+    return Pedestrian(straight(Pose(50.0, -10.0, math.pi / 2), 20.0), 6.0 - before, speed, 0, 6.0, 14.0)
 
 
-def play(network, walkers, cars=None, times=TIMES):
+def play(network, pedestrians, cars=None, times=TIMES):
     """``cars``: function of the step that returns (xy, heading, speed) of cars."""
-    people = Walkers(network, walkers, times)
+    pedestrians = Pedestrians(network, pedestrians, times)
     colours = np.zeros((len(times), len(network.lanes)), np.int8)
     if network.signals is not None:
         colours, _ = network.signals.colours(times, len(network.lanes))
@@ -52,7 +54,7 @@ def play(network, walkers, cars=None, times=TIMES):
     for t in range(len(times)):
         xy, heading, speed = cars(t) if cars else (np.zeros((0, 2)), np.zeros(0), np.zeros(0))
         vehicles = Boxes(xy, heading, speed, np.tile(CAR[:, :2], (len(xy), 1)))
-        seen, claims = people.step(t, vehicles, np.ones(len(xy), bool), colours[t])
+        seen, claims = pedestrians.step(t, vehicles, np.ones(len(xy), bool), colours[t])
         out.append((seen.xy, seen.heading, seen.speed, claims))
     return [np.stack(column) for column in zip(*out, strict=True)]
 
@@ -70,13 +72,13 @@ def test_pedestrians_cross_a_free_road_at_their_speed():
     on = (xy[:, 0, 1] > -4.0) & (xy[:, 0, 1] < 4.0)
     near = (xy[:, 0, 1] > -5.0) & (xy[:, 0, 1] < 4.0)
     assert np.all(claims[on, 0]) and not np.any(claims[~near, 0])
-    # Walkers stop at the end of their path.
+    # Pedestrians stop at the end of their path.
     assert xy[-1, 0, 1] <= 10.0 and speed[-1, 0] < 0.2
 
 
 @pytest.mark.parametrize("marked", [True, False])
 def test_pedestrians_wait_for_cars_that_cannot_stop(marked):
-    # The walker reaches the kerb after 4.3 s; the car is then 9 m before the crossing at 10 m/s.
+    # The pedestrian reaches the kerb after 4.3 s; the car is then 9 m before the crossing at 10 m/s.
     xy, _, speed, claims = play(street(marked), (over(),), car_at(-2.0, 10.0))
     car = -2.0 + np.arange(len(xy))
     passing = (car > 40.0) & (car < 52.0)
@@ -119,33 +121,37 @@ def test_pedestrians_wait_for_enough_red_at_lights():
     assert np.all(colour[on, 1] == Colour.RED)
 
 
-def test_no_walker_enters_a_standing_queue():
+def test_no_pedestrian_enters_a_standing_queue():
     standing = lambda t: (np.array([[50.0, -1.75]]), np.zeros(1), np.zeros(1))  # noqa: E731
     xy, _, speed, _ = play(street(), (over(),), standing)
     assert xy[:, 0, 1].max() < -4.0 and speed[-1, 0] == pytest.approx(0.0, abs=0.05)
     # Nor off crossings.
-    along = Walker(straight(Pose(50.0, -10.0, math.pi / 2), 20.0), 0.0, 1.4)
+    along = Pedestrian(straight(Pose(50.0, -10.0, math.pi / 2), 20.0), 0.0, 1.4)
     xy = play(street(), (along,), standing)[0]
     assert xy[:, 0, 1].max() < -1.75 - 0.95
 
 
-def test_walkers_move_independently():
-    people = (over(1.1), over(1.7, before=3.0), Walker(straight(Pose(0.0, -6.0, 0.0), 100.0), 5.0, 1.3))
-    together = play(street(), people, car_at(-20.0, 8.0))
-    for i, one in enumerate(people):
+def test_pedestrians_move_independently():
+    pedestrians = (
+        over(1.1),
+        over(1.7, before=3.0),
+        Pedestrian(straight(Pose(0.0, -6.0, 0.0), 100.0), 5.0, 1.3),
+    )
+    together = play(street(), pedestrians, car_at(-20.0, 8.0))
+    for i, one in enumerate(pedestrians):
         alone = play(street(), (one,), car_at(-20.0, 8.0))
         for a, b in zip(together[:3], alone[:3], strict=True):
             assert np.array_equal(a[:, i], b[:, 0])
 
 
 @pytest.mark.slow
-def test_placed_walkers_are_on_their_paths_and_some_cross_during_the_recording():
+def test_placed_pedestrians_are_on_their_paths_and_some_cross_during_the_recording():
     network = street()
     crossing, count = 0, 0
     for seed in range(40):
-        people = place_walkers(network, 3.0, np.random.default_rng(seed), TIMES)
-        count += len(people)
-        for one in people:
+        pedestrians = place_pedestrians(network, 3.0, np.random.default_rng(seed), TIMES)
+        count += len(pedestrians)
+        for one in pedestrians:
             length = float(one.curve.arc_m[-1])
             assert 0.0 <= one.start_m <= length
             assert 0.7 <= one.speed_mps <= 2.0
@@ -156,17 +162,17 @@ def test_placed_walkers_are_on_their_paths_and_some_cross_during_the_recording()
                 assert other[1] == pytest.approx(-kerb[1], abs=0.5)
             else:
                 assert np.abs(one.curve.xy[:, 1]).min() > 4.5
-        xy = play(network, people)[0] if people else np.zeros((151, 0, 2))
+        xy = play(network, pedestrians)[0] if pedestrians else np.zeros((151, 0, 2))
         crossing += int(np.sum((np.abs(xy[60:, :, 1]) < 3.0).any(axis=0)))
     # Poisson means: 3 per 100 m of two sidewalks of 100 m, and 1.5 at the crossing.
     assert count / 40 == pytest.approx(7.5, abs=1.5)
     assert crossing / 40 > 0.7
-    again = place_walkers(network, 3.0, np.random.default_rng(7), TIMES)
-    same = place_walkers(network, 3.0, np.random.default_rng(7), TIMES)
+    again = place_pedestrians(network, 3.0, np.random.default_rng(7), TIMES)
+    same = place_pedestrians(network, 3.0, np.random.default_rng(7), TIMES)
     assert [(w.start_m, w.speed_mps) for w in again] == [(w.start_m, w.speed_mps) for w in same]
 
 
-def test_no_walkers_without_crossings():
+def test_no_pedestrians_without_crossings():
     network = RoadNetwork("test", street().lanes, ())
     xy, _, _, claims = play(network, ())
     assert xy.shape == (151, 0, 2) and claims.shape == (151, 0)

@@ -7,7 +7,7 @@ from drivax.scenario.schema import AgentKind
 from drivax.synthetic.expert.candidates import (
     HARD_M,
     NEAR_M,
-    NEAR_PEOPLE_M,
+    NEAR_VULNERABLE_M,
     SPACING_M,
     Shift,
     arrivals,
@@ -45,12 +45,12 @@ def test_conflicts_agree_with_clipped_polygons(seed):
     way = way_of(roles, Shift(2.5, 5.0, 25.0, 35.0, 55.0))
     box = user_boxes(motion)[1:, ::15]
     valid = rng.random(box.shape[:2]) < 0.9
-    people = motion.kind[1:] == AgentKind.PEDESTRIAN
-    got = find_conflicts(way, motion.size_m[0], box, valid, people)
+    pedestrians = motion.kind[1:] == AgentKind.PEDESTRIAN
+    got = find_conflicts(way, motion.size_m[0], box, valid, pedestrians)
     result = dict(zip(zip(got.user, got.step, got.point, strict=True), got.hard, strict=True))
     brute = {}
     for u in range(len(box)):
-        near = NEAR_PEOPLE_M if people[u] else NEAR_M
+        near = NEAR_VULNERABLE_M if pedestrians[u] else NEAR_M
         for t in np.flatnonzero(valid[u]):
             theirs = box_corners(
                 box[u, t, :2], np.arctan2(box[u, t, 3], box[u, t, 2]), box[u, t, 4], box[u, t, 5]

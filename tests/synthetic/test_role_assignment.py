@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 from drivax.synthetic.roads.families import FAMILIES
 from drivax.synthetic.roads.network import Control
 from drivax.synthetic.traffic.paths import LaneChange, Sway, lane_path
-from drivax.synthetic.traffic.role_assignment import conflicts_on, giving_way, with_feeders
+from drivax.synthetic.traffic.role_assignment import add_feeders, conflicts_on, yielding_destinations
 
 from .traffic_scenes import crossroads, road
 
@@ -26,17 +26,17 @@ def test_conflicts_are_connectors_with_priority_that_need_not_wait():
     yielding = dataclasses.replace(network, lanes=tuple(lanes))
     assert conflicts_on(yielding, lane_path(yielding, (0, 1, 2), Sway())) == {4}
     assert conflicts_on(yielding, lane_path(yielding, (3, 4, 5), Sway())) == frozenset()
-    assert [place.lane for place in giving_way(yielding)] == [1]
+    assert [place.lane for place in yielding_destinations(yielding)] == [1]
     lanes[4] = dataclasses.replace(lanes[4], yields_to=(1,))
     both = dataclasses.replace(network, lanes=tuple(lanes))
     assert conflicts_on(both, lane_path(both, (0, 1, 2), Sway())) == frozenset()
-    assert giving_way(both) == ()
+    assert yielding_destinations(both) == ()
 
 
 def test_all_crossing_connectors_conflict_at_an_all_way_stop():
     network = crossroads(control=[Control.ALL_WAY_STOP] * 2)
     assert conflicts_on(network, lane_path(network, (0, 1, 2), Sway())) == {4}
-    assert sorted(place.lane for place in giving_way(network)) == [1, 4]
+    assert sorted(place.lane for place in yielding_destinations(network)) == [1, 4]
 
 
 def test_the_target_lane_of_a_lane_change_conflicts():
@@ -54,4 +54,4 @@ def test_feeders_are_the_lanes_within_reach_against_shortest_paths():
         begin, end, cost = zip(*edges, strict=True)
         away = dijkstra(csr_array((cost, (begin, end)), shape=[len(network.lanes)] * 2), indices=target)
         wanted = set(np.flatnonzero(away < 160.0).tolist())
-        assert with_feeders(network, frozenset({target})) == wanted
+        assert add_feeders(network, frozenset({target})) == wanted

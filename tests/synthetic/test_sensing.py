@@ -6,7 +6,7 @@ import shapely
 
 from drivax.geometry.boxes import corners
 from drivax.scenario.recording import Tracks
-from drivax.synthetic.expert.violations import touching
+from drivax.synthetic.expert.violations import first_overlap_step
 from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, visible
 
 SENSOR = SensorConfig()
@@ -32,9 +32,9 @@ EGO = (0.0, 0.0, 0.0, 4.6, 1.9)
 
 
 def test_vans_occlude_pedestrians_and_pedestrians_occlude_no_agent():
-    van, person = (10.0, 0.0, 0.0, 5.0, 2.0), (15.0, 0.0, 0.0, 0.6, 0.6)
-    assert look([EGO, van, person], [1.5, 2.4, 1.75]) == [True, True, False]
-    assert look([EGO, van, person], [1.5, 2.4, 1.75], [True, False, True]) == [True, True, True]
+    van, is_pedestrian = (10.0, 0.0, 0.0, 5.0, 2.0), (15.0, 0.0, 0.0, 0.6, 0.6)
+    assert look([EGO, van, is_pedestrian], [1.5, 2.4, 1.75]) == [True, True, False]
+    assert look([EGO, van, is_pedestrian], [1.5, 2.4, 1.75], [True, False, True]) == [True, True, True]
     # Beside the van it is in view.
     assert look([EGO, van, (15.0, 3.0, 0.0, 0.6, 0.6)], [1.5, 2.4, 1.75]) == [True, True, True]
 
@@ -173,7 +173,7 @@ class Extreme(np.random.Generator):
         return 1e6 * self.choice([-1.0, 1.0], size=(size[0], 1)) * np.ones(size)
 
 
-#: The longest vehicles of the world (buses), cars, and people.
+#: The longest vehicles of the world (buses), cars, and pedestrians.
 LARGEST = ((12.0, 2.55), (5.3, 2.05), (0.7, 0.7))
 
 
@@ -212,7 +212,10 @@ def test_noise_never_makes_a_user_overlap_a_free_ego(length, width):
     for k in range(count):
         for _ in range(30):
             middle = (near[k] + far[k]) / 2
-            touches = touching(np.stack([ego, box(middle, k)])[:, None], one, np.ones((2, 2), bool)).min() < 1
+            touches = (
+                first_overlap_step(np.stack([ego, box(middle, k)])[:, None], one, np.ones((2, 2), bool)).min()
+                < 1
+            )
             near[k], far[k] = (middle, far[k]) if touches else (near[k], middle)
     plain = tracks(count + 1, 4)
     plain.valid[:] = True

@@ -79,7 +79,7 @@ def test_combined_plans_keep_their_own_cycles():
 
 
 def test_stretching_a_cycle_lengthens_the_first_green():
-    longer = PLAN.stretched(30.0)
+    longer = PLAN.stretch(30.0)
     assert longer.cycle_s == 30.0
     assert longer.green_s == (13.0, 8.0)
 

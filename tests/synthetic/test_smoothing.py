@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import LinearConstraint, minimize
 
 from drivax.synthetic.expert import smoothing
-from drivax.synthetic.expert.smoothing import Bounds, smoothed
+from drivax.synthetic.expert.smoothing import Bounds, smooth_speeds
 
 
 def bounds(steps, low=-np.inf, high=np.inf, top=40.0, acceleration=(-6.0, 2.3), jerk=25.0):
@@ -19,7 +19,7 @@ def braking(steps=40):
 
 def test_constant_speed_is_unchanged():
     at, speed = np.arange(51) * 1.0, np.full(51, 10.0)
-    drive = smoothed(at, speed, 0.0, bounds(50))
+    drive = smooth_speeds(at, speed, 0.0, bounds(50))
     assert drive.excess <= 0.0
     assert np.allclose(drive.speed, 10.0)
     assert np.allclose(drive.at_m, at)
@@ -32,7 +32,7 @@ def test_smoothing_solves_the_quadratic_programme(high):
     steps = 21
     at, speed = braking(steps)
     limits = bounds(steps, high=high, acceleration=(-4.5, 2.0), jerk=8.0)
-    drive = smoothed(at, speed, -0.5, limits)
+    drive = smooth_speeds(at, speed, -0.5, limits)
     tril = np.tril(np.ones((steps, steps)))
     rate = tril * 0.1
     place = np.array([[(n - m + 0.5) * 0.01 if m <= n else 0.0 for m in range(steps)] for n in range(steps)])
@@ -75,7 +75,7 @@ def test_smoothing_solves_the_quadratic_programme(high):
 
 def test_bounds_are_kept():
     at, speed = braking()
-    drive = smoothed(at, speed, 0.0, bounds(40, high=19.0))
+    drive = smooth_speeds(at, speed, 0.0, bounds(40, high=19.0))
     a = np.diff(drive.speed) / 0.1
     assert drive.excess < 0.02
     assert drive.at_m.max() < 19.02
@@ -87,11 +87,11 @@ def test_bounds_are_kept():
 def test_excess_of_infeasible_bounds_is_reported():
     # From 12 m/s a car needs 12 m with 6 m/s2.
     at, speed = braking()
-    assert smoothed(at, speed, 0.0, bounds(40, high=11.0)).excess > 0.1
+    assert smooth_speeds(at, speed, 0.0, bounds(40, high=11.0)).excess > 0.1
 
 
 def test_stopped_drives_stand():
     at, speed = braking(80)
-    drive = smoothed(at, speed, 0.0, bounds(80))
+    drive = smooth_speeds(at, speed, 0.0, bounds(80))
     assert drive.speed[-1] == 0.0
     assert np.ptp(drive.at_m[-3:]) < 0.01

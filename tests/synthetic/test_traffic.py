@@ -12,8 +12,8 @@ from drivax.synthetic.roads.network import Crossing, Draft, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Sway, lane_path, random_lanes
-from drivax.synthetic.traffic.population import Density, draw_drivers, driven_path, placed
-from drivax.synthetic.traffic.roles import EgoPlan, Override, Roles, Scripted, Staging, Walker
+from drivax.synthetic.traffic.placement import Density, draw_drivers, draw_path, place_vehicles
+from drivax.synthetic.traffic.roles import EgoPlan, Override, Pedestrian, Roles, Scripted, Staging
 from drivax.synthetic.traffic.simulation import Traffic
 
 from . import traffic_scenes
@@ -214,18 +214,20 @@ def test_planned_ego_follows_its_plan_and_others_react():
     assert gap.min() > 0.5 and motion.speed[1, -1] < 0.5
 
 
-def test_cars_stop_for_walkers_on_a_crossing():
+def test_cars_stop_for_pedestrians_on_a_crossing():
     network, _ = road(400.0)
     axis = np.array([[200.0, -2.5], [200.0, 2.5]])
     network = RoadNetwork("test", network.lanes, (), crossings=(Crossing(axis, 3.0, ((0, 200.0),)),))
     way = straight(Pose(200.0, -8.0, math.pi / 2), 16.0)
-    people = (Walker(way, 0.0, 1.3, crossing=0, kerb_m=5.5, across_m=10.5),)
+    pedestrians = (Pedestrian(way, 0.0, 1.3, crossing=0, kerb_m=5.5, across_m=10.5),)
     table = drivers(2, speed_factor=0.8)
-    motion = traffic_scenes.run(network, [(0,)] * 2, table, [115.0, 90.0], [11.0] * 2, 25.0, walkers=people)
+    motion = traffic_scenes.run(
+        network, [(0,)] * 2, table, [115.0, 90.0], [11.0] * 2, 25.0, pedestrians=pedestrians
+    )
     assert motion.xy[2, -1, 1] > 2.0
     crossing = np.abs(motion.xy[2, :, 1]) < 2.5
     front = motion.xy[0, :, 0] + table.size_m[0, 0] / 2
-    # While a walker is on the lane, the car is before the crosswalk or beyond it.
+    # While a pedestrian is on the lane, the car is before the crosswalk or beyond it.
     rear = motion.xy[0, :, 0] - table.size_m[0, 0] / 2
     assert np.all((front[crossing] < 198.5) | (rear[crossing] > 201.5))
     assert motion.xy[0, -1, 0] > 230.0 and motion.acceleration.min() > -5.0
@@ -236,8 +238,10 @@ def test_repeated_runs_are_equal_and_users_keep_their_order():
     steps = 50
     stands = Scripted.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
     comes = Scripted.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
-    people = (Walker(straight(Pose(0.0, 9.0, 0.0), 80.0), 0.0, 1.2),)
-    scene = roles(network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, walkers=people, parked=(stands,))
+    pedestrians = (Pedestrian(straight(Pose(0.0, 9.0, 0.0), 80.0), 0.0, 1.2),)
+    scene = roles(
+        network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, pedestrians=pedestrians, parked=(stands,)
+    )
     traffic = Traffic(scene, np.arange(steps) / 10)
     staging = Staging(overrides=(Override(0, 10, 30, -3.0),), extras=(comes,))
     first, calm, again = traffic.run(staging), traffic.run(), traffic.run(staging)
@@ -246,7 +250,7 @@ def test_repeated_runs_are_equal_and_users_keep_their_order():
     for name in ("xy", "heading", "speed", "valid", "distance_m", "acceleration", "size_m"):
         assert np.array_equal(getattr(first, name), getattr(again, name)), name
     assert not np.array_equal(first.xy[0], calm.xy[0])
-    later = first.since(20)
+    later = first.from_step(20)
     assert np.array_equal(later.xy, first.xy[:, 20:]) and later.acceleration.shape == (2, steps - 20)
 
 
@@ -257,11 +261,11 @@ def test_dense_traffic_has_no_overlaps(family, seed):
     network = family.build(rng)
     start = network.starts[int(rng.integers(len(network.starts)))]
     along = float(rng.uniform(start.low_m, start.high_m))
-    where = placed(network, start.lane, along, Density(spacing_m=(12.0, 40.0)), rng)
+    where = place_vehicles(network, start.lane, along, Density(spacing_m=(12.0, 40.0)), rng)
     first = [start.lane, *where.lane]
     table = draw_drivers(len(first), Density(), rng, [network.lanes[lane] for lane in first])
     paths = [
-        driven_path(network, random_lanes(network, lane, rng), bool(cyclist), rng)
+        draw_path(network, random_lanes(network, lane, rng), bool(cyclist), rng)
         for lane, cyclist in zip(first, table.cyclist, strict=True)
     ]
     at = np.array([along, *where.along_m])

@@ -11,12 +11,12 @@ from drivax.scenario.schema import AgentKind
 from drivax.synthetic.expert.violations import (
     against_traffic,
     find_violation,
+    first_overlap_step,
     goes_against_traffic,
     inside,
     last_stop,
     leaves_road,
     passes,
-    touching,
     user_boxes,
 )
 from drivax.synthetic.roads.families import CurvedRoad, SignalisedJunction
@@ -30,7 +30,7 @@ from drivax.synthetic.world import WorldConfig, generate_recording
 from .oracles import box_corners, shared_area, winding_number
 from .staged_scenes import CAR, TIMES, WIDTH, crossed, road, scene, user
 
-PERSON = (0.6, 0.6, 1.75)
+PEDESTRIAN = (0.6, 0.6, 1.75)
 
 
 def cause(roles, motion, staging=None, hardest=4.0, first_step=0):
@@ -70,7 +70,7 @@ def test_touching_agrees_with_clipped_polygons():
     cos, sin = np.cos(heading)[..., None], np.sin(heading)[..., None]
     tested = ~np.eye(12, dtype=bool)
     tested[3, 7] = tested[7, 3] = False
-    got = touching(np.concatenate([xy, cos, sin, skinless], axis=-1), valid, tested)
+    got = first_overlap_step(np.concatenate([xy, cos, sin, skinless], axis=-1), valid, tested)
     for i in range(12):
         for j in range(i + 1, 12):
             steps = [
@@ -171,11 +171,11 @@ def test_collisions_of_ego_and_of_others():
     assert cause(roles, motion) == "others_collide"
     roles, motion = scene(road(), 12.0, [user((60.0, WIDTH)), user((62.0, WIDTH))])
     assert cause(roles, motion) == ""  # both were put there and never move
-    people = [
-        user((60.0, WIDTH), size=PERSON, kind=AgentKind.PEDESTRIAN, velocity=(1.0, 0.0)),
-        user((61.0, WIDTH), size=PERSON, kind=AgentKind.PEDESTRIAN),
+    pedestrians = [
+        user((60.0, WIDTH), size=PEDESTRIAN, kind=AgentKind.PEDESTRIAN, velocity=(1.0, 0.0)),
+        user((61.0, WIDTH), size=PEDESTRIAN, kind=AgentKind.PEDESTRIAN),
     ]
-    roles, motion = scene(road(), 12.0, people)
+    roles, motion = scene(road(), 12.0, pedestrians)
     assert cause(roles, motion) == ""
     roles, motion = scene(road(), 12.0, [user((80.0, 0.0))])
     violation = find_violation(roles, motion, TIMES, 0, Staging(), 4.0)
@@ -217,7 +217,7 @@ def test_lights_of_other_lanes_apply_off_the_route(aside_m, counts):
     beside = [
         replace(
             lane,
-            curve=lane.curve.shifted(WIDTH),
+            curve=lane.curve.parallel(WIDTH),
             successors=tuple(k + 3 for k in lane.successors),
             predecessors=tuple(k + 3 for k in lane.predecessors),
         )

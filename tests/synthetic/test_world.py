@@ -59,11 +59,14 @@ def test_no_users_overlap(index):
         corners = {
             i: box_corners(tracks.xy[i, t], tracks.heading[i, t], *tracks.size[i, t, :2]) for i in present
         }
-        person = tracks.kind == AgentKind.PEDESTRIAN
+        is_pedestrian = tracks.kind == AgentKind.PEDESTRIAN
         for i in present:
             for j in present[present > i]:
-                # People pass each other as they like.
-                if not (person[i] and person[j]) and np.hypot(*(tracks.xy[i, t] - tracks.xy[j, t])) < 11.0:
+                # Pedestrians pass each other as they like.
+                if (
+                    not (is_pedestrian[i] and is_pedestrian[j])
+                    and np.hypot(*(tracks.xy[i, t] - tracks.xy[j, t])) < 11.0
+                ):
                     assert shared_area(corners[i], corners[j]) == 0.0, (i, j, t)
 
 
@@ -288,13 +291,13 @@ def test_critical_recording_is_a_window_of_the_traffic(monkeypatch):
         kept.setdefault("motion", result := original(traffic, *args, **more))
         return result
 
-    def chosen(network, motion, colour, steps):
+    def select(network, motion, colour, steps):
         kept["found"] = steps[critical_steps(network, motion, colour, steps)].tolist()
         return critical_steps(network, motion, colour, steps)
 
     original = world.Traffic.run
     monkeypatch.setattr(world.Traffic, "run", run)
-    monkeypatch.setattr(world, "critical_steps", chosen)
+    monkeypatch.setattr(world, "critical_steps", select)
     config = dataclasses.replace(EXACT, rare_rate=0.0, critical_share=1.0)
     begins, lit = set(), 0
     for index in range(0, 60, 2):

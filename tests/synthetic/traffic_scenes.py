@@ -11,7 +11,7 @@ import numpy as np
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Draft, RoadNetwork
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.population import Density, draw_drivers
+from drivax.synthetic.traffic.placement import Density, draw_drivers
 from drivax.synthetic.traffic.roles import Roles
 from drivax.synthetic.traffic.simulation import Traffic
 
@@ -27,7 +27,7 @@ def drivers(count, seed=0, **values):
 
 def twins(count, **values):
     """Copies of one driver."""
-    return drivers(1, **values).chosen(np.zeros(count, int))
+    return drivers(1, **values).select(np.zeros(count, int))
 
 
 def roles(network, ways, table, at, speed, **more):

@@ -147,7 +147,7 @@ def test_left_overs_of_a_killed_process_are_no_checkpoints(tmp_path: Path):
     (tmp_path / "step-x").mkdir()
     checkpoints = Checkpoints(tmp_path)
     assert checkpoints.steps() == []
-    with pytest.raises(DataError, match="there is no checkpoint; train without --resume"):
+    with pytest.raises(DataError, match="no checkpoint found; train without --resume"):
         checkpoints.restore({"a": 0})
 
 
@@ -171,7 +171,7 @@ def test_template_that_does_not_fit_is_refused(tmp_path: Path, template: dict[st
 def test_unknown_step_is_refused(tmp_path: Path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(1, {"a": 1})
-    with pytest.raises(DataError, match="no checkpoint of step 7; there are: 1"):
+    with pytest.raises(DataError, match="no checkpoint of step 7; available steps: 1"):
         checkpoints.restore({"a": 0}, 7)
 
 

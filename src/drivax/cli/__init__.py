@@ -101,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:  # tyro's --help (0) and its usage errors (2)
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
     except BrokenPipeError:
-        # The reader (head, less) has gone; keep the interpreter from complaining when it flushes at exit.
+        # The reader (head, less) has exited; avoid an error when the interpreter flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (Exception, KeyboardInterrupt) as error:
@@ -170,16 +170,16 @@ def _run(name: str, command: Command, arguments: list[str]) -> int:
     config = getattr(module, command.config)
     parse: Any = partial(tyro.cli, return_unknown_args=True) if command.overrides else tyro.cli
     parsed = parse(
-        config, prog=f"drivax {name}", args=arguments, description=_wrapped(getdoc(config) or ""),
+        config, prog=f"drivax {name}", args=arguments, description=_wrap(getdoc(config) or ""),
         config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
     return int(module.run(*parsed) if command.overrides else module.run(parsed))
 
 
-def _wrapped(text: str) -> str:
-    """Return the paragraphs of a text in lines as wide as the terminal.
+def _wrap(text: str) -> str:
+    """Wrap the paragraphs of a text to the width of the terminal.
 
-    Tyro joins lines unless they begin with a blank, and doubles empty ones: a zero-width space stands for those.
+    Tyro joins lines unless they begin with a blank, and doubles empty lines, hence the zero-width spaces.
     """
     fill = textwrap.TextWrapper(shutil.get_terminal_size((_COLUMNS, 0)).columns, "  ", "  ").fill
     return "\n\u200b\n".join(fill(" ".join(part.split())) for part in text.split("\n\n"))

@@ -50,10 +50,10 @@ class Bench(BenchConfig):
 
 
 def run(args: Bench, overrides: Sequence[str] = ()) -> int:
-    """Time and print."""
+    """Run the benchmark and print its results."""
     if args.encoders:
         times = bench_encoders(settings.load(EncoderBench, {"repeats": args.repeats}, overrides))
-        print(json.dumps(times, indent=1) if args.json else _encoders(times))
+        print(json.dumps(times, indent=1) if args.json else _encoders_text(times))
         return 0
     config = settings.load(BenchConfig, settings.plain(record_of(BenchConfig, args)), overrides)
     use_all_cores()
@@ -64,17 +64,21 @@ def run(args: Bench, overrides: Sequence[str] = ()) -> int:
             tempfile.TemporaryDirectory() as folder,
             Progress("generating", "scenarios", args.scenarios) as bar,
         ):
-            made = generate(
+            generated = generate(
                 Path(folder) / "set", args.scenarios, 0, Generation(workers=os.cpu_count() or 1),
                 lambda done, total: bar.update(done),
             )  # fmt: skip
-            bank = ScenarioBank.from_scenarios(ScenarioSet.open(made.path))
-    result, text = (bench_metrics(bank, config), _sets) if args.metrics else (bench(bank, config), _parts)
+            bank = ScenarioBank.from_scenarios(ScenarioSet.open(generated.path))
+    result, text = (
+        (bench_metrics(bank, config), _metric_sets_text)
+        if args.metrics
+        else (bench(bank, config), _parts_text)
+    )
     print(json.dumps(result, indent=1) if args.json else text(result))
     return 0
 
 
-def _parts(result: dict[str, Any]) -> str:
+def _parts_text(result: dict[str, Any]) -> str:
     lines = [
         f"{result['environment_steps_per_second']:,} environment steps/s (batch {result['batch']}, "
         f"{result['devices']} device(s), "
@@ -90,7 +94,7 @@ def _parts(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _sets(result: dict[str, Any]) -> str:
+def _metric_sets_text(result: dict[str, Any]) -> str:
     lines = [
         f"environment steps/s by metric set ({result['scenarios']:,} scenarios); x is relative to full at batch 32",
         "  metrics     batch   steps/s      x",
@@ -101,12 +105,12 @@ def _sets(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _encoders(result: dict[str, Any]) -> str:
+def _encoders_text(result: dict[str, Any]) -> str:
     batches = list(result["rows"][0]["forward_us"])
-    heads = "".join(f" {f'batch {batch}':>10}" for batch in batches)
+    headings = "".join(f" {f'batch {batch}':>10}" for batch in batches)
     lines = [
         f"encoders of an observation on {result['device']}; us per observation: forward, and forward and backward",
-        f"  {'encoder':<30} {'computes in':<11} {'parameters':>10} {'width':>5}{heads} {'backward':>10}",
+        f"  {'encoder':<30} {'computes in':<11} {'parameters':>10} {'width':>5}{headings} {'backward':>10}",
     ]
     for row in result["rows"]:
         times = "".join(f" {time_us:10.1f}" for time_us in (*row["forward_us"].values(), row["gradient_us"]))

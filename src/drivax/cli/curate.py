@@ -23,7 +23,7 @@ else:
     MethodName = tyro.extras.literal_type_from_choices(METHODS)
 
 #: Number of the most critical scenarios that are printed.
-_PRINTED = 10
+_PRINTED_SCENARIOS = 10
 
 
 @dataclass(frozen=True)
@@ -93,22 +93,24 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     changes = {"weights": args.weights, "scenario": args.scenario}
     changes = {name: value for name, value in changes.items() if value is not None}
     if args.again is None:
-        # Before anything is scored: training an ensemble takes a while.
+        # Check before scoring: training an ensemble takes minutes.
         check_combination(args.method, config, changes)
     check_output(args.out, args.overwrite)
     data = ScenarioSet.open(args.data)
     if args.export is not None:
         if args.out.resolve().is_relative_to(args.export[0].resolve()):
-            raise UsageError("lies where --export writes", file=args.out, cure="choose another --out")
+            raise UsageError(
+                "output is inside the --export folder", file=args.out, cure="choose another --out"
+            )
         check_top(data, *args.export, args.overwrite, args.all_windows)
     if args.again is None:
-        table = scored(args.method, Request(data, args.like, args.seed or 0, config))
+        table = score_with_progress(args.method, Request(data, args.like, args.seed or 0, config))
     else:
         table = read_scores(args.again, data)
         if table.method != args.method:
             raise UsageError(f"{args.again} is a table of {table.method}", cure=f"use curate {table.method}")
     if changes:
-        table = table.combined(replace(table.combination, **changes))
+        table = table.recombine(replace(table.combination, **changes))
     write_scores(table, args.out, args.overwrite)
     _print_statistics(table, args.out)
     if args.export is not None:
@@ -116,7 +118,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     return 0
 
 
-def scored(method: str, request: Request) -> ScoreTable:
+def score_with_progress(method: str, request: Request) -> ScoreTable:
     """Score a set (:func:`~drivax.curation.methods.curate`) with a progress bar."""
     from drivax.curation.methods import curate
     from drivax.tracking.progress import Progress
@@ -129,24 +131,24 @@ def scored(method: str, request: Request) -> ScoreTable:
         return curate(method, replace(request, progress=lambda done, _: bar.update(done), training=training))
 
 
-def _check_flags(args: Curate, overrides: Sequence[str], settable: bool) -> None:
-    """Refuse flags that the method, or --again, would ignore."""
+def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> None:
+    """Raise UsageError for flags that the method, or --again, would ignore."""
     again, subject = args.again is not None, args.method
     unused: dict[str, object] = {}
     if again:
         subject = f"{args.again}, which is not scored again,"
         unused["--like"] = args.like
-    if again or not settable:
+    if again or not has_settings:
         unused["--config"] = args.config
     if again or args.method not in ("ensemble", "random_matched"):
         unused["--seed"] = args.seed
     if args.all_windows and args.export is None:
         raise UsageError("--all-windows without a subset to choose", cure="pass --export TOP N")
-    given = [flag for flag, value in unused.items() if value is not None]
-    if again or not settable:
-        given += overrides
-    if given:
-        raise UsageError(f"{subject} has no such setting", cure="leave out " + " ".join(given))
+    unused_flags = [flag for flag, value in unused.items() if value is not None]
+    if again or not has_settings:
+        unused_flags += overrides
+    if unused_flags:
+        raise UsageError(f"{subject} has no such setting", cure="leave out " + " ".join(unused_flags))
     if args.method == "random_matched" and (args.weights is not None or args.scenario is not None):
         raise UsageError(
             "random_matched permutes finished scores, which have no components",
@@ -166,13 +168,13 @@ def _export(
     with Progress("exporting", "scenarios", count) as bar:
         write_top(table, data, count, top, overwrite, lambda done, _: bar.update(done), all_windows)
     file = top / OWN_SCORES
-    own = read_scores(file, ScenarioSet.open(top))
-    each = "" if all_windows else ", at most one per recording"
-    print(f"{top}: the {count:,} most critical scenarios{each}")
+    subset_scores = read_scores(file, ScenarioSet.open(top))
+    limit = "" if all_windows else ", at most one per recording"
+    print(f"{top}: the {count:,} most critical scenarios{limit}")
     print(f"{file}: their scores")
     print("  rank  score  scenario")
-    for rank, row in enumerate(own.order[:_PRINTED], start=1):
-        print(f"  {rank:>4}  {own.scenarios[row]:.3f}  {own.scenario_ids[row]}")
+    for rank, row in enumerate(subset_scores.order[:_PRINTED_SCENARIOS], start=1):
+        print(f"  {rank:>4}  {subset_scores.scenarios[row]:.3f}  {subset_scores.scenario_ids[row]}")
 
 
 def _print_statistics(table: ScoreTable, out: Path) -> None:
@@ -180,14 +182,14 @@ def _print_statistics(table: ScoreTable, out: Path) -> None:
 
     from drivax.curation.weights import WeightConfig, draw_statistics, sampling_weights
 
-    low, middle, high, most = np.quantile(table.scenarios, (0.05, 0.5, 0.95, 1.0))
+    low, median, high, maximum = np.quantile(table.scenarios, (0.05, 0.5, 0.95, 1.0))
     first = table.scenario_ids[table.order[0]]
     print(f"{out}: {len(table.scenario_ids):,} scenarios, {table.method}")
     if "error_rank_correlation" in table.config:
         print(
             f"  rank correlation of scores and errors over steps: {table.config['error_rank_correlation']:.2f}"
         )
-    print(f"  scores: 5 % {low:.3f}, median {middle:.3f}, 95 % {high:.3f}, largest {most:.3f} ({first})")
+    print(f"  scores: 5 % {low:.3f}, median {median:.3f}, 95 % {high:.3f}, largest {maximum:.3f} ({first})")
     for scale in ("step", "scenario"):
         draws = draw_statistics(sampling_weights(table, WeightConfig(), scale), table.drawable)
         print(

@@ -23,7 +23,7 @@ from drivax.datasets.doctor import Diagnosis, Part, counted, diagnose
 from drivax.files import format_bytes, free_bytes
 
 _COLUMNS = 100
-#: Modules of every extra, and what it is for.
+#: Modules and purpose of every extra.
 _EXTRAS = {
     "womd": (("google.protobuf", "google_crc32c"), "Waymo, ScenarioMax"),
     "av2": (("pyarrow",), "Argoverse 2"),
@@ -32,7 +32,7 @@ _EXTRAS = {
     "track": (("tensorboardX",), "TensorBoard"),
     "gym": (("gymnasium",), "Gymnasium"),
 }
-#: JAX runs in a process of its own, which a broken accelerator may hang or end.
+#: JAX runs in a separate process, which a broken accelerator may hang or crash.
 _ASK_JAX = "import jax, json; print(json.dumps([[d.platform, d.device_kind] for d in jax.devices()]))"
 
 
@@ -64,14 +64,14 @@ def run(args: Doctor) -> int:
 
 
 def machine() -> Iterator[tuple[str, str]]:
-    """Yield what is installed and the resources of the machine, as (name, value)."""
+    """Yield installed packages and resources of the machine, as (name, value)."""
     yield "drivax", metadata.version("drivax")
     yield "python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     yield "jax", metadata.version("jax")
     yield "devices", devices()
     for extra, (modules, purpose) in _EXTRAS.items():
-        absent = [module for module in modules if not _installed(module)]
-        state = "installed" if not absent else f"{', '.join(absent)} missing: pip install 'drivax[{extra}]'"
+        missing = [module for module in modules if not _is_installed(module)]
+        state = "installed" if not missing else f"{', '.join(missing)} missing: pip install 'drivax[{extra}]'"
         yield f"{extra} ({purpose})", state
     yield "cores", str(os.cpu_count())
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -79,7 +79,7 @@ def machine() -> Iterator[tuple[str, str]]:
     yield "disk", f"{format_bytes(free_bytes(Path.cwd()))} free here"
 
 
-def _installed(module: str) -> bool:
+def _is_installed(module: str) -> bool:
     try:
         return importlib.util.find_spec(module) is not None
     except ModuleNotFoundError:  # the package around it is missing
@@ -89,23 +89,23 @@ def _installed(module: str) -> bool:
 def devices(timeout_s: float = 60.0) -> str:
     """Return the devices of JAX, or its error."""
     try:
-        done = subprocess.run(
+        result = subprocess.run(
             [sys.executable, "-c", _ASK_JAX], capture_output=True, text=True, timeout=timeout_s, check=False
         )
-        if done.returncode == 0:
-            kinds = json.loads(done.stdout.splitlines()[-1])
+        if result.returncode == 0:
+            kinds = json.loads(result.stdout.splitlines()[-1])
             return ", ".join(kind if kind == platform else f"{platform}: {kind}" for platform, kind in kinds)
     except (subprocess.TimeoutExpired, ValueError, IndexError):
         return f"JAX does not answer (within {timeout_s:.0f} s); check the driver, or set JAX_PLATFORMS=cpu"
-    last = (done.stderr.strip() or "no message").splitlines()[-1]
-    return f"JAX does not start: {last}"
+    message = (result.stderr.strip() or "no message").splitlines()[-1]
+    return f"JAX does not start: {message}"
 
 
 def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     """Yield a diagnosis as (name, value)."""
     yield "path", str(diagnosis.path)
     for part in diagnosis.parts:
-        yield from _described(part, diagnosis.files[part.format])
+        yield from _part_rows(part, diagnosis.files[part.format])
     yield from (("shards", sentence) for sentence in diagnosis.shards)
     if diagnosis.parts:
         others = []
@@ -134,16 +134,16 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
         yield "verdict", "cannot be converted"
 
 
-def _described(part: Part, files: int) -> Iterator[tuple[str, str]]:
-    what = part.description
-    version = "" if what.version is None else f", version {what.version}"
-    yield "data set", f"{what.dataset}: {what.flavour}{version}"
+def _part_rows(part: Part, files: int) -> Iterator[tuple[str, str]]:
+    description = part.description
+    version = "" if description.version is None else f", version {description.version}"
+    yield "data set", f"{description.dataset}: {description.flavour}{version}"
     number = counted(part.looked if part.whole else files, "file")
-    looked = "" if part.whole else f" ({part.looked:,} of them looked into)"
-    recordings = "" if what.recordings is None else f", {counted(what.recordings, 'recording')}"
-    yield "format", f"{part.format}: {number}{looked}{recordings}{'' if part.whole else ' in those'}"
-    yield from (("note", note) for note in what.notes)
-    yield from (("missing", name) for name in what.missing)
+    sampled = "" if part.whole else f" ({part.looked:,} of them looked into)"
+    recordings = "" if description.recordings is None else f", {counted(description.recordings, 'recording')}"
+    yield "format", f"{part.format}: {number}{sampled}{recordings}{'' if part.whole else ' in those'}"
+    yield from (("note", note) for note in description.notes)
+    yield from (("missing", name) for name in description.missing)
 
 
 def _table(rows: Iterator[tuple[str, str]]) -> Table:

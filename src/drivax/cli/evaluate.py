@@ -64,19 +64,19 @@ class Evaluate(EvaluationConfig):  # noqa: D101
 
 def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     """Evaluate, then print the headline metrics and crashes."""
-    # Refuse unknown names before the long work.
+    # Check names before the evaluation starts.
     traffic = find_traffic(args.traffic)
     metrics = tuple(name for name in args.metrics if name != _DEVKIT)
     select_metrics(metrics)
     if _DEVKIT in args.metrics:
         import_extra("shapely")
-    requested = _task(overrides)
+    requested_task = _requested_task(overrides)
     data = ScenarioSet.open(args.data)
-    some = load(args.data, 1, filters=args.filter, scenarios=args.scenarios)
-    planner, task = find_planner(args.planner, some.bank, args.sample, requested)
+    first = load(args.data, 1, filters=args.filter, scenarios=args.scenarios)
+    planner, task = find_planner(args.planner, first.bank, args.sample, requested_task)
     config = record_of(EvaluationConfig, args, task=task, metrics=metrics)
     results = run_evaluation(
-        config, planner, data, args.out, traffic=traffic, sizes=some.sizes, overwrite=args.overwrite
+        config, planner, data, args.out, traffic=traffic, sizes=first.sizes, overwrite=args.overwrite
     )
     print(format_summary([results.summary()]))
     if metrics:
@@ -89,12 +89,12 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     return 0
 
 
-def _task(overrides: Sequence[str]) -> Task | None:
-    """Return the task of ``--task.KEY VALUE``; None without any."""
+def _requested_task(overrides: Sequence[str]) -> Task | None:
+    """Parse ``--task.KEY VALUE`` arguments; None without any."""
     if not overrides:
         return None
-    for word in overrides:
-        if word.startswith("--") and not word.startswith("--task."):
-            known = [f"--{name.replace('_', '-')}" for name in Evaluate.__dataclass_fields__]
-            raise UsageError(f"unknown option {word!r}", cure=did_you_mean(word, known))
+    for argument in overrides:
+        if argument.startswith("--") and not argument.startswith("--task."):
+            options = [f"--{name.replace('_', '-')}" for name in Evaluate.__dataclass_fields__]
+            raise UsageError(f"unknown option {argument!r}", cure=did_you_mean(argument, options))
     return settings.load(EvaluationConfig, {"planner": ""}, overrides).task

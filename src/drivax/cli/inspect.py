@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _COLUMNS = 100
 #: Number of scenarios of --observations, evenly spread over those selected.
-_OBSERVED = 256
+_OBSERVED_SCENARIOS = 256
 
 
 @dataclass(frozen=True)
@@ -63,47 +63,47 @@ def run(args: Inspect) -> int:
     from drivax.scenario.select.selection import Selection
 
     if not args.sets:
-        raise UsageError("no scenario set is named", cure="write drivax inspect SET")
+        raise UsageError("no scenario set given", cure="write drivax inspect SET")
     if args.json and args.html is not None:
         raise UsageError("--json and --html exclude each other", cure="call drivax inspect twice")
     _check_flags(args)
     selection = Selection.parse(args.filter)
-    opened = [Inspection.open(path, selection, not args.no_check) for path in args.sets]
+    inspections = [Inspection.open(path, selection, not args.no_check) for path in args.sets]
     if args.observations:
-        _observe(args, opened[0])
+        _observe(args, inspections[0])
     elif args.json:
-        sets = [{"scenarios": inspection.described()} for inspection in opened]
-        named = [{"set": str(path), **content} for path, content in zip(args.sets, sets, strict=True)]
-        json.dump(sets[0] if len(sets) == 1 else named, sys.stdout, indent=1)
+        sets = [{"scenarios": inspection.described()} for inspection in inspections]
+        named_sets = [{"set": str(path), **content} for path, content in zip(args.sets, sets, strict=True)]
+        json.dump(sets[0] if len(sets) == 1 else named_sets, sys.stdout, indent=1)
         print()
     elif args.html is not None:
         from drivax.report.pages.inspection import write_histograms
 
-        print(write_histograms(opened, args.html, args.overwrite))
+        print(write_histograms(inspections, args.html, args.overwrite))
     else:
-        _print(opened)
+        _print(inspections)
     return 0
 
 
-def _print(opened: list[Inspection]) -> None:
+def _print(inspections: list[Inspection]) -> None:
     """Print one set in full, or several side by side."""
     from drivax.report import inspection as tables
 
     console = _console()
-    if len(opened) > 1:
-        for table in tables.comparison(opened):
+    if len(inspections) > 1:
+        for table in tables.comparison(inspections):
             console.print(table.rich())
             console.print()
         return
-    (inspection,) = opened
+    (inspection,) = inspections
     console.print(tables.overview(inspection).rich())
     console.print()
     audit = tables.audit_table(inspection)
     console.print("audit: not done" if audit is None else audit.rich())
     console.print()
-    console.print(tables.listing(inspection).rich())
-    if len(inspection) > tables.LISTED:
-        console.print(f"{len(inspection) - tables.LISTED:,} more; --json lists all")
+    console.print(tables.scenarios_table(inspection).rich())
+    if len(inspection) > tables.MAX_LISTED:
+        console.print(f"{len(inspection) - tables.MAX_LISTED:,} more; --json lists all")
 
 
 def _console() -> Console:
@@ -119,7 +119,7 @@ def _check_flags(args: Inspect) -> None:
 
     if args.observations and (len(args.sets) > 1 or args.html is not None):
         raise UsageError(
-            "--observations describes one set, and makes no page", cure="name one set, and no --html"
+            "--observations takes one set, and writes no page", cure="name one set, without --html"
         )
     for name in ("planner", "traffic", "task", "draw"):
         if getattr(args, name) is not None and not args.observations:
@@ -127,11 +127,13 @@ def _check_flags(args: Inspect) -> None:
     if args.planner is not None and args.task is not None and is_policy(args.planner.partition("@")[0]):
         raise UsageError("a trained policy has a task of its own", cure="leave out --task")
     if args.draw is not None and args.draw.exists() and not args.overwrite:
-        raise UsageError("exists already", file=args.draw, cure="choose another name or pass --overwrite")
+        raise UsageError(
+            "output file already exists", file=args.draw, cure="choose another name or pass --overwrite"
+        )
 
 
 def _observe(args: Inspect, inspection: Inspection) -> None:
-    """Run the planner, then print statistics of its observations, and draw one."""
+    """Run the planner, print statistics of its observations, and draw one observation."""
     from drivax import settings
     from drivax.api import find_planner
     from drivax.evaluation.observation_statistics import observation_statistics
@@ -141,11 +143,11 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     from drivax.report.pictures.observation import draw_log_observation
     from drivax.scenario.bank.scenario_bank import ScenarioBank
 
-    scenarios = list(inspection.sample(_OBSERVED))
+    scenarios = list(inspection.sample(_OBSERVED_SCENARIOS))
     bank = ScenarioBank.from_scenarios(scenarios)
-    given = None if args.task is None else settings.load(TrainConfig, args.task).task
+    requested_task = None if args.task is None else settings.load(TrainConfig, args.task).task
     planner, task = find_planner(args.planner or "expert", bank)
-    task = given or task
+    task = requested_task or task
     if args.planner is None:
         planner = Expert(actions=task.actions)
     traffic = find_traffic(args.traffic or "log")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from drivax import settings
-from drivax.cli.curate import scored
+from drivax.cli.curate import score_with_progress
 from drivax.curation.methods import Request, check_current
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, sampling_weights
@@ -117,7 +117,7 @@ def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:
-    """Refuse another training than the arm's, and flags that the arm would ignore."""
+    """Raise UsageError for another training than that of the arm, or for flags that the arm ignores."""
     own, expected = (_algorithm(each) for each in (config, settings.load(TrainConfig, arm.preset)))
     if own != expected:
         raise UsageError(f"arm {args.arm} is trained by {expected}, not {own}", cure=f"use {arm.preset}")
@@ -143,7 +143,7 @@ def _algorithm(config: TrainConfig) -> str:
 def _table(args: Train, data: ScenarioSet, method: str) -> ScoreTable:
     """Return the scores of an arm's method, from --scores if given."""
     if args.scores is None:
-        return scored(method, Request(data))
+        return score_with_progress(method, Request(data))
     table = read_scores(args.scores, data)
     # `Arm.weighted` refuses scores of another method.
     if table.method == method:

@@ -1,7 +1,7 @@
-"""Ensemble of behaviour-cloning policies, trained on different folds of the recordings; they disagree on rare data.
+"""Ensemble of behaviour-cloning policies, trained on different folds of the recordings, that disagrees on rare data.
 
-Each member leaves one fold of the recordings out. All members are trained in one program, from different initial
-parameters, on the same drawn steps; each masks the steps of its own fold. Deep ensembles: Lakshminarayanan et al. 2017,
+Each member leaves out one fold of the recordings. All members are trained in one program, from different initial
+parameters, on the same batches; each masks the steps of its own fold. Deep ensembles: Lakshminarayanan et al. 2017,
 arXiv 1612.01474.
 """
 
@@ -28,7 +28,7 @@ from drivax.learning.experience import (
     Experience,
     ExperienceConfig,
     expert_actions,
-    recorded,
+    require_log,
     sample_steps,
     sampler,
 )
@@ -46,10 +46,10 @@ from drivax.tasks.task import Task
 #: Logs that are observed at once.
 _LOG_BATCH = 8
 #: Scenarios whose predictions are reduced at once: float64 copies of a large set take several times its memory.
-_BLOCK = 4096
+_BLOCK_SIZE = 4096
 #: Actions drawn from every member to estimate the mutual information.
 _SAMPLES = 16
-#: No past steps and no last action, which a policy could copy instead of observing the scene.
+#: Without past steps and the last action, which a policy could copy instead of using its surroundings.
 _OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
 
 _NETWORK = NetworkConfig(encoder=EntityConfig(), activation="relu")
@@ -124,21 +124,21 @@ class Predictions:
         errors = []
         for block in self._blocks():
             action, member = self.action[block].astype(np.float64), members[block, None, None]
-            own = np.take_along_axis(action, member[..., None], axis=2)[:, :, 0]
-            predicted = np.where(member < 0, action.mean(axis=2), own)
+            member_action = np.take_along_axis(action, member[..., None], axis=2)[:, :, 0]
+            predicted = np.where(member < 0, action.mean(axis=2), member_action)
             errors.append((((predicted - self.expert[block]) / deviation) ** 2).sum(axis=-1))
         return np.concatenate(errors)
 
     def _blocks(self) -> list[slice]:
-        return [slice(first, first + _BLOCK) for first in range(0, len(self.action), _BLOCK)]
+        return [slice(first, first + _BLOCK_SIZE) for first in range(0, len(self.action), _BLOCK_SIZE)]
 
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
     """A trained ensemble: the learner of one member, and the parameters of all along a leading axis.
 
-    Of the training set it has ``ScenarioSet.hash``, the fold of every scenario (-1 where no member has seen it), and
-    the standard deviation of the expert's actions, in units of the action space.
+    ``set_hash`` is the hash of the training set, ``fold`` the fold of every scenario (-1 if no member has seen it), and
+    ``deviation`` the standard deviation of the expert's actions, in units of the action space.
     """
 
     config: EnsembleConfig
@@ -150,18 +150,18 @@ class Ensemble:
 
     def predictions(self, data: ScenarioSet, progress: Progress | None = None) -> Predictions:
         """Return the predictions on a set, which need not be the training set."""
-        values = map_batches(data, lambda bank: self._of_bank(self.parameters, bank), progress)
+        values = map_batches(data, lambda bank: self._predict_bank(self.parameters, bank), progress)
         return Predictions(**{"information": None, **values})
 
     @partial(jax.jit, static_argnums=0)
-    def _of_bank(self, parameters: Any, bank: ScenarioBank) -> dict[str, Array]:
-        environment = recorded(self.learner.environment)
+    def _predict_bank(self, parameters: Any, bank: ScenarioBank) -> dict[str, Array]:
+        environment = require_log(self.learner.environment)
         steps = jnp.arange(bank.steps)
 
         def predict(index: Array) -> dict[str, Array]:
             observation = environment.observe_recorded(bank, (jnp.full_like(steps, index), steps))
             act = partial(self.learner.distribution, observation=observation)
-            values = {"action": jnp.moveaxis(jax.vmap(lambda own: act(own).mode())(parameters), 0, 1)}
+            values = {"action": jnp.moveaxis(jax.vmap(lambda member: act(member).mode())(parameters), 0, 1)}
             if self.config.cloning.loss == "likelihood":
                 values["information"] = mutual_information(jax.vmap(act)(parameters), jax.random.key(0))
             return values
@@ -183,8 +183,8 @@ def mutual_information(members: Distribution, key: Array) -> Float[Array, "*batc
     def estimate(key: Array) -> Array:
         actions = jax.vmap(lambda member, key: member.sample(key))(members, jax.random.split(key, count))
         log_prob = jax.vmap(density, (None, 0))(members, actions)  # [sampled from, density of, ...]
-        own = jnp.moveaxis(jnp.diagonal(log_prob), -1, 0)
-        return jnp.mean(own - jax.nn.logsumexp(log_prob, axis=1) + math.log(count), axis=0)
+        own_log_prob = jnp.moveaxis(jnp.diagonal(log_prob), -1, 0)
+        return jnp.mean(own_log_prob - jax.nn.logsumexp(log_prob, axis=1) + math.log(count), axis=0)
 
     mean = jnp.mean(jax.lax.map(estimate, jax.random.split(key, _SAMPLES)), axis=0)
     return jnp.clip(mean, 0.0, math.log(count))
@@ -196,22 +196,22 @@ def assign_folds(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers,
     Raises:
         UsageError: There are fewer recordings than folds.
     """
-    names, number = np.unique(clusters, return_inverse=True)
+    names, recording = np.unique(clusters, return_inverse=True)
     if len(names) < folds:
         cure = f"use {folds} recordings or more, or fewer folds"
         raise UsageError(f"{len(names)} recordings for {folds} folds", cure=cure)
-    return np.random.default_rng(seed).permutation(len(names))[number] % folds
+    return np.random.default_rng(seed).permutation(len(names))[recording] % folds
 
 
 def sample_recordings(clusters: Sequence[str], count: int | None, seed: int) -> Int[Numbers, " n"]:
     """Return the scenarios of random whole recordings, at least ``count`` together, in order; None: all."""
-    names, number = np.unique(clusters, return_inverse=True)
+    names, recording = np.unique(clusters, return_inverse=True)
     if count is None:
-        return np.arange(len(number))
+        return np.arange(len(recording))
     rank = np.random.default_rng(seed).permutation(len(names))
-    sizes = np.bincount(rank[number])
+    sizes = np.bincount(rank[recording])
     # Take recordings until there are enough scenarios.
-    return np.flatnonzero((np.cumsum(sizes) - sizes < count)[rank[number]])
+    return np.flatnonzero((np.cumsum(sizes) - sizes < count)[rank[recording]])
 
 
 def train_ensemble(config: EnsembleConfig, data: ScenarioSet, log: Progress | None = None) -> Ensemble:
@@ -223,30 +223,30 @@ def train_ensemble(config: EnsembleConfig, data: ScenarioSet, log: Progress | No
     """
     environment = Driving(Simulator(config.task))
     clusters = np.array(recordings_of(data.entries))
-    chosen = sample_recordings(clusters.tolist(), config.learn_from, config.seed)
+    training_rows = sample_recordings(clusters.tolist(), config.learn_from, config.seed)
     fold = np.full(len(data), -1)
-    fold[chosen] = assign_folds(clusters[chosen].tolist(), config.folds, config.seed)
-    _check_memory(config, data, len(chosen), free_memory(jax.devices()[0]))
-    bank = ScenarioBank.from_scenarios(data[index] for index in chosen)
+    fold[training_rows] = assign_folds(clusters[training_rows].tolist(), config.folds, config.seed)
+    _check_memory(config, data, len(training_rows), free_memory(jax.devices()[0]))
+    bank = ScenarioBank.from_scenarios(data[index] for index in training_rows)
     experience, deviation = experience_of(config, environment, bank)
     learner = config.cloning.build(environment, bank, config.iterations)
-    parameters = fit(config, learner, experience, fold[chosen], log)
+    parameters = fit(config, learner, experience, fold[training_rows], log)
     return Ensemble(config, learner, parameters, data.hash, fold, deviation)
 
 
 def _check_memory(config: EnsembleConfig, data: ScenarioSet, count: int, free: int | None) -> None:
-    """Refuse more scenarios than fit on the device."""
+    """Raise UsageError if the scenarios do not fit on the device."""
     if free is None:
         return
     size = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)).nbytes
-    # A bank exists twice while it is made.
+    # Building a bank takes twice its memory.
     if 2 * size * count > free:
-        fits = free // (4 * size)
+        fitting = free // (4 * size)
         problem = (
             f"{count:,} scenarios take about {2e-9 * size * count:,.0f} GB, and {free / 1e9:,.0f} GB are free"
         )
-        fewer = f"pass --learn_from {fits} to train on fewer scenarios; all are scored"
-        raise UsageError(problem, file=data.path, cure=fewer if fits >= config.folds else "free memory")
+        cure = f"pass --learn_from {fitting} to train on fewer scenarios; all are scored"
+        raise UsageError(problem, file=data.path, cure=cure if fitting >= config.folds else "free memory")
 
 
 def experience_of(
@@ -264,36 +264,36 @@ def experience_of(
 
 def fit(
     config: EnsembleConfig, learner: Bc, experience: Experience, fold: Int[Numbers, " N"],
-    log: Progress | None = None, together: bool | None = None,
+    log: Progress | None = None, batched: bool | None = None,
 ) -> Any:  # fmt: skip
     """Return the trained parameters of all members, along a leading axis.
 
-    With ``together``, all members are updated in one stacked computation instead of one after the other; same results.
-    None: except on CPUs, where products of stacked small matrices take three times as long.
+    With ``batched``, all members are updated in one batched computation instead of one after another, with the same
+    results. None: except on CPUs, where products of batched small matrices take three times as long.
     """
-    environment, cloning = recorded(learner.environment), config.cloning
-    if together is None:
-        together = jax.default_backend() != "cpu"
-    used = math.ceil(cloning.batch * (1.0 - 1.0 / config.folds))
+    environment, cloning = require_log(learner.environment), config.cloning
+    if batched is None:
+        batched = jax.default_backend() != "cpu"
+    steps_per_member = math.ceil(cloning.batch * (1.0 - 1.0 / config.folds))
 
     def update(experience: Experience, fold: Array, trained: Any, key: Array) -> tuple[tuple[Any, Any], None]:
         indices = sample_steps(experience.critic, key, (cloning.batch,))
         observation, action, _ = expert_actions(environment, experience, indices)
 
         def update_member(member: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:
-            others = fold[indices[0]] != member[0]
-            # Steps of its own fold last. Steps are drawn independently, so which of the others are cut is random.
-            order = jnp.argsort(~others, stable=True)[:used]
+            is_other_fold = fold[indices[0]] != member[0]
+            # Sort steps of its own fold last. Steps are independent draws, so the other steps are cut at random.
+            order = jnp.argsort(~is_other_fold, stable=True)[:steps_per_member]
             batch = jax.tree.map(lambda leaf: leaf[order], observation)
 
             def loss(parameters: Any) -> tuple[Array, dict[str, Array]]:
                 return cloning.imitation_loss(
-                    learner.distribution(parameters, batch), action[order], others[order]
+                    learner.distribution(parameters, batch), action[order], is_other_fold[order]
                 )
 
             return imitation_update(member[1], learner.optimiser, loss)[0]
 
-        size = config.folds if together else None
+        size = config.folds if batched else None
         return jax.lax.map(update_member, (jnp.arange(config.folds), trained), batch_size=size), None
 
     @partial(jax.jit, donate_argnums=2)
@@ -305,9 +305,9 @@ def fit(
     keys = jax.random.split(network_key, config.folds)
     state = jax.jit(jax.vmap(learner.init, (None, 0)))(experience.data, keys)
     trained = (state.parameters, state.optimiser)
-    for done in range(config.iterations):
-        trained = iterate(experience, jnp.asarray(fold), trained, jax.random.fold_in(key, done))
+    for iteration in range(config.iterations):
+        trained = iterate(experience, jnp.asarray(fold), trained, jax.random.fold_in(key, iteration))
         jax.block_until_ready(trained)
         if log is not None:
-            log(done + 1, config.iterations)
+            log(iteration + 1, config.iterations)
     return trained[0]

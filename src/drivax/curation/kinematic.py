@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drivax.curation.logged import LOG_ROUTE, Logged
+from drivax.curation.logged import LOG_ROUTE, LoggedScenario
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, wrap
@@ -72,11 +72,11 @@ class KinematicConfig:
         names = ("full_braking_mps2", "full_jerk_mps3", "full_yaw_rps2", "edge_m", "lane_m", "crowd")
         check_positive({name: getattr(self, name) for name in names})
 
-    def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Float[Array, " T"]]:
+    def __call__(self, bank: ScenarioBank, log: LoggedScenario) -> dict[str, Float[Array, " T"]]:
         """Return the components of every step of a log."""
         return {
             "urgency": _urgencies(self, log),
-            "braking": jnp.clip(_required(bank, log) / self.full_braking_mps2, 0.0, 1.0),
+            "braking": jnp.clip(_required_braking_of_log(bank, log) / self.full_braking_mps2, 0.0, 1.0),
             "volatility": _volatility(self, log),
             "off_road": _edge_nearness(self, bank, log),
             "lane_deviation": _deviation(self, bank, log),
@@ -85,7 +85,7 @@ class KinematicConfig:
 
 
 def check_positive(values: dict[str, float]) -> None:
-    """Refuse scales that are not positive and finite."""
+    """Raise UsageError for scales that are not positive and finite."""
     for name, value in values.items():
         if not 0.0 < value < float("inf"):
             raise UsageError(f"{name} is {value}", cure="use a positive number")
@@ -95,8 +95,8 @@ def urgency(
     ttc_s: Float[Array, ""], speed_mps: Float[Array, ""], config: KinematicConfig
 ) -> Float[Array, ""]:
     """Return the scaled inverse time to collision: 0 beyond 5 s or standing, 1 at ``urgent_s`` or less."""
-    least, most = 1.0 / TTC_HORIZON_S, 1.0 / config.urgent_s
-    share = (1.0 / jnp.maximum(ttc_s, 1e-3) - least) / (most - least)
+    low, high = 1.0 / TTC_HORIZON_S, 1.0 / config.urgent_s
+    share = (1.0 / jnp.maximum(ttc_s, 1e-3) - low) / (high - low)
     return jnp.where(speed_mps >= STOPPED_MPS, jnp.clip(share, 0.0, 1.0), 0.0)
 
 
@@ -106,13 +106,13 @@ def required_braking(
 ) -> Float[Array, ""]:  # fmt: skip
     """Return the deceleration (m/s2) that avoids reaching the nearest agent on ego's logged path.
 
-    An agent is on the path where its box reaches into a strip of ego's width along the logged route, on ego's level,
-    up to about 75 m ahead. Oncoming agents count as standing, so that ego need not brake while it stands or gives way.
-    0 where no agent is on the path, or the nearest one is not approached.
+    An agent is on the path if its box overlaps a strip of ego's width along the logged route, on ego's level, up to
+    about 75 m ahead. Oncoming agents count as standing, so that ego need not brake while it stands or gives way. The
+    result is 0 if no agent is on the path, or ego does not approach the nearest one.
 
     Only agents that ``counts`` marks are considered; ``along_m`` is ego's arc length along the logged route.
     """
-    me, xy = frame.box[0], frame.box[:, :2]
+    ego_box, xy = frame.box[0], frame.box[:, :2]
 
     def window(offset_m: float) -> Any:
         near = along_m + offset_m
@@ -121,33 +121,35 @@ def required_braking(
     # Beyond a window the projection is its end point, so take the nearer of the two.
     first, second = map(window, _WINDOWS_M)
     nearer = first.distance_m <= second.distance_m
-    hits = jax.tree.map(lambda a, b: jnp.where(nearer.reshape(-1, *(1,) * (a.ndim - 1)), a, b), first, second)
-    cos = jnp.sum(frame.box[:, 2:4] * hits.heading, axis=-1)
+    projections = jax.tree.map(
+        lambda a, b: jnp.where(nearer.reshape(-1, *(1,) * (a.ndim - 1)), a, b), first, second
+    )
+    cos = jnp.sum(frame.box[:, 2:4] * projections.heading, axis=-1)
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
     length, width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
     counts = counts & (jnp.abs(frame.z - frame.z[0]) <= queries.LEVEL_M)
-    on_path = hits.distance_m < jnp.abs(sin) * length + jnp.abs(cos) * width + me[5] / 2
-    gap = hits.along_m - along_m - (jnp.abs(cos) * length + sin * width) - me[4] / 2
-    gap = jnp.where(counts & on_path & (hits.along_m > along_m), gap, jnp.inf)
+    on_path = projections.distance_m < jnp.abs(sin) * length + jnp.abs(cos) * width + ego_box[5] / 2
+    gap = projections.along_m - along_m - (jnp.abs(cos) * length + sin * width) - ego_box[4] / 2
+    gap = jnp.where(counts & on_path & (projections.along_m > along_m), gap, jnp.inf)
     nearest = jnp.argmin(gap)
-    away = jnp.maximum(jnp.sum(frame.velocity[nearest] * hits.heading[nearest]), 0.0)
-    closing = jnp.maximum(speed_mps - away, 0.0)
+    leader_speed_mps = jnp.maximum(jnp.sum(frame.velocity[nearest] * projections.heading[nearest]), 0.0)
+    closing = jnp.maximum(speed_mps - leader_speed_mps, 0.0)
     return closing * closing / (2.0 * jnp.maximum(gap[nearest], 0.1))
 
 
-def crowding(log: Logged, crowd: int) -> Float[Array, " T"]:
+def crowding(log: LoggedScenario, crowd: int) -> Float[Array, " T"]:
     """Return the number of valid agents, ego included, over ``crowd``, at most 1."""
     return jnp.minimum(log.frame.valid.sum(axis=1) / crowd, 1.0)
 
 
-def _urgencies(config: KinematicConfig, log: Logged) -> Float[Array, " T"]:
+def _urgencies(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(frame: Frame, ignored: Array, motion: Array) -> Array:
         return urgency(time_to_collision(frame, jnp.int32(0), ignored), motion[3], config)
 
     return jax.vmap(at_step)(log.frame, log.ignored, log.motion)
 
 
-def _required(bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
+def _required_braking_of_log(bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(frame: Frame, ignored: Array, along_m: Array, speed: Array) -> Array:
         counts = frame.valid & ~ignored & (jnp.arange(len(frame.valid)) > 0)
         return required_braking(bank, log.index, frame, counts, along_m, speed)
@@ -155,42 +157,42 @@ def _required(bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
     return jax.vmap(at_step)(log.frame, log.ignored, log.along_m, log.motion[:, 3])
 
 
-def _volatility(config: KinematicConfig, log: Logged) -> Float[Array, " T"]:
-    """Return the volatility of the action between a step and the next one; the last step repeats the one before.
+def _volatility(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]:
+    """Return the volatility of the action between each step and the next; the last step repeats the one before.
 
     Derivatives are nuPlan's (``metrics.comfort``), of a polynomial fitted to 1.5 s: noise of 1 cm/s in the speed gives
     some hundredths of a m/s3.
     """
     speed, heading = log.motion[:, 3], log.motion[:, 2]
-    known = log.valid[1:] & log.valid[:-1]
+    valid = log.valid[1:] & log.valid[:-1]
     acceleration = (speed[1:] - speed[:-1]) / DT_S
-    turned = jnp.concatenate([jnp.zeros(1), jnp.cumsum(wrap(heading[1:] - heading[:-1]))])
-    jerk = _derivative(acceleration, known, _JERK_ORDER, 1)
-    # At the middle of the action, as the jerk.
-    yaw = _derivative((turned[1:] + turned[:-1]) / 2, known, _YAW_ORDER, 2)
+    heading_change = jnp.concatenate([jnp.zeros(1), jnp.cumsum(wrap(heading[1:] - heading[:-1]))])
+    jerk = _derivative(acceleration, valid, _JERK_ORDER, 1)
+    # At the middle of the action, like the jerk.
+    yaw = _derivative((heading_change[1:] + heading_change[:-1]) / 2, valid, _YAW_ORDER, 2)
     share = jnp.maximum(jnp.abs(jerk) / config.full_jerk_mps3, jnp.abs(yaw) / config.full_yaw_rps2)
     share = jnp.minimum(share, 1.0)
     return jnp.concatenate([share, share[-1:]])
 
 
 def _derivative(
-    signal: Float[Array, " K"], known: Bool[Array, " K"], order: int, derivative: int
+    signal: Float[Array, " K"], valid: Bool[Array, " K"], order: int, derivative: int
 ) -> Float[Array, " K"]:
     """Differentiate a polynomial fitted to the known window around each sample; 0 where there is none."""
     sample = jnp.arange(len(signal))
-    first = jax.lax.cummax(jnp.where(known, -1, sample)) + 1
-    last = jax.lax.cummin(jnp.where(known, len(signal), sample), reverse=True) - 1
+    first = jax.lax.cummax(jnp.where(valid, -1, sample)) + 1
+    last = jax.lax.cummin(jnp.where(valid, len(signal), sample), reverse=True) - 1
     start = jnp.clip(sample - _WINDOW // 2, first, last - (_WINDOW - 1))
     window = signal[jnp.clip(start[:, None] + jnp.arange(_WINDOW), 0, len(signal) - 1)]
     # One filter for each position in a window.
     filters = jnp.asarray(savgol_matrix(_WINDOW, _WINDOW, order, derivative), jnp.float32)
     value = jnp.sum(filters[sample - start] * window, axis=-1) / DT_S**derivative
-    return jnp.where(known & (last - first >= _WINDOW - 1), value, 0.0)
+    return jnp.where(valid & (last - first >= _WINDOW - 1), value, 0.0)
 
 
-def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
+def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(box: Array, ground: Array) -> Array:
-        # A logged car without an edge nearby is on the road: on a driveway, or beyond the map.
+        # A logged car without an edge nearby counts as on the road: it is on a driveway, or beyond the map.
         road = jnp.ones(4, bool)
         beyond = queries.offroad_distance(bank, log.index, box[:2], corners(box), road, ground)
         return jnp.max(jnp.clip(1.0 + beyond / config.edge_m, 0.0, 1.0))
@@ -198,10 +200,10 @@ def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> 
     return jax.vmap(at_step)(log.frame.box[:, 0], log.ground_m)
 
 
-def _deviation(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
+def _deviation(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(xy: Array, ground: Array) -> Array:
         distance = queries.lane_distance(bank, log.index, xy, ground)
-        # Beyond the cut-off there is no lane: a car park, a driveway, the end of the map.
+        # Infinite where no lane is near: in a car park, on a driveway, beyond the map.
         return jnp.where(jnp.isfinite(distance), jnp.minimum(distance / config.lane_m, 1.0), 0.0)
 
     return jax.vmap(at_step)(log.motion[:, :2], log.ground_m)
@@ -235,7 +237,7 @@ class PublishedConfig:
     def __post_init__(self) -> None:
         check_positive(dict(vars(self)))
 
-    def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Float[Array, " T"]]:
+    def __call__(self, bank: ScenarioBank, log: LoggedScenario) -> dict[str, Float[Array, " T"]]:
         """Return the components of every step of a log."""
         xy = log.motion[:, :2]
         edge_m, lane_m = jax.vmap(
@@ -250,7 +252,7 @@ class PublishedConfig:
         }
 
 
-def _published_volatility(config: PublishedConfig, log: Logged) -> Float[Array, " T"]:
+def _published_volatility(config: PublishedConfig, log: LoggedScenario) -> Float[Array, " T"]:
     """Return jerk and yaw acceleration from two backward differences, 0 at the start."""
     heading = log.motion[:, 2]
     acceleration = _backward(norm(log.velocity)) / DT_S
@@ -263,7 +265,7 @@ def _backward(values: Float[Array, " T"]) -> Float[Array, " T"]:
     return jnp.concatenate([jnp.zeros(1), values[1:] - values[:-1]])
 
 
-def _interaction(config: PublishedConfig, log: Logged) -> Float[Array, " T"]:
+def _interaction(config: PublishedConfig, log: LoggedScenario) -> Float[Array, " T"]:
     """Return the largest product of distance and closing speed, ``max(0, -dp . dv)``, over all agents."""
 
     def largest(frame: Frame, velocity: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Logs as scores read them, and the evaluation of score functions over whole scenario sets."""
+"""Logged scenarios, and the evaluation of score functions over whole scenario sets."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ Numbers = np.ndarray[Any, Any]
 
 
 @record
-class Logged:
-    """One log; where ego is not observed, its last motion is repeated.
+class LoggedScenario:
+    """The log of one scenario; where ego is not observed, its last motion is repeated.
 
     Attributes:
         context, frame: Context of ego, and all agents, at every step.
         motion, velocity: x, y (m), heading (rad), speed (m/s) of ego; its velocity as logged (m/s).
         valid: Whether ego is observed.
-        ignored: Agents that overlapped ego when they appeared, until they part: metrics ignore them, too.
+        ignored: Agents that overlap ego from their first step, until they separate; metrics ignore them, too.
         along_m, ground_m: Arc length of ego along the logged route, and height of the ground under it.
     """
 
@@ -58,7 +58,7 @@ class Logged:
         return self.context.index[0]
 
 
-def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
+def read_log(bank: ScenarioBank, index: Int[Array, ""]) -> LoggedScenario:
     """Return the log of one scenario."""
     ego = bank.agents[index, :, 0]
     valid, steps = ego[:, AgentColumn.VALID] > 0, jnp.arange(bank.steps)
@@ -71,14 +71,14 @@ def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
         return frame_of(bank, index, context.step, bank.agents[index, context.step], alone(context), 0)
 
     frame = jax.vmap(frame_at)(contexts)
-    touching = jax.vmap(lambda now: overlaps(now, jnp.int32(0)))(frame)
-    return Logged(
+    overlapping = jax.vmap(lambda now: overlaps(now, jnp.int32(0)))(frame)
+    return LoggedScenario(
         context=contexts,
         motion=motion,
         velocity=ego[last_valid, AgentColumn.VELOCITY],
         valid=valid,
         frame=frame,
-        ignored=_ignored(touching, frame.valid),
+        ignored=_ignored_agents(overlapping, frame.valid),
         along_m=_along_route(bank, index, motion[:, :2]),
         ground_m=frame.z[:, 0] - bank.height_m(index, 0) / 2,
     )
@@ -90,32 +90,32 @@ def _context(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> A
     return AgentContext(index, step, jnp.int32(0), history, jnp.zeros(2), zero, z, ())
 
 
-def _ignored(touching: Bool[Array, "T S"], valid: Bool[Array, "T S"]) -> Bool[Array, "T S"]:
-    def step(carry: tuple[Array, Array], now: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
-        (ignored, was_valid), (touches, is_valid) = carry, now
+def _ignored_agents(overlapping: Bool[Array, "T S"], valid: Bool[Array, "T S"]) -> Bool[Array, "T S"]:
+    def step(carry: tuple[Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
+        (ignored, was_valid), (touches, is_valid) = carry, inputs
         ignored = touches & (ignored | ~was_valid)
         return (ignored, is_valid), ignored
 
-    none = jnp.zeros(touching.shape[1], bool)
-    return jax.lax.scan(step, (none, none), (touching, valid))[1]
+    none = jnp.zeros(overlapping.shape[1], bool)
+    return jax.lax.scan(step, (none, none), (overlapping, valid))[1]
 
 
 def _along_route(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, "T 2"]) -> Float[Array, " T"]:
-    def step(along: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+    def step(along: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
         # Search no further than the car can have moved, as the simulator does.
-        point, moved = now
-        hit = project_on_route(bank, index, point, along, 1.5 * moved + 2.0, route=LOG_ROUTE)
-        along = jnp.maximum(along, hit.along_m)
+        point, distance = inputs
+        projection = project_on_route(bank, index, point, along, 1.5 * distance + 2.0, route=LOG_ROUTE)
+        along = jnp.maximum(along, projection.along_m)
         return along, along
 
-    moved = jnp.concatenate([jnp.zeros(1), norm(xy[1:] - xy[:-1])])
-    return jax.lax.scan(step, jnp.zeros(()), (xy, moved))[1]
+    distance = jnp.concatenate([jnp.zeros(1), norm(xy[1:] - xy[:-1])])
+    return jax.lax.scan(step, jnp.zeros(()), (xy, distance))[1]
 
 
 @partial(jax.jit, static_argnums=0)
 def score_bank(score: Any, bank: ScenarioBank) -> dict[str, Array]:
     """Apply a hashable ``(bank, log) -> {name: [T, ...]}`` to every log of a bank: ``{name: [N, T, ...]}``."""
-    return jax.vmap(lambda index: score(bank, logged(bank, index)))(jnp.arange(len(bank)))
+    return jax.vmap(lambda index: score(bank, read_log(bank, index)))(jnp.arange(len(bank)))
 
 
 def score_steps(data: ScenarioSet, score: Any, progress: Progress | None = None) -> dict[str, Numbers]:

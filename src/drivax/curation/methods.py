@@ -1,4 +1,4 @@
-"""Registered curation methods: each turns a scenario set into a score table."""
+"""Registered curation methods, which score scenario sets."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ PUBLISHED = Combination(
     {"volatility": 0.40, "interaction": 0.05, "off_road": 0.05, "lane_deviation": 0.47, "density": 0.03},
     {"volatility": "p99", "interaction": "p99", "off_road": "p99", "lane_deviation": "std", "density": "mean"},
 )  # fmt: skip
-#: The 95th percentile: the very rarest steps may be noise.
+#: The 95th percentile, because the very rarest steps may be noise.
 RARITY = Combination({"rarity": 1.0}, "p95")
 _ALL = Combination({"all": 1.0})
 #: Percentile of a set's disagreement that scores 0.5.
-_HALF = 99.0
+_SCALE_PERCENTILE = 99.0
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,7 @@ class Request:
 class Method:
     """A registered method, with its default settings (``config``; None: it has none).
 
-    From the settings, ``combination`` tells how components become scores, and ``unweighted`` names components without a
-    weight.
+    Given the settings, ``combination`` combines components into scores, and ``unweighted`` names those without weight.
     """
 
     name: str
@@ -88,7 +87,7 @@ def curate(name: str, request: Request) -> ScoreTable:
         DataError: It cannot score this set.
     """
     if name not in METHODS:
-        raise UsageError(f"there is no method {name!r}", cure=did_you_mean(name, sorted(METHODS)))
+        raise UsageError(f"unknown method {name!r}", cure=did_you_mean(name, sorted(METHODS)))
     if (request.like is not None) != (name == "random_matched"):
         problem = "random_matched needs --like, a table of the same set, and no other method takes it"
         raise UsageError(problem, cure="drivax curate random_matched --like SCORES ...")
@@ -104,7 +103,7 @@ def curate(name: str, request: Request) -> ScoreTable:
 
 
 def check_current(table: ScoreTable, config: Any = None, file: Path | None = None) -> None:
-    """Refuse a table that differs in settings from what its method would write.
+    """Check that a table has the settings that its method would write now.
 
     ``config`` are the settings of the method (None: the defaults), ``file`` is the source of the table.
 
@@ -117,9 +116,9 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
     if table.components:
         current["combination"] = asdict(method.combination(config))
     if method.config is not None:  # fields of older tables by their present names
-        own = {name: stored[name] for name in current if name in stored and name != "combination"}
-        own = plain(settings.load(type(config), json.loads(json.dumps(own))))
-        stored |= {name: own[name] for name in own if name in stored}
+        renamed = {name: stored[name] for name in current if name in stored and name != "combination"}
+        renamed = plain(settings.load(type(config), json.loads(json.dumps(renamed))))
+        stored |= {name: renamed[name] for name in renamed if name in stored}
     # Through JSON: a table that was read has lists instead of tuples.
     stored, current = (json.loads(json.dumps(values)) for values in (stored, current))
     for name, value in current.items():
@@ -129,7 +128,7 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
 
 
 def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> None:
-    """Refuse other weights or aggregators (fields of :class:`Combination`) that a method cannot apply."""
+    """Raise UsageError for weights or aggregators (fields of :class:`Combination`) that a method cannot apply."""
     default = METHODS[name].combination(config)
     replace(default, **changes).check_components({*default.weights, *METHODS[name].unweighted(config)})
 
@@ -148,7 +147,7 @@ def make_table(
     empty = np.zeros(valid.shape)
     settings = {**({} if config is None else plain(config)), **details}
     table = ScoreTable(name, settings, data.hash, ids, valid, empty, empty[:, 0], components)
-    return table.combined(METHODS[name].combination(config))
+    return table.recombine(METHODS[name].combination(config))
 
 
 def ensemble_table(
@@ -170,15 +169,15 @@ def ensemble_table(
             the ensemble was trained on and for the rest.
     """
     predictions = ensemble.predictions(data, progress)
-    valid, own = valid_steps(data), data.hash == ensemble.set_hash
-    unseen = ensemble.fold < 0 if own else np.ones(len(data), bool)
+    valid, is_training_set = valid_steps(data), data.hash == ensemble.set_hash
+    unseen = ensemble.fold < 0 if is_training_set else np.ones(len(data), bool)
     groups = [group for group in (~unseen, unseen) if group.any()]
     scales: list[Any] = [scale] * len(groups)
     if predictions.information is None:
         dimensions = predictions.disagreement(ensemble.deviation)
         total = dimensions.sum(axis=-1)
         if scale is None:
-            scales = [float(np.percentile(total[group][valid[group]], _HALF)) for group in groups]
+            scales = [float(np.percentile(total[group][valid[group]], _SCALE_PERCENTILE)) for group in groups]
         half = np.zeros((len(data), 1))
         for group, value in zip(groups, scales, strict=True):
             half[group] = np.maximum(value, np.finfo(np.float64).tiny)
@@ -187,7 +186,7 @@ def ensemble_table(
         components["disagreement"] = total / (total + half)
     else:
         components = {"information": predictions.information / math.log(ensemble.config.folds)}
-    error = predictions.error(ensemble.deviation, ensemble.fold if own else None)
+    error = predictions.error(ensemble.deviation, ensemble.fold if is_training_set else None)
     details = {"trained_on": ensemble.set_hash, "scale": scales[0] if len(scales) == 1 else scales}
     table = make_table("ensemble", ensemble.config, data, components, details)
     known = predictions.known & groups[-1][:, None]
@@ -196,7 +195,7 @@ def ensemble_table(
 
 
 def _ensemble_combination(config: EnsembleConfig) -> Combination:
-    """Score a scenario as its most uncertain second."""
+    """Score a scenario by its most uncertain second."""
     by_likelihood = config.cloning.loss == "likelihood"
     return Combination({"information" if by_likelihood else "disagreement": 1.0}, "top10")
 
@@ -255,7 +254,7 @@ def event_kinds(data: ScenarioSet) -> Int[np.ndarray, " N"]:
     return np.array([max(int(scenario.record["event_kind"][0]), 0) for scenario in data])
 
 
-def _random_matched(request: Request) -> ScoreTable:
+def _permute_like(request: Request) -> ScoreTable:
     assert request.like is not None
     return permute_scores(read_scores(request.like, request.data), request.seed)
 
@@ -269,7 +268,7 @@ _METHODS = (
     Method("action_rarity", _RARITY, KernelRarity(), lambda _: RARITY),
     Method("action_rarity_published", _RARITY_PUBLISHED, PublishedRarity(), lambda _: RARITY),
     Method("uniform", _uniform),
-    Method("random_matched", _random_matched),
+    Method("random_matched", _permute_like),
     Method("oracle", _oracle),
 )
 #: All methods by name.

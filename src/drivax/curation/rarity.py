@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from drivax.curation.kinematic import check_positive
-from drivax.curation.logged import Logged
+from drivax.curation.logged import LoggedScenario
 from drivax.errors import DataError, UsageError
 from drivax.planners.simple import expert_action
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -34,7 +34,7 @@ _SPACE = Physical()
 class ExpertActions:
     """Score function that returns the action that follows the log from every step, in the default action space."""
 
-    def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Array]:
+    def __call__(self, bank: ScenarioBank, log: LoggedScenario) -> dict[str, Array]:
         """Return ``action [T, 2]``, clipped, and ``known [T]``: ego is observed at the step and at the next two.
 
         The curvature needs the second of them.
@@ -86,9 +86,9 @@ class KernelRarity:
 
     def scores(self, actions: Actions, at: Others) -> OtherValues:
         """Return the scores of the actions ``at``, in [0, 1], by the density of ``actions``."""
-        usual = np.median(self.density(actions, actions))
+        median_density = np.median(self.density(actions, actions))
         with np.errstate(divide="ignore", over="ignore"):  # infinite where the density is 0, and clipped
-            rarity = (usual / self.density(actions, at)) ** self.temper
+            rarity = (median_density / self.density(actions, at)) ** self.temper
         return np.minimum(rarity, self.most) / self.most
 
 
@@ -141,7 +141,7 @@ def rarity_steps(
     """
     if not known.any():
         raise DataError("no log has three consecutive steps, so no action is known", cure="check the set")
-    own = np.asarray(actions[known], np.float64)
+    known_actions = np.asarray(actions[known], np.float64)
     steps = np.zeros(known.shape)
-    steps[known] = config.scores(own, own)
+    steps[known] = config.scores(known_actions, known_actions)
     return steps

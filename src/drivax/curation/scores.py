@@ -29,7 +29,7 @@ _NUMBERED = re.compile(r"(p|top)(\d+)")
 
 @dataclass(frozen=True)
 class Combination:
-    """How components become scores.
+    """Weights and aggregators that combine components into scores.
 
     Attributes:
         weights: Non-negative weight of each component; only their ratios matter.
@@ -46,22 +46,22 @@ class Combination:
             if not 0.0 <= weight < float("inf"):
                 raise UsageError(f"the weight of {name!r} is {weight}", cure="use 0 or more")
         if not any(self.weights.values()):
-            raise UsageError("no component has a weight", cure="give one a weight above 0")
+            raise UsageError("all weights are 0", cure="give a component a weight above 0")
         aggregators = {"": self.scenario} if isinstance(self.scenario, str) else self.scenario
         for name in aggregators.values():
             check_aggregator(name)
         if not isinstance(self.scenario, str):
             missing = sorted(set(self.weights) - set(self.scenario))
             if missing:
-                problem = f"there is no aggregator for {missing[0]!r}"
+                problem = f"missing aggregator for {missing[0]!r}"
                 raise UsageError(problem, cure="name one for each component")
 
     def check_components(self, available: Collection[str]) -> None:
-        """Refuse weights and aggregators of components that are not available."""
+        """Raise UsageError for weights or aggregators of components that are not available."""
         for name in (*self.weights, *(() if isinstance(self.scenario, str) else self.scenario)):
             if name not in available:
                 cure = did_you_mean(name, sorted(available))
-                raise UsageError(f"there is no component {name!r}", cure=cure)
+                raise UsageError(f"unknown component {name!r}", cure=cure)
 
     def combine(self, components: Mapping[str, Steps], valid: Valid) -> tuple[Steps, Scenarios]:
         """Return the scores of steps and of scenarios, in [0, 1].
@@ -78,13 +78,13 @@ class Combination:
         steps = np.where(valid, np.minimum(steps, 1.0), 0.0)
         if isinstance(self.scenario, str):
             return steps, aggregate(steps, valid, self.scenario)
-        each = {name: aggregate(components[name], valid, self.scenario[name]) for name in shares}
-        scenarios = sum((share * each[name] for name, share in shares.items()), np.zeros(len(steps)))
+        aggregated = {name: aggregate(components[name], valid, self.scenario[name]) for name in shares}
+        scenarios = sum((share * aggregated[name] for name, share in shares.items()), np.zeros(len(steps)))
         return steps, np.minimum(scenarios, 1.0)
 
 
 def check_aggregator(name: str) -> None:
-    """Refuse an unknown aggregator."""
+    """Raise UsageError for an unknown aggregator."""
     match = _NUMBERED.fullmatch(name)
     if match is None:
         known = name in ("max", "mean", "std")
@@ -126,7 +126,7 @@ def aggregate(steps: Steps, valid: Valid, name: str) -> Scenarios:
 SCORES_VERSION = 3
 #: File name of the scores of an exported subset, in its folder.
 OWN_SCORES = "scores.npz"
-_AGAIN = "run `drivax curate` again"
+_RERUN = "run `drivax curate` again"
 _COMPONENT = "component_"
 
 
@@ -135,7 +135,7 @@ class ScoreTable:
     """Scores of every scenario and step of a set, in the set's order.
 
     Attributes:
-        method, config: Its name and configuration; ``combination`` holds the arguments of :meth:`combined`.
+        method, config: Its name and configuration; ``combination`` holds the arguments of :meth:`recombine`.
         set_hash, scenario_ids: ``ScenarioSet.hash`` of the data, and the id of each scenario.
         valid: Whether ego is observed; other steps score 0.
         steps, scenarios: Scores, in [0, 1].
@@ -167,11 +167,11 @@ class ScoreTable:
 
     @property
     def combination(self) -> Combination:
-        """How the components became scores."""
+        """The combination of components into scores."""
         return Combination(**self.config["combination"])
 
-    def combined(self, combination: Combination) -> ScoreTable:
-        """Return the scores of another combination of the same components."""
+    def recombine(self, combination: Combination) -> ScoreTable:
+        """Return the table with another combination of the same components."""
         steps, scenarios = combination.combine(self.components, self.valid)
         config = {**self.config, "combination": asdict(combination)}
         return replace(self, config=config, steps=steps, scenarios=scenarios)
@@ -230,18 +230,18 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
             table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components)
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         problem = f"not a score table, or damaged ({type(error).__name__})"
-        raise DataError(problem, file=file, cure=_AGAIN) from error
-    _check_range(table, file, _AGAIN)
+        raise DataError(problem, file=file, cure=_RERUN) from error
+    _check_range(table, file, _RERUN)
     return table
 
 
 def _check_source(version: object, set_hash: object, file: Path, data: ScenarioSet) -> None:
     if version != SCORES_VERSION:
-        raise DataError(f"version {version}, this drivax reads {SCORES_VERSION}", file=file, cure=_AGAIN)
+        raise DataError(f"version {version}, this drivax reads {SCORES_VERSION}", file=file, cure=_RERUN)
     if set_hash != data.hash:
-        own = data.path / OWN_SCORES
+        subset_scores = data.path / OWN_SCORES
         problem = f"scores are of other data (hash {str(set_hash)[:12]}, {data.path} has {data.hash[:12]})"
-        cure = f"use {own}" if own.is_file() and own != file else _AGAIN
+        cure = f"use {subset_scores}" if subset_scores.is_file() and subset_scores != file else _RERUN
         raise DataError(problem, file=file, cure=cure)
 
 
@@ -250,12 +250,12 @@ def _check_shapes(ids: tuple[str, ...], arrays: Mapping[str, Any], file: Path, d
     shape = (len(expected), data.capacity.steps)
     shapes = {name: shape[:1] if name == "scenario_score" else shape for name in arrays}
     if ids != expected or any(values.shape != shapes[name] for name, values in arrays.items()):
-        raise DataError("does not score every scenario and step of its set", file=file, cure=_AGAIN)
+        raise DataError("does not score every scenario and step of its set", file=file, cure=_RERUN)
 
 
 def _check_range(table: ScoreTable, file: Path | None, cure: str) -> None:
     for scores in (table.steps, table.scenarios[:, None], *table.components.values()):
-        wrong = np.flatnonzero(~((scores >= 0) & (scores <= 1)).all(axis=1))
-        if wrong.size:
-            record = table.scenario_ids[int(wrong[0])]
+        invalid = np.flatnonzero(~((scores >= 0) & (scores <= 1)).all(axis=1))
+        if invalid.size:
+            record = table.scenario_ids[int(invalid[0])]
             raise DataError("has a score outside [0, 1]", file=file, record=record, cure=cure)

@@ -18,7 +18,7 @@ from drivax.stats.clusters import recordings_of
 def check_top(
     data: ScenarioSet, out: Path, count: int, overwrite: bool = False, all_windows: bool = False
 ) -> None:
-    """Refuse a subset that cannot be written, before any work is done.
+    """Check, before any work, that a subset can be written.
 
     Raises:
         UsageError: There are fewer recordings (with ``all_windows``: scenarios), ``out`` exists, or is the set itself.
@@ -51,12 +51,12 @@ def subset_of_table(table: ScoreTable, indices: Sequence[int], subset: ScenarioS
 
     ``indices`` are the scenarios of the whole set in the order of the subset.
     """
-    chosen = list(indices)
+    rows = list(indices)
     source = subset.manifest["source"]["part_of"]
     source = {name: value for name, value in source.items() if name not in ("method", "config")}
-    ids = tuple(table.scenario_ids[index] for index in chosen)
-    scores = {name: getattr(table, name)[chosen] for name in ("valid", "steps", "scenarios")}
-    components = {name: component[chosen] for name, component in table.components.items()}
+    ids = tuple(table.scenario_ids[index] for index in rows)
+    scores = {name: getattr(table, name)[rows] for name in ("valid", "steps", "scenarios")}
+    components = {name: component[rows] for name, component in table.components.items()}
     config = {**table.config, "part_of": source}
     return replace(
         table, config=config, set_hash=subset.hash, scenario_ids=ids, components=components, **scores

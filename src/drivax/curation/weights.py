@@ -18,7 +18,7 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class WeightConfig:
-    """How a score becomes a weight, over all steps of a set that can be drawn.
+    """Settings that convert scores to sampling weights, over all drawable steps of a set.
 
     For the score s of a step, or of its scenario:
 
@@ -71,14 +71,16 @@ def sampling_weights(
     """
     drawable = table.drawable if usable is None else usable
     if not drawable.any():
-        raise UsageError("there is no step that can be drawn", cure="check the set")
+        raise UsageError("no step can be drawn", cure="check the set")
     weights = np.zeros(drawable.shape)
     if scale == "step":
         weights[drawable] = _weights(table.steps[drawable], np.ones(int(drawable.sum())), config)
     else:
-        kept = drawable.any(axis=1)
-        each = _weights(table.scenarios[kept], drawable[kept].sum(axis=1).astype(np.float64), config)
-        weights[kept] = np.where(drawable[kept], each[:, None], 0.0)
+        has_steps = drawable.any(axis=1)
+        weight = _weights(
+            table.scenarios[has_steps], drawable[has_steps].sum(axis=1).astype(np.float64), config
+        )
+        weights[has_steps] = np.where(drawable[has_steps], weight[:, None], 0.0)
     if not weights.any():
         raise UsageError("every score is 0, so all weights are 0", cure="set floor, or normalise: quantile")
     return weights / weights[drawable].mean()
@@ -98,23 +100,23 @@ def _weights(
         power = np.log(score + config.floor) / config.temperature
     if not np.isfinite(power.max()):
         return np.zeros(len(score))
-    weight = _clipped(np.exp(power - power.max()), mass, config.most)
+    weight = _clip(np.exp(power - power.max()), mass, config.most)
     return (1.0 - config.uniform) * weight / np.average(weight, weights=mass) + config.uniform
 
 
-def _clipped(weight: Float[Array, " n"], mass: Float[Array, " n"], most: float) -> Float[Array, " n"]:
+def _clip(weight: Float[Array, " n"], mass: Float[Array, " n"], most: float) -> Float[Array, " n"]:
     """Clip the largest weights to ``most`` times the mean of the result."""
     order = np.argsort(-weight, kind="stable")
-    ordered, own = weight[order], mass[order]
+    ordered, ordered_mass = weight[order], mass[order]
     if ordered[0] <= most * np.average(weight, weights=mass):
         return weight
-    # With the first k, of mass m, clipped to c: c = most (m c + rest) / n, where rest is the sum of all others.
-    clipped = np.cumsum(own) - own
-    rest = np.cumsum((ordered * own)[::-1])[::-1]
-    left = mass.sum() - most * clipped
-    limit = most * rest / np.where(left > 0.0, left, np.inf)
-    enough = np.flatnonzero((left > 0.0) & (limit >= ordered) & (limit > 0.0))
-    return np.minimum(weight, limit[enough[0]] if len(enough) else ordered[ordered > 0].min())
+    # If the first k, of mass m, are clipped to c, then c = most (m c + tail) / n, with the weighted sum of all others.
+    clipped_mass = np.cumsum(ordered_mass) - ordered_mass
+    tail_sum = np.cumsum((ordered * ordered_mass)[::-1])[::-1]
+    remaining = mass.sum() - most * clipped_mass
+    limit = most * tail_sum / np.where(remaining > 0.0, remaining, np.inf)
+    feasible = np.flatnonzero((remaining > 0.0) & (limit >= ordered) & (limit > 0.0))
+    return np.minimum(weight, limit[feasible[0]] if len(feasible) else ordered[ordered > 0].min())
 
 
 @dataclass(frozen=True)
@@ -139,11 +141,11 @@ class DrawStatistics:
 def draw_statistics(weights: Float[Array, "N T"], drawable: Bool[Array, "N T"]) -> DrawStatistics:
     """Return statistics of weights over the steps that can be drawn."""
     values = weights[drawable]
-    kept = drawable.any(axis=1)
+    has_steps = drawable.any(axis=1)
     ordered = np.sort(values)[::-1]
     return DrawStatistics(
         effective=effective_size(values) / values.size,
-        effective_scenarios=effective_size(weights.sum(axis=1)[kept]) / int(kept.sum()),
+        effective_scenarios=effective_size(weights.sum(axis=1)[has_steps]) / int(has_steps.sum()),
         tilt=float(np.quantile(values, 0.99) / values.mean()),
         largest=float(ordered[0] / values.mean()),
         concentration=float(ordered[: max(round(len(values) * 0.05), 1)].sum() / values.sum()),

@@ -21,10 +21,10 @@ from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interva
 from drivax.evaluation.pairing import Pairs, Split
 from drivax.evaluation.plan import ComparisonPlan, Decision, MetricComparison, Sensitivity, decide
 from drivax.stats import effects, significance
-from drivax.stats.clusters import defined, design_effect
+from drivax.stats.clusters import design_effect, drop_undefined
 from drivax.stats.intervals import Interval, interquartile_bootstrap, paired_bootstrap, split_bootstrap
-from drivax.stats.seeds import Crossed, difference_interval, seeds_interval
-from drivax.stats.significance import Evidence
+from drivax.stats.seeds import CrossedEffect, difference_interval, seeds_interval
+from drivax.stats.significance import SignificanceResult
 
 #: Smallest difference that matters by default, as a share of the standard deviation.
 _SMALL_EFFECT = 0.1
@@ -77,7 +77,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Side:
-    """One planner: the evaluations of its seeds, and which of the common scenarios are its own."""
+    """One planner: the evaluations of its seeds, and its arm of the common scenarios."""
 
     tables: Sequence[EpisodeTable]
     pairs: Pairs
@@ -102,15 +102,15 @@ class _Side:
 
     @property
     def recordings(self) -> int:
-        return len({cluster for cluster, mine in zip(self.pairs.clusters, self.arm, strict=True) if mine})
+        return len({cluster for cluster, in_arm in zip(self.pairs.clusters, self.arm, strict=True) if in_arm})
 
-    def interval(self, plan: ComparisonPlan, metric: str, counts: Bool[np.ndarray, " n"]) -> Interval:
-        """Return mean and interval over the scenarios that count."""
+    def interval(self, plan: ComparisonPlan, metric: str, included: Bool[np.ndarray, " n"]) -> Interval:
+        """Return mean and interval over the included scenarios."""
         clusters = self.pairs.clusters
         if len(self.tables) == 1:
-            x = np.where(counts, self.values(metric), np.nan)
+            x = np.where(included, self.values(metric), np.nan)
             return interval_of(metric, x, clusters, plan.confidence, plan.seed)
-        x = np.where(counts, self.by_seed(metric), np.nan)
+        x = np.where(included, self.by_seed(metric), np.nan)
         return seeds_interval(x, clusters, confidence=plan.confidence, share=metric in SHARES)
 
     def spread(self, plan: ComparisonPlan) -> SeedSpread | None:
@@ -125,11 +125,9 @@ class _Side:
 
 
 def compare(
-    plan: ComparisonPlan,
-    a: Sequence[EpisodeTable],
-    b: Sequence[EpisodeTable],
+    plan: ComparisonPlan, a: Sequence[EpisodeTable], b: Sequence[EpisodeTable],
     entries: Sequence[Mapping[str, Any]] = (),
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare two planners by a plan, each with an evaluation per seed.
 
     Manifest ``entries`` of the scenarios are for a stratified split.
@@ -146,13 +144,15 @@ def compare(
     if plan.split != "paired" and max(len(a), len(b)) > 1:
         raise UsageError("a split takes one evaluation of A and of B", cure="compare seeds in pairs")
     split = None if plan.split == "paired" else _split(plan, pairs, entries)
-    whole = np.ones(len(pairs.keys), bool)
-    arms = (whole, whole) if split is None else (split.first, ~split.first)
+    all_scenarios = np.ones(len(pairs.keys), bool)
+    arms = (all_scenarios, all_scenarios) if split is None else (split.first, ~split.first)
     sides = _Side(a, pairs, arms[0]), _Side(b, pairs, arms[1])
-    first, *others = (_compared(plan, metric, sides, split) for metric in (plan.primary, *plan.secondary))
+    first, *others = (
+        _compare_metric(plan, metric, sides, split) for metric in (plan.primary, *plan.secondary)
+    )
     if min(first.a.n, first.b.n) == 0:
         raise pairing.undefined_metric(plan.primary, (*a, *b))
-    adjusted = significance.holm([metric.evidence.p for metric in others])
+    adjusted = significance.holm_adjust([metric.evidence.p for metric in others])
     secondary = tuple(metric.with_winner(plan, p) for metric, p in zip(others, adjusted, strict=True))
     primary = first.with_winner(plan, first.evidence.p)
     sensitivity = _sensitivity(plan, sides, split)
@@ -186,12 +186,12 @@ def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, An
         missing = next((key for key in pairs.keys if key not in known), None)
         if missing is not None:
             cure = "pass the set that was evaluated with --data"
-            raise UsageError(f"nothing tells the stratum of {missing[1]}", cure=cure)
+            raise UsageError(f"stratum of scenario {missing[1]} is unknown", cure=cure)
         strata = pairing.strata_of([known[key] for key in pairs.keys], plan.strata)
     return pairing.assign(pairs.clusters, strata, plan.ratio, plan.seed)
 
 
-def _compared(
+def _compare_metric(
     plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side], split: Split | None
 ) -> MetricComparison:
     """Compare one metric, without its winner."""
@@ -199,8 +199,8 @@ def _compared(
     x, y = (side.values(metric) for side in sides)
     undefined = [int((np.isnan(v) & side.arm).sum()) for v, side in zip((x, y), sides, strict=True)]
     draws = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
-    both = ~np.isnan(x) & ~np.isnan(y) if split is None else np.ones(x.size, bool)
-    x, y = np.where(both, x, np.nan), np.where(both, y, np.nan)
+    included = ~np.isnan(x) & ~np.isnan(y) if split is None else np.ones(x.size, bool)
+    x, y = np.where(included, x, np.nan), np.where(included, y, np.nan)
     if split is not None:
         values = np.where(split.first, x, y)
         difference = split_bootstrap(values, split.first, clusters, strata=split.strata, **draws)
@@ -211,11 +211,11 @@ def _compared(
         difference = paired_bootstrap(x, y, clusters, **draws)
         evidence = _paired_test(plan, metric, x, y, clusters)
     else:
-        difference, crossed = _of_seeds(plan, metric, sides)
+        difference, crossed = _seed_difference(plan, metric, sides)
         p, units = (None, 0) if crossed is None else (crossed.p, crossed.clusters)
-        evidence = Evidence("t", p, units, exact=False)
+        evidence = SignificanceResult("t", p, units, exact=False)
     size = {"d": effects.cohens_d(x, y)} if split else asdict(effects.cohens_d_paired(x, y))
-    a, b = (side.interval(plan, metric, both) for side in sides)
+    a, b = (side.interval(plan, metric, included) for side in sides)
     column = sides[0].tables[0].metric(metric)
     unit, better = ("", "-") if column is None else (column.unit, column.better)
     return MetricComparison(
@@ -223,9 +223,9 @@ def _compared(
     )
 
 
-def _of_seeds(
+def _seed_difference(
     plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side]
-) -> tuple[Interval, Crossed | None]:
+) -> tuple[Interval, CrossedEffect | None]:
     """Return a difference whose interval covers other seeds and other recordings."""
     x, y = (side.by_seed(metric) for side in sides)
     return difference_interval(x, y, sides[0].pairs.clusters, plan.confidence)
@@ -233,60 +233,61 @@ def _of_seeds(
 
 def _paired_test(
     plan: ComparisonPlan, metric: str, x: Values, y: Values, clusters: Sequence[str]
-) -> Evidence:
+) -> SignificanceResult:
     """Apply McNemar's test to rates in independent pairs; else the plan's test of means, by recordings."""
-    _, labels = defined(x, clusters)
+    _, labels = drop_undefined(x, clusters)
     independent = labels.size == 0 or int(labels.max()) + 1 == labels.size
-    known = np.concatenate((x, y))
-    if metric in RATES and independent and np.isin(known[~np.isnan(known)], (0.0, 1.0)).all():
-        return significance.mcnemar(x, y)
+    values = np.concatenate((x, y))
+    if metric in RATES and independent and np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
+        return significance.mcnemar_test(x, y)
     permutation = plan.test == "permutation"
     test = significance.paired_permutation if permutation else significance.paired_bootstrap_test
     return test(x, y, clusters, plan.resamples, seed=plan.seed)
 
 
 def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split | None) -> Sensitivity | None:
-    """Return what the primary metric could have shown."""
+    """Return the sensitivity of the comparison in the primary metric."""
     x, y = (side.values(plan.primary) for side in sides)
     if split is None:
-        apart, labels = defined(x - y, sides[0].pairs.clusters)
-        share, deviation = None, float(apart.std(ddof=1)) if apart.size > 1 else 0.0
+        deviations, labels = drop_undefined(x - y, sides[0].pairs.clusters)
+        share, deviation = None, float(deviations.std(ddof=1)) if deviations.size > 1 else 0.0
     else:
         residuals = np.where(split.first, x - np.nanmean(x), y - np.nanmean(y))
-        apart, labels = defined(residuals, sides[0].pairs.clusters)
+        deviations, labels = drop_undefined(residuals, sides[0].pairs.clusters)
         a, b = x[~np.isnan(x)], y[~np.isnan(y)]
-        share = a.size / apart.size
-        deviation = effects.pooled_deviation(a, b) if apart.size > 2 else 0.0
-    if apart.size < 2:
+        share = a.size / deviations.size
+        deviation = effects.pooled_deviation(a, b) if deviations.size > 2 else 0.0
+    if deviations.size < 2:
         return None
-    inflation = design_effect(apart, labels)
+    inflation = design_effect(deviations, labels)
     smallest = plan.smallest_difference or _SMALL_EFFECT * deviation
     if max(len(side.tables) for side in sides) > 1:
-        crossed = _of_seeds(plan, plan.primary, sides)[1]
-        return _sensitivity_of_seeds(plan, crossed, apart.size, deviation, inflation, smallest)
+        crossed = _seed_difference(plan, plan.primary, sides)[1]
+        return _seed_sensitivity(plan, crossed, deviations.size, deviation, inflation, smallest)
     if deviation <= effects.ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
         return None
-    effect, n = smallest / deviation, apart.size / inflation
-    seen = effects.detectable(n, plan.power, plan.confidence, share)
+    effect, n = smallest / deviation, deviations.size / inflation
+    detectable_d = effects.detectable_effect(n, plan.power, plan.confidence, share)
     return Sensitivity(
         deviation=deviation,
         design_effect=inflation,
         smallest=smallest,
         power=effects.power(effect, n, plan.confidence, share),
-        detectable=None if seen is None else seen * deviation,
+        detectable=None if detectable_d is None else detectable_d * deviation,
         needed=math.ceil(inflation * effects.scenarios_needed(effect, plan.power, plan.confidence, share)),
     )
 
 
-def _sensitivity_of_seeds(
-    plan: ComparisonPlan, effect: Crossed | None, n: int, deviation: float, inflation: float, smallest: float
-) -> Sensitivity | None:
-    """Return the sensitivity where seeds vary too, which more scenarios do not change."""
+def _seed_sensitivity(
+    plan: ComparisonPlan, effect: CrossedEffect | None, n: int, deviation: float, inflation: float,
+    smallest: float,
+) -> Sensitivity | None:  # fmt: skip
+    """Return the sensitivity of a comparison over seeds, whose variance more scenarios do not reduce."""
     if effect is None or effect.error == 0.0:
         return None
-    chance, needed = effect.power(smallest, plan.confidence), n
-    if chance < plan.power:
+    power, needed = effect.power(smallest, plan.confidence), n
+    if power < plan.power:
         clusters = replace(effect, difference=smallest).clusters_needed(plan.power, plan.confidence)
         needed = None if clusters is None else math.ceil(clusters * n / effect.clusters)
-    least = effect.detectable(plan.power, plan.confidence)
-    return Sensitivity(deviation, inflation, smallest, chance, least, needed)
+    detectable = effect.detectable(plan.power, plan.confidence)
+    return Sensitivity(deviation, inflation, smallest, power, detectable, needed)

@@ -39,11 +39,11 @@ REAR_AXLE_M = 1.461
 _DEVKIT_ORDER = (0, 3, 2, 1)
 _STOPPED_MPS, _TTC_STOPPED_MPS = 0.05, 0.005
 _AHEAD_DEG, _BEHIND_DEG = 30.0, 150.0
-_TTC_STEP_S, _TTC_HORIZON_S, _TTC_LEAST_S = 0.1, 3.0, 0.95
-_OUTSIDE_M, _OVERSPEED_MPS, _LEAST_PROGRESS_M = 0.3, 2.23, 2.0
-_AGAINST_M, _FAR_AGAINST_M, _DIRECTION_S = 2.0, 6.0, 1.0
-#: A connector that ego has just left is kept within this distance, m.
-_STILL_ON_M = 5.0
+_TTC_STEP_S, _TTC_HORIZON_S, _MIN_TTC_S = 0.1, 3.0, 0.95
+_OUTSIDE_M, _OVERSPEED_MPS, _MIN_PROGRESS_M = 0.3, 2.23, 2.0
+_WRONG_WAY_M, _FAR_WRONG_WAY_M, _DIRECTION_S = 2.0, 6.0, 1.0
+#: Largest distance to a connector that ego has just left, and is still assigned to, m.
+_MAX_EXIT_M = 5.0
 _EGO_STOPPED, _TRACK_STOPPED, _FRONT, _REAR, _LATERAL = range(5)
 
 
@@ -75,7 +75,7 @@ class EgoMotion:
 
     @cached_property
     def boxes(self) -> Float64[np.ndarray, "t 6"]:
-        """The box as ``geometry.boxes`` takes it."""
+        """The box in the format of ``geometry.boxes``."""
         return _boxes(self.xy, self.heading, np.array(self.size_m))
 
     @cached_property
@@ -216,7 +216,7 @@ class DevkitVerdict:
         collisions: First contacts.
         ttc_s: Time to collision of each sample, inf if there is none within 3 s.
         in_lane: Samples in which all corners are in one lane, or in connected ones.
-        backward_m: Farthest way against traffic within a second, at most 0.
+        backward_m: Largest distance against traffic within a second, at most 0.
         progress_m: Progress of the expert and of ego.
         comfort: Comfort in detail.
     """
@@ -251,21 +251,21 @@ def devkit_verdict(ego: EgoMotion, tracks: Tracks, road: Road, expert_xy: Points
     collisions = _collisions(ego, tracks, in_lane)
     ttc_s = _time_to_collision(ego, tracks, road, in_lane, collisions)
     driven = _route(road, ego.xy)
-    backward_m = _backward(road, driven, ego)
+    backward_m = _wrong_way_distance(road, driven, ego)
     progress_m = _progress(road, expert_xy, ego.xy)
     comfort = comfort_series(ego)
     terms = {
         "fault_score": _fault_score(collisions, tracks),
         "drivable": float(_stays_on_road(ego, road, driven)),
-        "direction": 1.0 if -backward_m < _AGAINST_M else 0.5 if -backward_m < _FAR_AGAINST_M else 0.0,
-        "ttc_ok": float(ttc_s.min() >= _TTC_LEAST_S),
+        "direction": 1.0 if -backward_m < _WRONG_WAY_M else 0.5 if -backward_m < _FAR_WRONG_WAY_M else 0.0,
+        "ttc_ok": float(ttc_s.min() >= _MIN_TTC_S),
         "progress": 1.0 if progress_m is None else _progress_ratio(*progress_m),
         "speed": _speed_compliance(road, driven, ego.speed),
         "comfortable": float(all(comfort.within.values())),
     }
     terms["making_progress"] = float(terms["progress"] >= 0.2)
-    ours = {"progress_ratio": "progress", "speed_compliance": "speed"}
-    weighted = sum(weight * terms[ours.get(name, name)] for name, weight in NUPLAN_WEIGHTS.items())
+    term_names = {"progress_ratio": "progress", "speed_compliance": "speed"}
+    weighted = sum(weight * terms[term_names.get(name, name)] for name, weight in NUPLAN_WEIGHTS.items())
     mean = weighted / sum(NUPLAN_WEIGHTS.values())
     gates = ("fault_score", "drivable", "direction", "making_progress")
     return DevkitVerdict(
@@ -284,19 +284,19 @@ def comfort_series(ego: EgoMotion) -> Comfort:
     samples = len(ego.heading)
     along = ego.acceleration + ego.rear_axle_m * (ego.yaw_rate**2 + ego.yaw_acceleration)
 
-    def filtered(values: Float64[np.ndarray, " t"], window: tuple[int, int, int]) -> Any:
+    def apply_filter(values: Float64[np.ndarray, " t"], window: tuple[int, int, int]) -> Any:
         width, order, derivative = window
         matrix = savgol_matrix(samples, min(width, samples), order, derivative)
         return np.round(matrix @ values / ego.dt_s**derivative, 8)
 
-    heading, smooth = np.unwrap(ego.heading), filtered(along, SMOOTH)
+    heading, smooth = np.unwrap(ego.heading), apply_filter(along, SMOOTH)
     series = {
         "lon": smooth,
         "lat": np.zeros(samples),
-        "lonjerk": filtered(smooth, JERK),
-        "jerk": filtered(filtered(np.abs(ego.acceleration), SMOOTH), JERK),
-        "yaw": filtered(heading, YAW_RATE),
-        "yawacc": filtered(heading, YAW_ACCELERATION),
+        "lonjerk": apply_filter(smooth, JERK),
+        "jerk": apply_filter(apply_filter(np.abs(ego.acceleration), SMOOTH), JERK),
+        "yaw": apply_filter(heading, YAW_RATE),
+        "yawacc": apply_filter(heading, YAW_ACCELERATION),
     }
     limits = (LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS2)
     bounds = (LONGITUDINAL_MPS2, *((-limit, limit) for limit in limits))
@@ -334,7 +334,7 @@ def _in_one_lane(ego: EgoMotion, road: Road) -> Bool[np.ndarray, " t"]:
         lanes: list[set[int]] = []
         for corner in by_corner:
             known = _candidates(road, corner, candidates)
-            lanes.append(known or _current(road, corner))
+            lanes.append(known or _current_objects(road, corner))
             # As in the devkit: only in the second sample a corner's lanes become candidates of the next corners.
             candidates |= lanes[-1] if sample == 1 and not known else set()
         result[sample] = all(lanes) and _common_or_connected(road, lanes)
@@ -342,7 +342,7 @@ def _in_one_lane(ego: EgoMotion, road: Road) -> Bool[np.ndarray, " t"]:
     return result
 
 
-def _current(road: Road, inside: Bool[np.ndarray, " o"]) -> set[int]:
+def _current_objects(road: Road, inside: Bool[np.ndarray, " o"]) -> set[int]:
     """Return the lane of a point, else the connectors (``get_current_route_objects``)."""
     containing = np.flatnonzero(inside).tolist()
     lanes = [index for index in containing if not road.objects[index].connector]
@@ -353,8 +353,8 @@ def _candidates(road: Road, inside: Bool[np.ndarray, " o"], candidates: set[int]
     """Return the candidates that contain a point, or those that follow a single one."""
     matching = {index for index in candidates if inside[index]}
     if not matching and len(candidates) == 1:
-        (only,) = candidates
-        matching = {index for index in road.objects[only].successors if inside[index]}
+        (candidate,) = candidates
+        matching = {index for index in road.objects[candidate].successors if inside[index]}
     return matching
 
 
@@ -400,7 +400,7 @@ def _collisions(ego: EgoMotion, tracks: Tracks, in_lane: Bool[np.ndarray, " t"])
 
 
 def _fault_score(collisions: Sequence[Collision], tracks: Tracks) -> float:
-    """Return 1 - n/2 for n static objects hit at fault, 0 after a fault with a road user."""
+    """Return 1 - n/2 for n at-fault collisions with static objects, 0 after one with a road user."""
     static = [
         tracks.kind[each.agent] in (AgentKind.STATIC, AgentKind.OTHER) for each in collisions if each.at_fault
     ]
@@ -408,54 +408,53 @@ def _fault_score(collisions: Sequence[Collision], tracks: Tracks) -> float:
 
 
 def _time_to_collision(
-    ego: EgoMotion,
-    tracks: Tracks,
-    road: Road,
-    in_lane: Bool[np.ndarray, " t"],
+    ego: EgoMotion, tracks: Tracks, road: Road, in_lane: Bool[np.ndarray, " t"],
     collisions: Sequence[Collision],
-) -> Float64[np.ndarray, " t"]:
+) -> Float64[np.ndarray, " t"]:  # fmt: skip
     """Return the time to collision of every sample at constant velocities (``time_to_collision_within_bound``)."""
     times = np.full(len(ego.xy), np.inf)
     faults = {each.sample for each in collisions if each.at_fault}
-    hit = np.full(len(tracks.kind), len(ego.xy))
+    first_contact = np.full(len(tracks.kind), len(ego.xy))
     for each in collisions:
-        hit[each.agent] = each.sample
-    everywhere = ~in_lane | road.intersection(ego.rear_axle)
+        first_contact[each.agent] = each.sample
+    any_direction = ~in_lane | road.intersection(ego.rear_axle)
     ahead_s = np.arange(_TTC_STEP_S, _TTC_HORIZON_S, _TTC_STEP_S)
     for sample in range(len(ego.xy)):
         if sample in faults:
             times[sample] = 0.0
         elif abs(ego.speed[sample]) > _TTC_STOPPED_MPS:
             angle = _angle_deg(ego.rear_axle[sample], ego.heading[sample], tracks.xy[sample])
-            relevant = (angle < _AHEAD_DEG) | (everywhere[sample] & (angle <= _BEHIND_DEG))
-            agents = np.flatnonzero(relevant & tracks.present[sample] & (hit > sample))
-            own = _swept(ego.corners[sample], ego.heading[sample], abs(ego.speed[sample]), ahead_s)
-            others = _swept(
+            relevant = (angle < _AHEAD_DEG) | (any_direction[sample] & (angle <= _BEHIND_DEG))
+            agents = np.flatnonzero(relevant & tracks.present[sample] & (first_contact > sample))
+            ego_boxes = _sweep(ego.corners[sample], ego.heading[sample], abs(ego.speed[sample]), ahead_s)
+            others = _sweep(
                 tracks.corners[sample, agents],
                 tracks.heading[sample, agents],
                 tracks.speed[sample, agents],
                 ahead_s,
             )
-            meets = (
-                shapely.intersects(own, others).any(axis=0) if len(agents) else np.zeros(len(ahead_s), bool)
+            overlaps = (
+                shapely.intersects(ego_boxes, others).any(axis=0)
+                if len(agents)
+                else np.zeros(len(ahead_s), bool)
             )
-            if meets.any():
-                times[sample] = ahead_s[meets.argmax()]
+            if overlaps.any():
+                times[sample] = ahead_s[overlaps.argmax()]
     return times
 
 
-def _swept(
+def _sweep(
     boxes: Float64[np.ndarray, "*a 4 2"], heading: Any, speed: Any, times: Float64[np.ndarray, " k"]
 ) -> Any:
     """Return the boxes moved along their headings to every time."""
-    way = _directions(heading) * np.asarray(speed)[..., None]
-    return shapely.polygons(boxes[..., None, :, :] + times[:, None, None] * way[..., None, None, :])
+    direction = _directions(heading) * np.asarray(speed)[..., None]
+    return shapely.polygons(boxes[..., None, :, :] + times[:, None, None] * direction[..., None, None, :])
 
 
 def _stays_on_road(ego: EgoMotion, road: Road, driven: Sequence[Sequence[int]]) -> bool:
-    """Return whether no corner is 0.3 m or more outside (``drivable_area_compliance``).
+    """Return whether all corners are less than 0.3 m outside (``drivable_area_compliance``).
 
-    Corners in a lane are inside, and so are those within 0.3 m of the lanes of ego's centre.
+    Corners in a lane, or within 0.3 m of a lane of ego's centre, count as inside.
     """
     for sample, corner in np.argwhere(road.outside_m(ego) >= _OUTSIDE_M):
         if road.containing(ego.corners[sample, corner][None]).any():
@@ -469,93 +468,93 @@ def _stays_on_road(ego: EgoMotion, road: Road, driven: Sequence[Sequence[int]]) 
 
 def _route(road: Road, points: Points) -> list[list[int]]:
     """Return the lane or the connectors of each point, with its history (``get_route``)."""
-    inside, crossing = road.containing(points), road.intersection(points)
+    containing, crossing = road.containing(points), road.intersection(points)
     route: list[list[int]] = []
     current: list[int] = []
-    for sample, here in enumerate(inside):
-        current = sorted(_candidates(road, here, set(current))) if current else []
+    for sample, inside_objects in enumerate(containing):
+        current = sorted(_candidates(road, inside_objects, set(current))) if current else []
         if not current:
-            current = sorted(_current(road, here))
+            current = sorted(_current_objects(road, inside_objects))
             connects = bool(current) and road.objects[current[0]].connector
             last = route[-1] if sample > 1 else []
             if last and road.objects[last[0]].connector and (connects or (not current and crossing[sample])):
                 point = shapely.points(points[sample])
-                near = [n for n in last if shapely.distance(road.objects[n].polygon, point) < _STILL_ON_M]
+                near = [n for n in last if shapely.distance(road.objects[n].polygon, point) < _MAX_EXIT_M]
                 current = near or current
         route.append(current)
-    return _without_extra_connectors(road, route)
+    return _drop_extra_connectors(road, route)
 
 
-def _without_extra_connectors(road: Road, route: list[list[int]]) -> list[list[int]]:
-    """Where several connectors overlap, keep those by which the route goes on."""
+def _drop_extra_connectors(road: Road, route: list[list[int]]) -> list[list[int]]:
+    """Keep, of overlapping connectors, those that the route continues on."""
     result = list(route)
     for sample in range(len(result) - 2, -1, -1):
-        here, after = result[sample], result[sample + 1]
-        if len(here) <= 1:
+        objects, next_objects = result[sample], result[sample + 1]
+        if len(objects) <= 1:
             continue
-        if len(here) > len(after) and set(after) <= set(here):
-            result[sample] = after
-        if after and not road.objects[after[0]].connector:
-            entering = [index for index in here if index in road.objects[after[0]].predecessors]
-            result[sample] = entering or result[sample]
+        if len(objects) > len(next_objects) and set(next_objects) <= set(objects):
+            result[sample] = next_objects
+        if next_objects and not road.objects[next_objects[0]].connector:
+            connecting = [index for index in objects if index in road.objects[next_objects[0]].predecessors]
+            result[sample] = connecting or result[sample]
     return result
 
 
-def _backward(road: Road, driven: Sequence[Sequence[int]], ego: EgoMotion) -> float:
-    """Return the farthest way against traffic within a second (``driving_direction_compliance``), at most 0."""
+def _wrong_way_distance(road: Road, driven: Sequence[Sequence[int]], ego: EgoMotion) -> float:
+    """Return the largest distance against traffic within a second (``driving_direction_compliance``), at most 0."""
     progress = np.zeros(len(ego.xy))
-    last, before = (driven[0][0] if driven[0] else None), None
-    for sample, here in enumerate(driven):
-        if not here:
+    last_object, last_position = (driven[0][0] if driven[0] else None), None
+    for sample, objects in enumerate(driven):
+        if not objects:
             continue
-        if here[0] == last:
-            at = _along(road.objects[here[0]].line, ego.xy[sample])
+        if objects[0] == last_object:
+            position = _locate(road.objects[objects[0]].line, ego.xy[sample])
             # As in the devkit: a position at the very start of a line counts as no progress.
-            progress[sample] = at - before if before is not None and at else 0.0
-            before = at
+            progress[sample] = position - last_position if last_position is not None and position else 0.0
+            last_position = position
         else:
-            last, before = here[0], None
+            last_object, last_position = objects[0], None
     samples = round(_DIRECTION_S / ego.dt_s)
     sums = [progress[max(0, end - samples) : end + 1].sum() for end in range(len(progress))]
     return -abs(float(min(sums)))
 
 
-def _along(line: Any, point: Float64[np.ndarray, " 2"]) -> float:
+def _locate(line: Any, point: Float64[np.ndarray, " 2"]) -> float:
     return float(shapely.line_locate_point(line, shapely.points(point)))
 
 
 def _progress(road: Road, expert_xy: Points, ego_xy: Points) -> tuple[float, float] | None:
     """Return the progress of expert and ego along the expert's roadblocks; None without a route."""
-    pairs: list[tuple[int, Any]] = []
-    for here in _route(road, expert_xy):
-        if here and (not pairs or road.objects[here[0]].block != pairs[-1][0]):
-            pairs.append((road.objects[here[0]].block, road.objects[here[0]].line))
-    if not pairs:
+    blocks: list[tuple[int, Any]] = []
+    for objects in _route(road, expert_xy):
+        if objects and (not blocks or road.objects[objects[0]].block != blocks[-1][0]):
+            blocks.append((road.objects[objects[0]].block, road.objects[objects[0]].line))
+    if not blocks:
         return None
-    return _block_progress(road, pairs, expert_xy), _block_progress(road, pairs, ego_xy)
+    return _block_progress(road, blocks, expert_xy), _block_progress(road, blocks, ego_xy)
 
 
 def _block_progress(road: Road, pairs: Sequence[tuple[int, Any]], points: Points) -> float:
-    """Return the way along the base lines of a chain of roadblocks (``ego_progress_along_expert_route``)."""
-    at, total = 0, 0.0
-    before = _along(pairs[0][1], points[0])
+    """Return the progress along the base lines of a chain of roadblocks (``ego_progress_along_expert_route``)."""
+    index, total = 0, 0.0
+    last_m = _locate(pairs[0][1], points[0])
     for x, y in points[1:]:
-        ahead = at
+        after = index
         skipped = 0.0
-        while ahead < len(pairs) and not shapely.contains_xy(road.blocks[pairs[ahead][0]], x, y):
-            ahead += 1
-            if at + 1 < ahead < len(pairs):
-                line, previous, following = (pairs[index][1] for index in (ahead - 1, ahead - 2, ahead))
-                skipped += _along(line, _end(following, 0)) - _along(line, _end(previous, -1))
-        if ahead == len(pairs):
+        while after < len(pairs) and not shapely.contains_xy(road.blocks[pairs[after][0]], x, y):
+            after += 1
+            if index + 1 < after < len(pairs):
+                line, previous, following = (pairs[number][1] for number in (after - 1, after - 2, after))
+                skipped += _locate(line, _end(following, 0)) - _locate(line, _end(previous, -1))
+        if after == len(pairs):
             continue
-        here = _along(pairs[ahead][1], np.array([x, y]))
-        if ahead == at:
-            total += here - before
+        here_m = _locate(pairs[after][1], np.array([x, y]))
+        if after == index:
+            total += here_m - last_m
         else:
-            left_m = shapely.length(pairs[at][1]) - before
-            total += left_m + skipped + here - _along(pairs[ahead][1], _end(pairs[at][1], -1))
-        at, before = ahead, here
+            rest_m = shapely.length(pairs[index][1]) - last_m
+            total += rest_m + skipped + here_m - _locate(pairs[after][1], _end(pairs[index][1], -1))
+        index, last_m = after, here_m
     return float(total)
 
 
@@ -564,9 +563,9 @@ def _end(line: Any, index: int) -> Float64[np.ndarray, " 2"]:
 
 
 def _progress_ratio(expert_m: float, ego_m: float) -> float:
-    if ego_m < -_LEAST_PROGRESS_M:
+    if ego_m < -_MIN_PROGRESS_M:
         return 0.0
-    return min(1.0, max(ego_m, _LEAST_PROGRESS_M) / max(expert_m, _LEAST_PROGRESS_M))
+    return min(1.0, max(ego_m, _MIN_PROGRESS_M) / max(expert_m, _MIN_PROGRESS_M))
 
 
 def _speed_compliance(road: Road, driven: Sequence[Sequence[int]], speed: Float64[np.ndarray, " t"]) -> float:
@@ -575,12 +574,12 @@ def _speed_compliance(road: Road, driven: Sequence[Sequence[int]], speed: Float6
     A connector has the highest limit of the lanes that it joins; samples without a lane, or where a limit is unknown,
     count as 0.
     """
-    over = np.zeros(len(speed))
-    for sample, here in enumerate(driven):
-        lanes = [road.objects[index] for index in here]
+    speeding = np.zeros(len(speed))
+    for sample, objects in enumerate(driven):
+        lanes = [road.objects[index] for index in objects]
         if lanes and lanes[0].connector:
             lanes = [road.objects[n] for each in lanes for n in (*each.successors, *each.predecessors)]
         limits = [lane.limit_mps for lane in lanes]
         if limits and all(limits):
-            over[sample] = max(0.0, speed[sample] - max(limit for limit in limits if limit))
-    return max(0.0, 1.0 - over.sum() / (_OVERSPEED_MPS * max(len(speed) - 1, 1)))
+            speeding[sample] = max(0.0, speed[sample] - max(limit for limit in limits if limit))
+    return max(0.0, 1.0 - speeding.sum() / (_OVERSPEED_MPS * max(len(speed) - 1, 1)))

@@ -41,7 +41,7 @@ SHARES = names_of(_COLUMNS, "rate", "score")
 NOT_SUMMARISED = tuple(name for name, column in _COLUMNS.items() if not column.summarised)
 #: Columns that are 0 in an episode in which the planner crashed.
 FAILED = tuple(name for name, column in _COLUMNS.items() if column.fails_on_crash)
-#: What to do about a damaged run folder.
+#: Cure for a damaged run folder.
 _RERUN = "run drivax evaluate again"
 
 Array = np.ndarray[Any, Any]
@@ -106,7 +106,7 @@ class EpisodeTable:
 
     @classmethod
     def read(cls, path: str | Path) -> EpisodeTable:
-        """Read the episodes of a run folder that ``drivax evaluate`` wrote; trajectories follow when asked for.
+        """Read the episodes of a run folder of ``drivax evaluate``; trajectories are read on first access.
 
         Raises:
             DataError: The folder or a file is missing or damaged, or the run is not an evaluation.
@@ -125,10 +125,10 @@ class EpisodeTable:
     def read_seeds(cls, path: str | Path) -> tuple[EpisodeTable, ...]:
         """Read the evaluation in a folder, or those in its sub-folders: one per training seed, ordered by name."""
         path = Path(path)
-        inside = sorted(file.parent for file in path.glob("*/episodes.csv"))
-        if (path / "run.json").is_file() or not inside:
+        folders = sorted(file.parent for file in path.glob("*/episodes.csv"))
+        if (path / "run.json").is_file() or not folders:
             return (cls.read(path),)
-        return tuple(cls.read(folder) for folder in inside)
+        return tuple(cls.read(folder) for folder in folders)
 
     @property
     def planner(self) -> str:
@@ -145,7 +145,9 @@ class EpisodeTable:
         """Unit, direction and text of user-defined metrics."""
         info = (self.info.get("own_metrics") or {}).items()
         texts = {name: [str(metric[key]) for key in ("unit", "better", "text")] for name, metric in info}
-        return {name: Column(unit, cast(Direction, way), text) for name, (unit, way, text) in texts.items()}
+        return {
+            name: Column(unit, cast(Direction, better), text) for name, (unit, better, text) in texts.items()
+        }
 
     @property
     def data(self) -> Mapping[str, Any]:
@@ -203,11 +205,11 @@ class EpisodeTable:
     def summary(self) -> dict[str, Any]:
         """Return mean and 95 % interval of every metric (:func:`interval_of`), the content of ``summary.json``.
 
-        A metric that is defined nowhere has mean null and n 0.
+        A metric without any defined value has mean null and n 0.
         """
         clusters = np.array(self.clusters)
-        shown = {name: values for name, values in self.metrics.items() if name not in NOT_SUMMARISED}
-        table = {name: interval_of(name, values, clusters).as_dict() for name, values in shown.items()}
+        summarised = {name: values for name, values in self.metrics.items() if name not in NOT_SUMMARISED}
+        table = {name: interval_of(name, values, clusters).as_dict() for name, values in summarised.items()}
         return {"planner": self.planner, "traffic": self.traffic, "metrics": table}
 
     def rows(self) -> list[dict[str, str]]:
@@ -228,16 +230,16 @@ class EpisodeTable:
             writer = csv.DictWriter(file, [*KEYS, *self.metrics], lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows())
-        driven = self.trajectories
-        arrays = {f"{name}_step": driven.events[name].astype(np.int16) for name in EVENTS}
-        arrays |= {} if driven.others is None else {"others": driven.others}
+        trajectories = self.trajectories
+        arrays = {f"{name}_step": trajectories.events[name].astype(np.int16) for name in EVENTS}
+        arrays |= {} if trajectories.others is None else {"others": trajectories.others}
         np.savez_compressed(
             folder / "trajectories.npz",
             allow_pickle=False,
             scenario_id=np.array(self.keys["scenario_id"]),
-            ego=driven.ego.astype(np.float32),
-            action=driven.action.astype(np.float16),
-            start=driven.start.astype(np.int32),
+            ego=trajectories.ego.astype(np.float32),
+            action=trajectories.action.astype(np.float16),
+            start=trajectories.start.astype(np.int32),
             **arrays,
         )
 
@@ -250,7 +252,7 @@ class EpisodeTable:
         run_path = self.data.get("path")
         if data is None and run_path is None:
             file = None if self.folder is None else self.folder / "run.json"
-            raise DataError("names no scenario set", file=file, cure="pass it with --data SET")
+            raise DataError("no scenario set recorded", file=file, cure="pass it with --data SET")
         path = data if data is not None else Path(str(run_path))
         if data is None and not path.exists():
             cure = "pass its new path with --data SET"
@@ -266,14 +268,14 @@ class EpisodeTable:
 def fail_crashed(metrics: Mapping[str, Array], crashed: Any) -> dict[str, Array]:
     """Set the metrics :data:`FAILED` of crashed episodes to 0 where defined, and add the column ``crashed``.
 
-    So crashing never improves a score. All other metrics are as measured until the crash; user-defined ones come last.
+    A crash thus never improves a score. Other metrics cover the steps before the crash; user-defined ones come last.
     """
     values = {
         name: np.where(crashed & ~np.isnan(column), 0.0, column) if name in FAILED else column
         for name, column in metrics.items()
     }
-    ours = {name: column for name, column in values.items() if name in METRICS}
-    return ours | {"crashed": np.asarray(crashed, np.float64)} | values
+    built_in = {name: column for name, column in values.items() if name in METRICS}
+    return built_in | {"crashed": np.asarray(crashed, np.float64)} | values
 
 
 def interval_of(name: str, values: Any, clusters: Any, confidence: float = 0.95, seed: int = 0) -> Interval:
@@ -309,7 +311,7 @@ def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Arr
 
 
 def _read_metric(path: Path, name: str, cells: Sequence[str]) -> Array:
-    """A metric's cells as float64; an empty cell is NaN (undefined), any other must be finite."""
+    """Parse the cells of a metric as float64; empty cells are NaN (undefined), all others must be finite."""
     values = np.full(len(cells), np.nan)
     for row, cell in enumerate(cells):
         if not cell.strip():
@@ -357,9 +359,9 @@ def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: boo
         others.ndim != 4 or others.shape[:2] != ego.shape[:2] or others.shape[3] != 3 or others.dtype != np.int16
     )):  # fmt: skip
         raise DataError("its arrays disagree in shape", file=path, cure=_RERUN)
-    row_of = {key: row for row, key in enumerate(_numbered(ids))}
+    row_of = {key: row for row, key in enumerate(_with_occurrence(ids))}
     try:
-        rows = [row_of[key] for key in _numbered(scenario_ids)]
+        rows = [row_of[key] for key in _with_occurrence(scenario_ids)]
     except KeyError as error:
         raise DataError("lacks an episode", file=path, record=error.args[0][0], cure=_RERUN) from None
     order = slice(None) if rows == list(range(n)) else rows
@@ -369,10 +371,10 @@ def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: boo
     )
 
 
-def _numbered(ids: Sequence[str]) -> list[tuple[str, int]]:
+def _with_occurrence(ids: Sequence[str]) -> list[tuple[str, int]]:
     """Return each id with the number of its earlier occurrences."""
-    seen: dict[str, Iterator[int]] = defaultdict(count)
-    return [(name, next(seen[name])) for name in ids]
+    counters: dict[str, Iterator[int]] = defaultdict(count)
+    return [(name, next(counters[name])) for name in ids]
 
 
 def _text(value: Any) -> str:

@@ -12,7 +12,7 @@ import jax
 
 from drivax.errors import DrivaxError
 
-#: Scenarios loaded at a time at most, whatever the memory; their bank then takes about 6 GB.
+#: Maximum number of scenarios loaded at a time; their bank takes about 6 GB.
 MOST = 10_000
 #: Bytes that a program may need per scenario; PDM-Closed needs half (docs/log/2026-11-22-evaluation.md).
 _PROGRAM_BYTES = 8_000_000

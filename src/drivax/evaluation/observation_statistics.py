@@ -1,4 +1,4 @@
-"""Statistics of the features of an observation, and which of them matter: for failures, and to a policy.
+"""Statistics of observation features, their correlation with collisions, and their importance to a policy.
 
 States of closed-loop episodes are sampled ``every`` steps. Of each column of each group: mean, standard deviation and
 extremes over all valid rows, entries that are not finite, correlation with collisions, and importance to the planner.
@@ -35,8 +35,8 @@ Values = np.ndarray[Any, Any]
 
 
 @record
-class Looks:
-    """Sampled states of episodes, ``[episode, look]``, with the planner's carry, random key and observation.
+class SampledStates:
+    """Sampled states of episodes, ``[episode, sample]``, with the planner's carry, random key and observation.
 
     ``hit``: ego has collided by then; ``collides``: it collides before the end of the log, ``[episode]``.
     """
@@ -45,7 +45,7 @@ class Looks:
     carry: Any
     key: Array
     observation: dict[str, Array]
-    hit: Bool[Array, "*batch look"]
+    hit: Bool[Array, "*batch sample"]
     collides: Bool[Array, "*batch"]
 
 
@@ -101,8 +101,8 @@ class ObservationStatistics:
         """Return plain values for JSON; null where undefined."""
         names = ("planner", "episodes", "collisions", "states", "permuted")
         features = [_plain(asdict(feature)) for feature in self.features]
-        about = {name: getattr(self, name) for name in names}
-        return about | {"groups": _plain(self.groups), "features": features}
+        summary = {name: getattr(self, name) for name in names}
+        return summary | {"groups": _plain(self.groups), "features": features}
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -116,7 +116,7 @@ def observation_statistics(
     planner: Planner, bank: ScenarioBank, task: Task, *, permute: bool, traffic: Traffic | None = None,
     every: int = EVERY, seed: int = 0,
 ) -> ObservationStatistics:  # fmt: skip
-    """Drive every scenario of a bank from its current step to the end, and describe the observations.
+    """Drive every scenario of a bank from its current step to the end, and summarise the observations.
 
     Args:
         planner: The planner; ``expert`` for the log itself.
@@ -133,17 +133,17 @@ def observation_statistics(
     check_actions(planner, task)
     traffic = traffic or LogTraffic()
     simulator, bank = Simulator(evaluation_task(task), traffic), prepare_bank(traffic, bank)
-    looks = look_at(simulator, planner, bank, every, seed)
-    seen = {name: np.asarray(leaf) for name, leaf in looks.observation.items()}
-    hit, collides = np.asarray(looks.hit), np.asarray(looks.collides)
+    samples = sample_states(simulator, planner, bank, every, seed)
+    observations = {name: np.asarray(leaf) for name, leaf in samples.observation.items()}
+    hit, collides = np.asarray(samples.hit), np.asarray(samples.collides)
     columns, groups, permuted = {}, {}, 0
     if permute:
         rows = np.unique(np.linspace(0, hit.size - 1, min(PERMUTED, hit.size)).round().astype(int))
-        known, permuted = (looks.state, looks.carry, looks.key, looks.observation), len(rows)
-        *rest, shown = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], known)
+        states, permuted = (samples.state, samples.carry, samples.key, samples.observation), len(rows)
+        *rest, inputs = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], states)
         act = partial(_actions, simulator, planner, bank, *rest)
-        columns, groups = importances(act, jax.device_get(shown), seed)
-    features = column_statistics(task.observation.features, seen, hit, collides, columns)
+        columns, groups = importances(act, jax.device_get(inputs), seed)
+    features = column_statistics(task.observation.features, observations, hit, collides, columns)
     return ObservationStatistics(
         planner.name, len(collides), int(collides.sum()), hit.size, permuted, features, groups
     )
@@ -153,7 +153,7 @@ def column_statistics(
     features: Features, observation: Mapping[str, Values], hit: Values, collides: Values,
     importance: Mapping[tuple[str, int], float],
 ) -> tuple[FeatureStatistics, ...]:  # fmt: skip
-    """Return statistics of every column of observations ``[episode, look, ...]`` by group; see :class:`Looks`.
+    """Return statistics of every column of :class:`SampledStates` observations ``[episode, sample, ...]``, by group.
 
     ``importance`` has permuted columns by group and number.
     """
@@ -165,55 +165,57 @@ def column_statistics(
             valid = observation.get(f"{group}_mask", np.ones(values.shape, bool))
             before = valid & ~hit.reshape(*hit.shape, *(1,) * (valid.ndim - hit.ndim))
             correlation = collision_correlation(values, before, collides)
-            last = importance.get((group, column), math.nan)
-            statistics.append(FeatureStatistics(group, name, *_moments(values, valid), correlation, last))
+            change = importance.get((group, column), math.nan)
+            statistics.append(FeatureStatistics(group, name, *_moments(values, valid), correlation, change))
     return tuple(statistics)
 
 
-def look_at(simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0) -> Looks:
+def sample_states(
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0
+) -> SampledStates:
     """Return sampled states of one episode per scenario; the episodes are those of an evaluation with this seed."""
     batches, size = [], min(BATCH, len(bank))
     for first in range(0, len(bank), BATCH):
         rows = np.arange(first, min(first + BATCH, len(bank)))
-        # A short last batch repeats its last scenario, so that one compilation serves all.
+        # Pad the last batch with its last scenario, so that all batches share one compilation.
         index = jnp.asarray(np.pad(rows, (0, size - len(rows)), mode="edge"), jnp.int32)
-        looks = _looks(simulator, planner, bank, index, episode_keys(bank, index, seed), every)
-        kept = len(rows)
-        batches.append(jax.tree.map(lambda leaf, kept=kept: leaf[:kept], looks))
+        samples = _sample_batch(simulator, planner, bank, index, episode_keys(bank, index, seed), every)
+        count = len(rows)
+        batches.append(jax.tree.map(lambda leaf, count=count: leaf[:count], samples))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
 
 
 @partial(jax.jit, static_argnames=("simulator", "every"))
-def _looks(
+def _sample_batch(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, index: Int[Array, " B"], keys: Array, every: int
-) -> Looks:  # fmt: skip
+) -> SampledStates:  # fmt: skip
     return jax.vmap(partial(_episode, simulator, planner, bank, every))(index, keys)
 
 
 def _episode(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, index: Array, key: Array
-) -> Looks:
+) -> SampledStates:
     state = simulator.reset(bank, index)
     begin_key, key = jax.random.split(key)
     carry = planner.init(bank, state, begin_key)
-    actions = bank.steps - 1 - CURRENT_STEP
-    keys = jax.random.split(key, actions)
+    steps = bank.steps - 1 - CURRENT_STEP
+    keys = jax.random.split(key, steps)
 
-    def step(now: Any, key: Array) -> tuple[Any, None]:
-        state, carry, hit = now
+    def step(loop_state: Any, key: Array) -> tuple[Any, None]:
+        state, carry, hit = loop_state
         state, carry, _ = advance(simulator, planner, bank, state, carry, key)
         return (state, carry, hit | state.facts.collision), None
 
-    def look(now: Any, keys: Array) -> tuple[Any, Any]:
-        state, carry, hit = now
-        seen = state, carry, keys[0], dict(simulator.observe(bank, state.context)), hit
-        return jax.lax.scan(step, now, keys)[0], seen
+    def sample(loop_state: Any, keys: Array) -> tuple[Any, Any]:
+        state, carry, hit = loop_state
+        samples = state, carry, keys[0], dict(simulator.observe(bank, state.context)), hit
+        return jax.lax.scan(step, loop_state, keys)[0], samples
 
-    whole = actions - actions % every
+    sampled_steps = steps - steps % every
     first = (state, carry, state.facts.collision)
-    now, seen = jax.lax.scan(look, first, keys[:whole].reshape(-1, every))
-    (_, _, hit), _ = jax.lax.scan(step, now, keys[whole:])
-    return Looks(*seen, collides=hit)
+    loop_state, samples = jax.lax.scan(sample, first, keys[:sampled_steps].reshape(-1, every))
+    (_, _, hit), _ = jax.lax.scan(step, loop_state, keys[sampled_steps:])
+    return SampledStates(*samples, collides=hit)
 
 
 @partial(jax.jit, static_argnames=("simulator",))
@@ -232,25 +234,25 @@ def _actions(
 def _moments(values: Values, valid: Values) -> tuple[int, int, float, float, float, float]:
     """Return count, broken, mean, std, low and high of :class:`FeatureStatistics`."""
     finite = np.isfinite(values)
-    kept, broken = values[valid & finite].astype(np.float64), int((~finite).sum())
-    if not kept.size:
+    x, broken = values[valid & finite].astype(np.float64), int((~finite).sum())
+    if not x.size:
         return 0, broken, math.nan, math.nan, math.nan, math.nan
-    return kept.size, broken, float(kept.mean()), float(kept.std()), float(kept.min()), float(kept.max())
+    return (x.size, broken, float(x.mean()), float(x.std()), float(x.min()), float(x.max()))
 
 
 def collision_correlation(values: Values, valid: Values, collides: Values) -> float:
     """Return the point-biserial correlation of a column with collisions, over episodes (Tate 1954).
 
-    Pearson's r of the column's mean over its valid entries ``[episode, look, ...]`` and whether the episode has a
+    Pearson's r of the column's mean over its valid entries ``[episode, sample, ...]`` and whether the episode has a
     collision (1) or none (0). Episodes without valid entries are left out; NaN where all episodes are of one kind or
     have the same mean.
     """
     counts = (valid & np.isfinite(values)).reshape(len(values), -1)
     total = np.where(counts, values.reshape(len(values), -1), 0.0).sum(axis=1, dtype=np.float64)
-    there = counts.any(axis=1)
-    mean = total[there] / counts.sum(axis=1)[there]
-    outcome = collides[there].astype(np.float64)
-    # A column that is constant but for rounding correlates with nothing.
+    has_values = counts.any(axis=1)
+    mean = total[has_values] / counts.sum(axis=1)[has_values]
+    outcome = collides[has_values].astype(np.float64)
+    # Treat a column as constant if it only varies by rounding.
     if len(mean) < 3 or outcome.std() == 0 or mean.std() <= 1e-6 * max(np.abs(mean).max(), 1e-6):
         return math.nan
     return float(((mean - mean.mean()) * (outcome - outcome.mean())).mean() / (mean.std() * outcome.std()))
@@ -259,7 +261,7 @@ def collision_correlation(values: Values, valid: Values, collides: Values) -> fl
 def importances(
     act: Callable[[dict[str, Any]], Any], observation: Mapping[str, Values], seed: int = 0
 ) -> tuple[dict[tuple[str, int], float], dict[str, float]]:
-    """Return how much actions change when a feature is permuted, by (group, column) and by group.
+    """Return the change of actions when a feature is permuted, by (group, column) and by group.
 
     Permutation importance (Breiman 2001), of the action instead of a loss. A column's entries are permuted among the
     valid rows of all states; a whole group is exchanged between states, mask included. The change is the root mean
@@ -273,26 +275,26 @@ def importances(
         seed: Seed of the permutations.
     """
     rng = np.random.default_rng(seed)
-    before = np.asarray(act(dict(observation)), np.float64)
-    std = before.std(axis=0)
+    actions = np.asarray(act(dict(observation)), np.float64)
+    std = actions.std(axis=0)
     varies = std > 1e-6
 
-    def change(altered: dict[str, Values]) -> float:
+    def change(changed: dict[str, Values]) -> float:
         if not varies.any():
             return math.nan
-        apart = (np.asarray(act(dict(observation) | altered), np.float64) - before)[:, varies] / std[varies]
-        return float(np.sqrt(np.mean(apart**2)))
+        shift = (np.asarray(act(dict(observation) | changed), np.float64) - actions)[:, varies] / std[varies]
+        return float(np.sqrt(np.mean(shift**2)))
 
     columns, groups = {}, {}
     for group, values in observation.items():
-        own = f"{group}_mask"
+        mask_name = f"{group}_mask"
         if group.removesuffix("_mask") in observation and group.endswith("_mask"):
             continue
         order = rng.permutation(len(values))
         groups[group] = change(
-            {name: observation[name][order] for name in (group, own) if name in observation}
+            {name: observation[name][order] for name in (group, mask_name) if name in observation}
         )
-        valid = observation.get(own, np.ones(values.shape[:-1], bool))
+        valid = observation.get(mask_name, np.ones(values.shape[:-1], bool))
         for column in range(values.shape[-1]):
             permuted = np.array(values)
             permuted[valid, column] = rng.permutation(values[valid, column])

@@ -13,12 +13,12 @@ from jaxtyping import Bool, Float64, Int64
 
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.episode_table import NOT_SUMMARISED, EpisodeTable, ScenarioKey
-from drivax.stats.clusters import dense, stratum_of_clusters
+from drivax.stats.clusters import cluster_strata, dense_labels
 
 #: Settings of an evaluation that must agree between paired episodes.
-_STARTS = ("noisy_start", "start_step")
+_START_SETTINGS = ("noisy_start", "start_step")
 #: Strata of fewer recordings are merged.
-_LEAST = 10
+_MIN_CLUSTERS = 10
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Pairs:
 
 
 def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
-    """Why the episodes of two runs cannot be paired, worded to follow their names, and what to do; None if they can.
+    """Return problem and cure if the episodes of two runs cannot be paired; None if they can.
 
     Pairs need the same scenario set, traffic and starts.
     """
@@ -54,7 +54,7 @@ def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
     if a.traffic != b.traffic:
         traffic = f"{a.traffic} and {b.traffic}"
         return f"differ in traffic ({traffic})", "evaluate both with the same --traffic"
-    for name in _STARTS:
+    for name in _START_SETTINGS:
         values = [run.settings.get(name) for run in (a, b)]
         if None not in values and values[0] != values[1]:
             return f"differ in {name} ({values[0]} and {values[1]})", "evaluate both with the same"
@@ -67,7 +67,7 @@ def comparable(a: EpisodeTable, b: EpisodeTable) -> bool:
 
 
 def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
-    """Refuse evaluations of A and B, one per training seed, whose episodes cannot be paired.
+    """Check that the evaluations of A and B, one per training seed, can be paired.
 
     Raises:
         UsageError: A run is named twice, a side holds several planners, or sets, traffic or starts differ.
@@ -90,16 +90,16 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
 
 
 def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) -> None:
-    """Refuse a metric that a comparison cannot use.
+    """Check that a comparison can use a metric.
 
     Raises:
-        UsageError: An evaluation lacks it, it has no meaningful mean, or it is primary without a direction.
+        UsageError: An evaluation lacks it, its mean has no meaning, or it is primary without a better direction.
     """
     for table in tables:
         if metric not in table.metrics:
-            known = [name for name in table.metrics if all(name in other.metrics for other in tables)]
+            available = [name for name in table.metrics if all(name in other.metrics for other in tables)]
             problem = f"{table.folder or table.name} has no metric {metric!r}"
-            raise UsageError(problem, cure=did_you_mean(metric, known))
+            raise UsageError(problem, cure=did_you_mean(metric, available))
     if metric in NOT_SUMMARISED:
         raise UsageError(f"{metric} is a code or count without a mean", cure="choose another metric")
     if metric.endswith("_partial"):
@@ -107,7 +107,7 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
         raise UsageError(problem, cure=f"choose {metric.removesuffix('_partial')}, or one of its inputs")
     info = tables[0].metric(metric)
     if primary and (info is None or info.better == "-"):
-        raise UsageError(f"{metric} is neither better high nor low", cure="choose another primary metric")
+        raise UsageError(f"{metric} has no better direction", cure="choose another primary metric")
 
 
 def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
@@ -115,18 +115,18 @@ def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
     partial = [table.metrics.get(f"{metric}_partial", np.full(1, np.nan)) for table in tables]
     if any(not np.isnan(values).all() for values in partial):
         problem = f"every {metric} is partial: one of its inputs is undefined in these scenarios"
-        return UsageError(problem, cure="choose another primary metric, as success or accuracy")
+        return UsageError(problem, cure="choose another primary metric, for example success or accuracy")
     problem = f"{metric} is defined for A and B in no common scenario"
     return UsageError(problem, cure="choose another primary metric")
 
 
 @dataclass(frozen=True)
 class Split:
-    """Which scenario is in which arm; the scenarios of a recording are in the same one.
+    """Assignment of scenarios to two arms; all scenarios of a recording are in the same arm.
 
     Attributes:
-        first: Which scenarios are in the first arm.
-        strata: Number of the stratum of each scenario; all 0 where the split is random.
+        first: Mask of the first arm.
+        strata: Stratum of each scenario; all 0 in a random split.
     """
 
     first: Bool[np.ndarray, " n"]
@@ -155,31 +155,31 @@ def assign(clusters: Sequence[str], strata: Sequence[str] | None, ratio: float, 
     """Assign whole clusters to two arms at random, in each stratum (None: in all) a share of ``ratio`` to the first.
 
     A cluster belongs to the most frequent stratum of its scenarios (the first by name among equals). Strata of fewer
-    than ten clusters are merged. Rounding in one stratum is made up for in the next.
+    than ten clusters are merged. The rounding error of a stratum carries over to the next.
 
     Raises:
         UsageError: An arm is empty.
     """
-    labels = dense(clusters, len(clusters), "cluster")
+    labels = dense_labels(clusters, len(clusters), "cluster")
     count = int(labels.max()) + 1
-    of = np.zeros(count, np.int64)
+    stratum_of = np.zeros(count, np.int64)
     if strata is not None:
-        of = stratum_of_clusters(_most_frequent(labels, strata), labels, _LEAST)
-    rng, first, seen, assigned = np.random.default_rng(seed), np.zeros(count, bool), 0, 0
-    for stratum in range(int(of.max()) + 1):
-        inside = rng.permutation(np.flatnonzero(of == stratum))
-        seen += inside.size
-        count_here = round(ratio * seen) - assigned
-        first[inside[:count_here]] = True
-        assigned += count_here
+        stratum_of = cluster_strata(_most_frequent(labels, strata), labels, _MIN_CLUSTERS)
+    rng, first, available, assigned = np.random.default_rng(seed), np.zeros(count, bool), 0, 0
+    for stratum in range(int(stratum_of.max()) + 1):
+        members = rng.permutation(np.flatnonzero(stratum_of == stratum))
+        available += members.size
+        quota = round(ratio * available) - assigned
+        first[members[:quota]] = True
+        assigned += quota
     if not first.any() or first.all():
         problem = f"{count} recordings at a ratio of {ratio} leave an arm empty"
         raise UsageError(problem, cure="use split: paired, or evaluate more scenarios")
-    return Split(first[labels], of[labels])
+    return Split(first[labels], stratum_of[labels])
 
 
 def _most_frequent(labels: Int64[np.ndarray, " n"], strata: Sequence[str]) -> list[str]:
-    """Return for each scenario the stratum that its cluster belongs to."""
+    """Return the stratum of each scenario's cluster."""
     votes: dict[int, Counter[str]] = {}
     for label, stratum in zip(labels, strata, strict=True):
         votes.setdefault(int(label), Counter())[stratum] += 1

@@ -9,14 +9,14 @@ from typing import Literal
 
 from drivax.errors import UsageError
 from drivax.stats.intervals import Interval
-from drivax.stats.significance import Evidence
+from drivax.stats.significance import SignificanceResult
 
 Arm = Literal["A", "B"]
 
 
 @dataclass(frozen=True)
 class ComparisonPlan:
-    """What is compared and how it is decided; written as YAML before it is run.
+    """Metrics, split, tests and decision rule of a comparison, written as YAML before it is run.
 
     Attributes:
         name: Heading of the page.
@@ -66,7 +66,7 @@ class ComparisonPlan:
             raise UsageError("the smallest difference that matters is above 0", cure="give its size, or null")
         if len(set(self.secondary)) < len(self.secondary):
             raise UsageError("a metric is named twice", cure="name each metric once")
-        # So that another primary metric can be chosen without a second list.
+        # So that the primary metric can be changed without changing the secondary ones.
         others = tuple(name for name in self.secondary if name != self.primary)
         object.__setattr__(self, "secondary", others)
         if self.split != "paired" and self.test == "bootstrap":
@@ -76,7 +76,7 @@ class ComparisonPlan:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What the data could have shown; differences are in the unit of the metric.
+    """Sensitivity of a comparison; differences are in the unit of the metric.
 
     Attributes:
         deviation: Standard deviation of the paired differences, or within the arms of a split.
@@ -119,7 +119,7 @@ class MetricComparison:
     b: Interval
     difference: Interval
     effects: Mapping[str, float | None]
-    evidence: Evidence
+    evidence: SignificanceResult
     p_adjusted: float | None
     winner: Arm | None
     seeds: int
@@ -136,12 +136,12 @@ class MetricComparison:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the plan's rule decides.
+    """Decision by the rule of a plan.
 
     Attributes:
         recommendation: The planner to take, no difference, or not enough scenarios to decide.
         because: The part of the rule that decided.
-        needed: Scenarios needed, where there are not enough.
+        needed: Number of scenarios needed, if there are too few.
         caveats: Secondary metrics in which the recommended planner is worse.
     """
 
@@ -152,11 +152,9 @@ class Decision:
 
 
 def decide(
-    plan: ComparisonPlan,
-    primary: MetricComparison,
-    secondary: Sequence[MetricComparison],
+    plan: ComparisonPlan, primary: MetricComparison, secondary: Sequence[MetricComparison],
     sensitivity: Sensitivity | None,
-) -> Decision:
+) -> Decision:  # fmt: skip
     """Decide by the rule: enough scenarios, then the test, then the power to conclude "no difference".
 
     With fewer scenarios than the plan's minimum nothing is decided. A test that rejects gives the better planner. One

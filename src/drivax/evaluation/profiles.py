@@ -41,8 +41,8 @@ TERMS = {
 _NEGATED = ("fault_score", "drivable")
 #: Longest window of the speeds of simulated traffic, steps.
 _SPEED_STEPS = 5
-#: Terms count as different beyond this.
-_DIFFERENT = 0.005
+#: Largest difference of equal terms.
+_TOLERANCE = 0.005
 FILE = "devkit.csv"
 
 
@@ -64,11 +64,11 @@ class ProfileRow:
 
     @property
     def differing(self) -> tuple[str, ...]:
-        """Terms that differ, the score left out."""
+        """Terms that differ, except the score."""
         return tuple(
             name
             for name in TERMS
-            if name != "score" and abs(self.ours[name] - self.devkit[name]) > _DIFFERENT
+            if name != "score" and abs(self.ours[name] - self.devkit[name]) > _TOLERANCE
         )
 
 
@@ -77,8 +77,8 @@ def devkit_rows(
 ) -> list[ProfileRow]:
     """Evaluate every episode of a table by the devkit's rules.
 
-    Our maps hold lane centre lines and road edges: lanes are strips of their width, the drivable area ends at the
-    edges, and connectors stand for intersections. Agents on another level of the road are left out.
+    drivax maps hold lane centre lines and road edges, so lanes are strips of constant width, the drivable area ends at
+    the edges, and connectors stand for intersections. Agents on another level of the road are left out.
 
     Args:
         table: Episodes with trajectories.
@@ -145,7 +145,7 @@ def format_rows(rows: Sequence[ProfileRow]) -> str:
         pairs = np.array([(row.ours[name], row.devkit[name]) for row in rows])
         pairs = pairs[~np.isnan(pairs).any(axis=1)]
         means = [f"{mean:.3f}" for mean in pairs.mean(axis=0)] if len(pairs) else ["", ""]
-        differ = int((np.abs(pairs[:, 0] - pairs[:, 1]) > _DIFFERENT).sum())
+        differ = int((np.abs(pairs[:, 0] - pairs[:, 1]) > _TOLERANCE).sum())
         term = f"1 - {metric}" if name in _NEGATED else metric
         numbers = (*means, f"{differ:,}", f"{len(pairs):,}")
         lines.append((Cell(name), Cell(term), *map(Cell, numbers)))
@@ -157,25 +157,25 @@ def format_rows(rows: Sequence[ProfileRow]) -> str:
 
 
 def _ego(scenario: Scenario, motion: Float[np.ndarray[Any, Any], "t 4"], start: int) -> EgoMotion:
-    """Ego's motion: acceleration over the last step (the first one logged), yaw rate over the next."""
+    """Return ego's motion; accelerations are backward differences (the first from the log), yaw rates forward ones."""
     x, y, heading, speed = motion.T
     before = max(start - 1, 0)
     # A noisy start does not come from the log.
     logged = (
         np.allclose(motion[0, :2], scenario.agent_xy[start, 0], atol=1e-3) and scenario.agent_valid[before, 0]
     )
-    last = float(np.hypot(*scenario.agent_velocity[before, 0])) if logged else speed[0]
-    turned = np.diff(np.unwrap(heading))
-    yaw_rate = np.append(turned, turned[-1:]) / DT_S if len(turned) else np.zeros(1)
+    previous_speed = float(np.hypot(*scenario.agent_velocity[before, 0])) if logged else speed[0]
+    turns = np.diff(np.unwrap(heading))
+    yaw_rate = np.append(turns, turns[-1:]) / DT_S if len(turns) else np.zeros(1)
     length, width = scenario.agent_size[0, :2].astype(np.float64)
     return EgoMotion(
-        np.stack([x, y], axis=-1), heading, np.abs(speed), np.diff(speed, prepend=last) / DT_S, yaw_rate,
+        np.stack([x, y], axis=-1), heading, np.abs(speed), np.diff(speed, prepend=previous_speed) / DT_S, yaw_rate,
         np.diff(yaw_rate, prepend=yaw_rate[:1]) / DT_S, (float(length), float(width)), float(length) * REAR_AXLE,
     )  # fmt: skip
 
 
 def _tracks(scenario: Scenario, steps: slice, others: Float[np.ndarray[Any, Any], "t A 3"] | None) -> Tracks:
-    """The other agents: moving ones where traffic put them, and parked ones."""
+    """Return the other agents, as moved by traffic, and parked ones."""
     count = scenario.agent_xy.shape[1] if others is None else others.shape[1]
     slots = slice(1, count)
     kind = np.concatenate([scenario.agent_kind[slots], scenario.parked_kind])
@@ -188,43 +188,44 @@ def _tracks(scenario: Scenario, steps: slice, others: Float[np.ndarray[Any, Any]
         poses = others[:, 1:].astype(np.float64)
         xy, heading, moving = poses[..., :2], poses[..., 2], ~np.isnan(poses[..., 0])
         speed = _speeds(xy)
-    ground = _filled(scenario.agent_z[:, :1], scenario.agent_valid[:, :1])[steps]
+    ground = _fill_gaps(scenario.agent_z[:, :1], scenario.agent_valid[:, :1])[steps]
     level = (
-        np.abs(_filled(scenario.agent_z[:, slots], scenario.agent_valid[:, slots])[steps] - ground) <= LEVEL_M
+        np.abs(_fill_gaps(scenario.agent_z[:, slots], scenario.agent_valid[:, slots])[steps] - ground)
+        <= LEVEL_M
     )
     parked = scenario.parked_valid[steps] & (np.abs(scenario.parked_z - ground) <= LEVEL_M)
     present = np.concatenate([moving & level, parked], axis=1)
-    there = present.any(axis=0)
+    seen = present.any(axis=0)
 
-    def joined(of_moving: Any, of_parked: Any) -> Any:
-        still = np.broadcast_to(of_parked, (len(parked), *np.shape(of_parked)))
-        return np.nan_to_num(np.concatenate([of_moving, still], axis=1)[:, there]).astype(np.float64)
+    def concatenate(of_moving: Any, of_parked: Any) -> Any:
+        static_values = np.broadcast_to(of_parked, (len(parked), *np.shape(of_parked)))
+        return np.nan_to_num(np.concatenate([of_moving, static_values], axis=1)[:, seen]).astype(np.float64)
 
-    static = np.isin(kind[there], (AgentKind.STATIC, AgentKind.OTHER))
-    size = np.concatenate([scenario.agent_size[slots, :2], scenario.parked_size[:, :2]])[there]
+    static = np.isin(kind[seen], (AgentKind.STATIC, AgentKind.OTHER))
+    size = np.concatenate([scenario.agent_size[slots, :2], scenario.parked_size[:, :2]])[seen]
     return Tracks(
-        joined(xy, scenario.parked_xy),
-        joined(heading, scenario.parked_heading),
-        np.where(static, 0.0, joined(speed, np.zeros(parked.shape[1]))),
-        present[:, there], size.astype(np.float64), kind[there],
+        concatenate(xy, scenario.parked_xy),
+        concatenate(heading, scenario.parked_heading),
+        np.where(static, 0.0, concatenate(speed, np.zeros(parked.shape[1]))),
+        present[:, seen], size.astype(np.float64), kind[seen],
     )  # fmt: skip
 
 
 def _speeds(xy: Float[np.ndarray[Any, Any], "t A 2"]) -> Float[np.ndarray[Any, Any], "t A"]:
-    """Speeds over the longest window, up to 0.5 s, of which both ends are present: stored poses have steps of 2 cm."""
+    """Speeds over the longest valid window of up to 0.5 s, because stored positions are multiples of 2 cm."""
     speed = np.zeros(xy.shape[:2])
-    for back in range(1, _SPEED_STEPS + 1):
-        moved = np.linalg.norm(xy[back:] - xy[:-back], axis=-1) / (back * DT_S)
-        speed[back:] = np.where(np.isnan(moved), speed[back:], moved)
+    for lag in range(1, _SPEED_STEPS + 1):
+        window_speed = np.linalg.norm(xy[lag:] - xy[:-lag], axis=-1) / (lag * DT_S)
+        speed[lag:] = np.where(np.isnan(window_speed), speed[lag:], window_speed)
     first = np.isnan(np.concatenate([xy[:1] + np.nan, xy[:-1]])[..., 0])
-    ahead = np.linalg.norm(np.diff(xy, axis=0, append=xy[-1:]), axis=-1) / DT_S
-    return np.where(first, np.nan_to_num(ahead), speed)
+    next_speed = np.linalg.norm(np.diff(xy, axis=0, append=xy[-1:]), axis=-1) / DT_S
+    return np.where(first, np.nan_to_num(next_speed), speed)
 
 
-def _filled(
+def _fill_gaps(
     values: Float[np.ndarray[Any, Any], "t A"], valid: Bool[np.ndarray[Any, Any], "t A"]
 ) -> Float[np.ndarray[Any, Any], "t A"]:
-    """Values with each gap filled by the nearest valid step before it, else by the first valid one."""
+    """Fill gaps with the last valid value, or with the first one at the beginning."""
     steps = np.arange(len(values))[:, None]
     last = np.maximum.accumulate(np.where(valid, steps, -1), axis=0)
     return np.take_along_axis(values, np.where(last >= 0, last, valid.argmax(axis=0)), axis=0)
@@ -234,17 +235,17 @@ def _road(scenario: Scenario, steps: slice, sizes: Sizes) -> Road:
     objects = _objects(scenario)
     crossing = shapely.unary_union([each.polygon for each in objects if each.connector])
     bank = ScenarioBank.from_scenarios([scenario], trim=sizes)
-    heights = _filled(scenario.agent_z[:, :1], scenario.agent_valid[:, :1])[steps, 0]
+    heights = _fill_gaps(scenario.agent_z[:, :1], scenario.agent_valid[:, :1])[steps, 0]
     z = jnp.asarray(heights - scenario.agent_size[0, 2] / 2)
 
     def outside_m(ego: EgoMotion) -> np.ndarray[Any, Any]:
-        return np.asarray(_beyond_edges(bank, jnp.asarray(ego.boxes, jnp.float32), z), np.float64)
+        return np.asarray(_corner_distances(bank, jnp.asarray(ego.boxes, jnp.float32), z), np.float64)
 
     return Road(objects, outside_m, lambda points: shapely.contains_xy(crossing, points[:, 0], points[:, 1]))
 
 
 @jax.jit
-def _beyond_edges(
+def _corner_distances(
     bank: ScenarioBank, boxes: Float[Array, "t 6"], z: Float[Array, " t"]
 ) -> Float[Array, "t 4"]:
     """Distance of the corners of boxes beyond the road edges."""
@@ -262,15 +263,15 @@ def _objects(scenario: Scenario) -> list[RoadObject]:
     """Lanes and connectors, in the order of the lane graph; those without segments have an empty area."""
     count = int((scenario.lane_id >= 0).sum())
     first, last = (int(end) for end in scenario.segment_blocks[1:3])
-    lane, at = scenario.segment_lane[first:last], scenario.segment_start_m[first:last]
+    lane, start_m = scenario.segment_lane[first:last], scenario.segment_start_m[first:last]
     blocks = _blocks(scenario, count)
     objects = []
     for index in range(count):
-        own = first + np.flatnonzero(lane == index)[np.argsort(at[lane == index], kind="stable")]
-        points = np.concatenate([scenario.segment_a[own, :2], scenario.segment_b[own[-1:], :2]]).astype(
-            np.float64
-        )
-        line: Any = shapely.linestrings(points) if len(own) else shapely.LineString()
+        segments = first + np.flatnonzero(lane == index)[np.argsort(start_m[lane == index], kind="stable")]
+        points = np.concatenate(
+            [scenario.segment_a[segments, :2], scenario.segment_b[segments[-1:], :2]]
+        ).astype(np.float64)
+        line: Any = shapely.linestrings(points) if len(segments) else shapely.LineString()
         width, limit = float(scenario.lane_width[index]), float(scenario.lane_limit[index])
         half = (width if width > 0 else DEFAULT_LANE_WIDTH_M) / 2
         links = (scenario.lane_successor[index], scenario.lane_predecessor[index])
@@ -285,7 +286,7 @@ def _objects(scenario: Scenario) -> list[RoadObject]:
 
 
 def _blocks(scenario: Scenario, count: int) -> list[int]:
-    """Roadblock of every lane: parallel lanes, and connectors between the same two blocks, share one."""
+    """Return the roadblock of every lane, shared by parallel lanes, and by connectors between the same two blocks."""
     blocks = list(range(count))
     for index in range(count):
         for other in (int(scenario.lane_left[index]), int(scenario.lane_right[index])):

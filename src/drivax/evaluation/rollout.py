@@ -26,10 +26,10 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import SimState
 from drivax.tasks.task import Task
 
-#: What the key of an episode is folded with to draw its start.
-_START = 1
+#: Number folded into the key of an episode to draw its start.
+_START_STREAM = 1
 #: Units of packed positions (m) and headings (rad), and the reach of int16 from a scenario's origin.
-_METRES, _RADIANS, _REACH_M = 0.02, 1e-4, 650.0
+_POSITION_UNIT_M, _HEADING_UNIT_RAD, _MAX_POSITION_M = 0.02, 1e-4, 650.0
 #: Stands for "absent" in a packed pose.
 _ABSENT = -32768
 
@@ -45,7 +45,7 @@ class Episodes:
         actions: Executed actions, after bounds and actuators.
         others: Packed poses of the other agents at each step (:func:`pack_poses`); None in log traffic.
         offroad_steps: Number of steps off the road.
-        crashed: First step whose action was not finite, -1 for none; nothing is measured from there on.
+        crashed: First step with a non-finite action, -1 for none; metrics cover the steps before it.
     """
 
     metrics: dict[str, Value]
@@ -63,15 +63,15 @@ def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Arra
 
 
 def evaluation_task(task: Task) -> Task:
-    """Return the task as evaluation runs it: with all metrics, and episodes that go on to the end of the log."""
+    """Return the task for evaluation: all metrics, and episodes that last to the end of the log."""
     own = task.metrics if isinstance(task.metrics, tuple) else ()
     return replace(task, to_the_end=True, metrics=("full", *own))
 
 
 def check_actions(planner: Planner, task: Task) -> None:
-    """Refuse a planner that acts in another action space than the task."""
+    """Raise UsageError for a planner with another action space than the task."""
     if getattr(planner, "actions", task.actions) != task.actions:
-        problem = f"planner {planner.name} acts in another action space than the task"
+        problem = f"planner {planner.name} has another action space than the task"
         raise UsageError(problem, cure="use the task's")
 
 
@@ -91,7 +91,7 @@ def drive(
 def _episode(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, start_step: int, slot: Any, index: Array, key: Array
 ) -> Episodes:  # fmt: skip
-    state = simulator.reset(bank, index, start_step, slot, jax.random.fold_in(key, _START))
+    state = simulator.reset(bank, index, start_step, slot, jax.random.fold_in(key, _START_STREAM))
     begin_key, key = jax.random.split(key)
     carry = planner.init(bank, state, begin_key)
 
@@ -99,31 +99,37 @@ def _episode(
         traffic = simulator.traffic
         return None if traffic.name == LogTraffic.name else pack_poses(traffic.agents(bank, state.context, 0))
 
-    def step(now: Any, key: Array) -> Any:
-        state, kept, carry, sound = now
+    def step(loop_state: Any, key: Array) -> Any:
+        state, measured, carry, is_finite = loop_state
         state, carry, finite = advance(simulator, planner, bank, state, carry, key)
-        sound &= finite
-        kept = state if planner.replays else jax.tree.map(partial(jnp.where, sound), state, kept)
-        context = kept.context
-        seen = context.history[-1], context.action, sound & state.facts.offroad, sound, others(state)
-        return (state, kept, carry, sound), seen
+        is_finite &= finite
+        measured = state if planner.replays else jax.tree.map(partial(jnp.where, is_finite), state, measured)
+        context = measured.context
+        outputs = (
+            context.history[-1],
+            context.action,
+            is_finite & state.facts.offroad,
+            is_finite,
+            others(state),
+        )
+        return (state, measured, carry, is_finite), outputs
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)
     first = (state, state, carry, jnp.ones((), bool))
-    (last, final, _, _), (motion, actions, offroad, sound, moved) = jax.lax.scan(step, first, keys)
+    (last, final, _, _), (motion, actions, offroad, is_finite, later_others) = jax.lax.scan(step, first, keys)
     others_first = others(state)
-    metrics, to_the_end = episode_metrics(bank, final), episode_metrics(bank, last)
-    # What a scenario defines does not depend on how soon its planner crashed.
+    metrics, uncut_metrics = episode_metrics(bank, final), episode_metrics(bank, last)
+    # Whether a metric is defined must not depend on when the planner crashed.
     names = [name for name in FAILED if name in metrics]
-    failed = {name: replace(metrics[name], defined=to_the_end[name].defined) for name in names}
+    failed = {name: replace(metrics[name], defined=uncut_metrics[name].defined) for name in names}
     return Episodes(
         metrics=metrics | failed,
         events=event_steps(final.episode),
         motion=jnp.concatenate([state.context.history[-1][None], motion]),
         actions=actions,
-        others=None if others_first is None else jnp.concatenate([others_first[None], moved]),
+        others=None if others_first is None else jnp.concatenate([others_first[None], later_others]),
         offroad_steps=offroad.sum().astype(jnp.int32),
-        crashed=jnp.where(sound.all(), -1, start_step + jnp.argmin(sound)),
+        crashed=jnp.where(is_finite.all(), -1, start_step + jnp.argmin(is_finite)),
     )
 
 
@@ -141,22 +147,22 @@ def advance(
         action = simulator.task.actuated(state.context.history[-1], action, state.context.action)
         logged = logged_motion(bank, state.context, 1)
         return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
-    context, sound = state.context, jnp.isfinite(action).all()
+    context, is_finite = state.context, jnp.isfinite(action).all()
     length_m = bank.length_m(context.index, context.slot)
-    nothing = simulator.task.first_action(context.history, length_m)
-    return simulator.step(bank, state, jnp.where(sound, action, nothing))[0], carry, sound
+    fallback = simulator.task.first_action(context.history, length_m)
+    return simulator.step(bank, state, jnp.where(is_finite, action, fallback))[0], carry, is_finite
 
 
 def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
     """Pack positions and headings of bank rows; agents further than 650 m from the origin count as absent."""
     xy = agents[..., AgentColumn.XY]
     heading = jnp.arctan2(agents[..., AgentColumn.SIN], agents[..., AgentColumn.COS])
-    poses = jnp.concatenate([xy / _METRES, heading[..., None] / _RADIANS], axis=-1)
-    present = (agents[..., AgentColumn.VALID] > 0) & (jnp.abs(xy) < _REACH_M).all(axis=-1)
+    poses = jnp.concatenate([xy / _POSITION_UNIT_M, heading[..., None] / _HEADING_UNIT_RAD], axis=-1)
+    present = (agents[..., AgentColumn.VALID] > 0) & (jnp.abs(xy) < _MAX_POSITION_M).all(axis=-1)
     return jnp.where(present[..., None], jnp.round(poses), _ABSENT).astype(jnp.int16)
 
 
 def unpack_poses(rows: Int16[np.ndarray, "*batch A 3"]) -> Float32[np.ndarray, "*batch A 3"]:
     """Return positions (m) and headings (rad), NaN where absent."""
-    poses = rows * np.array([_METRES, _METRES, _RADIANS], np.float32)
+    poses = rows * np.array([_POSITION_UNIT_M, _POSITION_UNIT_M, _HEADING_UNIT_RAD], np.float32)
     return np.where(rows == _ABSENT, np.nan, poses).astype(np.float32)

@@ -130,7 +130,7 @@ def _to_chords(offset: Sequence[Array], along: Sequence[Array]) -> tuple[Array, 
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
-    """Mask of points to keep so that no dropped point is further than the tolerance from the rest.
+    """Mask of points to keep, within the tolerance of all dropped points.
 
     Douglas and Peucker, Cartographica 10(2), 1973, run on all polylines at once and level by level: every interval
     between kept points whose farthest point exceeds the tolerance is split there. Distance is to the chord as a
@@ -210,11 +210,9 @@ def project(
 
 
 def project_monotone(
-    points: Float[Array, "point dim"],
-    xy: Float[Array, "query 2"],
-    window_m: Float[Array, " query"],
+    points: Float[Array, "point dim"], xy: Float[Array, "query 2"], window_m: Float[Array, " query"],
     first_window_m: float = np.inf,
-) -> Float[Array, " query"]:
+) -> Float[Array, " query"]:  # fmt: skip
     """Non-decreasing arc lengths of successive positions along a polyline, without jumps to another branch.
 
     ``s[k]`` is the arc length in ``[s[k-1], s[k-1] + window[k]]`` whose point is nearest to ``xy[k]``; the first

@@ -91,7 +91,7 @@ class TrainConfig:
         self.environment(LogTraffic())  # checks the steps at which episodes begin
 
     def environment(self, traffic: Traffic) -> Driving:
-        """Return the environment of training with :attr:`traffic`, as ``policies.find_traffic`` finds it."""
+        """Return the environment of training with :attr:`traffic` (``policies.find_traffic``)."""
         return Driving(Simulator(self.task, traffic, self.start), self.latest_start, self.earliest_start)
 
     @property

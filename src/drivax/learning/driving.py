@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.learning.environment import Environments, Outcome, in_any
+from drivax.learning.environment import Environments, Outcome, any_across_learners
 from drivax.learning.experience import ExpertActions, ExpertSteps, StepIndex
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
@@ -25,13 +25,13 @@ from drivax.simulator.types import AgentContext, EpisodeStart, Frame, SimState
 from drivax.tasks.actions import Discrete
 from drivax.tasks.task import Task
 
-#: Scenarios that are replayed at a time.
+#: Scenarios that are replayed in one batch.
 _BATCH = 64
 
 
 @dataclass(frozen=True)
 class Driving:
-    """A simulator with scenarios drawn with replacement.
+    """A simulator whose episodes start in scenarios drawn with replacement.
 
     Attributes:
         simulator: Task, traffic and kind of start.
@@ -132,14 +132,14 @@ class Driving:
 
         def demonstrate(index: Array, step: Array) -> tuple[dict[str, Array], Array, Array]:
             context = self._logged_context(data, index, step)
-            return (dict(self._logged.observe(data, context)), *self._expert_action(data, context))
+            return (dict(self._log_simulator.observe(data, context)), *self._expert_action(data, context))
 
         return jax.vmap(demonstrate)(index, step)
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
         """Observe logged steps as in :meth:`demonstrations`."""
         contexts = partial(self._logged_context, data)
-        return jax.vmap(lambda *index: dict(self._logged.observe(data, contexts(*index))))(*index)
+        return jax.vmap(lambda *index: dict(self._log_simulator.observe(data, contexts(*index))))(*index)
 
     def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
         """Return the log as a rollout of the expert from the current step on, with the simulator's rewards and ends.
@@ -158,26 +158,28 @@ class Driving:
         return ExpertSteps(action, reward, terminated, truncated, _has_expert_action(data) & ~over, clipped)
 
     @property
-    def _logged(self) -> Simulator:
-        """The simulator with all agents as logged and without metrics."""
+    def _log_simulator(self) -> Simulator:
+        """Simulator of log traffic without metrics."""
         return Simulator(replace(self.task, metrics="none"))
 
     def _logged_context(self, bank: ScenarioBank, index: Array, step: Array) -> AgentContext:
         """Return the context of a logged step as if the expert had driven there."""
-        context, before = (self._logged.context(bank, index, t) for t in (step, jnp.maximum(step - 1, 0)))
+        context, before = (
+            self._log_simulator.context(bank, index, t) for t in (step, jnp.maximum(step - 1, 0))
+        )
         return replace(context, action=self._expert_action(bank, before)[0])
 
     def _expert_action(
         self, bank: ScenarioBank, context: AgentContext
     ) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
-        """The expert's action as executed, and whether it was clipped."""
+        """Return the expert's executed action, and whether it was clipped."""
         space = self.task.actions
         action = expert_action(bank, context, space)
         return space.actuated(context.history[-1], action, context.action), space.clipped(action)
 
     def _rollout(self, bank: ScenarioBank, index: Int[Array, ""]) -> tuple[Array, ...]:
         """Action, reward, terminated, truncated and clipped of the expert in one scenario from the current step on."""
-        simulator = self._logged
+        simulator = self._log_simulator
         first = simulator.reset(bank, index)
         first = replace(first, context=self._logged_context(bank, index, first.start))
 
@@ -192,7 +194,7 @@ class Driving:
 def _draw(
     bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int
 ) -> tuple[Int[Array, " B"], Int[Array, " B"], Array]:
-    """Draw scenarios, steps at which the ego is valid (else the current step), and keys for starts."""
+    """Draw scenarios, steps with a valid ego (else the current step), and keys for starts."""
     index_key, step_key = jax.random.split(key)
     index = jax.random.randint(index_key, (count,), 0, len(bank))
     step = jax.random.randint(step_key, (count,), earliest, latest + 1)
@@ -204,19 +206,19 @@ def _draw(
 
 
 def _has_expert_action(bank: ScenarioBank) -> Bool[Array, "N T"]:
-    """Steps from the current one on with an expert action: the ego is valid there and for two more steps."""
+    """Mask of steps with an expert action: from the current step on, with a valid ego then and for two more steps."""
     valid = bank.agents[:, :, 0, AgentColumn.VALID] > 0
-    continued = jnp.pad(valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:], ((0, 0), (0, 2)))
-    return continued & (jnp.arange(bank.steps) >= CURRENT_STEP)
+    has_successors = jnp.pad(valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:], ((0, 0), (0, 2)))
+    return has_successors & (jnp.arange(bank.steps) >= CURRENT_STEP)
 
 
 def _totals(
     bank: ScenarioBank, state: SimState, terms: dict[str, Array], done: Array, over: Array
 ) -> dict[str, Array]:
-    """Sum, over the batch, metrics of episodes that end now and reward terms of steps that are no resets."""
+    """Sum metrics of ending episodes, and reward terms of steps other than resets, over the batch."""
     logged = [name for name in state.episode.selection.names if name not in CODES]
 
-    def of_episodes() -> dict[str, Array]:
+    def episode_sums() -> dict[str, Array]:
         values = jax.vmap(episode_metrics, (None, 0))(bank, state)
         sums = {}
         for name in logged:
@@ -225,8 +227,8 @@ def _totals(
             sums[f"{name}/n"] = defined.sum().astype(jnp.float32)
         return sums
 
-    # Most steps end no episode; one condition for the whole program lets the branch be skipped.
+    # Most steps end no episode; a single condition lets the program skip the branch.
     zeros = {name: jnp.zeros(()) for metric in logged for name in (metric, f"{metric}/n")}
-    totals: dict[str, Any] = jax.lax.cond(in_any(done), of_episodes, lambda: zeros)
+    totals: dict[str, Any] = jax.lax.cond(any_across_learners(done), episode_sums, lambda: zeros)
     rewards = {f"reward/{name}": jnp.sum(jnp.where(over, 0.0, term)) for name, term in terms.items()}
     return totals | rewards

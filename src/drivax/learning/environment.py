@@ -36,7 +36,7 @@ class Outcome:
     Attributes:
         reward: Rewards.
         terminated: The episode ended by a failure: bootstrap zero.
-        truncated: The episode was cut off: bootstrap the value of the state that the step led to.
+        truncated: The episode was cut off: bootstrap the value of the next state.
         cache: :meth:`Environment.cache` of the new state.
         totals: Sums to log over environments that were not over: ``"<name>"`` with its count ``"<name>/n"``, or
             ``"reward/<name>"`` over steps.
@@ -51,7 +51,7 @@ class Outcome:
 
 @runtime_checkable
 class Environment(Protocol):
-    """What an algorithm acts in."""
+    """An environment that algorithms train in."""
 
     @property
     def action_size(self) -> int:
@@ -72,7 +72,7 @@ class Environment(Protocol):
         ...
 
     def stored(self, state: Any) -> Any:
-        """Return what the replay buffer stores of states, from which they can be observed again."""
+        """Return the part of states that the replay buffer stores; they can be observed from it."""
         ...
 
     def observe(self, data: Any, stored: Any) -> dict[str, Array]:
@@ -84,7 +84,7 @@ class Environment(Protocol):
         ...
 
     def cache(self, data: Any, state: Any) -> Any:
-        """Return what a step computes from states and the next step reuses."""
+        """Return intermediate results of states that the next step reuses."""
         ...
 
     def step(
@@ -101,8 +101,8 @@ class Environment(Protocol):
 class Rollout:
     """Experience ``[time, batch]``. ``alive`` is false for steps that only reset an environment; mask them out.
 
-    The row after row t holds what row t led to, final states included; the last row led to the environments' current
-    state. One of ``observation`` and ``state`` (what the replay buffer stores) is kept, the other is None.
+    The successor of row t is in row t + 1, final states included; that of the last row is the environments' current
+    state. Either ``observation`` or ``state`` (for the replay buffer) is kept, the other is None.
     """
 
     observation: dict[str, Array] | None
@@ -131,12 +131,9 @@ Store = Literal["state", "observation"]
 
 
 def transition(
-    environment: Environment,
-    now: Environments,
-    sampled: Sampled,
-    outcome: Outcome,
+    environment: Environment, now: Environments, sampled: Sampled, outcome: Outcome,
     keep: Store = "observation",
-) -> Rollout:
+) -> Rollout:  # fmt: skip
     """Return one row of a rollout, given the environments before the step, the sampled actions, and the outcome."""
     raw_action, _, extra = sampled
     return Rollout(
@@ -152,14 +149,9 @@ def transition(
 
 
 def collect(
-    environment: Environment,
-    data: Any,
-    environments: Environments,
-    actor: Actor,
-    key: Array,
-    steps: int,
+    environment: Environment, data: Any, environments: Environments, actor: Actor, key: Array, steps: int,
     keep: Store = "observation",
-) -> tuple[Environments, Rollout, dict[str, Array]]:
+) -> tuple[Environments, Rollout, dict[str, Array]]:  # fmt: skip
     """Unroll ``steps`` steps in every environment.
 
     Returns:
@@ -183,16 +175,16 @@ def collect(
 
 
 @custom_vmap
-def in_any(condition: Bool[Array, "*batch"]) -> Bool[Array, ""]:
-    """Whether a condition holds anywhere: in the batch, and under ``vmap`` in any learner.
+def any_across_learners(condition: Bool[Array, "*batch"]) -> Bool[Array, ""]:
+    """Whether a condition holds anywhere in the batch and, under ``vmap``, in any learner.
 
-    ``jax.lax.cond`` on one condition per learner computes both branches; on this single condition it branches.
+    ``jax.lax.cond`` computes both branches if it has a condition per learner; with this single one it computes one.
     """
     return condition.any()
 
 
-@in_any.def_vmap
+@any_across_learners.def_vmap
 def _in_any_learner(
     axis_size: int, in_batched: Any, condition: Bool[Array, "*batch"]
 ) -> tuple[Bool[Array, ""], bool]:
-    return in_any(condition.reshape(-1)), False
+    return any_across_learners(condition.reshape(-1)), False

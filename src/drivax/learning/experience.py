@@ -1,10 +1,10 @@
-"""Logged experience: actions of an expert, their outcome, and the weights that steps are drawn by.
+"""Logged experience: actions of an expert, their outcome, and sampling weights of steps.
 
-No observation is stored: a step is an index (scenario, step), observed when it is drawn. Rewards and ends depend on all
-earlier steps, so they are replayed once before training.
+No observation is stored: a step is an index (scenario, step), observed when it is drawn. Rewards and episode ends
+depend on all earlier steps, so the log is replayed once before training.
 
-Steps are drawn by the inverse of the cumulative distribution in integers: float32 would round a weight among a million
-others by a twentieth, 32 bits by a five-thousandth, and no step of weight zero is ever drawn.
+Steps are drawn by inverting the cumulative distribution, stored as 32-bit integers: among a million weights they round
+one by a five-thousandth, float32 by a twentieth. A step of weight zero is never drawn.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ StepIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
 #: Observations, expert actions within the bounds, and whether those were clipped.
 ExpertActions = tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]
 
-_LAST = 2**32 - 1
+_MAX_UINT32 = 2**32 - 1
 
 
 @dataclass(frozen=True)
 class WeightedSet:
-    """Scenarios to train on, with weights ``[scenario, step]`` of at least 0 that steps are drawn in proportion to."""
+    """Scenarios to train on, with sampling weights ``[scenario, step]`` of at least 0."""
 
     scenarios: ScenarioSet
     weights: np.ndarray
@@ -46,7 +46,7 @@ class Sampler:
     """A distribution over the steps of scenarios, made by :func:`sampler`.
 
     Attributes:
-        cumulative: Share of all weight up to each step, scenario by scenario, in units of ``1 / (2^32 - 1)``.
+        cumulative: Cumulative probability up to each step, scenario by scenario, in units of ``1 / (2^32 - 1)``.
         effective: Effective sample size.
         steps: Steps per scenario.
     """
@@ -57,22 +57,22 @@ class Sampler:
 
 
 def sampler(weights: np.ndarray) -> Sampler:
-    """Return a sampler of steps in proportion to weights ``[N, T]`` of at least 0; DataError if none is above 0.
+    """Return a sampler of steps with probabilities proportional to ``weights`` ``[N, T]``; DataError if all are 0.
 
-    A step with a share of all weight below ``2^-32`` may never be drawn.
+    A step with a probability below ``2^-32`` may never be drawn.
     """
     total = np.cumsum(weights.reshape(-1), dtype=np.float64)
     if not total[-1] > 0.0:
-        raise DataError("no step has any weight", cure="give a usable step a weight above 0")
-    cumulative = np.floor(total / total[-1] * _LAST).astype(np.uint32)
+        raise DataError("all weights are 0", cure="give a usable step a weight above 0")
+    cumulative = np.floor(total / total[-1] * _MAX_UINT32).astype(np.uint32)
     effective = jnp.asarray(effective_size(weights), jnp.float32)
     return Sampler(jnp.asarray(cumulative), effective, weights.shape[1])
 
 
 def sample_steps(sampler: Sampler, key: Array, shape: tuple[int, ...]) -> StepIndex:
     """Draw step indices with replacement."""
-    number = jnp.minimum(jax.random.bits(key, shape, jnp.uint32), jnp.uint32(_LAST - 1))
-    # The first step whose share exceeds the number: never a step without weight.
+    number = jnp.minimum(jax.random.bits(key, shape, jnp.uint32), jnp.uint32(_MAX_UINT32 - 1))
+    # The first step whose cumulative probability exceeds the number never has weight zero.
     position = jnp.searchsorted(sampler.cumulative, number, side="right").astype(jnp.int32)
     return position // sampler.steps, position % sampler.steps
 
@@ -83,9 +83,9 @@ def check_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     if weights.shape != shape:
         problem = f"weights of shape {weights.shape} for {shape[0]} scenarios of {shape[1]} steps"
         raise UsageError(problem, cure="make weights for every step of this scenario set")
-    bad = np.argwhere(~(np.isfinite(weights) & (weights >= 0.0)))
-    if len(bad):
-        scenario, step = bad[0]
+    invalid = np.argwhere(~(np.isfinite(weights) & (weights >= 0.0)))
+    if len(invalid):
+        scenario, step = invalid[0]
         problem = f"the weight of step {step} of scenario {scenario} is {weights[scenario, step]}"
         raise UsageError(problem, cure="use finite numbers of at least 0")
     return weights.astype(np.float64)
@@ -108,7 +108,7 @@ class ExpertSteps:
 
 
 @runtime_checkable
-class Recorded(Environment, Protocol):
+class LoggedEnvironment(Environment, Protocol):
     """An environment whose data hold episodes of an expert."""
 
     def expert_steps(self, data: Any) -> ExpertSteps:
@@ -120,9 +120,9 @@ class Recorded(Environment, Protocol):
         ...
 
 
-def recorded(environment: Environment) -> Recorded:
-    """Return the environment; raises UsageError if it has no expert episodes."""
-    if not isinstance(environment, Recorded):
+def require_log(environment: Environment) -> LoggedEnvironment:
+    """Return an environment with expert episodes; raises UsageError for any other."""
+    if not isinstance(environment, LoggedEnvironment):
         problem = f"{type(environment).__name__} has no logged episodes"
         raise UsageError(problem, cure="implement `expert_steps`")
     return environment
@@ -137,8 +137,8 @@ class Experience:
         expert: The expert's steps.
         usable: Steps to learn from.
         uniform: Sampler of usable steps without weights.
-        critic: Sampler of the steps that values are learned from.
-        policy: Sampler of the steps that the policy is improved at; None: the critic's.
+        critic: Sampler of steps for policy evaluation.
+        policy: Sampler of steps for policy improvement; None: the critic's.
     """
 
     data: Any
@@ -156,11 +156,11 @@ class Experience:
 
 @dataclass(frozen=True)
 class ExperienceConfig:
-    """Which logged steps are learned from.
+    """Settings of the logged steps to learn from.
 
     Attributes:
         mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
-        weighted: What learns from weighted steps: ``all``, or only the ``policy``, with values from uniform steps.
+        weighted: What weights apply to: ``all``, or only the ``policy``, with values learned from uniform steps.
     """
 
     mask_clipped: bool = True
@@ -171,7 +171,7 @@ class ExperienceConfig:
 
         Raises UsageError if there is no expert or the weights do not fit the data, DataError if no step is usable.
         """
-        expert = _expert_steps(recorded(environment), data)
+        expert = _expert_steps(require_log(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)
         uniform = sampler(np.asarray(usable, np.float64))
         if weights is None:
@@ -183,18 +183,18 @@ class ExperienceConfig:
 
 
 @partial(jax.jit, static_argnums=0)
-def _expert_steps(environment: Recorded, data: Any) -> ExpertSteps:
+def _expert_steps(environment: LoggedEnvironment, data: Any) -> ExpertSteps:
     return environment.expert_steps(data)
 
 
-def expert_actions(environment: Recorded, experience: Experience, index: StepIndex) -> ExpertActions:
+def expert_actions(environment: LoggedEnvironment, experience: Experience, index: StepIndex) -> ExpertActions:
     """Return the expert's actions at logged steps."""
     expert = experience.expert
     observation = environment.observe_recorded(experience.data, index)
     return observation, expert.action[index], expert.clipped[index]
 
 
-def transitions(environment: Recorded, experience: Experience, index: StepIndex) -> Transitions:
+def transitions(environment: LoggedEnvironment, experience: Experience, index: StepIndex) -> Transitions:
     """Return logged steps, observed before and after."""
     (scenario, step), expert = index, experience.expert
     observation, action, _ = expert_actions(environment, experience, index)

@@ -51,16 +51,10 @@ def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
 
 
 def train(
-    config: TrainConfig,
-    data: ScenarioSet | WeightedSet,
-    out: str | Path,
-    *,
-    validation: ScenarioSet | None = None,
-    resume: bool = False,
-    overwrite: bool = False,
-    seeds: int = 1,
+    config: TrainConfig, data: ScenarioSet | WeightedSet, out: str | Path, *,
+    validation: ScenarioSet | None = None, resume: bool = False, overwrite: bool = False, seeds: int = 1,
     log: Callable[[str], None] = lambda line: None,
-) -> RunFolder:
+) -> RunFolder:  # fmt: skip
     """Train a policy and write the run folder: configuration, metrics, checkpoints of the full state.
 
     Args:
@@ -71,7 +65,7 @@ def train(
         resume: Continue the run in ``out`` from its newest checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-0``, ...
-        log: Called with lines about memory, pretrained networks, and seeds that stop early.
+        log: Called with lines about memory, pretrained networks, and early stopping.
 
     Raises:
         UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
@@ -87,7 +81,7 @@ def train(
         RunFolder.check(out, overwrite, "training")
         if config.begin_from is not None:
             # With its step, so that resuming finds the same checkpoint.
-            config = replace(config, begin_from=str(Pretrained.of(config.begin_from)))
+            config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
     if config.patience and validation is None:
         raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
     if seeds < 1:
@@ -102,7 +96,7 @@ def train(
     memory = program.account(None if held_out is None else held_out.bank)
     memory.check()
     log(memory.text())
-    # Before any folder is made: they may not fit.
+    # Before any folder is created, because they may not fit.
     networks = None if resume else pretrained_networks(config.begin_from, program, log)
     folders = folders or _create_folders(config, data, notes, out, numbers, overwrite)
     with contextlib.ExitStack() as stack:
@@ -128,8 +122,8 @@ def hashes(validation: ScenarioSet | None, weights: np.ndarray | None) -> dict[s
 def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
     """Return the means to log, given the values of an iteration.
 
-    A name with a count ``<name>/n`` is a sum: its mean is logged, and nothing if the count is 0. Sums of
-    ``rollout/reward/*`` are over steps. All else is logged as it is.
+    A name with a count ``<name>/n`` is a sum: its mean is logged, or nothing if the count is 0. Sums of
+    ``rollout/reward/*`` are divided by the number of steps. All other values are logged unchanged.
     """
     values = {name: float(value) for name, value in raw.items() if not name.endswith("/n")}
     steps = values.pop("rollout/steps", 0.0)
@@ -145,7 +139,7 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _environment(config: TrainConfig, data: ScenarioSet) -> tuple[Driving, ScenarioBank]:
-    """Environment of a training, and its bank."""
+    """Return the environment of a training, and its bank."""
     environment = config.environment(find_traffic(config.traffic))
     return environment, prepare_bank(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
 
@@ -155,7 +149,7 @@ def _create_folders(
 ) -> list[RunFolder]:
     """Create the run folder of each seed: ``out``, or for several ``out/seed-<seed>``."""
     if config.begin_from is not None:
-        notes = {**notes, "networks_from": Pretrained.of(config.begin_from).notes()}
+        notes = {**notes, "networks_from": PretrainedRun.of(config.begin_from).notes()}
     if len(seeds) == 1:
         return [RunFolder.create(out, config, [data], overwrite, kind="training", **notes)]
     RunFolder.create(out, config, [data], overwrite, kind="seeds", seeds=len(seeds), **notes)
@@ -168,10 +162,10 @@ def _resumed_folders(
 ) -> tuple[TrainConfig, list[RunFolder]]:
     """Return the configuration of a run, and the folder of each of its seeds; UsageError if inputs differ."""
     folder = RunFolder.open(out)
-    before = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
-    before |= {name: folder.info.get(name) for name in ("validation", "weights")}
-    for name, now in {**notes, "data": [data.hash]}.items():
-        if before[name] != now:
+    stored = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
+    stored |= {name: folder.info.get(name) for name in ("validation", "weights")}
+    for name, value in {**notes, "data": [data.hash]}.items():
+        if stored[name] != value:
             problem, option = _RESUMED_WITH_OTHER[name]
             raise UsageError(problem, file=out, cure=f"resume with the same {option}")
     folders = [RunFolder.open(path) for path in seed_folders(out)]
@@ -209,21 +203,21 @@ def _learn(run: _Run) -> None:
             state, values = program.step(state)
             values = jax.device_get(values)
             rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
-            # Read once, so that every seed has a checkpoint of the same iteration.
-            stops = stop.received and iteration < config.iterations
-            logged = (mean_logs(program.seeds.member(values, number)) for number in range(len(run.logs)))
-            rows = [row | {"steps_per_second": rate} for row in logged]
-            _record(run, iteration, state, rows, stops)
+            # Read once, so that all seeds write a checkpoint of the same iteration.
+            preempted = stop.received and iteration < config.iterations
+            means = (mean_logs(program.seeds.member(values, number)) for number in range(len(run.logs)))
+            rows = [row | {"steps_per_second": rate} for row in means]
+            _record(run, iteration, state, rows, preempted)
             success = [row["rollout/success"] for row in rows if "rollout/success" in row]
-            text = f"success {sum(success) / len(success):.2f}" if success else ""
-            progress.update(run.steps(iteration), text)
-            if stops:
+            note = f"success {sum(success) / len(success):.2f}" if success else ""
+            progress.update(run.steps(iteration), note)
+            if preempted:
                 problem = f"SIGTERM stopped the training after {run.steps(iteration):,} steps"
                 raise Preempted(problem, cure="continue it with --resume")
 
 
 def _start(run: _Run) -> tuple[int, Any]:
-    """Return the finished iterations and the state after them: of the newest checkpoint that all seeds have, or 0."""
+    """Return the number of finished iterations and the state: of the newest checkpoint of all seeds, or initial."""
     program, logs = run.program, run.logs
     steps = [set(log.checkpoints.steps()) for log in logs if not log.stopped]
     if not steps:
@@ -235,11 +229,11 @@ def _start(run: _Run) -> tuple[int, Any]:
         networks = run.networks
         if networks is None:
             networks = pretrained_networks(run.config.begin_from, program, run.log)
-        return 0, first_state(program, networks)
+        return 0, initial_state(program, networks)
     template = program.seeds.member_shapes(program.shapes)
     states = []
     for log in logs:
-        # A seed that stopped early keeps its last checkpoint; the program computes it without writing anything.
+        # A seed that stopped early resumes from its last checkpoint, but writes nothing more.
         last = log.newest if log.stopped else step
         log.start(last)
         states.append(log.checkpoints.restore(template, last))
@@ -247,20 +241,20 @@ def _start(run: _Run) -> tuple[int, Any]:
 
 
 def _record(
-    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], stops: bool
+    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], preempted: bool
 ) -> None:
     """Log, validate and save one iteration of every seed that has not stopped."""
     config, steps = run.config, run.steps(iteration)
     last = iteration == config.iterations
-    due = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
+    evaluates = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
     for number, log in enumerate(run.logs):
         if log.stopped:
             continue
         row = rows[number]
-        if due and run.validation is not None:
+        if evaluates and run.validation is not None:
             row |= _validation(run, run.validation, state, number)
         rank = log.write(steps, row)
-        if last or due or stops or iteration % config.checkpoint_every == 0:
+        if last or evaluates or preempted or iteration % config.checkpoint_every == 0:
             log.checkpoints.save(steps, run.program.seeds.member(state, number), rank)
         if log.stopped and not last:
             seed, patience = run.program.seeds.seeds[number], config.patience
@@ -281,7 +275,7 @@ def _validation(run: _Run, validation: Validation, state: LearnerState, number: 
 
 
 @dataclass(frozen=True)
-class Pretrained:
+class PretrainedRun:
     """A checkpoint of another run, and the data sets that it was trained on, as in its ``run.json``."""
 
     run: Path
@@ -289,8 +283,8 @@ class Pretrained:
     data: list[dict[str, Any]]
 
     @classmethod
-    def of(cls, name: str) -> Pretrained:
-        """Find the checkpoint ``RUN@STEP``, or of ``RUN`` the best, or the newest without a validation.
+    def of(cls, name: str) -> PretrainedRun:
+        """Find the checkpoint ``RUN@STEP``; for ``RUN`` the best one, or the newest without validation.
 
         Raises UsageError if the folder holds several seeds or an exported policy, DataError if it is no training run or
         has no checkpoint.
@@ -314,7 +308,7 @@ class Pretrained:
         return {"run": str(self.run), "step": self.step, "data": self.data}
 
     def networks(self, state: Any) -> dict[str, Any]:
-        """Return the stored networks by the paths that they replace in a fresh state of one seed, or its shapes.
+        """Return the stored networks by their paths in the initial state of one seed (or its shapes).
 
         Networks that the checkpoint lacks are left out. Raises DataError for the first array that does not fit.
         """
@@ -323,7 +317,7 @@ class Pretrained:
         networks = _networks(state)
         sources = {path: source for path in networks if (source := _source(path, stored))}
         templates = {source: networks[path] for path, source in sources.items()}
-        cure = "begin from a run with the same network, observation and actions"
+        cure = "start from a run with the same network, observation and actions"
         restored = checkpoints.restore_parts(templates, self.step, cure)
         return {path: restored[source] for path, source in sources.items()}
 
@@ -332,25 +326,25 @@ def pretrained_networks(name: str | None, program: Program, log: Callable[[str],
     """Return the networks of the run ``RUN`` or ``RUN@STEP`` by their paths in the state, and log them."""
     if name is None:
         return {}
-    run = Pretrained.of(name)
+    run = PretrainedRun.of(name)
     networks = run.networks(program.seeds.member_shapes(program.shapes))
-    log(f"begins with {', '.join(path.removeprefix('.') for path in networks)} of {run}")
+    log(f"starts from {', '.join(path.removeprefix('.') for path in networks)} of {run}")
     return networks
 
 
-def first_state(program: Program, networks: Mapping[str, Any]) -> Any:
-    """Return the first state of all seeds, each with these networks in place of its own."""
-    fresh, seeds = program.first_state(), program.seeds
+def initial_state(program: Program, networks: Mapping[str, Any]) -> Any:
+    """Return the initial state of all seeds, with these networks in place of their own."""
+    state, seeds = program.initial_state(), program.seeds
     if not networks:
-        return fresh
-    states = [with_networks(seeds.member(fresh, number), networks) for number in range(len(seeds.seeds))]
+        return state
+    states = [replace_networks(seeds.member(state, number), networks) for number in range(len(seeds.seeds))]
     return program.state_of(states)
 
 
-def with_networks(state: Any, networks: Mapping[str, Any], at: str = "") -> Any:
-    """Return a state with these networks, by their paths, in place of its own."""
+def replace_networks(state: Any, networks: Mapping[str, Any], at: str = "") -> Any:
+    """Replace networks of a state, given by their paths."""
     fields = {
-        name: with_networks(value, networks, path) if _is_state(value) else networks.get(path, value)
+        name: replace_networks(value, networks, path) if _is_state(value) else networks.get(path, value)
         for name, path, value in _fields(state, at)
     }
     return replace(state, **fields)

@@ -75,13 +75,9 @@ def load_policy(
 
 
 def export_policy(
-    run: str | Path,
-    out: str | Path,
-    bank: ScenarioBank,
-    notes: Mapping[str, Any] | None = None,
-    *,
+    run: str | Path, out: str | Path, bank: ScenarioBank, notes: Mapping[str, Any] | None = None, *,
     overwrite: bool = False,
-) -> RunFolder:
+) -> RunFolder:  # fmt: skip
     """Write the best policy of a run (the newest without a validation) to a folder that loads like the run.
 
     The folder holds the planner's parameters, the configuration, and the provenance (command, versions, commit and

@@ -23,21 +23,21 @@ from drivax.errors import UsageError
 from drivax.evaluation.memory import memory_of
 from drivax.learning.algorithm import Learner
 
-#: Threads of XLA's pool, enough that one never waits for another.
+#: Threads of XLA's pool, enough to avoid deadlocks.
 _THREADS = 8
 _AXIS = "devices"
 
-_REST = "networks and optimiser"
+_NETWORKS = "networks and optimiser"
 _CURES = {
     "scenarios": "train on fewer scenarios",
     "validation": "validate on fewer scenarios",
     "replay": "lower algorithm.replay.capacity, or set algorithm.replay.store to state",
     "environments": "lower algorithm.environments",
-    _REST: "choose a smaller network, or fewer --seeds",
+    _NETWORKS: "choose a smaller network, or fewer --seeds",
     "program": "lower algorithm.environments, unroll or batch, or raise algorithm.minibatches",
 }
 #: Fields of a learner's state that are listed separately.
-_FIELDS = ("replay", "environments")
+_LISTED_FIELDS = ("replay", "environments")
 
 
 def widen_pool() -> None:
@@ -58,35 +58,35 @@ class Seeds:
     seeds: tuple[int, ...]
 
     @property
-    def stacked(self) -> bool:
+    def is_stacked(self) -> bool:
         """Whether states have a leading axis."""
         return len(self.seeds) > 1
 
     def init(self, data: Any) -> Any:
         """Return the first state."""
-        if not self.stacked:
+        if not self.is_stacked:
             return self.learner.init(data, jax.random.key(self.seeds[0]))
         keys = jnp.stack([jax.random.key(seed) for seed in self.seeds])
         return jax.vmap(self.learner.init, (None, 0))(data, keys)
 
     def iterate(self, data: Any, state: Any) -> tuple[Any, dict[str, Array]]:
-        """Return the state after one iteration of all seeds, and what each logs."""
-        if not self.stacked:
+        """Return the state after one iteration of all seeds, and the logs of each."""
+        if not self.is_stacked:
             return self.learner.iterate(data, state)
         return jax.vmap(self.learner.iterate, (None, 0))(data, state)
 
     def member_shapes(self, shapes: Any) -> Any:
         """Return shapes of the state of one seed, given those of all."""
-        rank = int(self.stacked)
+        rank = int(self.is_stacked)
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[rank:], leaf.dtype), shapes)
 
     def member(self, tree: Any, number: int) -> Any:
-        """Select what belongs to one seed: of the state, part of it, or what is logged."""
-        return jax.tree.map(lambda leaf: leaf[number], tree) if self.stacked else tree
+        """Select one seed from a state, part of it, or logs."""
+        return jax.tree.map(lambda leaf: leaf[number], tree) if self.is_stacked else tree
 
     def stack(self, states: Sequence[Any]) -> Any:
         """Return the state of all seeds, given that of each."""
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states) if self.stacked else states[0]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states) if self.is_stacked else states[0]
 
 
 class Program:
@@ -106,7 +106,7 @@ class Program:
             self._layout = _layout(self._mesh, len(seeds.seeds), shapes)
             data = jax.device_put(data, NamedSharding(self._mesh, PartitionSpec()))
             shapes = jax.tree.map(
-                lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place),
+                lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
                 shapes, self._layout,
             )  # fmt: skip
         self.data, self.shapes = data, shapes
@@ -121,7 +121,7 @@ class Program:
         """Return the memory of the fullest device, with ``validation`` held next to the data."""
         return account(self.data, validation, self.shapes, self.compiled, self.devices)
 
-    def first_state(self) -> Any:
+    def initial_state(self) -> Any:
         """Return the first state of all seeds."""
         return jax.jit(self.seeds.init, out_shardings=self._layout)(self.data)
 
@@ -131,15 +131,15 @@ class Program:
         return state if self._layout is None else jax.device_put(state, self._layout)
 
     def step(self, state: Any) -> tuple[Any, Any]:
-        """Return the state after one iteration, and what each seed logs; the old state is donated."""
+        """Return the state after one iteration, and the logs of each seed; the old state is donated."""
         return self.compiled(self.data, state)
 
 
 def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | None = None) -> list[Any]:
-    """Return the requested number of devices; None: all of this machine that work can be divided among.
+    """Return the requested number of devices; None: all local devices if the work can be divided among them, else one.
 
-    That is seeds, the environments of their state (or its shapes), or the batch of an algorithm that learns from data
-    alone. Raises UsageError if there are fewer devices, or nothing can be divided among them.
+    Work is divided by seeds, by environments of their state (or its shapes), or by the batch of an offline algorithm.
+    Raises UsageError if there are fewer devices, or the work cannot be divided among them.
     """
     available = jax.local_devices()
     if requested is not None and not 1 <= requested <= len(available):
@@ -151,20 +151,20 @@ def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | N
     sizes = {leaf.shape[axis] for leaf, axis in _divisible(state, seeds) if axis is not None}
     kind = "environments" if sizes else "steps per batch"
     sizes |= set() if batch is None else {batch}
-    odd = [size for size in sizes if size % count]
-    if sizes and not odd:
+    indivisible = [size for size in sizes if size % count]
+    if sizes and not indivisible:
         return available[:count]
     if requested is None:
         return available[:1]
-    what = f"{odd[0]} {kind}" if odd else "an algorithm without environments or batches"
+    work = f"{indivisible[0]} {kind}" if indivisible else "an algorithm without environments or batches"
     cure = f"use a multiple of {count} {kind} or seeds, or fewer devices"
-    raise UsageError(f"{what} cannot be divided among {count} devices", cure=cure)
+    raise UsageError(f"{work} cannot be divided among {count} devices", cure=cure)
 
 
-def divided(tree: Any, axis: int) -> Any:
-    """Ask the compiler to divide this axis where one seed's work is divided among devices; values do not change.
+def shard_axis(tree: Any, axis: int) -> Any:
+    """Shard an axis over the devices that one seed is divided among; values do not change.
 
-    Otherwise it may compute a whole update on every device.
+    Without this constraint the compiler may compute the whole update on every device.
     """
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty or mesh.size == 1 or any(leaf.shape[axis] % mesh.size for leaf in jax.tree.leaves(tree)):
@@ -197,7 +197,7 @@ def _divisible(state: Any, seeds: int) -> list[tuple[Any, int | None]]:
 
 @dataclass(frozen=True)
 class MemoryAccount:
-    """Bytes that a run takes on its fullest device by purpose, and the device's memory, None if unknown."""
+    """Memory of a run on its fullest device by purpose, in bytes, and the device's capacity, None if unknown."""
 
     sizes: Mapping[str, int]
     limit: int | None
@@ -211,11 +211,11 @@ class MemoryAccount:
     def text(self) -> str:
         """Return the account as one line."""
         sizes = ", ".join(f"{name} {_readable(size)}" for name, size in self.sizes.items() if size)
-        of = "" if self.limit is None else f" of {_readable(self.limit)}"
-        return f"memory: {_readable(self.total)}{of} on {self.device}: {sizes}"
+        limit = "" if self.limit is None else f" of {_readable(self.limit)}"
+        return f"memory: {_readable(self.total)}{limit} on {self.device}: {sizes}"
 
     def check(self) -> None:
-        """Raise UsageError if the run does not fit; its cure concerns what takes the most."""
+        """Raise UsageError if the run does not fit, with a cure for its largest part."""
         if self.limit is not None and self.total > self.limit:
             largest = max(self.sizes, key=lambda name: self.sizes[name])
             raise UsageError(f"training does not fit; {self.text()}", cure=_CURES[largest])
@@ -229,11 +229,11 @@ def account(
     ``state`` may be the shapes of the learners' state with their sharding.
     """
     sizes = {"scenarios": _bytes(data), "validation": _bytes(validation)} | dict.fromkeys(
-        (*_FIELDS, _REST), 0
+        (*_LISTED_FIELDS, _NETWORKS), 0
     )
     for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
         names = [getattr(key, "name", "") for key in path]
-        sizes[next((name for name in names if name in _FIELDS), _REST)] += _leaf_bytes(leaf)
+        sizes[next((name for name in names if name in _LISTED_FIELDS), _NETWORKS)] += _leaf_bytes(leaf)
     sizes["program"] = _program_bytes(compiled)
     device = devices[0]
     return MemoryAccount(sizes, memory_of(device, len(devices)), f"{device.platform}:{device.id}")

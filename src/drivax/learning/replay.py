@@ -47,7 +47,7 @@ class Replay:
     """Contents of the buffer ``[row, environment]``.
 
     Attributes:
-        stored: States, or observations in bfloat16, as ``store`` says.
+        stored: States, or observations in bfloat16, according to ``store``.
         action: Actions in [-1, 1].
         reward: Rewards.
         terminated: Whether the episode ended by a failure.
@@ -110,8 +110,8 @@ class ReplayBuffer:
     def add(self, replay: Replay, rollout: Rollout) -> Replay:
         """Write a rollout over the oldest rows; UsageError if it has more steps than the buffer has rows.
 
-        The rollout continues the last one, keeps states or observations as ``store`` says, and its raw actions are
-        actions in [-1, 1].
+        The rollout must continue the last one, keep states or observations according to ``store``, and have raw actions
+        in [-1, 1].
         """
         rows, steps = replay.reward.shape[0], rollout.reward.shape[0]
         if steps > rows:

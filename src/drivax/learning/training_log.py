@@ -59,7 +59,7 @@ def validate(planner: Planner, validation: Validation, task: Task, traffic: Traf
         problem = f"actions of the policy are not finite in {len(results.crashes)} of {len(results)} episodes"
         raise DrivaxError(problem, cure="lower the learning rate, or resume from an earlier checkpoint")
     values = {name: x for name, x in results.metrics.items() if np.isfinite(x).any()}
-    # Full scores where there are any; partial scores are never mixed with them.
+    # Prefer full scores, and never mix them with partial ones.
     score = next(name for name in _SCORES if name in values)
     return {
         f"validation/{name}": float(np.nanmean(values[name])) for name in (score, *_METRICS) if name in values
@@ -67,7 +67,7 @@ def validate(planner: Planner, validation: Validation, task: Task, traffic: Traf
 
 
 def rank(rule: Rule, row: Mapping[str, Any]) -> tuple[float, ...] | None:
-    """Return what a checkpoint is ranked by (higher is better), given its row of ``metrics.jsonl``.
+    """Return the rank of a checkpoint (higher is better) from its row of ``metrics.jsonl``.
 
     Undefined values rank last. None if the row has no validation.
     """
@@ -145,11 +145,11 @@ class TrainingLog:
 
     @property
     def stopped(self) -> bool:
-        """Whether patience is exceeded: nothing more is written."""
+        """Whether patience is exceeded, after which nothing is written."""
         return patience_exceeded(self._ranks, self._patience)
 
     def start(self, step: int | None) -> None:
-        """Open the log: a new one, or after a step of the run so far, dropping what is later."""
+        """Open a new log, or the log of the run up to a step; later rows and checkpoints are dropped."""
         if step is not None:
             self.checkpoints.drop_after(step)
             self._read_ranks(step)

@@ -13,8 +13,8 @@ from drivax.networks.distributions import (
     Distribution,
     DistributionName,
     distribution,
-    first_parameters,
-    parameters_of,
+    initial_parameters,
+    parameter_count,
 )
 from drivax.networks.encoders import (
     ACTIVATIONS,
@@ -71,18 +71,18 @@ class _Head(nnx.Module):
     def __call__(self, x: Array, extra: Array | None = None) -> Array:
         """Apply the head to ``x``, or to ``x`` and ``extra`` concatenated; ``extra`` may have further leading axes."""
         if extra is not None and extra.shape[:-1] == x.shape[:-1]:
-            # Nothing is shared: one product is faster than two.
+            # Nothing to share: one product is faster than two.
             x, extra = jnp.concatenate([x, extra], axis=-1), None
         layers = [*self.hidden, self.out]
         for number, layer in enumerate(layers):
-            x = layer(x) if number or extra is None else _concatenated(layer, x, extra)
+            x = layer(x) if number or extra is None else _apply_concatenated(layer, x, extra)
             if number < len(self.hidden):
                 x = ACTIVATIONS[self.activation](x)
         return x
 
 
-def _concatenated(layer: nnx.Linear, x: Array, extra: Array) -> Array:
-    """Apply a layer to both, concatenated; the product with ``x`` is computed once for all of ``extra``."""
+def _apply_concatenated(layer: nnx.Linear, x: Array, extra: Array) -> Array:
+    """Apply a layer to ``x`` and ``extra`` concatenated; the product with ``x`` is shared by all of ``extra``."""
     kernel, bias = layer.kernel[...], 0.0 if layer.bias is None else layer.bias[...]
     width = x.shape[-1]
     return x @ kernel[:width] + extra @ kernel[width:] + bias
@@ -98,16 +98,16 @@ class Policy(nnx.Module):
         self.kind: DistributionName = config.distribution
         self.first_scale = config.first_scale
         self.encoder = config.encoder.build(spec, rngs)
-        self.head = _Head(config, self.encoder.width, parameters_of(self.kind, self.actions), 0.01, rngs)
+        self.head = _Head(config, self.encoder.width, parameter_count(self.kind, self.actions), 0.01, rngs)
 
     def __call__(self, groups: Groups) -> Distribution:
         """Return the action distribution; before training it is centred at zero with ``first_scale``."""
-        return self.of(self.encoder(groups))
+        return self.from_embedding(self.encoder(groups))
 
-    def of(self, embedding: Float[Array, "*batch width"]) -> Distribution:
+    def from_embedding(self, embedding: Float[Array, "*batch width"]) -> Distribution:
         """Return the action distribution of an embedding."""
-        first = first_parameters(self.kind, self.actions, self.first_scale)
-        return distribution(self.kind, self.head(embedding) + first, self.actions)
+        initial = initial_parameters(self.kind, self.actions, self.first_scale)
+        return distribution(self.kind, self.head(embedding) + initial, self.actions)
 
 
 class Value(nnx.Module):
@@ -121,9 +121,9 @@ class Value(nnx.Module):
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch"]:
         """Return the expected discounted return."""
-        return self.of(self.encoder(groups))
+        return self.from_embedding(self.encoder(groups))
 
-    def of(self, embedding: Float[Array, "*batch width"]) -> Float[Array, "*batch"]:
+    def from_embedding(self, embedding: Float[Array, "*batch width"]) -> Float[Array, "*batch"]:
         """Return the value of an embedding."""
         return self.head(embedding)[..., 0]
 
@@ -138,12 +138,12 @@ class ActorCritic(nnx.Module):
         self.policy = Policy(config, spec, rngs, actions)
         self.value = Value(config, spec, rngs, self.policy.encoder if self.shared else None)
 
-    def both(self, groups: Groups) -> tuple[Distribution, Float[Array, "*batch"]]:
+    def policy_and_value(self, groups: Groups) -> tuple[Distribution, Float[Array, "*batch"]]:
         """Return action distribution and value; a shared encoder runs once."""
         if not self.shared:
             return self.policy(groups), self.value(groups)
         embedding = self.policy.encoder(groups)
-        return self.policy.of(embedding), self.value.of(embedding)
+        return self.policy.from_embedding(embedding), self.value.from_embedding(embedding)
 
 
 class Critic(nnx.Module):

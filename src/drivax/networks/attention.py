@@ -23,7 +23,7 @@ from drivax.networks.encoders import Groups, GroupSpec, dense_layers, group_name
 
 Dtype = Literal["float32", "bfloat16"]
 
-#: Logit of masked tokens: finite, because a softmax over masked tokens alone must stay finite.
+#: Logit of masked tokens; finite, so that a softmax over masked tokens only stays finite.
 _MASKED = -1e30
 
 
@@ -32,13 +32,13 @@ class Attention(nnx.Module):
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
         self.dtype = dtype
-        split, joined = (width, heads, width // heads), (heads, width // heads, width)
-        into = nnx.initializers.lecun_normal(in_axis=0, out_axis=(1, 2))
-        back = nnx.initializers.lecun_normal(in_axis=(0, 1), out_axis=2)
-        self.query = nnx.Param(into(rngs.params(), split))
-        self.key = nnx.Param(into(rngs.params(), split))
-        self.value = nnx.Param(into(rngs.params(), split))
-        self.out = nnx.Param(back(rngs.params(), joined))
+        in_shape, out_shape = (width, heads, width // heads), (heads, width // heads, width)
+        in_init = nnx.initializers.lecun_normal(in_axis=0, out_axis=(1, 2))
+        out_init = nnx.initializers.lecun_normal(in_axis=(0, 1), out_axis=2)
+        self.query = nnx.Param(in_init(rngs.params(), in_shape))
+        self.key = nnx.Param(in_init(rngs.params(), in_shape))
+        self.value = nnx.Param(in_init(rngs.params(), in_shape))
+        self.out = nnx.Param(out_init(rngs.params(), out_shape))
 
     def __call__(
         self,
@@ -49,7 +49,7 @@ class Attention(nnx.Module):
         """Return ``softmax(Q K^T / sqrt(width / heads)) V`` over tokens in ``mask`` (None: all); zeros without any."""
         _, heads, size = self.query.shape
         if queries.shape[-2] * heads < self.query.shape[0]:
-            return self._few(queries, tokens, mask)
+            return self._attend_few_queries(queries, tokens, mask)
         query = self._times("...qd,dhc->...qhc", queries, self.query) * size**-0.5
         key = self._times("...kd,dhc->...khc", tokens, self.key)
         value = self._times("...kd,dhc->...khc", tokens, self.value)
@@ -57,8 +57,8 @@ class Attention(nnx.Module):
         mean = self._times("...hqk,...khc->...qhc", weights, value)
         return self._times("...qhc,hcd->...qd", mean, self.out)
 
-    def _few(self, queries: Array, tokens: Array, mask: Array | None) -> Array:
-        # For few queries, keys are applied to queries and values to outputs, never to all tokens:
+    def _attend_few_queries(self, queries: Array, tokens: Array, mask: Array | None) -> Array:
+        # With few queries it is cheaper to project them than all tokens:
         # ``(W_q x) . (W_k y) = (W_k^T W_q x) . y``, and the mean of ``W_v y`` is ``W_v`` times the mean of ``y``.
         query = self._times("...qd,dhc->...qhc", queries, self.query) * self.query.shape[2] ** -0.5
         projected = self._times("...qhc,dhc->...qhd", query, self.key)
@@ -70,14 +70,14 @@ class Attention(nnx.Module):
         def product(left: Array, right: Array) -> Array:
             return jnp.einsum(axes, left, right, preferred_element_type=jnp.float32)
 
-        def rounded(left: Array, right: Array) -> Array:
+        def float32_product(left: Array, right: Array) -> Array:
             return product(left.astype(jnp.float32), right.astype(jnp.float32))
 
         left, right = jnp.asarray(left[...], self.dtype), jnp.asarray(right[...], self.dtype)
         if self.dtype == "float32":
             return product(left, right)
-        # XLA for CPUs lacks some bfloat16 products; float32 products of the rounded numbers are the same.
-        return jax.lax.platform_dependent(left, right, cpu=rounded, default=product)
+        # XLA lacks some bfloat16 products on CPUs; float32 products of the rounded numbers give the same result.
+        return jax.lax.platform_dependent(left, right, cpu=float32_product, default=product)
 
 
 def _weights(
@@ -90,8 +90,8 @@ def _weights(
     return jnp.where(valid, jax.nn.softmax(jnp.where(valid, logits, _MASKED)), 0.0)
 
 
-class Attend(nnx.Module):
-    """``x + attention(norm(x), tokens)`` with normalised ``tokens``; self-attention without them."""
+class ResidualAttention(nnx.Module):
+    """``x + attention(norm(x), tokens)`` with normalised ``tokens``; without them, self-attention."""
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
         self.norm = nnx.LayerNorm(width, rngs=rngs)
@@ -109,7 +109,7 @@ class Attend(nnx.Module):
 
 
 class FeedForward(nnx.Module):
-    """``x + W_2 gelu(W_1 norm(x))`` with four times the width between."""
+    """``x + W_2 gelu(W_1 norm(x))`` with a hidden layer four times as wide."""
 
     def __init__(self, width: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
         self.norm = nnx.LayerNorm(width, rngs=rngs)
@@ -125,7 +125,7 @@ class SelfAttention(nnx.Module):
     """A transformer layer: self-attention over rows, then two dense layers."""
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
-        self.attend = Attend(width, heads, rngs, dtype)
+        self.attend = ResidualAttention(width, heads, rngs, dtype)
         self.feed_forward = FeedForward(width, rngs, dtype)
 
     def __call__(
@@ -144,7 +144,7 @@ def masked_mean(
 
 
 @dataclass(frozen=True)
-class Form:
+class GroupShape:
     """Shape of a group in one observation, features last, and whether it has a mask."""
 
     shape: tuple[int, ...]
@@ -171,7 +171,7 @@ class Form:
         return math.prod(self.shape[:-1]) // self.rows
 
 
-class Rows(NamedTuple):
+class TokenRows(NamedTuple):
     """Rows of tokens and their mask."""
 
     value: Float[Array, "*batch rows time width"]
@@ -183,24 +183,24 @@ class Rows(NamedTuple):
         return self.value.reshape(*lead, rows * times, width), self.mask.reshape(*lead, rows * times)
 
 
-def forms(spec: GroupSpec) -> dict[str, Form]:
+def group_shapes(spec: GroupSpec) -> dict[str, GroupShape]:
     """Return the shape of each group."""
-    return {name: Form(tuple(spec[name]), f"{name}_mask" in spec) for name in group_names(spec)}
+    return {name: GroupShape(tuple(spec[name]), f"{name}_mask" in spec) for name in group_names(spec)}
 
 
-def raw_rows(groups: Groups, name: str, form: Form) -> Rows:
-    """Return a group's features as rows of times; masked ones are zero."""
+def group_rows(groups: Groups, name: str, shape: GroupShape) -> TokenRows:
+    """Return the features of a group as rows of tokens; masked tokens are zero."""
     value = groups[name].astype(jnp.float32)
-    axes = (*value.shape[: value.ndim - len(form.shape)], form.rows, form.times)
-    value = value.reshape(*axes, form.features)
-    mask = groups[f"{name}_mask"].reshape(axes) if form.masked else jnp.ones(axes, bool)
-    return Rows(jnp.where(mask[..., None], value, 0.0) if form.masked else value, mask)
+    axes = (*value.shape[: value.ndim - len(shape.shape)], shape.rows, shape.times)
+    value = value.reshape(*axes, shape.features)
+    mask = groups[f"{name}_mask"].reshape(axes) if shape.masked else jnp.ones(axes, bool)
+    return TokenRows(jnp.where(mask[..., None], value, 0.0) if shape.masked else value, mask)
 
 
 def time_code(times: int, width: int) -> Float[np.ndarray, "time width"]:
     """Return the sinusoidal encoding of time, counted back from the last step (Vaswani et al. 2017, section 3.5)."""
-    back = np.arange(times - 1, -1, -1)[:, None]
-    angle = back / 10_000 ** (2 * np.arange((width + 1) // 2) / width)
+    steps_back = np.arange(times - 1, -1, -1)[:, None]
+    angle = steps_back / 10_000 ** (2 * np.arange((width + 1) // 2) / width)
     return np.stack([np.sin(angle), np.cos(angle)], axis=-1).reshape(times, -1)[:, :width].astype(np.float32)
 
 
@@ -213,28 +213,28 @@ class Embedding(nnx.Module):
     def __init__(
         self, spec: GroupSpec, width: int, hidden: tuple[int, ...], rngs: nnx.Rngs, dtype: Dtype
     ) -> None:
-        self.forms = forms(spec)
+        self.group_shapes = group_shapes(spec)
         self.dtype = dtype
         self.hidden, self.out, self.norms = nnx.Dict(), nnx.Dict(), nnx.Dict()
-        for name, form in self.forms.items():
-            self.hidden[name] = dense_layers(form.features, hidden, rngs)
-            self.out[name] = nnx.Linear(hidden[-1] if hidden else form.features, width, rngs=rngs)
+        for name, shape in self.group_shapes.items():
+            self.hidden[name] = dense_layers(shape.features, hidden, rngs)
+            self.out[name] = nnx.Linear(hidden[-1] if hidden else shape.features, width, rngs=rngs)
             self.norms[name] = nnx.LayerNorm(width, rngs=rngs)
         self.width = width
 
-    def __call__(self, groups: Groups) -> dict[str, Rows]:
+    def __call__(self, groups: Groups) -> dict[str, TokenRows]:
         """Return the tokens of each group by name."""
-        return {name: self._rows(groups, name) for name in self.forms}
+        return {name: self._rows(groups, name) for name in self.group_shapes}
 
-    def _rows(self, groups: Groups, name: str) -> Rows:
-        form = self.forms[name]
-        x, mask = raw_rows(groups, name, form)
+    def _rows(self, groups: Groups, name: str) -> TokenRows:
+        shape = self.group_shapes[name]
+        x, mask = group_rows(groups, name, shape)
         for layer in self.hidden[name]:
             x = nnx.relu(layer(x))
         x = self.out[name](x)
-        if form.series:
-            x = x + jnp.asarray(time_code(form.times, self.width))
-        return Rows(self.norms[name](x).astype(self.dtype), mask)
+        if shape.series:
+            x = x + jnp.asarray(time_code(shape.times, self.width))
+        return TokenRows(self.norms[name](x).astype(self.dtype), mask)
 
 
 def concatenate_groups(groups: list[tuple[Array, Array]]) -> tuple[Array, Array]:

@@ -26,11 +26,11 @@ REPARAMETRISED: tuple[DistributionName, ...] = ("gaussian", "beta")
 
 _MIN_SCALE, _MAX_SCALE = 1e-3, 2.0
 #: Actions are clipped to +-0.999 (a raw action of +-3.8) before arctanh, which has poles at the bounds.
-_SQUASHED = 0.999
+_MAX_ACTION = 0.999
 #: Distance that a Beta's raw action keeps from 0 and 1, where the log-density has poles.
 _EDGE = 1e-6
 #: Gaussians in a mixture.
-_PARTS = 3
+_COMPONENTS = 3
 #: Nodes of the Gauss-Hermite rule; the mean of tanh is within 1e-3 for every scale up to 2.
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(24)
 
@@ -64,7 +64,7 @@ class Distribution(Protocol):
         ...
 
     def raw_action(self, action: Float[Array, "*batch action"]) -> Float[Array, "*batch raw"]:
-        """Return the raw action of an action, or of the nearest one that has any."""
+        """Return the raw action that maps to an action, or to the nearest reachable one."""
         ...
 
     def mode(self) -> Float[Array, "*batch action"]:
@@ -76,11 +76,11 @@ class Distribution(Protocol):
         ...
 
     def entropy_estimate(self, key: Array) -> Float[Array, "*batch"]:
-        """Return the entropy of the action: in closed form if there is one, else estimated by one sample."""
+        """Return the entropy of the action, in closed form or estimated from one sample."""
         ...
 
 
-class _Squashed:
+class _SquashedActions:
     """Actions that are ``tanh`` of raw actions; their entropy has no closed form."""
 
     def action(self, raw_action: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
@@ -89,7 +89,7 @@ class _Squashed:
 
     def raw_action(self, action: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
         """Return ``arctanh`` of actions, clipped to +-0.999."""
-        return jnp.arctanh(jnp.clip(action, -_SQUASHED, _SQUASHED))
+        return jnp.arctanh(jnp.clip(action, -_MAX_ACTION, _MAX_ACTION))
 
     def entropy_estimate(self: Distribution, key: Array) -> Float[Array, "*batch"]:
         """Return minus the log-density of one sample."""
@@ -97,7 +97,7 @@ class _Squashed:
 
 
 @record
-class SquashedGaussian(_Squashed):
+class SquashedGaussian(_SquashedActions):
     """``tanh`` of a diagonal Gaussian with mean ``loc`` and standard deviation ``scale``."""
 
     loc: Float[Array, "*batch action"]
@@ -105,7 +105,7 @@ class SquashedGaussian(_Squashed):
 
     @classmethod
     def from_parameters(cls, parameters: Float[Array, "*batch two_actions"]) -> SquashedGaussian:
-        """Make one of a head's output: means, and standard deviations before softplus."""
+        """Split the output of a head into means, and standard deviations before softplus."""
         loc, raw = jnp.split(parameters, 2, axis=-1)
         return cls(loc, jnp.clip(jax.nn.softplus(raw), _MIN_SCALE, _MAX_SCALE))
 
@@ -121,7 +121,7 @@ class SquashedGaussian(_Squashed):
         return jnp.sum(gaussian - jacobian, axis=-1)
 
     def mode(self) -> Float[Array, "*batch action"]:
-        """Return the squashed mean, which is the median of the action; its density may peak elsewhere."""
+        """Return the squashed mean: the median of the action, but not always the peak of its density."""
         return jnp.tanh(self.loc)
 
     def mean_action(self) -> Float[Array, "*batch action"]:
@@ -132,14 +132,14 @@ class SquashedGaussian(_Squashed):
 
 @record
 class Beta:
-    """``2 x - 1`` of independent ``x ~ Beta(alpha, beta)`` with both above 1, so that there is one peak."""
+    """``2 x - 1`` of independent ``x ~ Beta(alpha, beta)``, unimodal because both parameters are above 1."""
 
     alpha: Float[Array, "*batch action"]
     beta: Float[Array, "*batch action"]
 
     @classmethod
     def from_parameters(cls, parameters: Float[Array, "*batch two_actions"]) -> Beta:
-        """Make one of a head's output: ``1 + softplus`` of either half."""
+        """Split the output of a head into halves; each parameter is ``1 + softplus``."""
         alpha, beta = jnp.split(1.0 + jax.nn.softplus(parameters), 2, axis=-1)
         return cls(alpha, beta)
 
@@ -162,7 +162,7 @@ class Beta:
         return jnp.clip((action + 1.0) / 2.0, _EDGE, 1.0 - _EDGE)
 
     def mode(self) -> Float[Array, "*batch action"]:
-        """Return the peak of the density; the centre of the uniform distribution, which has none."""
+        """Return the peak of the density; for the uniform distribution, its centre."""
         above = jnp.maximum(self.alpha + self.beta - 2.0, _EDGE)
         return (self.alpha - self.beta) / above
 
@@ -223,43 +223,43 @@ class Grid:
 
 
 @record
-class Mixture(_Squashed):
+class Mixture(_SquashedActions):
     """``tanh`` of a mixture of diagonal Gaussians (mixture density network; Bishop 1994), which can have several modes.
 
     Samples have no gradient in the logits.
     """
 
     logits: Float[Array, "*batch part"]
-    parts: SquashedGaussian
+    components: SquashedGaussian
 
     @classmethod
     def from_parameters(cls, parameters: Float[Array, "*batch parameters"]) -> Mixture:
         """Make one of a head's output: logits, then each part as in :meth:`SquashedGaussian.from_parameters`."""
-        logits, rest = jnp.split(parameters, [_PARTS], axis=-1)
-        return cls(logits, SquashedGaussian.from_parameters(rest.reshape(*rest.shape[:-1], _PARTS, -1)))
+        logits, rest = jnp.split(parameters, [_COMPONENTS], axis=-1)
+        return cls(logits, SquashedGaussian.from_parameters(rest.reshape(*rest.shape[:-1], _COMPONENTS, -1)))
 
     def sample(self, key: Array) -> Float[Array, "*batch action"]:
-        """Sample one of the parts."""
-        part_key, noise_key = jax.random.split(key)
-        part = jax.random.categorical(part_key, self.logits)
-        return _part(self.parts.sample(noise_key), part)
+        """Sample a component, then a raw action from it."""
+        component_key, noise_key = jax.random.split(key)
+        component = jax.random.categorical(component_key, self.logits)
+        return _select_component(self.components.sample(noise_key), component)
 
     def log_prob(self, raw_action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
-        """Return the log of the weighted sum of the parts' densities."""
+        """Return the log of the weighted sum of the components' densities."""
         shares, sample = jax.nn.log_softmax(self.logits), raw_action[..., None, :]
-        each = jnp.broadcast_to(sample, jnp.broadcast_shapes(sample.shape, self.parts.loc.shape))
-        return jax.nn.logsumexp(shares + self.parts.log_prob(each), axis=-1)
+        each = jnp.broadcast_to(sample, jnp.broadcast_shapes(sample.shape, self.components.loc.shape))
+        return jax.nn.logsumexp(shares + self.components.log_prob(each), axis=-1)
 
     def mode(self) -> Float[Array, "*batch action"]:
-        """Return the squashed mean of the likeliest part."""
-        return _part(self.parts.mode(), jnp.argmax(self.logits, axis=-1))
+        """Return the squashed mean of the component with the largest weight."""
+        return _select_component(self.components.mode(), jnp.argmax(self.logits, axis=-1))
 
     def mean_action(self) -> Float[Array, "*batch action"]:
-        """Return the mean of the parts' means, within 1e-3."""
-        return jnp.sum(jax.nn.softmax(self.logits)[..., None] * self.parts.mean_action(), axis=-2)
+        """Return the weighted mean of the components' means, within 1e-3."""
+        return jnp.sum(jax.nn.softmax(self.logits)[..., None] * self.components.mean_action(), axis=-2)
 
 
-def _part(values: Float[Array, "*batch part action"], index: Int[Array, "*batch"]) -> Array:
+def _select_component(values: Float[Array, "*batch part action"], index: Int[Array, "*batch"]) -> Array:
     return jnp.take_along_axis(values, index[..., None, None], axis=-2)[..., 0, :]
 
 
@@ -269,14 +269,14 @@ def combinations(levels: tuple[tuple[float, ...], ...]) -> Float[np.ndarray, "co
     return np.stack([axis.ravel() for axis in axes], axis=-1)
 
 
-def parameters_of(kind: DistributionName, actions: Actions) -> int:
+def parameter_count(kind: DistributionName, actions: Actions) -> int:
     """Return the number of parameters of a distribution; raises UsageError for a grid of actions without levels."""
     if kind == "grid":
         return len(combinations(_levels(actions)))
-    return _PARTS * (1 + 2 * actions.size) if kind == "mixture" else 2 * actions.size
+    return _COMPONENTS * (1 + 2 * actions.size) if kind == "mixture" else 2 * actions.size
 
 
-def first_parameters(
+def initial_parameters(
     kind: DistributionName, actions: Actions, scale: float
 ) -> Float[np.ndarray, " parameters"]:
     """Return the parameters of a distribution centred at zero; UsageError if a Beta would have no peak.
@@ -290,10 +290,10 @@ def first_parameters(
     if kind == "gaussian":
         return np.repeat(np.array([0.0, spread], np.float32), actions.size)
     if kind == "mixture":
-        # Equal parts would stay equal; the part around zero starts as the largest.
-        means = np.linspace(-scale, scale, _PARTS)
-        parts = [np.repeat([mean, spread], actions.size) for mean in means]
-        return np.concatenate([(means == 0.0).astype(float), *parts]).astype(np.float32)
+        # Equal components would stay equal; the one around zero starts with the largest weight.
+        means = np.linspace(-scale, scale, _COMPONENTS)
+        components = [np.repeat([mean, spread], actions.size) for mean in means]
+        return np.concatenate([(means == 0.0).astype(float), *components]).astype(np.float32)
     # A symmetric Beta's action has the variance 1 / (2 alpha + 1).
     above = (scale**-2 - 1.0) / 2.0 - 1.0
     if above <= 0.0:

@@ -118,8 +118,8 @@ class MlpEncoder(nnx.Module):
         row = jnp.concatenate([value.reshape(axes), mask.astype(jnp.float32)], axis=-1)
         if not self.pools:
             return row
-        # A row is valid if any of its times is; without rows the embedding is zero.
-        return largest(self.activation, _weights(self.shared[name]), row, mask.any(axis=-1))
+        # A row is valid if any of its times is; without valid rows the embedding is zero.
+        return max_pool(self.activation, _weights(self.shared[name]), row, mask.any(axis=-1))
 
 
 def dense_layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
@@ -153,86 +153,84 @@ def dense(
     return x
 
 
-def largest(
-    activation: Activation,
-    layers: Layers,
-    rows: Float[Array, "*batch row inputs"],
-    there: Bool[Array, "*batch row"],
-) -> Float[Array, "*batch outputs"]:
+def max_pool(
+    activation: Activation, layers: Layers, rows: Float[Array, "*batch row inputs"],
+    valid: Bool[Array, "*batch row"],
+) -> Float[Array, "*batch outputs"]:  # fmt: skip
     """Return the maximum of zero and the valid rows after the layers."""
-    if only_winners(rows.shape[-2], [rows.shape[-1], *(bias.shape[0] for _, bias in layers)]):
-        return _of_layers(activation, tuple(layers), rows, there)
-    return _of_rows(dense(activation, layers, rows), there)
+    if recomputes_maxima(rows.shape[-2], [rows.shape[-1], *(bias.shape[0] for _, bias in layers)]):
+        return _encode_and_max(activation, tuple(layers), rows, valid)
+    return _max_over_rows(dense(activation, layers, rows), valid)
 
 
-def only_winners(rows: int, sizes: Sequence[int]) -> bool:
-    """Whether it is less work to differentiate the maximal rows only, given the widths of a row and of each layer.
+def recomputes_maxima(rows: int, sizes: Sequence[int]) -> bool:
+    """Whether it is cheaper to encode the maximal rows again than to differentiate all rows.
 
-    A backward pass takes two products per layer and row. A maximal row takes three, because it is embedded again, but
-    only one output of the last layer.
+    ``sizes`` are the widths of a row and of each layer. A backward pass takes two products per layer and row. A maximal
+    row takes three, because it is encoded again, but only one output of the last layer.
     """
     products = [inputs * outputs for inputs, outputs in pairwise(sizes)]
     return 3 * sizes[-1] * (sum(products[:-1]) + sizes[-2]) < 2 * rows * sum(products)
 
 
 @jax.custom_vjp
-def _of_rows(
-    embedded: Float[Array, "*batch row outputs"], there: Bool[Array, "*batch row"]
+def _max_over_rows(
+    embedded: Float[Array, "*batch row outputs"], valid: Bool[Array, "*batch row"]
 ) -> Float[Array, "*batch outputs"]:
-    return jnp.max(embedded, axis=-2, initial=0.0, where=there[..., None])
+    return jnp.max(embedded, axis=-2, initial=0.0, where=valid[..., None])
 
 
-def _of_rows_forward(embedded: Array, there: Array) -> tuple[Array, tuple[Array, Array, int]]:
-    largest, winner, counts = _winners(embedded, there)
-    return largest, (winner, counts, embedded.shape[-2])
+def _max_over_rows_forward(embedded: Array, valid: Array) -> tuple[Array, tuple[Array, Array, int]]:
+    maximum, argmax, positive = _row_maxima(embedded, valid)
+    return maximum, (argmax, positive, embedded.shape[-2])
 
 
-def _of_rows_backward(kept: tuple[Array, Array, int], gradient: Array) -> tuple[Array, None]:
-    winner, counts, rows = kept
-    won = jnp.arange(rows)[:, None] == winner[..., None, :]
-    return jnp.where(won, jnp.where(counts, gradient, 0.0)[..., None, :], 0.0), None
+def _max_over_rows_backward(residuals: tuple[Array, Array, int], gradient: Array) -> tuple[Array, None]:
+    argmax, positive, rows = residuals
+    is_maximum = jnp.arange(rows)[:, None] == argmax[..., None, :]
+    return jnp.where(is_maximum, jnp.where(positive, gradient, 0.0)[..., None, :], 0.0), None
 
 
-_of_rows.defvjp(_of_rows_forward, _of_rows_backward)
+_max_over_rows.defvjp(_max_over_rows_forward, _max_over_rows_backward)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _of_layers(
-    activation: Activation,
-    layers: Layers,
-    rows: Float[Array, "*batch row inputs"],
-    there: Bool[Array, "*batch row"],
-) -> Float[Array, "*batch outputs"]:
-    return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=there[..., None])
+def _encode_and_max(
+    activation: Activation, layers: Layers, rows: Float[Array, "*batch row inputs"],
+    valid: Bool[Array, "*batch row"],
+) -> Float[Array, "*batch outputs"]:  # fmt: skip
+    return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=valid[..., None])
 
 
-def _of_layers_forward(
-    activation: Activation, layers: Layers, rows: Array, there: Array
+def _encode_and_max_forward(
+    activation: Activation, layers: Layers, rows: Array, valid: Array
 ) -> tuple[Array, Any]:
-    largest, winner, counts = _winners(dense(activation, layers, rows), there)
-    return largest, (layers, rows, winner, counts)
+    maximum, argmax, positive = _row_maxima(dense(activation, layers, rows), valid)
+    return maximum, (layers, rows, argmax, positive)
 
 
-def _of_layers_backward(activation: Activation, kept: Any, gradient: Array) -> tuple[Any, Array, None]:
-    layers, rows, winner, counts = kept
+def _encode_and_max_backward(
+    activation: Activation, residuals: Any, gradient: Array
+) -> tuple[Any, Array, None]:
+    layers, rows, argmax, positive = residuals
 
-    def again(layers: Layers, rows: Array) -> Array:
+    def recompute(layers: Layers, rows: Array) -> Array:
         """Return each output from the row that attains it."""
-        won = dense(activation, layers[:-1], jnp.take_along_axis(rows, winner[..., None], axis=-2))
+        inputs = dense(activation, layers[:-1], jnp.take_along_axis(rows, argmax[..., None], axis=-2))
         kernel, bias = layers[-1]
-        return ACTIVATIONS[activation](jnp.sum(won * kernel.T, axis=-1) + bias)
+        return ACTIVATIONS[activation](jnp.sum(inputs * kernel.T, axis=-1) + bias)
 
-    _, pull = jax.vjp(again, layers, rows)
-    return *pull(jnp.where(counts, gradient, 0.0)), None
-
-
-_of_layers.defvjp(_of_layers_forward, _of_layers_backward)
+    _, vjp = jax.vjp(recompute, layers, rows)
+    return *vjp(jnp.where(positive, gradient, 0.0)), None
 
 
-def _winners(embedded: Array, there: Array) -> tuple[Array, Array, Array]:
-    """Return the maximum, its row, and whether it is above zero, so that it has a gradient."""
+_encode_and_max.defvjp(_encode_and_max_forward, _encode_and_max_backward)
+
+
+def _row_maxima(embedded: Array, valid: Array) -> tuple[Array, Array, Array]:
+    """Return the maximum over rows, its row, and whether it is above zero and so has a gradient."""
     # Invalid rows are never above zero.
-    candidates = jnp.where(there[..., None], embedded, 0.0)
+    candidates = jnp.where(valid[..., None], embedded, 0.0)
     maximum = jnp.max(candidates, axis=-2)
     return jnp.maximum(maximum, 0.0), jnp.argmax(candidates, axis=-2), maximum > 0.0
 
@@ -251,7 +249,7 @@ def _group_statistics(value: Array, mask: Array | None) -> tuple[Array, Array]:
     counts = jnp.ones(len(rows)) if mask is None else mask.reshape(-1).astype(jnp.float32)
     share = (counts / jnp.maximum(counts.sum(), 1.0))[:, None]
     mean = jnp.sum(jnp.where(share > 0, rows, 0.0) * share, axis=0)
-    # Of the residuals, not of squares: differences of large squares cancel.
+    # From residuals, because differences of large squares cancel.
     variance = jnp.sum(jnp.where(share > 0, rows - mean, 0.0) ** 2 * share, axis=0)
     return mean, jnp.where(counts.sum() > 0, jnp.sqrt(variance), 1.0)
 
@@ -279,9 +277,9 @@ class NormalisedEncoder(nnx.Module):
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch."""
-        return self.encoder(dict(groups) | {name: self._scaled(name, groups[name]) for name in self.mean})
+        return self.encoder(dict(groups) | {name: self._normalise(name, groups[name]) for name in self.mean})
 
-    def _scaled(self, name: str, value: Array) -> Array:
+    def _normalise(self, name: str, value: Array) -> Array:
         mean, deviation = (jax.lax.stop_gradient(values[name][...]) for values in (self.mean, self.deviation))
         return jnp.clip(
             (value - mean) / jnp.maximum(deviation, _MIN_DEVIATION), -_MAX_DEVIATIONS, _MAX_DEVIATIONS

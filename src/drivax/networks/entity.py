@@ -9,7 +9,15 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from drivax.networks.attention import Attention, Dtype, Form, concatenate_groups, forms, masked_mean, raw_rows
+from drivax.networks.attention import (
+    Attention,
+    Dtype,
+    GroupShape,
+    concatenate_groups,
+    group_rows,
+    group_shapes,
+    masked_mean,
+)
 from drivax.networks.encoders import Groups, GroupSpec
 
 #: Parts of the embedding, in order.
@@ -59,12 +67,12 @@ class EntityEncoder(nnx.Module):
 
     def __init__(self, config: EntityConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         width = config.entity_width
-        self.forms = forms(spec)
-        self.parts = {name: _part(config, name, form) for name, form in self.forms.items()}
+        self.group_shapes = group_shapes(spec)
+        self.parts = {name: _part_of(config, name, shape) for name, shape in self.group_shapes.items()}
         self.order = tuple(part for part in _PARTS if part in self.parts.values())
         self.width = width * len(self.order)
         # The width of a row is that of its features at all times, and of the mask of a series.
-        sizes = {n: form.times * (form.features + form.series) for n, form in self.forms.items()}
+        sizes = {n: shape.times * (shape.features + shape.series) for n, shape in self.group_shapes.items()}
         self.layers = nnx.Dict({name: nnx.Linear(size, width, rngs=rngs) for name, size in sizes.items()})
         self.attention = Attention(width, config.heads, rngs, config.dtype)
         self.norm = nnx.LayerNorm(width, rngs=rngs)
@@ -73,7 +81,7 @@ class EntityEncoder(nnx.Module):
         """Return the embedding of an observation or a batch; float32."""
         rows = {}
         for part in self.order:
-            names = [name for name, own in self.parts.items() if own == part]
+            names = [name for name, group_part in self.parts.items() if group_part == part]
             rows[part] = concatenate_groups([self._entities(groups, name) for name in names])
         means = {part: masked_mean(*rows[part]) for part in self.order}
         if "others" in means:
@@ -84,16 +92,16 @@ class EntityEncoder(nnx.Module):
 
     def _entities(self, groups: Groups, name: str) -> tuple[Array, Array]:
         """Return an embedding per row, and whether any of its times is valid."""
-        value, mask = raw_rows(groups, name, self.forms[name])
+        value, mask = group_rows(groups, name, self.group_shapes[name])
         x = value.reshape(*value.shape[:-2], -1)
-        if self.forms[name].series:
+        if self.group_shapes[name].series:
             x = jnp.concatenate([x, mask.astype(jnp.float32)], axis=-1)
         return nnx.relu(self.layers[name](x)), mask.any(axis=-1)
 
 
-def _part(config: EntityConfig, name: str, form: Form) -> str:
+def _part_of(config: EntityConfig, name: str, shape: GroupShape) -> str:
     if name in config.goal:
         return "goal"
     if name in config.context:
         return "context"
-    return "others" if form.masked else "ego"
+    return "others" if shape.masked else "ego"

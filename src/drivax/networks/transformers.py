@@ -13,14 +13,14 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from drivax.networks.attention import (
-    Attend,
     Dtype,
     Embedding,
     FeedForward,
-    Rows,
+    ResidualAttention,
     SelfAttention,
+    TokenRows,
     concatenate_groups,
-    forms,
+    group_shapes,
     masked_mean,
 )
 from drivax.networks.encoders import Groups, GroupSpec
@@ -123,7 +123,7 @@ class WayformerConfig(LatentConfig):
     Attributes:
         fusion: ``early``: one encoder over all tokens; ``late``: one per group, latents averaged; ``hierarchical``: one
             layer per group, then ``layers`` over all latents.
-        factorised: Whether tokens of a group first attend over times, then over rows.
+        factorised: Whether tokens of a group attend over times, then over rows, before the latents.
     """
 
     kind: Literal["wayformer"] = "wayformer"
@@ -133,8 +133,10 @@ class WayformerConfig(LatentConfig):
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
         """Return the encoder with fresh parameters."""
         layers = self.sizes.layers
-        local, whole = {"early": (0, layers), "late": (layers, 0), "hierarchical": (1, layers)}[self.fusion]
-        fusion = Fusion(local, whole, every_layer=False, factorised=self.factorised)
+        group_layers, joint_layers = {"early": (0, layers), "late": (layers, 0), "hierarchical": (1, layers)}[
+            self.fusion
+        ]
+        fusion = Fusion(group_layers, joint_layers, every_layer=False, factorised=self.factorised)
         return LatentEncoder(self.sizes, fusion, spec, rngs)
 
 
@@ -155,29 +157,35 @@ class MtrConfig(TransformerConfig):
 
 @dataclass(frozen=True)
 class Fusion:
-    """How latent queries of groups are combined.
+    """Depth of the stages of a :class:`LatentEncoder`.
 
     Attributes:
-        local: Layers of latents per group; 0: none.
-        whole: Layers of latents over all groups; 0: none.
-        every_layer: Whether latents attend to the tokens before each layer, or before the first only.
+        group_layers: Depth of the latents of each group; 0: none.
+        joint_layers: Depth of the latents over all groups; 0: none.
+        every_layer: Whether latents attend to the tokens before every layer, or only before the first.
         factorised: See :class:`WayformerConfig`.
     """
 
-    local: int
-    whole: int
+    group_layers: int
+    joint_layers: int
     every_layer: bool
     factorised: bool = False
 
 
 class _Latents(nnx.Module):
-    """Learned queries with cross-attention to tokens and self-attention."""
+    """Learned latent queries with cross-attention to tokens and self-attention.
+
+    Attributes (names of stored parameters):
+        first: Initial latents.
+        looks: Cross-attention layers.
+        layers: Self-attention layers.
+    """
 
     def __init__(self, sizes: Sizes, layers: int, every_layer: bool, rngs: nnx.Rngs) -> None:
         width, heads, dtype = sizes.width, sizes.heads, sizes.dtype
         self.first = nnx.Param(nnx.initializers.normal(0.02)(rngs.params(), (sizes.latents, width)))
-        looks = layers if every_layer else 1
-        self.looks = nnx.List([Attend(width, heads, rngs, dtype) for _ in range(looks)])
+        cross_layers = layers if every_layer else 1
+        self.looks = nnx.List([ResidualAttention(width, heads, rngs, dtype) for _ in range(cross_layers)])
         self.layers = nnx.List([SelfAttention(width, heads, rngs, dtype) for _ in range(layers)])
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 
@@ -193,7 +201,7 @@ class _Latents(nnx.Module):
 
 
 class _Factorised(nnx.Module):
-    """Attention over the times of each row, then over the rows of each time."""
+    """Self-attention over the times of each row, then over the rows of each time."""
 
     def __init__(self, sizes: Sizes, rngs: nnx.Rngs) -> None:
         self.time = SelfAttention(sizes.width, sizes.heads, rngs, sizes.dtype)
@@ -201,26 +209,32 @@ class _Factorised(nnx.Module):
         self.norm = nnx.LayerNorm(sizes.width, rngs=rngs)
         self.dtype = sizes.dtype
 
-    def __call__(self, rows: Rows) -> Rows:
+    def __call__(self, rows: TokenRows) -> TokenRows:
         x = self.time(rows.value, rows.mask)
         x = self.space(jnp.swapaxes(x, -3, -2), jnp.swapaxes(rows.mask, -2, -1))
-        return Rows(self.norm(jnp.swapaxes(x, -3, -2)).astype(self.dtype), rows.mask)
+        return TokenRows(self.norm(jnp.swapaxes(x, -3, -2)).astype(self.dtype), rows.mask)
 
 
 class LatentEncoder(nnx.Module):
-    """Mean of latent queries over each group, over all groups, or over both in turn."""
+    """Mean of latent queries over each group, over all groups, or over both in turn.
+
+    Attributes (names of stored parameters):
+        before: Factorised attention within each group, before its latents.
+        local: Latents of each group.
+        whole: Latents over all groups.
+    """
 
     def __init__(self, sizes: Sizes, fusion: Fusion, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         self.width = sizes.width
         self.embedding = Embedding(spec, sizes.width, sizes.embedding, rngs, sizes.dtype)
-        names = tuple(self.embedding.forms)
+        names = tuple(self.embedding.group_shapes)
         self.before = nnx.Dict({name: _Factorised(sizes, rngs) for name in names if fusion.factorised})
 
         def latents(layers: int) -> _Latents:
             return _Latents(sizes, layers, fusion.every_layer, rngs)
 
-        self.local = nnx.Dict({name: latents(fusion.local) for name in names if fusion.local})
-        self.whole = nnx.List([latents(fusion.whole)] if fusion.whole else [])
+        self.local = nnx.Dict({name: latents(fusion.group_layers) for name in names if fusion.group_layers})
+        self.whole = nnx.List([latents(fusion.joint_layers)] if fusion.joint_layers else [])
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch; float32."""
@@ -238,43 +252,49 @@ class LatentEncoder(nnx.Module):
 
 
 class MtrEncoder(nnx.Module):
-    """Attention over the times of each mover, then over movers and map; mean of the movers without a mask (ego)."""
+    """Attention over the times of each mover, then over movers and map; mean of the movers without a mask (ego).
+
+    Attributes (names of stored parameters):
+        time: Self-attention over the times of a mover.
+        among: Attention among movers, by layer.
+        around: Attention of movers to the map, by layer.
+    """
 
     def __init__(self, sizes: Sizes, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         width, heads, dtype = sizes.width, sizes.heads, sizes.dtype
         self.width = width
         self.embedding = Embedding(spec, width, sizes.embedding, rngs, dtype)
-        kinds = forms(spec)
-        movers = tuple(name for name, form in kinds.items() if form.series or not form.masked)
+        shapes = group_shapes(spec)
+        movers = tuple(name for name, shape in shapes.items() if shape.series or not shape.masked)
         # Without movers, all rows count as movers.
-        self.movers = movers or tuple(kinds)
-        self.map = tuple(name for name in kinds if name not in self.movers)
-        self.own = tuple(name for name in self.movers if not kinds[name].masked)
+        self.mover_groups = movers or tuple(shapes)
+        self.map_groups = tuple(name for name in shapes if name not in self.mover_groups)
+        self.ego_groups = tuple(name for name in self.mover_groups if not shapes[name].masked)
         self.time = SelfAttention(width, heads, rngs, dtype)
-        self.among = nnx.List([Attend(width, heads, rngs, dtype) for _ in range(sizes.layers)])
-        depth = sizes.layers if self.map else 0
-        self.around = nnx.List([Attend(width, heads, rngs, dtype) for _ in range(depth)])
+        self.among = nnx.List([ResidualAttention(width, heads, rngs, dtype) for _ in range(sizes.layers)])
+        map_layers = sizes.layers if self.map_groups else 0
+        self.around = nnx.List([ResidualAttention(width, heads, rngs, dtype) for _ in range(map_layers)])
         self.feed_forward = nnx.List([FeedForward(width, rngs, dtype) for _ in range(sizes.layers)])
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch; float32."""
         tokens = self.embedding(groups)
-        movers = {name: self._mover(name, tokens[name]) for name in self.movers}
+        movers = {name: self._mover(name, tokens[name]) for name in self.mover_groups}
         x, mask = concatenate_groups(list(movers.values()))
-        around = concatenate_groups([tokens[name].flat() for name in self.map]) if self.map else None
+        map_groups = [tokens[name].flat() for name in self.map_groups]
+        map_tokens = concatenate_groups(map_groups) if map_groups else None
         for number, layer in enumerate(self.feed_forward):
             x = self.among[number](x, mask=mask)
-            if around is not None:
-                x = self.around[number](x, *around)
+            if map_tokens is not None:
+                x = self.around[number](x, *map_tokens)
             x = layer(x)
-        queried = [
-            m if name in self.own or not self.own else jnp.zeros_like(m) for name, (_, m) in movers.items()
-        ]
-        return masked_mean(self.norm(x), jnp.concatenate(queried, axis=-1))
+        pooled = self.ego_groups or self.mover_groups
+        masks = [m if name in pooled else jnp.zeros_like(m) for name, (_, m) in movers.items()]
+        return masked_mean(self.norm(x), jnp.concatenate(masks, axis=-1))
 
-    def _mover(self, name: str, rows: Rows) -> tuple[Array, Array]:
+    def _mover(self, name: str, rows: TokenRows) -> tuple[Array, Array]:
         """Return one token per row: the mean over its times after self-attention."""
-        if not self.embedding.forms[name].series:
+        if not self.embedding.group_shapes[name].series:
             return rows.flat()
         return masked_mean(self.time(rows.value, rows.mask), rows.mask), rows.mask.any(axis=-1)

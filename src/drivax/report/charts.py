@@ -1,4 +1,4 @@
-"""Charts as inline SVG: learning curves, distributions, histograms, their axes, and the signals of the player."""
+"""Charts as inline SVG: learning curves, distributions, histograms, and the signals of the player."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.evaluation.episode_table import SHARES, EpisodeTable
-from drivax.evaluation.tables import metric_label
+from drivax.evaluation.result_tables import metric_label
 from drivax.geometry.vectors import wrap
 from drivax.metrics import comfort
 from drivax.metrics.comfort import WINDOW, savgol_matrix
@@ -23,34 +23,34 @@ from drivax.scenario.schema import DT_S
 WIDTH, HEIGHT = 380, 210
 _RIGHT, _TOP, _BOTTOM = 12, 10, 34
 Points = Float[np.ndarray[Any, Any], "point 2"]
-#: A longer line is averaged into this many bins.
-_MOST_POINTS = 150
-#: Groups of quantities that are shown; the others are folded away.
-_FIRST = ("validation", "evaluation", "rollout")
+#: Maximum number of points of a line; longer lines are averaged into bins.
+_MAX_POINTS = 150
+#: Groups of quantities with visible curves; the others are collapsed.
+_VISIBLE = ("validation", "evaluation", "rollout")
 
 
 def curve_sections(runs: Sequence[Training]) -> str:
-    """Return all learning curves: the policy's results visible, losses and the rest folded away."""
+    """Return all learning curves: the policy's results visible, losses and all others collapsed."""
     names = list(dict.fromkeys(name for run in runs for name in run.curves))
     drawable = [name for name in names if any(len(run.curves.get(name, ())) > 1 for run in runs)]
     if not drawable:
         return "<p>No quantity was logged more than once.</p>"
-    first = [name for group in _FIRST for name in drawable if name.split("/")[0] == group] or drawable[:6]
-    rest = [name for name in drawable if name not in first]
-    more = f"<details><summary>{len(rest)} more curves</summary>{_charts(rest, runs)}</details>"
-    return series_legend([run.name for run in runs]) + _charts(first, runs) + (more if rest else "")
+    visible = [name for group in _VISIBLE for name in drawable if name.split("/")[0] == group] or drawable[:6]
+    hidden = [name for name in drawable if name not in visible]
+    details = f"<details><summary>{len(hidden)} more curves</summary>{_charts(hidden, runs)}</details>"
+    return series_legend([run.name for run in runs]) + _charts(visible, runs) + (details if hidden else "")
 
 
 def chart(
-    title: str, lines: Mapping[str, tuple[Stroke, Points]], share: bool = False, across: str = ""
+    title: str, lines: Mapping[str, tuple[Stroke, Points]], share: bool = False, x_label: str = ""
 ) -> str:
-    """Return one chart as HTML, with a title above and words (``across``) below.
+    """Return one chart as HTML, with a title above and ``x_label`` below.
 
-    ``lines`` has the stroke and the points (horizontal, vertical) of each run; with ``share``, the vertical axis is
-    from 0 to 1 where all values fit.
+    ``lines`` has the stroke and the points (x, y) of each run. With ``share``, the vertical axis is from 0 to 1 if all
+    values fit.
     """
-    drawn = {name: (style, _thinned(points)) for name, (style, points) in lines.items() if len(points)}
-    values = np.concatenate([points for _, points in drawn.values()])
+    binned = {name: (style, _bin_points(points)) for name, (style, points) in lines.items() if len(points)}
+    values = np.concatenate([points for _, points in binned.values()])
     x_ticks = ticks(min(0.0, float(values[:, 0].min())), float(values[:, 0].max()), 5)
     low, high = float(values[:, 1].min()), float(values[:, 1].max())
     y_ticks = [0.0, 0.25, 0.5, 0.75, 1.0] if share and low >= 0 and high <= 1 else ticks(low, high, 5)
@@ -60,40 +60,42 @@ def chart(
     shapes += [axes.mark(value) for value in x_ticks if value <= axes.x1 + 1e-9]
     shapes += [
         f'<polyline {style.svg} points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
-        for name, (style, points) in drawn.items()
+        for name, (style, points) in binned.items()
     ]
-    return axes.figure(title, shapes, across)
+    return axes.figure(title, shapes, x_label)
 
 
-def _thinned(points: Points) -> Float[np.ndarray[Any, Any], "bin 2"]:
-    """Return points in order of their step, averaged into bins where there are too many."""
+def _bin_points(points: Points) -> Float[np.ndarray[Any, Any], "bin 2"]:
+    """Return points in order of their step, averaged into bins if there are too many."""
     points = points[np.argsort(points[:, 0], kind="stable")]
-    if len(points) <= _MOST_POINTS:
+    if len(points) <= _MAX_POINTS:
         return points
-    return np.stack([part.mean(axis=0) for part in np.array_split(points, _MOST_POINTS)])
+    return np.stack([bin_points.mean(axis=0) for bin_points in np.array_split(points, _MAX_POINTS)])
 
 
 def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
-    drawn, styled = [], list(enumerate(runs))
+    charts, numbered = [], list(enumerate(runs))
     for name in names:
-        lines = {run.name: (stroke(at), run.curves[name]) for at, run in styled if name in run.curves}
+        lines = {
+            run.name: (stroke(number), run.curves[name]) for number, run in numbered if name in run.curves
+        }
         share = name.split("/")[-1] in (*SHARES, "progress_ratio")
-        drawn.append(chart(name, lines, share, across="environment steps"))
-    return f"<div class=charts>{''.join(drawn)}</div>"
+        charts.append(chart(name, lines, share, x_label="environment steps"))
+    return f"<div class=charts>{''.join(charts)}</div>"
 
 
 class Axes:
-    """Maps data to the drawing; ``left`` is the margin of the vertical axis, pixels."""
+    """Mapping from data to pixels; ``left`` is the margin of the vertical axis."""
 
     def __init__(self, x0: float, x1: float, y0: float, y1: float, left: int) -> None:
         self.x0, self.x1, self.y0, self.y1, self.left = x0, x1, y0, y1, left
 
     def x(self, value: Any) -> Any:
-        """Return the horizontal place of a value, pixels."""
+        """Return the x coordinate of a value, pixels."""
         return self.left + (value - self.x0) / (self.x1 - self.x0) * (WIDTH - self.left - _RIGHT)
 
     def y(self, value: Any) -> Any:
-        """Return the vertical place of a value, pixels."""
+        """Return the y coordinate of a value, pixels."""
         return HEIGHT - _BOTTOM - (value - self.y0) / (self.y1 - self.y0) * (HEIGHT - _BOTTOM - _TOP)
 
     def path(self, points: Any) -> str:
@@ -113,30 +115,30 @@ class Axes:
         y = HEIGHT - _BOTTOM + 15
         return f'<text x="{self.x(value):.1f}" y="{y}" text-anchor="middle">{compact(value)}</text>'
 
-    def figure(self, title: str, shapes: Iterable[str], across: str, facts: str = "") -> str:
-        """Return the chart: a caption (``facts`` is HTML), shapes, and words below the horizontal axis."""
+    def figure(self, title: str, shapes: Iterable[str], x_label: str, facts: str = "") -> str:
+        """Return the chart: caption (``facts`` is HTML), shapes, and the label of the horizontal axis."""
         middle = (self.left + WIDTH - _RIGHT) / 2
         return (
             f"<figure class=chart><figcaption>{escape(title)}{facts}</figcaption>"
             f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">{"".join(shapes)}'
-            f'<text x="{middle:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(across)}</text></svg></figure>'
+            f'<text x="{middle:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(x_label)}</text></svg></figure>'
         )
 
 
-def ticks(low: float, high: float, most: int) -> list[float]:
+def ticks(low: float, high: float, maximum: int) -> list[float]:
     """Return evenly spaced round numbers that enclose ``[low, high]``: steps of 1, 2 or 5 times a power of ten."""
     if high - low < 1e-12 * max(1.0, abs(low), abs(high)):
         pad = max(0.5 * abs(low), 0.5)
         low, high = low - pad, high + pad
-    rough = (high - low) / most
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * (1 - 1e-9))
+    minimum_step = (high - low) / maximum
+    power = 10.0 ** math.floor(math.log10(minimum_step))
+    step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= minimum_step * (1 - 1e-9))
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
-    return [step * place for place in range(first, last + 1)]
+    return [step * index for index in range(first, last + 1)]
 
 
 def compact(value: float) -> str:
-    """Return a number in few letters: ``1.5M``, ``20k``, ``0.25``."""
+    """Format a number compactly: ``1.5M``, ``20k``, ``0.25``."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:.4g}{letter}".replace("-", "−")
@@ -145,8 +147,8 @@ def compact(value: float) -> str:
 
 def series_legend(names: Sequence[str]) -> str:
     """Return the legend of charts: names in the order of their strokes."""
-    styled = [(stroke(place).key, escape(name)) for place, name in enumerate(names)]
-    items = "".join(f'<li><i style="background:{style}"></i>{name}</li>' for style, name in styled)
+    entries = [(stroke(index).key, escape(name)) for index, name in enumerate(names)]
+    items = "".join(f'<li><i style="background:{style}"></i>{name}</li>' for style, name in entries)
     return f"<ul class=series>{items}</ul>"
 
 
@@ -156,43 +158,43 @@ SPREAD = (
     "vmax_score", "progress_ratio", "min_ttc", "average_ttc", "max_jerk", "max_lateral_acceleration", "comfort",
     "speeding_max", "route_deviation_max", "ade", "goal_distance", "distance",
 )  # fmt: skip
-#: Steps of a drawn line at most, so that a chart does not average its corners.
-_LEVELS = 75
-#: Bins of a histogram at most.
+#: Maximum number of steps of a distribution, so that a chart does not average its corners.
+_MAX_STEPS = 75
+#: Maximum number of bins of a histogram.
 BINS = 24
 
 
 def distribution_charts(runs: Sequence[EpisodeTable]) -> str:
     """Return a chart for each metric of :data:`SPREAD` that differs between episodes; empty without any."""
-    styles = {run.name: stroke(place) for place, run in enumerate(runs)}
+    styles = {run.name: stroke(index) for index, run in enumerate(runs)}
     charts = []
     for name in SPREAD:
         lines = {run.name: distribution(run.metrics[name]) for run in runs if name in run.metrics}
         values = np.concatenate([line[:, 0] for line in lines.values()]) if lines else np.zeros(0)
         if values.size and values.min() < values.max():
-            drawn = {run: (styles[run], line) for run, line in lines.items()}
-            charts.append(chart(metric_label(name, runs).text, drawn, share=True))
+            styled = {run: (styles[run], line) for run, line in lines.items()}
+            charts.append(chart(metric_label(name, runs).text, styled, share=True))
     return f"{series_legend(list(styles))}<div class=charts>{''.join(charts)}</div>" if charts else ""
 
 
 def distribution(values: Any) -> Float[np.ndarray[Any, Any], "point 2"]:
-    """Return the corners of the empirical distribution function: value, share of the defined values up to it.
+    """Return the corners of the empirical distribution function of the defined values: value, cumulative share.
 
     More than 75 values are thinned evenly, so that no corner moves by more than 1 / 75.
     """
-    known = np.sort(np.asarray(values, np.float64))
-    known = known[~np.isnan(known)]
-    if not known.size:
+    sorted_values = np.sort(np.asarray(values, np.float64))
+    sorted_values = sorted_values[~np.isnan(sorted_values)]
+    if not sorted_values.size:
         return np.zeros((0, 2))
-    share = np.arange(1, known.size + 1) / known.size
-    if known.size > _LEVELS:
-        rows = np.unique(np.ceil(np.linspace(1, known.size, _LEVELS)).astype(int)) - 1
-        known, share = known[rows], share[rows]
-    return np.column_stack((np.repeat(known, 2), np.concatenate(([0.0], np.repeat(share, 2)[:-1]))))
+    share = np.arange(1, sorted_values.size + 1) / sorted_values.size
+    if sorted_values.size > _MAX_STEPS:
+        rows = np.unique(np.ceil(np.linspace(1, sorted_values.size, _MAX_STEPS)).astype(int)) - 1
+        sorted_values, share = sorted_values[rows], share[rows]
+    return np.column_stack((np.repeat(sorted_values, 2), np.concatenate(([0.0], np.repeat(share, 2)[:-1]))))
 
 
 def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenario") -> str:
-    """Return one histogram as HTML: the share of each series in common bins; the unit is written below."""
+    """Return one histogram as HTML: the share of each series in common bins, labelled with the unit."""
     values = np.concatenate(list(series.values()))
     edges = bins(values)
     shares = {name: _shares(numbers, edges) for name, numbers in series.items()}
@@ -200,30 +202,30 @@ def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenari
     low, high = float(edges[0]), float(edges[-1])
     axes = Axes(low, high, 0.0, levels[-1], left=44)
     shapes = [axes.horizontal(value, f"{compact(100 * value)} %") for value in levels]
-    whole = bool((values == np.round(values)).all())
+    integers = bool((values == np.round(values)).all())
     marks = [value for value in ticks(low, high, 5) if low <= value <= high]
-    shapes += [axes.mark(value) for value in marks if not whole or value == round(value)]
-    draw = _bars if len(shares) == 1 else _steps
-    shapes += [draw(axes, edges, share, stroke(place)) for place, share in enumerate(shares.values())]
+    shapes += [axes.mark(value) for value in marks if not integers or value == round(value)]
+    draw = _bars if len(shares) == 1 else _outline
+    shapes += [draw(axes, edges, share, stroke(index)) for index, share in enumerate(shares.values())]
     names = {name: escape(f"{name}: ") if len(series) > 1 else "" for name in series}
     facts = "".join(f"<small>{names[name]}{_facts(numbers)}</small>" for name, numbers in series.items())
     return axes.figure(title, shapes, unit, facts)
 
 
-def bins(values: Values, most: int = BINS) -> Values:
-    """Return the edges of at most ``most`` equal bins of a round width that hold all values.
+def bins(values: Values, maximum: int = BINS) -> Values:
+    """Return the edges of at most ``maximum`` equal bins of a round width that hold all values.
 
-    Whole numbers get bins that are centred on them while each number has its own.
+    Integers get a bin each, centred on them, while there are enough bins.
     """
     low, high = float(values.min()), float(values.max())
-    whole = bool((values == np.round(values)).all())
+    integers = bool((values == np.round(values)).all())
     if low == high:
         return low + np.array([-1.5, -0.5, 0.5, 1.5])
-    if whole and high - low < most:
+    if integers and high - low < maximum:
         return np.arange(low - 0.5, high + 1.0)
-    edges = ticks(min(low, 0.0) if low < 0.5 * high else low, high, most - 1)
+    edges = ticks(min(low, 0.0) if low < 0.5 * high else low, high, maximum - 1)
     width = edges[1] - edges[0]
-    if whole and width < 1.0:
+    if integers and width < 1.0:
         return np.arange(math.floor(low), math.ceil(high) + 1.5)
     return np.append(edges, edges[-1] + width) if edges[-1] <= high else np.array(edges)
 
@@ -256,14 +258,14 @@ def _bars(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
     )
 
 
-def _steps(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
+def _outline(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
     corners = np.column_stack((np.repeat(edges, 2), np.concatenate(([0.0], np.repeat(shares, 2), [0.0]))))
     return f'<polyline {style.svg} points="{axes.path(corners)}"/>'
 
 
 Array = np.ndarray[Any, Any]
-#: Below this speed a path has no curvature: headings jitter more than the car moves.
-_CURVED_MPS = 0.5
+#: Curvature is undefined below this speed, at which headings jitter more than the car moves.
+_MIN_SPEED_MPS = 0.5
 
 
 @dataclass(frozen=True)
@@ -287,8 +289,8 @@ SIGNALS = (
 )
 #: Commands: the first two numbers of an action.
 COMMANDS = (
-    Signal("lengthwise", "command lengthwise", "1 is the most", 0.001),
-    Signal("sideways", "command sideways", "1 is the most", 0.001),
+    Signal("lengthwise", "command lengthwise", "maximum 1", 0.001),
+    Signal("sideways", "command sideways", "maximum 1", 0.001),
 )
 COMMANDED = len(COMMANDS)
 
@@ -298,8 +300,8 @@ def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
 
     The path has position [m], heading [rad] and speed [m/s]; NaN where the agent is absent. Savitzky-Golay windows of
     nuPlan: accelerations 8/2, jerk 15/2 of them, yaw rate 5/2 (``metrics.comfort``). Curvature is yaw rate over speed.
-    The steps at either end have values of the first or last window's polynomial. Values are NaN outside of the last
-    unbroken stretch of the path, at its first step, and, except for speed, throughout if it has fewer than 16 steps.
+    Steps near the ends take values of the first or last window's polynomial. Values are NaN outside the last contiguous
+    stretch of the path and at its first step; except for speed, all are NaN if it has fewer than 16 steps.
     """
     present = np.asarray(np.isfinite(ego).all(axis=1))
     values = {signal.name: np.full(len(ego), np.nan) for signal in SIGNALS}
@@ -311,15 +313,17 @@ def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
     first = int(gaps[-1]) + 1 if gaps.size else 0
     if end - first <= WINDOW:
         return values
-    path, at = np.asarray(ego[first:end], np.float64), slice(first + 1, end)
-    turned = np.asarray(wrap(np.diff(path[:, 2])))
-    along, middle = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
+    path, steps = np.asarray(ego[first:end], np.float64), slice(first + 1, end)
+    heading_changes = np.asarray(wrap(np.diff(path[:, 2])))
+    along, speed = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
     samples = end - first - 1
     smooth = savgol_matrix(samples, *comfort.SMOOTH)
-    rate = savgol_matrix(samples, *comfort.YAW_RATE) @ np.cumsum(turned) / DT_S
-    values["acceleration"][at] = smooth @ along
-    values["lateral"][at] = smooth @ (middle * turned / DT_S)
-    values["jerk"][at] = savgol_matrix(samples, *comfort.JERK) @ smooth @ along / DT_S
-    values["yaw_rate"][at] = rate
-    values["curvature"][at] = np.where(middle >= _CURVED_MPS, rate / np.maximum(middle, _CURVED_MPS), np.nan)
+    rate = savgol_matrix(samples, *comfort.YAW_RATE) @ np.cumsum(heading_changes) / DT_S
+    values["acceleration"][steps] = smooth @ along
+    values["lateral"][steps] = smooth @ (speed * heading_changes / DT_S)
+    values["jerk"][steps] = savgol_matrix(samples, *comfort.JERK) @ smooth @ along / DT_S
+    values["yaw_rate"][steps] = rate
+    values["curvature"][steps] = np.where(
+        speed >= _MIN_SPEED_MPS, rate / np.maximum(speed, _MIN_SPEED_MPS), np.nan
+    )
     return values

@@ -21,7 +21,7 @@ from drivax.report.pictures.drawing import Rollout
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 
-#: Kinds of failure, gravest first: (words, metric, value that means failure).
+#: Kinds of failure, most severe first: (name, metric, value that means failure).
 FAILURES = (
     ("planner crashed", "crashed", 1.0),
     ("at-fault collision", "at_fault_collision", 1.0),
@@ -31,8 +31,8 @@ FAILURES = (
     ("left the map", "left_map", 1.0),
     ("goal not reached", "reached_goal", 0.0),
 )
-#: Share of successes among the shown episodes where there are enough failures.
-_SUCCESS_SHARE = 0.25
+#: Share of successes among the shown episodes if there are enough failures.
+_MIN_SUCCESS_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -54,23 +54,23 @@ class EpisodeGroup:
 
 
 def outcome(run: EpisodeTable, row: int) -> str:
-    """Return the gravest failure of an episode, ``success``, or ``unjudged`` where nothing is defined."""
+    """Return the most severe failure of an episode, ``success``, or ``unjudged`` if no metric is defined."""
     defined = False
-    for words, metric, bad in FAILURES:
-        value = _value(run, metric, row)
+    for name, metric, failure_value in FAILURES:
+        value = _metric_value(run, metric, row)
         defined |= not np.isnan(value)
-        if value == bad:
-            return words
+        if value == failure_value:
+            return name
     return "success" if defined else "unjudged"
 
 
-def worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> list[int]:
-    """Return the rows of a run, worst episode first: by failure, then by score.
+def sort_worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> list[int]:
+    """Return the rows of a run, worst episode first, by failure and score.
 
-    Among equals those come first that more of the other runs completed without failure, then by scenario id.
+    Ties are broken by the number of other runs without failure, the largest first, then by scenario id.
     """
-    order = (*(words for words, _, _ in FAILURES), "unjudged", "success")
-    rank = {words: place for place, words in enumerate(order)}
+    order = (*(name for name, _, _ in FAILURES), "unjudged", "success")
+    rank = {name: index for index, name in enumerate(order)}
     completed: Counter[ScenarioKey] = Counter()
     for other in others:
         if comparable(run, other):
@@ -79,36 +79,36 @@ def worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> list[
     scenarios = run.scenarios
 
     def key(row: int) -> tuple[int, float, int, str, int]:
-        score = _value(run, "vmax_score", row)
-        known = 1.0 if np.isnan(score) else score
-        return rank[outcome(run, row)], known, -completed[scenarios[row]], scenarios[row][1], row
+        score = _metric_value(run, "vmax_score", row)
+        sort_score = 1.0 if np.isnan(score) else score
+        return rank[outcome(run, row)], sort_score, -completed[scenarios[row]], scenarios[row][1], row
 
     return sorted(range(len(run)), key=key)
 
 
 def choose(runs: Sequence[EpisodeTable], count: int) -> list[EpisodeGroup]:
-    """Return episodes of the last run: failures of every kind in turn, worst score first, and some successes.
+    """Choose episodes of the last run: failures of every kind in turn, worst score first, and some successes.
 
-    Among equal failures those come first that another planner completed; among successes those where others failed.
+    Ties among failures favour those where other planners succeeded; successes are sorted by the failures of others.
     """
     kinds: dict[str, list[EpisodeGroup]] = {}
-    for group in ranked(runs):
+    for group in rank_scenarios(runs):
         kinds.setdefault(group.outcome, []).append(group)
     successes = kinds.pop("success", [])
-    successes.sort(key=lambda group: (_completed(runs, group), group.scenario_id))
+    successes.sort(key=lambda group: (_count_successes(runs, group), group.scenario_id))
     in_turn = zip_longest(*kinds.values())  # the first of each kind, then the second of each, and so on
     failures = [group for turn in in_turn for group in turn if group is not None]
-    most = max(count - len(successes), count - round(_SUCCESS_SHARE * count))
-    return (failures[:most] + successes[: count - min(most, len(failures))])[:count]
+    failure_count = max(count - len(successes), count - round(_MIN_SUCCESS_SHARE * count))
+    return (failures[:failure_count] + successes[: count - min(failure_count, len(failures))])[:count]
 
 
-def _completed(runs: Sequence[EpisodeTable], group: EpisodeGroup) -> int:
+def _count_successes(runs: Sequence[EpisodeTable], group: EpisodeGroup) -> int:
     """Return the number of runs without a failure."""
     rows = zip(runs, group.rows, strict=True)
     return sum(outcome(run, row) == "success" for run, row in rows if row is not None)
 
 
-def ranked(runs: Sequence[EpisodeTable]) -> list[EpisodeGroup]:
+def rank_scenarios(runs: Sequence[EpisodeTable]) -> list[EpisodeGroup]:
     """Return all scenarios of the last run with a stored trajectory, worst first."""
     policy = runs[-1]
     others = [_first_rows(run) if comparable(policy, run) else {} for run in runs[:-1]]
@@ -116,7 +116,7 @@ def ranked(runs: Sequence[EpisodeTable]) -> list[EpisodeGroup]:
         row: EpisodeGroup(*key, (*(rows.get(key) for rows in others), row), outcome(policy, row))
         for key, row in _first_rows(policy).items()
     }
-    return [groups[row] for row in worst_first(policy, runs[:-1]) if row in groups]
+    return [groups[row] for row in sort_worst_first(policy, runs[:-1]) if row in groups]
 
 
 def _first_rows(run: EpisodeTable) -> dict[ScenarioKey, int]:
@@ -124,7 +124,7 @@ def _first_rows(run: EpisodeTable) -> dict[ScenarioKey, int]:
     return {key: row for row, key in reversed([*enumerate(run.scenarios)])}
 
 
-def _value(run: EpisodeTable, metric: str, row: int) -> float:
+def _metric_value(run: EpisodeTable, metric: str, row: int) -> float:
     """Return a metric of an episode; NaN where it is undefined or missing."""
     return float(run.metrics[metric][row]) if metric in run.metrics else float("nan")
 

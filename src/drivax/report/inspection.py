@@ -27,7 +27,7 @@ Array = np.ndarray[Any, Any]
 Entry = Mapping[str, Any]
 
 _SOURCE = ("steps", "tracks", "tracks_valid_now", "map_features", "map_points", "lights", "lost")
-#: Scenarios with records that are read; the manifest describes the rest.
+#: Number of scenarios whose records are read; all others are described by the manifest.
 SAMPLE = 1000
 
 
@@ -35,8 +35,8 @@ SAMPLE = 1000
 class Inspection:
     """An opened scenario set, with the rows of its selected scenarios (at least one).
 
-    ``unknown`` has the number of scenarios that lack what a filter asks for, by filter; ``checked`` says whether every
-    checksum was tested.
+    ``unknown`` has the number of scenarios that lack the value of a filter, by filter; ``checked`` says whether all
+    checksums were tested.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Inspection:
 
     @classmethod
     def open(cls, path: Path, selection: Selection, check: bool = True) -> Inspection:
-        """Open a set; ``check`` reads all of it and tests every checksum.
+        """Open a set; with ``check``, read all of it and test every checksum.
 
         Raises:
             DataError: The set is damaged, or no scenario is selected.
@@ -58,9 +58,9 @@ class Inspection:
         rows, unknown = tuple(selection.rows(scenarios.entries)), selection.unknown(scenarios.entries)
         if not rows:
             text = " and ".join(condition.text for condition in selection.filters)
-            lacking = ", ".join(f"{count:,} lack what {name!r} asks for" for name, count in unknown.items())
-            problem = f"none of {len(scenarios):,} scenarios has {text}{f' ({lacking})' if lacking else ''}"
-            cure = "drivax inspect without --filter shows what there is"
+            missing = ", ".join(f"{count:,} lack the value of {name!r}" for name, count in unknown.items())
+            problem = f"none of {len(scenarios):,} scenarios has {text}{f' ({missing})' if missing else ''}"
+            cure = "list the values with drivax inspect without --filter"
             raise DataError(problem, file=path, cure=cure)
         return cls(path.resolve().name, scenarios, rows, unknown, check)
 
@@ -92,11 +92,11 @@ class Inspection:
         """Origin of the set, and what was read and left out; empty for sets that were written by hand."""
         return self.scenarios.manifest["source"]
 
-    def sample(self, most: int | None = None) -> Iterator[Scenario]:
-        """Return at most ``most`` (``SAMPLE`` by default) of the selected scenarios, evenly spread."""
-        most = SAMPLE if most is None else most
-        places = np.unique(np.linspace(0, len(self.rows) - 1, min(most, len(self.rows))).round())
-        return (self.scenarios[self.rows[int(place)]] for place in places)
+    def sample(self, maximum: int | None = None) -> Iterator[Scenario]:
+        """Return at most ``maximum`` (``SAMPLE`` by default) of the selected scenarios, evenly spread."""
+        maximum = SAMPLE if maximum is None else maximum
+        indices = np.unique(np.linspace(0, len(self.rows) - 1, min(maximum, len(self.rows))).round())
+        return (self.scenarios[self.rows[int(index)]] for index in indices)
 
     @property
     def hours(self) -> float:
@@ -124,15 +124,15 @@ class Inspection:
         numbers = (read(entry) for entry in self.entries)
         return np.array([value for value in numbers if value is not None], np.float64)
 
-    def words(self, read: Callable[[Entry], Sequence[str]]) -> dict[str, int]:
-        """Return the number of scenarios with each word, the most frequent first."""
+    def value_counts(self, read: Callable[[Entry], Sequence[str]]) -> dict[str, int]:
+        """Return the number of scenarios with each value, the most frequent first."""
         counts = Counter(word for entry in self.entries for word in read(entry))
         return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
     def tags(self) -> dict[str, dict[str, int]]:
         """Return the number of scenarios with each value of each tag except the data set."""
-        names = self.words(lambda entry: [name for name in entry["tags"] if name != "dataset"])
-        return {name: self.words(lambda e, name=name: sorted(tag_words(e, name))) for name in names}
+        names = self.value_counts(lambda entry: [name for name in entry["tags"] if name != "dataset"])
+        return {name: self.value_counts(lambda e, name=name: sorted(tag_words(e, name))) for name in names}
 
     def totals(self, read: Callable[[Entry], Mapping[str, int]]) -> dict[str, tuple[int, int]]:
         """Return the sum of each counter, and the number of scenarios where it is not zero."""
@@ -210,7 +210,7 @@ def speeds(inspection: Inspection) -> Speeds:
 
 
 #: Maximum numbers of listed scenarios, named values of a tag, sets per table, and causes of unreadable records.
-LISTED, NAMED, ACROSS, _CAUSES = 30, 6, 4, 3
+MAX_LISTED, MAX_NAMED, SETS_PER_TABLE, _MAX_CAUSES = 30, 6, 4, 3
 #: A label and one text per set.
 Row = tuple[str, list[str]]
 
@@ -220,40 +220,43 @@ def overview(inspection: Inspection) -> Table:
     scenarios, count = inspection.scenarios, len(inspection)
     manifest, capacity = scenarios.manifest, scenarios.capacity
     segments = f"recorded segments: {inspection.recordings:,}, shards: {len(manifest['shards']):,}"
-    rows = [("set", str(scenarios.path)), ("scenarios", f"{_selected(inspection)} ({segments})")]
+    rows = [("set", str(scenarios.path)), ("scenarios", f"{_count_text(inspection)} ({segments})")]
     unknown = inspection.unknown.items()
-    rows += [("", f"{lacking:,} lack what {name!r} asks for and are left out") for name, lacking in unknown]
+    rows += [("", f"{missing:,} lack the value of {name!r} and are left out") for name, missing in unknown]
     size = f"{inspection.megabytes:,.1f} MB, {manifest['record_bytes'] / 1e3:,.0f} kB per scenario"
     sizes = (
         f"{capacity.name}: {capacity.agents} moving and {capacity.parked} parked agents, {capacity.segments:,} map "
         f"segments, {capacity.lanes} lanes, {capacity.lights} lights"
     )
     rows += [
-        ("data sets", _counted(inspection.words(lambda entry: [entry["dataset"]]), count)),
-        ("duration", f"{_hours(inspection)} at {_rate(inspection)}"),
+        ("data sets", _counts_text(inspection.value_counts(lambda entry: [entry["dataset"]]), count)),
+        ("duration", f"{_hours_text(inspection)} at {_rate_text(inspection)}"),
         ("size", size),
         ("capacity", sizes),
         ("written by", f"drivax {manifest['drivax_version']}, schema {manifest['schema_version']}"),
-        *_left_out(inspection.source),
-        *((name, _counted(values, count)) for name, values in inspection.tags().items()),
-        ("flags", _counted(inspection.words(lambda entry: entry["flags"]), count)),
-        ("did not fit", _totals(inspection.totals(lambda entry: entry["overflow"]))),
-        ("left out", _totals(inspection.totals(lambda entry: entry["source"].get("lost", {})))),
+        *_skipped_rows(inspection.source),
+        *((name, _counts_text(values, count)) for name, values in inspection.tags().items()),
+        ("flags", _counts_text(inspection.value_counts(lambda entry: entry["flags"]), count)),
+        ("did not fit", _totals_text(inspection.totals(lambda entry: entry["overflow"]))),
+        ("left out", _totals_text(inspection.totals(lambda entry: entry["source"].get("lost", {})))),
         ("integrity", "every checksum is right" if inspection.checked else "not tested (--no-check)"),
     ]
     return _table("overview", ["", ""], [(label, [text]) for label, text in rows], left=True)
 
 
-def _left_out(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield what a conversion read and did not store: counts, and the first causes."""
-    bad, filtered = source.get("skipped_records", []), source.get("filtered", 0)
-    if bad:
-        yield "skipped", f"{len(bad):,} record{'s' if len(bad) > 1 else ''} that could not be converted"
-    for row in bad[:_CAUSES]:
+def _skipped_rows(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield the records that a conversion skipped or filtered: counts, and the first causes."""
+    skipped, filtered = source.get("skipped_records", []), source.get("filtered", 0)
+    if skipped:
+        yield (
+            "skipped",
+            f"{len(skipped):,} record{'s' if len(skipped) > 1 else ''} that could not be converted",
+        )
+    for row in skipped[:_MAX_CAUSES]:
         record = "" if row["record"] is None else f"record {row['record']}: "
         yield "", f"{row['file']}: {record}{row['problem']}"
-    if len(bad) > _CAUSES:
-        yield "", f"{len(bad) - _CAUSES:,} more in manifest.json"
+    if len(skipped) > _MAX_CAUSES:
+        yield "", f"{len(skipped) - _MAX_CAUSES:,} more in manifest.json"
     if filtered:
         filters = " and ".join(source["filters"])
         yield "filtered", f"{filtered:,} scenario{'s' if filtered > 1 else ''} left out by {filters}"
@@ -271,22 +274,22 @@ def audit_table(inspection: Inspection) -> Table | None:
 
 
 def finding_text(values: Sequence[Any]) -> str:
-    """Return booleans as a count, numbers as mean, median and largest, words as counts."""
+    """Format booleans as a count, numbers as mean, median and maximum, and text values as counts."""
     if not values:
         return MISSING
     if all(isinstance(value, bool) for value in values):
         return f"{sum(values):,} of {len(values):,} ({_percent(sum(values), len(values))})"
     if all(isinstance(value, str) for value in values):
-        return _counted({word: values.count(word) for word in sorted(set(values))}, len(values))
+        return _counts_text({word: values.count(word) for word in sorted(set(values))}, len(values))
     numbers = np.array(values, np.float64)
     return f"mean {short(numbers.mean())}, median {short(np.median(numbers))}, most {short(numbers.max())}"
 
 
-def listing(inspection: Inspection) -> Table:
+def scenarios_table(inspection: Inspection) -> Table:
     """Return the first scenarios with the counts of their source."""
     names = ("steps", "tracks", "now", "lanes", "lines", "edges", "others", "points", "lights", "segments")
-    columns = (Column("scenario", label=True, most=24), *map(Column, names))
-    listed = inspection.entries[:LISTED]
+    columns = (Column("scenario", label=True, max_width=24), *map(Column, names))
+    listed = inspection.entries[:MAX_LISTED]
     rows = ((entry["scenario_id"], *(f"{count:,}" for count in _counts(entry))) for entry in listed)
     return Table("scenarios", columns, tuple(tuple(map(Cell, row)) for row in rows))
 
@@ -300,12 +303,14 @@ def _counts(entry: Entry) -> tuple[int, ...]:
 
 
 def comparison(inspections: Sequence[Inspection]) -> list[Table]:
-    """Return several sets side by side, ``ACROSS`` per table: sizes, averages per scenario, shares of tags."""
-    groups = [inspections[first : first + ACROSS] for first in range(0, len(inspections), ACROSS)]
-    return [content_table(group, _share_rows(group), most=24) for group in groups]
+    """Return several sets side by side, ``SETS_PER_TABLE`` per table: sizes, averages per scenario, shares of tags."""
+    groups = [
+        inspections[first : first + SETS_PER_TABLE] for first in range(0, len(inspections), SETS_PER_TABLE)
+    ]
+    return [content_table(group, _share_rows(group), max_width=24) for group in groups]
 
 
-def content_table(inspections: Sequence[Inspection], more: Sequence[Row] = (), **columns: Any) -> Table:
+def content_table(inspections: Sequence[Inspection], extra: Sequence[Row] = (), **columns: Any) -> Table:
     """Return sizes of sets and averages of their scenarios, one column per set."""
     rows: list[Row] = [
         (label, [text(inspection) for inspection in inspections]) for label, text in _CONTENT.items()
@@ -315,17 +320,17 @@ def content_table(inspections: Sequence[Inspection], more: Sequence[Row] = (), *
         label = f"{quantity.label}, {quantity.unit}" if quantity.unit else quantity.label
         rows.append((label, [short(values.mean()) if len(values) else MISSING for values in known]))
     names = ["", *(inspection.name for inspection in inspections)]
-    return _table("sets", names, [*rows, *more], **columns)
+    return _table("sets", names, [*rows, *extra], **columns)
 
 
 #: Rows of the table of contents before the quantities.
 _CONTENT: Mapping[str, Callable[[Inspection], str]] = {
-    "scenarios": lambda of_set: _selected(of_set),
+    "scenarios": lambda of_set: _count_text(of_set),
     "recordings": lambda of_set: f"{of_set.recordings:,}",
-    "data sets": lambda of_set: ", ".join(of_set.words(lambda entry: [entry["dataset"]])),
-    "places": lambda of_set: _places(of_set),
-    "duration": lambda of_set: _hours(of_set),
-    "rate": lambda of_set: _rate(of_set),
+    "data sets": lambda of_set: ", ".join(of_set.value_counts(lambda entry: [entry["dataset"]])),
+    "places": lambda of_set: _places_text(of_set),
+    "duration": lambda of_set: _hours_text(of_set),
+    "rate": lambda of_set: _rate_text(of_set),
     "skipped": lambda of_set: f"{of_set.source.get('skipped', 0):,}",
     "MB": lambda of_set: f"{of_set.megabytes:,.1f}",
 }
@@ -341,16 +346,16 @@ def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
     """Return shares of scenarios with a finding, a value of a tag, a flag."""
     sizes = [len(inspection) for inspection in inspections]
     rows = _percents("", true_findings(inspections))
-    tagged = [inspection.tags() for inspection in inspections]
-    for name in dict.fromkeys(name for tags in tagged for name in tags if name != "place"):
-        counts = [tags.get(name, {}) for tags in tagged]
-        shares = of_all(counts, sizes)
-        if len(shares) > 2 * NAMED:
+    tags_by_set = [inspection.tags() for inspection in inspections]
+    for name in dict.fromkeys(name for tags in tags_by_set for name in tags if name != "place"):
+        counts = [tags.get(name, {}) for tags in tags_by_set]
+        shares = with_sizes(counts, sizes)
+        if len(shares) > 2 * MAX_NAMED:
             rows.append((name, [f"{len(of_set):,} values" if of_set else MISSING for of_set in counts]))
         else:
             rows += _percents(f"{name} ", shares)
-    flags = [inspection.words(lambda entry: entry["flags"]) for inspection in inspections]
-    return rows + _percents("flag ", of_all(flags, sizes))
+    flags = [inspection.value_counts(lambda entry: entry["flags"]) for inspection in inspections]
+    return rows + _percents("flag ", with_sizes(flags, sizes))
 
 
 #: Per value, ``(count, of)`` for each set.
@@ -358,7 +363,7 @@ Counts = dict[str, list[tuple[int, int]]]
 
 
 def true_findings(inspections: Sequence[Inspection]) -> Counts:
-    """Return for each yes-or-no finding of the audit in how many of how many scenarios it is true."""
+    """Return the number of scenarios for which each boolean finding of the audit is true, and known."""
     findings = {}
     for name in dict.fromkeys(name for inspection in inspections for name in inspection.findings()):
         known = [inspection.finding(name) for inspection in inspections]
@@ -367,7 +372,7 @@ def true_findings(inspections: Sequence[Inspection]) -> Counts:
     return findings
 
 
-def of_all(counts: Sequence[Mapping[str, int]], sizes: Sequence[int]) -> Counts:
+def with_sizes(counts: Sequence[Mapping[str, int]], sizes: Sequence[int]) -> Counts:
     """Return the counts of each value with the sizes of the sets."""
     values = dict.fromkeys(value for of_set in counts for value in of_set)
     return {
@@ -380,45 +385,47 @@ def _percents(prefix: str, counts: Counts) -> list[Row]:
     return [(prefix + value, [_percent(*count) for count in sets]) for value, sets in counts.items()]
 
 
-def _percent(count: int, of: int) -> str:
-    return f"{100 * count / of:.3g} %" if of else MISSING
+def _percent(count: int, total: int) -> str:
+    return f"{100 * count / total:.3g} %" if total else MISSING
 
 
-def _selected(inspection: Inspection) -> str:
-    count, whole = len(inspection), len(inspection.scenarios)
-    return f"{count:,}" if count == whole else f"{count:,} of {whole:,}"
+def _count_text(inspection: Inspection) -> str:
+    count, total = len(inspection), len(inspection.scenarios)
+    return f"{count:,}" if count == total else f"{count:,} of {total:,}"
 
 
-def _hours(inspection: Inspection) -> str:
+def _hours_text(inspection: Inspection) -> str:
     hours = inspection.hours
     return f"{short(hours)} h" if hours >= 1 else f"{short(60 * hours)} min"
 
 
-def _rate(inspection: Inspection) -> str:
+def _rate_text(inspection: Inspection) -> str:
     low, high = inspection.rate_hz()
     return f"{low:.3g} Hz" if high - low < 0.05 else f"{low:.3g} to {high:.3g} Hz"
 
 
-def _places(inspection: Inspection) -> str:
-    places = inspection.words(lambda entry: [entry["tags"]["place"]] if "place" in entry["tags"] else [])
-    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
-    return ", ".join(list(places)[:NAMED]) + more if places else MISSING
+def _places_text(inspection: Inspection) -> str:
+    places = inspection.value_counts(
+        lambda entry: [entry["tags"]["place"]] if "place" in entry["tags"] else []
+    )
+    rest = f" and {len(places) - MAX_NAMED} more" if len(places) > MAX_NAMED else ""
+    return ", ".join(list(places)[:MAX_NAMED]) + rest if places else MISSING
 
 
-def _counted(counts: Mapping[str, int], of: int) -> str:
-    shown = list(counts.items())[: 2 * NAMED]
-    texts = [name if count == of else f"{name} ({count:,} of {of:,})" for name, count in shown]
-    more = len(counts) - len(texts)
-    return ", ".join(texts) + (f" and {more:,} more" if more else "") or "none"
+def _counts_text(counts: Mapping[str, int], total: int) -> str:
+    shown = list(counts.items())[: 2 * MAX_NAMED]
+    texts = [name if count == total else f"{name} ({count:,} of {total:,})" for name, count in shown]
+    hidden = len(counts) - len(texts)
+    return ", ".join(texts) + (f" and {hidden:,} more" if hidden else "") or "none"
 
 
-def _totals(totals: Mapping[str, tuple[int, int]]) -> str:
+def _totals_text(totals: Mapping[str, tuple[int, int]]) -> str:
     texts = [f"{name} {count:,} (in {scenarios:,})" for name, (count, scenarios) in totals.items()]
     return ", ".join(texts) or "nothing"
 
 
 def observation_overview(statistics: ObservationStatistics) -> str:
-    """Return the size of the statistics in one line, with the number of NaN or infinite entries."""
+    """Summarise the statistics in one line, with the number of NaN or infinite entries."""
     broken = f"{statistics.broken:,} entries are NaN or infinite"
     return (
         f"{statistics.states:,} states of {statistics.episodes:,} episodes of {statistics.planner}, "
@@ -433,8 +440,8 @@ def observation_table(statistics: ObservationStatistics) -> Table:
     rows = []
     for group, features in groupby(statistics.features, lambda feature: feature.group):
         empty = (Cell(""),) * (len(names) - 1)
-        last = statistics.groups[group] if statistics.permuted else math.nan
-        rows.append((Cell(group, style="group"), *empty, Cell(_decimal(last))))
+        importance = statistics.groups[group] if statistics.permuted else math.nan
+        rows.append((Cell(group, style="group"), *empty, Cell(_decimal(importance))))
         for feature in features:
             texts = _feature_texts(feature)[: len(names)]
             rows.append((Cell(f"  {feature.name}"), *map(Cell, texts)))

@@ -29,7 +29,7 @@ class Training:
 
 
 def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Training]]:
-    """Read run folders of either kind, every seed of a run with several; a repeated name gets its folder as suffix."""
+    """Read run folders of either kind, and every seed of a run; a repeated name gets its folder as suffix."""
     folders = [inside for folder in folders for inside in seed_folders(folder)]
     resolved = [folder.resolve() for folder in folders]
     if not folders or len(set(resolved)) < len(resolved):
@@ -57,7 +57,7 @@ def read_evaluations(folders: Sequence[Path]) -> list[EpisodeTable]:
     """Read run folders, at least one of them an evaluation; see :func:`read_runs`."""
     evaluations, _ = read_runs(folders)
     if not evaluations:
-        raise UsageError("no evaluation was given", cure="name run folders of drivax evaluate")
+        raise UsageError("no run folder is an evaluation", cure="name run folders of drivax evaluate")
     return evaluations
 
 

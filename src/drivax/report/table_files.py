@@ -1,4 +1,4 @@
-"""Tables of evaluations as files: CSV with all digits for programs, Markdown and LaTeX for people."""
+"""Tables of evaluations as CSV (with all digits), Markdown and LaTeX files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation import tables
+from drivax.evaluation import result_tables
 from drivax.evaluation.episode_table import ADDED, EpisodeTable, Tags
 from drivax.evaluation.pairing import comparable
 from drivax.files import check_output, write_text
@@ -15,12 +15,12 @@ from drivax.report.episodes import EvaluatedSet
 from drivax.report.runs import read_evaluations
 from drivax.table import Table
 
-#: Columns of a breakdown: what tells planners apart, few enough for a page.
+#: Columns of a breakdown, few enough for a page.
 KEY_METRICS = (
     "success", "accuracy", "collision", "at_fault_collision", "offroad", "red_light", "progress_ratio", "vmax_score",
 )  # fmt: skip
 #: Metrics of a transfer matrix.
-TRANSFERRED = ("success", "vmax_score")
+TRANSFER_METRICS = ("success", "vmax_score")
 
 
 def write_tables(
@@ -28,11 +28,11 @@ def write_tables(
 ) -> list[Path]:  # fmt: skip
     """Write every table of a report into a folder, each as ``.csv``, ``.md`` and ``.tex``; returns the files.
 
-    ``results`` and, of several runs, ``differences``; ``collisions`` where kinds of collision are known; ``by-TAG`` for
-    the tags of the scenarios; ``transfer-METRIC`` where runs were evaluated on several data sets.
+    The tables are ``results``; for several runs ``differences``; ``collisions`` if kinds of collision are known;
+    ``by-TAG`` for the tags of the scenarios; ``transfer-METRIC`` if runs were evaluated on several data sets.
 
-    The last evaluation is the policy. ``data`` is its scenario set, where it has moved; ``metrics`` are further columns
-    of ``episodes.csv``, or a set of metrics, for ``results``, ``differences`` and ``by-TAG``.
+    The last evaluation is the policy. ``data`` is the new path of its scenario set, if it has moved; ``metrics`` are
+    extra columns of ``episodes.csv``, or a set of metrics, for ``results``, ``differences`` and ``by-TAG``.
 
     Raises:
         DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.
@@ -49,48 +49,52 @@ def write_tables(
     return [out / name for name in texts]
 
 
-def exported_metrics(runs: Sequence[EpisodeTable], more: Sequence[str] = ()) -> list[str]:
-    """Return the metrics of the files: the headline, progress in metres, the user's own, and ``more``.
+def exported_metrics(runs: Sequence[EpisodeTable], extra: Sequence[str] = ()) -> list[str]:
+    """Return the metrics of the files: the headline, progress in metres, user-defined ones, and ``extra``.
 
     Raises:
         UsageError: No run has such a column.
     """
-    names = tables.ordered(tables.metric_names(runs))
+    names = result_tables.sort_metrics(result_tables.metric_names(runs))
     requested = {"progress"}
-    for entry in more:
+    for entry in extra:
         if entry not in SETS and entry not in names:
             raise UsageError(f"no run has a mean of {entry!r}", cure=did_you_mean(entry, names))
         requested.update(SETS.get(entry, (entry,)))
-    first = tables.headline(names)
+    first = result_tables.headline_names(names)
     rest = [name for name in names if name in requested or name not in (*METRICS, *ADDED)]
     return [*first, *(name for name in rest if name not in first)] or names
 
 
-def _tables(runs: Sequence[EpisodeTable], data: Path | None, more: Sequence[str]) -> list[Table]:
-    usual, metrics = exported_metrics(runs), exported_metrics(runs, more)
-    results = [tables.results_table(runs, metrics)]
+def _tables(runs: Sequence[EpisodeTable], data: Path | None, extra: Sequence[str]) -> list[Table]:
+    default_metrics, metrics = exported_metrics(runs), exported_metrics(runs, extra)
+    results = [result_tables.results_table(runs, metrics)]
     if len(runs) > 1:
         others = [run for run in runs[:-1] if comparable(runs[-1], run)]
-        results.append(tables.differences_table(runs[-1], others, metrics))
+        results.append(result_tables.differences_table(runs[-1], others, metrics))
     if any("collision_type" in run.metrics for run in runs):
-        results.append(tables.collisions_table(runs))
-    added = [name for name in metrics if name not in usual]
+        results.append(result_tables.collisions_table(runs))
+    added = [name for name in metrics if name not in default_metrics]
     results += strata_tables(runs, EvaluatedSet(runs[-1], data).tags(), added)
     return results + transfer_tables(runs)
 
 
-def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, more: Sequence[str] = ()) -> list[Table]:
-    """Return a table for each tag of the scenarios, over the runs on these scenarios; with ``more`` metrics."""
+def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, extra: Sequence[str] = ()) -> list[Table]:
+    """Return a table for each tag of the scenarios, over the runs on these scenarios, with ``extra`` metrics."""
     evaluated = [run for run in runs if any(key in tags for key in run.scenarios)]
     known = {name for values in tags.values() for name in values}
-    names = dict.fromkeys((*KEY_METRICS, *more))
+    names = dict.fromkeys((*KEY_METRICS, *extra))
     metrics = [name for name in names if any(name in run.metrics for run in evaluated)]
-    return [tables.strata_table(evaluated, tags, tag, metrics) for tag in tables.STRATA if tag in known]
+    return [
+        result_tables.strata_table(evaluated, tags, tag, metrics)
+        for tag in result_tables.STRATA
+        if tag in known
+    ]
 
 
 def transfer_tables(runs: Sequence[EpisodeTable]) -> list[Table]:
     """Return a matrix of training and evaluation data for each metric; none where all runs share one set."""
-    if len({tables.set_key(run.data) for run in runs}) < 2:
+    if len({result_tables.set_key(run.data) for run in runs}) < 2:
         return []
-    known = [name for name in TRANSFERRED if any(tables.summarise(run, name).n for run in runs)]
-    return [tables.transfer_table(runs, name) for name in known]
+    known = [name for name in TRANSFER_METRICS if any(result_tables.summarise(run, name).n for run in runs)]
+    return [result_tables.transfer_table(runs, name) for name in known]

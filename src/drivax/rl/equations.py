@@ -14,14 +14,10 @@ from jaxtyping import Array, Bool, Float
 
 
 def generalised_advantages(
-    reward_t: Float[Array, "time *batch"],
-    value_t: Float[Array, "time *batch"],
-    value_tp1: Float[Array, "time *batch"],
-    terminated_t: Bool[Array, "time *batch"],
-    truncated_t: Bool[Array, "time *batch"],
-    gamma: float,
-    lambda_: float,
-) -> tuple[Float[Array, "time *batch"], Float[Array, "time *batch"]]:
+    reward_t: Float[Array, "time *batch"], value_t: Float[Array, "time *batch"],
+    value_tp1: Float[Array, "time *batch"], terminated_t: Bool[Array, "time *batch"],
+    truncated_t: Bool[Array, "time *batch"], gamma: float, lambda_: float,
+) -> tuple[Float[Array, "time *batch"], Float[Array, "time *batch"]]:  # fmt: skip
     """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438).
 
     ``delta_t = r_t + gamma (1 - terminated_t) V(s_{t+1}) - V(s_t)`` and
@@ -45,11 +41,9 @@ def generalised_advantages(
 
 
 def clipped_surrogate_loss(
-    log_prob: Float[Array, "*batch"],
-    old_log_prob: Float[Array, "*batch"],
-    advantage: Float[Array, "*batch"],
+    log_prob: Float[Array, "*batch"], old_log_prob: Float[Array, "*batch"], advantage: Float[Array, "*batch"],
     clip: float,
-) -> Float[Array, "*batch"]:
+) -> Float[Array, "*batch"]:  # fmt: skip
     """Clipped surrogate objective of PPO as a loss (Schulman et al. 2017, arXiv 1707.06347, eq. 7).
 
     ``-min(rho A, clip(rho, 1 - eps, 1 + eps) A)`` with ``rho = exp(log_prob - old_log_prob)``.
@@ -59,11 +53,9 @@ def clipped_surrogate_loss(
 
 
 def td_target(
-    reward_t: Float[Array, "*batch"],
-    value_tp1: Float[Array, "*batch"],
-    terminated_t: Bool[Array, "*batch"],
+    reward_t: Float[Array, "*batch"], value_tp1: Float[Array, "*batch"], terminated_t: Bool[Array, "*batch"],
     gamma: float,
-) -> Float[Array, "*batch"]:
+) -> Float[Array, "*batch"]:  # fmt: skip
     """One-step target ``r_t + gamma (1 - terminated_t) V(s_{t+1})`` (Sutton 1988).
 
     A truncated step bootstraps the value of its final state. No gradient flows into the targets.
@@ -121,11 +113,9 @@ def log_mass(
 
 
 def conservative_penalty(
-    q: Float[Array, "action *batch"],
-    log_density: Float[Array, "action *batch"],
-    q_data: Float[Array, "*batch"],
-    temperature: float = 1.0,
-) -> Float[Array, "*batch"]:
+    q: Float[Array, "action *batch"], log_density: Float[Array, "action *batch"],
+    q_data: Float[Array, "*batch"], temperature: float = 1.0,
+) -> Float[Array, "*batch"]:  # fmt: skip
     """``log_mass(Q(s, .)) - Q(s, a)`` with the logged action ``a``: the regulariser CQL(H) (arXiv 2006.04779, eq. 4).
 
     A tabular critic that also minimises half the squared error of ``r + gamma V`` ends at

@@ -222,7 +222,7 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
         if _names_preset(cls, value):
             base = cls.preset(str(value["preset"]))
             rest = {name: given for name, given in value.items() if name != "preset"}
-            value = _completed(_plain(base, cls), base, rest)
+            value = _merge_defaults(_plain(base, cls), base, rest)
         return build(_on_defaults(cls, value), cls)
 
     return hook
@@ -238,7 +238,7 @@ def _on_defaults(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
             default = field.default_factory()
         section = _value(given.get(field.name)) if _is_record(type(default)) else None
         if isinstance(section, Mapping):
-            result[field.name] = _completed(_plain(default, hints[field.name]), default, section)
+            result[field.name] = _merge_defaults(_plain(default, hints[field.name]), default, section)
     return result
 
 
@@ -248,15 +248,15 @@ def _names_preset(cls: Any, given: Mapping[str, Any]) -> bool:
     return "preset" in given and "preset" not in named and callable(getattr(cls, "preset", None))
 
 
-def _completed(base: dict[str, Any], default: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    other_kind = "kind" in given and str(given["kind"]) != kind_of(type(default))
-    if other_kind or _names_preset(type(default), given):
-        return dict(given)
-    result = base | dict(given)
-    for name, value in given.items():
+def _merge_defaults(base: dict[str, Any], default: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    other_kind = "kind" in values and str(values["kind"]) != kind_of(type(default))
+    if other_kind or _names_preset(type(default), values):
+        return dict(values)
+    result = base | dict(values)
+    for name, value in values.items():
         inner = getattr(default, name, None)
         if _is_record(type(inner)) and isinstance(value, Mapping):
-            result[name] = _completed(base[name], inner, value)
+            result[name] = _merge_defaults(base[name], inner, value)
     return result
 
 

@@ -16,6 +16,6 @@ from .ranking import rank_correlation as rank_correlation
 from .ranking import roc_auc as roc_auc
 from .seeds import crossed_difference as crossed_difference
 from .seeds import seeds_interval as seeds_interval
-from .significance import holm as holm
-from .significance import mcnemar as mcnemar
+from .significance import holm_adjust as holm_adjust
+from .significance import mcnemar_test as mcnemar_test
 from .significance import paired_permutation as paired_permutation

@@ -33,8 +33,8 @@ def recordings_of(entries: Sequence[Mapping[str, Any]]) -> list[str]:
     return recordings(*([str(entry[name]) for entry in entries] for name in names))
 
 
-def numbers(values: Any) -> Values:
-    """Return values as float64 with NaN where undefined; refuse infinite ones."""
+def as_values(values: Any) -> Values:
+    """Convert to float64 with NaN where undefined; refuse infinite values."""
     x = np.asarray(values, dtype=np.float64)
     if x.ndim != 1 or np.isinf(x).any():
         problem = "values must be a list of finite numbers, NaN or None"
@@ -42,23 +42,23 @@ def numbers(values: Any) -> Values:
     return x
 
 
-def differences(a: Any, b: Any) -> Values:
+def paired_differences(a: Any, b: Any) -> Values:
     """Return ``a - b`` pair by pair, NaN where either is undefined."""
-    first, second = numbers(a), numbers(b)
+    first, second = as_values(a), as_values(b)
     if first.shape != second.shape:
         problem = f"pairs need two lists of one length, not {first.size} and {second.size}"
         raise UsageError(problem, cure="pair by scenario first")
     return first - second
 
 
-def defined(values: Any, clusters: Any = None) -> tuple[Values, Labels]:
+def drop_undefined(values: Any, clusters: Any = None) -> tuple[Values, Labels]:
     """Return the defined values and their dense cluster labels; without clusters each value is its own."""
-    x = numbers(values)
-    labels, keep = dense(clusters, x.size, "cluster"), ~np.isnan(x)
-    return x[keep], dense(labels[keep], int(keep.sum()), "cluster")
+    x = as_values(values)
+    labels, keep = dense_labels(clusters, x.size, "cluster"), ~np.isnan(x)
+    return x[keep], dense_labels(labels[keep], int(keep.sum()), "cluster")
 
 
-def dense(labels: Any, count: int, kind: str) -> Labels:
+def dense_labels(labels: Any, count: int, kind: str) -> Labels:
     """Return labels as numbers from 0 on; None gives each of ``count`` values its own.
 
     Raises UsageError unless there are ``count`` labels; the message calls them ``kind``.
@@ -71,7 +71,7 @@ def dense(labels: Any, count: int, kind: str) -> Labels:
     return np.unique(np.asarray(labels), return_inverse=True)[1].astype(np.int64)
 
 
-def totals(x: Values, labels: Labels) -> tuple[Totals, Totals]:
+def cluster_totals(x: Values, labels: Labels) -> tuple[Totals, Totals]:
     """Return sum and number of the values of each cluster."""
     return np.bincount(labels, weights=x), np.bincount(labels).astype(np.float64)
 
@@ -84,7 +84,7 @@ def design_effect(x: Values, labels: Labels) -> float:
     mean squared deviation, for shares ``p (1 - p)``. Where all values agree, or there is one cluster, ``V`` cannot be
     estimated, and clusters count as single values: ``n / C``.
     """
-    sums, counts = totals(x, labels)
+    sums, counts = cluster_totals(x, labels)
     n, clusters, mean = x.size, sums.size, float(x.mean())
     if clusters == n:
         return 1.0
@@ -95,21 +95,21 @@ def design_effect(x: Values, labels: Labels) -> float:
     return min(max(1.0, variance / (spread / n)), float(n))
 
 
-def stratum_of_clusters(strata: Any, labels: Labels, least: int = 2) -> Strata:
-    """Return the stratum of each cluster, given stratum and dense cluster label of each value.
+def cluster_strata(strata: Any, labels: Labels, minimum: int = 2) -> Strata:
+    """Return the stratum of each cluster, given the stratum and the dense cluster label of each value.
 
-    Strata with fewer than ``least`` clusters are pooled; a pool that is still smaller joins the smallest other stratum
-    (Cochran 1977, section 5A.12, "collapsed strata"). Raises UsageError if a cluster lies in two strata.
+    Strata with fewer than ``minimum`` clusters are pooled; a pool that is still too small joins the smallest other
+    stratum (Cochran 1977, section 5A.12, "collapsed strata"). Raises UsageError if a cluster lies in two strata.
     """
-    own = dense(strata, labels.size, "stratum")
+    value_strata = dense_labels(strata, labels.size, "stratum")
     _, first = np.unique(labels, return_index=True)
-    of = own[first]
-    if (of[labels] != own).any():
+    stratum = value_strata[first]
+    if (stratum[labels] != value_strata).any():
         raise UsageError("a cluster lies in two strata", cure="give all values of a cluster one stratum")
-    sizes = np.bincount(of)
-    of = np.where(sizes[of] < least, sizes.size, of)
-    sizes = np.bincount(of, minlength=sizes.size + 1)
+    sizes = np.bincount(stratum)
+    stratum = np.where(sizes[stratum] < minimum, sizes.size, stratum)
+    sizes = np.bincount(stratum, minlength=sizes.size + 1)
     others = np.flatnonzero(sizes[:-1])
-    if 0 < sizes[-1] < least and others.size:
-        of = np.where(of == sizes.size - 1, others[sizes[others].argmin()], of)
-    return dense(of, of.size, "stratum")
+    if 0 < sizes[-1] < minimum and others.size:
+        stratum = np.where(stratum == sizes.size - 1, others[sizes[others].argmin()], stratum)
+    return dense_labels(stratum, stratum.size, "stratum")

@@ -1,4 +1,4 @@
-"""Effect sizes, power, and the number of scenarios that it takes to detect a difference."""
+"""Effect sizes, power, and the number of scenarios needed to detect a difference."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from scipy import special
 
 from drivax.errors import UsageError
-from drivax.stats.clusters import differences, numbers
+from drivax.stats.clusters import as_values, paired_differences
 
 #: Deviations below this, relative to the values, are rounding.
 ROUNDING = 1e-9
-#: The largest number of scenarios that is considered.
-_MOST = 10**12
+#: Upper bound of :func:`scenarios_needed`.
+_MAX_SCENARIOS = 10**12
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ def cohens_d_paired(a: Any, b: Any) -> PairedEffect:
     Cohen, Statistical Power Analysis, 1988, section 2.3.5 (``d_z``); Cumming, Understanding the New Statistics, 2012,
     chapter 11 (``d_av``). Standard deviations have ``n - 1``; pairs with an undefined value are left out.
     """
-    x = differences(a, b)
-    keep = ~np.isnan(x)
+    difference = paired_differences(a, b)
+    keep = ~np.isnan(difference)
     if keep.sum() < 2:
         return PairedEffect(None, None)
-    paired, first, second = x[keep], numbers(a)[keep], numbers(b)[keep]
-    within = math.sqrt((first.var(ddof=1) + second.var(ddof=1)) / 2)
-    return PairedEffect(_over(paired.mean(), paired.std(ddof=1)), _over(paired.mean(), within))
+    paired, first, second = difference[keep], as_values(a)[keep], as_values(b)[keep]
+    average_deviation = math.sqrt((first.var(ddof=1) + second.var(ddof=1)) / 2)
+    return PairedEffect(_ratio(paired.mean(), paired.std(ddof=1)), _ratio(paired.mean(), average_deviation))
 
 
 def cohens_d(a: Any, b: Any) -> float | None:
@@ -49,63 +49,63 @@ def cohens_d(a: Any, b: Any) -> float | None:
 
     None where nothing varies, or a sample has fewer than two defined values.
     """
-    first, second = (values[~np.isnan(values)] for values in (numbers(a), numbers(b)))
+    first, second = (values[~np.isnan(values)] for values in (as_values(a), as_values(b)))
     if min(first.size, second.size) < 2:
         return None
-    return _over(first.mean() - second.mean(), pooled_deviation(first, second))
+    return _ratio(first.mean() - second.mean(), pooled_deviation(first, second))
 
 
 def pooled_deviation(a: Any, b: Any) -> float:
     """``sqrt(((n_a - 1) s_a^2 + (n_b - 1) s_b^2) / (n_a + n_b - 2))`` of defined values."""
-    first, second = numbers(a), numbers(b)
+    first, second = as_values(a), as_values(b)
     squares = sum(float(np.square(sample - sample.mean()).sum()) for sample in (first, second))
     return math.sqrt(squares / (first.size + second.size - 2))
 
 
-def _over(difference: Any, deviation: Any) -> float | None:
+def _ratio(difference: Any, deviation: Any) -> float | None:
     return float(difference / deviation) if deviation > ROUNDING * abs(difference) else None
 
 
 def power(effect: float, n: float, confidence: float = 0.95, share: float | None = None) -> float:
     """Return the probability that a two-sided t-test detects an effect of this size.
 
-    ``P(|T| > t)`` with ``T`` noncentral t: for pairs ``n - 1`` degrees of freedom and noncentrality ``d sqrt(n)``, for
+    ``P(|T| > t)`` with ``T`` noncentral t: for pairs ``n - 1`` degrees of dof and noncentrality ``d sqrt(n)``, for
     two arms ``n - 2`` and ``d sqrt(n w (1 - w))`` (Cohen 1988, section 2.3; Johnson, Kotz and Balakrishnan, Continuous
     Univariate Distributions 2, 1995, chapter 31).
 
     Args:
         effect: ``d_z`` of pairs, or Cohen's d of two arms.
         n: Pairs, or scenarios of both arms; may be fractional (an effective sample size).
-        confidence: 1 - level of the test.
+        confidence: 1 - significance level.
         share: ``w``, the share of the first arm; None for pairs.
     """
     if not (0 < confidence < 1 and (share is None or 0 < share < 1) and n > 0):
         cure = "confidence and share lie between 0 and 1, n above 0"
         raise UsageError("confidence, share or n out of range", cure=cure)
-    freedom = n - (1 if share is None else 2)
-    if freedom <= 0:
+    dof = n - (1 if share is None else 2)
+    if dof <= 0:
         return 0.0
-    shift = abs(effect) * math.sqrt(n if share is None else n * share * (1 - share))
-    bound = float(special.stdtrit(freedom, (1 + confidence) / 2))
-    if shift - bound > 10:
+    noncentrality = abs(effect) * math.sqrt(n if share is None else n * share * (1 - share))
+    critical = float(special.stdtrit(dof, (1 + confidence) / 2))
+    if noncentrality - critical > 10:
         return 1.0
-    below, above = (float(special.nctdtr(freedom, shift, t)) for t in (-bound, bound))
+    below, above = (float(special.nctdtr(dof, noncentrality, t)) for t in (-critical, critical))
     return min(1.0, 1.0 - above + (below if math.isfinite(below) else 0.0))
 
 
 def scenarios_needed(
     effect: float, target: float = 0.8, confidence: float = 0.95, share: float | None = None
 ) -> int:
-    """Return the least number of independent scenarios with which an effect is detected with power ``target``.
+    """Return the smallest number of independent scenarios that detects an effect with power ``target``.
 
-    Counts pairs, or scenarios of both arms together; clusters take ``deff`` times as many. Arguments as for
+    Counts pairs, or scenarios of both arms together; clustered ones need ``deff`` times as many. Arguments as for
     :func:`power`.
     """
     if effect == 0 or not 0 < target < 1:
         problem = f"no number of scenarios detects an effect of {effect} with power {target}"
         raise UsageError(problem, cure="give an effect, and a power between 0 and 1")
     low, high = 1, 2
-    while not power(effect, high, confidence, share) >= target and high < _MOST:
+    while not power(effect, high, confidence, share) >= target and high < _MAX_SCENARIOS:
         low, high = high, 2 * high
     while high - low > 1:
         middle = (low + high) // 2
@@ -113,7 +113,7 @@ def scenarios_needed(
     return high
 
 
-def detectable(
+def detectable_effect(
     n: float, target: float = 0.8, confidence: float = 0.95, share: float | None = None
 ) -> float | None:
     """Return the smallest effect that is detected with power ``target``; None where ``n`` is too small for any."""

@@ -21,13 +21,13 @@ from drivax.stats.clusters import (
     Strata,
     Totals,
     Values,
-    defined,
-    dense,
+    as_values,
+    cluster_strata,
+    cluster_totals,
+    dense_labels,
     design_effect,
-    differences,
-    numbers,
-    stratum_of_clusters,
-    totals,
+    drop_undefined,
+    paired_differences,
 )
 
 RESAMPLES = 10_000
@@ -48,11 +48,11 @@ class Interval:
     n: int
 
     def as_dict(self) -> dict[str, float | int | None]:
-        """Return the four numbers by name, as ``summary.json`` stores them."""
+        """Return the four numbers by name, in the format of ``summary.json``."""
         return asdict(self)
 
 
-NOTHING = Interval(None, None, None, 0)
+UNDEFINED = Interval(None, None, None, 0)
 
 
 def effective_size(weights: Any) -> float:
@@ -66,14 +66,14 @@ def wilson(successes: float | int, n: float | int, confidence: float = 0.95) -> 
     """Score interval of a proportion (Wilson, J. Am. Stat. Assoc. 22, 1927).
 
     ``centre = (p + z^2 / 2n) / (1 + z^2 / n)``,
-    ``half = z / (1 + z^2 / n) * sqrt(p (1 - p) / n + z^2 / 4n^2)``; never empty, never outside [0, 1]. The number of
-    trials ``n`` may be fractional (an effective sample size).
+    ``half = z / (1 + z^2 / n) * sqrt(p (1 - p) / n + z^2 / 4n^2)``; always within [0, 1]. The trials ``n`` may be
+    fractional (an effective sample size).
     """
     z = normal_quantile(confidence)
     if not 0 <= successes <= n:
         raise UsageError(f"{successes} successes of {n} trials are impossible", cure="use 0 to n successes")
     if n == 0:
-        return NOTHING
+        return UNDEFINED
     p = successes / n
     shrink = 1.0 + z * z / n
     centre = (p + z * z / (2 * n)) / shrink
@@ -89,9 +89,9 @@ def rate(values: Any, clusters: Any = None, confidence: float = 0.95) -> Interva
     The trials are replaced by the effective sample size ``n / deff`` (Kish 1965; Dean and Pagano, J. Surv.
     Stat. Methodol. 3, 2015) with the design effect of :func:`~drivax.stats.clusters.design_effect`.
     """
-    x, labels = defined(values, clusters)
+    x, labels = drop_undefined(values, clusters)
     if x.size == 0:
-        return NOTHING
+        return UNDEFINED
     if not np.isin(x, (0.0, 1.0)).all():
         raise UsageError("a rate takes only 0 and 1", cure="use bootstrap_mean for other values")
     n, p = x.size, float(x.mean())
@@ -104,26 +104,26 @@ def bootstrap_mean(
     values: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES,
     *, strata: Any = None, seed: int,
 ) -> Interval:  # fmt: skip
-    """Percentile bootstrap interval of a mean, resampling whole clusters, within strata where these are given.
+    """Percentile bootstrap interval of a mean, resampling whole clusters, within strata if given.
 
     Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3; clusters: Davison and Hinkley,
     Bootstrap Methods, 1997, section 3.8: draw as many clusters as there are, with replacement; the mean of a
-    resample is its sum over its number of episodes. Strata, of which those of a single cluster are pooled: of the
-    ``C_h`` clusters of each draw ``C_h - 1`` and weigh them by ``C_h / (C_h - 1)``, so that the variance is right
-    however small strata are (Rao, Wu and Yue, Surv. Methodol. 18, 1992).
+    resample is its sum over its number of episodes. Strata: draw ``C_h - 1`` of the ``C_h`` clusters of each and weight
+    them by ``C_h / (C_h - 1)``, which keeps the variance right in small strata (Rao, Wu and Yue, Surv. Methodol. 18,
+    1992); strata of a single cluster are pooled.
     """
     check_draws(confidence, resamples)
-    x, labels = defined(values, clusters)
+    x, labels = drop_undefined(values, clusters)
     if x.size == 0:
-        return NOTHING
-    of = None
+        return UNDEFINED
+    strata_of_clusters = None
     if strata is not None:
-        keep = ~np.isnan(numbers(values))
-        of = stratum_of_clusters(dense(strata, keep.size, "stratum")[keep], labels)
+        keep = ~np.isnan(as_values(values))
+        strata_of_clusters = cluster_strata(dense_labels(strata, keep.size, "stratum")[keep], labels)
     mean = float(x.mean())
     if labels.max() == 0:
         return Interval(mean, None, None, x.size)
-    means = _resampled_means(x, labels, of, resamples, np.random.default_rng(seed))
+    means = _resample_means(x, labels, strata_of_clusters, resamples, np.random.default_rng(seed))
     return Interval(mean, *_percentiles(means, confidence), x.size)
 
 
@@ -137,19 +137,27 @@ def split_bootstrap(
     marks the episodes of the first arm.
     """
     check_draws(confidence, resamples)
-    x = numbers(values)
+    x = as_values(values)
     rng, arms = np.random.default_rng(seed), []
-    of = None if strata is None else dense(strata, x.size, "stratum")
+    scenario_strata = None if strata is None else dense_labels(strata, x.size, "stratum")
     for arm in (first, ~first):
         chosen = arm & ~np.isnan(x)
-        arm_values, labels = defined(x[chosen], dense(clusters, x.size, "cluster")[chosen])
+        arm_values, labels = drop_undefined(x[chosen], dense_labels(clusters, x.size, "cluster")[chosen])
         if arm_values.size == 0:
-            return NOTHING
-        arms.append((arm_values, labels, None if of is None else stratum_of_clusters(of[chosen], labels)))
+            return UNDEFINED
+        arms.append(
+            (
+                arm_values,
+                labels,
+                None if scenario_strata is None else cluster_strata(scenario_strata[chosen], labels),
+            )
+        )
     mean, n = float(arms[0][0].mean() - arms[1][0].mean()), sum(values.size for values, _, _ in arms)
     if min(labels.max() for _, labels, _ in arms) == 0:
         return Interval(mean, None, None, n)
-    means = [_resampled_means(values, labels, own, resamples, rng) for values, labels, own in arms]
+    means = [
+        _resample_means(values, labels, arm_strata, resamples, rng) for values, labels, arm_strata in arms
+    ]
     return Interval(mean, *_percentiles(means[0] - means[1], confidence), n)
 
 
@@ -160,7 +168,7 @@ def paired_bootstrap(
 
     Pairing removes the spread between scenarios that both planners share (Efron and Tibshirani 1993, chapter 8).
     """
-    return bootstrap_mean(differences(a, b), clusters, confidence, resamples, seed=seed)
+    return bootstrap_mean(paired_differences(a, b), clusters, confidence, resamples, seed=seed)
 
 
 def interquartile_bootstrap(
@@ -169,26 +177,26 @@ def interquartile_bootstrap(
     """Percentile bootstrap interval of the interquartile mean over training seeds of their mean episode.
 
     Seeds and clusters are crossed: every seed is evaluated on every scenario. Each resample draws as many of both as
-    there are, independently and with replacement (Owen, Ann. Appl. Stat. 1, 2007, "The pigeonhole bootstrap"). With few
-    seeds it is too narrow, as every bootstrap; for means see :func:`~drivax.stats.seeds.seeds_interval`. ``values`` are
-    ``[seed, episode]``; ``n`` counts the defined ones.
+    there are, independently and with replacement (Owen, Ann. Appl. Stat. 1, 2007, "The pigeonhole bootstrap"). Like
+    every bootstrap it is too narrow with few seeds; for means see :func:`~drivax.stats.seeds.seeds_interval`.
+    ``values`` are ``[seed, episode]``; ``n`` counts the defined ones.
     """
     check_draws(confidence, resamples)
-    rows = [numbers(row) for row in values]
-    labels = dense(clusters, rows[0].size, "cluster")
+    rows = [as_values(row) for row in values]
+    labels = dense_labels(clusters, rows[0].size, "cluster")
     if any(row.size != labels.size for row in rows):
         raise UsageError("seeds have different episodes", cure="give one value per seed and episode")
     sums, counts = _seed_totals(np.stack(rows), labels)
-    n, (seeds, clusters_count) = int(counts.sum()), sums.shape
+    n, (seeds, cluster_count) = int(counts.sum()), sums.shape
     if not n:
-        return NOTHING
+        return UNDEFINED
     mean = _interquartile(np.ones(seeds, int), sums.sum(axis=1), counts.sum(axis=1))
-    if clusters_count < 2:
+    if cluster_count < 2:
         return Interval(mean, None, None, n)
     rng, means = np.random.default_rng(seed), np.empty(resamples)
-    for at in range(resamples):
-        cluster_draws, seed_draws = _times_drawn(clusters_count, rng), _times_drawn(seeds, rng)
-        means[at] = _interquartile(seed_draws, sums @ cluster_draws, counts @ cluster_draws)
+    for number in range(resamples):
+        cluster_draws, seed_draws = _draw_counts(cluster_count, rng), _draw_counts(seeds, rng)
+        means[number] = _interquartile(seed_draws, sums @ cluster_draws, counts @ cluster_draws)
     return Interval(mean, *_percentiles(means, confidence), n)
 
 
@@ -201,19 +209,19 @@ def _seed_totals(
     return np.stack(sums), np.stack([np.bincount(labels, row, count) for row in valid])
 
 
-def _times_drawn(count: int, rng: np.random.Generator) -> Labels:
+def _draw_counts(count: int, rng: np.random.Generator) -> Labels:
     """Return how often each of ``count`` units is drawn in ``count`` draws with replacement."""
     return np.bincount(rng.integers(0, count, count), minlength=count)
 
 
 def interquartile_mean(values: Any) -> float | None:
-    """Mean of the middle half of the values, as of training seeds; None without values.
+    """Mean of the middle half of the values (of training seeds, say); None without values.
 
     More robust to a failed seed than the mean, more efficient than the median (Agarwal et al., NeurIPS 2021, "Deep
     reinforcement learning at the edge of the statistical precipice"). The value of rank ``i`` of ``n`` covers the
     quantiles from ``i / n`` to ``(i + 1) / n`` and is weighted by their overlap with [1/4, 3/4].
     """
-    x = np.sort(numbers(values))
+    x = np.sort(as_values(values))
     x = x[~np.isnan(x)]
     if x.size == 0:
         return None
@@ -229,7 +237,7 @@ def _interquartile(draws: Labels, sums: Totals, counts: Totals) -> float:
 
 
 def check_draws(confidence: float, resamples: int) -> None:
-    """Refuse an impossible confidence or number of resamples."""
+    """Raise UsageError for a confidence outside (0, 1) or no resamples."""
     normal_quantile(confidence)
     if resamples < 1:
         raise UsageError(f"number of resamples is {resamples}", cure="use 1000 or more")
@@ -238,7 +246,7 @@ def check_draws(confidence: float, resamples: int) -> None:
 def normal_quantile(confidence: float) -> float:
     """Two-sided quantile z of the standard normal distribution."""
     if not 0 < confidence < 1:
-        raise UsageError(f"confidence is {confidence}", cure="use a number between 0 and 1, as 0.95")
+        raise UsageError(f"confidence is {confidence}", cure="use a number between 0 and 1, for example 0.95")
     return float(special.ndtri((1 + confidence) / 2))
 
 
@@ -248,31 +256,31 @@ def _percentiles(values: Float64[np.ndarray, " resample"], confidence: float) ->
     return float(low), float(high)
 
 
-def _resampled_means(
+def _resample_means(
     x: Values, labels: Labels, strata: Strata | None, resamples: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, " resample"]:
     """Return means of resamples of whole clusters, within strata."""
-    sums, counts = totals(x, labels)
+    sums, counts = cluster_totals(x, labels)
     if strata is None:
-        drawn = _drawn_totals(sums, counts, sums.size, resamples, rng)
-        return drawn[0] / drawn[1]
+        draws = _draw_totals(sums, counts, sums.size, resamples, rng)
+        return draws[0] / draws[1]
     total = np.zeros((2, resamples))
     for stratum in range(int(strata.max()) + 1):
-        inside = strata == stratum
-        size = int(inside.sum())
-        total += size / (size - 1) * _drawn_totals(sums[inside], counts[inside], size - 1, resamples, rng)
+        members = strata == stratum
+        size = int(members.sum())
+        total += size / (size - 1) * _draw_totals(sums[members], counts[members], size - 1, resamples, rng)
     return total[0] / total[1]
 
 
-def _drawn_totals(
+def _draw_totals(
     sums: Totals, counts: Totals, draws: int, resamples: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "2 resample"]:
-    """Return sum and number of the values of ``draws`` clusters drawn with replacement, ``resamples`` times."""
-    chunks, same = [], bool((counts == counts[0]).all())
+    """Return sum and number of the values of ``draws`` clusters index with replacement, ``resamples`` times."""
+    chunks, equal_counts = [], bool((counts == counts[0]).all())
     for size in chunk_sizes(resamples, draws):
-        drawn = rng.integers(0, sums.size, size=(size, draws), dtype=np.int32)
-        number = np.full(size, counts[0] * draws) if same else counts[drawn].sum(axis=1)
-        chunks.append((sums[drawn].sum(axis=1), number))
+        index = rng.integers(0, sums.size, size=(size, draws), dtype=np.int32)
+        number = np.full(size, counts[0] * draws) if equal_counts else counts[index].sum(axis=1)
+        chunks.append((sums[index].sum(axis=1), number))
     return np.concatenate(chunks, axis=1)
 
 

@@ -19,7 +19,7 @@ Labels = Bool[np.ndarray[Any, Any], " n"]
 
 def roc_auc(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
     """Return the probability that a positive scores above a negative; a tie counts half (Hanley and McNeil, 1982)."""
-    return _auc(*_masses(_ranks(scores, labels), labels, weights))
+    return _auc(*_weights_by_rank(_ranks(scores, labels), labels, weights))
 
 
 def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> tuple[float, float]:
@@ -29,64 +29,64 @@ def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> t
     """
     positive, negative = scores[labels], scores[~labels]
     if min(len(positive), len(negative)) < 2:
-        raise UsageError("an interval needs two of either kind", cure="use a larger set")
+        raise UsageError("an interval needs two positives and two negatives", cure="use a larger set")
     ranks = rankdata(scores)
-    above = (ranks[labels] - rankdata(positive)) / len(negative)
-    below = 1.0 - (ranks[~labels] - rankdata(negative)) / len(positive)
-    spread = np.sqrt(above.var(ddof=1) / len(positive) + below.var(ddof=1) / len(negative))
-    reach = float(norm.ppf(0.5 + confidence / 2) * spread)
-    middle = float(above.mean())
-    return max(middle - reach, 0.0), min(middle + reach, 1.0)
+    positive_share = (ranks[labels] - rankdata(positive)) / len(negative)
+    negative_share = 1.0 - (ranks[~labels] - rankdata(negative)) / len(positive)
+    error = np.sqrt(positive_share.var(ddof=1) / len(positive) + negative_share.var(ddof=1) / len(negative))
+    half = float(norm.ppf(0.5 + confidence / 2) * error)
+    auc = float(positive_share.mean())
+    return max(auc - half, 0.0), min(auc + half, 1.0)
 
 
 def precision_at_base_rate(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Return the share of positives among as many of the highest scores; of equal ones at the edge a share is taken.
+    """Return the precision among the ``k`` highest scores, with ``k`` the number of positives.
 
-    1 for a perfect ranking, the base rate for a random one.
+    Ties at the threshold count in proportion. 1 for a perfect ranking, the base rate for a random one.
     """
-    return _precision(*_masses(_ranks(scores, labels), labels, weights))
+    return _precision(*_weights_by_rank(_ranks(scores, labels), labels, weights))
 
 
 def bootstrap_intervals(
     scores: Numbers, labels: Labels, weights: Numbers, clusters: Int[np.ndarray[Any, Any], " n"],
     resamples: int = 500, confidence: float = 0.95,
 ) -> tuple[tuple[float, float], tuple[float, float]]:  # fmt: skip
-    """Return intervals of :func:`roc_auc` and :func:`precision_at_base_rate`, by percentiles of a cluster bootstrap.
+    """Return cluster-bootstrap percentile intervals of :func:`roc_auc` and :func:`precision_at_base_rate`.
 
-    Whole clusters are drawn with replacement (Davison and Hinkley, Bootstrap Methods, 1997, 3.8): those with
-    a positive and those without are drawn separately, so that the base rate stays.
+    Clusters with a positive and those without are drawn separately, which keeps the base rate (Davison and Hinkley,
+    Bootstrap Methods, 1997, 3.8).
     """
     rank, rng = _ranks(scores, labels), np.random.default_rng(0)
-    number, cluster = np.unique(clusters, return_inverse=True)
-    holds = np.bincount(cluster, labels, len(number)) > 0
-    kinds = [np.flatnonzero(holds), np.flatnonzero(~holds)]
+    names, cluster = np.unique(clusters, return_inverse=True)
+    has_positive = np.bincount(cluster, labels, len(names)) > 0
+    groups = [np.flatnonzero(has_positive), np.flatnonzero(~has_positive)]
     samples = []
     for _ in range(resamples):
-        drawn = np.concatenate([rng.choice(kind, len(kind)) for kind in kinds if len(kind)])
-        times = np.bincount(drawn, minlength=len(number))[cluster]
-        masses = _masses(rank, labels, weights * times)
-        samples.append((_auc(*masses), _precision(*masses)))
-    low, high = _bounds(samples, confidence)
+        drawn = np.concatenate([rng.choice(group, len(group)) for group in groups if len(group)])
+        draws = np.bincount(drawn, minlength=len(names))[cluster]
+        by_rank = _weights_by_rank(rank, labels, weights * draws)
+        samples.append((_auc(*by_rank), _precision(*by_rank)))
+    low, high = _percentiles(samples, confidence)
     return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
 
-def _bounds(samples: Any, confidence: float) -> np.ndarray[Any, Any]:
+def _percentiles(samples: Any, confidence: float) -> np.ndarray[Any, Any]:
     tail = (1.0 - confidence) / 2
     return np.quantile(samples, (tail, 1.0 - tail), axis=0)
 
 
 def _ranks(scores: Numbers, labels: Labels) -> Int[np.ndarray[Any, Any], " n"]:
-    """Return the rank of every score among the distinct ones, the lowest first."""
+    """Return the index of each score among the sorted distinct scores."""
     if labels.all() or not labels.any():
         cure = "use a set that has positives and negatives"
         raise UsageError("labels are all true or all false", cure=cure)
     return np.unique(scores, return_inverse=True)[1]
 
 
-def _masses(
+def _weights_by_rank(
     rank: Int[np.ndarray[Any, Any], " n"], labels: Labels, weights: Numbers | None
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Return the weight of positives and of negatives, by score."""
+    """Return the total weight of positives and of negatives at each rank."""
     count, weights = int(rank.max()) + 1, np.ones(len(rank)) if weights is None else weights
     return np.bincount(rank, weights * labels, count), np.bincount(rank, weights * ~labels, count)
 
@@ -99,8 +99,8 @@ def _auc(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> floa
 def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
     positive, total = positive[::-1], (positive + negative)[::-1]
     count = positive.sum()
-    left = count - (np.cumsum(total) - total)
-    taken = np.clip(np.divide(left, total, out=np.zeros_like(total), where=total > 0), 0.0, 1.0)
+    remaining = count - (np.cumsum(total) - total)
+    taken = np.clip(np.divide(remaining, total, out=np.zeros_like(total), where=total > 0), 0.0, 1.0)
     return float(np.sum(positive * taken) / count)
 
 
@@ -113,18 +113,18 @@ def rank_correlation(first: Numbers, second: Numbers) -> float:
 def correlation_interval(
     first: Numbers, second: Numbers, clusters: Any, resamples: int = 200, confidence: float = 0.95
 ) -> tuple[float, float]:
-    """Return the interval of :func:`rank_correlation`, by percentiles of a bootstrap of whole clusters.
+    """Return the cluster-bootstrap percentile interval of :func:`rank_correlation`.
 
-    Davison and Hinkley, Bootstrap Methods, 1997, 3.8. (-1, 1) if there is a single cluster, or nearly all scores are
-    equal.
+    (-1, 1) for a single cluster, or if a resample has constant scores (Davison and Hinkley, Bootstrap Methods, 1997,
+    3.8).
     """
-    number = np.unique(np.asarray(clusters), return_inverse=True)[1]
-    members = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
+    labels = np.unique(np.asarray(clusters), return_inverse=True)[1]
+    members = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     rng, samples = np.random.default_rng(0), []
     for _ in range(resamples):
         drawn = np.concatenate([members[n] for n in rng.integers(len(members), size=len(members))])
         samples.append(rank_correlation(first[drawn], second[drawn]))
     if len(members) < 2 or np.isnan(samples).any():
         return -1.0, 1.0
-    low, high = _bounds(samples, confidence)
+    low, high = _percentiles(samples, confidence)
     return float(low), float(high)

@@ -15,7 +15,15 @@ from jaxtyping import Bool, Float64
 from scipy import special
 
 from drivax.errors import UsageError
-from drivax.stats.clusters import Totals, defined, dense, differences, numbers, stratum_of_clusters, totals
+from drivax.stats.clusters import (
+    Totals,
+    as_values,
+    cluster_strata,
+    cluster_totals,
+    dense_labels,
+    drop_undefined,
+    paired_differences,
+)
 from drivax.stats.intervals import RESAMPLES, check_draws, chunk_sizes
 
 #: Resampled statistics this close to the observed one, relative to its size, are ties.
@@ -23,14 +31,14 @@ _TIE = 1e-9
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """The result of a test.
+class SignificanceResult:
+    """Result of a significance test.
 
     Attributes:
         name: Name of the test.
-        p: Probability of a difference at least as large under the null hypothesis; None if nothing is defined.
-        units: Number of exchanged units: discordant pairs, or clusters whose values differ.
-        exact: Whether every permutation was counted, rather than a sample.
+        p: Two-sided p-value; None if no value is defined.
+        units: Number of exchangeable units: discordant pairs, or clusters whose values differ.
+        exact: Whether the p-value is exact (closed form, or all permutations) rather than sampled.
     """
 
     name: str
@@ -39,87 +47,88 @@ class Evidence:
     exact: bool
 
 
-def mcnemar(a: Any, b: Any, *, mid: bool = True) -> Evidence:
+def mcnemar_test(a: Any, b: Any, *, mid: bool = True) -> SignificanceResult:
     """McNemar's test of two rates in independent pairs, exact or mid-p.
 
-    Under the null hypothesis the ``n`` pairs in which only one planner fails (discordant pairs) are tosses of a fair
-    coin: ``p = 2 P(X <= k)``, at most 1, with ``X ~ Binomial(n, 1/2)`` and ``k`` the rarer of both (McNemar,
-    Psychometrika 12, 1947). The mid-p value, ``p - P(X = k)``, is less conservative and keeps its level nearly always
-    (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013). Scenarios are independent.
+    Under the null hypothesis, either planner is equally likely to be the only one that fails in each of the ``n``
+    discordant pairs: ``p = 2 P(X <= k)``, at most 1, with ``X ~ Binomial(n, 1/2)`` and ``k`` the smaller of the two
+    counts (McNemar, Psychometrika 12, 1947). The mid-p value, ``p - P(X = k)``, is less conservative and nearly always
+    keeps its level (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013).
     """
-    for values in (numbers(a), numbers(b)):
+    for values in (as_values(a), as_values(b)):
         if not np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
             raise UsageError("McNemar's test takes only 0 and 1", cure="use paired_permutation")
-    pairs = differences(a, b)
+    pairs = paired_differences(a, b)
     name = "McNemar mid-p" if mid else "McNemar exact"
     if np.isnan(pairs).all():
-        return Evidence(name, None, 0, exact=True)
+        return SignificanceResult(name, None, 0, exact=True)
     more, fewer = int((pairs > 0).sum()), int((pairs < 0).sum())
     n, k = more + fewer, min(more, fewer)
-    at_most = float(special.bdtr(k, n, 0.5)) if n else 1.0
-    here = at_most - float(special.bdtr(k - 1, n, 0.5)) if k else at_most
-    p = min(1.0, 2.0 * at_most - here) if mid and n else min(1.0, 2.0 * at_most)
-    return Evidence(name, p, n, exact=True)
+    cdf = float(special.bdtr(k, n, 0.5)) if n else 1.0
+    pmf = cdf - float(special.bdtr(k - 1, n, 0.5)) if k else cdf
+    p = min(1.0, 2.0 * cdf - pmf) if mid and n else min(1.0, 2.0 * cdf)
+    return SignificanceResult(name, p, n, exact=True)
 
 
 def paired_permutation(
     a: Any, b: Any, clusters: Any = None, resamples: int = RESAMPLES, *, seed: int
-) -> Evidence:
-    """Permutation test of a mean paired difference: the signs of whole clusters are flipped.
+) -> SignificanceResult:
+    """Sign-flipping permutation test of a mean paired difference, by cluster.
 
     If the planners are interchangeable, the difference of each cluster has either sign with equal probability
     (Fisher, The Design of Experiments, 1935, section 21; Good, Permutation, Parametric and Bootstrap Tests, 2005,
-    section 3.2). All ``2^C`` sign patterns are counted where they are no more than ``resamples``, else random ones:
-    ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol. Biol. 9, 2010). For 0/1
-    values in clusters of one this is McNemar's exact test.
+    section 3.2). All ``2^C`` sign patterns are enumerated if there are at most ``resamples``; otherwise ``resamples``
+    random ones are drawn and ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol.
+    Biol. 9, 2010). For 0/1 values in clusters of one this is McNemar's exact test.
     """
     check_draws(0.95, resamples)
-    x, labels = defined(differences(a, b), clusters)
+    x, labels = drop_undefined(paired_differences(a, b), clusters)
     if x.size == 0:
-        return Evidence("permutation", None, 0, exact=True)
-    sums = totals(x, labels)[0]
+        return SignificanceResult("permutation", None, 0, exact=True)
+    sums = cluster_totals(x, labels)[0]
     size = np.abs(sums)
-    # Clusters without a difference change nothing whatever their sign.
+    # Clusters without a difference do not change the statistic.
     sums = sums[size > _TIE * size.max()]
-    least = abs(float(sums.sum())) - _TIE * float(size.sum())
+    threshold = abs(float(sums.sum())) - _TIE * float(size.sum())
     if 2.0**sums.size <= resamples:
         signs = 1.0 - 2.0 * (np.arange(2**sums.size)[:, None] >> np.arange(sums.size) & 1)
-        return Evidence("permutation", float((np.abs(signs @ sums) >= least).mean()), sums.size, exact=True)
-    rng, beyond = np.random.default_rng(seed), 0
+        p = float((np.abs(signs @ sums) >= threshold).mean())
+        return SignificanceResult("permutation", p, sums.size, exact=True)
+    rng, extreme = np.random.default_rng(seed), 0
     for count in chunk_sizes(resamples, sums.size):
-        kept = rng.integers(0, 2, size=(count, sums.size), dtype=np.int8).astype(np.float64)
-        beyond += int((np.abs(2.0 * (kept @ sums) - sums.sum()) >= least).sum())
-    return Evidence("permutation", (1 + beyond) / (1 + resamples), sums.size, exact=False)
+        positive = rng.integers(0, 2, size=(count, sums.size), dtype=np.int8).astype(np.float64)
+        extreme += int((np.abs(2.0 * (positive @ sums) - sums.sum()) >= threshold).sum())
+    return SignificanceResult("permutation", (1 + extreme) / (1 + resamples), sums.size, exact=False)
 
 
 def paired_bootstrap_test(
     a: Any, b: Any, clusters: Any = None, resamples: int = RESAMPLES, *, seed: int
-) -> Evidence:
-    """Bootstrap test of a mean paired difference without the assumption of symmetry, resampling whole clusters.
+) -> SignificanceResult:
+    """Bootstrap test of a mean paired difference, resampling whole clusters; assumes no symmetry.
 
     ``t = m / se`` is compared with ``t* = (m* - m) / se*`` of resamples, ``p = (1 + #{|t*| >= |t|}) / (1 + resamples)``
     (Efron and Tibshirani 1993, section 16.4; symmetric bootstrap-t: Hall, The Bootstrap and Edgeworth Expansion, 1992,
     section 3.6), with the standard error of a ratio of totals, ``se^2 = C / (C - 1) sum((S_c - m n_c)^2) / n^2``.
     """
     check_draws(0.95, resamples)
-    x, labels = defined(differences(a, b), clusters)
+    x, labels = drop_undefined(paired_differences(a, b), clusters)
     if x.size == 0 or labels.max() == 0:
-        return Evidence("bootstrap", None, 0, exact=False)
-    sums, counts = totals(x, labels)
+        return SignificanceResult("bootstrap", None, 0, exact=False)
+    sums, counts = cluster_totals(x, labels)
     if not sums.any():
-        return Evidence("bootstrap", 1.0, 0, exact=False)
+        return SignificanceResult("bootstrap", 1.0, 0, exact=False)
     moments = np.stack((sums, counts, sums * sums, sums * counts, counts * counts), axis=1)
     mean, error = (float(value[0]) for value in _mean_and_error(moments.sum(axis=0)[None], sums.size))
     if error == 0.0:
-        return Evidence("bootstrap", 1.0 / (1 + resamples), sums.size, exact=False)
-    rng, beyond = np.random.default_rng(seed), 0
+        return SignificanceResult("bootstrap", 1.0 / (1 + resamples), sums.size, exact=False)
+    rng, extreme = np.random.default_rng(seed), 0
     for count in chunk_sizes(resamples, sums.size):
-        times = rng.multinomial(sums.size, np.full(sums.size, 1.0 / sums.size), size=count)
-        means, errors = _mean_and_error(times @ moments, sums.size)
+        draws = rng.multinomial(sums.size, np.full(sums.size, 1.0 / sums.size), size=count)
+        means, errors = _mean_and_error(draws @ moments, sums.size)
         # A resample without variance supports the null hypothesis, unless it repeats the mean.
         deviations = np.abs(means - mean)
-        beyond += int((deviations >= (abs(mean) / error) * errors - _TIE * abs(mean)).sum())
-    return Evidence("bootstrap", (1 + beyond) / (1 + resamples), sums.size, exact=False)
+        extreme += int((deviations >= (abs(mean) / error) * errors - _TIE * abs(mean)).sum())
+    return SignificanceResult("bootstrap", (1 + extreme) / (1 + resamples), sums.size, exact=False)
 
 
 def _mean_and_error(
@@ -135,56 +144,56 @@ def _mean_and_error(
 def split_permutation(
     values: Any, first: Bool[np.ndarray, " n"], clusters: Any = None, strata: Any = None,
     resamples: int = RESAMPLES, *, seed: int,
-) -> Evidence:  # fmt: skip
-    """Permutation test of the means of two arms: whole clusters are reassigned, keeping their number in each arm.
+) -> SignificanceResult:  # fmt: skip
+    """Permutation test of the means of two arms, reassigning whole clusters; the sizes of the arms stay, by stratum.
 
     Under the null hypothesis every assignment is as likely as the observed one, and the test is exact (Fisher 1935;
-    Good 2005, section 3.3); strata keep their numbers in each arm. ``first`` marks the scenarios of the first arm.
+    Good 2005, section 3.3). ``first`` marks the scenarios of the first arm.
     Raises UsageError if a cluster is in both arms or in two strata.
     """
     check_draws(0.95, resamples)
-    keep = ~np.isnan(numbers(values))
-    x, labels = defined(values, clusters)
+    keep = ~np.isnan(as_values(values))
+    x, labels = drop_undefined(values, clusters)
     arm = first[keep]
     if x.size == 0 or arm.all() or not arm.any():
-        return Evidence("permutation", None, 0, exact=False)
-    sums, counts = totals(x, labels)
-    mine = totals(arm.astype(np.float64), labels)[0] > 0
-    if (mine[labels] != arm).any():
+        return SignificanceResult("permutation", None, 0, exact=False)
+    sums, counts = cluster_totals(x, labels)
+    in_first = cluster_totals(arm.astype(np.float64), labels)[0] > 0
+    if (in_first[labels] != arm).any():
         raise UsageError("a cluster is in both arms", cure="assign whole clusters")
-    of = np.zeros(sums.size, np.int64)
+    stratum = np.zeros(sums.size, np.int64)
     if strata is not None:
-        of = stratum_of_clusters(dense(strata, keep.size, "stratum")[keep], labels, least=1)
+        stratum = cluster_strata(dense_labels(strata, keep.size, "stratum")[keep], labels, minimum=1)
     tie = _TIE * float(np.abs(x).max())
-    least = abs(float(_between(mine[None], sums, counts)[0])) - tie
-    rng, beyond = np.random.default_rng(seed), 0
+    threshold = abs(float(_arm_difference(in_first[None], sums, counts)[0])) - tie
+    rng, extreme = np.random.default_rng(seed), 0
     for count in chunk_sizes(resamples, sums.size):
-        drawn = np.empty((count, sums.size), bool)
-        for stratum in range(int(of.max()) + 1):
-            inside = of == stratum
-            drawn[:, inside] = rng.permuted(np.tile(mine[inside], (count, 1)), axis=1)
-        beyond += int((np.abs(_between(drawn, sums, counts)) >= least).sum())
-    return Evidence("permutation", (1 + beyond) / (1 + resamples), sums.size, exact=False)
+        draws = np.empty((count, sums.size), bool)
+        for number in range(int(stratum.max()) + 1):
+            members = stratum == number
+            draws[:, members] = rng.permuted(np.tile(in_first[members], (count, 1)), axis=1)
+        extreme += int((np.abs(_arm_difference(draws, sums, counts)) >= threshold).sum())
+    return SignificanceResult("permutation", (1 + extreme) / (1 + resamples), sums.size, exact=False)
 
 
-def _between(
-    mine: Bool[np.ndarray, "draw cluster"], sums: Totals, counts: Totals
+def _arm_difference(
+    in_first: Bool[np.ndarray, "draw cluster"], sums: Totals, counts: Totals
 ) -> Float64[np.ndarray, " draw"]:
     """Return the difference of the means of two arms."""
-    total, number = (mine.astype(np.float64) @ values for values in (sums, counts))
+    total, number = (in_first.astype(np.float64) @ values for values in (sums, counts))
     return total / number - (sums.sum() - total) / (counts.sum() - number)
 
 
-def holm(ps: Sequence[float | None]) -> list[float | None]:
-    """Holm's adjustment of p-values for multiple tests, valid under any dependence (Holm, Scand. J. Stat. 6, 1979).
+def holm_adjust(ps: Sequence[float | None]) -> list[float | None]:
+    """Adjust p-values for multiple tests, under any dependence (Holm, Scand. J. Stat. 6, 1979).
 
-    In ascending order ``p_(i)`` becomes the largest of ``(m - j) p_(j)``, ``j`` from 0 to ``i``, at most 1. None
-    (nothing to test) does not count in ``m``.
+    In ascending order ``p_(i)`` becomes the largest of ``(m - j) p_(j)``, ``j`` from 0 to ``i``, at most 1. None stands
+    for no test and does not count in ``m``.
     """
-    order = sorted((p, place) for place, p in enumerate(ps) if p is not None)
+    order = sorted((p, index) for index, p in enumerate(ps) if p is not None)
     adjusted: list[float | None] = [None] * len(ps)
     largest = 0.0
-    for rank, (p, place) in enumerate(order):
+    for rank, (p, index) in enumerate(order):
         largest = max(largest, min(1.0, (len(order) - rank) * p))
-        adjusted[place] = largest
+        adjusted[index] = largest
     return adjusted

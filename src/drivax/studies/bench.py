@@ -37,13 +37,13 @@ from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
 
-#: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table; larger sizes only if fastest.
+#: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table; larger ones count if fastest.
 METRIC_SETS, BATCHES, LARGER = ("none", "training", "full"), (32, 128), (256, 512, 1024)
-#: Number of environments for which the compiler counts operations and bytes.
-_COUNTED = 16384
-#: Actions, observations and frame; and the carry of the loop: states, which episodes ended, rewards, and those.
-_Driven = tuple[Array, Mapping[str, Array], Frame]
-_Carry = tuple[SimState, Bool[Array, " B"], Float[Array, " B"], _Driven]
+#: Number of environments in the compiler's cost analysis.
+_COST_BATCH = 16384
+#: Actions, observations and frames; and the carry of the loop: states, which episodes have ended, rewards, outputs.
+_PlannerOutputs = tuple[Array, Mapping[str, Array], Frame]
+_Carry = tuple[SimState, Bool[Array, " B"], Float[Array, " B"], _PlannerOutputs]
 
 
 @dataclass(frozen=True)
@@ -84,23 +84,23 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
     """
     config = config or BenchConfig()
     simulator, bank = _simulator(bank, config)
-    whole = compiled(bank, config)
+    program = compile_program(bank, config)
     states = _states(simulator, bank, config.batch)
     parts = _parts(simulator)
-    seconds = {name: _time_part(config, part, bank, states) for name, part in parts.items()}
-    whole_bank = without_grid(bank)
-    brute = sum(_time_part(config, parts[name], whole_bank, states) for name in ("edges", "lanes"))
+    times_us = {name: _time_part(config, part, bank, states) for name, part in parts.items()}
+    no_grid = without_grid(bank)
+    brute_force = sum(_time_part(config, parts[name], no_grid, states) for name in ("edges", "lanes"))
     return {
-        "environment_steps_per_second": round(steps_per_second([whole], config.repeats)[0]),
+        "environment_steps_per_second": round(steps_per_second([program], config.repeats)[0]),
         "batch": config.batch,
         "devices": jax.device_count(),
         "scenarios": len(bank),
         "traffic": simulator.traffic.name,
-        "state_bytes": whole.state_bytes,
+        "state_bytes": program.state_bytes,
         "bank_bytes_per_scenario": bank.nbytes // len(bank),
-        "compile_seconds": round(whole.compile_seconds, 2),
-        "brute_force_ratio": round(brute / (seconds["edges"] + seconds["lanes"]), 2),
-        "by_part": {name: round(value, 3) for name, value in seconds.items()},
+        "compile_seconds": round(program.compile_seconds, 2),
+        "brute_force_ratio": round(brute_force / (times_us["edges"] + times_us["lanes"]), 2),
+        "by_part": {name: round(value, 3) for name, value in times_us.items()},
         "cost_by_part": {name: _cost(part, bank, states) for name, part in parts.items()},
         "versions": versions(),
     }
@@ -117,9 +117,9 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
 
     def program(metrics: MetricNames, batch: int) -> Program:
         task = replace(config.task, metrics=metrics)
-        return compiled(bank, replace(config, batch=batch, task=task))
+        return compile_program(bank, replace(config, batch=batch, task=task))
 
-    bank = spread(bank)
+    bank = replicate(bank)
     kinds = [(metrics, batch) for metrics in METRIC_SETS for batch in (*BATCHES, *LARGER)]
     speeds = dict(
         zip(kinds, steps_per_second([program(*kind) for kind in kinds], config.repeats), strict=True)
@@ -160,14 +160,14 @@ class Program:
     temporary_bytes: int
 
 
-def compiled(bank: ScenarioBank, config: BenchConfig) -> Program:
-    """Return a program that steps, resets, observes, rewards and evaluates a batch, driven by IDM."""
+def compile_program(bank: ScenarioBank, config: BenchConfig) -> Program:
+    """Compile a program that steps and resets a batch driven by IDM, with observations, rewards and metrics."""
     simulator, bank = _simulator(bank, config)
     states = _states(simulator, bank, config.batch)
     keys = jax.random.split(jax.random.key(2), jax.device_count())
     carry = _carry(simulator, config, bank, states)
     started = time.perf_counter()
-    program = _shared(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
+    program = _shard_states(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
     seconds = time.perf_counter() - started
     memory = program.memory_analysis()
     return Program(
@@ -184,11 +184,11 @@ def compiled(bank: ScenarioBank, config: BenchConfig) -> Program:
 def steps_per_second(programs: Sequence[Program], repeats: int) -> list[float]:
     """Return the environment steps per second of each program: medians of alternating runs."""
     times: list[list[float]] = [[] for _ in programs]
-    for turn in range(repeats + 1):
+    for repeat in range(repeats + 1):
         for program, seconds in zip(programs, times, strict=True):
             started = time.perf_counter()
             jax.block_until_ready(program.run())
-            if turn:
+            if repeat:
                 seconds.append(time.perf_counter() - started)
     return [
         program.steps / statistics.median(seconds) for program, seconds in zip(programs, times, strict=True)
@@ -199,15 +199,15 @@ def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, Scen
     """Return the simulator, and the bank on every device."""
     if config.batch % jax.device_count():
         raise UsageError(
-            f"a batch of {config.batch} does not divide among {jax.device_count()} devices",
-            cure="give a multiple",
+            f"batch size {config.batch} is not a multiple of the {jax.device_count()} devices",
+            cure="choose a multiple",
         )
     traffic = find_traffic(config.traffic)
-    return Simulator(config.task, traffic), spread(prepare_bank(traffic, bank))
+    return Simulator(config.task, traffic), replicate(prepare_bank(traffic, bank))
 
 
-def spread(bank: ScenarioBank) -> ScenarioBank:
-    """Return the bank on every device; free if it is there already."""
+def replicate(bank: ScenarioBank) -> ScenarioBank:
+    """Copy the bank to every device that lacks it."""
     return jax.device_put(bank, NamedSharding(_mesh(), PartitionSpec()))
 
 
@@ -226,8 +226,8 @@ def _mesh() -> Mesh:
     return jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
 
 
-def _shared(function: Callable[..., Any]) -> Any:
-    """Return a program of bank, states and keys in which every device has its share of the states, and a key."""
+def _shard_states(function: Callable[..., Any]) -> Any:
+    """Jit a function of bank, states and keys, with the states and keys sharded over the devices."""
     share = PartitionSpec("device")
     return jax.jit(
         jax.shard_map(
@@ -239,35 +239,37 @@ def _shared(function: Callable[..., Any]) -> Any:
 def _run(
     simulator: Simulator, config: BenchConfig, bank: ScenarioBank, carry: _Carry, keys: Array
 ) -> tuple[Any, Array]:
-    """Step a batch; return all results, so that nothing is optimised away, and the number of steps."""
+    """Step a batch; return the number of steps, and all results, so that the compiler removes none."""
     key, batch = keys[0], carry[1].shape[0]
     step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0, 0))
 
-    def evaluated(states: SimState) -> Array:
+    def sum_metrics(states: SimState) -> Array:
         values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
         return jnp.sum(jnp.asarray([value.value for value in values.values()], jnp.float32))
 
     def iteration(carry: _Carry, index: Int[Array, " B"]) -> tuple[_Carry, Array]:
-        states, over, total, (action, _, frame) = carry
-        fresh = map_where(over, partial(simulator.new_episode, bank), index)
-        states, transition = step(bank, states, action, over, fresh, frame)
-        done = transition.terminated | transition.truncated
+        states, done, total, (action, _, frame) = carry
+        starts = map_where(done, partial(simulator.new_episode, bank), index)
+        states, transition = step(bank, states, action, done, starts, frame)
+        ended = transition.terminated | transition.truncated
         # As in training: metrics are computed when some episode of the batch ends.
-        total += jax.lax.cond(done.any(), evaluated, lambda _: jnp.zeros(()), states)
+        total += jax.lax.cond(ended.any(), sum_metrics, lambda _: jnp.zeros(()), states)
         total += transition.reward
-        # Here, where the frame of all agents is at hand, and not at the start of the next iteration.
-        return (states, done, total, _driven(simulator, config, bank, states)), (~over).sum()
+        # Computed here, where the frame of all agents is known, not at the start of the next iteration.
+        return (states, ended, total, _planner_outputs(simulator, config, bank, states)), (~done).sum()
 
-    begins = jax.random.randint(key, (config.steps, batch), 0, len(bank))
-    (_, _, total, driven), alive = jax.lax.scan(iteration, carry, begins)
-    return (total, driven), alive.sum()[None]
+    start_index = jax.random.randint(key, (config.steps, batch), 0, len(bank))
+    (_, _, total, outputs), stepped = jax.lax.scan(iteration, carry, start_index)
+    return (total, outputs), stepped.sum()[None]
 
 
-def _driven(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Driven:
+def _planner_outputs(
+    simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState
+) -> _PlannerOutputs:
     """Return the planner's actions, the task's observations and the frame of all agents."""
     planner = IdmPlanner(config.task.actions)
 
-    def drive(state: SimState) -> _Driven:
+    def drive(state: SimState) -> _PlannerOutputs:
         situation = simulator.situation(bank, state)
         action, _ = planner.act((), bank, state, situation, None, jax.random.key(0))
         return action, simulator.observe(bank, state.context), situation.surroundings.frame
@@ -276,18 +278,18 @@ def _driven(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, state
 
 
 def _carry(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Carry:
-    """Return the carry before the first iteration, in which every episode starts."""
-    driven = jax.eval_shape(lambda: _driven(simulator, config, bank, states))
-    driven = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), driven)
-    begins = jnp.ones(config.batch, bool), jnp.zeros(config.batch)
-    return states, *jax.device_put((*begins, driven), NamedSharding(_mesh(), PartitionSpec("device")))
+    """Return the initial carry, which makes the first iteration reset every environment."""
+    outputs = jax.eval_shape(lambda: _planner_outputs(simulator, config, bank, states))
+    outputs = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outputs)
+    ended = jnp.ones(config.batch, bool), jnp.zeros(config.batch)
+    return states, *jax.device_put((*ended, outputs), NamedSharding(_mesh(), PartitionSpec("device")))
 
 
 Part = Callable[[ScenarioBank, SimState], Any]
 
 
 def without_grid(bank: ScenarioBank) -> ScenarioBank:
-    """Return the bank with a grid of one cell, so that every query visits every segment once."""
+    """Return the bank with a grid of a single cell, so that a query visits all segments."""
     n = len(bank)
     return replace(
         bank,
@@ -298,7 +300,7 @@ def without_grid(bank: ScenarioBank) -> ScenarioBank:
 
 
 def _parts(simulator: Simulator) -> Mapping[str, Part]:
-    """Return the parts of a step, unbatched; work that parts share is counted in each."""
+    """Return the parts of a step, unbatched; shared work counts in each part."""
 
     def frame(bank: ScenarioBank, state: SimState) -> Any:
         return simulator.frame(bank, state.context, alone(state.context), 0)
@@ -312,12 +314,12 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
         return state.context.z - bank.height_m(state.context.index, state.context.slot) / 2
 
     def edges(bank: ScenarioBank, state: SimState) -> Any:
-        me = box(bank, state)
-        return left_of_edges(bank, state.context.index, me[:2], corners(me), ground(bank, state))
+        ego = box(bank, state)
+        return left_of_edges(bank, state.context.index, ego[:2], corners(ego), ground(bank, state))
 
     def lanes(bank: ScenarioBank, state: SimState) -> Any:
-        me = box(bank, state)
-        return around_lanes(bank, state.context.index, me[:2], me[2:4], corners(me), ground(bank, state))
+        ego = box(bank, state)
+        return around_lanes(bank, state.context.index, ego[:2], ego[2:4], corners(ego), ground(bank, state))
 
     def route(bank: ScenarioBank, state: SimState) -> Any:
         return project_on_route(
@@ -353,47 +355,49 @@ def _total(part: Part, bank: ScenarioBank, state: SimState) -> Array:
 
 
 def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimState) -> float:
-    """Return the microseconds per environment and step of a part."""
-    program = _repeated(config, part)
+    """Return the time of a part in microseconds per environment and step."""
+    program = _repeat_part(config, part)
     return _median(lambda: program(bank, states, None), config.repeats) / config.steps / config.batch * 1e6
 
 
-def _repeated(config: BenchConfig, part: Part) -> Any:
-    """Return a program that computes a part ``config.steps`` times, and returns the shift of the last time."""
+def _repeat_part(config: BenchConfig, part: Part) -> Any:
+    """Return a program that computes a part ``config.steps`` times in sequence."""
 
-    def repeated(bank: ScenarioBank, states: SimState, _: Any) -> Array:
+    def run(bank: ScenarioBank, states: SimState, _: Any) -> Array:
         def iteration(shift: Array, _: None) -> tuple[Array, None]:
-            totals = jax.vmap(lambda state, by: _total(part, bank, _shifted(state, by)))(states, shift)
-            # Iterations depend on each other, so that nothing is moved out of the loop.
+            totals = jax.vmap(lambda state, distance: _total(part, bank, _shift(state, distance)))(
+                states, shift
+            )
+            # Each iteration depends on the last one, so that the compiler moves nothing out of the loop.
             return shift + 1e-20 * jnp.where(jnp.isfinite(totals), totals, 0.0), None
 
         return jax.lax.scan(iteration, jnp.zeros(states.start.shape), None, config.steps)[0]
 
-    return _shared(repeated)
+    return _shard_states(run)
 
 
-def _shifted(state: SimState, by: Array) -> SimState:
-    """Return the same state, moved by a distance that only the compiler notices."""
+def _shift(state: SimState, by_m: Array) -> SimState:
+    """Return the state moved by a negligible distance."""
     context = state.context
-    moved = replace(context, history=context.history + by, index=context.index + by.astype(jnp.int32))
+    moved = replace(context, history=context.history + by_m, index=context.index + by_m.astype(jnp.int32))
     return replace(state, context=moved)
 
 
 def _cost(part: Part, bank: ScenarioBank, states: SimState) -> dict[str, float]:
-    """Return a part's operations and bytes per environment as the compiler counts them.
+    """Return a part's operations and bytes per environment by the compiler's cost analysis.
 
-    It counts an indexed array as read whole; with very many environments in one scenario, only the rows that are read
-    remain.
+    The analysis counts an indexed array as read in full; many environments in a bank of one scenario make that
+    negligible.
     """
 
     def with_rows(tree: Any, rows: int) -> Any:
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((rows, *leaf.shape[1:]), leaf.dtype), tree)
 
     program = jax.jit(jax.vmap(part, in_axes=(None, 0)))
-    counts = program.lower(with_rows(bank, 1), with_rows(states, _COUNTED)).compile().cost_analysis() or {}
+    counts = program.lower(with_rows(bank, 1), with_rows(states, _COST_BATCH)).compile().cost_analysis() or {}
     return {
-        "operations": round(counts.get("flops", 0.0) / _COUNTED),
-        "bytes": round(counts.get("bytes accessed", 0.0) / _COUNTED),
+        "operations": round(counts.get("flops", 0.0) / _COST_BATCH),
+        "bytes": round(counts.get("bytes accessed", 0.0) / _COST_BATCH),
     }
 
 

@@ -49,8 +49,8 @@ VARIANTS: dict[str, _Encoder] = {
     "wayformer small, hierarchical": WayformerConfig(fusion="hierarchical"),
     "wayformer small, factorised": WayformerConfig(factorised=True),
 }
-#: Shortest timing, s: one call of a small encoder is too short for the clock.
-_LEAST_S = 0.05
+#: Minimum duration of a timing, s; single calls of small encoders are too short for the clock.
+_MIN_TIMING_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,7 @@ class EncoderBench:
     def __post_init__(self) -> None:
         for name in self.only:
             if name not in ENCODERS and name not in VARIANTS:
-                raise UsageError(
-                    f"there is no encoder {name!r}", cure=did_you_mean(name, [*ENCODERS, *VARIANTS])
-                )
+                raise UsageError(f"unknown encoder {name!r}", cure=did_you_mean(name, [*ENCODERS, *VARIANTS]))
         if not self.batches or min(*self.batches, self.repeats, 1) < 1:
             raise UsageError(
                 f"batches {self.batches}, repeats {self.repeats}", cure="use at least one, of 1 or more"
@@ -86,7 +84,7 @@ def bench_encoders(config: EncoderBench | None = None, *, times: bool = True) ->
 
     Args:
         config: Settings.
-        times: Whether to time them; sizes alone take no computation.
+        times: Whether to time them; sizes need no computation.
 
     Returns:
         The object of ``drivax bench --encoders --json``: ``observation`` with the shapes of the groups, ``device``,
@@ -128,7 +126,7 @@ def encoder_sizes(config: EncoderConfig, spec: GroupSpec) -> dict[str, int]:
 
 
 def random_observations(spec: GroupSpec, batch: int) -> dict[str, Array]:
-    """Return observations of noise; about half of the rows are valid."""
+    """Return observations of normal noise with about half of the rows valid."""
     rng = np.random.default_rng(0)
     noise = {
         name: rng.normal(size=(batch, *shape)).astype(np.float32) for name, shape in sorted(spec.items())
@@ -140,7 +138,7 @@ def random_observations(spec: GroupSpec, batch: int) -> dict[str, Array]:
 
 def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[str, Any]:
     graph, empty = nnx.split(nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0))))
-    # Times do not depend on what the parameters are.
+    # Times do not depend on the values of parameters.
     rng = np.random.default_rng(0)
     parameters = jax.tree.map(lambda leaf: jnp.asarray(0.05 * rng.normal(size=leaf.shape), leaf.dtype), empty)
 
@@ -162,7 +160,7 @@ def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[
 
 
 def _microseconds(function: Any, parameters: Any, groups: dict[str, Array], repeats: int) -> float:
-    """Return the median time per observation, after a call that compiles and a call that sets how many are timed."""
+    """Return the median time per observation; the first call compiles, the second sets the calls per timing."""
     batch = next(iter(groups.values())).shape[0]
 
     def seconds(calls: int) -> float:
@@ -172,5 +170,5 @@ def _microseconds(function: Any, parameters: Any, groups: dict[str, Array], repe
         return (time.perf_counter() - started) / calls
 
     seconds(1)
-    calls = math.ceil(_LEAST_S / seconds(1))
+    calls = math.ceil(_MIN_TIMING_S / seconds(1))
     return round(1e6 * statistics.median(seconds(calls) for _ in range(repeats)) / batch, 2)

@@ -1,4 +1,4 @@
-"""What a study compares: arms, claims about them, settings and scenario sets.
+"""Definition of a study: arms, claims about them, settings and scenario sets.
 
 A study is declared by a YAML file (:class:`StudyDefinition`); ``configs/studies/longtail.yaml`` is the long-tail study.
 """
@@ -40,7 +40,7 @@ class Arm:
         method: Name of the curation method that scores its steps.
         scale: Whether weights are of steps or of scenarios.
         permuted: Whether the scores are permuted among scenarios: the matched random control of ``method``.
-        weights: How scores become weights; None: as the study or the command line says.
+        weights: Settings of the sampling weights; None: those of the study.
     """
 
     preset: str = "offline/cql"
@@ -50,19 +50,15 @@ class Arm:
     weights: WeightConfig | None = None
 
     def weighted(
-        self,
-        data: ScenarioSet,
-        tables: Tables,
-        config: WeightConfig,
-        usable: np.ndarray | None = None,
+        self, data: ScenarioSet, tables: Tables, config: WeightConfig, usable: np.ndarray | None = None,
         seed: int = 0,
-    ) -> WeightedSet:
+    ) -> WeightedSet:  # fmt: skip
         """Return a set with the sampling weights of this arm.
 
         Args:
             data: The set.
             tables: Score tables of the set.
-            config: How scores become weights, for arms without ``weights``.
+            config: Settings of the sampling weights, for arms without ``weights``.
             usable: Steps that the training learns from (:func:`~drivax.curation.weights.sampling_weights`).
             seed: Seed of the permutation.
 
@@ -89,7 +85,7 @@ class Claim:
     """A claim about two arms.
 
     Attributes:
-        words: The claim.
+        words: Text of the claim.
         arm: The arm that is claimed to be better.
         reference: The arm that it is compared with.
         group: Claims whose p-values are adjusted together.
@@ -109,19 +105,19 @@ class Claim:
 
 @dataclass(frozen=True)
 class StudyDefinition:
-    """A study, as a YAML file declares it.
+    """Definition of a study in a YAML file.
 
     Attributes:
         title: Title of its report.
-        baselines: Arms that must drive well before the others are trained. The smallest detectable difference is
-            estimated from the first two; ``checkpoints_by`` is tested on the first.
+        baselines: Arms that must meet the conditions before the others are trained. The smallest detectable difference
+            is estimated from the first two; ``checkpoints_by`` is tested on the first.
         planners: Planners without training that are evaluated next to the arms.
         metrics: Metrics that are reported, by name.
         groups: Heading of each group of claims.
         arms: The arms.
         claims: The claims.
-        checkpoints_by: Training metric whose maximum chooses another checkpoint of the first baseline; what that rule
-            costs is reported.
+        checkpoints_by: Training metric whose maximum selects another checkpoint of the first baseline; the cost of that
+            rule is reported.
     """
 
     title: str
@@ -136,19 +132,19 @@ class StudyDefinition:
     def __post_init__(self) -> None:
         if len(self.baselines) < 2:
             raise ValueError("a study needs two baselines")
-        for names, known, what in (
+        for names, available, kind in (
             (self.baselines, self.arms, "baseline"), (self.planners, PLANNERS, "planner"),
             (self.metrics, METRICS, "metric"), ([arm.method for arm in self.arms.values()], METHODS, "method"),
         ):  # fmt: skip
             for name in names:
-                if name not in known:
-                    raise ValueError(f"there is no {what} {name!r}; {did_you_mean(name, list(known))}")
+                if name not in available:
+                    raise ValueError(f"unknown {kind} {name!r}; {did_you_mean(name, list(available))}")
         for claim in self.claims:
-            for name, known in (
+            for name, available in (
                 (claim.arm, self.arms), (claim.reference, self.arms), (claim.group, self.groups),
                 (claim.metric, self.metrics),
             ):  # fmt: skip
-                if name not in known:
+                if name not in available:
                     raise ValueError(f"the claim {claim.words!r} names {name!r}, which the study lacks")
 
 
@@ -170,15 +166,15 @@ class StudyConfig:
     Attributes:
         arms: Names of its arms, its baselines among them; empty: all.
         seeds: Number of trainings of each arm.
-        total_steps: Logged steps that each training draws; null: as its preset says.
-        training: More settings of every training, as on a command line: ``[--algorithm.batch, "128"]``.
+        total_steps: Logged steps that each training draws; null: those of its preset.
+        training: Further settings of every training, as on the command line: ``[--algorithm.batch, "128"]``.
         validations: Number of validations in closed loop; the best checkpoint is tested.
-        weights: How scores become weights, the same for all methods.
+        weights: Settings of the sampling weights, the same for all methods.
         ensemble: The ensemble.
         progress: Every seed of a baseline must make this share of the expert's progress on the validation set.
         flat: Largest change of a baseline's score, mean over seeds, from the third to the last quarter of its
             validations.
-        rare: Share of the test scenarios that count as rare, by the kinematic heuristic, if none are labelled.
+        rare: Share of test scenarios that count as rare by the kinematic heuristic, if none are labelled.
     """
 
     renamed: ClassVar[dict[str, str]] = {"agents": "arms", "scouts": "ensemble"}
@@ -224,14 +220,16 @@ class StudySets:
             UsageError: One is missing.
         """
         if (data / "train").is_dir():
-            rest = tuple(path for path in (data / "test", data / "test-rare") if path.is_dir())
-            validation, test = validation or data / "validation", tuple(test) or rest
+            test_sets = tuple(path for path in (data / "test", data / "test-rare") if path.is_dir())
+            validation, test = validation or data / "validation", tuple(test) or test_sets
             data = data / "train"
         if not data.is_dir():
-            raise UsageError("does not exist", file=data, cure="name a scenario set, or a benchmark's folder")
+            raise UsageError(
+                "scenario set not found", file=data, cure="name a scenario set, or a benchmark's folder"
+            )
         if validation is None or not test:
             raise UsageError(
-                "a study needs scenarios to train, to validate and to test on",
+                "no validation or test set",
                 file=data,
                 cure="pass --validation and --test, or a folder of `drivax generate --benchmark`",
             )
@@ -252,14 +250,14 @@ class Study:
     folder: Path
 
     def __post_init__(self) -> None:
-        known = list(self.definition.arms)
+        available = list(self.definition.arms)
         for name in self.config.arms:
-            if name not in known:
-                raise UsageError(f"there is no arm {name!r}", cure=did_you_mean(name, known))
+            if name not in available:
+                raise UsageError(f"unknown arm {name!r}", cure=did_you_mean(name, available))
         for name in self.definition.baselines if self.config.arms else ():
             if name not in self.config.arms:
-                raise UsageError(f"a study without {name}", cure="everything is compared with it; add it")
-        object.__setattr__(self, "config", replace(self.config, arms=self.config.arms or tuple(known)))
+                raise UsageError(f"baseline {name!r} is missing", cure="add it to arms")
+        object.__setattr__(self, "config", replace(self.config, arms=self.config.arms or tuple(available)))
 
     @property
     def arms(self) -> Mapping[str, Arm]:

@@ -11,8 +11,8 @@ from typing import Any
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
+from drivax.evaluation.result_tables import paired_differences
 from drivax.evaluation.runner import EvaluationConfig, format_summary, run_evaluation
-from drivax.evaluation.tables import paired_differences
 from drivax.files import write_json
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
@@ -30,7 +30,7 @@ from drivax.tracking.run_folder import describe_run
 #: Planners that the trained policy is compared with.
 REFERENCES = ("expert", "constant_velocity", "idm")
 #: Metrics of the paired comparison.
-_COMPARED = ("success", "vmax_score")
+_METRICS = ("success", "vmax_score")
 #: Training and held-out sets draw their maps from different seeds.
 _TRAINING_SEED, _HELD_OUT_SEED = 0, 1_000_000
 
@@ -43,8 +43,8 @@ class DemoConfig:
         training: Number of training scenarios.
         held_out: Number of test scenarios.
         preset: Training configuration.
-        overrides: Changes to it, as on the command line.
-        workers: Processes that generate; one per CPU core by default.
+        overrides: Changes to the training configuration, as on the command line.
+        workers: Number of generating processes; one per CPU core by default.
     """
 
     training: int = 256
@@ -80,12 +80,9 @@ class Demo:
 
 
 def run_demo(
-    out: Path,
-    config: DemoConfig | None = None,
-    log: Callable[[str], None] = lambda _: None,
-    *,
+    out: Path, config: DemoConfig | None = None, log: Callable[[str], None] = lambda _: None, *,
     overwrite: bool = False,
-) -> Demo:
+) -> Demo:  # fmt: skip
     """Generate both sets, train, evaluate all planners and write the report.
 
     Args:
@@ -99,7 +96,9 @@ def run_demo(
     """
     config = config or DemoConfig()
     if out.exists() and any(out.iterdir()) and not overwrite:
-        raise UsageError("exists already", file=out, cure="choose another --out or pass --overwrite")
+        raise UsageError(
+            "output folder already exists", file=out, cure="choose another --out or pass --overwrite"
+        )
     out.mkdir(parents=True, exist_ok=True)
     log(f"1/4  {config.training} training and {config.held_out} held-out scenarios of the built-in world")
     training = _scenarios(out / "sets" / "train", config.training, _TRAINING_SEED, config)
@@ -114,14 +113,14 @@ def run_demo(
     for name, (planner, task) in planners.items():
         folder = out / "evaluation" / name
         folder.parent.mkdir(exist_ok=True)
-        named = EvaluationConfig(planner=name if name in REFERENCES else str(run), task=task)
-        results[name] = run_evaluation(named, planner, held_out, folder, overwrite=True)
+        evaluation = EvaluationConfig(planner=name if name in REFERENCES else str(run), task=task)
+        results[name] = run_evaluation(evaluation, planner, held_out, folder, overwrite=True)
         runs.append(folder)
     log("4/4  writing the report")
     report = write_report([run, *runs], out / "report.html", overwrite=True)
     policy = results["policy"]
     differences = {
-        name: {metric: paired_differences(policy, results[name], metric).as_dict() for metric in _COMPARED}
+        name: {metric: paired_differences(policy, results[name], metric).as_dict() for metric in _METRICS}
         for name in REFERENCES
     }
     demo = Demo(report, [result.summary() for result in results.values()], differences)

@@ -22,9 +22,9 @@ from drivax.table import Cell, Column, Table
 _STRATA: Mapping[Stratum, str] = {
     "ordinary": "Ordinary traffic", "common": "Common scenarios", "rare": "Rare scenarios",
 }  # fmt: skip
-_SIGNS = {"supported": "▲ supported", "contradicted": "▼ contradicted", "undecided": "undecided"}
+_VERDICT_TEXTS = {"supported": "▲ supported", "contradicted": "▼ contradicted", "undecided": "undecided"}
 #: Cells of the map of actions along either dimension, and its size in pixels.
-_CELLS, _SIZE = 48, 336
+_MAP_CELLS, _MAP_SIZE = 48, 336
 _STYLE = """
 .claims td, .claims th { text-align: left; }
 .claims th[scope=row] { min-width: 19em; }
@@ -39,12 +39,9 @@ Results = Mapping[str, Any]
 
 
 def write_report(
-    definition: StudyDefinition,
-    results: Results,
-    tables: Mapping[str, ScoreTable],
-    actions: Float[np.ndarray, "n 2"],
-    out: Path,
-) -> None:
+    definition: StudyDefinition, results: Results, tables: Mapping[str, ScoreTable],
+    actions: Float[np.ndarray, "n 2"], out: Path,
+) -> None:  # fmt: skip
     """Write the report of a study.
 
     Args:
@@ -54,7 +51,7 @@ def write_report(
         actions: Actions of the experts in the training set, in units of the action space.
         out: The HTML file.
     """
-    scored = {name: table for name, table in tables.items() if name != "uniform"}
+    scored_tables = {name: table for name, table in tables.items() if name != "uniform"}
     rule = definition.checkpoints_by.rpartition("/")[2]
     sections = {
         "Before the comparison": _conditions(definition, results),
@@ -63,16 +60,16 @@ def write_report(
         "Distribution of the sampling weights": draws_table(results).html(),
         "Are the methods different?": _rankings(results),
         f"Choosing checkpoints by the highest {rule}": _rule_cost(results, rule),
-        "Scores": _scores(scored),
+        "Scores": _scores(scored_tables),
         "Actions of the experts": _action_map(actions),
     }
-    body = [f"<section><h2>{escape(title)}</h2>{html}</section>" for title, html in sections.items()]
-    write_text(out, page(definition.title, _lead(definition, results), body, _STYLE))
+    sections_html = [f"<section><h2>{escape(title)}</h2>{html}</section>" for title, html in sections.items()]
+    write_text(out, page(definition.title, _lead(definition, results), sections_html, _STYLE))
 
 
 def _lead(definition: StudyDefinition, results: Results) -> str:
     verdicts = [claim["verdict"] for claim in results["claims"]]
-    counts = ", ".join(f"{verdicts.count(name)} {name}" for name in _SIGNS)
+    counts = ", ".join(f"{verdicts.count(name)} {name}" for name in _VERDICT_TEXTS)
     about, caution = results["about"], ""
     if not all(arm["met"] for arm in results["conditions"] if arm["arm"] in definition.baselines):
         caution = (
@@ -101,7 +98,7 @@ def _interval(value: float, bounds: Sequence[float], spec: str) -> str:
 
 
 def conditions_table(results: Results) -> Table:
-    """Return how well every arm drives before the test, and whether its score has settled."""
+    """Return the validation results of every arm, and whether its score has converged."""
     rows = [
         (
             arm["arm"],
@@ -143,7 +140,7 @@ def _claim(result: Mapping[str, Any]) -> tuple[str, ...]:
         "" if interval is None else _interval(result["difference"], interval, "+.3f"),
         "" if change is None else _interval(change[0], change[1:], "+.0%"),
         "" if p is None else f"{p:.3f}".replace("0.000", "<0.001"),
-        _SIGNS[result["verdict"]],
+        _VERDICT_TEXTS[result["verdict"]],
         result["needed"],
     )
 
@@ -172,13 +169,13 @@ def draws_table(results: Results) -> Table:
 
 
 def rankings_table(results: Results) -> Table:
-    """Return how similar the methods rank scenarios."""
+    """Return the similarity of the methods' rankings of scenarios."""
     rows = [
         (
             " and ".join(pair["methods"]),
             _interval(pair["rho"], pair["interval"], "+.2f"),
             f"{pair['overlap']:.0%}",
-            _SIGNS[pair["orthogonal"]],
+            _VERDICT_TEXTS[pair["orthogonal"]],
         )
         for pair in results["rankings"]
     ]
@@ -187,7 +184,7 @@ def rankings_table(results: Results) -> Table:
 
 
 def rule_cost_table(results: Results, rule: str) -> Table:
-    """Return what choosing checkpoints by the highest ``rule`` costs."""
+    """Return the cost of choosing checkpoints by the highest ``rule``."""
     rows = [
         (_label(name), _interval(cost["difference"], cost["interval"], "+.3f"))
         for name, cost in results["rule_cost"].items()
@@ -196,7 +193,7 @@ def rule_cost_table(results: Results, rule: str) -> Table:
 
 
 def validations_table(results: Results, rule: str) -> Table:
-    """Return the first baseline's ``rule`` and score at each validation, and how many seeds peak there."""
+    """Return the first baseline's ``rule`` and score at each validation, and the number of seeds that peak there."""
     curves = {
         name: np.array([seed[key] for seed in results["validations"]])
         for name, key in ((rule, "rule"), ("score", "score"))
@@ -259,11 +256,11 @@ def _rankings(results: Results) -> str:
 
 def _rule_cost(results: Results, rule: str) -> str:
     seeds = results["validations"]
-    same = sum(int(np.argmax(seed["rule"]) == np.argmax(seed["score"])) for seed in seeds)
+    agreeing = sum(int(np.argmax(seed["rule"]) == np.argmax(seed["score"])) for seed in seeds)
     return (
         f"{rule_cost_table(results, rule).html()}<p><small>The baseline's checkpoints with the highest {escape(rule)} "
         "on held-out steps against those with the best validation score, on the test set: the same runs, seed by seed. "
-        f"Both rules choose the same checkpoint for {same} of the {len(seeds)} seeds.</small></p>"
+        f"Both rules choose the same checkpoint for {agreeing} of the {len(seeds)} seeds.</small></p>"
         f"{validations_table(results, rule).html()}"
     )
 
@@ -273,32 +270,33 @@ def _scores(tables: Mapping[str, ScoreTable]) -> str:
         histogram(f"{name}: scores of scenarios", {name: table.scenarios}, "score")
         for name, table in tables.items()
     )
-    tops = [
+    top_rows = [
         (name, *(table.scenario_ids[row] for row in table.order[:3]))
         for name, table in tables.items()
         if name != "oracle"  # labels do not rank what they mark
     ]
     return (
         f"<div class=charts>{charts}</div>"
-        + _table("dense", ("method", "most critical", "second", "third"), tops).html()
+        + _table("dense", ("method", "most critical", "second", "third"), top_rows).html()
         + "<p>These drives can be watched in <a href=critical.html>critical.html</a>.</p>"
     )
 
 
 def _action_map(actions: Float[np.ndarray, "n 2"]) -> str:
-    counts, _, _ = np.histogram2d(actions[:, 0], actions[:, 1], bins=_CELLS, range=((-1, 1), (-1, 1)))
+    counts, _, _ = np.histogram2d(actions[:, 0], actions[:, 1], bins=_MAP_CELLS, range=((-1, 1), (-1, 1)))
     opacity = np.log1p(counts) / np.log1p(counts.max())
-    side = _SIZE / _CELLS
+    side = _MAP_SIZE / _MAP_CELLS
     cells = "".join(
-        f'<rect x="{30 + column * side:.1f}" y="{(_CELLS - 1 - row) * side:.1f}" width="{side:.1f}" '
+        f'<rect x="{30 + column * side:.1f}" y="{(_MAP_CELLS - 1 - row) * side:.1f}" width="{side:.1f}" '
         f'height="{side:.1f}" fill="var(--ink)" fill-opacity="{opacity[row, column]:.2f}"/>'
         for row, column in np.argwhere(counts > 0)
     )
     return (
         f'<figure class="chart map"><figcaption>Frequency of the experts\' actions<small>logarithmic; '
         f"{len(actions):,} steps</small></figcaption>"
-        f'<svg viewBox="0 0 {_SIZE + 40} {_SIZE + 30}" role="img" aria-label="map of actions">{cells}'
-        f'<text x="{30 + _SIZE / 2:.0f}" y="{_SIZE + 20}" text-anchor="middle">steering, left is positive</text>'
-        f'<text transform="translate(18 {_SIZE / 2:.0f}) rotate(-90)" text-anchor="middle">acceleration</text>'
+        f'<svg viewBox="0 0 {_MAP_SIZE + 40} {_MAP_SIZE + 30}" role="img" aria-label="map of actions">{cells}'
+        f'<text x="{30 + _MAP_SIZE / 2:.0f}" y="{_MAP_SIZE + 20}" text-anchor="middle">steering, left is positive'
+        "</text>"
+        f'<text transform="translate(18 {_MAP_SIZE / 2:.0f}) rotate(-90)" text-anchor="middle">acceleration</text>'
         "</svg></figure>"
     )

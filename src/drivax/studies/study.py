@@ -1,7 +1,7 @@
 """The study runner: score, train, evaluate, test the claims, write the report.
 
 Arms differ in how logged steps are drawn. Each is trained with several seeds under one budget and evaluated on one test
-set; claims compare arms scenario by scenario. What is finished is not repeated: a study that was stopped resumes.
+set; claims compare arms scenario by scenario. An interrupted study resumes without repeating finished work.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from drivax.tracking.workers import one_core_each
 
 _PROGRESS = "validation/progress_ratio"
 #: Methods whose most critical scenarios the player shows, and the number of each.
-_SHOWN, _TOP = ("kinematic", "ensemble", "action_rarity"), 3
+_PLAYER_METHODS, _PLAYER_TOP = ("kinematic", "ensemble", "action_rarity"), 3
 Log = Callable[[str], None]
 
 
@@ -88,9 +88,9 @@ def run_study(
 
     Args:
         study: The study.
-        cores: Number of trainings side by side; None: one per core.
-        anyway: Go on even if the baselines do not drive well enough; the report says so.
-        log: Called with a line about every step.
+        cores: Number of parallel trainings; None: one per core.
+        anyway: Continue even if the baselines do not meet their conditions; the report says so.
+        log: Called with one line per step.
 
     Returns:
         The contents of ``results.json``.
@@ -99,7 +99,7 @@ def run_study(
         UsageError: The baselines do not drive well enough, the folder holds another study, or a run in it is of other
             settings.
     """
-    _open(study)
+    _open_folder(study)
     tables = _score(study, log)
     definition, config = study.definition, study.config
     data, test = ScenarioSet.open(study.sets.train), _test_set(study)
@@ -111,14 +111,14 @@ def run_study(
             run_evaluation(EvaluationConfig(name), make_planner(name), test, study.evaluation(name))
     jobs = [Job(study, arm, seed, usable) for seed in range(config.seeds) for arm in config.arms]
     _train_and_evaluate([job for job in jobs if job.arm in definition.baselines], cores, log)
-    met, strata = _conditions(study, definition.baselines), _strata(study, test)
+    baseline_conditions, strata = _conditions(study, definition.baselines), _strata(study, test)
     in_first_group = [claim for claim in study.claims if claim.group == next(iter(definition.groups))]
     first, second = (_episodes(study, name) for name in definition.baselines[:2])
     smallest = detectable(first, second, strata, definition.metrics, max(len(in_first_group), 1))
-    for condition in met:
+    for condition in baseline_conditions:
         log(str(condition))
     log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in smallest.items()))
-    if not all(condition.met for condition in met) and not anyway:
+    if not all(condition.met for condition in baseline_conditions) and not anyway:
         raise UsageError(
             "the baseline does not drive well enough for a comparison",
             file=study.folder,
@@ -142,7 +142,12 @@ def _write_pages(
     expert = score_steps(data, ExpertActions())
     actions = expert["action"][expert["known"]]
     write_report(study.definition, results, tables, actions, study.folder / "report.html")
-    tops = {row: tables[name] for name in _SHOWN if name in tables for row in top_rows(tables[name], _TOP)}
+    tops = {
+        row: tables[name]
+        for name in _PLAYER_METHODS
+        if name in tables
+        for row in top_rows(tables[name], _PLAYER_TOP)
+    }
     write_player(
         [data[row] for row in tops],
         study.folder / "critical.html",
@@ -152,18 +157,18 @@ def _write_pages(
     )
 
 
-def _open(study: Study) -> None:
+def _open_folder(study: Study) -> None:
     """Create the folder of a study, or check that it holds this one."""
     sets = study.sets
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
     definition = hashlib.sha256(settings.dump(study.definition).encode()).hexdigest()
     if not study.folder.exists() or not any(study.folder.iterdir()):
-        rest = [name for name, arm in study.arms.items() if arm.method != "oracle"]
-        if len(rest) < len(study.arms) and not event_kinds(data[0]).any():
+        unlabelled_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
+        if len(unlabelled_arms) < len(study.arms) and not event_kinds(data[0]).any():
             raise UsageError(
                 "has no labelled events, which the oracle and its control need",
                 file=sets.train,
-                cure=f"pass --arms [{','.join(rest)}]",
+                cure=f"pass --arms [{','.join(unlabelled_arms)}]",
             )
         RunFolder.create(study.folder, study.config, data, kind="study", definition=definition)
         return
@@ -197,15 +202,15 @@ def _score(study: Study, log: Log) -> dict[str, ScoreTable]:
 
 
 def _test_set(study: Study) -> ScenarioSet:
-    """Return the test scenarios as one set: if events are labelled, half of them with an event."""
+    """Return the test scenarios as one set; if events are labelled, half of them have one."""
     if not study.test.is_dir():
         parts = [ScenarioSet.open(path) for path in study.sets.test]
         rows = [(part, row) for part in parts for row in range(len(part))]
         with_event = np.concatenate([event_kinds(part) for part in parts]) > 0
         if with_event.any() and not with_event.all():
             count = min(with_event.sum(), (~with_event).sum())
-            chosen = [np.flatnonzero(stratum)[:count] for stratum in (with_event, ~with_event)]
-            rows = [rows[index] for index in np.sort(np.concatenate(chosen))]
+            selected = [np.flatnonzero(stratum)[:count] for stratum in (with_event, ~with_event)]
+            rows = [rows[index] for index in np.sort(np.concatenate(selected))]
         source = {"command": "study", "sets": [part.hash for part in parts]}
         with ScenarioWriter(study.test, parts[0].capacity, source, expected=len(rows)) as writer:
             for part, row in rows:
@@ -214,7 +219,7 @@ def _test_set(study: Study) -> ScenarioSet:
 
 
 def _strata(study: Study, test: ScenarioSet) -> Strata:
-    """Return which test scenarios are rare (labelled, else most critical), and the share of rare ones on the road."""
+    """Return the rare test scenarios (labelled, else most critical), and their share in ordinary traffic."""
     recordings = recordings_of(test.entries)
     rare = event_kinds(test) > 0
     labelled = bool(rare.any())
@@ -232,10 +237,12 @@ def _strata(study: Study, test: ScenarioSet) -> Strata:
 
 
 def _train_and_evaluate(jobs: Sequence[Job], cores: int | None, log: Log) -> None:
-    """Run the jobs that are not finished, each on one core."""
-    waiting = [job for job in jobs if not _is_finished(job)]
-    for number, (job, took) in enumerate(one_core_each(_run_job, waiting, cores), start=1):
-        log(f"trained and evaluated {job.arm}, seed {job.seed} in {took:.0f} s ({number} of {len(waiting)})")
+    """Run the unfinished jobs, each on one core."""
+    pending = [job for job in jobs if not _is_finished(job)]
+    for number, (job, seconds) in enumerate(one_core_each(_run_job, pending, cores), start=1):
+        log(
+            f"trained and evaluated {job.arm}, seed {job.seed} in {seconds:.0f} s ({number} of {len(pending)})"
+        )
 
 
 def _is_finished(job: Job) -> bool:
@@ -254,7 +261,7 @@ def _is_finished(job: Job) -> bool:
         folder.info.get(name) != value for name, value in expected.items()
     ):
         raise UsageError(
-            "was trained with other settings or weights than this study asks for", file=run,
+            "was trained with other settings or weights than those of this study", file=run,
             cure=f"remove it and {' and '.join(map(str, evaluations))}; all are made again",
         )  # fmt: skip
     return is_evaluated(job.study, job.arm, job.seed)
@@ -274,20 +281,18 @@ def is_evaluated(study: Study, arm: str, seed: int) -> bool:
         )
         if evaluated < trained:
             raise UsageError(
-                "is older than the run that it evaluates",
-                file=folder,
-                cure="remove it; it is made again",
+                "is older than the run that it evaluates", file=folder, cure="remove it; it is made again"
             )
     return all(folder.is_dir() for folder in evaluations)
 
 
 def _run_job(job: Job) -> float:
-    """Train and evaluate an arm; return the seconds it took."""
+    """Train and evaluate an arm; return the elapsed seconds."""
     started, study = time.perf_counter(), job.study
     config, run = study.train_config(job.arm, job.seed), study.run(job.arm, job.seed)
     steps = Checkpoints(run / "checkpoints").steps()
     if config.iterations * config.algorithm.steps_per_iteration not in steps:
-        _refuse_evaluated(job, steps)
+        _check_not_evaluated(job, steps)
         validation = ScenarioSet.open(study.sets.validation)
         train(config, job.weighted(), run, validation=validation, resume=bool(steps), overwrite=not steps)
     test = ScenarioSet.open(study.test)
@@ -302,8 +307,8 @@ def _run_job(job: Job) -> float:
     return time.perf_counter() - started
 
 
-def _refuse_evaluated(job: Job, steps: Sequence[int]) -> None:
-    """Refuse to train again a run that lost its checkpoints after it was evaluated: pairs would mix two trainings."""
+def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:
+    """Raise UsageError if an evaluated run has lost its checkpoints: training again would mix two trainings."""
     names = job.study.evaluations(job.arm)
     evaluated = [folder for name in names if (folder := job.study.evaluation(name, job.seed)).is_dir()]
     if not steps and evaluated:
@@ -342,7 +347,7 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
         rows = [row for row in read_rows(study.run(arm, seed) / "metrics.jsonl") if _PROGRESS in row]
         curves.append(
             {
-                "score": [_score_of(row) for row in rows],
+                "score": [_validation_score(row) for row in rows],
                 "progress": [row[_PROGRESS] for row in rows],
                 "rule": [row[metric] for row in rows if row.get(metric) is not None],
             }
@@ -350,7 +355,7 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
     return curves
 
 
-def _score_of(row: Mapping[str, float]) -> float:
+def _validation_score(row: Mapping[str, float]) -> float:
     ranked = rank("score", row)
     assert ranked is not None
     return ranked[0]
@@ -363,12 +368,9 @@ def _episodes(study: Study, name: str) -> Episodes:
 
 
 def _results(
-    study: Study,
-    test: ScenarioSet,
-    strata: Strata,
-    tables: Mapping[str, ScoreTable],
+    study: Study, test: ScenarioSet, strata: Strata, tables: Mapping[str, ScoreTable],
     usable: Bool[np.ndarray, "N T"],
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     definition, metrics, data = study.definition, study.definition.metrics, ScenarioSet.open(study.sets.train)
     episodes = {}
     for name in definition.planners:

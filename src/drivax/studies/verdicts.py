@@ -16,8 +16,8 @@ from drivax.curation.subset import top_rows
 from drivax.evaluation.episode_table import SHARES
 from drivax.metrics.catalogue import METRICS
 from drivax.stats.ranking import correlation_interval, rank_correlation
-from drivax.stats.seeds import Crossed, crossed_difference, crossed_mean, log_ratio, seeds_interval
-from drivax.stats.significance import holm
+from drivax.stats.seeds import CrossedEffect, crossed_difference, crossed_mean, log_ratio, seeds_interval
+from drivax.stats.significance import holm_adjust
 from drivax.studies.definition import Claim, Stratum
 
 #: Rankings are unrelated if their correlation's interval is within ±UNRELATED, related if it is beyond ±RELATED.
@@ -37,7 +37,7 @@ Verdict = Literal["supported", "contradicted", "undecided"]
 
 @dataclass(frozen=True)
 class Strata:
-    """What the statistics know of the test scenarios.
+    """Recordings and rarity of the test scenarios.
 
     Attributes:
         recordings: Recording of every scenario: scenarios of one recording are dependent.
@@ -70,12 +70,12 @@ class Strata:
 
 @dataclass(frozen=True)
 class Condition:
-    """How well an arm drives before anything is compared.
+    """Result of an arm on the validation set, before arms are compared.
 
     Attributes:
         arm: Its name.
         progress: Share of the expert's progress on the validation set at the best checkpoints, mean over seeds.
-        least: The same of the worst seed.
+        least: Progress of the worst seed.
         change: Change of the validation score from the third to the last quarter of the validations, mean over seeds.
         moved: Absolute value of that change, mean over seeds.
         met: Whether every seed makes enough progress, and scores no longer move.
@@ -122,12 +122,12 @@ class ClaimResult:
         change: Relative change and its interval; None if undefined.
         adjusted: P-value adjusted within the group (Holm).
         verdict: The verdict.
-        needed: If undecided: how many seeds or recordings would decide, if the true effect were the estimate.
+        needed: If undecided, the number of seeds or recordings that would decide, if the true effect were the estimate.
     """
 
     claim: Claim
-    tested: Crossed | None
-    difference: Crossed | None
+    tested: CrossedEffect | None
+    difference: CrossedEffect | None
     change: tuple[float, float, float] | None
     adjusted: float | None
     verdict: Verdict = "undecided"
@@ -163,9 +163,9 @@ def decide_claims(
     for group in set(groups):
         members = [index for index, name in enumerate(groups) if name == group]
         tested = [results[index].tested for index in members]
-        adjusted = holm([None if effect is None else effect.p for effect in tested])
+        adjusted = holm_adjust([None if effect is None else effect.p for effect in tested])
         for index, p in zip(members, adjusted, strict=True):
-            results[index] = _decided(replace(results[index], adjusted=p), len(members))
+            results[index] = _decide(replace(results[index], adjusted=p), len(members))
     return results
 
 
@@ -184,12 +184,12 @@ def _effects(claim: Claim, episodes: Mapping[str, Episodes], strata: Strata) -> 
     return ClaimResult(claim, tested, difference, (math.expm1(ratio.difference), low, high), None)
 
 
-def _decided(result: ClaimResult, claims: int) -> ClaimResult:
+def _decide(result: ClaimResult, claims: int) -> ClaimResult:
     if result.tested is None or result.adjusted is None:
-        why = "fewer than two recordings define it"
+        reason = "fewer than two recordings define it"
         if result.difference is not None:
-            why = "the mean of an arm is 0: no ratio"
-        return replace(result, needed=why)
+            reason = "the mean of an arm is 0: no ratio"
+        return replace(result, needed=reason)
     if result.adjusted >= _LEVEL:
         return replace(result, needed=needed(result.tested, claims))
     lower_is_better = METRICS[result.claim.metric].better == "low"
@@ -197,8 +197,8 @@ def _decided(result: ClaimResult, claims: int) -> ClaimResult:
     return replace(result, verdict="supported" if better else "contradicted")
 
 
-def needed(effect: Crossed, claims: int) -> str:
-    """Return in words how many seeds or recordings would decide.
+def needed(effect: CrossedEffect, claims: int) -> str:
+    """Describe the number of seeds or recordings that would decide.
 
     Args:
         effect: The effect that is tested.
@@ -224,8 +224,8 @@ def detectable(
 ) -> dict[str, float]:
     """Return the smallest differences in ordinary traffic that the study detects with a probability of 80 %.
 
-    Known before the other arms are trained: as if seeds of two arms varied as those of the first, and the arms differed
-    by scenario as the first and the second do.
+    An estimate before the other arms are trained: assumes that seeds of all arms vary like those of the first baseline,
+    and that arms differ by scenario like the two baselines.
 
     Args:
         first: Values of the first baseline.
@@ -238,9 +238,9 @@ def detectable(
     for name in metrics:
         if strata.is_comparable(np.concatenate([first[name], second[name]]), weights):
             effect = crossed_difference(first[name], second[name], strata.recordings, weights)
-            (seeds, _), (both, _) = effect.seeds, effect.both
-            equal = replace(effect, seeds=(seeds, seeds), both=(both, both))
-            smallest[name] = equal.detectable(confidence=level(claims))
+            (seeds, _), (interaction, _) = effect.seeds, effect.interaction
+            equal_arms = replace(effect, seeds=(seeds, seeds), interaction=(interaction, interaction))
+            smallest[name] = equal_arms.detectable(confidence=level(claims))
     return smallest
 
 
@@ -254,10 +254,10 @@ def rates(
     means: dict[Stratum, dict[str, dict[str, float | int | None]]] = {}
     for stratum in ("ordinary", "common", "rare"):
         weights = strata.weights(stratum)
-        defined = {name: episodes[name] for name in metrics if strata.is_comparable(episodes[name], weights)}
-        if defined:
+        known = {name: episodes[name] for name in metrics if strata.is_comparable(episodes[name], weights)}
+        if known:
             means[stratum] = {
-                name: _rate(values, strata, weights, name in _SHARES) for name, values in defined.items()
+                name: _rate(values, strata, weights, name in _SHARES) for name, values in known.items()
             }
     return means
 
@@ -270,7 +270,7 @@ def _rate(values: Values, strata: Strata, weights: Weights, share: bool) -> dict
 def rule_cost(
     rule: Episodes, best: Episodes, strata: Strata, metrics: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
-    """Return what other checkpoints of the same runs cost in ordinary traffic: differences of pairs, by metric.
+    """Return the cost of another checkpoint rule in ordinary traffic: paired differences, by metric.
 
     Args:
         rule: Values of every seed with the checkpoint of the rule.
@@ -288,7 +288,7 @@ def rule_cost(
 
 
 def rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]) -> list[dict[str, Any]]:
-    """Return how similar methods rank scenarios: rank correlation, overlap of the top 5 %, and a verdict.
+    """Compare the rankings of scenarios by methods: rank correlation, overlap of the top 5 %, and a verdict.
 
     Args:
         tables: Score tables of one set by method.
@@ -296,10 +296,10 @@ def rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]) -> lis
     """
     pairs = []
     for first, second in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):
-        scores, others = (tables[name].scenarios for name in (first, second))
+        scores, other_scores = (tables[name].scenarios for name in (first, second))
         count = max(round(_TOP * len(scores)), 1)
-        tops = [set(top_rows(tables[name], count)) for name in (first, second)]
-        low, high = correlation_interval(scores, others, recordings)
+        top_sets = [set(top_rows(tables[name], count)) for name in (first, second)]
+        low, high = correlation_interval(scores, other_scores, recordings)
         verdict: Verdict = "undecided"
         if max(-low, high) < UNRELATED:
             verdict = "supported"
@@ -308,9 +308,9 @@ def rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]) -> lis
         pairs.append(
             {
                 "methods": [first, second],
-                "rho": rank_correlation(scores, others),
+                "rho": rank_correlation(scores, other_scores),
                 "interval": [low, high],
-                "overlap": len(tops[0] & tops[1]) / count,
+                "overlap": len(top_sets[0] & top_sets[1]) / count,
                 "orthogonal": verdict,
             }
         )

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivax.synthetic.roads.families import FAMILIES, RoadFamily
 from drivax.synthetic.roads.style import GRID, RING, RoadStyle
-from drivax.synthetic.traffic.population import Density
+from drivax.synthetic.traffic.placement import Density
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Domain:
     Attributes:
         name: Tag of every scenario.
         shares: Relative frequency of each road family; families without one do not occur.
-        walkers: Pedestrians per 100 m of sidewalk, low and high, drawn per scenario.
+        pedestrians: Pedestrians per 100 m of sidewalk, low and high, drawn per scenario.
         parked_share: Share of occupied bays, low and high, drawn per scenario.
         double_share: Share of scenarios with bays that have a double-parked car.
     """
@@ -27,7 +27,7 @@ class Domain:
     style: RoadStyle
     shares: tuple[tuple[str, float], ...]
     density: Density = field(default_factory=Density)
-    walkers: tuple[float, float] = (0.3, 2.0)
+    pedestrians: tuple[float, float] = (0.3, 2.0)
     parked_share: tuple[float, float] = (0.4, 0.9)
     double_share: float = 0.1
 
@@ -68,7 +68,7 @@ RING_DOMAIN = Domain(
     style=RING,
     shares=tuple((family, share) for family, _, share in _SHARES if share),
     density=Density(spacing_m=(14.0, 60.0), vehicles=40, cyclist_share=0.14),
-    walkers=(0.5, 3.0),
+    pedestrians=(0.5, 3.0),
     parked_share=(0.6, 1.0),
     double_share=0.25,
 )

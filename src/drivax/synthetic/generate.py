@@ -96,7 +96,7 @@ class Generation:
             raise UsageError(f"workers is {self.workers}", cure="use 0 or more")
         if self.capacity not in CAPACITIES:
             raise UsageError(
-                f"there is no capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
+                f"unknown capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
             )
         self.world.check()
 
@@ -171,13 +171,9 @@ class _Counts:
 
 
 def generate(
-    out: str | Path,
-    scenarios: int,
-    seed: int = 0,
-    options: Generation | None = None,
-    progress: Progress | None = None,
-    audit: Audit | None = None,
-) -> GeneratedSet:
+    out: str | Path, scenarios: int, seed: int = 0, options: Generation | None = None,
+    progress: Progress | None = None, audit: Audit | None = None,
+) -> GeneratedSet:  # fmt: skip
     """Generate a scenario set.
 
     Args:
@@ -201,14 +197,9 @@ def generate(
 
 
 def write_set(
-    out: str | Path,
-    scenarios: int,
-    seed: int,
-    options: Generation,
-    notes: Mapping[str, Any],
-    progress: Progress | None,
-    audit: Audit | None,
-) -> GeneratedSet:
+    out: str | Path, scenarios: int, seed: int, options: Generation, notes: Mapping[str, Any],
+    progress: Progress | None, audit: Audit | None,
+) -> GeneratedSet:  # fmt: skip
     """:func:`generate` without checks; ``notes`` go into the manifest's source."""
     begin = time.monotonic()
     source = {"command": "generate", "world": WORLD_VERSION, "seed": seed, "scenarios": scenarios, **notes}
@@ -243,7 +234,7 @@ def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> list[_
 
 def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, None, None]:
     """Draw all scenarios in order."""
-    spans = [(at, min(at + _CHUNK, scenarios)) for at in range(0, scenarios, _CHUNK)]
+    spans = [(start, min(start + _CHUNK, scenarios)) for start in range(0, scenarios, _CHUNK)]
     if options.workers == 0:
         for first, last in spans:
             yield from _draw_chunk(first, last, seed, options)
@@ -298,12 +289,9 @@ def sizes(train: int | None = None) -> dict[str, int]:
 
 
 def generate_benchmark(
-    out: str | Path,
-    options: Generation | None = None,
-    train: int | None = None,
-    progress: Progress | None = None,
-    audit: Audit | None = None,
-) -> dict[str, GeneratedSet]:
+    out: str | Path, options: Generation | None = None, train: int | None = None,
+    progress: Progress | None = None, audit: Audit | None = None,
+) -> dict[str, GeneratedSet]:  # fmt: skip
     """Write ``OUT/train``, ``OUT/validation``, ``OUT/test`` and ``OUT/test-rare``.
 
     Args:
@@ -332,9 +320,9 @@ def generate_benchmark(
         notes = {"benchmark": BENCHMARK_VERSION, "split": name}
         done = sum(counts[earlier] for earlier in sets)
 
-        def report(here: int, _: int, done: int = done) -> None:
+        def report(current: int, _: int, done: int = done) -> None:
             if progress is not None:
-                progress(done + here, sum(counts.values()))
+                progress(done + current, sum(counts.values()))
 
         own = dataclasses.replace(options, world=world)
         sets[name] = write_set(Path(out) / name, counts[name], split.seed, own, notes, report, audit)

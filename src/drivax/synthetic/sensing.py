@@ -147,14 +147,14 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Looks, step: _Looks) ->
     # Batches keep the tables in the processor's cache.
     for first in range(0, len(target), _LOOKS):
         batch = slice(first, first + _LOOKS)
-        at, to, ax, ay = step[batch], target[batch], ray_x[batch], ray_y[batch]
-        to_x, to_y = x[near_rows].take(at, axis=1), y[near_rows].take(at, axis=1)
+        position, to, ax, ay = step[batch], target[batch], ray_x[batch], ray_y[batch]
+        to_x, to_y = x[near_rows].take(position, axis=1), y[near_rows].take(position, axis=1)
         ahead = to_x * ax + to_y * ay
         to_y *= ax
         to_x *= ay
         to_y -= to_x
         reach = radius[near_rows, None] + radius[to]
-        meets = blocking[near_rows].take(at, axis=1) & (np.abs(to_y, out=to_y) < reach)
+        meets = blocking[near_rows].take(position, axis=1) & (np.abs(to_y, out=to_y) < reach)
         meets &= ahead > -radius[near_rows, None]
         reach += length[batch]
         meets &= ahead < reach
@@ -166,12 +166,10 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Looks, step: _Looks) ->
 
 
 def _cuts(
-    eye: Float64[np.ndarray, "pair 2"],
-    points: Float64[np.ndarray, "pair point 2"],
-    heights_m: tuple[float, Float64[np.ndarray, " pair"]],
-    box: Float64[np.ndarray, "pair 6"],
+    eye: Float64[np.ndarray, "pair 2"], points: Float64[np.ndarray, "pair point 2"],
+    heights_m: tuple[float, Float64[np.ndarray, " pair"]], box: Float64[np.ndarray, "pair 6"],
     top_m: Float64[np.ndarray, " pair"],
-) -> Bool[np.ndarray, "pair point"]:
+) -> Bool[np.ndarray, "pair point"]:  # fmt: skip
     """Whether rays from an eye to points, at two heights, pass through upright boxes (slab test)."""
     enters, leaves = passage(eye[:, None], points, box[:, None])
     high, low = heights_m[0], heights_m[1][:, None]
@@ -181,10 +179,10 @@ def _cuts(
 
 def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
     """Return the largest distance by which :func:`noisy` can move a corner of a box, m."""
-    most = _MOST_SIGMA * config.level
-    turn = most * config.heading_rad
-    along = most * config.along_m + turn * width_m / 2
-    return float(np.hypot(along, most * config.across_m + turn * length_m / 2))
+    maximum = _MOST_SIGMA * config.level
+    turn = maximum * config.heading_rad
+    along = maximum * config.along_m + turn * width_m / 2
+    return float(np.hypot(along, maximum * config.across_m + turn * length_m / 2))
 
 
 def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfig) -> Tracks:

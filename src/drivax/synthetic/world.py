@@ -36,7 +36,7 @@ from drivax.synthetic.roads.families import RoadFamily
 from drivax.synthetic.roads.network import RoadNetwork, feature_id, map_features
 from drivax.synthetic.roads.signals import light_states
 from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, sight
-from drivax.synthetic.traffic.population import LONGEST_M
+from drivax.synthetic.traffic.placement import LARGEST_VEHICLE_M
 from drivax.synthetic.traffic.role_assignment import SignalTiming, assign_roles, conflicts_on
 from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 from drivax.synthetic.traffic.simulation import Traffic
@@ -47,7 +47,7 @@ WORLD_VERSION = 2
 _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
 #: Candidate first steps of a critical recording: earliest, latest delay, stride.
-_EARLIEST, _LATER, _EVERY = 28, 16, 4
+_EARLIEST_STEP, _MAX_DELAY_STEPS, _CRITICAL_STRIDE = 28, 16, 4
 #: Ego may react to an event this many steps before it begins.
 _FORESEEN = 8
 #: Lights are recorded within this distance of ego's log, m: a scenario's map reaches a little further.
@@ -94,7 +94,7 @@ class WorldConfig:
             UsageError: The first wrong setting.
         """
         if self.domain not in DOMAINS:
-            raise UsageError(f"there is no domain {self.domain!r}", cure=f"use one of {', '.join(DOMAINS)}")
+            raise UsageError(f"unknown domain {self.domain!r}", cure=f"use one of {', '.join(DOMAINS)}")
         for name in ("rare_rate", "critical_share", "lane_change_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure="use a share from 0 to 1")
@@ -106,7 +106,7 @@ class WorldConfig:
         self.sensor.check()
         if self.scenarios_per_map < 1:
             raise UsageError(f"scenarios_per_map is {self.scenarios_per_map}", cure="use 1 or more")
-        if largest_shift_m(self.noise, *LONGEST_M) > EGO_SKIN_M:
+        if largest_shift_m(self.noise, *LARGEST_VEHICLE_M) > EGO_SKIN_M:
             raise UsageError(
                 f"noise.level {self.noise.level} could make a recorded vehicle touch ego that did not",
                 cure="use a smaller one",
@@ -115,7 +115,7 @@ class WorldConfig:
 
 
 @dataclass(frozen=True)
-class Generated:
+class GeneratedRecording:
     """A recording with its road family and domain, and the numbers of rejected draws by family and cause."""
 
     recording: Recording
@@ -129,7 +129,7 @@ def generate_recording(seed: int, index: int, config: WorldConfig | None = None)
     return generate_one(seed, index, config or WorldConfig()).recording
 
 
-def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
+def generate_one(seed: int, index: int, config: WorldConfig) -> GeneratedRecording:
     """Generate a recording with its family and rejected attempts.
 
     The kind of event is drawn first, so that kinds whose draws fail more often are not rarer. A rare scenario has roads
@@ -145,8 +145,8 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
     rejected: Counter[tuple[str, str]] = Counter()
     for attempt in range(_ATTEMPTS):
         event = events[attempt // _PER_KIND % len(events)]
-        place = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
-        family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *place))
+        sample = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
+        family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *sample))
         rng = np.random.default_rng([seed, 2, index, attempt])
         places = destinations_for(event, network, attempt > 0) if event else ()
         result = _attempt(_Draw(network, places, event, severity), domain, config, rng)
@@ -157,10 +157,10 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
         recording = replace(
             result,
             scenario_id=f"{name}-{index:06d}-{family.name}",
-            segment=f"{name}-{'r' if event else 'm'}{place[0]:06d}.{place[1]}",
+            segment=f"{name}-{'r' if event else 'm'}{sample[0]:06d}.{sample[1]}",
             tags={"family": family.name, "domain": config.domain, **result.tags},
         )
-        return Generated(recording, family.name, config.domain, dict(rejected))
+        return GeneratedRecording(recording, family.name, config.domain, dict(rejected))
     causes = ", ".join(f"{cause} in {family} {n}" for (family, cause), n in sorted(rejected.items()))
     raise UsageError(
         f"no clean expert in {_ATTEMPTS} attempts for seed {seed}, index {index}: {causes}",
@@ -203,7 +203,7 @@ class _Draw:
 def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Generator) -> Recording | str:
     """Return the recording of one draw, or the cause of its rejection."""
     critical = not draw.event and rng.random() < config.critical_share
-    times = (np.arange(_WARM_UP + STEPS + _LATER * critical) - _WARM_UP) * DT_S
+    times = (np.arange(_WARM_UP + STEPS + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
     roles = assign_roles(
         draw.network,
         domain,
@@ -220,11 +220,13 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
         if critical:
             first = _critical_step(traffic, motion, rng)
         begin, tags = first or _WARM_UP, {} if first is None else {"critical": "yes"}
-        traffic, motion = traffic.until(begin + STEPS), motion.until(begin + STEPS)
+        traffic, motion = traffic.before_step(begin + STEPS), motion.before_step(begin + STEPS)
         motion, cause = expert.drive_ego(
             roles, traffic.times_s, Staging(), begin, traffic.run, unplanned=motion
         )
-        return cause or _perceived(replace(_recorded(roles, motion, begin, None), tags=tags), config, rng)
+        return cause or _add_perception(
+            replace(_to_recording(roles, motion, begin, None), tags=tags), config, rng
+        )
     view, cause = EgoView(roles, traffic.run(), _WARM_UP), UNSUITED[0]
     for _ in range(_STAGINGS):
         staged = stage(draw.event, view, draw.severity_mps2, rng)
@@ -233,12 +235,12 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
         aware = staged.first_step - _FORESEEN
         motion, cause = expert.drive_ego(roles, times, staged.staging, _WARM_UP, traffic.run, aware)
         if not cause and endangers_ego(view, motion, staged):
-            return _perceived(_recorded(roles, motion, _WARM_UP, staged), config, rng)
+            return _add_perception(_to_recording(roles, motion, _WARM_UP, staged), config, rng)
         cause = cause or UNSUITED[1]
     return cause
 
 
-def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
+def _add_perception(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
     """Add perception noise and the visibility mask."""
     tracks, ego = recording.tracks, recording.ego
     seen = sight(tracks, ego, config.sensor)
@@ -250,14 +252,14 @@ def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -
     network = traffic.roles.network
     if not conflicts_on(network, motion.paths[0]):
         return None
-    steps = np.arange(_EARLIEST, _WARM_UP + _LATER + 1, _EVERY)
+    steps = np.arange(_EARLIEST_STEP, _WARM_UP + _MAX_DELAY_STEPS + 1, _CRITICAL_STRIDE)
     candidates = np.flatnonzero(critical_steps(network, motion, traffic.colour, steps))
     return int(steps[rng.choice(candidates)]) if len(candidates) else None
 
 
-def _recorded(roles: Roles, motion: Motion, first: int, staged: StagedEvent | None) -> Recording:
+def _to_recording(roles: Roles, motion: Motion, first: int, staged: StagedEvent | None) -> Recording:
     """Return the recording from a step on, without id and segment."""
-    network, motion = roles.network, motion.since(first)
+    network, motion = roles.network, motion.from_step(first)
     times = np.arange(STEPS) * DT_S
     events, tags = (), {}
     if staged is not None:
@@ -302,8 +304,8 @@ def _lights(network: RoadNetwork, motion: Motion, times_s: Float64[np.ndarray, "
 def _tracks(motion: Motion, actors: tuple[int, ...]) -> Tracks:
     """Return tracks of ego, an event's actors and the nearest others, with zeros where invalid."""
     valid = motion.valid
-    apart = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
-    nearest = np.where(valid, apart, np.inf).min(axis=1)
+    separation = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
+    nearest = np.where(valid, separation, np.inf).min(axis=1)
     nearest[[0, *actors]] = -1.0
     rows = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
     rows = rows[np.isfinite(nearest[rows])]

@@ -63,21 +63,25 @@ class Physical:
         return (jnp.abs(action) > 1.0 + _ROUNDING).any()
 
     def actuated(self, motion: Motion, action: Vector, last: Vector) -> Vector:
-        """Return the executed action, given the one executed a step ago.
+        """Clip an action to the bounds, and to the actuator rates given the last executed action.
 
-        Clips to the bounds and the actuator rates. At standstill the last acceleration counts as at least zero.
+        At standstill, the last acceleration counts as at least zero.
         """
         action = jnp.clip(action, -1.0, 1.0)
         if self.jerk_mps3 is None and self.steering_rate is None:
             return action
         acceleration, steering = self._quantities(action)
-        had, steered = self._quantities(last)
-        had = jnp.where(motion[3] > 0.0, had, jnp.maximum(had, 0.0))
+        last_acceleration, last_steering = self._quantities(last)
+        last_acceleration = jnp.where(motion[3] > 0.0, last_acceleration, jnp.maximum(last_acceleration, 0.0))
         if self.jerk_mps3 is not None:
-            acceleration = jnp.clip(acceleration, had - self.jerk_mps3 * DT_S, had + self.jerk_mps3 * DT_S)
+            acceleration = jnp.clip(
+                acceleration,
+                last_acceleration - self.jerk_mps3 * DT_S,
+                last_acceleration + self.jerk_mps3 * DT_S,
+            )
         if self.steering_rate is not None:
-            reach = self.steering_rate * DT_S
-            steering = jnp.clip(steering, steered - reach, steered + reach)
+            limit = self.steering_rate * DT_S
+            steering = jnp.clip(steering, last_steering - limit, last_steering + limit)
         return self._action(acceleration, steering)
 
     def move(self, motion: Motion, action: Vector, length_m: Any) -> Motion:

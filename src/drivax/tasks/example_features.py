@@ -63,7 +63,7 @@ def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) ->
     apart = norm(middle + along[:, None] * direction)
     fits = (layer == RoadLayer.LANE) & (apart < 2.5) & (direction[:, 0] > 0.5)
     best = first_smallest(jnp.where(fits, apart**2 + (4.0 * direction[:, 1]) ** 2, 1e9))
-    curvature = jnp.where(fits[best], features.shown_curvature(bank.road_curvature[context.index, best]), 0.0)
+    curvature = jnp.where(fits[best], features.scale_curvature(bank.road_curvature[context.index, best]), 0.0)
     return jnp.stack([curvature, fits[best].astype(jnp.float32)])
 
 

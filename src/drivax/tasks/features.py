@@ -26,7 +26,7 @@ POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 #: Unit of curvature, 1/m: a turn of 10 m radius is 1.
 CURVATURE_PM = 0.1
 #: Cap of curvatures, in these units.
-_MOST_CURVED = 3.0
+_MAX_CURVATURE = 3.0
 #: Half the distance over which the curvature of the route is measured, m.
 _ARM_M = 2.0
 
@@ -76,8 +76,8 @@ class View:
     @classmethod
     def of(cls, context: AgentContext) -> View:
         """Return the frame of the driven agent now."""
-        now = context.history[-1]
-        return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
+        motion = context.history[-1]
+        return cls(motion[:2], jnp.cos(motion[2]), jnp.sin(motion[2]))
 
     def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
         """Transform a position, m."""
@@ -110,14 +110,14 @@ class Features:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            chosen, known = getattr(self, field.name), tuple(COLUMNS[field.name])
+            selected, available = getattr(self, field.name), tuple(COLUMNS[field.name])
             place = f"observation.features.{field.name}"
-            for number, name in enumerate(chosen):
-                if name not in known:
-                    raise UsageError(f"{place} has no {name!r}", cure=did_you_mean(name, known))
-                if name in chosen[:number]:
+            for number, name in enumerate(selected):
+                if name not in available:
+                    raise UsageError(f"{place} has no {name!r}", cure=did_you_mean(name, available))
+                if name in selected[:number]:
                     raise UsageError(f"{place} names {name!r} twice", cure="name it once")
-            object.__setattr__(self, field.name, tuple(name for name in known if name in chosen))
+            object.__setattr__(self, field.name, tuple(name for name in available if name in selected))
 
 
 def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> dict[str, tuple[str, ...]]:
@@ -133,61 +133,61 @@ def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> di
             names[group] = tuple(str(column) for column in range(shape[-1]))
             continue
         columns = [(name, COLUMNS[group][name]) for name in getattr(features, group)]
-        rest = shape[-1] - sum(len(parts) for _, parts in columns)
-        columns = [(name, parts or tuple(map(str, range(rest)))) for name, parts in columns]
+        unnamed = shape[-1] - sum(len(parts) for _, parts in columns)
+        columns = [(name, parts or tuple(map(str, range(unnamed)))) for name, parts in columns]
         names[group] = tuple(f"{name} {part}".strip() for name, parts in columns for part in parts)
     return names
 
 
-def joined(
-    chosen: Sequence[str], parts: Mapping[str, Callable[[], Array]], rows: tuple[int, ...]
+def concatenate_features(
+    selected: Sequence[str], parts: Mapping[str, Callable[[], Array]], rows: tuple[int, ...]
 ) -> Float[Array, "... F"]:
     """Concatenate the columns of the selected features, computed by ``parts`` (``[*rows, columns]`` each).
 
     Selected features that ``parts`` lacks are skipped; other features are not computed.
     """
-    columns = [parts[name]() for name in chosen if name in parts]
+    columns = [parts[name]() for name in selected if name in parts]
     return jnp.concatenate(columns, axis=-1) if columns else jnp.zeros((*rows, 0))
 
 
-def columns_of(group: str, chosen: Sequence[str]) -> list[int]:
+def columns_of(group: str, selected: Sequence[str]) -> list[int]:
     """Return the indices of the selected features' columns among those of all default features."""
     start, columns = 0, []
     for name in getattr(Features(), group):
         width = len(COLUMNS[group][name])
-        columns += range(start, start + width) if name in chosen else ()
+        columns += range(start, start + width) if name in selected else ()
         start += width
     return columns
 
 
-def shown_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
+def scale_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return a curvature (1/m) in units of 0.1 1/m, clipped to 3."""
-    return jnp.clip(curvature / CURVATURE_PM, -_MOST_CURVED, _MOST_CURVED)
+    return jnp.clip(curvature / CURVATURE_PM, -_MAX_CURVATURE, _MAX_CURVATURE)
 
 
 def has_route(bank: ScenarioBank, context: AgentContext) -> Bool[Array, ""]:
-    """Whether the driven agent has a route on lanes; without one the bank holds the log's path, which is privileged."""
+    """Whether the driven agent has a route on lanes; if not, the bank holds the logged path, which is privileged."""
     return ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
 
 
 def route_curvature(
     bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, " K"]
 ) -> Float[Array, " K"]:
-    """Return the curvature of the route to the goal, 1/m, left positive: its turn over 4 m around a position.
+    """Return the curvature of the route to the goal, 1/m, left positive, averaged over 4 m around each position.
 
-    At the ends of the route the distance is shorter.
+    The window is shorter at the ends of the route.
     """
     last = (bank.route_points[index, 0] - 1).astype(jnp.float32)
-    before, behind = jnp.clip(along_m - _ARM_M, 0.0, last), jnp.clip(along_m + _ARM_M, 0.0, last)
+    start_m, end_m = jnp.clip(along_m - _ARM_M, 0.0, last), jnp.clip(along_m + _ARM_M, 0.0, last)
     zero = jnp.zeros(())
-    start, _ = route_ahead(bank, index, zero, before)
-    end, _ = route_ahead(bank, index, zero, behind)
+    start, _ = route_ahead(bank, index, zero, start_m)
+    end, _ = route_ahead(bank, index, zero, end_m)
     (c0, s0), (c1, s1) = ((rows[:, RouteColumn.COS], rows[:, RouteColumn.SIN]) for rows in (start, end))
-    apart = behind - before
-    # Without a route its rows are zero and have no angle.
-    angle = jnp.arctan2(c0 * s1 - s0 * c1, jnp.where(apart > 0, c0 * c1 + s0 * s1, 1.0))
-    turn = jnp.where(apart > 0, angle, 0.0)
-    return turn / jnp.maximum(apart, 1.0)
+    distance = end_m - start_m
+    # Without a route, rows are zero and have no angle.
+    angle = jnp.arctan2(c0 * s1 - s0 * c1, jnp.where(distance > 0, c0 * c1 + s0 * s1, 1.0))
+    turn = jnp.where(distance > 0, angle, 0.0)
+    return turn / jnp.maximum(distance, 1.0)
 
 
 def recommended_speed(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -202,9 +202,9 @@ def goal_ahead(goal_m: Float[Array, " 2"]) -> Float[Array, " 2"]:
 
 def cut_rows(rows: Float[Array, "P F"], count: int) -> Float[Array, "R F"]:
     """Cut each road piece (position, direction, length, ...) into equal pieces along its chord."""
-    place = ((jnp.arange(count) + 0.5) / count - 0.5)[:, None]
+    offsets = ((jnp.arange(count) + 0.5) / count - 0.5)[:, None]
     position, direction, length = rows[:, None, :2], rows[:, None, 2:4], rows[:, None, 4:5]
-    middle = position + direction * length * (PIECE_M / POSITION_M) * place
+    middle = position + direction * length * (PIECE_M / POSITION_M) * offsets
     shape = (*middle.shape[:2], rows.shape[1] - 5)
     parts = [middle, jnp.broadcast_to(direction, middle.shape)]
     parts += [jnp.broadcast_to(length / count, (*shape[:2], 1)), jnp.broadcast_to(rows[:, None, 5:], shape)]

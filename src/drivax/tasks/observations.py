@@ -25,7 +25,13 @@ from drivax.simulator.types import HISTORY, AgentContext
 from drivax.tasks import features
 from drivax.tasks.features import COLUMNS, PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Features, Frames, View
 from drivax.tasks.own import check_unique, name_of
-from drivax.tasks.perception import MOVED_LIGHTS, MOVED_ROAD, Perception, perceived, position_errors
+from drivax.tasks.perception import (
+    LIGHT_NOISE_STREAM,
+    ROAD_NOISE_STREAM,
+    Perception,
+    perceive,
+    position_errors,
+)
 
 #: Block size of the running count.
 _BLOCK = 8
@@ -59,7 +65,7 @@ class OwnGroup:
     def observe(self, bank: ScenarioBank, context: AgentContext, frames: Frames) -> Observation:
         """Return the group, and its mask if it has one."""
         rows = self.feature(bank, context, frames)
-        return _masked(self.name, *rows) if isinstance(rows, tuple) else {self.name: rows}
+        return _masked_group(self.name, *rows) if isinstance(rows, tuple) else {self.name: rows}
 
 
 @dataclass(frozen=True)
@@ -158,35 +164,35 @@ def observe(
     action; ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
     ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's groups.
     """
-    view, chosen = View.of(context), config.features
+    view, selected = View.of(context), config.features
     if config.perception.of_agents:
-        frames = perceived(config.perception, bank, context, frames)
+        frames = perceive(config.perception, bank, context, frames)
     result = _ego(config, bank, context, view)
-    if chosen.agents:
+    if selected.agents:
         result |= _agents(config, bank, context, view, frames)
-    if config.road and chosen.road:
-        result |= _shown_road(config, bank, context, view)
-    if chosen.lights:
+    if config.road and selected.road:
+        result |= _road_group(config, bank, context, view)
+    if selected.lights:
         result |= _lights(config, bank, context, view, frames(0).lights)
-    if chosen.route:
+    if selected.route:
         result |= _route(config, bank, context, view)
     for group in config.own:
         result |= group.observe(bank, context, frames)
     return result
 
 
-def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> Observation:
+def _masked_group(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> Observation:
     return {name: jnp.where(mask[..., None], rows, 0.0), f"{name}_mask": mask}
 
 
 def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     past = context.history[HISTORY - config.steps :]
-    turned = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
+    direction = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
     size = bank.agent_box[context.index, context.slot, : SizeColumn.KIND] / SIZE_M
     moving = {
         "position": lambda: view.point(past[:, :2]) / POSITION_M,
-        "heading": lambda: turned[:, ::-1],
-        "velocity": lambda: turned * past[:, 3:4] / SPEED_MPS,
+        "heading": lambda: direction[:, ::-1],
+        "velocity": lambda: direction * past[:, 3:4] / SPEED_MPS,
         "time": lambda: -DT_S * jnp.arange(config.steps - 1, -1, -1, dtype=jnp.float32)[:, None],
     }
     static = {
@@ -196,58 +202,58 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, v
         "last_action": lambda: context.action,
     }
     groups = (("ego", config.features.ego, moving), ("ego_static", config.features.ego_static, static))
-    return {name: features.joined(chosen, parts, ()) for name, chosen, parts in groups if chosen}
+    return {name: features.concatenate_features(names, parts, ()) for name, names, parts in groups if names}
 
 
 def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
     """Return the indices of the smallest entries, nearest first; padded with 0."""
-    chosen = jax.lax.top_k(-distance, min(count, distance.shape[0]))[1]
-    return jnp.pad(chosen, (0, count - chosen.shape[0]))
+    indices = jax.lax.top_k(-distance, min(count, distance.shape[0]))[1]
+    return jnp.pad(indices, (0, count - indices.shape[0]))
 
 
 def _agents(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, frames: Frames
 ) -> Observation:
-    now, chosen_features = frames(0), config.features.agents
-    slots = now.valid.shape[0]
-    seen = now.valid & (jnp.arange(slots) != context.slot)
-    dx, dy = now.box[:, 0] - view.xy[0], now.box[:, 1] - view.xy[1]
-    distance = jnp.where(seen, dx * dx + dy * dy, jnp.inf)
+    frame_now, chosen_features = frames(0), config.features.agents
+    slots = frame_now.valid.shape[0]
+    visible = frame_now.valid & (jnp.arange(slots) != context.slot)
+    dx, dy = frame_now.box[:, 0] - view.xy[0], frame_now.box[:, 1] - view.xy[1]
+    distance = jnp.where(visible, dx * dx + dy * dy, jnp.inf)
     chosen = _nearest(distance, config.agents)
-    there = seen[chosen] & (jnp.arange(config.agents) < slots)
+    exists = visible[chosen] & (jnp.arange(config.agents) < slots)
 
     def row(back: int) -> tuple[Float[Array, "K F"], Bool[Array, " K"]]:
-        frame = now if back == 0 else frames(back)
+        frame = frame_now if back == 0 else frames(back)
         box, x = frame.box[chosen], context.history[HISTORY - 1 - back]
-        own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
+        ego_velocity = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
         parts = {
             "position": lambda: view.point(box[:, :2]) / POSITION_M,
             "heading": lambda: view.vector(box[:, 2:4])[:, ::-1],
             "velocity": lambda: view.vector(frame.velocity[chosen]) / SPEED_MPS,
-            "relative_velocity": lambda: view.vector(frame.velocity[chosen] - own) / SPEED_MPS,
+            "relative_velocity": lambda: view.vector(frame.velocity[chosen] - ego_velocity) / SPEED_MPS,
             "time": lambda: jnp.full((config.agents, 1), -DT_S * back),
         }
-        return features.joined(chosen_features, parts, (config.agents,)), frame.valid[chosen]
+        return features.concatenate_features(chosen_features, parts, (config.agents,)), frame.valid[chosen]
 
     past = [row(back) for back in range(config.steps - 1, -1, -1)]
     moving, mask = (jnp.stack(rows, axis=1) for rows in zip(*past, strict=True))
-    mask &= there[:, None]
-    size = now.box[chosen, 4:6] / SIZE_M
+    mask &= exists[:, None]
+    size = frame_now.box[chosen, 4:6] / SIZE_M
     parts = {
         "length": lambda: size[:, :1],
         "width": lambda: size[:, 1:],
         "height": lambda: bank.agent_box[context.index, chosen, SizeColumn.HEIGHT][..., None] / SIZE_M,
-        "type": lambda: (now.kind[chosen, None] == jnp.arange(1, 5)).astype(jnp.float32),
+        "type": lambda: (frame_now.kind[chosen, None] == jnp.arange(1, 5)).astype(jnp.float32),
     }
-    static = features.joined(chosen_features, parts, (config.agents,))
+    static = features.concatenate_features(chosen_features, parts, (config.agents,))
     static = jnp.broadcast_to(static[:, None], (*moving.shape[:2], static.shape[-1]))
-    return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
+    return _masked_group("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
 
-def _shown_road(
+def _road_group(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View
 ) -> Observation:
-    """Return the road group: pieces cut, with noise, in the selected columns."""
+    """Return the road group: pieces cut into rows, with noise, in the selected columns."""
     selected, noisy = config.features.road, config.perception.noise_m > 0
     pieces = replace(config, road=config.road // config.road_cut, road_cut=1)
     group = _road(pieces, bank, context, view)
@@ -257,11 +263,11 @@ def _shown_road(
     if config.road_cut > 1:
         rows, mask = features.cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
     if noisy:
-        errors = position_errors(config.perception, bank, context, MOVED_ROAD, config.road)
+        errors = position_errors(config.perception, bank, context, ROAD_NOISE_STREAM, config.road)
         rows = rows.at[:, :2].add(errors / POSITION_M)
     columns = features.columns_of("road", selected)
     columns += [rows.shape[-1] - 1] if "curvature" in selected else []
-    return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
+    return _masked_group("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
 
 def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
@@ -271,38 +277,38 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
     inside = (ahead < config.road_ahead_m) & (ahead > -config.road_behind_m)
     inside &= (jnp.abs(left) < config.road_side_m) & (layer != RoadLayer.NONE)
     kinds = (RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA)
-    for shown, kind in zip((config.lanes, config.edges, config.crosswalks), kinds, strict=True):
-        inside &= shown or layer != kind
-    # Compact without sorting: the running count is the target of each row inside.
+    for included, kind in zip((config.lanes, config.edges, config.crosswalks), kinds, strict=True):
+        inside &= included or layer != kind
+    # Compact without sorting: the running count is the target index of each row inside.
     running = running_count(inside)
-    place = jnp.where(inside, running - 1, config.road)
-    take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(len(inside)), mode="drop")
-    rows = bank.road[context.index, take]
+    target = jnp.where(inside, running - 1, config.road)
+    source = jnp.zeros(config.road, jnp.int32).at[target].set(jnp.arange(len(inside)), mode="drop")
+    rows = bank.road[context.index, source]
     types = (rows[:, RoadColumn.LAYER, None] == jnp.asarray(kinds)).astype(jnp.float32)
     limit = rows[:, RoadColumn.LIMIT, None]
     parts = [view.point(rows[:, RoadColumn.XY]) / POSITION_M, view.vector(rows[:, RoadColumn.DIRECTION])]
     parts += [rows[:, RoadColumn.LENGTH, None] / PIECE_M, types]
     parts += [jnp.maximum(limit, 0.0) / SPEED_MPS, (limit > 0).astype(jnp.float32)]
     if "curvature" in config.features.road:
-        parts.append(features.shown_curvature(bank.road_curvature[context.index, take])[:, None])
-    return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
+        parts.append(features.scale_curvature(bank.road_curvature[context.index, source])[:, None])
+    return _masked_group("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
 
 
 def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
     """Return the cumulative count of true entries: within blocks of eight, then over blocks.
 
-    ``jnp.cumsum`` is several times slower on a CPU: it adds entry by entry.
+    ``jnp.cumsum`` is several times slower on CPUs, because it adds entry by entry.
     """
     count = inside.shape[0]
     blocks = -(-count // _BLOCK)
     # One row per position in a block: additions run along the blocks.
     positions = jnp.pad(inside.astype(jnp.float32), (0, blocks * _BLOCK - count)).reshape(blocks, _BLOCK).T
-    within = [positions[0]]
+    in_block = [positions[0]]
     for row in positions[1:]:
-        within.append(within[-1] + row)
+        in_block.append(in_block[-1] + row)
     # Exact in any matrix precision: factors are at most eight.
-    before = within[-1] @ jnp.triu(jnp.ones((blocks, blocks)), 1)
-    return jnp.stack([row + before for row in within], axis=-1).reshape(-1)[:count].astype(jnp.int32)
+    block_start = in_block[-1] @ jnp.triu(jnp.ones((blocks, blocks)), 1)
+    return jnp.stack([row + block_start for row in in_block], axis=-1).reshape(-1)[:count].astype(jnp.int32)
 
 
 def _lights(
@@ -310,26 +316,26 @@ def _lights(
 ) -> Observation:
     line = bank.light_line[context.index]
     dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
-    # Lights whose line is well behind are passed. Those on the route come first, then the nearest.
-    seen = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_PASSED_M)
+    # Ignore lights whose line is well behind ego. Sort those on the route first, then by distance.
+    relevant = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_PASSED_M)
     perception, on_route = config.perception, line[LightRow.ARC] < NEVER_M
     rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, 1e4)
-    chosen = _nearest(jnp.where(seen, rank, jnp.inf), config.lights)
-    there = seen[chosen] & (jnp.arange(config.lights) < state.shape[0])
+    chosen = _nearest(jnp.where(relevant, rank, jnp.inf), config.lights)
+    exists = relevant[chosen] & (jnp.arange(config.lights) < state.shape[0])
 
     def position() -> Float[Array, "K 2"]:
-        middle = view.point(line[LightRow.XY, chosen].T)
+        xy = view.point(line[LightRow.XY, chosen].T)
         if perception.noise_m > 0:
-            errors = position_errors(perception, bank, context, MOVED_LIGHTS, state.shape[0])
-            middle = middle + errors[chosen]
-        return middle / POSITION_M
+            errors = position_errors(perception, bank, context, LIGHT_NOISE_STREAM, state.shape[0])
+            xy = xy + errors[chosen]
+        return xy / POSITION_M
 
     parts = {
         "position": position,
         "state": lambda: _colour(state[chosen]),
         "on_route": lambda: on_route[chosen, None].astype(jnp.float32),
     }
-    return _masked("lights", features.joined(config.features.lights, parts, ()), there)
+    return _masked_group("lights", features.concatenate_features(config.features.lights, parts, ()), exists)
 
 
 def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
@@ -341,8 +347,8 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
 
 def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
-    rows, there = route_ahead(bank, context.index, context.route_m, offsets)
-    there &= features.has_route(bank, context)
+    rows, exists = route_ahead(bank, context.index, context.route_m, offsets)
+    exists &= features.has_route(bank, context)
     limit = rows[:, RouteColumn.LIMIT, None]
 
     def curvature() -> Float[Array, "K 1"]:
@@ -353,8 +359,8 @@ def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext,
         "position": lambda: view.point(rows[:, RouteColumn.XY]) / POSITION_M,
         "heading": lambda: view.vector(rows[:, RouteColumn.HEADING])[:, ::-1],
         "limit": lambda: jnp.where(limit > 0, limit / SPEED_MPS, 0.0),
-        "curvature": lambda: features.shown_curvature(curvature()),
+        "curvature": lambda: features.scale_curvature(curvature()),
         "recommended_speed": lambda: features.recommended_speed(curvature()) / SPEED_MPS,
         "goal": lambda: jnp.broadcast_to(features.goal_ahead(view.point(goal)), (config.route, 2)),
     }
-    return _masked("route", features.joined(config.features.route, parts, ()), there)
+    return _masked_group("route", features.concatenate_features(config.features.route, parts, ()), exists)

@@ -22,10 +22,10 @@ def name_of(function: Any, name: str = "") -> str:
 
 
 def check_unique(section: str, names: Sequence[str], taken: Sequence[str]) -> None:
-    """Refuse names that are taken or repeated.
+    """Check that names are distinct and not taken.
 
     Raises:
-        ValueError: Names the first.
+        ValueError: A name is taken or repeated.
     """
     seen = set(taken)
     for name in names:

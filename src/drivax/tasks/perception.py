@@ -30,7 +30,7 @@ from drivax.simulator.types import HISTORY, AgentContext, Frame
 #: Numbers folded into the key of a step, by what is drawn.
 #: Added to step numbers, since keys are folded with numbers from 0 on.
 _BEFORE = 16
-_DROPPED, _MOVED, _DROPPED_LIGHTS, MOVED_LIGHTS, MOVED_ROAD = range(5)
+_DROPOUT_STREAM, _NOISE_STREAM, _LIGHT_DROPOUT_STREAM, LIGHT_NOISE_STREAM, ROAD_NOISE_STREAM = range(5)
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Perception:
 
     @property
     def of_agents(self) -> bool:
-        """Whether agents are perceived with errors."""
+        """Whether the perception of agents has errors."""
         return self.occlusion or self.of_lights or self.noise_m > 0
 
     @property
@@ -73,46 +73,50 @@ class Perception:
         return self.range_m is not None or self.dropout_m is not None
 
 
-def perceived(
+def perceive(
     config: Perception, bank: ScenarioBank, context: AgentContext, frames: Callable[[int], Frame]
 ) -> Callable[[int], Frame]:
-    """Return the frames as ego perceives them: unseen agents not valid, unseen lights -1, and positions with errors.
+    """Return the perceived frames: undetected agents are not valid, undetected lights -1, and positions have errors.
 
     Ego itself is exact. ``frames`` returns the true frame of all agents some steps ago.
     """
-    return cache(lambda back: _sensed(config, bank, context, frames(back), back))
+    return cache(lambda back: _add_errors(config, bank, context, frames(back), back))
 
 
-def _sensed(config: Perception, bank: ScenarioBank, context: AgentContext, frame: Frame, back: int) -> Frame:
-    eye, slots = context.history[HISTORY - 1 - back], jnp.arange(frame.valid.shape[0])
-    others, seen, place = slots != context.slot, frame.valid, frame.box[:, :2]
-    distance = norm(place - eye[:2])
+def _add_errors(
+    config: Perception, bank: ScenarioBank, context: AgentContext, frame: Frame, back: int
+) -> Frame:
+    ego_motion, slots = context.history[HISTORY - 1 - back], jnp.arange(frame.valid.shape[0])
+    others, detected, xy = slots != context.slot, frame.valid, frame.box[:, :2]
+    distance = norm(xy - ego_motion[:2])
     key = _key(config, bank, context, back)
-    seen &= _reported(config, jax.random.fold_in(key, _DROPPED), distance)
+    detected &= _is_detected(config, jax.random.fold_in(key, _DROPOUT_STREAM), distance)
     if config.occlusion:
-        level = jnp.abs(frame.z - frame.z[context.slot]) <= LEVEL_M
-        slim = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
-        seen &= in_view(eye[:2], frame.box, frame.valid & others & level & ~slim)
+        same_level = jnp.abs(frame.z - frame.z[context.slot]) <= LEVEL_M
+        is_thin = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
+        detected &= in_view(ego_motion[:2], frame.box, frame.valid & others & same_level & ~is_thin)
     if config.noise_m > 0:
-        # Drawn in ego's frame: invariant to rotations of the map.
-        error = config.noise_m * _each(jax.random.fold_in(key, _MOVED), len(slots))
-        place = place + rotate(error, jnp.cos(eye[2]), jnp.sin(eye[2]))
-    place = jnp.where(others[:, None], place, frame.box[:, :2])
-    box = jnp.concatenate([place, frame.box[:, 2:]], axis=-1)
+        # Drawn in ego's frame, so that it is invariant to rotations of the map.
+        error = config.noise_m * _normal_per_slot(jax.random.fold_in(key, _NOISE_STREAM), len(slots))
+        xy = xy + rotate(error, jnp.cos(ego_motion[2]), jnp.sin(ego_motion[2]))
+    xy = jnp.where(others[:, None], xy, frame.box[:, :2])
+    box = jnp.concatenate([xy, frame.box[:, 2:]], axis=-1)
     lights = frame.lights
     if config.of_lights:
         line = bank.light_line[context.index, LightRow.XY]
-        lights = jnp.where(lights_seen(config, bank, context, norm(line.T - eye[:2]), back), lights, -1)
-    return replace(frame, box=box, valid=jnp.where(others, seen, frame.valid), lights=lights)
+        lights = jnp.where(
+            lights_seen(config, bank, context, norm(line.T - ego_motion[:2]), back), lights, -1
+        )
+    return replace(frame, box=box, valid=jnp.where(others, detected, frame.valid), lights=lights)
 
 
 def in_view(
     eye: Float[Array, " 2"], box: Float[Array, "S 6"], blocks: Bool[Array, " S"]
 ) -> Bool[Array, " S"]:
-    """Return which agents are visible from a point: those with a visible centre or corner.
+    """Return a mask of agents whose centre or a corner is visible from a point.
 
-    A box of ``blocks`` blocks lines of sight through its inside; touching does not block. No box blocks itself, and a
-    box around the eye blocks nothing. All S x S x 5 pairs are tested, about 40 operations each.
+    Boxes in ``blocks`` occlude lines of sight through their interior, but not those that touch them. No box occludes
+    itself, and a box around the eye occludes nothing. All S x S x 5 pairs are tested, about 40 operations each.
     """
     dx, dy = eye[0] - box[:, 0], eye[1] - box[:, 1]
     along, across = dx * box[:, 2] + dy * box[:, 3], dy * box[:, 2] - dx * box[:, 3]
@@ -120,24 +124,24 @@ def in_view(
     points = jnp.concatenate([corners(box), box[:, None, :2]], axis=1)
     enters, leaves = passage(eye, points[:, :, None], box)
     others = ~jnp.eye(len(box), dtype=bool)
-    cut = (enters < leaves) & (blocks & ~inside) & others[:, None]
-    return ~cut.any(axis=2).all(axis=1)
+    blocked = (enters < leaves) & (blocks & ~inside) & others[:, None]
+    return ~blocked.any(axis=2).all(axis=1)
 
 
 def lights_seen(
     config: Perception, bank: ScenarioBank, context: AgentContext, distance_m: Float[Array, " L"],
     back: int = 0,
 ) -> Bool[Array, " L"]:  # fmt: skip
-    """Return which stop lines were seen ``back`` steps ago, at these distances."""
-    key = jax.random.fold_in(_key(config, bank, context, back), _DROPPED_LIGHTS)
-    return _reported(config, key, distance_m)
+    """Return a mask of the stop lines that were detected ``back`` steps ago, given their distances."""
+    key = jax.random.fold_in(_key(config, bank, context, back), _LIGHT_DROPOUT_STREAM)
+    return _is_detected(config, key, distance_m)
 
 
 def position_errors(
-    config: Perception, bank: ScenarioBank, context: AgentContext, drawn: int, count: int
+    config: Perception, bank: ScenarioBank, context: AgentContext, stream: int, count: int
 ) -> Float[Array, "count 2"]:
-    """Return position errors of ``MOVED_LIGHTS`` or ``MOVED_ROAD`` in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), drawn), count)
+    """Return position errors of ``LIGHT_NOISE_STREAM`` or ``ROAD_NOISE_STREAM`` in the ego frame, m."""
+    return config.noise_m * _normal_per_slot(jax.random.fold_in(_key(config, bank, context), stream), count)
 
 
 def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: int = 0) -> Array:
@@ -147,18 +151,18 @@ def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: in
     return key
 
 
-def _reported(config: Perception, key: Array, distance_m: Float[Array, " S"]) -> Bool[Array, " S"]:
-    """Return which agents are in range and not dropped at random."""
-    seen = jnp.ones(distance_m.shape, bool)
+def _is_detected(config: Perception, key: Array, distance_m: Float[Array, " S"]) -> Bool[Array, " S"]:
+    """Return a mask of the agents in range that are not dropped at random."""
+    detected = jnp.ones(distance_m.shape, bool)
     if config.range_m is not None:
-        seen &= distance_m <= config.range_m
+        detected &= distance_m <= config.range_m
     if config.dropout_m is not None:
         draw = jax.vmap(lambda slot: jax.random.uniform(jax.random.fold_in(key, slot)))
-        seen &= draw(jnp.arange(len(distance_m))) < jnp.exp(-distance_m / config.dropout_m)
-    return seen
+        detected &= draw(jnp.arange(len(distance_m))) < jnp.exp(-distance_m / config.dropout_m)
+    return detected
 
 
-def _each(key: Array, count: int) -> Float[Array, "count 2"]:
+def _normal_per_slot(key: Array, count: int) -> Float[Array, "count 2"]:
     """Return two standard normal numbers per slot, independent of the number of slots."""
     draw = jax.vmap(lambda slot: jax.random.normal(jax.random.fold_in(key, slot), (2,)))
     return draw(jnp.arange(count))

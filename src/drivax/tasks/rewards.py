@@ -22,16 +22,16 @@ from drivax.tasks.own import check_unique, name_of
 
 Term = Callable[[Facts, Facts, Surroundings], Scalar]
 
-#: Progress of one step that earns the whole progress reward: 12 m/s.
-_FULL_PROGRESS_M = 12.0 * DT_S
+#: Progress of one step with the full progress reward, at 12 m/s.
+_PROGRESS_SCALE_M = 12.0 * DT_S
 #: Speeding by more than this is penalised, m/s (5 mph).
 _SPEEDING_MPS = 2.23
-#: Times to collision below this fall short, s (the published aggressive driver).
-_SHORT_S = 1.0
+#: Time to collision below which ``ttc_shortfall`` is positive, s (the published aggressive driver).
+_MIN_TTC_S = 1.0
 #: nuPlan's limits of jerk and lateral acceleration; their sum is the unpublished "max" of the published comfort.
 _JERK_MPS3, _LATERAL_MPS2 = 8.37, 4.89
 #: Cap of distances from the log, m.
-_FAR_FROM_LOG_M = 10.0
+_MAX_LOG_DISTANCE_M = 10.0
 #: The goal is reached within this distance, m (semantics, ``reached_goal``).
 _GOAL_M = 3.0
 
@@ -66,8 +66,8 @@ def reward_term(*reads: str, option: str | None = None) -> Callable[[Any], Any]:
     return register
 
 
-def _event(happens: Bool[Array, ""]) -> Scalar:
-    return happens.astype(jnp.float32)
+def _event(condition: Bool[Array, ""]) -> Scalar:
+    return condition.astype(jnp.float32)
 
 
 def _event_term(name: str, fact: str) -> None:
@@ -90,18 +90,18 @@ _event_term("off_route", "off_route")
 @reward_term("routed", "progress_m")
 def progress(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Progress along the route as a share of that at 12 m/s, in [0, 1]; 0 without a route."""
-    return now.routed * jnp.clip((now.progress_m - before.progress_m) / _FULL_PROGRESS_M, 0.0, 1.0)
+    return now.routed * jnp.clip((now.progress_m - before.progress_m) / _PROGRESS_SCALE_M, 0.0, 1.0)
 
 
 @reward_term("acceleration_mps2", "lateral_acceleration_mps2", "jerk_mps3")
 def discomfort(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Largest of acceleration, lateral acceleration and jerk over nuPlan's limits, squared, in [0, 1].
 
-    Causal differences over 0.5 s: the reward never needs the future.
+    Causal differences over 0.5 s, so that the reward never depends on future steps.
     """
     along = jnp.where(now.acceleration_mps2 < 0, now.acceleration_mps2 / 4.05, now.acceleration_mps2 / 2.40)
-    parts = jnp.stack([along, now.lateral_acceleration_mps2 / _LATERAL_MPS2, now.jerk_mps3 / _JERK_MPS3])
-    return jnp.clip(jnp.max(parts * parts), 0.0, 1.0)
+    ratios = jnp.stack([along, now.lateral_acceleration_mps2 / _LATERAL_MPS2, now.jerk_mps3 / _JERK_MPS3])
+    return jnp.clip(jnp.max(ratios * ratios), 0.0, 1.0)
 
 
 @reward_term("limit_mps", "speed_mps")
@@ -122,8 +122,8 @@ def comfort(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 
     Magnitudes in m/s3 and m/s2, causal over 0.5 s; ``max`` is 8.37 + 4.89, nuPlan's limits of both.
     """
-    felt = jnp.abs(now.jerk_mps3) + jnp.abs(now.lateral_acceleration_mps2)
-    return 1.0 - jnp.minimum(1.0, felt / (_JERK_MPS3 + _LATERAL_MPS2))
+    magnitude = jnp.abs(now.jerk_mps3) + jnp.abs(now.lateral_acceleration_mps2)
+    return 1.0 - jnp.minimum(1.0, magnitude / (_JERK_MPS3 + _LATERAL_MPS2))
 
 
 @reward_term("limit_mps", "speed_mps")
@@ -141,7 +141,7 @@ def ttc(before: Facts, now: Facts, around: Surroundings, ttc_s: float = 1.5) -> 
 @reward_term("ttc_s", "ttc_defined")
 def ttc_shortfall(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Shortfall of the time to collision from 1 s, in [0, 1]; 0 while standing."""
-    return now.ttc_defined * jnp.clip(1.0 - now.ttc_s / _SHORT_S, 0.0, 1.0)
+    return now.ttc_defined * jnp.clip(1.0 - now.ttc_s / _MIN_TTC_S, 0.0, 1.0)
 
 
 @reward_term("gap_m", option="close_m")
@@ -163,13 +163,13 @@ def straddling(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 @reward_term("log_divergence_m", "logged")
 def log_divergence(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Distance to the agent's logged position at this step, m, at most 10; 0 without one."""
-    return now.logged * jnp.minimum(now.log_divergence_m, _FAR_FROM_LOG_M)
+    return now.logged * jnp.minimum(now.log_divergence_m, _MAX_LOG_DISTANCE_M)
 
 
 @reward_term("lag_m", "logged")
 def lag(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Distance by which the agent is behind its logged position along its heading, m, 0 to 10; 0 without one."""
-    return now.logged * jnp.clip(now.lag_m, 0.0, _FAR_FROM_LOG_M)
+    return now.logged * jnp.clip(now.lag_m, 0.0, _MAX_LOG_DISTANCE_M)
 
 
 @reward_term("limit_mps", "speed_mps")
@@ -232,7 +232,7 @@ _Weights: Any = make_dataclass("_Weights", _FIELDS, frozen=True)
 
 @dataclass(frozen=True)
 class RewardConfig(_Weights):
-    """A preset and the weights that differ from it, by term: None keeps the preset's weight, 0 switches the term off.
+    """A preset, and weights by term that override it: None keeps the preset's weight, 0 disables the term.
 
     Attributes:
         preset: ``safety``, ``navigation`` and ``behaviour`` each include the previous; ``published`` has the form and
@@ -252,8 +252,8 @@ class RewardConfig(_Weights):
 
     def __post_init__(self) -> None:
         check_unique("rewards.own", [term.name for term in self.own], tuple(TERMS))
-        upper = {"collision_margin_m": FARTHEST_GAP_M, "ttc_s": TTC_HORIZON_S, "close_m": FARTHEST_GAP_M}
-        for name, bound in upper.items():
+        bounds = {"collision_margin_m": FARTHEST_GAP_M, "ttc_s": TTC_HORIZON_S, "close_m": FARTHEST_GAP_M}
+        for name, bound in bounds.items():
             if not 0.0 <= getattr(self, name) <= bound:
                 raise ValueError(f"{name} is {getattr(self, name)}; choose 0 to {bound:g}")
         if not 0.0 < self.scale < math.inf:
@@ -267,7 +267,7 @@ class RewardConfig(_Weights):
 
     @property
     def reads(self) -> frozenset[str]:
-        """Facts that the terms read: with a user's term all but those on request."""
+        """Facts that the terms read; user-defined terms read all but those on request."""
         reads = {name: term.reads for name, term in TERMS.items()}
         reads |= {term.name: FACTS.union(term.reads) for term in self.own}
         if self.collision_margin_m:
@@ -276,10 +276,10 @@ class RewardConfig(_Weights):
 
     def weigh(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Scalar]:
         """Return the weighted and scaled terms by name."""
-        own = {term.name: term.term for term in self.own}
+        own_terms = {term.name: term.term for term in self.own}
         result = {}
         for name, weight in self.weights().items():
             term = TERMS.get(name)
             options = (getattr(self, term.option),) if term is not None and term.option is not None else ()
-            result[name] = self.scale * weight * (term or own[name])(before, now, around, *options)
+            result[name] = self.scale * weight * (term or own_terms[name])(before, now, around, *options)
         return result

@@ -1,8 +1,8 @@
-"""Checkpoints: a whole training state on disk, restored bit for bit.
+"""Checkpoints of complete training states, restored bit for bit.
 
-Orbax stores the arrays; ``about.json`` names every leaf with its dtype, shape and CRC-32, so that errors name the leaf
+Orbax stores the arrays; ``about.json`` has name, dtype, shape and CRC-32 of every leaf, so that errors name the leaf
 that does not fit or is damaged. A checkpoint appears under its name only when it is complete. Exported policies are
-one plain file instead (:func:`pack`), without training state.
+single files without training state (:func:`pack`).
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ class Checkpoints:
         return sorted(int(name) for name in names if name.isdecimal())
 
     def best(self) -> int | None:
-        """Return the step with the highest score, the later of equal ones; None without scores."""
+        """Return the step with the highest score, the latest if several tie; None without scores."""
         scores = [(self.about(step)["score"], step) for step in self.steps()]
-        known = [(tuple(np.atleast_1d(score)), step) for score, step in scores if score is not None]
-        return max(known)[1] if known else None
+        scored = [(tuple(np.atleast_1d(score)), step) for score, step in scores if score is not None]
+        return max(scored)[1] if scored else None
 
     def best_or_newest(self) -> int | None:
         """Return the best step, or the newest without scores; None if there is no checkpoint."""
@@ -63,8 +63,8 @@ class Checkpoints:
         """Return step, score and leaves of a checkpoint; raises DataError if it is missing or damaged."""
         file = self._path(step) / ABOUT
         if not file.is_file():
-            cure = f"there are: {', '.join(map(str, self.steps())) or 'none'}"
-            raise DataError(f"there is no checkpoint of step {step}", file=self.folder, cure=cure)
+            cure = f"available steps: {', '.join(map(str, self.steps())) or 'none'}"
+            raise DataError(f"no checkpoint of step {step}", file=self.folder, cure=cure)
         try:
             about = json.loads(file.read_bytes())
             for leaf in about.get("leaves", ()):
@@ -74,9 +74,9 @@ class Checkpoints:
             raise DataError(f"is damaged ({error})", file=file, cure="use another checkpoint") from error
 
     def save(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
-        """Store a pytree of JAX or numpy arrays (typed keys too) and numbers, drop others, and return the folder.
+        """Store a pytree of numbers and JAX or NumPy arrays, delete superseded checkpoints, and return the folder.
 
-        Higher scores are better; of several numbers the first that differs decides. NaN counts as none.
+        Higher scores are better; sequences compare lexicographically. A NaN score counts as none.
         """
         arrays, leaves = _describe(state)
         score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
@@ -90,13 +90,13 @@ class Checkpoints:
         return final
 
     def drop_after(self, step: int) -> None:
-        """Drop all checkpoints of later steps, which belong to a run that was cut off."""
+        """Delete all checkpoints of later steps, which belong to an interrupted run."""
         for later in self.steps():
             if later > step:
                 self._remove(later)
 
     def restore(self, template: State, step: int | None = None, part: str = "") -> State:
-        """Return the stored state, or a part of it, as ``.parameters``, given such a pytree or its shapes.
+        """Return the stored state, or a part of it (``.parameters``, for example), given such a pytree or its shapes.
 
         ``step`` None is the newest checkpoint. Raises DataError with the first leaf if the checkpoint is missing,
         damaged, or does not fit the template.
@@ -110,7 +110,7 @@ class Checkpoints:
         if step is None:
             step = max(self.steps(), default=None)
         if step is None:
-            raise DataError("there is no checkpoint", file=self.folder, cure="train without --resume")
+            raise DataError("no checkpoint found", file=self.folder, cure="train without --resume")
         stored = self.about(step)["leaves"]
         path = self._path(step)
         requested = {
@@ -129,16 +129,16 @@ class Checkpoints:
 
     def _drop(self) -> None:
         steps = self.steps()
-        stay = {*steps[-self.keep :], *([self.best()] if self.keep_best else [])}
+        kept = {*steps[-self.keep :], *([self.best()] if self.keep_best else [])}
         for step in steps:
-            if step not in stay:
+            if step not in kept:
                 self._remove(step)
 
     def _remove(self, step: int) -> None:
         # Renamed first: a half-deleted folder must not look like a checkpoint.
-        doomed = self.folder / f".step-{step}.old-{os.getpid()}"
-        self._path(step).rename(doomed)
-        shutil.rmtree(doomed, ignore_errors=True)
+        hidden = self.folder / f".step-{step}.old-{os.getpid()}"
+        self._path(step).rename(hidden)
+        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def is_part(leaf: str, parts: Iterable[str]) -> bool:
@@ -147,7 +147,7 @@ def is_part(leaf: str, parts: Iterable[str]) -> bool:
 
 
 def _present_name(leaf: str) -> str:
-    """Return the name of a leaf with each renamed field under its present name."""
+    """Return the name of a leaf with the current names of renamed fields."""
     return re.sub(r"\.(\w+)", lambda field: f".{_RENAMED_FIELDS.get(field[1], field[1])}", leaf)
 
 

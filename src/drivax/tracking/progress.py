@@ -24,15 +24,9 @@ class Progress:
     """
 
     def __init__(
-        self,
-        what: str,
-        unit: str,
-        total: int | None = None,
-        *,
-        stream: Any = None,
-        interval_s: float = INTERVAL_S,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+        self, what: str, unit: str, total: int | None = None, *, stream: Any = None,
+        interval_s: float = INTERVAL_S, clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
         self.what, self.unit, self.total = what, unit, total
         self.done = 0
         self._stream = sys.stderr if stream is None else stream
@@ -77,11 +71,11 @@ class Progress:
 
     def line(self, note: str = "") -> str:
         """Return the progress so far as one line."""
-        rate, count, left = self.rate(), f"{self.done:,} {self.unit}", ""
+        rate, count, eta = self.rate(), f"{self.done:,} {self.unit}", ""
         if self.total:
             count = f"{self.done:,} of {self.total:,} {self.unit} ({100 * self.done / self.total:.0f} %)"
-            left = f"{duration((self.total - self.done) / rate)} left" if rate > 0 else ""
-        return ", ".join(part for part in (f"{self.what}: {count}", f"{_number(rate)}/s", left, note) if part)
+            eta = f"{duration((self.total - self.done) / rate)} left" if rate > 0 else ""
+        return ", ".join(part for part in (f"{self.what}: {count}", f"{_number(rate)}/s", eta, note) if part)
 
     def summary(self) -> str:
         """Return the whole as one line."""
@@ -110,9 +104,9 @@ def duration(seconds: float) -> str:
     """Format seconds as ``4.2 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
+    rounded = round(seconds)
+    if rounded < 3600:
+        return f"{rounded // 60} min {rounded % 60} s"
     minutes = round(seconds / 60)
     return f"{minutes // 60} h {minutes % 60} min"
 

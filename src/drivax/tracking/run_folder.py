@@ -1,8 +1,7 @@
-"""Run folders: what was run, on which data, with which versions, on which machine.
+"""Run folders: configuration, data, versions and machine of a run, and its outputs.
 
-A run folder holds ``config.yaml`` (the whole configuration, defaults included), ``run.json`` (everything else that a
-reader needs to believe or repeat the run), and what the run produces: ``metrics.jsonl``, ``checkpoints/``,
-``episodes.csv``, reports.
+A run folder holds ``config.yaml`` (the whole configuration, defaults included), ``run.json`` (all other information
+needed to reproduce the run), and outputs: ``metrics.jsonl``, ``checkpoints/``, ``episodes.csv``, reports.
 """
 
 from __future__ import annotations
@@ -47,14 +46,10 @@ class RunFolder:
 
     @classmethod
     def create(
-        cls,
-        path: str | Path,
-        config: Any,
-        data: Sequence[ScenarioSet] = (),
-        overwrite: bool = False,
+        cls, path: str | Path, config: Any, data: Sequence[ScenarioSet] = (), overwrite: bool = False,
         **info: Any,
-    ) -> RunFolder:
-        """Make a folder with ``config.yaml`` and ``run.json``; it appears with both in it.
+    ) -> RunFolder:  # fmt: skip
+        """Create a folder with ``config.yaml`` and ``run.json`` atomically.
 
         Args:
             path: Folder to create.
@@ -159,8 +154,8 @@ def seed_folders(path: str | Path) -> list[Path]:
     path = Path(path)
     if _kind(path) != "seeds":
         return [path]
-    inside = (file.parent for file in path.glob("seed-*/" + RUN_FILE))
-    return sorted(inside, key=lambda folder: int(folder.name.removeprefix("seed-")))
+    folders = (file.parent for file in path.glob("seed-*/" + RUN_FILE))
+    return sorted(folders, key=lambda folder: int(folder.name.removeprefix("seed-")))
 
 
 def _kind(path: Path) -> str | None:
@@ -174,7 +169,9 @@ def run_and_step(name: str) -> tuple[str, int | None]:
     """Split ``RUN@STEP`` or ``RUN``, which leaves the step None; raises UsageError if the step is not a number."""
     run, at, step = name.partition("@")
     if at and not step.isdecimal():
-        raise UsageError(f"{step!r} is not a checkpoint step", cure="write RUN@STEP, as runs/a@100000")
+        raise UsageError(
+            f"{step!r} is not a checkpoint step", cure="write RUN@STEP, for example runs/a@100000"
+        )
     return run, int(step) if at else None
 
 
@@ -198,7 +195,7 @@ def is_policy(name: str | Path) -> bool:
 
 
 def learned_from(planner: str) -> list[dict[str, Any]]:
-    """Return the training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), pretraining included, else none."""
+    """Return the training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), including pretraining."""
     folder = planner.partition("@")[0]
     path = policy_folder(folder) if is_policy(folder) else Path(folder)
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
@@ -206,11 +203,11 @@ def learned_from(planner: str) -> list[dict[str, Any]]:
 
 
 def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the data sets that a training's ``run.json`` names, its own first, each once."""
-    known: dict[str, dict[str, Any]] = {}
+    """Return the distinct data sets in a training's ``run.json``, its own first."""
+    by_hash: dict[str, dict[str, Any]] = {}
     for entry in (*info.get("data", ()), *info.get("networks_from", {}).get("data", ())):
-        known.setdefault(entry["hash"], entry)
-    return list(known.values())
+        by_hash.setdefault(entry["hash"], entry)
+    return list(by_hash.values())
 
 
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
@@ -250,18 +247,18 @@ def machine() -> dict[str, Any]:
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:
-    """Return the commit of the checkout around a folder, and whether package or presets differ; None outside of one."""
+    """Return the commit of the checkout around a folder, and whether package or presets are modified, if any."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(folder), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
     try:
-        # An installed package may lie inside a foreign repository: only a checkout that tracks this file counts.
-        own = Path(__file__).resolve()
-        git("ls-files", "--error-unmatch", str(own))
-        top = git("rev-parse", "--show-toplevel")
-        changed = git("status", "--porcelain", "--", str(own.parents[1]), f"{top}/configs")
+        # An installed package may lie in another repository: only a checkout that tracks this file counts.
+        this_file = Path(__file__).resolve()
+        git("ls-files", "--error-unmatch", str(this_file))
+        root = git("rev-parse", "--show-toplevel")
+        changed = git("status", "--porcelain", "--", str(this_file.parents[1]), f"{root}/configs")
         return {"commit": git("rev-parse", "HEAD"), "changed": bool(changed)}
     except (OSError, subprocess.SubprocessError):
         return None

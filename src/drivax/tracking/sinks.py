@@ -1,4 +1,4 @@
-"""Where logged numbers go: ``metrics.jsonl`` always, TensorBoard where tensorboardX is installed."""
+"""Sinks of logged metrics: ``metrics.jsonl`` always, TensorBoard if tensorboardX is installed."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class JsonLines:
     def __init__(self, file: str | Path, resume_step: int | None = None) -> None:
         self.path = Path(file)
         if resume_step is not None and self.path.exists():
-            kept = [line for line, row in _rows(self.path) if row["step"] <= resume_step]
-            write_text(self.path, "".join(kept))
+            lines = [line for line, row in _rows(self.path) if row["step"] <= resume_step]
+            write_text(self.path, "".join(lines))
         self._file = self.path.open("wb" if resume_step is None else "ab")
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
@@ -94,7 +94,7 @@ class MetricLog:
 
 
 def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a ``metrics.jsonl`` but a last one that was cut off; raises DataError if another is damaged."""
+    """Yield the rows of a ``metrics.jsonl``, without an incomplete last one; raises DataError for a damaged row."""
     for _, row in _rows(Path(file)):
         yield row
 

@@ -1,4 +1,4 @@
-"""Worker processes that end with their parent, however it ends."""
+"""Worker processes that exit whenever their parent does."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Result = TypeVar("Result")
 
 
 def worker_pool(workers: int, cores: Sequence[int] | None = None) -> ProcessPoolExecutor:
-    """Return a pool of new processes that end silently on Ctrl-C, and with their parent if it is killed.
+    """Return a pool of spawned processes that exit silently on Ctrl-C, and when their parent is killed.
 
-    Each may use one of ``cores``; None: any.
+    Each is bound to one of ``cores``; None: to no core.
     """
     processes = multiprocessing.get_context("spawn")
     free: Any = None
@@ -32,17 +32,17 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> ProcessPool
 def one_core_each(
     call: Callable[[Task], Result], tasks: Sequence[Task], cores: int | None = None
 ) -> Iterator[tuple[Task, Result]]:
-    """Call an importable function with each task in a process that has one core; yield results as they finish.
+    """Call an importable function with each task in a single-core process; yield results as they finish.
 
-    Trainings that run side by side neither wait for each other nor change each other's results. At most ``cores`` cores
-    are used; None: all that this process may use.
+    Parallel tasks neither wait for each other nor change each other's results. At most ``cores`` cores are used; None:
+    all cores of this process.
     """
-    known = sorted(os.sched_getaffinity(0))[:cores]
-    with worker_pool(len(known), known) as pool:
-        waiting = {pool.submit(call, task): task for task in tasks}
+    available = sorted(os.sched_getaffinity(0))[:cores]
+    with worker_pool(len(available), available) as pool:
+        futures = {pool.submit(call, task): task for task in tasks}
         try:
-            for done in as_completed(waiting):
-                yield waiting[done], done.result()
+            for future in as_completed(futures):
+                yield futures[future], future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -59,11 +59,11 @@ def _start(free: Any) -> None:
         os.sched_setaffinity(0, {free.get()})
     # On Ctrl-C workers die at once and silently; the parent cleans up.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
-def _die_with_parent() -> None:
-    # A parent that is killed cannot stop its workers, and they would wait for work for ever.
+def _exit_with_parent() -> None:
+    # A killed parent cannot stop its workers, which would wait for work forever.
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -15,17 +15,17 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
-from drivax.learning.algorithms.optimisers import check_falling, clipped_adam
+from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
     Experience,
     ExperienceConfig,
     ExpertActions,
     expert_actions,
-    recorded,
+    require_log,
     sample_steps,
 )  # fmt: skip
-from drivax.learning.program import divided
+from drivax.learning.program import shard_axis
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
@@ -38,7 +38,7 @@ Carry = tuple[Any, Any]
 
 
 @runtime_checkable
-class Demonstrated(Environment, Protocol):
+class ExpertEnvironment(Environment, Protocol):
     """An environment whose data hold actions of an expert."""
 
     def demonstrations(self, data: Any, key: Array, count: int) -> ExpertActions:
@@ -55,9 +55,9 @@ class Cloning:
             the expert's action, which also fits the standard deviation.
         batch: Logged steps per update.
         updates: Updates per iteration.
-        learning_rate, last_rate: The rate of Adam falls linearly to ``last_rate`` times itself; 1: constant.
-        falling: Share of the run over which it falls; then it stays.
-        gradient_norm: Gradients are clipped to this global norm; None: no clipping.
+        learning_rate, last_rate: Initial learning rate of Adam, and the final one relative to it; 1: constant.
+        falling: Share of the run over which the rate decays linearly; it is constant afterwards.
+        gradient_norm: Maximum global norm of the gradient; None: no clipping.
         mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
     """
 
@@ -73,7 +73,7 @@ class Cloning:
     def __post_init__(self) -> None:
         if self.batch < 1 or self.updates < 1:
             raise ValueError("batch and updates are at least 1")
-        check_falling(self.falling)
+        check_decay_share(self.falling)
 
     def optimiser(self, updates: int) -> optax.GradientTransformation:
         """Return the optimiser of a run of ``updates``."""
@@ -81,15 +81,15 @@ class Cloning:
         return clipped_adam(self.learning_rate, self.gradient_norm, updates=updates, last=self.last_rate)
 
     def batch_loss(
-        self, policy: PolicyFunction, parameters: Any, environment: Demonstrated, data: Any, key: Array
+        self, policy: PolicyFunction, parameters: Any, environment: ExpertEnvironment, data: Any, key: Array
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
         """Return the imitation loss on a random batch of expert actions, and values to log."""
         if isinstance(data, Experience):
             index = sample_steps(data.policy or data.critic, key, (self.batch,))
-            batch = expert_actions(recorded(environment), data, index)
+            batch = expert_actions(require_log(environment), data, index)
         else:
             batch = environment.demonstrations(data, key, self.batch)
-        observation, action, clipped = divided(batch, axis=0)
+        observation, action, clipped = shard_axis(batch, axis=0)
         return self.imitation_loss(policy(parameters, observation), action, ~(clipped & self.mask_clipped))
 
     def imitation_loss(
@@ -111,7 +111,7 @@ class Cloning:
     def run_updates(
         self, carry: Carry, optimiser: optax.GradientTransformation, loss: AuxiliaryLoss, key: Array
     ) -> tuple[Carry, dict[str, Array]]:
-        """Take the updates of one iteration, and return the means of what the loss logs."""
+        """Take the updates of one iteration, and return the mean of each logged value."""
 
         def update(carry: Carry, key: Array) -> tuple[Carry, dict[str, Array]]:
             return imitation_update(carry, optimiser, lambda parameters: loss(parameters, key))
@@ -145,7 +145,7 @@ class BcConfig(Cloning):
 
 @record
 class BcState:
-    """Everything that a run needs to continue."""
+    """State of a run."""
 
     parameters: Any
     optimiser: Any
@@ -157,11 +157,11 @@ class Bc:
     """Behaviour cloning in one environment."""
 
     def __init__(self, config: BcConfig, environment: Environment, data: Any, iterations: int) -> None:
-        self.config, self.environment, self.batch = config, demonstrated(environment), config.batch
+        self.config, self.environment, self.batch = config, require_expert(environment), config.batch
         check_loss(config, config.network)
         self.spec = environment.shapes(data)
         self.optimiser = config.optimiser(iterations * config.updates)
-        # Structure only: no number is drawn.
+        # Traced only: no random numbers are drawn.
         self.graph = nnx.graphdef(nnx.eval_shape(lambda: self._network(jax.random.key(0))))
 
     def _network(self, key: Array) -> Policy:
@@ -201,7 +201,7 @@ def imitation_update(
     optimiser: optax.GradientTransformation,
     loss: Callable[[Any], tuple[Array, dict[str, Array]]],
 ) -> tuple[Carry, dict[str, Array]]:
-    """Take one gradient step, and return what the loss logs."""
+    """Take one gradient step, and return the values that the loss logs."""
     parameters, state = carry
     (_, logs), gradient = jax.value_and_grad(loss, has_aux=True)(parameters)
     logs["imitation_gradient_norm"] = optax.tree.norm(gradient)
@@ -209,16 +209,16 @@ def imitation_update(
     return (optax.apply_updates(parameters, change), state), logs
 
 
-def demonstrated(environment: Environment) -> Demonstrated:
-    """Return the environment; raises UsageError if it has no expert actions."""
-    if not isinstance(environment, Demonstrated):
+def require_expert(environment: Environment) -> ExpertEnvironment:
+    """Return an environment with expert actions; raises UsageError for any other."""
+    if not isinstance(environment, ExpertEnvironment):
         problem = f"{type(environment).__name__} has no expert to imitate"
         raise UsageError(problem, cure="implement `demonstrations`")
     return environment
 
 
 def check_loss(cloning: Cloning, network: NetworkConfig) -> None:
-    """Raise UsageError for a squared error of a mode without gradient: of levels or mixtures."""
+    """Raise UsageError for the loss ``mse`` of a grid or mixture policy, whose mode has no gradient."""
     if cloning.loss == "mse" and network.distribution not in REPARAMETRISED:
         problem = f"the mode of {network.distribution!r} has no gradient for the loss 'mse'"
         raise UsageError(problem, cure="use loss: likelihood")

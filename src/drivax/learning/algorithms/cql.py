@@ -21,7 +21,7 @@ from drivax.networks.distributions import Distribution
 from drivax.rl.equations import conservative_penalty, penalty_weight_loss, scaled_policy_loss, td_target
 
 #: Largest logarithm of the Lagrange multiplier.
-_LARGEST_WEIGHT = math.log(1e6)
+_MAX_LOG_WEIGHT = math.log(1e6)
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class CqlConfig(OfflineConfig):
     """CQL(H), with ``imitation`` above 0 also a behaviour cloning term in the policy's loss.
 
     Attributes:
-        penalty: Weight of the conservative penalty relative to half the squared TD error; with a ``gap`` the first one.
+        penalty: Weight of the conservative penalty relative to half the squared TD error; initial with a ``gap``.
         gap: Target penalty of a Lagrange multiplier that replaces the weight; None: constant weight.
         penalty_rate: Learning rate of the multiplier.
-        actions: Actions that the penalty samples from each distribution: uniform, and the policy at the state.
-        next_actions: Sample the penalty's actions from the policy at the next state, too.
-        backup_actions: Actions of the policy at the next state; the highest value (of the smaller critic) is backed up.
-            A single one has on average less value than the expert's next action, which accumulates over steps.
-        importance: Divide each by its density; otherwise the logged action is among the actions instead.
+        actions: Number of actions that the penalty samples from each distribution: uniform, and the current policy.
+        next_actions: Also sample the penalty's actions from the policy at the next state.
+        backup_actions: Number of actions sampled at the next state; the highest value (of the smaller critic) is backed
+            up. A single one has on average less value than the expert's action, an error that accumulates over steps.
+        importance: Weight sampled actions by their inverse density; otherwise add the logged action to them.
         penalty_temperature: Temperature of the penalty's soft maximum.
         imitation: Weight of the squared error of the policy's mode from the expert's action. Above 0, the policy's loss
             is divided by the mean absolute Q, so that the weight does not depend on the scale of rewards.
@@ -68,7 +68,7 @@ class CqlConfig(OfflineConfig):
             raise UsageError(problem, cure="use more than 0")
         if self.penalty < 0.0 or self.imitation < 0.0 or (self.gap is not None and self.penalty == 0.0):
             problem = "penalty or imitation is negative, or penalty is 0 with a gap"
-            raise UsageError(problem, cure="use 0 or more, and with a gap more than 0")
+            raise UsageError(problem, cure="use 0 or more, or more than 0 with a gap")
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Cql:
         """Return CQL in an environment."""
@@ -116,7 +116,7 @@ class Cql(Offline[CqlConfig]):
         td = td_target(batch.reward, next_value, batch.terminated, self.config.gamma)
         policy = self.distribution(parameters, batch.observation)
         action, log_density = self._penalty_actions(policy, next_policy, batch.action, sample_key)
-        # In one call, so that each observation is encoded, and its gradient taken, once.
+        # In one call, so that each observation is encoded and differentiated once.
         actions = jnp.concatenate([batch.action[None], action])
         q_values = self.q_values(trained["critic"], batch.observation, actions)
         q, sampled_q = q_values[:, 0], jnp.moveaxis(q_values[:, 1:], 1, 0)
@@ -135,7 +135,7 @@ class Cql(Offline[CqlConfig]):
     def _penalty_actions(
         self, policy: Distribution, next_policy: Distribution, logged: Float[Array, "B D"], key: Array
     ) -> tuple[Float[Array, "K B D"], Float[Array, "K B"]]:
-        """Actions of the penalty and their log-densities, 0 without importance weights."""
+        """Return the penalty's actions and their log-densities, 0 without importance weights."""
         config = self.config
         uniform_key, policy_key, next_key = jax.random.split(key, 3)
         shape = (config.actions, *logged.shape)
@@ -152,10 +152,10 @@ class Cql(Offline[CqlConfig]):
         return stacked, jnp.zeros(stacked.shape[:-1])
 
     def _penalty_weight(self, trained: Trained, penalty: Array) -> tuple[Array, Array]:
-        """The penalty's weight, without gradient, and the loss that moves it."""
+        """Return the penalty's weight, without gradient, and the loss of its multiplier."""
         if self.config.gap is None:
             return jnp.asarray(self.config.penalty), jnp.zeros(())
-        log_weight = jnp.minimum(trained["log_penalty"], _LARGEST_WEIGHT)
+        log_weight = jnp.minimum(trained["log_penalty"], _MAX_LOG_WEIGHT)
         loss = jnp.mean(penalty_weight_loss(log_weight, penalty, self.config.gap))
         return jax.lax.stop_gradient(jnp.exp(log_weight)), loss
 

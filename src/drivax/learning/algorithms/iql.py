@@ -26,9 +26,9 @@ class IqlConfig(OfflineConfig):
     """IQL.
 
     Attributes:
-        expectile: Expectile of Q that the value regresses to: 0.5 the mean, toward 1 the best logged action.
+        expectile: Expectile of Q that the value regresses to: 0.5 is the mean, 1 the best logged action.
         inverse_temperature: ``beta`` of the imitation weights ``exp(beta A)``; 0: uniform weights.
-        largest_weight: Bound that weights are clipped to.
+        largest_weight: Upper bound of the weights.
         loss: Imitation loss: ``likelihood``, as published, or ``mse`` of the mode, in action units.
     """
 
@@ -41,7 +41,7 @@ class IqlConfig(OfflineConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.0 < self.expectile < 1.0:
-            raise UsageError(f"an expectile of {self.expectile:g}", cure="use more than 0 and less than 1")
+            raise UsageError(f"expectile is {self.expectile:g}", cure="use more than 0 and less than 1")
         if self.inverse_temperature < 0.0 or self.largest_weight <= 0.0:
             problem = "inverse_temperature or largest_weight is too small"
             raise UsageError(problem, cure="use 0 or more, and a largest_weight above 0")
@@ -62,7 +62,7 @@ class Iql(Offline[IqlConfig]):
         return super().networks(key) | {"value": Value(self.network, self.spec, nnx.Rngs(value_key))}
 
     def optimisers(self) -> dict[Hashable, optax.GradientTransformation]:
-        """Return the optimisers; the value has that of the critics."""
+        """Return the optimisers; the value uses the critics' learning rate."""
         return super().optimisers() | {"value": self.adam(self.config.critic_rate)}
 
     def loss(

@@ -35,19 +35,19 @@ class OffPolicyConfig(Protocol):
 
     @property
     def tau(self) -> float:
-        """Step of target networks per update."""
+        """Polyak averaging rate of target networks."""
         ...
 
 
 Config = TypeVar("Config", bound=OffPolicyConfig)
-#: Everything that gradients change: networks and scalars, by name (``trained["policy"]``).
+#: Trained networks and scalars, by name (``trained["policy"]``).
 Trained = Any
-#: What is trained, target networks by name, and the optimiser's state.
+#: Trained parameters, target networks by name, and the optimiser's state.
 Carry = tuple[Trained, dict[str, Any], Any]
 
 
 class SoftActor(NamedTuple):
-    """The losses of a soft actor, and their ingredients."""
+    """Losses of a soft actor, with the policy and Q values that they use."""
 
     policy: Distribution
     q_values: Float[Array, "2 B"]
@@ -76,7 +76,7 @@ class OffPolicy(Generic[Config]):
     def __init__(self, config: Config, environment: Environment, data: Any) -> None:
         self.config, self.environment = config, environment
         self.spec = environment.shapes(data)
-        # Structures only: no number is drawn.
+        # Traced only: no random numbers are drawn.
         networks = nnx.eval_shape(lambda: self.networks(jax.random.key(0)))
         self.graphs = {name: nnx.graphdef(network) for name, network in networks.items()}
 
@@ -108,8 +108,8 @@ class OffPolicy(Generic[Config]):
         """Return the policy as a planner."""
         return NetworkPlanner(parameters, self.graphs["policy"], name, samples)
 
-    #: From what is trained, target networks and a batch to the sum of all losses, each of which reaches its own
-    #: parameters only, and values to log.
+    #: Map trained parameters, target networks and a batch to the sum of all losses and values to log; the gradient of
+    #: each loss reaches only its own parameters.
     loss: Callable[..., tuple[Array, dict[str, Array]]]
 
     def update_networks(self, carry: Carry, *batch: Any) -> tuple[Carry, dict[str, Array]]:

@@ -17,18 +17,18 @@ from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
 from drivax.learning.algorithms.off_policy import Carry, OffPolicy, Trained, squared_error
-from drivax.learning.algorithms.optimisers import check_falling, clipped_adam
+from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
     Experience,
     ExperienceConfig,
-    Recorded,
+    LoggedEnvironment,
     expert_actions,
-    recorded,
+    require_log,
     sample_steps,
     transitions,
 )
-from drivax.learning.program import divided
+from drivax.learning.program import shard_axis
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Critic, NetworkConfig
 from drivax.networks.distributions import REPARAMETRISED, Actions
@@ -45,11 +45,11 @@ class FittedQConfig:
     """Settings of fitted-Q evaluation on held-out steps, at every validation.
 
     Attributes:
-        updates: Updates of a new critic at each validation; 0: no such evaluation.
+        updates: Updates of a new critic at each validation; 0: no fitted-Q evaluation.
         batch: Steps per update.
-        rate: Learning rate of Adam, falling linearly to a tenth.
-        tau: Step of the target critic per update.
-        gradient_norm: Gradients are clipped to this global norm.
+        rate: Initial learning rate of Adam; decays linearly to a tenth.
+        tau: Polyak averaging rate of the target critic.
+        gradient_norm: Maximum global norm of the gradient.
     """
 
     updates: int = 0
@@ -69,20 +69,18 @@ class FittedQ:
 
     config: FittedQConfig
     network: NetworkConfig
-    environment: Recorded
+    environment: LoggedEnvironment
     gamma: float
 
     def value(
-        self,
-        data: Experience,
-        act: Callable[[dict[str, Array]], Float[Array, "B D"]],
+        self, data: Experience, act: Callable[[dict[str, Array]], Float[Array, "B D"]],
         statistics: Statistics = MappingProxyType({}),
-    ) -> Float[Array, ""]:
-        """Return the estimated discounted return of a policy from where episodes begin.
+    ) -> Float[Array, ""]:  # fmt: skip
+        """Return the estimated discounted return of a policy from the start of episodes.
 
         The critic learns ``Q(s, a) = r + gamma (1 - terminated) Q'(s', pi(s'))`` from logged steps; the result is the
-        mean of ``Q(s, pi(s))`` over the first usable step of every scenario. Draws are the same in every call.
-        ``statistics`` are those of features, if the network normalises them.
+        mean of ``Q(s, pi(s))`` over the first usable step of every scenario. Every call draws the same steps.
+        ``statistics`` normalise the features, if the network does.
         """
         network_key, key = jax.random.split(jax.random.key(0))
         actions = Actions(self.environment.action_size, self.environment.levels)
@@ -131,11 +129,11 @@ class OfflineConfig:
         batch: Steps per update.
         updates: Updates per iteration.
         gamma: Discount.
-        tau: Step of target networks per update.
-        policy_rate, critic_rate: Learning rates of Adam; a value network has that of the critics.
-        last_rate: Both fall linearly to ``last_rate`` times the first; 1: constant.
-        falling: Share of the run over which they fall; then they stay.
-        gradient_norm: Gradients of each network are clipped to this global norm.
+        tau: Polyak averaging rate of target networks.
+        policy_rate, critic_rate: Initial learning rates of Adam; a value network uses that of the critics.
+        last_rate: Final learning rates relative to the initial ones; 1: constant.
+        falling: Share of the run over which the rates decay linearly; they are constant afterwards.
+        gradient_norm: Maximum global norm of each network's gradient.
         normalise: Normalise every feature of an observation by its mean and standard deviation over logged steps.
         fitted_q: Fitted-Q evaluation on held-out steps, for ``checkpoint_rule: fitted_q``.
     """
@@ -157,7 +155,7 @@ class OfflineConfig:
     def __post_init__(self) -> None:
         if self.batch < 1 or self.updates < 1:
             raise ValueError("batch and updates are at least 1")
-        check_falling(self.falling)
+        check_decay_share(self.falling)
 
     @property
     def steps_per_iteration(self) -> int:
@@ -176,15 +174,15 @@ class OfflineConfig:
         return replace(self.network, encoder=NormalisedConfig(self.network.encoder))
 
     def check_gradient(self) -> None:
-        """Raise UsageError for a policy without a gradient through its actions: of levels or mixtures."""
+        """Raise UsageError for a grid or mixture policy, whose actions have no gradient."""
         if self.network.distribution not in REPARAMETRISED:
             problem = f"{type(self).__name__} needs a policy with a gradient through its actions"
-            raise UsageError(problem, cure="use gaussian or beta; iql and bc learn all")
+            raise UsageError(problem, cure="use gaussian or beta; iql and bc take any distribution")
 
 
 @record
 class OfflineState:
-    """Everything that a run needs to continue; ``rest`` is all that is trained in addition to the policy, by name."""
+    """State of a run; ``rest`` holds all that is trained in addition to the policy, by name."""
 
     networks: ClassVar[tuple[str, ...]] = ("parameters", "rest", "target")
 
@@ -197,15 +195,15 @@ class OfflineState:
 
 
 Config = TypeVar("Config", bound=OfflineConfig)
-#: Observations of the steps that the policy is improved at, and the expert's actions.
+#: Observations of the steps for policy improvement, and the expert's actions.
 PolicyBatch = tuple[dict[str, Array], Float[Array, "B D"]]
 
 
 class Offline(OffPolicy[Config]):
     """An offline algorithm in one environment.
 
-    A batch of :meth:`loss` holds the steps that values are learned from, those that the policy is improved at (the same
-    unless weights are for the policy alone), and a key.
+    :meth:`loss` takes the steps for policy evaluation, those for policy improvement (the same unless weights are for
+    the policy alone), and a key.
     """
 
     def __init__(self, config: Config, environment: Environment, data: Any, iterations: int) -> None:
@@ -220,7 +218,7 @@ class Offline(OffPolicy[Config]):
         return self.config.networks
 
     def scalars(self) -> dict[str, float]:
-        """Return initial values of scalars that are trained too."""
+        """Return the initial values of trainable scalars."""
         return {}
 
     def optimisers(self) -> dict[Hashable, optax.GradientTransformation]:
@@ -228,7 +226,7 @@ class Offline(OffPolicy[Config]):
         return {"policy": self.adam(self.config.policy_rate), "critic": self.adam(self.config.critic_rate)}
 
     def adam(self, rate: float, every: int = 1) -> optax.GradientTransformation:
-        """Return Adam for a network that is updated in every n-th update."""
+        """Return Adam for a network that every n-th update changes."""
         config = self.config
         updates = round(config.falling * self.updates) // every if config.last_rate != 1.0 else 0
         return clipped_adam(rate, config.gradient_norm, updates=updates, last=config.last_rate)
@@ -237,7 +235,7 @@ class Offline(OffPolicy[Config]):
         """Return the first state."""
         network_key, key = jax.random.split(key)
         networks = self.networks(network_key)
-        # Loading a policy needs shapes of its parameters only, and has no experience.
+        # Loading a policy only needs shapes of its parameters, and has no experience.
         if self.config.normalise and isinstance(data, Experience):
             statistics = self._statistics(data)
             for network in networks.values():
@@ -246,7 +244,7 @@ class Offline(OffPolicy[Config]):
         trained |= {name: jnp.asarray(value, jnp.float32) for name, value in self.scalars().items()}
         return OfflineState(
             parameters=trained["policy"],
-            rest=_rest(trained),
+            rest=_without_policy(trained),
             target={name: jax.tree.map(jnp.copy, trained[name]) for name in self.targets},
             optimiser=self.optimiser.init(trained),
             key=key,
@@ -264,28 +262,32 @@ class Offline(OffPolicy[Config]):
         first = ({"policy": state.parameters, **state.rest}, state.target, state.optimiser)
         keys = jax.random.split(update_key, self.config.updates)
         (trained, target, optimiser), logs = jax.lax.scan(update, first, keys)
-        after = OfflineState(trained["policy"], _rest(trained), target, optimiser, key, state.iteration + 1)
+        after = OfflineState(
+            trained["policy"], _without_policy(trained), target, optimiser, key, state.iteration + 1
+        )
         return after, {f"loss/{name}": value.mean() for name, value in logs.items()} | data.sizes()
 
     def _draw(self, data: Experience, key: Array) -> tuple[Transitions, PolicyBatch]:
-        """Draw steps to learn values from, and steps to improve the policy at."""
-        environment, count = recorded(self.environment), (self.config.batch,)
+        """Draw the steps for policy evaluation and those for policy improvement."""
+        environment, count = require_log(self.environment), (self.config.batch,)
         critic_key, policy_key = jax.random.split(key)
-        batch = divided(transitions(environment, data, sample_steps(data.critic, critic_key, count)), axis=0)
+        batch = shard_axis(
+            transitions(environment, data, sample_steps(data.critic, critic_key, count)), axis=0
+        )
         if data.policy is None:
             return batch, (batch.observation, batch.action)
         drawn = expert_actions(environment, data, sample_steps(data.policy, policy_key, count))
-        observation, action, _ = divided(drawn, axis=0)
+        observation, action, _ = shard_axis(drawn, axis=0)
         return batch, (observation, action)
 
     def _statistics(self, data: Experience) -> Statistics:
-        """Statistics of features over uniformly drawn steps, the same for every seed."""
+        """Return feature statistics over uniformly drawn steps, the same for every seed."""
         index = sample_steps(data.uniform, jax.random.key(0), (_SAMPLES // _BATCH, _BATCH))
-        observe = partial(recorded(self.environment).observe_recorded, data.data)
+        observe = partial(require_log(self.environment).observe_recorded, data.data)
         return feature_statistics(jax.lax.map(observe, index))
 
     def held_out_metrics(self, data: Experience, state: OfflineState) -> dict[str, float]:
-        """Return ``mean_q``: the smaller critic's value of the policy's mode, always over the same held-out steps.
+        """Return ``mean_q``: the smaller critic's value of the policy's mode over a fixed set of held-out steps.
 
         Overestimation raises it, too. ``fitted_q``, if configured, is the return that :class:`FittedQ` estimates.
         """
@@ -297,19 +299,19 @@ class Offline(OffPolicy[Config]):
     @partial(jax.jit, static_argnums=0)
     def _mean_q(self, data: Experience, policy: Any, critic: Any) -> Float[Array, ""]:
         index = sample_steps(data.critic, jax.random.key(0), (_SAMPLES,))
-        observation = recorded(self.environment).observe_recorded(data.data, index)
+        observation = require_log(self.environment).observe_recorded(data.data, index)
         action = self.distribution(policy, observation).mode()
         return jnp.mean(jnp.min(self.q_values(critic, observation, action), axis=0))
 
     @partial(jax.jit, static_argnums=0)
     def _fitted_q(self, data: Experience, policy: Any) -> Float[Array, ""]:
         config = self.config
-        evaluation = FittedQ(config.fitted_q, config.networks, recorded(self.environment), config.gamma)
+        evaluation = FittedQ(config.fitted_q, config.networks, require_log(self.environment), config.gamma)
         statistics = self._statistics(data) if config.normalise else {}
         return evaluation.value(
             data, lambda observation: self.distribution(policy, observation).mode(), statistics
         )
 
 
-def _rest(trained: Trained) -> Trained:
+def _without_policy(trained: Trained) -> Trained:
     return {name: value for name, value in trained.items() if name != "policy"}

@@ -23,7 +23,7 @@ from drivax.learning.environment import (
     collect,
     transition,
 )
-from drivax.learning.program import divided
+from drivax.learning.program import shard_axis
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
@@ -40,12 +40,12 @@ class PpoConfig:
         environments: Environments in parallel.
         unroll: Steps per environment and iteration.
         epochs, minibatches: Passes over the rollout, and updates per pass.
-        learning_rate, last_rate: The rate of Adam falls linearly over the run to ``last_rate`` times itself.
+        learning_rate, last_rate: Initial learning rate of Adam, and the final one relative to it; the decay is linear.
         gamma, lambda_: Discount, and decay of generalised advantages.
-        clip: Bound of the probability ratio's distance from 1.
+        clip: Clipping range of the probability ratio around 1.
         value_coefficient, entropy_coefficient: Weights in the loss.
-        gradient_norm: Gradients are clipped to this global norm (None: no clipping), separately for policy and value
-            unless they share an encoder.
+        gradient_norm: Maximum global norm of gradients (None: no clipping), separately for policy and value unless they
+            share an encoder.
     """
 
     kind: Literal["ppo"] = "ppo"
@@ -82,7 +82,7 @@ class PpoConfig:
 
 @record
 class PpoState:
-    """Everything that a run needs to continue: networks, optimiser, environments, key and step."""
+    """State of a run: networks, optimiser, environments, key and step."""
 
     networks: ClassVar[tuple[str, ...]] = ("parameters",)
 
@@ -161,7 +161,7 @@ class Ppo:
 
     def sample_action(self, state: PpoState, observation: Any, key: Array) -> SampledAction:
         """Sample the policy, with log-probabilities and values as extras."""
-        policy, value = self.network(state.parameters).both(observation)
+        policy, value = self.network(state.parameters).policy_and_value(observation)
         raw_action = policy.sample(key)
         extra = {"log_prob": policy.log_prob(raw_action), "value": value}
         return SampledAction(raw_action, policy.action(raw_action), extra)
@@ -186,7 +186,7 @@ class Ppo:
             order = jax.random.permutation(order_key, config.steps_per_iteration)
             order = order.reshape(config.minibatches, -1)
             # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
-            shuffled = divided(jax.tree.map(lambda leaf: leaf[order], batch), axis=1)
+            shuffled = shard_axis(jax.tree.map(lambda leaf: leaf[order], batch), axis=1)
             keys = jax.random.split(noise_key, config.minibatches)
             return jax.lax.scan(update, carry, (shuffled, keys))
 
@@ -231,7 +231,7 @@ class Ppo:
         def mean(value: Array) -> Array:
             return jnp.sum(value * alive) / jnp.maximum(jnp.sum(alive), 1.0)
 
-        policy, value = self.network(parameters).both(minibatch["observation"])
+        policy, value = self.network(parameters).policy_and_value(minibatch["observation"])
         log_prob = policy.log_prob(minibatch["raw_action"])
         centre = mean(minibatch["advantage"])
         deviation = jnp.sqrt(mean((minibatch["advantage"] - centre) ** 2)) + 1e-8

@@ -24,8 +24,8 @@ from drivax.learning.environment import (
     Outcome,
     Rollout,
     SampledAction,
+    any_across_learners,
     collect,
-    in_any,
     transition,
 )
 from drivax.learning.replay import Replay, ReplayBuffer, ReplayConfig, ReplayIndex, Transitions
@@ -47,13 +47,13 @@ class SacConfig:
         updates_per_step: Updates per step of all environments.
         batch: Steps per update.
         warm_up: Steps before the first update.
-        explore: Actions before the first update: uniform, or of the policy.
+        explore: Actions before the first update: ``uniform``, or sampled from the ``policy``.
         policy_rate, critic_rate, temperature_rate: Learning rates of Adam.
         gamma: Discount.
-        tau: Step of the target critics per update.
+        tau: Polyak averaging rate of the target critics.
         temperature: Initial temperature.
         target_entropy: Target entropy of the policy; by default minus the size of an action.
-        gradient_norm: Gradients of the policy and of the critics are clipped to this global norm; None: no clipping.
+        gradient_norm: Maximum global norm of the gradients of policy and critics; None: no clipping.
     """
 
     kind: Literal["sac"] = "sac"
@@ -99,8 +99,8 @@ class SacConfig:
 
 
 @record
-class Trained:
-    """Everything that gradients change."""
+class SacParameters:
+    """Parameters of all networks, and the temperature."""
 
     policy: Any
     critic: Any
@@ -112,7 +112,7 @@ class Trained:
 
 @record
 class SacState:
-    """Everything that a run needs to continue; ``parameters`` are the policy's."""
+    """State of a run; ``parameters`` are the policy's."""
 
     networks: ClassVar[tuple[str, ...]] = ("parameters", "critic", "target")
 
@@ -139,7 +139,7 @@ class Sac(OffPolicy[SacConfig]):
             "critic": clipped_adam(config.critic_rate, config.gradient_norm),
             "temperature": optax.adam(config.temperature_rate),
         }
-        self.optimiser = optax.partition(optimisers, Trained("policy", "critic", "temperature"))
+        self.optimiser = optax.partition(optimisers, SacParameters("policy", "critic", "temperature"))
 
     def init(self, data: Any, key: Array) -> SacState:
         """Return the first state."""
@@ -148,7 +148,7 @@ class Sac(OffPolicy[SacConfig]):
         policy, critic = (nnx.state(networks[name], nnx.Param) for name in ("policy", "critic"))
         log_temperature = jnp.asarray(math.log(self.config.temperature), jnp.float32)
         environments = self.environment.start(data, environment_key, self.config.environments)
-        trained: Any = Trained(policy, critic, log_temperature)
+        trained: Any = SacParameters(policy, critic, log_temperature)
         return SacState(
             parameters=policy,
             critic=critic,
@@ -211,7 +211,7 @@ class Sac(OffPolicy[SacConfig]):
         config = self.config
         _, draw_key, update_key, key = jax.random.split(state.key, 4)
         before = state.iteration * config.steps_per_iteration
-        trained = Trained(state.parameters, state.critic, state.log_temperature)
+        trained = SacParameters(state.parameters, state.critic, state.log_temperature)
         first: Carry = (trained, {"critic": state.target}, state.optimiser)
 
         @jax.jit  # so that the shapes of its logs do not trace it a second time
@@ -228,7 +228,7 @@ class Sac(OffPolicy[SacConfig]):
             return carry, _sums(logs)
 
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(learn)[1])
-        warm = in_any(before + config.steps_per_iteration >= config.warm_up)
+        warm = any_across_learners(before + config.steps_per_iteration >= config.warm_up)
         (trained, target, optimiser), losses = jax.lax.cond(warm, learn, lambda: (first, zeros))
         after = SacState(
             trained.policy, trained.critic, trained.log_temperature, target["critic"], optimiser, state.replay,
@@ -237,13 +237,9 @@ class Sac(OffPolicy[SacConfig]):
         return after, losses
 
     def loss(
-        self,
-        trained: Trained,
-        target: Any,
-        batch: Transitions,
-        key: Array,
+        self, trained: SacParameters, target: Any, batch: Transitions, key: Array,
         auxiliary_loss: AuxiliaryLoss | None,
-    ) -> tuple[Array, dict[str, Array]]:
+    ) -> tuple[Array, dict[str, Array]]:  # fmt: skip
         """Return the sum of the losses of critics, policy and temperature."""
         next_key, key, auxiliary_key = jax.random.split(key, 3)
         next_policy = self.distribution(trained.policy, batch.next_observation)

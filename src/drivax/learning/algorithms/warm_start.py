@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from drivax.errors import UsageError
-from drivax.learning.algorithms.behaviour_cloning import Cloning, check_loss, demonstrated
+from drivax.learning.algorithms.behaviour_cloning import Cloning, check_loss, require_expert
 from drivax.learning.algorithms.ppo import Ppo, PpoConfig
 from drivax.learning.algorithms.sac import Sac, SacConfig
-from drivax.learning.environment import Environment, in_any
+from drivax.learning.environment import Environment, any_across_learners
 from drivax.planners.planner import Planner
 from drivax.scenario.record import record
 
@@ -42,7 +42,7 @@ class WarmStart:
         if min(self.iterations, self.settle, self.half_life) < 0 or self.weight < 0.0:
             raise UsageError("a setting of warm_start is negative", cure="use 0 or more")
 
-    def remaining(self, iterations: int) -> int:
+    def online_iterations(self, iterations: int) -> int:
         """Return the iterations of a run after pretraining; raises UsageError if none are left."""
         if iterations <= self.iterations:
             cure = "raise total_steps, or lower warm_start.iterations"
@@ -51,10 +51,12 @@ class WarmStart:
 
     def build(
         self, config: SacConfig | PpoConfig, environment: Environment, data: Any, iterations: int
-    ) -> WarmStarted:
+    ) -> WarmStartLearner:
         """Return the learner of a run of ``iterations``."""
         check_loss(self.cloning, config.network)
-        return WarmStarted(self, config.build(environment, data, self.remaining(iterations)), environment)
+        return WarmStartLearner(
+            self, config.build(environment, data, self.online_iterations(iterations)), environment
+        )
 
     def weight_at(self, iteration: Int[Array, ""]) -> Float[Array, ""]:
         """Return the imitation weight, given the iterations since pretraining."""
@@ -76,7 +78,7 @@ class BcSacConfig:
         """Environment steps of one iteration."""
         return self.sac.steps_per_iteration
 
-    def build(self, environment: Environment, data: Any, iterations: int) -> WarmStarted:
+    def build(self, environment: Environment, data: Any, iterations: int) -> WarmStartLearner:
         """Return behaviour cloning, then SAC, in an environment."""
         return self.warm_start.build(self.sac, environment, data, iterations)
 
@@ -94,7 +96,7 @@ class BcPpoConfig:
         """Environment steps of one iteration."""
         return self.ppo.steps_per_iteration
 
-    def build(self, environment: Environment, data: Any, iterations: int) -> WarmStarted:
+    def build(self, environment: Environment, data: Any, iterations: int) -> WarmStartLearner:
         """Return behaviour cloning, then PPO, in an environment."""
         return self.warm_start.build(self.ppo, environment, data, iterations)
 
@@ -111,11 +113,11 @@ class WarmStartState:
     iteration: Array
 
 
-class WarmStarted:
+class WarmStartLearner:
     """A learner after a phase of behaviour cloning."""
 
     def __init__(self, config: WarmStart, online: Ppo | Sac, environment: Environment) -> None:
-        self.config, self.online, self.environment = config, online, demonstrated(environment)
+        self.config, self.online, self.environment = config, online, require_expert(environment)
         self.optimiser = config.cloning.optimiser(config.iterations * config.cloning.updates)
         # Jitted, so that the names of logs do not trace them a second time.
         self._phases = jax.jit(self._clone), jax.jit(self._learn)
@@ -140,7 +142,7 @@ class WarmStarted:
             leaves = {name: leaf for logged in shapes for name, leaf in logged.items()}
             return after, {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in leaves.items()} | logs
 
-        cloning = in_any(state.iteration < self.config.iterations)
+        cloning = any_across_learners(state.iteration < self.config.iterations)
         return jax.lax.cond(cloning, *(partial(run, phase) for phase in self._phases))
 
     def _clone(self, data: Any, state: WarmStartState) -> tuple[WarmStartState, dict[str, Array]]:
@@ -149,7 +151,7 @@ class WarmStarted:
         carry, cloning = (state.parameters, state.optimiser), self.config.cloning
         carry, logs = cloning.run_updates(carry, self.optimiser, partial(self._imitation, data), update_key)
         learner = replace(state.learner, key=key)
-        return WarmStartState(carry[0], learner, carry[1], state.iteration + 1), _counted(logs)
+        return WarmStartState(carry[0], learner, carry[1], state.iteration + 1), _with_counts(logs)
 
     def _learn(self, data: Any, state: WarmStartState) -> tuple[WarmStartState, dict[str, Array]]:
         """Run an iteration of the learner, with the imitation loss if it has a weight."""
@@ -166,7 +168,7 @@ class WarmStarted:
             settling = state.learner.iteration < self.config.settle
             parameters = jax.tree.map(partial(jnp.where, settling), fixed, after.parameters)
             after = replace(after, parameters=parameters)
-        return self._state(after, state.optimiser, state.iteration + 1), _counted(logs)
+        return self._state(after, state.optimiser, state.iteration + 1), _with_counts(logs)
 
     def _imitation(self, data: Any, parameters: Any, key: Array) -> tuple[Array, dict[str, Array]]:
         policy, cloning = self.online.distribution, self.config.cloning
@@ -176,7 +178,7 @@ class WarmStarted:
         return WarmStartState(learner.parameters, replace(learner, parameters=()), optimiser, iteration)
 
 
-def _counted(logs: Mapping[str, Array]) -> dict[str, Array]:
+def _with_counts(logs: Mapping[str, Array]) -> dict[str, Array]:
     """Add a count of 1 to values without one, so that the other phase logs nothing for them."""
     means = [name for name in logs if not name.startswith("rollout/") and not name.endswith("/n")]
     return {**logs, **{f"{name}/n": jnp.ones(()) for name in means if f"{name}/n" not in logs}}

@@ -11,7 +11,7 @@ from pathlib import Path
 from drivax import settings
 from drivax.evaluation.comparison import Comparison
 from drivax.evaluation.plan import MetricComparison
-from drivax.evaluation.tables import MetricLabel, metric_label
+from drivax.evaluation.result_tables import MetricLabel, metric_label
 from drivax.files import check_output, write_text
 from drivax.report.pages.page import asset, facts_html, page, section
 from drivax.table import MISSING, Cell, Column, Table, bounds, interval_cell, number, suffix
@@ -69,11 +69,11 @@ def _picture(metric: MetricComparison, label: MetricLabel) -> str:
     mean, low, high = metric.difference.mean, metric.difference.low, metric.difference.high
     if mean is None or low is None or high is None or low == high:
         return ""
-    reach = 1.15 * max(abs(low), abs(high))
-    left, middle, right = (_WIDTH / 2 * (1 + value / reach) for value in (low, mean, high))
-    words = f"A − B: {number(mean, label.unit, signed=True)}, {bounds(metric.difference, label.unit, signed=True)}"
+    limit = 1.15 * max(abs(low), abs(high))
+    left, middle, right = (_WIDTH / 2 * (1 + value / limit) for value in (low, mean, high))
+    label_text = f"A − B: {number(mean, label.unit, signed=True)}, {bounds(metric.difference, label.unit, signed=True)}"
     return (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(words)}">'
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(label_text)}">'
         f'<line x1="{_WIDTH / 2}" x2="{_WIDTH / 2}" y1="2" y2="22"/>'
         f'<line class="span" x1="{left:.1f}" x2="{right:.1f}" y1="12" y2="12"/>'
         f'<circle cx="{middle:.1f}" cy="12" r="4"/>'
@@ -82,7 +82,7 @@ def _picture(metric: MetricComparison, label: MetricLabel) -> str:
 
 
 def _label(metric: MetricComparison) -> MetricLabel:
-    """Return how a metric is shown; the user's own metrics under their names, with their units."""
+    """Return the label of a metric; user-defined metrics keep their names and units."""
     known = metric_label(metric.metric)
     if known.explanation or not metric.unit:
         return known
@@ -92,7 +92,7 @@ def _label(metric: MetricComparison) -> MetricLabel:
 
 
 def _p_text(p: float | None) -> str:
-    """Return a p-value with three digits, or that it is below 0.001."""
+    """Format a p-value with three digits, or as ``< 0.001``."""
     return MISSING if p is None else "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
@@ -102,7 +102,7 @@ def effect_name(comparison: Comparison) -> str:
 
 
 def conditions(comparison: Comparison) -> str:
-    """Return what was compared: scenarios and traffic."""
+    """Describe the scenarios and the traffic of a comparison."""
     (a, b), (recordings_a, recordings_b) = comparison.scenarios, comparison.recordings
     traffic = f"{comparison.traffic} traffic"
     if comparison.plan.split == "paired":
@@ -158,11 +158,11 @@ def _test_sentence(comparison: Comparison) -> str:
     p = _p_text(metric.evidence.p)
     test = f"{bounds(metric.difference, label.unit, signed=True)}, p {p if p[0] == '<' else '= ' + p}"
     size = number(abs(metric.difference.mean), label.unit) + suffix(label.unit, signed=True)
-    more = "higher" if metric.difference.mean > 0 else "lower"
+    direction = "higher" if metric.difference.mean > 0 else "lower"
     if metric.winner is None:
-        return f"{label.text} is {size} {more} with A ({test}): it may be chance."
-    alone = f" The test alone favours {metric.winner}." if comparison.decision.because == "minimum" else ""
-    return f"{label.text} is {size} {more} with A ({test}).{alone}"
+        return f"{label.text} is {size} {direction} with A ({test}): it may be chance."
+    note = f" The test alone favours {metric.winner}." if comparison.decision.because == "minimum" else ""
+    return f"{label.text} is {size} {direction} with A ({test}).{note}"
 
 
 def _power_sentences(comparison: Comparison) -> list[str]:
@@ -173,17 +173,17 @@ def _power_sentences(comparison: Comparison) -> list[str]:
     unit = _label(comparison.primary).unit
     sentences = []
     if sensitivity.detectable is not None:
-        least = number(sensitivity.detectable, unit) + suffix(unit, signed=True)
+        size = number(sensitivity.detectable, unit) + suffix(unit, signed=True)
         power = f"{100 * comparison.plan.power:.0f} %"
-        sentences.append(f"A difference of {least} would be detected in {power} of such comparisons.")
+        sentences.append(f"A difference of {size} would be detected in {power} of such comparisons.")
     if needed is not None:
-        least = number(sensitivity.smallest, unit) + suffix(unit, signed=True)
-        sentences.append(f"{needed:,} scenarios are needed; the smallest difference that matters is {least}.")
+        size = number(sensitivity.smallest, unit) + suffix(unit, signed=True)
+        sentences.append(f"{needed:,} scenarios are needed; the smallest difference that matters is {size}.")
     return sentences
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return what a reader should know about the numbers."""
+    """Return notes on undefined values, seeds and sensitivity."""
     lines = []
     for metric in (comparison.primary, *comparison.secondary):
         if metric.undefined_a or metric.undefined_b:

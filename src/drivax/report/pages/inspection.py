@@ -13,9 +13,9 @@ from drivax.report.inspection import (
     Counts,
     Inspection,
     content_table,
-    of_all,
     speeds,
     true_findings,
+    with_sizes,
 )
 from drivax.report.pages.page import asset, definitions, page, section
 from drivax.report.pictures.palette import stroke
@@ -62,9 +62,9 @@ def _quantities(inspections: Sequence[Inspection]) -> str:
     for quantity in QUANTITIES:
         values = [inspection.values(quantity.read) for inspection in inspections]
         series.append((quantity.label, quantity.unit or "per scenario", values))
-    sampled = [speeds(inspection) for inspection in inspections]
-    series.append(("speed of ego", "m/s", [sample.ego for sample in sampled]))
-    series.append(("speed of other vehicles now", "m/s", [sample.vehicles for sample in sampled]))
+    samples = [speeds(inspection) for inspection in inspections]
+    series.append(("speed of ego", "m/s", [sample.ego for sample in samples]))
+    series.append(("speed of other vehicles now", "m/s", [sample.vehicles for sample in samples]))
     charts = "".join(
         histogram(title, dict(zip(names, values, strict=True)), unit)
         for title, unit, values in series
@@ -72,7 +72,7 @@ def _quantities(inspections: Sequence[Inspection]) -> str:
     )
     counts = [
         f"{sample.scenarios:,} of {len(inspection):,} scenarios of {inspection.name}"
-        for sample, inspection in zip(sampled, inspections, strict=True)
+        for sample, inspection in zip(samples, inspections, strict=True)
         if sample.scenarios < len(inspection)
     ]
     note = f"Speeds: {escape('; '.join(counts))}, evenly spread." if counts else ""
@@ -88,12 +88,12 @@ def _shares(inspections: Sequence[Inspection]) -> str:
     tagged = [inspection.tags() for inspection in inspections]
     sizes = [len(inspection) for inspection in inspections]
     groups = {
-        name: of_all([tags.get(name, {}) for tags in tagged], sizes)
+        name: with_sizes([tags.get(name, {}) for tags in tagged], sizes)
         for name in dict.fromkeys(name for tags in tagged for name in tags)
     }
-    flags = [inspection.words(lambda entry: entry["flags"]) for inspection in inspections]
+    flags = [inspection.value_counts(lambda entry: entry["flags"]) for inspection in inspections]
     bars = [_bars(name, counts) for name, counts in groups.items() if len(counts) <= _MOST_VALUES]
-    bars += [_bars("flags", of_all(flags, sizes)), _bars("audit", true_findings(inspections))]
+    bars += [_bars("flags", with_sizes(flags, sizes)), _bars("audit", true_findings(inspections))]
     return section("Tags, flags, audit", _legend(inspections), f"<div class=bars>{''.join(bars)}</div>")
 
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation import tables
+from drivax.evaluation import result_tables
 from drivax.evaluation.episode_table import RATES, EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable, mismatch
 from drivax.files import check_output, write_text
 from drivax.report.charts import curve_sections, distribution_charts
-from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, outcome, rollouts_of, worst_first
+from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, outcome, rollouts_of, sort_worst_first
 from drivax.report.pages.page import (
     asset,
     data_element,
@@ -48,23 +48,23 @@ def write_report(
         runs: Run folders of ``drivax evaluate`` and ``drivax train``, in the order of the tables.
         out: The file.
         data: The scenario set of the evaluation, where it has moved.
-        episodes: Number of playable episodes; 0 leaves out rollouts and tags and needs no scenario set.
+        episodes: Number of playable episodes; with 0, there are no rollouts and tags, and no scenario set is needed.
         overwrite: Replace an existing file.
 
     Raises:
         DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.
-        UsageError: ``out`` exists, or the arguments make no sense.
+        UsageError: ``out`` exists, no run is given, or ``episodes`` is negative.
     """
     check_output(out, overwrite)
     if episodes < 0:
         raise UsageError(f"cannot show {episodes} episodes", cure="give 0 or more")
     evaluations, trainings = read_runs(runs)
-    packed, tags = _from_set(evaluations, data, episodes) if evaluations and episodes else ((), {})
+    packed, tags = _load_episodes(evaluations, data, episodes) if evaluations and episodes else ((), {})
     write_text(out, _page(evaluations, trainings, packed, tags))
     return out
 
 
-def _from_set(runs: Sequence[EpisodeTable], data: Path | None, count: int) -> tuple[Packed, Tags]:
+def _load_episodes(runs: Sequence[EpisodeTable], data: Path | None, count: int) -> tuple[Packed, Tags]:
     """Return the selected episodes with their data for the player, and the tags of all scenarios."""
     scenarios = EvaluatedSet(runs[-1], data)
     packed = []
@@ -82,16 +82,16 @@ def _page(runs: Sequence[EpisodeTable], trainings: Sequence[Training], packed: P
             _results(runs), _differences(runs), _transfer(runs), _collisions(runs),
             _strata(runs, tags), _distributions(runs), _episodes(runs, packed),
         ]  # fmt: skip
-        played: dict[ScenarioKey, int] = {group.key: place for place, (group, _) in enumerate(packed)}
+        playable: dict[ScenarioKey, int] = {group.key: index for index, (group, _) in enumerate(packed)}
         data = player_data([episode for _, episode in packed]) if packed else []
-        data.append(episode_data(runs, tags, played))
+        data.append(episode_data(runs, tags, playable))
         scripts += [*(player_scripts() if packed else ()), asset("episode_table.js")]
     if trainings:
         sections.append(section("Learning curves", curve_sections(trainings)))
     if runs:
-        meanings = explanations(tables.ordered(tables.metric_names(runs)), runs)
+        meanings = explanations(result_tables.sort_metrics(result_tables.metric_names(runs)), runs)
         sections.append(section("What the metrics mean", meanings))
-    sections.append(_origin([*runs, *trainings]))
+    sections.append(_provenance([*runs, *trainings]))
     title = f"{runs[-1].name}: evaluation report" if runs else "training report"
     return page(title, _lead(runs), sections, data=data, scripts=scripts)
 
@@ -101,74 +101,76 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
         return "<p class=lead>Training runs only; evaluate a policy to see how it drives.</p>"
     policy = runs[-1]
     path = Path(str(policy.data.get("path", "its scenario set")))
-    name, where = escape(policy.name), escape(str(policy.data.get("name") or path.name))
-    for metric, words in (("success", "succeeds in"), ("accuracy", "drives without failure in")):
-        interval = tables.summarise(policy, metric)
+    name, data_name = escape(policy.name), escape(str(policy.data.get("name") or path.name))
+    for metric, verb in (("success", "succeeds in"), ("accuracy", "drives without failure in")):
+        interval = result_tables.summarise(policy, metric)
         if interval.mean is not None:
             share = number(interval.mean, "rate") + suffix("rate")
             return (
-                f"<p class=lead><b>{name}</b> {words} <b>{share}</b> ({bounds(interval, 'rate')}) of {interval.n} "
-                f"{'episode' if interval.n == 1 else 'episodes'} of {where}, {escape(policy.traffic)} traffic.</p>"
+                f"<p class=lead><b>{name}</b> {verb} <b>{share}</b> ({bounds(interval, 'rate')}) of {interval.n} "
+                f"{'episode' if interval.n == 1 else 'episodes'} of {data_name}, {escape(policy.traffic)} traffic.</p>"
             )
-    return f"<p class=lead><b>{name}</b>: {len(policy)} episodes of {where}.</p>"
+    return f"<p class=lead><b>{name}</b>: {len(policy)} episodes of {data_name}.</p>"
 
 
 def _results(runs: Sequence[EpisodeTable]) -> str:
-    names = tables.metric_names(runs)
-    first = _first(runs, names)
-    rest = [name for name in tables.ordered(names) if name not in first]
-    table = tables.planners_table(runs, first).html() if first else ""
-    more = f"<summary>{len(rest)} more metrics</summary>{tables.planners_table(runs, rest).html()}"
+    names = result_tables.metric_names(runs)
+    shown = _first_metrics(runs, names)
+    others = [name for name in result_tables.sort_metrics(names) if name not in shown]
+    table = result_tables.planners_table(runs, shown).html() if shown else ""
+    details = (
+        f"<summary>{len(others)} more metrics</summary>{result_tables.planners_table(runs, others).html()}"
+    )
     note = (
-        f"Mean, {tables.CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; "
+        f"Mean, {result_tables.CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; "
         "undefined episodes are left out. The best mean is underlined, whether or not it is clearly best. Click a "
         "mean for its episodes. Intervals: Wilson's for rates (with the effective number of episodes where some share "
         "a recording), a bootstrap over recordings otherwise."
     )
-    more = f"<details>{more}</details>" if rest else ""
-    return section("Results", _warning(runs), table, more, note=note)
+    details = f"<details>{details}</details>" if others else ""
+    return section("Results", _comparability_warning(runs), table, details, note=note)
 
 
-def _first(runs: Sequence[EpisodeTable], names: Sequence[str]) -> list[str]:
+def _first_metrics(runs: Sequence[EpisodeTable], names: Sequence[str]) -> list[str]:
     """Return the metrics of the first table: the headline, after crashes where there were any."""
     crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
-    return [*(["crashed"] if crashed and "crashed" in names else []), *tables.headline(names)]
+    return [*(["crashed"] if crashed and "crashed" in names else []), *result_tables.headline_names(names)]
 
 
-def _warning(runs: Sequence[EpisodeTable]) -> str:
-    """Return which rows cannot be compared with the policy's, and why; empty where all can."""
+def _comparability_warning(runs: Sequence[EpisodeTable]) -> str:
+    """Return a warning about runs that are not comparable with the policy; empty if all are."""
     policy = runs[-1]
     reasons = []
     for run in runs[:-1]:
-        scenarios, of = set(run.scenarios), set(policy.scenarios)
+        scenarios, policy_scenarios = set(run.scenarios), set(policy.scenarios)
         if unmatched := mismatch(run, policy):
             reasons.append(f"{run.name} and {policy.name} {unmatched[0]}")
-        elif scenarios != of:
-            counts = f"{len(scenarios & of)} of {len(scenarios)} and {len(of)}"
+        elif scenarios != policy_scenarios:
+            counts = f"{len(scenarios & policy_scenarios)} of {len(scenarios)} and {len(policy_scenarios)}"
             reasons.append(f"{run.name} and {policy.name} have {counts} scenarios in common")
-    words = "; ".join(map(escape, reasons))
-    return f"<p><b>Not all rows are comparable:</b> {words}.</p>" if words else ""
+    text = "; ".join(map(escape, reasons))
+    return f"<p><b>Not all rows are comparable:</b> {text}.</p>" if text else ""
 
 
 def _differences(runs: Sequence[EpisodeTable]) -> str:
     policy, others = runs[-1], runs[:-1]
-    names = _first(runs, list(policy.metrics)) or tables.ordered(list(policy.metrics))
+    names = _first_metrics(runs, list(policy.metrics)) or result_tables.sort_metrics(list(policy.metrics))
     if not others or not names:
         return ""
     note = (
         "Mean of the differences, scenario by scenario, over those where both are defined (n pairs), with a "
-        f"{tables.CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval excludes "
-        "zero; it is not widened for the number of comparisons. “All equal”: no pair differs from the next, so that a "
-        "bootstrap has no width."
+        f"{result_tables.CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval "
+        "excludes zero; it is not widened for the number of comparisons. “All equal”: no pair differs from the next, "
+        "so that a bootstrap has no width."
     )
-    table = tables.differences_table(policy, others, names).html()
+    table = result_tables.differences_table(policy, others, names).html()
     return section(f"{escape(policy.name)} against the others", table, note=note)
 
 
 def _transfer(runs: Sequence[EpisodeTable]) -> str:
     """Return the results by training and evaluation data; empty where all runs share one set."""
     parts = "".join(
-        f"<h3>{escape(tables.metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
+        f"<h3>{escape(result_tables.metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
         for table in transfer_tables(runs)
     )
     note = (
@@ -180,10 +182,10 @@ def _transfer(runs: Sequence[EpisodeTable]) -> str:
 
 def _collisions(runs: Sequence[EpisodeTable]) -> str:
     """Return the kinds of the first collision with their meanings; empty without collisions of a known kind."""
-    table = tables.collisions_table(runs)
+    table = result_tables.collisions_table(runs)
     if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
         return ""
-    kinds = tables.COLLISION_KINDS.values()
+    kinds = result_tables.COLLISION_KINDS.values()
     meanings = definitions((name, f"{meaning[:1].upper()}{meaning[1:]}.") for name, meaning in kinds)
     counted = [(run, run.metrics["collision_type"] > 0) for run in runs if "collision_type" in run.metrics]
     total = ", ".join(f"{escape(run.name)} {int(hit.sum())} of {len(run)}" for run, hit in counted)
@@ -194,9 +196,9 @@ def _collisions(runs: Sequence[EpisodeTable]) -> str:
 def _strata(runs: Sequence[EpisodeTable], tags: Tags) -> str:
     """Return the results by kind of scenario; empty without tags."""
     parts = "".join(
-        f"<details{'' if place else ' open'}><summary>{escape(table.name.replace('-', ' '))}</summary>"
+        f"<details{'' if index else ' open'}><summary>{escape(table.name.replace('-', ' '))}</summary>"
         f"{table.html()}</details>"
-        for place, table in enumerate(strata_tables(runs, tags))
+        for index, table in enumerate(strata_tables(runs, tags))
     )
     note = "Tags describe the log. Small strata have wide intervals; of many cells, some stand out by chance."
     return section("By kind of scenario", parts, note=note)
@@ -209,12 +211,12 @@ def _distributions(runs: Sequence[EpisodeTable]) -> str:
 
 def _episodes(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     note = "▶ marks those that play below." if packed else "Rollouts and tags were left out of this page."
-    words = (
-        "<p>All episodes, worst first: the gravest kind of failure, then the lowest score. Click a number in the "
+    text = (
+        "<p>All episodes, worst first: by the severity of failures, then by the lowest score. Click a number in the "
         f"tables above for its episodes. {note}</p>"
     )
-    listed = asset("episode_list.html").rstrip()
-    return section("Episodes", words, listed, _player(runs, packed), attributes=" id=episodes")
+    episode_list = asset("episode_list.html").rstrip()
+    return section("Episodes", text, episode_list, _player(runs, packed), attributes=" id=episodes")
 
 
 def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
@@ -227,9 +229,9 @@ def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
         for group, _ in packed
     )
     policy = escape(runs[-1].name)
-    shown = [run for run in runs if comparable(run, runs[-1])]
-    words = f"Other agents are drawn as they moved around {policy};</b> around the others they reacted differently."
-    caution = f"<p><b>{words}</p>" if len(shown) > 1 and runs[-1].traffic != "log" else ""
+    comparable_runs = [run for run in runs if comparable(run, runs[-1])]
+    text = f"Other agents are drawn as they moved around {policy};</b> around the others they reacted differently."
+    caution = f"<p><b>{text}</p>" if len(comparable_runs) > 1 and runs[-1].traffic != "log" else ""
     return (
         f"<h3>Rollouts</h3><p>Selected by rule: failures of {policy} first, each kind in turn, then successes. All "
         f"planners start from the same state at the same time.</p>{caution}"
@@ -239,12 +241,12 @@ def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
 
 def explanations(metrics: Sequence[str], runs: Sequence[EpisodeTable]) -> str:
     """Return a list that explains each known metric in one line."""
-    labels = [label for metric in metrics if (label := tables.metric_label(metric, runs)).explanation]
+    labels = [label for metric in metrics if (label := result_tables.metric_label(metric, runs)).explanation]
     return definitions((label.heading, label.explanation) for label in labels)
 
 
-def _origin(runs: Sequence[EpisodeTable | Training]) -> str:
-    """Return where the numbers come from: commands, data, versions and every ``run.json``."""
+def _provenance(runs: Sequence[EpisodeTable | Training]) -> str:
+    """Return the provenance of the numbers: commands, data, versions and every ``run.json``."""
     rows = []
     for run in runs:
         data = run.data if isinstance(run, EpisodeTable) else {}
@@ -267,7 +269,7 @@ def _origin(runs: Sequence[EpisodeTable | Training]) -> str:
     )
 
 
-#: Tags with more values than this (ids, places) are not offered as a choice.
+#: Maximum number of values of a tag that can be selected; excludes ids and places.
 MOST_VALUES = 24
 #: Columns of the list, as far as a run has them; all other metrics filter and sort it.
 _SHOWN = (
@@ -275,53 +277,52 @@ _SHOWN = (
 )  # fmt: skip
 
 
-def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[ScenarioKey, int]) -> str:
-    """Return the data of the list as a script element; the policy is the last run, ``played`` has places in the player.
+def episode_data(runs: Sequence[EpisodeTable], tags: Tags, playable: Mapping[ScenarioKey, int]) -> str:
+    """Return the data of the list as a script element; ``playable`` has the player's index of each shown episode.
 
-    ``metrics`` says how each is shown and which value of a rate is a failure; ``runs[].values`` holds one column per
-    metric with four significant digits, null where undefined, rows worst first; ``runs[].errors`` by row the step and
-    the error of a crash; ``tags`` holds for each tag its values and for each scenario the index of its value, which is
-    ``unknown`` where it has none.
+    ``metrics`` has the label of each metric, and the value of a rate that means failure; ``runs[].values`` one column
+    per metric with four significant digits, null where undefined, worst row first; ``runs[].errors`` step and error of
+    each crash by row; ``tags`` the values of each tag, and the index of each scenario's value.
     """
-    names = tables.ordered(tables.metric_names(runs))
-    names += [name for name in tables.metric_names(runs) if name in tables.CODES]
+    names = result_tables.sort_metrics(result_tables.metric_names(runs))
+    names += [name for name in result_tables.metric_names(runs) if name in result_tables.CODES]
     keys = list(dict.fromkeys(key for run in runs for key in run.scenarios))
-    place = {key: number for number, key in enumerate(keys)}
+    index_of = {key: number for number, key in enumerate(keys)}
     return data_element(
         {
             "scenarios": [key[1] for key in keys],
             "tags": _tags([tags.get(key, {}) for key in keys]),
-            "played": {str(place[key]): number for key, number in played.items()},
+            "played": {str(index_of[key]): number for key, number in playable.items()},
             "metrics": [_metric(name, runs) for name in names],
             "shown": [names.index(name) for name in _SHOWN if name in names],
-            "runs": [_run(run, runs, names, place) for run in runs],
+            "runs": [_run(run, runs, names, index_of) for run in runs],
         },
         id="list",
     )
 
 
 def _metric(name: str, runs: Sequence[EpisodeTable]) -> dict[str, Any]:
-    label = tables.metric_label(name, runs)
+    label = result_tables.metric_label(name, runs)
     bad = {"high": 0, "low": 1, "-": None}[label.better] if name in RATES else None
     return {"name": name, "label": label.text, "better": label.better, "unit": label.unit, "bad": bad}
 
 
 def _run(
-    run: EpisodeTable, runs: Sequence[EpisodeTable], names: Sequence[str], place: Mapping[ScenarioKey, int]
+    run: EpisodeTable, runs: Sequence[EpisodeTable], names: Sequence[str], index_of: Mapping[ScenarioKey, int]
 ) -> dict[str, Any]:
-    rows = worst_first(run, [other for other in runs if other is not run])
+    rows = sort_worst_first(run, [other for other in runs if other is not run])
     outcomes = [outcome(run, row) for row in rows]
     distinct = list(dict.fromkeys(outcomes))
     keys = run.scenarios
     scenarios, crashes = [keys[row] for row in rows], run.crash_by_scenario
-    failed = ((str(row), key) for row, key in enumerate(scenarios))
+    row_keys = ((str(row), key) for row, key in enumerate(scenarios))
     return {
         "name": run.name,
         "playable": comparable(run, runs[-1]),
-        "scenario": [place[key] for key in scenarios],
+        "scenario": [index_of[key] for key in scenarios],
         "outcomes": distinct,
-        "outcome": [distinct.index(words) for words in outcomes],
-        "errors": {row: (crashes[key].step, crashes[key].error) for row, key in failed if key in crashes},
+        "outcome": [distinct.index(name) for name in outcomes],
+        "errors": {row: (crashes[key].step, crashes[key].error) for row, key in row_keys if key in crashes},
         "values": [_column(run.metrics.get(name), rows) for name in names],
     }
 
@@ -329,21 +330,21 @@ def _run(
 def _column(values: Any, rows: Sequence[int]) -> list[float | None]:
     if values is None:
         return [None] * len(rows)
-    return [None if np.isnan(value) else _rounded(value) for value in np.asarray(values)[rows]]
+    return [None if np.isnan(value) else _round_significant(value) for value in np.asarray(values)[rows]]
 
 
-def _rounded(value: float) -> float:
-    """Return four significant digits; whole numbers as such, which are shorter."""
+def _round_significant(value: float) -> float:
+    """Round to four significant digits; integers become ``int``, which is shorter in JSON."""
     rounded = float(f"{value:.4g}")
     return int(rounded) if rounded.is_integer() else rounded
 
 
-def _tags(tagged: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
+def _tags(scenario_tags: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     columns = []
-    for name in dict.fromkeys(name for tags in tagged for name in tags):
-        values = [tags.get(name, tables.UNKNOWN) for tags in tagged]
+    for name in dict.fromkeys(name for tags in scenario_tags for name in tags):
+        values = [tags.get(name, result_tables.UNKNOWN) for tags in scenario_tags]
         distinct = sorted(set(values))
         if 1 < len(distinct) <= MOST_VALUES:
-            number = {value: place for place, value in enumerate(distinct)}
+            number = {value: index for index, value in enumerate(distinct)}
             columns.append({"name": name, "words": distinct, "of": [number[value] for value in values]})
     return columns

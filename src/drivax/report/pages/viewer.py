@@ -21,7 +21,7 @@ from drivax.report.pictures.player_data import pack_episode
 from drivax.scenario.schema import DT_S, Scenario
 from drivax.scenario.store import ScenarioSet
 
-#: Findings of the audit that make a log unclean, and their words in the list.
+#: Findings of the audit that count as violations, and their text in the list.
 _FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red", "log_reverses": "drives backwards"}
 
 
@@ -33,15 +33,15 @@ def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ())
     """
     if limit is not None and limit < 1:
         raise UsageError(f"a limit of {limit} leaves no scenario", cure="use 1 or more")
-    known: dict[str, int] = {}
+    row_of: dict[str, int] = {}
     for row, entry in enumerate(data.entries):
-        known.setdefault(entry["scenario_id"], row)
+        row_of.setdefault(entry["scenario_id"], row)
     for name in ids:
-        if name not in known:
-            near = did_you_mean(name, known)
-            cure = near if near.startswith("did") else "list them with `drivax inspect SET --json`"
+        if name not in row_of:
+            hint = did_you_mean(name, row_of)
+            cure = hint if hint.startswith("did") else "list them with `drivax inspect SET --json`"
             raise UsageError("is not in the set", file=data.path, record=name, cure=cure)
-    rows = [known[name] for name in ids] if ids else range(len(data))
+    rows = [row_of[name] for name in ids] if ids else range(len(data))
     return [data[row] for row in rows[:limit]]
 
 
@@ -56,7 +56,7 @@ def write_player(
     """
     check_output(out, overwrite)
     if not scenarios:
-        raise UsageError("there is no scenario to show", cure="name at least one")
+        raise UsageError("no scenarios to show", cure="name at least one")
     packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
     unclean = sum(bool(findings(scenario)) for scenario in scenarios)
     audited = sum(bool(scenario.audit) for scenario in scenarios)
@@ -69,11 +69,11 @@ def write_player(
 
 
 def findings(scenario: Scenario) -> str:
-    """Return the violations that the audit found in a log, in words."""
-    words = [words for name, words in _FINDINGS.items() if scenario.audit.get(name)]
+    """Return the violations that the audit found in a log, as text."""
+    names = [names for name, names in _FINDINGS.items() if scenario.audit.get(name)]
     if (share := scenario.audit.get("log_offroad_fraction")) is not None and share > 0:
-        words.append("off-road")
-    return ", ".join(words)
+        names.append("off-road")
+    return ", ".join(names)
 
 
 def criticality_html(table: ScoreTable, row: int) -> str:
@@ -84,12 +84,12 @@ def criticality_html(table: ScoreTable, row: int) -> str:
     points = {
         name.replace("_", " "): np.column_stack([time, values[valid]]) for name, values in series.items()
     }
-    lines = {name: (stroke(place), line) for place, (name, line) in enumerate(points.items())}
+    lines = {name: (stroke(index), line) for index, (name, line) in enumerate(points.items())}
     rank = int(np.flatnonzero(table.order == row)[0]) + 1
-    words = f"score {table.scenarios[row]:.3f}, rank {rank:,} of {len(table.scenarios):,} by {table.method}"
+    summary = f"score {table.scenarios[row]:.3f}, rank {rank:,} of {len(table.scenarios):,} by {table.method}"
     return (
-        f"<h3>Criticality</h3><p>{escape(words)}</p>"
-        f"{chart('criticality over time', lines, share=True, across='s')}{series_legend(list(lines))}"
+        f"<h3>Criticality</h3><p>{escape(summary)}</p>"
+        f"{chart('criticality over time', lines, share=True, x_label='s')}{series_legend(list(lines))}"
     )
 
 
@@ -114,11 +114,11 @@ def _browser(scenarios: Sequence[Scenario], details: Sequence[str]) -> str:
 
 def _button(scenario: Scenario) -> str:
     violations = findings(scenario)
-    words = (scenario.id, violations, *_flags(scenario), *scenario.tags, *scenario.tags.values())
-    bad = f"<span class=bad>{escape(violations)}</span>" if violations else ""
+    search_text = (scenario.id, violations, *_flags(scenario), *scenario.tags, *scenario.tags.values())
+    violations_html = f"<span class=bad>{escape(violations)}</span>" if violations else ""
     return (
-        f'<button type=button data-episode aria-pressed=false data-words="{escape(" ".join(words).lower())}">'
-        f"{escape(scenario.id)}<small>{escape(' · '.join(scenario.tags.values()))}</small>{bad}</button>"
+        f'<button type=button data-episode aria-pressed=false data-words="{escape(" ".join(search_text).lower())}">'
+        f"{escape(scenario.id)}<small>{escape(' · '.join(scenario.tags.values()))}</small>{violations_html}</button>"
     )
 
 
@@ -145,8 +145,8 @@ def _details(scenario: Scenario, details: str) -> str:
 
 
 def _facts(values: Mapping[str, Any]) -> str:
-    words = ((escape(name.replace("_", " ")), escape(_text(value))) for name, value in values.items())
-    return f"<dl>{''.join(f'<dt>{name}</dt><dd>{text}</dd>' for name, text in words)}</dl>"
+    items = ((escape(name.replace("_", " ")), escape(_text(value))) for name, value in values.items())
+    return f"<dl>{''.join(f'<dt>{name}</dt><dd>{text}</dd>' for name, text in items)}</dl>"
 
 
 def _text(value: Any) -> str:
@@ -158,5 +158,5 @@ def _text(value: Any) -> str:
 
 
 def _flags(scenario: Scenario) -> list[str]:
-    named: Iterable[Any] = scenario.has
-    return [str(flag.name).replace("_", " ").lower() for flag in named]
+    flags: Iterable[Any] = scenario.has
+    return [str(flag.name).replace("_", " ").lower() for flag in flags]

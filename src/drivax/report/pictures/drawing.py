@@ -1,4 +1,4 @@
-"""What is drawn of an episode: one record behind player, videos, still pictures and Gymnasium rendering."""
+"""Drawing of an episode, shared by player, videos, still pictures and Gymnasium rendering."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ WIDTHS: Mapping[str, float] = {
     "lane": 1.0, "bike": 1.0, "line": 1.0, "edge": 1.8, "route": 2.0, "goal": 2.0, "ego": 2.0, "log": 1.4, "ink": 1.4,
     "outline": 0.8, "red": 5.0, "amber": 4.0, "green": 2.5, "unknown": 2.0,
 }  # fmt: skip
-#: Events that are marked, and their words.
+#: Marked events, and their text.
 EVENT_WORDS: Mapping[str, str] = {
     "collision": "collision", "offroad": "off-road", "red_light": "red light", "crashed": "planner crashed",
 }  # fmt: skip
-#: Map and agents further than this from every ego path are left out, metres.
+#: Margin around all ego paths within which map and agents are drawn, metres.
 MARGIN_M = 90.0
 #: Radii of a stop sign and of the ring around the goal, metres.
 STOP_M, GOAL_M = 0.9, 2.0
@@ -42,7 +42,7 @@ class Rollout:
     """One planner's episode in a scenario.
 
     Attributes:
-        planner, outcome: Its name, and its outcome in words.
+        planner, outcome: Names of the planner and of the outcome.
         ego: Position [m], heading [rad], speed [m/s] at every step, local frame; NaN where the agent is absent.
         start: Step at which the planner took over.
         events: Step of the first event by name, -1 for none.
@@ -64,13 +64,13 @@ def with_traffic_of(rollout: Rollout, scenario: Scenario) -> Scenario:
     if rollout.others is None:
         return scenario
     pose = rollout.others[rollout.start :]
-    steps, known = slice(rollout.start, rollout.start + len(pose)), slice(1, pose.shape[1])
-    present = np.asarray(np.isfinite(pose[:, known]).all(axis=-1))
-    filled = np.where(present[..., None], pose[:, known], 0.0)
+    steps, slots = slice(rollout.start, rollout.start + len(pose)), slice(1, pose.shape[1])
+    present = np.asarray(np.isfinite(pose[:, slots]).all(axis=-1))
+    poses = np.where(present[..., None], pose[:, slots], 0.0)
     record = scenario.record.copy()
     record["agent_valid"][steps, 1:] = False
-    record["agent_valid"][steps, known] = present
-    record["agent_xy"][steps, known], record["agent_heading"][steps, known] = filled[..., :2], filled[..., 2]
+    record["agent_valid"][steps, slots] = present
+    record["agent_xy"][steps, slots], record["agent_heading"][steps, slots] = (poses[..., :2], poses[..., 2])
     return replace(scenario, record=record)
 
 
@@ -116,14 +116,16 @@ class Boxes:
         """Yield the agents at a step, one shape per colour."""
         rows: list[int] = np.flatnonzero(self.valid[step]).tolist()
         for colour in dict.fromkeys(self.colour[row] for row in rows):
-            same = [row for row in rows if self.colour[row] == colour]
-            outlines = [_outline(self.xy[step, row], self.heading[step, row], self.size[row]) for row in same]
+            group = [row for row in rows if self.colour[row] == colour]
+            outlines = [
+                _outline(self.xy[step, row], self.heading[step, row], self.size[row]) for row in group
+            ]
             yield Shape(outlines, "outline", colour, level=4)
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A scenario as it is drawn, local frame, metres.
+    """Drawing of a scenario, in its local frame, metres.
 
     Attributes:
         layers, stops: Polylines of the map by layer, and positions of stop signs.
@@ -144,7 +146,7 @@ class Drawing:
 
     @classmethod
     def of(cls, scenario: Scenario, box: Box) -> Drawing:
-        """Return what is drawn of a scenario inside (low x, low y, high x, high y)."""
+        """Return the drawing of a scenario within a box (low x, low y, high x, high y)."""
         signs = scenario.stop_xy[(scenario.stop_xy != 0).any(axis=1)]
         line, state = _lights(scenario)
         near = _within(line[:, 0], box)
@@ -153,11 +155,11 @@ class Drawing:
         return cls(
             road_lines(scenario, box), signs[_within(signs, box)], route[_within(route, box)],
             goal[_within(goal, box)], line[near], state[:, near],
-            _agents(scenario, box), _parked(scenario, box), _box_of(scenario, slice(0, 1), None),
+            _agents(scenario, box), _parked_boxes(scenario, box), _box_of(scenario, slice(0, 1), None),
         )  # fmt: skip
 
     def ground(self) -> Iterator[Shape]:
-        """Yield what never changes: map, stop signs, route and goal."""
+        """Yield the static shapes: map, stop signs, route and goal."""
         yield Shape(self.layers["crosswalk"], fill="crosswalk")
         for name in LAYERS[1:]:
             yield Shape(self.layers[name], name, level=1)
@@ -262,7 +264,7 @@ def _agents(scenario: Scenario, box: Box) -> Boxes:
     return _box_of(scenario, rows, near[:, rows])
 
 
-def _parked(scenario: Scenario, box: Box) -> Boxes:
+def _parked_boxes(scenario: Scenario, box: Box) -> Boxes:
     steps = int(scenario.steps)
     rows = np.flatnonzero(scenario.parked_valid[:steps].any(axis=0) & _within(scenario.parked_xy, box))
     colours = [agent_colour(int(kind)) for kind in scenario.parked_kind[rows]]

@@ -83,20 +83,23 @@ def draw_observation(config: ObservationConfig, observation: Mapping[str, Any], 
     groups = ObservationGroups.of(config, observation)
     low, high = _extent(groups)
     width, height = high - low
-    tall = 7.6
-    wide = min(max(tall * width / height, 3.2), 10.0)
-    figure = Figure(figsize=(wide + 2.9, tall + 0.5), dpi=100, facecolor="white")
-    across, up = figure.get_size_inches()
-    axes = figure.add_axes((0.15 / across, 0.15 / up, wide / across, tall / up), facecolor=LIGHT["ground"])
+    height_in = 7.6
+    width_in = min(max(height_in * width / height, 3.2), 10.0)
+    figure = Figure(figsize=(width_in + 2.9, height_in + 0.5), dpi=100, facecolor="white")
+    figure_width, figure_height = figure.get_size_inches()
+    axes = figure.add_axes(
+        (0.15 / figure_width, 0.15 / figure_height, width_in / figure_width, height_in / figure_height),
+        facecolor=LIGHT["ground"],
+    )
     _draw(axes, config, groups)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[])
     axes.set_aspect("equal", adjustable="box", anchor="NW")
     for side in axes.spines.values():
         side.set_color(LIGHT["lane"])
     _scale_bar(axes, low, high)
-    _legend(figure, (wide + 0.4) / across, config, groups)
+    _legend(figure, (width_in + 0.4) / figure_width, config, groups)
     style: dict[str, Any] = {"fontsize": 11, "color": LIGHT["ink"], "va": "center", "weight": "bold"}
-    figure.text(0.15 / across, 1 - 0.2 / up, title, **style)
+    figure.text(0.15 / figure_width, 1 - 0.2 / figure_height, title, **style)
     return figure
 
 
@@ -109,7 +112,7 @@ def draw_log_observation(
     return draw_observation(task.observation, observe(bank), title)
 
 
-def _up(points: Values) -> Values:
+def _to_paper(points: Values) -> Values:
     """Return points of the ego frame (ahead, left) on paper: ahead is up, left is left."""
     return np.stack([-points[..., 1], points[..., 0]], axis=-1)
 
@@ -119,7 +122,7 @@ def _extent(groups: ObservationGroups) -> tuple[Values, Values]:
     points = [np.zeros((1, 2)), np.array([[20.0, 12.0], [-8.0, -12.0]])]
     for group in ("agents", "road", "lights", "route", "ego"):
         if groups.has(group, "position"):
-            points.append(_up(groups[group, "position"][groups.masks[group]]))
+            points.append(_to_paper(groups[group, "position"][groups.masks[group]]))
     everything = np.clip(np.concatenate(points), -_FARTHEST_M, _FARTHEST_M)
     low, high = everything.min(axis=0) - _MARGIN_M, everything.max(axis=0) + _MARGIN_M
     width, height = high - low
@@ -130,8 +133,13 @@ def _extent(groups: ObservationGroups) -> tuple[Values, Values]:
 def _draw(axes: Axes, config: ObservationConfig, groups: ObservationGroups) -> None:
     if config.road:
         _draw_reach(axes, config)
-    drawn = (("road", _draw_road), ("route", _draw_route), ("lights", _draw_lights), ("agents", _draw_agents))
-    for group, draw in drawn:
+    layers = (
+        ("road", _draw_road),
+        ("route", _draw_route),
+        ("lights", _draw_lights),
+        ("agents", _draw_agents),
+    )
+    for group, draw in layers:
         if groups.has(group, "position"):
             draw(axes, groups)
     _draw_ego(axes, groups)
@@ -153,7 +161,7 @@ def _draw_road(axes: Axes, groups: ObservationGroups) -> None:
     mask = groups.masks["road"]
     middle = groups["road", "position"][mask]
     if not groups.has("road", "direction"):
-        axes.scatter(*_up(middle).T, s=5, color=LIGHT["edge"], zorder=1)
+        axes.scatter(*_to_paper(middle).T, s=5, color=LIGHT["edge"], zorder=1)
         return
     direction = groups["road", "direction"][mask]
     length, kinds = np.ones((len(middle), 1)), np.eye(3)[np.zeros(len(middle), int)]
@@ -162,7 +170,7 @@ def _draw_road(axes: Axes, groups: ObservationGroups) -> None:
     if groups.has("road", "type"):
         kinds = groups["road", "type"][mask]
     half = direction * length / 2
-    pieces = _up(np.stack([middle - half, middle + half], axis=1))
+    pieces = _to_paper(np.stack([middle - half, middle + half], axis=1))
     for number, (colour, width) in enumerate(_ROADS.values()):
         chosen = kinds[:, number] > 0
         style: dict[str, Any] = {"linewidths": width, "capstyle": "butt", "zorder": 1.5 - number / 4}
@@ -171,26 +179,26 @@ def _draw_road(axes: Axes, groups: ObservationGroups) -> None:
             collection.set(linestyles=[(0, (0.5, 0.5))], alpha=0.55)
         axes.add_collection(collection)
     lanes = kinds[:, 0] > 0
-    turned = _up(direction[lanes])
+    turned = _to_paper(direction[lanes])
     axes.quiver(
-        *_up(middle[lanes]).T, *turned.T, color=LIGHT["line"], angles="xy", pivot="mid", scale_units="xy", scale=0.6,
-        units="xy", width=0.22, headwidth=4.5, headlength=4.5, headaxislength=4, zorder=1.6,
+        *_to_paper(middle[lanes]).T, *turned.T, color=LIGHT["line"], angles="xy", pivot="mid", scale_units="xy",
+        scale=0.6, units="xy", width=0.22, headwidth=4.5, headlength=4.5, headaxislength=4, zorder=1.6,
     )  # fmt: skip
 
 
 def _draw_route(axes: Axes, groups: ObservationGroups) -> None:
-    points = _up(groups["route", "position"][groups.masks["route"]])
+    points = _to_paper(groups["route", "position"][groups.masks["route"]])
     line = np.concatenate([np.zeros((1, 2)), points])
     axes.plot(*line.T, color=LIGHT["route"], linewidth=1.4, alpha=0.5, zorder=2)
     axes.scatter(*points.T, s=22, color=LIGHT["route"], edgecolor="white", linewidth=0.6, zorder=2.1)
     if groups.has("route", "goal") and len(points):
-        goal = _up(groups["route", "goal"][groups.masks["route"]][:1])
+        goal = _to_paper(groups["route", "goal"][groups.masks["route"]][:1])
         axes.scatter(*goal.T, s=170, marker="*", color=LIGHT["route"], edgecolor="white", zorder=2.2)
 
 
 def _draw_lights(axes: Axes, groups: ObservationGroups) -> None:
     for row in np.flatnonzero(groups.masks["lights"]):
-        x, y = _up(groups["lights", "position"][row])
+        x, y = _to_paper(groups["lights", "position"][row])
         state = groups["lights", "state"][row] if groups.has("lights", "state") else np.eye(4)[0]
         colour = LIGHT[list(_STATES.values())[int(np.argmax(state))]]
         mine = groups.has("lights", "on_route") and groups["lights", "on_route"][row, 0] > 0
@@ -209,40 +217,40 @@ def _draw_agents(axes: Axes, groups: ObservationGroups) -> None:
             faded = 1.0 if now else 0.12 + 0.3 * step / steps
             _outline(axes, groups, "agents", (row, step), colour, faded, 4.0 + step / steps)
         if kind[1] + kind[2] > 0:  # pedestrians and cyclists get a halo
-            place = _up(groups["agents", "position"][row, -1])
+            place = _to_paper(groups["agents", "position"][row, -1])
             axes.scatter(*place, s=70, color=colour, alpha=0.45, linewidth=0, zorder=3.9)
         if groups.has("agents", "velocity"):
             _arrow(axes, groups["agents", "position"][row, -1], groups["agents", "velocity"][row, -1])
 
 
 def _outline(
-    axes: Axes, groups: ObservationGroups, group: str, at: tuple[Any, ...], colour: str, alpha: float, zorder: float
+    axes: Axes, groups: ObservationGroups, group: str, index: tuple[Any, ...], colour: str, alpha: float, zorder: float
 ) -> None:  # fmt: skip
     """Draw a box where heading and size are known, else a dot."""
     from matplotlib.patches import Circle, Polygon
 
-    place, style = groups[group, "position"][at], {"alpha": alpha, "zorder": zorder, "linewidth": 0.7}
+    xy, style = groups[group, "position"][index], {"alpha": alpha, "zorder": zorder, "linewidth": 0.7}
     sizes = "ego_static" if group == "ego" else group
     edge = LIGHT["outline"] if alpha == 1.0 else "none"
     if groups.has(group, "heading") and groups.has(sizes, "length", "width"):
-        sin, cos = groups[group, "heading"][at]
-        size = [groups[sizes, name][() if group == "ego" else at][0] for name in ("length", "width")]
-        outline = _up(corners(np.array([*place, cos, sin, *size])))
+        sin, cos = groups[group, "heading"][index]
+        size = [groups[sizes, name][() if group == "ego" else index][0] for name in ("length", "width")]
+        outline = _to_paper(corners(np.array([*xy, cos, sin, *size])))
         axes.add_patch(Polygon(outline, closed=True, facecolor=colour, edgecolor=edge, **style))
         if alpha == 1.0:  # the windscreen shows the front
-            front = _up(corners(np.array([*(place + 0.22 * size[0] * np.array([cos, sin])), cos, sin,
+            front = _to_paper(corners(np.array([*(xy + 0.22 * size[0] * np.array([cos, sin])), cos, sin,
                                           0.16 * size[0], 0.72 * size[1]])))  # fmt: skip
             front_style: dict[str, Any] = {"facecolor": LIGHT["ink"], "alpha": 0.65, "zorder": zorder + 0.01}
             axes.add_patch(Polygon(front, closed=True, **front_style))
     else:
-        axes.add_patch(Circle(tuple(_up(place)), _DOT_M, facecolor=colour, edgecolor=edge, **style))
+        axes.add_patch(Circle(tuple(_to_paper(xy)), _DOT_M, facecolor=colour, edgecolor=edge, **style))
 
 
 def _arrow(axes: Axes, place: Values, velocity: Values) -> None:
     """Draw an arrow to the position in one second at this velocity."""
     if np.hypot(*velocity) < 0.5:
         return
-    start, end = _up(place), _up(place + velocity)
+    start, end = _to_paper(place), _to_paper(place + velocity)
     axes.annotate(
         "", xy=tuple(end), xytext=tuple(start), zorder=5.5, annotation_clip=True,
         arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0,

@@ -82,22 +82,19 @@ def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) ->
         "centre": scale.centre,
         "map": {name: _lines(scale, drawing.layers[name]) for name in LAYERS},
         "layers": LAYERS,
-        "stops": _encoded(scale.points(drawing.stops)),
-        "route": _encoded(scale.points(drawing.route)),
-        "goal": _encoded(scale.points(drawing.goal)),
+        "stops": _encode(scale.points(drawing.stops)),
+        "route": _encode(scale.points(drawing.route)),
+        "goal": _encode(scale.points(drawing.goal)),
         "agents": _boxes(scale, drawing.agents, _poses(scale, drawing.agents).swapaxes(0, 1)),
-        "parked": _parked(scale, drawing.parked),
-        "lights": {
-            "line": _encoded(scale.points(drawing.light_line)),
-            "state": _encoded(drawing.light_state),
-        },
-        "log": _encoded(_poses(scale, drawing.log)[:, 0]),
+        "parked": _parked_entries(scale, drawing.parked),
+        "lights": {"line": _encode(scale.points(drawing.light_line)), "state": _encode(drawing.light_state)},
+        "log": _encode(_poses(scale, drawing.log)[:, 0]),
         "size": [round(float(length), 2) for length in drawing.log.size[0]],
         "rollouts": [_rollout(rollout, scale, int(scenario.steps)) for rollout in rollouts],
     }
 
 
-def _encoded(array: Array) -> str:
+def _encode(array: Array) -> str:
     kind = "<i2" if array.dtype == np.int16 else "i1"
     return base64.b64encode(np.ascontiguousarray(array, dtype=kind).tobytes()).decode("ascii")
 
@@ -105,7 +102,7 @@ def _encoded(array: Array) -> str:
 def _lines(scale: Scale, lines: Sequence[Array]) -> dict[str, str]:
     counts = np.array([len(line) for line in lines], np.int16)
     points = scale.points(np.concatenate(lines)) if lines else np.zeros((0, 2), np.int16)
-    return {"counts": _encoded(counts), "points": _encoded(points)}
+    return {"counts": _encode(counts), "points": _encode(points)}
 
 
 def _poses(scale: Scale, boxes: Boxes) -> Array:
@@ -114,15 +111,15 @@ def _poses(scale: Scale, boxes: Boxes) -> Array:
 
 def _boxes(scale: Scale, boxes: Boxes, poses: Array) -> dict[str, Any]:
     return {
-        "kind": list(boxes.colour), "size": _encoded(scale.lengths(boxes.size)), "pose": _encoded(poses)
+        "kind": list(boxes.colour), "size": _encode(scale.lengths(boxes.size)), "pose": _encode(poses)
     }  # fmt: skip
 
 
-def _parked(scale: Scale, parked: Boxes) -> dict[str, Any]:
+def _parked_entries(scale: Scale, parked: Boxes) -> dict[str, Any]:
     seen = parked.valid
     poses = scale.poses(parked.xy[0], parked.heading[0], np.ones(len(parked.size), bool))
     first, last = seen.argmax(axis=0), len(seen) - 1 - seen[::-1].argmax(axis=0)
-    return _boxes(scale, parked, poses) | {"seen": _encoded(np.stack((first, last), -1).astype(np.int16))}
+    return _boxes(scale, parked, poses) | {"seen": _encode(np.stack((first, last), -1).astype(np.int16))}
 
 
 def _rollout(rollout: Rollout, scale: Scale, steps: int) -> dict[str, Any]:
@@ -131,8 +128,8 @@ def _rollout(rollout: Rollout, scale: Scale, steps: int) -> dict[str, Any]:
     speed = np.clip(np.round(np.where(valid, ego[:, 3], 0.0) * 100), -32_000, 32_000)
     return {
         "planner": rollout.planner,
-        "pose": _encoded(scale.poses(ego[:, :2], ego[:, 2], valid)),
-        "speed": _encoded(speed.astype(np.int16)),
+        "pose": _encode(scale.poses(ego[:, :2], ego[:, 2], valid)),
+        "speed": _encode(speed.astype(np.int16)),
         "signals": _signals(ego, rollout.action),
         "start": rollout.start,
         "events": {name: rollout.events[name] for name in EVENT_WORDS if rollout.events.get(name, -1) >= 0},
@@ -149,4 +146,4 @@ def _signals(ego: Float[Array, "step 4"], action: Float[Array, "step 2"] | None)
 
 def _signal(signal: Signal, values: Float[Array, " step"]) -> str:
     whole = np.clip(np.round(values / signal.step), -32_000, 32_000)
-    return _encoded(np.where(np.isnan(whole), ABSENT, whole).astype(np.int16))
+    return _encode(np.where(np.isnan(whole), ABSENT, whole).astype(np.int16))

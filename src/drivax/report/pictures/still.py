@@ -79,8 +79,8 @@ def draw_on(
     """Draw a square of a scenario on given axes; the arguments are those of :func:`draw_scenario`."""
     from matplotlib.patches import Rectangle
 
-    (x, y), around = centre, reach_m + 5.0
-    drawing = Drawing.of(scenario, (x - around, y - around, x + around, y + around))
+    (x, y), half_size_m = centre, reach_m + 5.0
+    drawing = Drawing.of(scenario, (x - half_size_m, y - half_size_m, x + half_size_m, y + half_size_m))
     logged = path is not None
     if path is None:
         path = np.column_stack((scenario.agent_xy[:, 0], scenario.agent_heading[:, 0])).astype(np.float64)

@@ -19,7 +19,7 @@ from jaxtyping import UInt8
 from drivax.errors import UsageError, did_you_mean, missing_package
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import atomic_write, check_output
-from drivax.report.episodes import EpisodeGroup, EvaluatedSet, ranked, rollouts_of
+from drivax.report.episodes import EpisodeGroup, EvaluatedSet, rank_scenarios, rollouts_of
 from drivax.report.pictures.drawing import (
     EVENT_WORDS,
     LIGHTS,
@@ -64,7 +64,7 @@ def write_videos(
         UsageError: A file exists, there is no such scenario, or a package for videos is not installed.
     """
     evaluations = read_evaluations(runs)
-    groups = _selected(evaluations, which)
+    groups = _select_episodes(evaluations, which)
     if not side_by_side:
         evaluations = evaluations[-1:]
         groups = [replace(group, rows=group.rows[-1:]) for group in groups]
@@ -80,9 +80,9 @@ def write_videos(
     return files
 
 
-def _selected(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
+def _select_episodes(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
     """Return the requested episodes, worst first."""
-    groups = ranked(runs)
+    groups = rank_scenarios(runs)
     if which == "all":
         return groups
     if which.startswith("worst:"):
@@ -124,10 +124,10 @@ def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light"
         panes = [draw_frame(scenery, rollout, step, dt_s) for scenery, rollout in drawn]
         for pane in panes if across > 1 else ():
             pane[:, -1, :3] = rgb(THEMES[theme]["lane"])
-        yield np.concatenate((_tiled(panes, across), legend))
+        yield np.concatenate((_tile(panes, across), legend))
 
 
-def _tiled(panes: Sequence[Picture], across: int) -> Picture:
+def _tile(panes: Sequence[Picture], across: int) -> Picture:
     """Return pictures of one size in rows, the last row filled with empty ones."""
     missing = -len(panes) % across
     filled = [*panes, *(np.full_like(panes[0], panes[0][-1, -1]) for _ in range(missing))]

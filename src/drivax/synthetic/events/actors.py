@@ -38,7 +38,7 @@ def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
     return speed_mps / gain_mps2 + (distance_m - ramp) / speed_mps
 
 
-def walk(
+def gait(
     distance_m: float, speed_mps: float, rates_mps2: tuple[float, float], times_s: Times
 ) -> tuple[Times, Times] | None:
     """Distance and speed of a walk from rest at time 0 to rest; None where it is too short to reach its speed.
@@ -51,18 +51,14 @@ def walk(
         return None
     slows = travel_s(distance_m - stopping, speed_mps, gain)
     gone, up = speed_change(0.0, speed_mps, gain, np.minimum(times_s, slows))
-    more, down = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
-    return gone + more, np.where(times_s < slows, up, down)
+    extra, down = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
+    return gone + extra, np.where(times_s < slows, up, down)
 
 
 def along_track(
-    track: Track,
-    station: Times,
-    left_m: Times,
-    kind: AgentKind,
-    size_m: Size,
+    track: Track, station: Times, left_m: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
-) -> Scripted:
+) -> Scripted:  # fmt: skip
     """Actor at stations and lateral offsets of ego's path, headed along its motion."""
     valid = valid & (station >= 0.0) & (station <= track.length_m - 1.0)
     xy, heading = track.pose(station, left_m)
@@ -70,12 +66,9 @@ def along_track(
 
 
 def scripted_motion(
-    xy: Float64[np.ndarray, "time 2"],
-    heading: Times,
-    kind: AgentKind,
-    size_m: Size,
+    xy: Float64[np.ndarray, "time 2"], heading: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
-) -> Scripted:
+) -> Scripted:  # fmt: skip
     """Actor at positions, headed along its motion; at rest it keeps its last heading, or the given one."""
     step = np.gradient(xy, DT_S, axis=0)
     speed = np.hypot(step[:, 0], step[:, 1])
@@ -109,8 +102,10 @@ def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> S
     arc = Curve(user.xy, user.heading).arc_m
     times = DT_S * (np.arange(len(arc)) - step)
     gone, slower = speed_change(float(user.speed[step]), 0.0, braking_mps2, times)
-    at = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
+    position = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
     grows = np.concatenate([[True], np.diff(arc) > 1e-6])
-    heading = np.interp(at, arc[grows], np.unwrap(user.heading)[grows])
+    heading = np.interp(position, arc[grows], np.unwrap(user.heading)[grows])
     speed = np.where(times < 0, user.speed, np.minimum(slower, user.speed))
-    return replace(user, xy=curves.interpolate(at, arc[grows], user.xy[grows]), heading=heading, speed=speed)
+    return replace(
+        user, xy=curves.interpolate(position, arc[grows], user.xy[grows]), heading=heading, speed=speed
+    )

@@ -51,8 +51,8 @@ def required_deceleration(
     some = (time_s > 0) & (speed_mps * time_s > room_m)
     room, time = room_m[some], time_s[some]
     rolling = 2 * (speed_mps * time - room) / time**2
-    rest = speed_mps**2 / (2 * room)
-    return float(np.max(np.where(room >= speed_mps * time / 2, rolling, rest), initial=0.0))
+    stopping = speed_mps**2 / (2 * room)
+    return float(np.max(np.where(room >= speed_mps * time / 2, rolling, stopping), initial=0.0))
 
 
 def waiting_room(speed_mps: float, deceleration_mps2: float, time_s: float) -> float:
@@ -75,7 +75,7 @@ def actor_boxes(actor: Scripted) -> Float64[np.ndarray, "time 6"]:
     return boxes(actor.xy, actor.heading, actor.size_m[:2])
 
 
-def first_blocked(view: EgoView, adversary: Scripted, step: int) -> Float64[np.ndarray, " time"]:
+def first_blocked_station(view: EgoView, adversary: Scripted, step: int) -> Float64[np.ndarray, " time"]:
     """First station ahead at which ego would touch the actor, for each step from ``step`` on, m (infinite: none)."""
     track, last = view.track, view.last_step
     box = actor_boxes(adversary)[step : last + 1]
@@ -85,16 +85,16 @@ def first_blocked(view: EgoView, adversary: Scripted, step: int) -> Float64[np.n
     ego = boxes(xy, track.heading[begin:], size)
     reach = (math.hypot(*size) + math.hypot(*adversary.size_m[:2])) / 2
     gap = (box[:, None, 0] - xy[:, 0]) ** 2 + (box[:, None, 1] - xy[:, 1]) ** 2
-    time, place = np.nonzero((gap < reach**2) & adversary.valid[step : last + 1, None])
-    hit = overlap(ego[place], box[time])
+    time, index = np.nonzero((gap < reach**2) & adversary.valid[step : last + 1, None])
+    hit = overlap(ego[index], box[time])
     result = np.full(len(box), math.inf)
-    np.minimum.at(result, time[hit], station[place[hit]])
+    np.minimum.at(result, time[hit], station[index[hit]])
     return result
 
 
 def severity(view: EgoView, adversary: Scripted, step: int) -> float:
     """Constant deceleration from a step on with which ego just avoids the actor, m/s2."""
-    room = first_blocked(view, adversary, step) - view.track.at[step]
+    room = first_blocked_station(view, adversary, step) - view.track.at[step]
     return required_by_samples(float(view.motion.speed[0, step]), room)
 
 
@@ -173,11 +173,11 @@ def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
     rows, moves = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
     moves = moves[moves <= last]
     gap = np.sum((motion.xy[rows][:, moves] - extra.xy[moves]) ** 2, axis=-1)
-    turned = motion.heading[rows][:, moves]
-    crosses = np.abs(np.cos(turned - extra.heading[moves])) < 0.7
+    headings = motion.heading[rows][:, moves]
+    crosses = np.abs(np.cos(headings - extra.heading[moves])) < 0.7
     row, step = np.nonzero(motion.valid[rows][:, moves] & crosses & (gap < _NEAR_M**2))
     size = motion.size_m[rows[row], :2] + _CROSSED_M
-    other = boxes(motion.xy[rows[row], moves[step]], turned[row, step], size)
+    other = boxes(motion.xy[rows[row], moves[step]], headings[row, step], size)
     hit = overlap(actor_boxes(extra)[moves[step]], other)
     return tuple(np.unique(rows[row[hit]]).tolist())
 
@@ -208,18 +208,16 @@ def enter_when_clear(view: EgoView, extra: Scripted, until: int, removed: tuple[
     if appears >= last or not extra.valid[appears]:
         return None
     seen = appears > view.first_step and np.hypot(*(extra.xy[appears] - motion.xy[0, appears])) < _VIEW_M
-    now = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
-    if seen or not _is_clear(*now):
+    scene = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
+    if seen or not _is_clear(*scene):
         return None
     return replace(extra, valid=extra.valid & (np.arange(len(extra.valid)) >= appears))
 
 
 def _is_clear(
-    box: Float64[np.ndarray, " 6"],
-    other: Float64[np.ndarray, "user 6"],
-    valid: Bool[np.ndarray, " user"],
+    box: Float64[np.ndarray, " 6"], other: Float64[np.ndarray, "user 6"], valid: Bool[np.ndarray, " user"],
     speed: Float64[np.ndarray, " user"],
-) -> bool:
+) -> bool:  # fmt: skip
     """Whether a new box is clear of all others, each extended by its travel of the next 0.8 s."""
     longer = other.copy()
     longer[:, 4] += _BEHIND_S * speed

@@ -9,7 +9,7 @@ import numpy as np
 from drivax.synthetic.events.adversary import (
     comes_close,
     enter_when_clear,
-    first_blocked,
+    first_blocked_station,
     severity,
     vehicles_that_cross,
 )
@@ -48,14 +48,14 @@ _NEAR_MPS2 = 0.6
 
 
 def possible(kind: EventKind, network: RoadNetwork) -> bool:
-    """Whether a network has what an event needs, such as a light, a lane that ends or bays."""
+    """Whether an event is possible in a network: it may need a light, a lane that ends, or bays."""
     return SCRIPTS[kind].possible(network)
 
 
 def destinations_for(kind: EventKind, network: RoadNetwork, again: bool = False) -> tuple[Destination, ...]:
-    """Places of which ego should pass one, so that an event can be staged; empty: anywhere.
+    """Return candidate places for ego to pass, so that an event can be staged; empty: anywhere.
 
-    ``again`` after staging has failed: then kinds that can happen anywhere get places too.
+    ``again``: staging has failed before, so that kinds that can happen anywhere get places, too.
     """
     return SCRIPTS[kind].destinations(network) if again or kind in _PLACED else ()
 
@@ -96,7 +96,7 @@ def _check(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
     low, high = SEVERITY_MPS2
     if not low <= required <= high or abs(required - proposal.severity_mps2) > _NEAR_MPS2:
         return None
-    blocked = np.isfinite(first_blocked(view, adversary, begin))
+    blocked = np.isfinite(first_blocked_station(view, adversary, begin))
     entered = begin + int(np.argmax(blocked))
     if (
         not blocked.any()

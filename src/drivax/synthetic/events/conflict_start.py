@@ -57,16 +57,16 @@ def critical_steps(
 
     The driver takes over from row 0 of the motion ``CURRENT_STEP`` later.
     """
-    path, motion = motion.paths[0], motion.every(_STRIDE)
+    path, motion = motion.paths[0], motion.every_nth(_STRIDE)
     others, colour, size_m = _project_others(path, motion), colour[::_STRIDE], motion.size_m[0, :2]
-    now = (np.asarray(steps) + CURRENT_STEP) // _STRIDE
-    at, speed = motion.distance_m[0, now], motion.speed[0, now]
+    step = (np.asarray(steps) + CURRENT_STEP) // _STRIDE
+    position, speed = motion.distance_m[0, step], motion.speed[0, step]
     fastest = speed_profile(path, 1.0, _LATERAL_MPS2, _SLOWING_MPS2)
-    hit, behind = np.zeros(len(now), bool), np.zeros((len(others.box), len(now)), bool)
+    hit, behind = np.zeros(len(step), bool), np.zeros((len(others.box), len(step)), bool)
     for _ in range((STEPS - CURRENT_STEP - 1) // _STRIDE):
-        gap, leader = _leader(others, now, at, size_m)
-        line = _stop_line_m(network, path, colour[now], at + size_m[0] / 2) + 2.0 - _STOP_SHORT_M
-        target_mps = fastest[np.minimum((at / path.step_m).astype(int), len(fastest) - 1)]
+        gap, leader = _leader(others, step, position, size_m)
+        line = _stop_line_m(network, path, colour[step], position + size_m[0] / 2) + 2.0 - _STOP_SHORT_M
+        target_mps = fastest[np.minimum((position / path.step_m).astype(int), len(fastest) - 1)]
         a = idm_acceleration(
             np.stack([speed, speed]),
             np.stack([target_mps, target_mps]),
@@ -75,8 +75,8 @@ def critical_steps(
             _DRIVER,
         ).min(axis=0)
         after = np.maximum(speed + a * _STRIDE * DT_S, 0.0)
-        at, speed, now = at + (speed + after) / 2 * _STRIDE * DT_S, after, now + 1
-        hit |= _hits(others, now, path, at, size_m, behind)
+        position, speed, step = position + (speed + after) / 2 * _STRIDE * DT_S, after, step + 1
+        hit |= _hits(others, step, path, position, size_m, behind)
     return hit
 
 
@@ -91,8 +91,8 @@ def _project_others(path: Path, motion: Motion) -> _Others:
     )
     extent, index = extents(path, every, _NEAR_M)
     valid = motion.valid[1:].ravel()[index]
-    place = np.clip((extent.near_m + extent.far_m) / 2 / path.step_m, 0, len(path.curve.xy) - 1).astype(int)
-    along = every.speed[index] * np.cos(every.heading[index] - path.curve.heading[place])
+    sample = np.clip((extent.near_m + extent.far_m) / 2 / path.step_m, 0, len(path.curve.xy) - 1).astype(int)
+    along = every.speed[index] * np.cos(every.heading[index] - path.curve.heading[sample])
 
     def table(values: Float64[np.ndarray, " k"], empty: float) -> Float64[np.ndarray, "user time"]:
         result = np.full(len(every.xy), empty)
@@ -134,21 +134,17 @@ def _stop_line_m(
 
 
 def _hits(
-    others: _Others,
-    now: _Steps,
-    path: Path,
-    at: _Floats,
-    size_m: Float64[np.ndarray, " 2"],
+    others: _Others, now: _Steps, path: Path, at: _Floats, size_m: Float64[np.ndarray, " 2"],
     behind: Bool[np.ndarray, "user start"],
-) -> Bool[np.ndarray, " start"]:
+) -> Bool[np.ndarray, " start"]:  # fmt: skip
     """Whether an agent overlaps ego and did not come from behind; adds agents that did to ``behind``."""
     half, side = size_m / 2
     near, far, right, left = others.extent[..., now]
     maybe = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
     behind |= maybe & ((near + far) / 2 <= at - half)
     user, start = np.nonzero(maybe & ~behind)
-    place = np.minimum((at[start] / path.step_m).astype(int), len(path.curve.xy) - 1)
-    ego = boxes(path.curve.xy[place], path.curve.heading[place], size_m)
+    index = np.minimum((at[start] / path.step_m).astype(int), len(path.curve.xy) - 1)
+    ego = boxes(path.curve.xy[index], path.curve.heading[index], size_m)
     result = np.zeros(len(at), bool)
     result[start[overlap(ego, others.box[user, now[start]])]] = True
     return result

@@ -11,7 +11,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.actors import CAR_M, Times, along_curve
 from drivax.synthetic.events.adversary import (
     comes_close,
-    first_blocked,
+    first_blocked_station,
     required_by_samples,
     vehicles_in_lane,
 )
@@ -75,11 +75,13 @@ def _chain(
 ) -> list[int]:
     """Draw successive lanes before (-1) or after (1) a lane up to a total length."""
     result: list[int] = []
-    total, at = 0.0, first
-    while total < length_m and (links := lanes[at].successors if direction > 0 else lanes[at].predecessors):
-        at = int(rng.choice(links))
-        result.append(at)
-        total += lanes[at].length_m
+    total, lane = 0.0, first
+    while total < length_m and (
+        links := lanes[lane].successors if direction > 0 else lanes[lane].predecessors
+    ):
+        lane = int(rng.choice(links))
+        result.append(lane)
+        total += lanes[lane].length_m
     return result
 
 
@@ -108,13 +110,15 @@ class CrossTraffic(EventScript):
         return tuple(
             Destination(index, (0.0, 0.0), self.arrival_s)
             for index, lane in enumerate(network.lanes)
-            if lane.connector and lane.predecessors and self._conflicting(network, index)
+            if lane.connector and lane.predecessors and self._lower_priority_conflicts(network, index)
         )
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         network, share = view.roles.network, float(rng.uniform(*self.speed_share))
-        connectors = sorted({other for mine in view.connectors for other in self._conflicting(network, mine)})
+        connectors = sorted(
+            {other for mine in view.connectors for other in self._lower_priority_conflicts(network, mine)}
+        )
         if not connectors:
             return None
         lane = int(rng.choice(connectors))
@@ -126,14 +130,14 @@ class CrossTraffic(EventScript):
         if scheduled is None:
             return None
         entry, adversary, required = scheduled
-        leaves = int(np.argmax(~np.isfinite(first_blocked(view, adversary, entry))[8:])) + 8 + entry
+        leaves = int(np.argmax(~np.isfinite(first_blocked_station(view, adversary, entry))[8:])) + 8 + entry
         # A queue at its light would block the actor.
         removed = vehicles_in_lane(view, adversary, entry + 5)
         last = min(max(leaves, entry + 10), view.last_step)
         staging = Staging(extras=(adversary,), removed=removed)
         return Proposal(staging, required, adversary, entry - decides, last)
 
-    def _conflicting(self, network: RoadNetwork, mine: int) -> list[int]:
+    def _lower_priority_conflicts(self, network: RoadNetwork, mine: int) -> list[int]:
         """Connectors that cross a straight one and have to give way to it."""
         lane = network.lanes[mine]
         if not _straight_on(lane):
@@ -166,7 +170,7 @@ class CrossTraffic(EventScript):
         if first > last:
             return None
         # The blocked stations are the same for all entry steps, shifted in time.
-        blocked = first_blocked(view, entering(first), first - decides)
+        blocked = first_blocked_station(view, entering(first), first - decides)
         requires = np.zeros(last + 1)
         for entry in range(first, last + 1):
             begin = entry - decides + NOTICED

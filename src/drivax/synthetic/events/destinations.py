@@ -10,8 +10,8 @@ import numpy as np
 from drivax.scenario.schema import RoadKind
 from drivax.synthetic.roads.network import Control, RoadNetwork, Start
 from drivax.synthetic.roads.signals import SignalPlan
-from drivax.synthetic.traffic.paths import onward
-from drivax.synthetic.traffic.population import Placement
+from drivax.synthetic.traffic.paths import next_lanes
+from drivax.synthetic.traffic.placement import Placement
 
 #: Free speed of ego as a share of the limit.
 _PACE = 0.88
@@ -62,7 +62,7 @@ class DestinationRoute:
 def open_road(
     network: RoadNetwork, lowest_limit_mps: float = 0.0, has_neighbour: bool = False
 ) -> tuple[Destination, ...]:
-    """Places on ordinary lanes, with at least this speed limit and with neighbours if needed, away from their ends."""
+    """Return places away from the ends of ordinary lanes with a minimum speed limit, and with neighbours if needed."""
     return tuple(
         Destination(index, (_BEFORE_M, lane.length_m - _AFTER_M), _MIDWAY_S, alone=False)
         for index, lane in enumerate(network.lanes)
@@ -78,7 +78,7 @@ def draw_route(
 ) -> DestinationRoute | None:
     """Draw a route past one of several destinations; None where none can be reached."""
     order = rng.permutation(len(destinations)).tolist()
-    routes = (route_past(network, destinations[place], rng) for place in order)
+    routes = (route_past(network, destinations[index], rng) for index in order)
     return next((route for route in routes if route is not None), None)
 
 
@@ -86,31 +86,31 @@ def route_past(
     network: RoadNetwork, destination: Destination, rng: np.random.Generator
 ) -> DestinationRoute | None:
     """Draw a route past a destination to the end of the map; None where a light or a sign before it delays ego."""
-    time, at = float(rng.uniform(*destination.when_s)), float(rng.uniform(*destination.along_m))
+    time, position = float(rng.uniform(*destination.when_s)), float(rng.uniform(*destination.along_m))
     lane, lanes = destination.lane, [destination.lane]
-    while at < time * _pace(network, lane):
-        time -= at / _pace(network, lane)
-        before = _before(network, lanes)
+    while position < time * _pace(network, lane):
+        time -= position / _pace(network, lane)
+        before = _feeding_lanes(network, lanes)
         if not before or (lane != destination.lane and network.lanes[lane].control != Control.NONE):
             return None
         lane = int(rng.choice(before))
         lanes.insert(0, lane)
-        at = network.lanes[lane].length_m
-    here = network.lanes[lane]
-    if here.connector:
+        position = network.lanes[lane].length_m
+    current = network.lanes[lane]
+    if current.connector:
         return None
-    at = min(at - time * _pace(network, lane), here.length_m - _FROM_END_M)
-    start, room = Start(lane, at, at), at
-    while room < _BEFORE_S * _pace(network, lane) + _BEHIND_M and (before := _before(network, lanes)):
+    position = min(position - time * _pace(network, lane), current.length_m - _FROM_END_M)
+    start, room = Start(lane, position, position), position
+    while room < _BEFORE_S * _pace(network, lane) + _BEHIND_M and (before := _feeding_lanes(network, lanes)):
         lanes.insert(0, int(rng.choice(before)))
         room += network.lanes[lanes[0]].length_m
-    place = len(lanes) - 1
+    index = len(lanes) - 1
     while network.lanes[lanes[-1]].successors:
-        following = onward(network, lanes)
+        following = next_lanes(network, lanes)
         if not following:
             return None
         lanes.append(int(rng.choice(following)))
-    return DestinationRoute(start, tuple(lanes), place, destination.alone, destination.followed)
+    return DestinationRoute(start, tuple(lanes), index, destination.alone, destination.followed)
 
 
 def rearrange(
@@ -143,7 +143,7 @@ def _pace(network: RoadNetwork, lane: int) -> float:
     return _PACE * network.lanes[lane].limit_mps
 
 
-def _before(network: RoadNetwork, lanes: list[int]) -> list[int]:
+def _feeding_lanes(network: RoadNetwork, lanes: list[int]) -> list[int]:
     """Predecessors of the first lane that are not part of the route."""
     before = network.lanes[lanes[0]].predecessors
     return [k for k in before if k not in lanes and network.lanes[k].kind != RoadKind.LANE_BIKE]

@@ -42,9 +42,9 @@ class Track:
         self, station: Float64[np.ndarray, "*n"], left_m: Float64[np.ndarray, "*n"] | float = 0.0
     ) -> tuple[Float64[np.ndarray, "*n 2"], Float64[np.ndarray, "*n"]]:
         """Positions at stations and lateral offsets, and the path's headings there."""
-        place = np.clip(station / STEP_M, 0.0, len(self.xy) - 1.001)
-        index = place.astype(int)
-        share = place - index
+        sample = np.clip(station / STEP_M, 0.0, len(self.xy) - 1.001)
+        index = sample.astype(int)
+        share = sample - index
         heading = self.heading[index] + share * (self.heading[index + 1] - self.heading[index])
         xy = self.xy[index] + share[..., None] * (self.xy[index + 1] - self.xy[index])
         return xy + np.asarray(left_m)[..., None] * normals(heading), heading
@@ -71,21 +71,21 @@ def ego_track(motion: Motion) -> Track:
     arc = Curve(xy, heading).arc_m
     moved = np.concatenate([[True], np.diff(arc) > 1e-3])
     # Rounding must not move an ego at rest.
-    points, turned, along = xy[moved], heading[moved], arc[moved]
+    points, headings, along = xy[moved], heading[moved], arc[moved]
     if motion.paths:
         curve = motion.paths[0].curve
-        place = int(np.argmin(np.hypot(*(curve.xy - xy[-1]).T))) + 2
-        rest, turn = curve.xy[place:], curve.heading[place:]
-        gaps = np.hypot(*np.diff(np.concatenate([points[-1:], rest]), axis=0).T)
-        points = np.concatenate([points, rest])
-        shift = 2 * math.pi * np.round((turned[-1] - turn[:1]) / (2 * math.pi))
-        turned = np.concatenate([turned, turn + shift])
+        index = int(np.argmin(np.hypot(*(curve.xy - xy[-1]).T))) + 2
+        remainder, turn = curve.xy[index:], curve.heading[index:]
+        gaps = np.hypot(*np.diff(np.concatenate([points[-1:], remainder]), axis=0).T)
+        points = np.concatenate([points, remainder])
+        shift = 2 * math.pi * np.round((headings[-1] - turn[:1]) / (2 * math.pi))
+        headings = np.concatenate([headings, turn + shift])
         along = np.concatenate([along, along[-1] + np.cumsum(gaps)])
-    out = np.array([np.cos(turned[-1]), np.sin(turned[-1])])
+    out = np.array([np.cos(headings[-1]), np.sin(headings[-1])])
     points = np.concatenate([points, [points[-1] + 300.0 * out]])
-    turned, along = np.append(turned, turned[-1]), np.append(along, along[-1] + 300.0)
+    headings, along = (np.append(headings, headings[-1]), np.append(along, along[-1] + 300.0))
     station = np.arange(0.0, arc[-1] + _BEYOND_M, STEP_M)
-    return Track(interpolate(station, along, points), np.interp(station, along, turned), arc)
+    return Track(interpolate(station, along, points), np.interp(station, along, headings), arc)
 
 
 @dataclass(frozen=True)
@@ -139,9 +139,9 @@ class EgoView:
     def lane_at(self, station: float) -> int:
         """Lane of ego at a station (-1: none), the route's where several coincide."""
         xy, heading = self.track.place(station)
-        points, turned, lane = self._lane_points
+        points, headings, lane = self._lane_points
         gap = np.hypot(*(points - xy).T)
-        near = (gap < 2.0) & (np.cos(turned - heading) > 0.8)
+        near = (gap < 2.0) & (np.cos(headings - heading) > 0.8)
         if not near.any():
             return -1
         on_route = near & np.isin(lane, self.roles.route)
@@ -153,8 +153,8 @@ class EgoView:
         lane = self.lane_at(station)
         if lane < 0:
             return -1
-        here = self.roles.network.lanes[lane]
-        return here.left if side > 0 else here.right
+        current = self.roles.network.lanes[lane]
+        return current.left if side > 0 else current.right
 
     @cached_property
     def lane_ends(self) -> list[tuple[float, int]]:
@@ -162,9 +162,9 @@ class EgoView:
         result = []
         for lane in self.roles.network.lanes:
             if lane.ends or lane.exit_only:
-                (station,), (aside,) = self.track.project(lane.curve.xy[-1:])
-                if 2.0 < abs(aside) < 5.5 and station > 0:
-                    result.append((float(station), 1 if aside > 0 else -1))
+                (station,), (lateral,) = self.track.project(lane.curve.xy[-1:])
+                if 2.0 < abs(lateral) < 5.5 and station > 0:
+                    result.append((float(station), 1 if lateral > 0 else -1))
         return result
 
     def edge_m(self, station: float, side: int) -> float:
@@ -180,8 +180,8 @@ class EgoView:
             across = (ay > 0) != (by > 0)
             if across.any():
                 ax, bx = (a @ out)[across], (b @ out)[across]
-                at = ax + (bx - ax) * ay[across] / (ay[across] - by[across])
-                best = min(best, float(np.min(at[at > 0.0], initial=math.inf)))
+                position = ax + (bx - ax) * ay[across] / (ay[across] - by[across])
+                best = min(best, float(np.min(position[position > 0.0], initial=math.inf)))
         return best
 
     def plain_road(self, station: float) -> bool:
@@ -209,10 +209,10 @@ class EgoView:
     def on_path(self, step: int) -> tuple[Float64[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
         """Stations of all vehicles at a step, and whether they drive on ego's path (False for ego itself)."""
         count = self.motion.vehicles
-        station, aside = self.track.project(self.motion.xy[:count, step])
+        station, lateral = self.track.project(self.motion.xy[:count, step])
         _, heading = self.track.pose(station)
         same = np.cos(self.motion.heading[:count, step] - heading) > 0.8
-        on = self.motion.valid[:count, step] & (np.abs(aside) < 1.0) & same
+        on = self.motion.valid[:count, step] & (np.abs(lateral) < 1.0) & same
         on[0] = False
         return station, on
 

@@ -80,11 +80,11 @@ class EventScript(ABC):
     """Proposes events of one kind."""
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """Places of which ego should pass one; by default any open road."""
+        """Return candidate places for ego to pass; by default any open road."""
         return open_road(network)
 
     def possible(self, network: RoadNetwork) -> bool:
-        """Whether a network has what the event needs."""
+        """Whether the event is possible in a network."""
         return bool(self.destinations(network))
 
     @abstractmethod

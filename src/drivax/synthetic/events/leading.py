@@ -88,10 +88,12 @@ class LeadBrakes(EventScript):
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
         """See :class:`EventScript`: fast roads only."""
         places = open_road(network, _LEAST_MPS)
-        return tuple(replace(place, followed=True) for place in places) if self.tailgater else places
+        return (
+            tuple(replace(destination, followed=True) for destination in places) if self.tailgater else places
+        )
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
+        """See :class:`EventScript`; the severity is drawn from the possible range instead."""
         step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         tailgating = float(rng.uniform(*self.tailgating_s))
         if step is None:
@@ -112,12 +114,12 @@ class LeadBrakes(EventScript):
         if gap[leader] > self.within_s * speed:
             return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
         lead = float(motion.speed[leader, step])
-        drawn = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
-        last = view.last_step if drawn is None else step + _stands_until(speed, drawn[1])
-        if drawn is None or last > view.last_step:
+        draw = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
+        last = view.last_step if draw is None else step + _stands_until(speed, draw[1])
+        if draw is None or last > view.last_step:
             return None
-        staging = Staging(overrides=(Override(leader, step, last, -drawn[0]),), tailgates=tailgates)
-        adversary = brake_to_halt(motion, leader, step, drawn[0])
+        staging = Staging(overrides=(Override(leader, step, last, -draw[0]),), tailgates=tailgates)
+        adversary = brake_to_halt(motion, leader, step, draw[0])
         required = severity(view, adversary, step + NOTICED)
         return Proposal(staging, required, adversary, step, last, leader, followers)
 
@@ -133,7 +135,7 @@ class StalledVehicle(EventScript):
         return open_road(network, _LEAST_MPS)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
+        """See :class:`EventScript`; the severity is drawn from the possible range instead."""
         step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         return None if step is None else _propose_leader(view, step, headway, rng, None, ())
 
@@ -144,41 +146,40 @@ def _stands_until(speed_mps: float, severity_mps2: float) -> int:
 
 
 def _propose_leader(
-    view: EgoView,
-    step: int,
-    headway_s: float,
-    rng: np.random.Generator,
-    drives_on: Staging | None,
+    view: EgoView, step: int, headway_s: float, rng: np.random.Generator, drives_on: Staging | None,
     others: tuple[int, ...],
-) -> Proposal | None:
+) -> Proposal | None:  # fmt: skip
     """Propose a new leader at ego's speed that brakes to a halt; None near junctions, or where it requires too little.
 
     ``headway_s`` is its time gap to an ego in free traffic; it drives on later, with this further staging, or stays
     (None).
     """
-    track, lead = view.track, float(view.motion.speed[0, step])
+    track, ego_mps = view.track, float(view.motion.speed[0, step])
     lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
-    cruising = track.at + headway_s * lead + lengths
+    cruising = track.at + headway_s * ego_mps + lengths
     if view.meets_junction(float(cruising[view.first_step]), float(cruising[step])):
         return None
-    appears = view.first_step - _BEFORE
-    after = view.behind(cruising - CAR_M[0] / 2, appears)
-    speed, gap = float(after.motion.speed[0, step]), float(cruising[step] - after.track.at[step]) - lengths
-    drawn = draw_braking(speed, gap, lead, rng)
-    if drawn is None:
+    first_valid = view.first_step - _BEFORE
+    behind = view.behind(cruising - CAR_M[0] / 2, first_valid)
+    speed, gap = (
+        float(behind.motion.speed[0, step]),
+        float(cruising[step] - behind.track.at[step]) - lengths,
+    )
+    draw = draw_braking(speed, gap, ego_mps, rng)
+    if draw is None:
         return None
     times = DT_S * (np.arange(view.steps) - step)
-    gone, _ = speed_change(lead, 0.0, drawn[0], times)
-    last = view.last_step if drives_on is None else step + _stands_until(speed, drawn[1])
-    onward, _ = speed_change(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
-    station = np.where(times < 0, cruising, cruising[step] + gone + onward)
+    braked_m, _ = speed_change(ego_mps, 0.0, draw[0], times)
+    last = view.last_step if drives_on is None else step + _stands_until(speed, draw[1])
+    next_lanes, _ = speed_change(0.0, ego_mps, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
+    station = np.where(times < 0, cruising, cruising[step] + braked_m + next_lanes)
     if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
         return None
-    valid, left = np.arange(view.steps) >= appears, np.zeros(view.steps)
+    valid, left = np.arange(view.steps) >= first_valid, np.zeros(view.steps)
     adversary = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid)
     staging = replace(drives_on or Staging(), extras=(adversary,))
-    required = severity(after, adversary, step + NOTICED)
-    return Proposal(staging, required, adversary, step, last, None, others, after)
+    required = severity(behind, adversary, step + NOTICED)
+    return Proposal(staging, required, adversary, step, last, None, others, behind)
 
 
 @dataclass(frozen=True)
@@ -211,15 +212,15 @@ class CutIn(EventScript):
                 if neighbour >= 0 and not (lanes[neighbour].ends or lanes[neighbour].exit_only):
                     curve = lanes[neighbour].curve
                     nearest = int(np.argmin(np.hypot(*(curve.xy - lane.curve.xy[-1]).T)))
-                    at = float(curve.arc_m[nearest])
-                    places.append(Destination(neighbour, (at, at), self.end_after_s))
+                    position = float(curve.arc_m[nearest])
+                    places.append(Destination(neighbour, (position, position), self.end_after_s))
         return tuple(places)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
         if self.late_merge:
-            step, side = self._before_an_end(view, rng)
+            step, side = self._draw_lane_end(view, rng)
         shares = rng.uniform(*self.speed_share), rng.uniform(*self.slower_share)
         braking, lasts = float(rng.uniform(*self.braking_mps2)), float(rng.uniform(*self.lasts_s))
         if step is None:
@@ -243,8 +244,8 @@ class CutIn(EventScript):
         adjacent = self._adjacent_lane(view, station, start, finish, side)
         if adjacent is None or view.meets_junction(start, float(station[view.last_step])):
             return None
-        aside, valid = adjacent
-        left = side * aside * (1.0 - smooth_step(times / lasts))
+        lateral, valid = adjacent
+        left = side * lateral * (1.0 - smooth_step(times / lasts))
         adversary = along_track(view.track, station, left, AgentKind.VEHICLE, CAR_M, valid)
         if not adversary.valid[view.first_step : step + 1].all():
             return None
@@ -252,7 +253,7 @@ class CutIn(EventScript):
         last = min(step + round(max(lasts, (before - after) / braking) / DT_S), view.last_step)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, max(last, step + 1))
 
-    def _before_an_end(self, view: EgoView, rng: np.random.Generator) -> tuple[int | None, int]:
+    def _draw_lane_end(self, view: EgoView, rng: np.random.Generator) -> tuple[int | None, int]:
         """Draw a step at which ego is shortly before the end of an adjacent lane, and the side of that lane."""
         ends = view.lane_ends
         if not ends:
@@ -271,11 +272,11 @@ class CutIn(EventScript):
         """Lateral offset of the actor's lane, and the steps at which it exists next to ego's; None without one."""
         lanes, lane, reach = view.roles.network.lanes, -1, finish
         low = max(0.0, float(station.min()))
-        for place in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():
-            neighbour = view.neighbour(place, side)
+        for candidate in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():
+            neighbour = view.neighbour(candidate, side)
             if neighbour < 0:
                 break
-            reach = place
+            reach = candidate
             lane = neighbour if lane < 0 else lane
         if lane < 0 or reach > start - _EVERY_M:
             return None
@@ -285,6 +286,6 @@ class CutIn(EventScript):
             end, _ = view.track.project(lanes[lane].curve.xy[-1:])
             if not finish <= float(end[0]) <= finish + self.before_end_m:
                 return None
-        here = view.track.place(start)[0]
-        apart = float(np.min(np.hypot(*(lanes[view.neighbour(start, side)].curve.xy - here).T)))
-        return (apart, station >= reach) if 2.3 < apart < 5.0 else None
+        current = view.track.place(start)[0]
+        separation = float(np.min(np.hypot(*(lanes[view.neighbour(start, side)].curve.xy - current).T)))
+        return (separation, station >= reach) if 2.3 < separation < 5.0 else None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, Size, Times, along_track, scripted_motion, travel_s, walk
+from drivax.synthetic.events.actors import CAR_M, Size, Times, along_track, gait, scripted_motion, travel_s
 from drivax.synthetic.events.adversary import waiting_room
 from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
 from drivax.synthetic.events.kinds import EventScript, Proposal
@@ -16,7 +16,7 @@ from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
-_PERSON_M, _BICYCLE_M, _THING_M = (0.5, 0.6, 1.75), (1.8, 0.65, 1.7), (1.0, 1.0, 0.9)
+_PEDESTRIAN_M, _BICYCLE_M, _OBJECT_M = (0.5, 0.6, 1.75), (1.8, 0.65, 1.7), (1.0, 1.0, 0.9)
 #: Highest limit of streets with such events, m/s.
 _STREET_MPS = 20.0
 #: Acceleration of a pedestrian, m/s2.
@@ -50,7 +50,7 @@ def _entry(
     """Distance and speed of an obstacle that moves into ego's lane, braking harder where the distance is short."""
     gain, loss = rates_mps2
     times = DT_S * (np.arange(view.steps) - step)
-    return walk(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
+    return gait(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
 
 
 def _crossing_actor(view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size) -> Scripted:
@@ -74,7 +74,9 @@ class Jaywalker(_StreetScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         pace = float(rng.uniform(*self.speed_mps))
-        origin = (self._behind_parked if self.hidden else self._from_kerb)(view, severity_mps2, pace, rng)
+        origin = (self._emerge_from_behind_parked if self.hidden else self._from_kerb)(
+            view, severity_mps2, pace, rng
+        )
         if origin is None:
             return None
         step, station, offset = origin
@@ -84,10 +86,12 @@ class Jaywalker(_StreetScript):
         side = -int(math.copysign(1, offset))
         over = abs(offset) + min(view.edge_m(station, side), 14.0) + 0.6
         times = DT_S * (np.arange(view.steps) - step)
-        gait = walk(over, pace, (_START_MPS2, 2.0), times)
-        if gait is None:
+        profile = gait(over, pace, (_START_MPS2, 2.0), times)
+        if profile is None:
             return None
-        adversary = _crossing_actor(view, station, offset + side * gait[0], AgentKind.PEDESTRIAN, _PERSON_M)
+        adversary = _crossing_actor(
+            view, station, offset + side * profile[0], AgentKind.PEDESTRIAN, _PEDESTRIAN_M
+        )
         last = min(step + round(travel_s(over, pace, _START_MPS2) / DT_S), view.last_step)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
@@ -95,7 +99,7 @@ class Jaywalker(_StreetScript):
         self, view: EgoView, offset: float, speed: float, pace: float, requested: float
     ) -> float | None:
         """Room from ego's front to the pedestrian's line at the first step; None where ego would pass first."""
-        half = (view.ego_size_m[1] + _PERSON_M[0]) / 2
+        half = (view.ego_size_m[1] + _PEDESTRIAN_M[0]) / 2
         enters = travel_s(abs(offset) - half, pace, _START_MPS2)
         leaves = travel_s(abs(offset) + half, pace, _START_MPS2)
         room = speed * NOTICED_S + waiting_room(speed, requested, leaves - NOTICED_S)
@@ -110,7 +114,7 @@ class Jaywalker(_StreetScript):
         if step is None:
             return None
         own, speed = view.at_step(step)
-        front = own + (view.ego_size_m[0] + _PERSON_M[1]) / 2
+        front = own + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
         station, offset = front + speed, 0.0
         # The distance of the kerb depends on the station, which depends on that distance: iterate twice.
         for _ in range(2):
@@ -123,7 +127,7 @@ class Jaywalker(_StreetScript):
             station = front + room
         return step, station, side * offset
 
-    def _behind_parked(
+    def _emerge_from_behind_parked(
         self, view: EgoView, requested: float, pace: float, rng: np.random.Generator
     ) -> tuple[int, float, float] | None:
         if not view.roles.parked:
@@ -136,12 +140,12 @@ class Jaywalker(_StreetScript):
         for car in order[:6].tolist():
             line = float(station[car]) + view.roles.parked[car].size_m[0] / 2 + 0.55
             offset = float(left[car])
-            front = view.track.at[steps] + (view.ego_size_m[0] + _PERSON_M[1]) / 2
+            front = view.track.at[steps] + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
             rooms = [self._required_room(view, offset, float(v), pace, requested) for v in speed]
             rooms = [math.inf if room is None else room for room in rooms]
-            off = np.where(speed > 4.0, rooms, math.inf) - (line - front)
-            best = int(np.argmin(np.abs(off)))
-            if abs(off[best]) < 0.08 * speed[best]:
+            error = np.where(speed > 4.0, rooms, math.inf) - (line - front)
+            best = int(np.argmin(np.abs(error)))
+            if abs(error[best]) < 0.08 * speed[best]:
                 return int(steps[best]), line, offset
         return None
 
@@ -159,20 +163,20 @@ class LaneBlocked(EventScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
-        pace, rest = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
+        pace, deviation = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
         out = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
-        station, arrival_s = _blocked_station(view, step, severity_mps2, _THING_M[0])
+        station, arrival_s = _blocked_station(view, step, severity_mps2, _OBJECT_M[0])
         offset = view.edge_m(station, side) + out
-        half = (view.ego_size_m[1] + _THING_M[1]) / 2
+        half = (view.ego_size_m[1] + _OBJECT_M[1]) / 2
         if not offset < 9.0 or not view.plain_road(station):
             return None
-        gait = _entry(view, step, offset - rest, pace, (_ROLLING_MPS2, 3.0))
-        if gait is None or travel_s(offset - half, pace, _ROLLING_MPS2) > arrival_s - 0.05:
+        profile = _entry(view, step, offset - deviation, pace, (_ROLLING_MPS2, 3.0))
+        if profile is None or travel_s(offset - half, pace, _ROLLING_MPS2) > arrival_s - 0.05:
             return None
-        left = side * (offset - gait[0])
-        adversary = _crossing_actor(view, station, left, AgentKind.OTHER, _THING_M)
+        left = side * (offset - profile[0])
+        adversary = _crossing_actor(view, station, left, AgentKind.OTHER, _OBJECT_M)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, view.last_step)
 
 
@@ -194,13 +198,13 @@ class ReversingCar(_StreetScript):
         rear = view.edge_m(station, -1) + back
         if not 1.3 < rear < 7.0 or not _is_open_street(view, station):
             return None
-        gait = _entry(view, step, rear + into, pace, (self.gain_mps2, 2.5))
+        profile = _entry(view, step, rear + into, pace, (self.gain_mps2, 2.5))
         clears = view.ego_size_m[1] / 2
-        if gait is None or travel_s(rear - clears, pace, self.gain_mps2) > arrival_s - 0.05:
+        if profile is None or travel_s(rear - clears, pace, self.gain_mps2) > arrival_s - 0.05:
             return None
-        xy, heading = view.track.pose(np.full(view.steps, station), gait[0] - (rear + CAR_M[0] / 2))
+        xy, heading = view.track.pose(np.full(view.steps, station), profile[0] - (rear + CAR_M[0] / 2))
         valid = np.ones(view.steps, bool)
-        adversary = Scripted(AgentKind.VEHICLE, CAR_M, xy, heading - math.pi / 2, -gait[1], valid)
+        adversary = Scripted(AgentKind.VEHICLE, CAR_M, xy, heading - math.pi / 2, -profile[1], valid)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, view.last_step)
 
 
@@ -236,7 +240,7 @@ class WrongWayCyclist(_StreetScript):
         times = DT_S * (np.arange(view.steps) - step)
         # Share of the swing back after which ego's lane is clear.
         share = (half + outer) / (outer - inner) if outer < inner else 1.0
-        begin_back = clear - _time_of_share(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
+        begin_back = clear - _inverse_smooth_step(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
         swing = smooth_step(times / self.swing_s) - smooth_step((times - begin_back) / self.swing_s)
         if begin_back < self.swing_s * 0.6:
             return None
@@ -247,7 +251,7 @@ class WrongWayCyclist(_StreetScript):
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
 
-def _time_of_share(share: float) -> float:
+def _inverse_smooth_step(share: float) -> float:
     """Inverse of the smooth step: the share of its duration at which it reaches a share."""
     t = np.linspace(0.0, 1.0, 201)
     return float(np.interp(share, smooth_step(t), t))

@@ -13,9 +13,9 @@ from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import Curve, Pose
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
-from drivax.synthetic.traffic.lateral import located, quintic_step
+from drivax.synthetic.traffic.lateral import project_on_path, quintic_step
 from drivax.synthetic.traffic.path_arrays import speed_profile
-from drivax.synthetic.traffic.paths import Path, interpolated, smoothed_curvature
+from drivax.synthetic.traffic.paths import Path, interpolate_curve, mean_curvature
 from drivax.synthetic.traffic.roles import Drivers
 
 #: Distance between the samples of a candidate, m.
@@ -27,7 +27,7 @@ _RETURN_M = 30.0
 #: Hard margin at ego's bumpers and sides, m; the final check uses 0.1 m.
 HARD_M = (0.35, 0.2)
 #: Preferred margin, m, for vehicles and for pedestrians and cyclists.
-NEAR_M, NEAR_PEOPLE_M = (1.2, 0.5), (2.0, 1.2)
+NEAR_M, NEAR_VULNERABLE_M = (1.2, 0.5), (2.0, 1.2)
 #: Stride of the coarse pass over path samples.
 _STRIDE = 4
 #: Ego avoids passing a light that turns red sooner than this, s.
@@ -77,7 +77,7 @@ class CandidatePath:
     ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
         """Position and heading at distances from ego."""
         arc = SPACING_M * np.arange(len(self.xy))
-        curve = interpolated(Curve(self.xy, self.heading), arc, at_m)
+        curve = interpolate_curve(Curve(self.xy, self.heading), arc, at_m)
         return curve.xy, curve.heading
 
 
@@ -88,22 +88,26 @@ def shifted_path(
 
     ``span_m`` is the approximate position of ego on the path, and the reach of the result, m.
     """
-    begin, left, direction = located(path, np.array([pose.x, pose.y]), span_m[0])
+    begin, left, direction = project_on_path(path, np.array([pose.x, pose.y]), span_m[0])
     ahead = np.arange(0.0, min(span_m[1], path.length_m - begin - 1e-6), SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
-    base = interpolated(path.curve, grid, begin + ahead)
-    aside = quintic_step(ahead, (0.0, left, math.tan(wrap(pose.heading - direction))), _RETURN_M)
+    base = interpolate_curve(path.curve, grid, begin + ahead)
+    lateral = quintic_step(ahead, (0.0, left, math.tan(wrap(pose.heading - direction))), _RETURN_M)
     there, back = shift.there_m - shift.begin_m, shift.end_m - shift.back_m
-    aside += shift.aside_m * quintic_step(ahead, (shift.back_m, 1.0, 0.0), back)
-    aside -= shift.aside_m * quintic_step(ahead, (shift.begin_m, 1.0, 0.0), there)
+    lateral += shift.aside_m * quintic_step(ahead, (shift.back_m, 1.0, 0.0), back)
+    lateral -= shift.aside_m * quintic_step(ahead, (shift.begin_m, 1.0, 0.0), there)
     normal = np.stack([-np.sin(base.heading), np.cos(base.heading)], axis=-1)
-    stretch = np.maximum(1.0 - aside * np.interp(begin + ahead, grid, path.curvature), 0.2)
-    turned = np.arctan2(np.gradient(aside, SPACING_M), stretch)
-    curve = Curve(base.xy + aside[:, None] * normal, base.heading + turned)
+    stretch = np.maximum(1.0 - lateral * np.interp(begin + ahead, grid, path.curvature), 0.2)
+    relative_heading = np.arctan2(np.gradient(lateral, SPACING_M), stretch)
+    curve = Curve(base.xy + lateral[:, None] * normal, base.heading + relative_heading)
     arc = curve.arc_m
-    at = np.arange(0.0, float(arc[-1]), SPACING_M)
+    position = np.arange(0.0, float(arc[-1]), SPACING_M)
     return _with_speeds(
-        path, drivers, interpolated(curve, arc, at), (begin, np.interp(at, arc, ahead)), shift
+        path,
+        drivers,
+        interpolate_curve(curve, arc, position),
+        (begin, np.interp(position, arc, ahead)),
+        shift,
     )
 
 
@@ -111,7 +115,7 @@ def _with_speeds(
     path: Path, drivers: Drivers, curve: Curve, base_m: tuple[float, _Points], shift: Shift
 ) -> CandidatePath:
     """Add the speeds; ``base_m`` is ego's position and the samples' distances along the path."""
-    curvature = smoothed_curvature(curve, SPACING_M)
+    curvature = mean_curvature(curve, SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
     limit = np.interp(base_m[0] + base_m[1], grid, path.limit_mps)
     none = np.full((len(limit), 1), -1)
@@ -164,10 +168,11 @@ class StopLine:
 
 
 def find_conflicts(
-    candidate: CandidatePath, size_m: _Size, others: _Boxes, valid: _Exists, people: Bool[np.ndarray, " user"]
-) -> Conflicts:
-    """Find conflicts of ego's box along a path with boxes of others, of which ``people`` walk or cycle."""
-    margin = np.where(people[:, None], NEAR_PEOPLE_M, NEAR_M)
+    candidate: CandidatePath, size_m: _Size, others: _Boxes, valid: _Exists,
+    vulnerable: Bool[np.ndarray, " user"],
+) -> Conflicts:  # fmt: skip
+    """Find conflicts of ego's box along a path with boxes of others, of which ``vulnerable`` walk or cycle."""
+    margin = np.where(vulnerable[:, None], NEAR_VULNERABLE_M, NEAR_M)
     still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
     ego = candidate_boxes(candidate, size_m)
     moving = _box_conflicts(ego, others, valid & ~still[:, None], margin)
@@ -189,29 +194,31 @@ def _box_conflicts(
     """Find conflicts of boxes: circles at every fourth sample first, then exact overlap."""
     reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + margin_m).T)
     reach += _STRIDE * SPACING_M / 2
-    user, step = np.nonzero(valid & _around(others, ego, reach))
+    user, step = np.nonzero(valid & _is_near_path(others, ego, reach))
     coarse = ego[::_STRIDE, :2]
-    at = others[user, step, :2]
-    gap = (at[:, None, 0] - coarse[:, 0]) ** 2 + (at[:, None, 1] - coarse[:, 1]) ** 2
+    xy = others[user, step, :2]
+    gap = (xy[:, None, 0] - coarse[:, 0]) ** 2 + (xy[:, None, 1] - coarse[:, 1]) ** 2
     row, block = np.nonzero(gap < reach[user, None] ** 2)
     point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
     row = np.repeat(row, _STRIDE)
     inside = (point >= 0) & (point < len(ego))
     row, point = row[inside], point[inside]
     other, mine = others[user[row], step[row]], ego[point]
-    close = overlap(_wider(mine, margin_m[user[row]]), other)
+    close = overlap(_grow_boxes(mine, margin_m[user[row]]), other)
     row, point, other, mine = row[close], point[close], other[close], mine[close]
-    hard = overlap(_wider(mine, np.array(HARD_M)), other)
+    hard = overlap(_grow_boxes(mine, np.array(HARD_M)), other)
     return Conflicts(user[row], step[row], point, hard)
 
 
-def _wider(box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "n 6"]:
+def _grow_boxes(
+    box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]
+) -> Float64[np.ndarray, "n 6"]:
     """Grow boxes at each end and each side."""
     size = box[:, 4:] + 2 * by_m
     return np.concatenate([box[:, :4], size], axis=1)
 
 
-def _around(others: _Boxes, ego: _PathBoxes, reach: Float64[np.ndarray, " user"]) -> _Exists:
+def _is_near_path(others: _Boxes, ego: _PathBoxes, reach: Float64[np.ndarray, " user"]) -> _Exists:
     """Mask of users near the bounding rectangle of the path."""
     low, high = ego[:, :2].min(axis=0), ego[:, :2].max(axis=0)
     outside = np.maximum(low - others[..., :2], others[..., :2] - high).max(axis=-1)
@@ -219,13 +226,9 @@ def _around(others: _Boxes, ego: _PathBoxes, reach: Float64[np.ndarray, " user"]
 
 
 def stop_lines(
-    network: RoadNetwork,
-    path: Path,
-    ego_m: tuple[float, float],
-    times_s: _Series,
-    passed: _Series,
+    network: RoadNetwork, path: Path, ego_m: tuple[float, float], times_s: _Series, passed: _Series,
     arrivals: dict[int, _Steps],
-) -> list[StopLine]:
+) -> list[StopLine]:  # fmt: skip
     """Return the stop lines ahead of ego (path position of its centre, half length).
 
     ``passed`` is the path position of ego's centre at each time (on the clock of the lights) in the last run.
@@ -255,22 +258,19 @@ def stop_lines(
 
 
 def arrivals(
-    network: RoadNetwork,
-    paths: list[Path],
-    distance_m: Float64[np.ndarray, "vehicle time"],
-    valid: Bool[np.ndarray, "vehicle time"],
-    half_m: Float64[np.ndarray, " vehicle"],
-) -> dict[int, _Steps]:
+    network: RoadNetwork, paths: list[Path], distance_m: Float64[np.ndarray, "vehicle time"],
+    valid: Bool[np.ndarray, "vehicle time"], half_m: Float64[np.ndarray, " vehicle"],
+) -> dict[int, _Steps]:  # fmt: skip
     """Steps at which a vehicle other than ego is on, or about to enter, each connector to which another yields."""
     watched = {first for lane in network.lanes for first in lane.yields_to}
     result: dict[int, _Steps] = {}
     for vehicle in range(1, len(paths)):
         for span in paths[vehicle].spans:
             if span.lane in watched:
-                at, half = distance_m[vehicle], half_m[vehicle]
+                position, half = distance_m[vehicle], half_m[vehicle]
                 end = span.begin_m + span.scale * network.lanes[span.lane].length_m
-                here = (at + half > span.begin_m) & (at - half < end) & valid[vehicle]
+                on_lane = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
                 early = round(_YIELD_S / 0.1)
-                coming = np.convolve(here[::-1], np.ones(early + 1), mode="full")[: len(here)][::-1] > 0
-                result[span.lane] = result.get(span.lane, np.zeros(len(here), bool)) | coming
+                coming = np.convolve(on_lane[::-1], np.ones(early + 1), mode="full")[: len(on_lane)][::-1] > 0
+                result[span.lane] = result.get(span.lane, np.zeros(len(on_lane), bool)) | coming
     return result

@@ -65,27 +65,22 @@ def expert_lanes(
 
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
     """Adjacent lanes of a lane that is long enough for a change."""
-    this = network.lanes[lane]
-    neighbour = [other for other in (this.left, this.right) if other >= 0]
-    return [] if this.connector or not 70.0 < this.length_m < 100.0 else neighbour
+    current = network.lanes[lane]
+    neighbour = [other for other in (current.left, current.right) if other >= 0]
+    return [] if current.connector or not 70.0 < current.length_m < 100.0 else neighbour
 
 
 def expert_path(
     network: RoadNetwork, lanes: tuple[int, ...], change: LaneChange | None, rng: np.random.Generator
 ) -> Path:
     """Return ego's path, close to the centres of its lanes."""
-    return lane_path(network, lanes, Sway.drawn(rng, 0.12), change)
+    return lane_path(network, lanes, Sway.draw(rng, 0.12), change)
 
 
 def drive_ego(
-    roles: Roles,
-    times_s: Float64[np.ndarray, " time"],
-    staging: Staging,
-    first_step: int,
-    traffic_run: TrafficRun,
-    aware_step: int = 0,
-    unplanned: Motion | None = None,
-) -> tuple[Motion, str]:
+    roles: Roles, times_s: Float64[np.ndarray, " time"], staging: Staging, first_step: int,
+    traffic_run: TrafficRun, aware_step: int = 0, unplanned: Motion | None = None,
+) -> tuple[Motion, str]:  # fmt: skip
     """Drive ego like other traffic if that is acceptable, else along a plan that knows the others' motion.
 
     Others react to a plan, so each plan is simulated and checked, and replaced where it fails.

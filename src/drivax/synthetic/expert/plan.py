@@ -22,24 +22,24 @@ from drivax.synthetic.expert.candidates import (
     shifted_path,
     stop_lines,
 )
-from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smoothed
+from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smooth_speeds
 from drivax.synthetic.expert.speed_search import TOUCH, Occupancy, SpeedPlan, search
 from drivax.synthetic.expert.violations import against_traffic, inside, user_boxes
 from drivax.synthetic.roads.curves import Pose
-from drivax.synthetic.traffic.lateral import located
+from drivax.synthetic.traffic.lateral import project_on_path
 from drivax.synthetic.traffic.paths import Path
 from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 
 #: Bounds of acceleration (m/s2) and jerk (m/s3), tried in this order.
 _BOUNDS = (((-3.4, 2.0), 2.6), ((-4.0, 2.3), 4.1), ((-5.9, 2.3), 25.0))
 #: Cost below which the original path needs no alternatives.
-_CHEAP = 12.0
+_GOOD_COST = 12.0
 #: Costs of a shift: constant, per m of offset, per second against traffic.
 _LEAVING, _ASIDE, _AGAINST = 8.0, 2.0, 6.0
 #: Cost of passing a line when the light is about to turn red or ego must give way.
 _LATE = 30.0
 #: Factor on proximity costs for pedestrians and cyclists.
-_PEOPLE = 12.0
+_VULNERABLE = 12.0
 #: Steps by which motion is extrapolated.
 _BEYOND_STEPS = 20
 #: Lateral gap to what ego passes, m, and lateral acceleration of the shift, m/s2: preferred and tightest.
@@ -64,7 +64,7 @@ class _State:
         acceleration: Ego's acceleration in the step before.
         others, valid: Boxes of the other users, and when they exist.
         passed_m: Ego's distance along the path at each step of the last run.
-        people: Mask of pedestrians and cyclists among the others.
+        vulnerable: Mask of pedestrians and cyclists among the others.
         unreactive: Mask of others that do not react to ego.
     """
 
@@ -79,7 +79,7 @@ class _State:
     valid: Bool[np.ndarray, "user time"]
     passed_m: _Series
     lines: list[StopLine]
-    people: Bool[np.ndarray, " user"]
+    vulnerable: Bool[np.ndarray, " user"]
     unreactive: Bool[np.ndarray, " user"]
 
     def candidate(self, shift: Shift) -> CandidatePath:
@@ -124,8 +124,8 @@ def _state(
     x, y = motion.xy[0, first_step]
     pose = Pose(float(x), float(y), float(motion.heading[0, first_step]))
     paths = motion.paths or roles.paths
-    from_m = located(paths[0], motion.xy[0, first_step], float(motion.distance_m[0, first_step]))[0]
-    boxes, valid = _continued(motion, first_step)
+    from_m = project_on_path(paths[0], motion.xy[0, first_step], float(motion.distance_m[0, first_step]))[0]
+    boxes, valid = _extrapolate(motion, first_step)
     rows = np.arange(1, len(motion.kind))
     state = _State(
         roles=roles,
@@ -139,22 +139,22 @@ def _state(
         valid=valid,
         passed_m=np.zeros(boxes.shape[1]),
         lines=[],
-        people=np.isin(motion.kind[1:], (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)),
+        vulnerable=np.isin(motion.kind[1:], (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)),
         unreactive=(rows >= motion.vehicles) | np.isin(rows, sorted(unreactive)),
     )
     candidate = state.candidate(Shift())
     gap = candidate.xy[:, None] - motion.xy[0, first_step:]
     passed_m = candidate.base_m[np.argmin(np.sum(gap**2, axis=-1), axis=0)]
-    state = replace(state, passed_m=_longer(passed_m))
+    state = replace(state, passed_m=_repeat_last_step(passed_m))
     return replace(state, lines=_lines(motion, times_s[first_step:], state))
 
 
-def _longer(values: np.ndarray) -> np.ndarray:
+def _repeat_last_step(values: np.ndarray) -> np.ndarray:
     """Repeat the last value."""
     return np.append(values, np.repeat(values[-1:], _BEYOND_STEPS))
 
 
-def _continued(
+def _extrapolate(
     motion: Motion, first_step: int
 ) -> tuple[Float64[np.ndarray, "user time 6"], Bool[np.ndarray, "user time"]]:
     """Boxes of the others from a step on, extrapolated at constant velocity."""
@@ -162,8 +162,8 @@ def _continued(
     longer = np.repeat(box[:, -1:], _BEYOND_STEPS, axis=1)
     travelled = motion.speed[1:, -1:] * DT_S * np.arange(1, _BEYOND_STEPS + 1)
     longer[..., :2] += travelled[..., None] * longer[..., 2:4]
-    more = np.repeat(valid[:, -1:], _BEYOND_STEPS, axis=1)
-    return np.concatenate([box, longer], axis=1), np.concatenate([valid, more], axis=1)
+    extra = np.repeat(valid[:, -1:], _BEYOND_STEPS, axis=1)
+    return np.concatenate([box, longer], axis=1), np.concatenate([valid, extra], axis=1)
 
 
 def _lines(motion: Motion, times_s: _Series, state: _State) -> list[StopLine]:
@@ -172,7 +172,7 @@ def _lines(motion: Motion, times_s: _Series, state: _State) -> list[StopLine]:
     roles = state.roles
     distance, valid = motion.distance_m[:, -steps:], motion.valid[: motion.vehicles, -steps:]
     coming = arrivals(roles.network, motion.paths or roles.paths, distance, valid, half)
-    first = {lane: _longer(taken) for lane, taken in coming.items()}
+    first = {lane: _repeat_last_step(taken) for lane, taken in coming.items()}
     longer = np.append(times_s, times_s[-1] + DT_S * np.arange(1, _BEYOND_STEPS + 1))
     ego, passed = (state.from_m, float(half[0])), state.from_m + state.passed_m
     return stop_lines(roles.network, state.path, ego, longer, passed, first)
@@ -183,24 +183,24 @@ def _best_candidate(state: _State) -> tuple[CandidatePath, SpeedProfile]:
     candidate = state.candidate(Shift())
     conflicts = _conflicts(state, candidate)
     options = [_option(state, candidate, conflicts)]
-    drives: list[tuple[float, CandidatePath, SpeedProfile]] = []
-    if options[0].cost < _CHEAP:
-        drive = _smooth(state, options[0])
-        if drive.excess <= _TOLERANCE:
-            return candidate, drive
+    infeasible: list[tuple[float, CandidatePath, SpeedProfile]] = []
+    if options[0].cost < _GOOD_COST:
+        profile = _smooth(state, options[0])
+        if profile.excess <= _TOLERANCE:
+            return candidate, profile
     options += _passing_options(state, candidate, conflicts)
     for option in sorted(options, key=lambda option: option.cost):
-        drive = _smooth(state, option)
-        if drive.excess <= _TOLERANCE and not option.speeds.touches:
-            return option.candidate, drive
-        drives.append((drive.excess + 100.0 * option.speeds.touches, option.candidate, drive))
-    _, candidate, drive = min(drives, key=lambda entry: entry[0])
-    return candidate, drive
+        profile = _smooth(state, option)
+        if profile.excess <= _TOLERANCE and not option.speeds.touches:
+            return option.candidate, profile
+        infeasible.append((profile.excess + 100.0 * option.speeds.touches, option.candidate, profile))
+    _, candidate, profile = min(infeasible, key=lambda entry: entry[0])
+    return candidate, profile
 
 
 def _conflicts(state: _State, candidate: CandidatePath) -> Conflicts:
     """Return conflicts along a candidate, without those of vehicles that follow ego and will react."""
-    conflicts = find_conflicts(candidate, state.size_m, state.others, state.valid, state.people)
+    conflicts = find_conflicts(candidate, state.size_m, state.others, state.valid, state.vulnerable)
     follows = np.zeros(len(state.others), bool)
     order = np.lexsort((-conflicts.point, conflicts.step, conflicts.user))
     users, first = np.unique(conflicts.user[order], return_index=True)
@@ -218,8 +218,8 @@ def _option(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _O
     cost = speeds.cost
     if candidate.shift.aside_m:
         wrong = against_traffic(state.roles.network, candidate.xy[::4], candidate.heading[::4])
-        wrong_m, aside = float(wrong.sum() * 4 * SPACING_M), abs(candidate.shift.aside_m)
-        cost += _LEAVING + _ASIDE * aside + _AGAINST * wrong_m / max(state.speed, 4.0)
+        wrong_m, lateral = float(wrong.sum() * 4 * SPACING_M), abs(candidate.shift.aside_m)
+        cost += _LEAVING + _ASIDE * lateral + _AGAINST * wrong_m / max(state.speed, 4.0)
     return _Option(candidate, occupancy, speeds, cost)
 
 
@@ -227,15 +227,15 @@ def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
     """Return the occupancy of a candidate by others, stop lines, and the end of the map."""
     shape = (state.others.shape[1], len(candidate.xy))
     hard, near = np.zeros(shape, bool), np.zeros(shape)
-    weight = np.where(state.people[conflicts.user], _PEOPLE, 1.0)
+    weight = np.where(state.vulnerable[conflicts.user], _VULNERABLE, 1.0)
     np.maximum.at(near, (conflicts.step, conflicts.point), weight)
     hard[conflicts.step[conflicts.hard], conflicts.point[conflicts.hard]] = True
     thick = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + state.speed) + 0.5) / SPACING_M))
     for line in state.lines:
         if line.base_m < candidate.base_m[-1]:
-            place = int(np.searchsorted(candidate.base_m, line.base_m))
-            hard[line.closed, place : place + thick] = True
-            near[line.late, place : place + thick] = _LATE
+            index = int(np.searchsorted(candidate.base_m, line.base_m))
+            hard[line.closed, index : index + thick] = True
+            near[line.late, index : index + thick] = _LATE
     room = state.path.length_m - state.from_m - state.size_m[0] / 2 - 0.5
     hard[:, candidate.base_m > room] = True
     return Occupancy(SPACING_M, hard, near)
@@ -243,23 +243,23 @@ def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
 
 def _smooth(state: _State, option: _Option) -> SpeedProfile:
     """Smooth an option's speeds within the tightest feasible bounds."""
-    at, speed = option.speeds.fine(state.others.shape[1])
+    position, speed = option.speeds.fine(state.others.shape[1])
     speed[0] = state.speed
     hard = option.occupancy.hard[1:]
-    place = np.arange(hard.shape[1])
-    own = np.clip(np.rint(at[1:] / SPACING_M).astype(int), 0, len(place) - 1)
-    below = np.where(hard & (place < own[:, None]), place, -1).max(axis=1)
-    above = np.where(hard & (place > own[:, None]), place, len(place)).min(axis=1)
+    index = np.arange(hard.shape[1])
+    own = np.clip(np.rint(position[1:] / SPACING_M).astype(int), 0, len(index) - 1)
+    below = np.where(hard & (index < own[:, None]), index, -1).max(axis=1)
+    above = np.where(hard & (index > own[:, None]), index, len(index)).min(axis=1)
     # Steps at which even the best speeds touch something are unbounded.
     lost = hard[np.arange(len(hard)), own]
     low = np.where((below >= 0) & ~lost, (below + 1) * SPACING_M, -np.inf)
     high = np.where(lost, np.inf, (above - 1) * SPACING_M)
-    around = np.clip(own[:, None] + np.arange(-4, 5), 0, len(place) - 1)
+    around = np.clip(own[:, None] + np.arange(-4, 5), 0, len(index) - 1)
     top = np.maximum(option.candidate.limit_mps[around].min(axis=1), speed[1:])
     drive = None
     for acceleration, jerk in _BOUNDS:
         bounds = Bounds(low, np.maximum(high, low), top, acceleration, jerk)
-        drive = smoothed(at, speed, state.acceleration, bounds)
+        drive = smooth_speeds(position, speed, state.acceleration, bounds)
         if drive.excess <= _TOLERANCE:
             break
     assert drive is not None
@@ -290,14 +290,14 @@ def _passing_options(state: _State, candidate: CandidatePath, conflicts: Conflic
 
 def _first_hit(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Hit | None:
     """Return user, step and path sample of the first collision at the preferred speeds."""
-    at, speed, places = 0.0, state.speed, []
+    position, speed, places = 0.0, state.speed, []
     for _ in range(state.others.shape[1]):
-        places.append(at)
-        index = min(int(at / SPACING_M), len(candidate.xy) - 1)
+        places.append(position)
+        index = min(int(position / SPACING_M), len(candidate.xy) - 1)
         speed = min(speed + 1.5 * DT_S, max(float(candidate.preferred_mps[index]), speed - 2.0 * DT_S))
-        at += speed * DT_S
-    apart = np.abs(conflicts.point * SPACING_M - np.array(places)[conflicts.step])
-    touch = conflicts.hard & (apart < 0.3 + 0.05 * state.speed)
+        position += speed * DT_S
+    separation = np.abs(conflicts.point * SPACING_M - np.array(places)[conflicts.step])
+    touch = conflicts.hard & (separation < 0.3 + 0.05 * state.speed)
     if not touch.any():
         return None
     first = int(np.flatnonzero(touch)[np.argmin(conflicts.step[touch])])
@@ -305,13 +305,9 @@ def _first_hit(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
 
 
 def _shift(
-    state: _State,
-    candidate: CandidatePath,
-    conflicts: Conflicts,
-    hit: _Hit,
-    side: float,
+    state: _State, candidate: CandidatePath, conflicts: Conflicts, hit: _Hit, side: float,
     margins: tuple[float, float],
-) -> Shift | None:
+) -> Shift | None:  # fmt: skip
     """Return the shift that passes a user, and standing users close behind it, on one side (1: left, -1: right)."""
     room_m, step_mps2 = margins
     begin, end, edge = _extent(state, candidate, hit, side)
@@ -324,21 +320,21 @@ def _shift(
     ]
     for user in sorted(standing, key=lambda u: int(conflicts.point[conflicts.user == u].min())):
         mine = conflicts.hard & (conflicts.user == user)
-        place = int(conflicts.point[mine].min())
-        if user not in seen and begin < place * SPACING_M < end + 20.0:
-            more = _extent(state, candidate, (user, int(conflicts.step[mine].min()), place), side)
-            end, edge = max(end, more[1]), max(edge, more[2])
+        index = int(conflicts.point[mine].min())
+        if user not in seen and begin < index * SPACING_M < end + 20.0:
+            extra = _extent(state, candidate, (user, int(conflicts.step[mine].min()), index), side)
+            end, edge = max(end, extra[1]), max(edge, extra[2])
             seen.add(user)
-    aside = edge + half_w + room_m
-    if not 0.15 < aside < _FURTHEST_M:
+    lateral = edge + half_w + room_m
+    if not 0.15 < lateral < _FURTHEST_M:
         return None
     speed = max(state.speed, float(candidate.preferred_mps[hit[2]]) * 0.7)
-    length = max(speed * float(np.sqrt(5.77 * aside / step_mps2)), 3.0 * aside, 8.0)
-    gentle = max(length, speed * float(np.sqrt(5.77 * aside / _STEP_MPS2[0])))
+    length = max(speed * float(np.sqrt(5.77 * lateral / step_mps2)), 3.0 * lateral, 8.0)
+    gentle = max(length, speed * float(np.sqrt(5.77 * lateral / _STEP_MPS2[0])))
     out = max(0.0, begin - half_l - length)
     there = out + length
     back = max(end + half_l, there)
-    return Shift(side * aside, out, there, back, back + gentle)
+    return Shift(side * lateral, out, there, back, back + gentle)
 
 
 def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> tuple[float, float, float]:
@@ -351,6 +347,10 @@ def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> 
     # Moving users are passed over a longer stretch.
     later = min(step + 10, len(state.others[user]) - 1)
     moved = (state.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
-    at = point * SPACING_M
+    position = point * SPACING_M
     ahead, behind = max(3.0 * moved, 0.7 * -moved, 0.0), max(0.7 * abs(moved), 0.0)
-    return at + float(along.min()) - behind, at + float(along.max()) + ahead, float((side * left).max())
+    return (
+        position + float(along.min()) - behind,
+        position + float(along.max()) + ahead,
+        float((side * left).max()),
+    )

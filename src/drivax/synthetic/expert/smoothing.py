@@ -71,11 +71,11 @@ def _squares(rows: _Matrix, weight: _Rows) -> Float64[np.ndarray, "n n"]:
     return np.einsum("ki,kj->ij", rows * weight[:, None], rows)
 
 
-def _times(rows: _Matrix, values: _Knots) -> _Rows:
+def _matmul(rows: _Matrix, values: _Knots) -> _Rows:
     return np.einsum("ij,j->i", rows, values)
 
 
-def smoothed(at_m: _Series, speed: _Series, acceleration_mps2: float, bounds: Bounds) -> SpeedProfile:
+def smooth_speeds(at_m: _Series, speed: _Series, acceleration_mps2: float, bounds: Bounds) -> SpeedProfile:
     """Return the smoothest speed profile near a coarse plan (distances from 0, speeds; the first speed is kept).
 
     ``acceleration_mps2`` is the acceleration just before the first step.
@@ -88,7 +88,7 @@ def smoothed(at_m: _Series, speed: _Series, acceleration_mps2: float, bounds: Bo
     linear_terms = np.concatenate(
         [_PLACE * (at_m[1:] - free), _SPEED * (speed[1:] - speed[0]), np.zeros(steps), _JERK * before]
     )
-    target = _times(rows.T, linear_terms)
+    target = _matmul(rows.T, linear_terms)
     low_a, high_a = (np.full(steps, a) for a in bounds.acceleration_mps2)
     # Jerk counts a tenth, so that all bounds are exceeded by similar amounts.
     scale = np.repeat([1.0, 0.1], [3 * steps, steps])
@@ -96,37 +96,39 @@ def smoothed(at_m: _Series, speed: _Series, acceleration_mps2: float, bounds: Bo
     high = np.concatenate([bounds.high_m - free, bounds.top_mps - speed[0], high_a, before + limit])
     low = np.concatenate([bounds.low_m - free, np.full(steps, -speed[0]), low_a, before - limit])
     bounded = rows * scale[:, None]
-    knots = _least(base, target, bounded, low * scale, high * scale)
-    value = _times(bounded, knots)
+    knots = _minimise(base, target, bounded, low * scale, high * scale)
+    value = _matmul(bounded, knots)
     excess = float(np.maximum(np.maximum(value - high * scale, low * scale - value), 0.0).max())
-    return _profile(float(speed[0]), _times(rows[2 * steps : 3 * steps], knots), excess)
+    return _profile(float(speed[0]), _matmul(rows[2 * steps : 3 * steps], knots), excess)
 
 
-def _least(
+def _minimise(
     base: Float64[np.ndarray, "n n"], target: _Knots, rows: _Matrix, low: _Rows, high: _Rows
 ) -> _Knots:
     """Minimise ``a B a / 2 - t a`` and the penalties of ``low <= R a <= high`` by Newton steps with a line search."""
     a = np.linalg.solve(base, target)
-    value = _times(rows, a)
+    value = _matmul(rows, a)
     for _ in range(_NEWTON_STEPS):
         bound = np.clip(value, low, high)
-        hit = value != bound
-        active = rows[hit]
+        violated = value != bound
+        active = rows[violated]
         penalty = _squares(active, np.full(len(active), _PENALTY))
-        step = np.linalg.solve(base + penalty, target + _PENALTY * _times(active.T, bound[hit]))
+        step = np.linalg.solve(base + penalty, target + _PENALTY * _matmul(active.T, bound[violated]))
         step -= a
-        change = _times(rows, step)
+        change = _matmul(rows, step)
         if np.abs(change).max() < _SMALLEST:
             break
-        slope = float(np.sum(step * (_times(base, a) - target)))
-        curvature = float(np.sum(step * _times(base, step)))
-        share = _share(value, change, (low, high), (slope, curvature))
-        a = a + share * step
-        value = value + share * change
+        slope = float(np.sum(step * (_matmul(base, a) - target)))
+        curvature = float(np.sum(step * _matmul(base, step)))
+        step_length = _step_length(value, change, (low, high), (slope, curvature))
+        a = a + step_length * step
+        value = value + step_length * change
     return a
 
 
-def _share(value: _Rows, change: _Rows, limits: tuple[_Rows, _Rows], rise: tuple[float, float]) -> float:
+def _step_length(
+    value: _Rows, change: _Rows, limits: tuple[_Rows, _Rows], rise: tuple[float, float]
+) -> float:
     """Share of a Newton step that minimises the objective: its derivative vanishes, by bisection.
 
     ``rise`` is the first and second derivative of the objective without penalties.

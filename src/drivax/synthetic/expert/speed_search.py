@@ -52,8 +52,8 @@ class SpeedPlan:
 
     def fine(self, steps: int) -> tuple[Float64[np.ndarray, " time"], Float64[np.ndarray, " time"]]:
         """Distance and speed at every step of the recording."""
-        at = np.arange(steps) / COARSE
-        speed = np.interp(at, np.arange(len(self.speed)), self.speed)
+        position = np.arange(steps) / COARSE
+        speed = np.interp(position, np.arange(len(self.speed)), self.speed)
         travelled = np.cumsum((speed[1:] + speed[:-1]) * DT_S / 2)
         return np.concatenate([[0.0], travelled]), speed
 
@@ -90,11 +90,9 @@ def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]
 
 
 def search(
-    occupancy: Occupancy,
-    preferred_mps: Float64[np.ndarray, " place"],
-    limit_mps: Float64[np.ndarray, " place"],
-    speed_mps: float,
-) -> SpeedPlan:
+    occupancy: Occupancy, preferred_mps: Float64[np.ndarray, " place"],
+    limit_mps: Float64[np.ndarray, " place"], speed_mps: float,
+) -> SpeedPlan:  # fmt: skip
     """Return the cheapest speeds from the present one, with preferred and largest speeds at the places of a path."""
     steps = -(-(len(occupancy.hard) - 1) // COARSE)
     reach = occupancy.spacing_m * (occupancy.hard.shape[1] - 1)
@@ -108,17 +106,19 @@ def search(
     over = np.maximum(grid.speed[:, None] - bound, 0.0)
     always = np.where(difference > 0, _FAST, _SLOW) * difference**2 + _BEND * over**2
     always = (always * _STEP_S).astype(np.float32)
-    taken = _Taken(occupancy, grid)
+    taken = _OccupiedStates(occupancy, grid)
     layers = np.full((steps + 1, speeds * places + 1), np.inf, np.float32)
     layers[0, start * places] = 0.0
     for k in range(1, steps + 1):
         reached = layers[k - 1].take(grid.source)
         reached += grid.effort[:, None, None]
         layers[k, :-1] = (reached.min(axis=0) + always + taken.cost(k * COARSE)).ravel()
-    return _traced(grid, layers, taken)
+    return _trace_back(grid, layers, taken)
 
 
-def _traced(grid: _Grid, layers: Float32[np.ndarray, "coarse state"], taken: _Taken) -> SpeedPlan:
+def _trace_back(
+    grid: _Grid, layers: Float32[np.ndarray, "coarse state"], taken: _OccupiedStates
+) -> SpeedPlan:
     """Trace back from the cheapest final state."""
     places = len(grid.place)
     state = int(np.argmin(layers[-1]))
@@ -127,14 +127,14 @@ def _traced(grid: _Grid, layers: Float32[np.ndarray, "coarse state"], taken: _Ta
     for k in range(len(layers) - 1, 0, -1):
         v, s = divmod(state, places)
         speed.append(float(grid.speed[v]))
-        touches |= taken.touched(k * COARSE, v, s)
+        touches |= taken.touches(k * COARSE, v, s)
         source = grid.source[:, v, s]
         state = int(source[np.argmin(layers[k - 1][source] + grid.effort)])
     speed.append(float(grid.speed[state // places]))
     return SpeedPlan(np.array(speed[::-1]), cost, touches)
 
 
-class _Taken:
+class _OccupiedStates:
     """Costs of occupied states (speed, place), which keep their speed within half a coarse step."""
 
     def __init__(self, occupancy: Occupancy, grid: _Grid) -> None:
@@ -163,7 +163,7 @@ class _Taken:
         close = np.maximum(1.0 - (free - 1.0) / self._preferred_gap, 0.0) ** 2
         return around * self._pace + close * self._following
 
-    def touched(self, step: int, v: int, s: int) -> bool:
+    def touches(self, step: int, v: int, s: int) -> bool:
         """Whether something is touched around a step."""
         half = COARSE // 2
         rows = np.minimum(step + np.arange(-half, half + 1), len(self._occupancy.hard) - 1)

@@ -73,14 +73,14 @@ def find_violation(
 
     ``times_s`` are on the clock of the lights.
     """
-    now = slice(first_step, None)
-    speed = motion.speed[0, now]
+    window = slice(first_step, None)
+    speed = motion.speed[0, window]
     if np.sum(np.abs(speed)) * DT_S < _LEAST_M:
         return Violation("ego_hardly_moves")
-    if not motion.valid[0, now].all():
+    if not motion.valid[0, window].all():
         return Violation("ego_leaves_map")
-    box = user_boxes(motion)[:, now]
-    pairs = touching(box, motion.valid[:, now], _tested(motion))
+    box = user_boxes(motion)[:, window]
+    pairs = first_overlap_step(box, motion.valid[:, window], _tested_pairs(motion))
     touched = np.flatnonzero(pairs[0] < box.shape[1])
     if len(touched):
         return Violation("ego_collides", tuple(touched.tolist()), first_step + int(pairs[0].min()))
@@ -88,10 +88,10 @@ def find_violation(
         return Violation("ego_brakes_hard")
     if leaves_road(roles.network, box[0]):
         return Violation("ego_leaves_road")
-    cause = _rules_broken(roles, motion, times_s, first_step)
+    cause = _find_rule_violation(roles, motion, times_s, first_step)
     if cause:
         return Violation(cause)
-    against = goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, now])
+    against = goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, window])
     if against and not roles.parked and not is_staged(staging):
         return Violation("ego_wrong_way")
     return Violation("others_collide" if (pairs < box.shape[1]).any() else "")
@@ -102,14 +102,14 @@ def is_staged(staging: Staging) -> bool:
     return any(vars(staging).values())
 
 
-def _tested(motion: Motion) -> _UserPairs:
+def _tested_pairs(motion: Motion) -> _UserPairs:
     """Mask of pairs that must not overlap: not two pedestrians, not two static users."""
-    person = motion.kind == AgentKind.PEDESTRIAN
+    is_pedestrian = motion.kind == AgentKind.PEDESTRIAN
     moves = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
-    return (moves[:, None] | moves) & ~(person[:, None] & person)
+    return (moves[:, None] | moves) & ~(is_pedestrian[:, None] & is_pedestrian)
 
 
-def touching(
+def first_overlap_step(
     box: Float64[np.ndarray, "user time 6"], valid: Bool[np.ndarray, "user time"], tested: _UserPairs
 ) -> Int64[np.ndarray, "user user"]:
     """Return the step at which tested pairs first overlap (the number of steps: never); ego has a margin of 10 cm."""
@@ -117,10 +117,10 @@ def touching(
     box[0, :, 4:] += 2 * EGO_SKIN_M
     reach = np.hypot(box[:, 0, 4], box[:, 0, 5]) / 2
     # Broad phase: bounding rectangles of the trajectories.
-    at = np.where(valid[..., None], box[..., :2], np.nan)
+    xy = np.where(valid[..., None], box[..., :2], np.nan)
     with np.errstate(all="ignore"):
-        low = np.where(valid[..., None], at, np.inf).min(axis=1) - reach[:, None]
-        high = np.where(valid[..., None], at, -np.inf).max(axis=1) + reach[:, None]
+        low = np.where(valid[..., None], xy, np.inf).min(axis=1) - reach[:, None]
+        high = np.where(valid[..., None], xy, -np.inf).max(axis=1) + reach[:, None]
     meet = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=-1)
     first, second = np.nonzero(np.triu(tested & meet, 1))
     gap = np.sum((box[first, :, :2] - box[second, :, :2]) ** 2, axis=-1)
@@ -167,16 +167,16 @@ def passes(lane: Lane, front: _Points, heading: _Series) -> _Steps:
     return (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & within[1:]
 
 
-def _rules_broken(roles: Roles, motion: Motion, times_s: _Series, first_step: int) -> str:
+def _find_rule_violation(roles: Roles, motion: Motion, times_s: _Series, first_step: int) -> str:
     """Return ``ego_runs_red``, ``other_runs_red``, ``ego_runs_stop_sign``, or an empty string."""
-    network, now = roles.network, slice(first_step, None)
+    network, window = roles.network, slice(first_step, None)
     red = np.zeros((len(times_s) - first_step, len(network.lanes)), bool)
     if network.signals is not None:
-        red = network.signals.colours(times_s[now], len(network.lanes))[0] == Colour.RED
+        red = network.signals.colours(times_s[window], len(network.lanes))[0] == Colour.RED
     red_steps = red[:-1] & red[1:]
     for i, path in enumerate(motion.paths or roles.paths):
-        heading, valid = motion.heading[i, now], motion.valid[i, now]
-        front = _front(motion, i)[now]
+        heading, valid = motion.heading[i, window], motion.valid[i, window]
+        front = _front(motion, i)[window]
         for span in path.spans:
             lane = network.lanes[span.lane]
             stop = i == 0 and lane.control in (Control.STOP, Control.ALL_WAY_STOP)
@@ -185,9 +185,9 @@ def _rules_broken(roles: Roles, motion: Motion, times_s: _Series, first_step: in
             passed = passes(lane, front, heading) & valid[:-1] & valid[1:]
             if np.any(passed & red_steps[:, span.lane]):
                 return "ego_runs_red" if i == 0 else "other_runs_red"
-            if stop and not _stood(lane, motion, first_step, front, passed):
+            if stop and not _stopped_before_line(lane, motion, first_step, front, passed):
                 return "ego_runs_stop_sign"
-        if i == 0 and _passes_red_off_route(network, path, motion.xy[0, now], front, heading, red_steps):
+        if i == 0 and _passes_red_off_route(network, path, motion.xy[0, window], front, heading, red_steps):
             return "ego_runs_red"
     return ""
 
@@ -225,7 +225,7 @@ def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
     return result
 
 
-def _stood(lane: Lane, motion: Motion, first_step: int, front: _Points, passed: _Steps) -> bool:
+def _stopped_before_line(lane: Lane, motion: Motion, first_step: int, front: _Points, passed: _Steps) -> bool:
     """Whether ego stopped before each passing of a line."""
     for step in np.flatnonzero(passed):
         # The stop may lie before the recording.
@@ -245,13 +245,13 @@ def against_traffic(
 
     Where lanes cross, a lane that is hardly further away and not against the heading decides.
     """
-    at = np.concatenate([lane.curve.xy[::2] for lane in network.lanes])
+    points = np.concatenate([lane.curve.xy[::2] for lane in network.lanes])
     course = np.concatenate([lane.curve.heading[::2] for lane in network.lanes])
-    near = ((at >= xy.min(axis=0) - 6.0) & (at <= xy.max(axis=0) + 6.0)).all(axis=1)
-    at, course = at[near], course[near]
-    if not len(at):
+    near = ((points >= xy.min(axis=0) - 6.0) & (points <= xy.max(axis=0) + 6.0)).all(axis=1)
+    points, course = points[near], course[near]
+    if not len(points):
         return np.zeros(len(xy), bool)
-    gap = np.hypot(xy[:, None, 0] - at[:, 0], xy[:, None, 1] - at[:, 1])
+    gap = np.hypot(xy[:, None, 0] - points[:, 0], xy[:, None, 1] - points[:, 1])
     against = np.cos(heading[:, None] - course) < math.cos(math.radians(135.0))
     opposed = np.where(against, gap, np.inf).min(axis=1)
     return opposed < np.where(against, np.inf, gap).min(axis=1) - _DOUBT_M
@@ -275,35 +275,35 @@ def smoother(count: int, window: int, order: int, derivative: int = 0) -> Float6
     """
     half = window // 2
     first = np.clip(np.arange(count) - half + (window % 2 == 0), 0, count - window)
-    at = np.arange(count) - first.astype(float)
+    position = np.arange(count) - first.astype(float)
     if window % 2 == 0:
         inner = (np.arange(count) >= half) & (np.arange(count) < count - half)
-        at[inner] = half - 0.5
+        position[inner] = half - 0.5
     factorial = float(np.prod(np.arange(1, derivative + 1))) if derivative else 1.0
     rows = np.zeros((count, count))
     for row in range(count):
-        powers = (np.arange(window) - at[row])[:, None] ** np.arange(order + 1)
+        powers = (np.arange(window) - position[row])[:, None] ** np.arange(order + 1)
         rows[row, first[row] : first[row] + window] = np.linalg.pinv(powers)[derivative] * factorial
     return rows
 
 
 def quantities(heading: _Series, speed: _Series) -> dict[str, Float64[np.ndarray, " step"]]:
     """Return the smoothed quantities of :data:`LIMITS` at each step but the first."""
-    turned = wrap(np.diff(heading))
-    along, lateral = np.diff(speed) / DT_S, (speed[1:] + speed[:-1]) / 2 * turned / DT_S
-    course = np.cumsum(turned)
+    relative_heading = wrap(np.diff(heading))
+    along, lateral = np.diff(speed) / DT_S, (speed[1:] + speed[:-1]) / 2 * relative_heading / DT_S
+    course = np.cumsum(relative_heading)
     jerk = {"window": 15, "order": 2, "derivative": 1}
     return {
-        "longitudinal_mps2": _smoothed(along, 8, 2),
-        "lateral_mps2": _smoothed(lateral, 8, 2),
-        "jerk_mps3": _smoothed(along, **jerk),
-        "jerk_magnitude_mps3": _smoothed(np.hypot(along, lateral), **jerk),
-        "yaw_rate_rps": _smoothed(course, **jerk),
-        "yaw_acceleration_rps2": _smoothed(course, 15, 3, 2),
+        "longitudinal_mps2": _savgol_filter(along, 8, 2),
+        "lateral_mps2": _savgol_filter(lateral, 8, 2),
+        "jerk_mps3": _savgol_filter(along, **jerk),
+        "jerk_magnitude_mps3": _savgol_filter(np.hypot(along, lateral), **jerk),
+        "yaw_rate_rps": _savgol_filter(course, **jerk),
+        "yaw_acceleration_rps2": _savgol_filter(course, 15, 3, 2),
     }
 
 
-def _smoothed(
+def _savgol_filter(
     values: Float64[np.ndarray, " n"], window: int, order: int, derivative: int = 0
 ) -> Float64[np.ndarray, " n"]:
     # The last bits of BLAS would depend on the number of threads.

@@ -77,11 +77,11 @@ class Curve:
         """Positions and headings at distances along the curve, interpolated linearly."""
         return interpolate(along_m, self.arc_m, self.xy), np.interp(along_m, self.arc_m, self.heading)
 
-    def shifted(self, left_m: float) -> Curve:
+    def parallel(self, left_m: float) -> Curve:
         """Parallel curve at a distance to the left (negative: right)."""
         return Curve(self.xy + left_m * normals(self.heading), self.heading)
 
-    def displaced(self, left_m: Float64[np.ndarray, " point"]) -> Curve:
+    def offset_by(self, left_m: Float64[np.ndarray, " point"]) -> Curve:
         """Curve at a distance to the left that varies along it, with its own tangent headings.
 
         With arc length s, curvature k and displacement d the tangent turns by ``atan2(dd/ds, 1 - d k)``.
@@ -133,8 +133,10 @@ def from_curvature(curvature: Float64[np.ndarray, " point"], step_m: float, star
 def straight(start: Pose, length_m: float) -> Curve:
     """Straight line."""
     count = max(2, math.ceil(length_m / STEP_M) + 1)
-    at = np.linspace(0.0, length_m, count)
-    xy = np.column_stack([start.x + at * math.cos(start.heading), start.y + at * math.sin(start.heading)])
+    position = np.linspace(0.0, length_m, count)
+    xy = np.column_stack(
+        [start.x + position * math.cos(start.heading), start.y + position * math.sin(start.heading)]
+    )
     return Curve(xy, np.full(count, start.heading))
 
 
@@ -222,7 +224,7 @@ def connect_poses(start: Pose, end: Pose) -> Curve:
     return resample(join_curves(*parts), STEP_M)
 
 
-def winding(
+def draw_winding_curve(
     rng: np.random.Generator, length_m: float, *, max_curvature: float, max_turn: float, start: Pose
 ) -> Curve:
     """Draw a winding road: curvature is linear between random knots 35 to 90 m apart.
@@ -237,8 +239,8 @@ def winding(
         sign = -np.sign(values[-1]) if rng.random() < 2 / 3 and values[-1] else rng.choice([-1.0, 1.0])
         values.append(float(sign) * max_curvature * float(rng.uniform(0.15, 1.0)))
     count = math.ceil(length_m / STEP_M) + 1
-    at = np.arange(count) * STEP_M
-    curvature = np.interp(at, knots, values)
-    turned = np.concatenate([[0.0], np.cumsum((curvature[1:] + curvature[:-1]) * STEP_M / 2)])
-    excess = float(np.ptp(turned)) / max_turn
+    position = np.arange(count) * STEP_M
+    curvature = np.interp(position, knots, values)
+    headings = np.concatenate([[0.0], np.cumsum((curvature[1:] + curvature[:-1]) * STEP_M / 2)])
+    excess = float(np.ptp(headings)) / max_turn
     return from_curvature(curvature / max(1.0, excess), STEP_M, start)

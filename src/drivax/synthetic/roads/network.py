@@ -116,7 +116,7 @@ class RoadNetwork:
 
     Attributes:
         edges: Closed rings without the repeated point: the outer boundary counter-clockwise, islands clockwise.
-        walks: Sidewalks outside the edges.
+        sidewalks: Sidewalks outside the edges.
         busy: Lanes with denser traffic.
     """
 
@@ -128,40 +128,42 @@ class RoadNetwork:
     signals: SignalPlan | None = None
     starts: tuple[Start, ...] = ()
     crossings: tuple[Crossing, ...] = ()
-    walks: tuple[Curve, ...] = ()
+    sidewalks: tuple[Curve, ...] = ()
     bays: tuple[Bay, ...] = ()
     busy: tuple[int, ...] = ()
 
     @cached_property
     def conflicts(self) -> Bool[np.ndarray, "lane lane"]:
         """Pairs of connectors that come closer than ``CLEARANCE_M`` and begin at different lanes."""
-        return conflicting(self.lanes)
+        return conflict_matrix(self.lanes)
 
     @cached_property
     def shared_m(self) -> dict[tuple[int, int], float]:
-        """For successors of the same lane: distance along the first one over which both share space, m."""
+        """Distance along one of two successors of a lane over which they share space, m."""
         pairs = (pair for lane in self.lanes for pair in permutations(lane.successors, 2))
         return {(a, b): _shared_length(self.lanes[a].curve, self.lanes[b].curve) for a, b in pairs}
 
 
-def conflicting(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
+def conflict_matrix(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
     """See :attr:`RoadNetwork.conflicts`."""
     result = np.zeros((len(lanes), len(lanes)), bool)
     connectors = [i for i, lane in enumerate(lanes) if lane.connector]
     low = np.array([lanes[i].curve.xy.min(axis=0) for i in connectors]).reshape(-1, 2)
     high = np.array([lanes[i].curve.xy.max(axis=0) for i in connectors]).reshape(-1, 2)
     # Bounding boxes exclude most pairs of a network with several junctions.
-    apart = (low[:, None] - high).max(axis=-1) > CLEARANCE_M
+    separation = (low[:, None] - high).max(axis=-1) > CLEARANCE_M
     for (i, a), (k, b) in combinations(enumerate(connectors), 2):
-        if not (apart[i, k] or apart[k, i] or set(lanes[a].predecessors) & set(lanes[b].predecessors)):
+        if not (
+            separation[i, k] or separation[k, i] or set(lanes[a].predecessors) & set(lanes[b].predecessors)
+        ):
             gaps = _distances(lanes[a].curve.xy[::2], lanes[b].curve.xy[::2])
             result[a, b] = result[b, a] = gaps.min() < CLEARANCE_M
     return result
 
 
 def _shared_length(a: Curve, b: Curve) -> float:
-    apart = _distances(a.xy, b.xy).min(axis=1) > CLEARANCE_M
-    return float(a.arc_m[int(np.argmax(apart)) if apart.any() else -1])
+    separation = _distances(a.xy, b.xy).min(axis=1) > CLEARANCE_M
+    return float(a.arc_m[int(np.argmax(separation)) if separation.any() else -1])
 
 
 def _distances(a: Float64[np.ndarray, "a 2"], b: Float64[np.ndarray, "b 2"]) -> Float64[np.ndarray, "a b"]:
@@ -178,12 +180,12 @@ class Draft:
     markings: list[Line] = field(default_factory=list)
     crosswalks: list[Line] = field(default_factory=list)
     crossings: list[Crossing] = field(default_factory=list)
-    walks: list[Curve] = field(default_factory=list)
+    sidewalks: list[Curve] = field(default_factory=list)
     bays: list[Bay] = field(default_factory=list)
 
-    def lane(self, curve: Curve, width_m: float, limit_mps: float, **more: Any) -> int:
+    def lane(self, curve: Curve, width_m: float, limit_mps: float, **extra: Any) -> int:
         """Add a lane with further attributes of :class:`Lane` and return its index."""
-        self.lanes.append(Lane(curve, width_m, limit_mps, **more))
+        self.lanes.append(Lane(curve, width_m, limit_mps, **extra))
         return len(self.lanes) - 1
 
     def change(self, lane: int, **attributes: Any) -> None:
@@ -236,22 +238,22 @@ def feature_id(lane: int) -> int:
 def map_features(network: RoadNetwork) -> tuple[MapFeature, ...]:
     """Convert a network to map features: lanes first (ids 1, 2, ...), then edges, markings, crosswalks, stop signs."""
     features = [_lane_feature(index, lane) for index, lane in enumerate(network.lanes)]
-    closed = [Line(line.kind, np.concatenate([line.xy, line.xy[:1]])) for line in network.edges]
-    for line in (*closed, *network.markings, *network.crosswalks):
+    edges = [Line(line.kind, np.concatenate([line.xy, line.xy[:1]])) for line in network.edges]
+    for line in (*edges, *network.markings, *network.crosswalks):
         features.append(MapFeature(feature_id=len(features) + 1, kind=line.kind, points=_flat(line.xy)))
-    for before, connectors in _signed(network).items():
+    for stop_lane, connectors in _stop_controlled_lanes(network).items():
         features.append(
             MapFeature(
                 feature_id=len(features) + 1,
                 kind=RoadKind.STOP_SIGN,
-                points=_flat(network.lanes[before].curve.xy[-1:]),
+                points=_flat(network.lanes[stop_lane].curve.xy[-1:]),
                 lanes=tuple(map(feature_id, connectors)),
             )
         )
     return tuple(features)
 
 
-def _signed(network: RoadNetwork) -> dict[int, list[int]]:
+def _stop_controlled_lanes(network: RoadNetwork) -> dict[int, list[int]]:
     """Lanes that end at a stop sign, each with the connectors to which it applies."""
     signs: dict[int, list[int]] = {}
     for index, lane in enumerate(network.lanes):

@@ -55,10 +55,10 @@ class SignalPlan:
         starts = [0.0] * len(self.phases)
         programs = self._programs
         for program, lag in zip(programs, self.lags_s or (0.0,) * len(programs), strict=True):
-            at = lag
+            green_at = lag
             for phase in program:
-                starts[phase] = at
-                at += self.green_s[phase] + self.yellow_s + self.all_red_s
+                starts[phase] = green_at
+                green_at += self.green_s[phase] + self.yellow_s + self.all_red_s
         return tuple(starts)
 
     @property
@@ -73,7 +73,7 @@ class SignalPlan:
     def _duration_s(self, program: tuple[int, ...]) -> float:
         return sum(self.green_s[phase] for phase in program) + len(program) * (self.yellow_s + self.all_red_s)
 
-    def stretched(self, cycle_s: float) -> SignalPlan:
+    def stretch(self, cycle_s: float) -> SignalPlan:
         """Lengthen the first green so that the cycle takes ``cycle_s`` (one junction only)."""
         extra = cycle_s - self.cycle_s
         return replace(self, green_s=(self.green_s[0] + extra, *self.green_s[1:]))

@@ -26,7 +26,7 @@ class RoadStyle:
     fast_limits_mps: tuple[float, ...] = (22.4, 24.6, 26.8, 29.1)
     shoulder_m: tuple[float, float] = (0.5, 1.5)
     curvature: float = 1.0
-    walk_share: float = 0.8
+    sidewalk_share: float = 0.8
     parking_share: float = 0.3
 
 
@@ -39,7 +39,7 @@ RING = RoadStyle(
     fast_limits_mps=(19.4, 22.2),
     shoulder_m=(0.25, 0.7),
     curvature=1.3,
-    walk_share=0.95,
+    sidewalk_share=0.95,
     parking_share=0.7,
 )
 

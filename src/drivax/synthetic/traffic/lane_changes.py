@@ -65,12 +65,12 @@ class LaneChains:
         following = {i: _next_in_chain(network, i) for i in range(len(lanes)) if not lanes[i].connector}
         inner = set(following.values())
         for head in [i for i in following if i not in inner]:
-            at, last, lane = 0.0, head, head
+            position, last, lane = 0.0, head, head
             while lane >= 0:
-                self.chain[lane], self.offset_m[lane] = len(lengths), at
-                at += lanes[lane].length_m
+                self.chain[lane], self.offset_m[lane] = len(lengths), position
+                position += lanes[lane].length_m
                 last, lane = lane, following[lane]
-            lengths.append(at)
+            lengths.append(position)
             ends.append(lanes[last].ends and not lanes[last].successors)
         self.length_m, self.ends = np.array([*lengths, 0.0]), np.array([*ends, False])
         self.left, self.right = (
@@ -180,27 +180,27 @@ class LaneChanges:
         chain = np.where((lane >= 0) & now.active[:, None], chains.chain[lane], -1)
         return self._choose(now, options, (chain, chains.offset_m[lane] + along))
 
-    def _options(self, now: Situation, vehicles: _Indices, target: _Indices, here: _Place) -> _Options:
-        """Changes for which the lanes have room, and mandatory ones; ``here`` is the lane and the position on it."""
-        own, along = here
+    def _options(self, now: Situation, vehicles: _Indices, target: _Indices, current: _Place) -> _Options:
+        """Changes for which the lanes have room, and mandatory ones; ``current`` is the lane and the position on it."""
+        own, along = current
         chains = self.chains
         chain, own_chain = chains.chain[target], chains.chain[own]
-        at = chains.offset_m[target] + along / chains.lane_m[own] * chains.lane_m[target]
+        position = chains.offset_m[target] + along / chains.lane_m[own] * chains.lane_m[target]
         own_at = chains.offset_m[own] + along
         left = chains.length_m[own_chain] - own_at
         speed = now.speed[vehicles]
         mandatory = chains.ends[own_chain] & (left < np.maximum(_LEAVE_M, _LEAVE_S * speed))
         length = np.maximum(_DURATION_S * speed, _SHORTEST_M)
         length = np.where(mandatory, np.minimum(length, np.maximum(left - 2.0, 8.0)), length)
-        rest = chains.length_m[chain] - at
-        possible = (rest > length + 3.0) & (~chains.ends[own_chain] | (left > length))
-        optional = possible & (speed > _LEAST_MPS) & (at > _AFTER_M) & (rest > length + _BEFORE_M)
+        remainder = chains.length_m[chain] - position
+        possible = (remainder > length + 3.0) & (~chains.ends[own_chain] | (left > length))
+        optional = possible & (speed > _LEAST_MPS) & (position > _AFTER_M) & (remainder > length + _BEFORE_M)
         optional &= ~chains.exit[target] & ~chains.ends[chain]
         possible = np.where(mandatory, possible & ~chains.ends[chain], optional)
         limit = now.fastest[vehicles] * chains.limit[target] / chains.limit[own]
         k = np.flatnonzero(possible | mandatory)
         return _Options(vehicles[k], target[k], length[k], possible[k], mandatory[k], limit[k], left[k],
-                        (chain[k], at[k]), (own_chain[k], own_at[k]))  # fmt: skip
+                        (chain[k], position[k]), (own_chain[k], own_at[k]))  # fmt: skip
 
     def _choose(self, now: Situation, options: _Options, occupied: _Occupied) -> tuple[list[Change], Helped]:
         """Apply MOBIL to each option; take mandatory changes first, then those with the largest gain."""
@@ -209,25 +209,25 @@ class LaneChanges:
         new_leader, new_follower = self._neighbours(now, vehicles, o.there, occupied)
         _, ahead_gap, ahead_speed = new_leader
         behind, behind_gap, _ = new_follower
-        mine = self._follow(vehicles, speed, o.limit_mps, ahead_gap, ahead_speed)
+        own = self._follow(vehicles, speed, o.limit_mps, ahead_gap, ahead_speed)
         # After the change the new follower follows the vehicle, and the old follower the vehicle's old leader.
-        new_then, new_today = self._followed(now, vehicles, new_follower, new_leader)
+        new_after, new_before = self._follower_accelerations(now, vehicles, new_follower, new_leader)
         old_leader, old_follower = self._neighbours(now, vehicles, o.here, occupied)
-        old_today, old_then = self._followed(now, vehicles, old_follower, old_leader)
-        others = new_then - new_today + old_then - old_today
-        gain = mine - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
+        old_before, old_after = self._follower_accelerations(now, vehicles, old_follower, old_leader)
+        others = new_after - new_before + old_after - old_before
+        gain = own - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
         urgency = np.where(o.mandatory, 1.0 - np.clip(o.left_m / _LEAVE_M, 0.0, 1.0), 0.0)
         safe = _SAFE_MPS2 + urgency * (_URGENT_MPS2 - _SAFE_MPS2)
         follower_speed = np.where(behind >= 0, now.speed[np.maximum(behind, 0)], 0.0)
-        ok = o.possible & (new_then > -safe) & (mine > -safe)
-        ok &= ahead_gap > _ROOM_M + _ROOM_S * np.maximum(speed - ahead_speed, 0.0) * 4
-        ok &= behind_gap > _ROOM_M + _ROOM_S * follower_speed * (1 - 0.6 * urgency)
-        ok &= o.mandatory | (gain > _THRESHOLD_MPS2)
-        changes = self._without_contest(now, options, ok, gain)
-        moved = {change.vehicle for change in changes}
-        return changes, _helped(now, options, moved, new_leader, new_follower)
+        accepted = o.possible & (new_after > -safe) & (own > -safe)
+        accepted &= ahead_gap > _ROOM_M + _ROOM_S * np.maximum(speed - ahead_speed, 0.0) * 4
+        accepted &= behind_gap > _ROOM_M + _ROOM_S * follower_speed * (1 - 0.6 * urgency)
+        accepted &= o.mandatory | (gain > _THRESHOLD_MPS2)
+        changes = self._drop_contested(now, options, accepted, gain)
+        changing = {change.vehicle for change in changes}
+        return changes, _help_accelerations(now, options, changing, new_leader, new_follower)
 
-    def _followed(
+    def _follower_accelerations(
         self, now: Situation, vehicles: _Indices, follower: _Neighbour, leader: _Neighbour
     ) -> tuple[_Values, _Values]:
         """Return followers' accelerations behind the vehicle and behind its leader; 0 without a follower."""
@@ -251,13 +251,13 @@ class LaneChanges:
         self, now: Situation, vehicles: _Indices, place: _Place, occupied: _Occupied
     ) -> tuple[_Neighbour, _Neighbour]:
         """The nearest vehicle or obstacle ahead of each place on its chain, and the nearest vehicle behind."""
-        chain, at = place
+        chain, position = place
         pair = np.arange(len(vehicles))
-        apart = occupied[1] - at[:, None, None]
+        separation = occupied[1] - position[:, None, None]
         seen = occupied[0] == chain[:, None, None]
         seen[pair, vehicles] = False
         neighbours = []
-        for distance in (apart, -apart):
+        for distance in (separation, -separation):
             slots = np.where(seen & (distance >= 0), distance, np.inf)
             # NumPy reduces a last axis this short several times more slowly.
             gap = reduce(np.minimum, np.moveaxis(slots, -1, 0)) - self._half
@@ -266,7 +266,7 @@ class LaneChanges:
             neighbours.append((np.where(np.isfinite(nearest), row, -1), nearest, now.speed[row]))
         (row, nearest, speed), (behind, behind_gap, behind_speed) = neighbours
         if len(self._obstacle_m):
-            ahead = self._obstacle_m - at[:, None]
+            ahead = self._obstacle_m - position[:, None]
             on_chain = (self._obstacle_chain == chain[:, None]) & (ahead > -3.0)
             obstacle = np.where(on_chain, ahead, np.inf).min(axis=1) - _HALF_OBSTACLE_M
             row, speed = np.where(obstacle < nearest, -1, row), np.where(obstacle < nearest, 0.0, speed)
@@ -274,7 +274,7 @@ class LaneChanges:
         half = self._half[vehicles]
         return (row, nearest - half, speed), (behind, behind_gap - half, behind_speed)
 
-    def _without_contest(self, now: Situation, options: _Options, ok: _Mask, gain: _Values) -> list[Change]:
+    def _drop_contested(self, now: Situation, options: _Options, ok: _Mask, gain: _Values) -> list[Change]:
         """Return the best option of each vehicle; only one vehicle enters a gap at a time."""
         changes: dict[int, Change] = {}
         taken: list[tuple[int, float]] = []
@@ -284,13 +284,15 @@ class LaneChanges:
         )
         for _, row, k in order:
             chain, own = int(self.chains.chain[options.target[k]]), float(now.at_m[row])
-            if row not in changes and not any(c == chain and abs(own - at) < 40.0 for c, at in taken):
+            if row not in changes and not any(
+                c == chain and abs(own - position) < 40.0 for c, position in taken
+            ):
                 taken.append((chain, own))
                 changes[row] = Change(row, int(options.target[k]), float(options.length_m[k]))
         return list(changes.values())
 
 
-def _helped(
+def _help_accelerations(
     now: Situation, options: _Options, moved: set[int], leader: _Neighbour, follower: _Neighbour
 ) -> Helped:
     """Pairs that adjust to each other because a mandatory change has found no room yet."""

@@ -13,7 +13,7 @@ from drivax.synthetic.roads.curves import STEP_M, Curve
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.obstacles import Boxes, Extents, extents
 from drivax.synthetic.traffic.path_arrays import PathTables
-from drivax.synthetic.traffic.paths import SLOTS, LaneSpan, Path, interpolated, smoothed_curvature
+from drivax.synthetic.traffic.paths import SLOTS, LaneSpan, Path, interpolate_curve, mean_curvature
 
 #: Distance at which drivers begin to look for a detour around an obstacle, m.
 LOOK_M = 45.0
@@ -34,7 +34,9 @@ _Samples = Float64[np.ndarray, " point"]
 _Point = Float64[np.ndarray, " 2"]
 
 
-def displaced(path: Path, aside_m: _Samples, occupied: tuple[LaneSpan, ...] = ()) -> tuple[Path, _Samples]:
+def displace_path(
+    path: Path, aside_m: _Samples, occupied: tuple[LaneSpan, ...] = ()
+) -> tuple[Path, _Samples]:
     """Displace a path to the left by a smooth offset at each sample.
 
     ``occupied`` are further lanes that the vehicle occupies, in positions of the old path. Returns the new path, and
@@ -44,20 +46,20 @@ def displaced(path: Path, aside_m: _Samples, occupied: tuple[LaneSpan, ...] = ()
     normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
     slope = np.gradient(aside_m, step)
     stretch = np.maximum(1.0 - aside_m * np.gradient(curve.heading, step), 0.1)
-    aside = Curve(curve.xy + aside_m[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
-    old = step * np.arange(len(aside.xy))
-    new = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(aside.xy, axis=0).T))])
+    moved_curve = Curve(curve.xy + aside_m[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
+    old = step * np.arange(len(moved_curve.xy))
+    new = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(moved_curve.xy, axis=0).T))])
     count = max(2, round(float(new[-1]) / STEP_M) + 1)
-    at = np.linspace(0.0, new[-1], count)
-    source = np.interp(at, new, old)
+    position = np.linspace(0.0, new[-1], count)
+    source = np.interp(position, new, old)
     index = np.rint(source / step).astype(int)
     lane = path.lane[index]
     lane_m = path.lane_m[index] + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
     for span in occupied:
         _occupy(span, source, lane, lane_m)
-    moved, step = interpolated(aside, new, at), float(new[-1]) / (count - 1)
+    moved, step = interpolate_curve(moved_curve, new, position), float(new[-1]) / (count - 1)
     spans = _moved_spans(path, occupied, old, new)
-    curvature = smoothed_curvature(moved, step)
+    curvature = mean_curvature(moved, step)
     return Path(moved, step, curvature, path.limit_mps[index], spans, lane, lane_m), new
 
 
@@ -66,22 +68,22 @@ def _moved_spans(
 ) -> tuple[LaneSpan, ...]:
     """Lane spans of a displaced path, whose samples moved from the old to the new positions."""
 
-    def moved(metres: float) -> float:
+    def to_new(metres: float) -> float:
         if not math.isfinite(metres) or metres < 0.0:
             return metres
         return float(np.interp(metres, old, new)) + max(metres - float(old[-1]), 0.0)
 
     # A span is anchored at its end: what lies ahead of the displacement stays in place.
-    shifts = [moved(span.end_m) - span.end_m for span in path.spans]
+    shifts = [to_new(span.end_m) - span.end_m for span in path.spans]
     spans = [
         replace(
-            s, begin_m=s.begin_m + by, end_m=s.end_m + by, from_m=moved(s.from_m), until_m=moved(s.until_m)
+            s, begin_m=s.begin_m + by, end_m=s.end_m + by, from_m=to_new(s.from_m), until_m=to_new(s.until_m)
         )
         for s, by in zip(path.spans, shifts, strict=True)
     ]
     for s in occupied:
-        end = moved(s.until_m)
-        spans.append(LaneSpan(s.lane, s.begin_m + end - s.until_m, s.scale, moved(s.from_m), end, end))
+        end = to_new(s.until_m)
+        spans.append(LaneSpan(s.lane, s.begin_m + end - s.until_m, s.scale, to_new(s.from_m), end, end))
     return tuple(spans)
 
 
@@ -89,12 +91,12 @@ def _occupy(
     span: LaneSpan, at: _Samples, lane: np.ndarray, lane_m: Float64[np.ndarray, "point slot"]
 ) -> None:
     """Enter a lane into the first free slot of the samples on which it is occupied."""
-    here = (at >= span.from_m) & (at <= span.until_m) & ~(lane == span.lane).any(axis=1)
+    occupied = (at >= span.from_m) & (at <= span.until_m) & ~(lane == span.lane).any(axis=1)
     for slot in range(SLOTS):
-        free = here & (lane[:, slot] < 0)
+        free = occupied & (lane[:, slot] < 0)
         lane[free, slot] = span.lane
         lane_m[free, slot] = (at[free] - span.begin_m) / span.scale
-        here &= ~free
+        occupied &= ~free
 
 
 def quintic_step(at: _Samples, begin: tuple[float, float, float], length_m: float) -> _Samples:
@@ -102,17 +104,17 @@ def quintic_step(at: _Samples, begin: tuple[float, float, float], length_m: floa
 
     ``begin`` is the first position with the offset (m) and slope (m/m) there; the second derivative is zero.
     """
-    place, offset, slope = begin
-    u = np.clip((at - place) / length_m, 0.0, 1.0)
+    start_m, offset, slope = begin
+    u = np.clip((at - start_m) / length_m, 0.0, 1.0)
     rate = slope * length_m
     # Hermite basis of degree five: value and slope at 0; everything else is zero.
     value = 1 - 10 * u**3 + 15 * u**4 - 6 * u**5
     tangent = u - 6 * u**3 + 8 * u**4 - 3 * u**5
-    before = np.clip(at - place, -10.0, 0.0)
-    return np.where(at < place, offset + slope * before, offset * value + rate * tangent)
+    before = np.clip(at - start_m, -10.0, 0.0)
+    return np.where(at < start_m, offset + slope * before, offset * value + rate * tangent)
 
 
-def located(path: Path, xy: _Point, near_m: float | None = None) -> tuple[float, float, float]:
+def project_on_path(path: Path, xy: _Point, near_m: float | None = None) -> tuple[float, float, float]:
     """Project a point onto a path, if given only within 30 m of a position.
 
     Returns:
@@ -123,18 +125,18 @@ def located(path: Path, xy: _Point, near_m: float | None = None) -> tuple[float,
         first = max(0, int((near_m - 30.0) / path.step_m))
         last = max(first + 2, int((near_m + 30.0) / path.step_m))
     gap = xy - path.curve.xy[first:last]
-    place = first + int(np.argmin(np.sum(gap**2, axis=1)))
-    heading = float(path.curve.heading[place])
-    dx, dy = xy - path.curve.xy[place]
+    index = first + int(np.argmin(np.sum(gap**2, axis=1)))
+    heading = float(path.curve.heading[index])
+    dx, dy = xy - path.curve.xy[index]
     along = dx * math.cos(heading) + dy * math.sin(heading)
-    return place * path.step_m + float(along), float(dy * math.cos(heading) - dx * math.sin(heading)), heading
+    return index * path.step_m + float(along), float(dy * math.cos(heading) - dx * math.sin(heading)), heading
 
 
-def followed(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np.ndarray, " time"]:
+def positions_along(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np.ndarray, " time"]:
     """Positions along a path of a moving point, m."""
     result, near = np.zeros(len(xy)), None
     for k, point in enumerate(xy):
-        near = located(path, point, near)[0]
+        near = project_on_path(path, point, near)[0]
         result[k] = near
     return result
 
@@ -144,14 +146,14 @@ def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tu
 
     Returns the path, and the vehicle's position on it. The old lanes stay occupied for most of the change.
     """
-    place = min(max(at_m / present.step_m, 0.0), len(present.curve.xy) - 1.001)
-    index, share = int(place), place - int(place)
+    sample = min(max(at_m / present.step_m, 0.0), len(present.curve.xy) - 1.001)
+    index, share = int(sample), sample - int(sample)
     xy = present.curve.xy[index] * (1 - share) + present.curve.xy[index + 1] * share
     heading = float(present.curve.heading[index] * (1 - share) + present.curve.heading[index + 1] * share)
-    along, aside, direction = located(target, xy)
-    turned = float(np.clip(wrap(heading - direction), -0.6, 0.6))
+    along, lateral, direction = project_on_path(target, xy)
+    relative_heading = float(np.clip(wrap(heading - direction), -0.6, 0.6))
     old = target.step_m * np.arange(len(target.curve.xy))
-    offset = quintic_step(old, (along, aside, math.tan(turned)), length_m)
+    offset = quintic_step(old, (along, lateral, math.tan(relative_heading)), length_m)
     own = {span.lane for span in target.spans}
     left = along + _LEFT_SHARE * length_m
     occupied = tuple(
@@ -161,7 +163,7 @@ def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tu
         for s in present.spans
         if s.lane not in own and s.end_m > at_m - 3.0 and s.begin_m < at_m + length_m and s.until_m > at_m
     )
-    path, new = displaced(target, offset, occupied)
+    path, new = displace_path(target, offset, occupied)
     return path, float(np.interp(along, old, new))
 
 
@@ -175,7 +177,7 @@ def around(
     old = path.step_m * np.arange(len(path.curve.xy))
     out = 1.0 - quintic_step(old, (at_m[0], 1.0, 0.0), at_m[1] - at_m[0])
     back = quintic_step(old, (at_m[2], 1.0, 0.0), at_m[3] - at_m[2])
-    return displaced(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUDES_M else ())[0]
+    return displace_path(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUDES_M else ())[0]
 
 
 @dataclass(frozen=True)
@@ -193,15 +195,17 @@ def detour_request(
     network: RoadNetwork, tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
 ) -> DetourRequest:
     """Build the request of a vehicle at a path position and speed."""
-    at, adjacent = float(now[0]), []
-    lane, along = tables.on(np.array([at]), np.array([row]))
+    position, adjacent = float(now[0]), []
+    lane, along = tables.on(np.array([position]), np.array([row]))
     if lane[0, 0] >= 0:
-        here = network.lanes[lane[0, 0]]
-        for other in (here.left, here.right):
+        current = network.lanes[lane[0, 0]]
+        for other in (current.left, current.right):
             if other >= 0:
-                scale = here.length_m / network.lanes[other].length_m
-                adjacent.append(LaneSpan(other, at - float(along[0, 0]), scale, at, at + _ADJACENT_M))
-    return DetourRequest(tables.paths[row], at, float(now[1]), size_m, tuple(adjacent))
+                scale = current.length_m / network.lanes[other].length_m
+                adjacent.append(
+                    LaneSpan(other, position - float(along[0, 0]), scale, position, position + _ADJACENT_M)
+                )
+    return DetourRequest(tables.paths[row], position, float(now[1]), size_m, tuple(adjacent))
 
 
 #: Path positions of a detour: begin, end of the way out, begin of the way back, end.
@@ -233,59 +237,59 @@ class Detours:
         group = blocks & (seen.near_m <= last)
         left = float(seen.left_m[group].max()) + half_width + _ROOM_M
         right = float(seen.right_m[group].min()) - half_width - _ROOM_M
-        for aside in sorted([left, right], key=abs):
-            plan = _plan(request, first, last, aside)
-            if plan is not None and self._is_free(request, plan, aside, seen, moving):
-                return around(request.path, plan, aside, request.adjacent), plan[3]
+        for lateral in sorted([left, right], key=abs):
+            plan = _plan(request, first, last, lateral)
+            if plan is not None and self._is_free(request, plan, lateral, seen, moving):
+                return around(request.path, plan, lateral, request.adjacent), plan[3]
         return None
 
     def _is_free(
-        self, request: DetourRequest, plan: _Positions, aside: float, seen: Extents, moving: Boxes
+        self, request: DetourRequest, plan: _Positions, lateral: float, seen: Extents, moving: Boxes
     ) -> bool:
         """Whether the detour is free of road edges, standing obstacles and oncoming or overtaking users."""
         begin, out, back, end = plan
         half = request.size_m[1] / 2
-        low, high = aside - half - _EDGE_M, aside + half + _EDGE_M
+        low, high = lateral - half - _EDGE_M, lateral + half + _EDGE_M
         adjacent = (seen.near_m < back) & (seen.far_m > out) & (seen.right_m < high) & (seen.left_m > low)
         edges, _ = _extents(request, self._edge, (out + back) / 2, (end - begin) / 2 + 15.0)
         sweep = (edges.near_m > out) & (edges.near_m < back)
         sweep &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
         if adjacent.any() or sweep.any():
             return False
-        path, at, lasts = (
+        path, position, lasts = (
             request.path,
             request.at_m,
             (end - request.at_m) / max(request.speed, _PASS_MPS) + 1.0,
         )
-        others, near = _extents(request, moving, (at + end) / 2, end - at + 90.0, within_m=6.0)
+        others, near = _extents(request, moving, (position + end) / 2, end - position + 90.0, within_m=6.0)
         middle = np.clip((others.near_m + others.far_m) / 2, 0, path.length_m)
-        turned = wrap(near.heading - path.curve.heading[np.rint(middle / path.step_m).astype(int)])
-        speed = near.speed * np.cos(turned)
+        relative_heading = wrap(near.heading - path.curve.heading[np.rint(middle / path.step_m).astype(int)])
+        speed = near.speed * np.cos(relative_heading)
         meets = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
-        ahead = (others.far_m > at) & (others.near_m + np.minimum(speed, 0.0) * lasts < end + 5.0)
-        behind = (others.far_m <= at) & (others.far_m + speed * 3.0 > at - 6.0)
+        ahead = (others.far_m > position) & (others.near_m + np.minimum(speed, 0.0) * lasts < end + 5.0)
+        behind = (others.far_m <= position) & (others.far_m + speed * 3.0 > position - 6.0)
         # A moving vehicle beyond the detour in the own lane is a leader, no conflict.
         ahead &= ~((speed > 1.0) & (others.near_m > back))
         return not bool(np.any(meets & (ahead | behind)))
 
 
-def _plan(request: DetourRequest, first: float, last: float, aside: float) -> _Positions | None:
+def _plan(request: DetourRequest, first: float, last: float, lateral: float) -> _Positions | None:
     """Positions of a detour around the stretch from first to last; None if it is too wide, steep or late."""
     half = request.size_m[0] / 2
     out = first - half - 0.3
-    begin = max(request.at_m, out - max(_STEEPEST * 2 * abs(aside), 2.4 * request.speed))
+    begin = max(request.at_m, out - max(_STEEPEST * 2 * abs(lateral), 2.4 * request.speed))
     back = last + half + 0.5
-    end = back + max(_STEEPEST * 1.6 * abs(aside), 2.0 * min(request.speed, _PASS_MPS))
-    steep, late = out - begin < _STEEPEST * abs(aside), end > request.path.length_m - 5.0
-    return None if abs(aside) > _FURTHEST_M or steep or late else (begin, out, back, end)
+    end = back + max(_STEEPEST * 1.6 * abs(lateral), 2.0 * min(request.speed, _PASS_MPS))
+    steep, late = out - begin < _STEEPEST * abs(lateral), end > request.path.length_m - 5.0
+    return None if abs(lateral) > _FURTHEST_M or steep or late else (begin, out, back, end)
 
 
 def _dense(ring: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "dense 2"]:
     """A closed ring with points at most a metre apart."""
     closed = np.concatenate([ring, ring[:1]])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
-    at = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
-    return np.stack([np.interp(at, arc, closed[:, k]) for k in (0, 1)], axis=-1)
+    position = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
+    return np.stack([np.interp(position, arc, closed[:, k]) for k in (0, 1)], axis=-1)
 
 
 def _extents(
@@ -294,6 +298,6 @@ def _extents(
     """Extents along the path of the boxes within a radius of a position on it, and these boxes."""
     path = request.path
     centre = path.curve.xy[min(int(max(at_m, 0.0) / path.step_m), len(path.curve.xy) - 1)]
-    near = boxes.chosen(np.sum((boxes.xy - centre) ** 2, axis=1) < radius_m**2)
+    near = boxes.select(np.sum((boxes.xy - centre) ** 2, axis=1) < radius_m**2)
     seen, which = extents(path, near, within_m)
-    return seen, near.chosen(which)
+    return seen, near.select(which)

@@ -50,11 +50,11 @@ class Boxes:
         """Cosine and sine of the headings."""
         return np.cos(self.heading), np.sin(self.heading)
 
-    def chosen(self, which: np.ndarray) -> Boxes:
+    def select(self, which: np.ndarray) -> Boxes:
         """Return the boxes of some rows."""
         return Boxes(self.xy[which], self.heading[which], self.speed[which], self.size_m[which])
 
-    def joined(self, other: Boxes) -> Boxes:
+    def concatenate(self, other: Boxes) -> Boxes:
         """Return these boxes and others."""
         if not len(other):
             return self
@@ -80,20 +80,20 @@ def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, 
     near, rough = np.zeros(0, int), np.zeros(0, int)
     for first in range(0, len(inside), _BATCH):
         batch = inside[first : first + _BATCH]
-        gap = _squared(boxes.xy[batch, None], coarse)
+        gap = _squared_distance(boxes.xy[batch, None], coarse)
         best = gap.argmin(axis=1)
         close = gap[np.arange(len(batch)), best] < within_m**2
         near, rough = np.append(near, batch[close]), np.append(rough, 8 * best[close])
     window = np.clip(rough[:, None] + np.arange(-8, 9), 0, len(path.curve.xy) - 1)
-    fine = _squared(boxes.xy[near, None], path.curve.xy[window])
-    place = window[np.arange(len(near)), fine.argmin(axis=1)]
-    at, aside, turned = _relative(boxes, near, path.curve.xy[place], path.curve.heading[place])
-    length, width = _reach(boxes.size_m[near], turned)
-    at = at + place * path.step_m
-    return Extents(at - length, at + length, aside - width, aside + width), near
+    fine = _squared_distance(boxes.xy[near, None], path.curve.xy[window])
+    index = window[np.arange(len(near)), fine.argmin(axis=1)]
+    position, lateral, angle = _relative(boxes, near, path.curve.xy[index], path.curve.heading[index])
+    length, width = _reach(boxes.size_m[near], angle)
+    position = position + index * path.step_m
+    return Extents(position - length, position + length, lateral - width, lateral + width), near
 
 
-def _squared(
+def _squared_distance(
     a: Float64[np.ndarray, "*#batch 2"], b: Float64[np.ndarray, "*#batch 2"]
 ) -> Float64[np.ndarray, "..."]:
     """Squared distances."""
@@ -113,13 +113,13 @@ def _relative(
     return dx * cos + dy * sin, dy * cos - dx * sin, boxes.heading[which] - heading
 
 
-def _reach(size_m: Float64[np.ndarray, "k 2"], turned: _Values) -> tuple[_Values, _Values]:
+def _reach(size_m: Float64[np.ndarray, "k 2"], relative_heading: _Values) -> tuple[_Values, _Values]:
     """Half extents along and across a direction."""
-    cos, sin = np.abs(np.cos(turned)) / 2, np.abs(np.sin(turned)) / 2
+    cos, sin = np.abs(np.cos(relative_heading)) / 2, np.abs(np.sin(relative_heading)) / 2
     return cos * size_m[:, 0] + sin * size_m[:, 1], sin * size_m[:, 0] + cos * size_m[:, 1]
 
 
-class Standing:
+class StaticObstacles:
     """Static obstacles, in the coordinates of every vehicle's path."""
 
     def __init__(self, boxes: Boxes, tables: PathTables, width_m: PerVehicle) -> None:
@@ -138,8 +138,8 @@ class Standing:
         half = self._half[row] + _MARGIN_M
         block = np.sort(seen.near_m[(seen.right_m < half) & (seen.left_m > -half)])
         if len(block) > self.near_m.shape[1]:
-            more = len(block) - self.near_m.shape[1]
-            self.near_m = np.pad(self.near_m, ((0, 0), (0, more)), constant_values=np.inf)
+            extra = len(block) - self.near_m.shape[1]
+            self.near_m = np.pad(self.near_m, ((0, 0), (0, extra)), constant_values=np.inf)
         self.near_m[row] = np.inf
         self.near_m[row, : len(block)] = block
 
@@ -160,39 +160,39 @@ def nearest_obstacles(
     tables: PathTables, vehicles: Boxes, at_m: PerVehicle, active: VehicleMask, others: Boxes
 ) -> tuple[PerVehicle, PerVehicle]:
     """Gap from each front bumper to the nearest obstacle in the corridor of the own path, and its speed along it."""
-    count, users = len(vehicles), vehicles.joined(others)
+    count, users = len(vehicles), vehicles.concatenate(others)
     gap, speed = np.full(count, np.inf), np.zeros(count)
-    viewer, user = _close(vehicles, users, active)
+    viewer, user = _nearby_pairs(vehicles, users, active)
     if not len(viewer):
         return gap, speed
     pose, place_m, apart2 = _nearest(tables, at_m, viewer, users.xy[user])
-    at, left, turned = _relative(users, user, pose[:, :2], pose[:, 2])
-    at = at + place_m
-    length, width = _reach(users.size_m[user], turned)
+    position, left, relative_heading = _relative(users, user, pose[:, :2], pose[:, 2])
+    position = position + place_m
+    length, width = _reach(users.size_m[user], relative_heading)
     vehicle = user < count
     width = np.where(vehicle, np.minimum(width, _MIDDLE_M), width)
-    drift = users.speed[user] * np.sin(turned)
-    soon = left + drift * _FORESEEN_S
+    drift = users.speed[user] * np.sin(relative_heading)
+    left_soon = left + drift * _FORESEEN_S
     size = vehicles.size_m[viewer]
     half = size[:, 1] / 2 + np.where(vehicle, _VEHICLES_M, _MARGIN_M)
-    inside = (np.minimum(left, soon) - width < half) & (np.maximum(left, soon) + width > -half)
+    inside = (np.minimum(left, left_soon) - width < half) & (np.maximum(left, left_soon) + width > -half)
     # Beyond the last sample of the path, or next to the vehicle: no obstacle.
-    inside &= (at > at_m[viewer] + 0.3 * size[:, 0]) & (apart2 < 64.0)
+    inside &= (position > at_m[viewer] + 0.3 * size[:, 0]) & (apart2 < 64.0)
     k = inside.nonzero()[0]
     if not len(k):
         return gap, speed
     viewer, user, left, drift = viewer[k], user[k], left[k], drift[k]
-    room = at[k] - length[k] - at_m[viewer] - size[k, 0] / 2
-    stays = ~_gone(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[viewer], 1.0))
+    room = position[k] - length[k] - at_m[viewer] - size[k, 0] / 2
+    stays = ~_leaves_corridor(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[viewer], 1.0))
     # Of several obstacles of a vehicle the nearest is entered last.
     order = np.argsort(-room, kind="stable")
     order = order[stays[order]]
     gap[viewer[order]] = room[order]
-    speed[viewer[order]] = np.maximum(users.speed[user] * np.cos(turned[k]), 0.0)[order]
+    speed[viewer[order]] = np.maximum(users.speed[user] * np.cos(relative_heading[k]), 0.0)[order]
     return gap, speed
 
 
-def _close(vehicles: Boxes, users: Boxes, active: VehicleMask) -> tuple[_Indices, _Indices]:
+def _nearby_pairs(vehicles: Boxes, users: Boxes, active: VehicleMask) -> tuple[_Indices, _Indices]:
     """Pairs of a vehicle and a user (vehicles first) in a wedge ahead of it."""
     count = len(vehicles)
     dx, dy = users.xy[:, 0] - vehicles.xy[:, 0, None], users.xy[:, 1] - vehicles.xy[:, 1, None]
@@ -219,17 +219,19 @@ def _nearest(
 ) -> tuple[Float64[np.ndarray, "k 4"], _Values, _Values]:
     """The sample of a vehicle's path ahead that is nearest to a point, its position, and the squared distance."""
     step = tables.step_m[viewer]
-    place = np.rint((at_m[viewer, None] + _LOOKS_M) / step[:, None]).astype(int)
-    place = np.minimum(place, tables.last[viewer, None])
+    index = np.rint((at_m[viewer, None] + _LOOKS_M) / step[:, None]).astype(int)
+    index = np.minimum(index, tables.last[viewer, None])
     flat = tables.table.reshape(-1, 4)
-    points = flat.take(place + (viewer * tables.table.shape[1])[:, None], axis=0)
+    points = flat.take(index + (viewer * tables.table.shape[1])[:, None], axis=0)
     dx, dy = points[..., 0] - xy[:, 0, None], points[..., 1] - xy[:, 1, None]
-    apart = dx * dx + dy * dy
-    pair = np.arange(len(viewer)), apart.argmin(axis=1)
-    return points[pair], place[pair] * step, apart[pair]
+    separation = dx * dx + dy * dy
+    pair = np.arange(len(viewer)), separation.argmin(axis=1)
+    return points[pair], index[pair] * step, separation[pair]
 
 
-def _gone(left: _Values, drift: _Values, reach: _Values, seconds: _Values) -> Bool[np.ndarray, " k"]:
+def _leaves_corridor(
+    left: _Values, drift: _Values, reach: _Values, seconds: _Values
+) -> Bool[np.ndarray, " k"]:
     """Mask of crossing users that leave the corridor well before the vehicle arrives."""
-    then = left + drift * np.maximum(seconds - _WELL_S, 0.0)
-    return (seconds > 2 * _WELL_S) & (np.abs(then) > reach) & (then * drift > 0)
+    left_at_arrival = left + drift * np.maximum(seconds - _WELL_S, 0.0)
+    return (seconds > 2 * _WELL_S) & (np.abs(left_at_arrival) > reach) & (left_at_arrival * drift > 0)

@@ -104,27 +104,27 @@ class PathTables:
         for k, (begin, end, lane) in enumerate(sorted(connectors)[: self.connector.shape[1]]):
             self.connector[row, k], self.connector_begin[row, k] = lane, begin
             self.connector_end[row, k] = end
-        more = len(crossings) - self.crossing.shape[1]
-        if more > 0:
-            self.crossing = np.pad(self.crossing, ((0, 0), (0, more)), constant_values=-1)
-            self.crossing_m = np.pad(self.crossing_m, ((0, 0), (0, more)), constant_values=np.inf)
+        extra = len(crossings) - self.crossing.shape[1]
+        if extra > 0:
+            self.crossing = np.pad(self.crossing, ((0, 0), (0, extra)), constant_values=-1)
+            self.crossing_m = np.pad(self.crossing_m, ((0, 0), (0, extra)), constant_values=np.inf)
         self.crossing[row], self.crossing_m[row] = -1, np.inf
-        for k, (at, number) in enumerate(sorted(crossings)):
-            self.crossing_m[row, k], self.crossing[row, k] = at, number
+        for k, (position, number) in enumerate(sorted(crossings)):
+            self.crossing_m[row, k], self.crossing[row, k] = position, number
 
     def _grow(self, points: int) -> None:
-        more = points - self.table.shape[1]
-        if more > 0:
-            pad = ((0, 0), (0, more), (0, 0))
+        extra = points - self.table.shape[1]
+        if extra > 0:
+            pad = ((0, 0), (0, extra), (0, 0))
             self.table = np.pad(self.table, pad, mode="edge")
             self.lane = np.pad(self.lane, pad, constant_values=-1)
             self.lane_m = np.pad(self.lane_m, pad)
 
     def at(self, position_m: PerVehicle, rows: VehicleRows) -> Float64[np.ndarray, "v 4"]:
         """x, y, heading and fastest speed at positions on the paths of some vehicles."""
-        place = position_m / self.step_m[rows]
-        index = np.minimum(np.maximum(place.astype(int), 0), self.last[rows] - 1)
-        share = np.minimum(np.maximum(place - index, 0.0), 1.0)[:, None]
+        sample = position_m / self.step_m[rows]
+        index = np.minimum(np.maximum(sample.astype(int), 0), self.last[rows] - 1)
+        share = np.minimum(np.maximum(sample - index, 0.0), 1.0)[:, None]
         flat, index = self.table.reshape(-1, 4), index + rows * self.table.shape[1]
         low = flat.take(index, axis=0)
         return low + share * (flat.take(index + 1, axis=0) - low)

@@ -35,7 +35,7 @@ class LaneSpan:
     until_m: float = math.inf
     end_m: float = math.inf
 
-    def stretched(self, by: float) -> LaneSpan:
+    def stretch(self, by: float) -> LaneSpan:
         """Return the span on a path that is longer by a factor."""
         metres = {
             name: getattr(self, name) * by for name in ("begin_m", "scale", "from_m", "until_m", "end_m")
@@ -79,7 +79,7 @@ class LaneChange:
     length_m: float
 
 
-def onward(network: RoadNetwork, lanes: list[int]) -> list[int]:
+def next_lanes(network: RoadNetwork, lanes: list[int]) -> list[int]:
     """Return successors that keep a path free of repeated lanes and full roundabout turns."""
     seen = set(lanes)
     return [
@@ -95,7 +95,7 @@ def random_lanes(
     """Draw lanes to the end of the map, uniformly at forks, among preferred successors if there are any."""
     lanes = [first]
     while network.lanes[lanes[-1]].successors:
-        options = onward(network, lanes)
+        options = next_lanes(network, lanes)
         lanes.append(int(rng.choice([lane for lane in options if lane in preferred] or options)))
     return tuple(lanes)
 
@@ -104,31 +104,31 @@ def lane_path(
     network: RoadNetwork, lanes: tuple[int, ...], sway: Sway, change: LaneChange | None = None
 ) -> Path:
     """Build the path along consecutive lanes; with a lane change the new lane comes after the old one."""
-    pieces, spans, at = [], [], 0.0
-    for place, lane in enumerate(lanes):
-        if change is not None and place == change.section + 1:
+    pieces, spans, position = [], [], 0.0
+    for index, lane in enumerate(lanes):
+        if change is not None and index == change.section + 1:
             continue
         curve = network.lanes[lane].curve
-        if change is not None and place == change.section:
-            curve, crossing = _changed(curve, network.lanes[lanes[place + 1]].curve, change)
+        if change is not None and index == change.section:
+            curve, crossing = _lane_change_curve(curve, network.lanes[lanes[index + 1]].curve, change)
             length = float(curve.arc_m[-1])
             spans += [
-                _span(network, lane, at, length, until_m=at + crossing[1]),
-                _span(network, lanes[place + 1], at, length, from_m=at + crossing[0]),
+                _span(network, lane, position, length, until_m=position + crossing[1]),
+                _span(network, lanes[index + 1], position, length, from_m=position + crossing[0]),
             ]
         else:
             length = network.lanes[lane].length_m
-            spans.append(LaneSpan(lane, at, 1.0, end_m=at + length))
+            spans.append(LaneSpan(lane, position, 1.0, end_m=position + length))
         pieces.append(curve)
-        at += length
-    return _finished(network, resample(sway.applied(join_curves(*pieces)), STEP_M), at, spans)
+        position += length
+    return _build_path(network, resample(sway.apply(join_curves(*pieces)), STEP_M), position, spans)
 
 
 def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
     return LaneSpan(lane, at, length / network.lanes[lane].length_m, end_m=at + length, **when)
 
 
-def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float, float]]:
+def _lane_change_curve(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float, float]]:
     """Change from curve ``a`` to the parallel ``b``; also where the new lane is occupied from and the old one until."""
     count = max(len(a.xy), len(b.xy))
     a, b = (resample(c, float(c.arc_m[-1]) / (count - 1)) for c in (a, b))
@@ -136,8 +136,8 @@ def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float
     weight = smooth_step((arc - change.begin_m) / change.length_m)[:, None]
     xy = a.xy + weight * (b.xy - a.xy)
     rate = np.gradient(xy, axis=0)
-    turned = np.arctan2(rate[:, 1], rate[:, 0]) - a.heading
-    heading = a.heading + ((turned + math.pi) % (2 * math.pi) - math.pi)
+    relative_heading = np.arctan2(rate[:, 1], rate[:, 0]) - a.heading
+    heading = a.heading + ((relative_heading + math.pi) % (2 * math.pi) - math.pi)
     # The ends are exactly those of the lanes: a one-sided difference would bend the joint.
     whole_turns = round((a.heading[-1] - b.heading[-1]) / (2 * math.pi))
     heading[0], heading[-1] = a.heading[0], b.heading[-1] + 2 * math.pi * whole_turns
@@ -145,35 +145,35 @@ def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float
     return Curve(xy, heading), (max(0.0, change.begin_m - 15.0), end - 0.3 * change.length_m)
 
 
-def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[LaneSpan]) -> Path:
+def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[LaneSpan]) -> Path:
     """Add curvature, limits and lane slots; spans are stretched to the length of the swaying curve."""
     stretch = float(curve.arc_m[-1]) / length
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
-    spans = [span.stretched(stretch) for span in spans]
-    at = step * np.arange(len(curve.xy))
-    lane = np.full((len(at), SLOTS), -1)
-    lane_m = np.zeros((len(at), SLOTS))
-    used = np.zeros(len(at), int)
-    limit = np.full(len(at), math.inf)
+    spans = [span.stretch(stretch) for span in spans]
+    position = step * np.arange(len(curve.xy))
+    lane = np.full((len(position), SLOTS), -1)
+    lane_m = np.zeros((len(position), SLOTS))
+    used = np.zeros(len(position), int)
+    limit = np.full(len(position), math.inf)
     for span in spans:
         size = span.scale * network.lanes[span.lane].length_m
         # Samples beyond the last lane's end by rounding still belong to it.
-        first, last = np.searchsorted(at, [span.begin_m - 1e-6, span.begin_m + size - 1e-6])
-        samples = slice(int(first), len(at) if span is spans[-1] else int(last))
+        first, last = np.searchsorted(position, [span.begin_m - 1e-6, span.begin_m + size - 1e-6])
+        samples = slice(int(first), len(position) if span is spans[-1] else int(last))
         limit[samples] = np.minimum(limit[samples], network.lanes[span.lane].limit_mps)
-        here = at[samples]
-        inside = (here >= span.from_m) & (here <= span.until_m)
-        along = np.maximum(here - span.begin_m, 0.0) / span.scale
-        for shared_lane, shared in _sharing(network, span.lane, along):
+        current = position[samples]
+        inside = (current >= span.from_m) & (current <= span.until_m)
+        along = np.maximum(current - span.begin_m, 0.0) / span.scale
+        for shared_lane, shared in _lanes_sharing_space(network, span.lane, along):
             chosen = np.flatnonzero(inside & shared & (used[samples] < SLOTS))
             slot = used[samples][chosen]
             lane[samples][chosen, slot] = shared_lane
             lane_m[samples][chosen, slot] = along[chosen]
             used[samples][chosen] += 1
-    return Path(curve, step, smoothed_curvature(curve, step), limit, tuple(spans), lane, lane_m)
+    return Path(curve, step, mean_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 
 
-def interpolated(
+def interpolate_curve(
     curve: Curve, arc_m: Float64[np.ndarray, " point"], at_m: Float64[np.ndarray, " n"]
 ) -> Curve:
     """Interpolate a curve, whose samples lie at ``arc_m``, linearly at positions."""
@@ -181,7 +181,7 @@ def interpolated(
     return Curve(xy, np.interp(at_m, arc_m, curve.heading))
 
 
-def smoothed_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]:
+def mean_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]:
     """Curvature of an equally sampled curve, 1/m, averaged over 3 m."""
     window = max(1, round(_CURVATURE_WINDOW_M / step_m))
     rate = np.gradient(curve.heading, step_m)
@@ -190,7 +190,7 @@ def smoothed_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " poi
     return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
 
 
-def _sharing(
+def _lanes_sharing_space(
     network: RoadNetwork, lane: int, along: Float64[np.ndarray, " point"]
 ) -> list[tuple[int, np.ndarray]]:
     """Masks of where a vehicle on a lane occupies it, and lanes that branch off the same lane and are still close."""
@@ -212,7 +212,7 @@ class Sway:
     phase: tuple[float, ...] = ()
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, largest_m: float, aside_m: float = 0.0) -> Sway:
+    def draw(cls, rng: np.random.Generator, largest_m: float, aside_m: float = 0.0) -> Sway:
         """Draw two waves 60 to 160 m long with amplitudes of at most ``largest_m`` in sum, about a constant offset."""
         share = rng.uniform(0.2, 0.5, size=2) * largest_m
         waves = 2 * math.pi / rng.uniform(60.0, 160.0, size=2)
@@ -222,15 +222,15 @@ class Sway:
         drawn = (values.tolist() for values in (share, waves, phases))
         return cls(*(tuple(values + constant) for values, constant in zip(drawn, offset, strict=True)))
 
-    def applied(self, curve: Curve) -> Curve:
+    def apply(self, curve: Curve) -> Curve:
         """Return the curve that is driven; its heading is its tangent (to first order in the deviation)."""
         if not self.amplitude_m:
             return curve
-        aside, slope = np.zeros((2, len(curve.xy)))
+        lateral, slope = np.zeros((2, len(curve.xy)))
         for amplitude, wave, phase in zip(self.amplitude_m, self.wave_per_m, self.phase, strict=True):
             angle = wave * curve.arc_m + phase
-            aside += amplitude * np.sin(angle)
+            lateral += amplitude * np.sin(angle)
             slope += amplitude * wave * np.cos(angle)
         normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
-        stretch = 1.0 - aside * np.gradient(curve.heading, np.maximum(curve.arc_m, 1e-9))
-        return Curve(curve.xy + aside[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
+        stretch = 1.0 - lateral * np.gradient(curve.heading, np.maximum(curve.arc_m, 1e-9))
+        return Curve(curve.xy + lateral[:, None] * normal, curve.heading + np.arctan2(slope, stretch))

@@ -1,4 +1,4 @@
-"""Pedestrians: they walk along sidewalks, wait at kerbs until it is safe to cross, and cross."""
+"""Pedestrians, who walk along sidewalks, wait at kerbs until it is safe to cross, and cross."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes
 from drivax.synthetic.traffic.path_arrays import PerVehicle, VehicleMask
-from drivax.synthetic.traffic.roles import Walker
+from drivax.synthetic.traffic.roles import Pedestrian
 
-#: Distances from the kerb, m: where people wait, from where on they occupy the crossing, and look for a gap.
-_WAIT_M, _CLAIM_M, _LOOK_M = 0.4, 1.0, 1.8
-#: Acceleration of walkers, m/s2.
+#: Distances from the kerb, m, at which pedestrians wait, occupy the crossing, and start to look for a gap.
+_WAIT_M, _OCCUPY_M, _GAP_SEARCH_M = 0.4, 1.0, 1.8
+#: Acceleration of pedestrians, m/s2.
 _ACCELERATION_MPS2 = 1.5
 #: Drivers that need less braking than this yield at a crosswalk, m/s2; distance at which they stop before it, m.
 _YIELDING_MPS2, _STOP_SHORT_M = 2.5, 2.0
 #: Slower vehicles count as standing, m/s.
 _STANDING_MPS = 0.3
-#: Time gap to the next vehicle beyond the crossing time, s: where drivers yield, and where they do not.
+#: Accepted gap minus the crossing time, s, where drivers yield and where they do not.
 _MARGIN_S, _GAP_MARGIN_S = 1.0, 1.5
-#: Vehicles that see the crossing at a larger angle, or head elsewhere, do not approach it.
-_BEARING, _ASIDE = math.radians(75.0), math.radians(80.0)
-#: Distance that people keep from vehicles, m.
-_BERTH_M = 0.4
-#: Steps between looks at vehicles.
-_LOOK_STEPS = 2
+#: Largest bearing of a crossing from an approaching vehicle, and largest angle between their headings, rad.
+_MAX_BEARING, _MAX_HEADING_DIFFERENCE = math.radians(75.0), math.radians(80.0)
+#: Distance that pedestrians keep from vehicles, m.
+_CLEARANCE_M = 0.4
+#: Steps between two decisions.
+_DECISION_STEPS = 2
 #: Connectors next to lanes that begin or end this close to a crossing control it, m.
 _NEAR_JUNCTION_M = 25.0
 
-#: A number and a flag per walker.
+#: A number and a flag per pedestrian.
 _Values = Float64[np.ndarray, " w"]
 _Mask = Bool[np.ndarray, " w"]
 _Point = Float64[np.ndarray, " 2"]
@@ -45,7 +45,7 @@ _Point = Float64[np.ndarray, " 2"]
 
 @dataclass(frozen=True)
 class _CrossingConflicts:
-    """Intersections of crossings and lanes, and a mask of the connectors whose light must be red while people cross."""
+    """Intersections of crossings and lanes, and a mask of connectors that must be red while pedestrians cross."""
 
     xy: Float64[np.ndarray, "conflict 2"]
     heading: Float64[np.ndarray, " conflict"]
@@ -60,14 +60,14 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
     for index, crossing in enumerate(network.crossings):
         for lane, along in crossing.lanes:
             curve = network.lanes[lane].curve
-            place = min(int(np.searchsorted(curve.arc_m, along)), len(curve.xy) - 1)
-            poses.append([*curve.xy[place], curve.heading[place]])
+            sample = min(int(np.searchsorted(curve.arc_m, along)), len(curve.xy) - 1)
+            poses.append([*curve.xy[sample], curve.heading[sample]])
             owner.append(index)
     pose = np.array(poses, float).reshape(-1, 3)
     axes = np.array([crossing.axis for crossing in network.crossings]).reshape(-1, 2, 2)
     across = axes[:, 1] - axes[:, 0]
     length = np.hypot(*across.T)
-    # People walk in the middle of the crosswalk: a vehicle on its rim does not block it.
+    # Pedestrians walk in the middle of the crosswalk, so a vehicle at its edge does not block it.
     strip = np.column_stack([axes.mean(axis=1), across / length[:, None], length, np.ones(len(axes))])
     red = [_must_be_red(network, crossing) for crossing in network.crossings]
     return _CrossingConflicts(
@@ -81,37 +81,37 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
 
 
 def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, " lane"]:
-    """Mask of connectors with lights over a crossing, but for turns into the crossed road, which yield."""
+    """Mask of signalised connectors over a crossing, except turns into the crossed road, which yield."""
     result = np.zeros(len(network.lanes), bool)
     if network.signals is None:
         return result
     arrows = {lane for group in network.signals.groups if group.arrow for lane in group.lanes}
     for lane, along in crossing.lanes:
-        this = network.lanes[lane]
+        current = network.lanes[lane]
         entering, leaving = (), ()
-        if this.connector:
-            entering, leaving = ((lane,), ()) if along < this.length_m / 2 else ((), (lane,))
-        elif this.length_m - along < _NEAR_JUNCTION_M:
-            entering = this.successors
+        if current.connector:
+            entering, leaving = ((lane,), ()) if along < current.length_m / 2 else ((), (lane,))
+        elif current.length_m - along < _NEAR_JUNCTION_M:
+            entering = current.successors
         elif along < _NEAR_JUNCTION_M:
-            leaving = this.predecessors
+            leaving = current.predecessors
         for connector in (*entering, *leaving):
             curve = network.lanes[connector].curve
             straight = abs(float(curve.heading[-1] - curve.heading[0])) < math.radians(45.0)
-            held = connector in entering or straight or connector in arrows
-            result[connector] |= held and network.lanes[connector].control == Control.SIGNAL
+            conflicts = connector in entering or straight or connector in arrows
+            result[connector] |= conflicts and network.lanes[connector].control == Control.SIGNAL
     return result
 
 
-class Walkers:
+class Pedestrians:
     """Pedestrians, moved step by step."""
 
     def __init__(
-        self, network: RoadNetwork, walkers: tuple[Walker, ...], times_s: Float64[np.ndarray, " time"]
+        self, network: RoadNetwork, pedestrians: tuple[Pedestrian, ...], times_s: Float64[np.ndarray, " time"]
     ) -> None:
         self._conflicts = _crossing_conflicts(network)
-        self._red_left_s = _red_left(network, self._conflicts.red, times_s)
-        curves = [resample(walker.curve, STEP_M) for walker in walkers]
+        self._remaining_red = _remaining_red_s(network, self._conflicts.red, times_s)
+        curves = [resample(pedestrian.curve, STEP_M) for pedestrian in pedestrians]
         self._last = np.array([len(curve.xy) - 1 for curve in curves], int)
         self._table = np.zeros((len(curves), max([*self._last, 0]) + 1, 3))
         self._begin = np.arange(len(curves)) * self._table.shape[1]
@@ -119,40 +119,41 @@ class Walkers:
             row[: len(curve.xy)] = np.column_stack([curve.xy, curve.heading])
             row[len(curve.xy) :] = row[len(curve.xy) - 1]
         self._step_m = np.array([float(curve.arc_m[-1]) / (len(curve.xy) - 1) for curve in curves])
-        numbers = [[w.start_m, w.speed_mps, w.kerb_m, w.across_m] for w in walkers]
+        numbers = [[w.start_m, w.speed_mps, w.kerb_m, w.across_m] for w in pedestrians]
         self._at, self._free_speed, self._kerb, self._across = (
             np.array(numbers, float).reshape(-1, 4).T.copy()
         )
-        self._size_m = np.array([walker.size_m[:2] for walker in walkers], float).reshape(-1, 2)
+        self._size_m = np.array([pedestrian.size_m[:2] for pedestrian in pedestrians], float).reshape(-1, 2)
         self._speed = self._free_speed.copy()
-        self._crossing = np.array([walker.crossing for walker in walkers], int)
+        self._crossing = np.array([pedestrian.crossing for pedestrian in pedestrians], int)
         self._crosses = self._crossing >= 0
         self._any_crosses = bool(self._crosses.any())
-        # At lights and unmarked crossings drivers need not yield to people at the kerb.
-        asking = self._conflicts.marked & ~self._conflicts.red.any(axis=1)
-        self._asking = asking[self._crossing] if len(asking) else np.zeros(len(curves), bool)
-        self._released, self._into = np.zeros((2, len(curves)), bool)
+        # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
+        has_priority = self._conflicts.marked & ~self._conflicts.red.any(axis=1)
+        self._has_priority = (
+            has_priority[self._crossing] if len(has_priority) else np.zeros(len(curves), bool)
+        )
+        self._released, self._is_blocked = np.zeros((2, len(curves)), bool)
 
     def step(
         self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
-        """Return all walkers at step ``t``, then advance them; steps come in order.
+        """Return all pedestrians at step ``t`` and the occupied crossings, then advance; call it step by step.
 
-        Also return a mask of the crossings that drivers must keep free: a walker is on it or, where drivers must yield,
-        about to step on it.
+        A crossing is occupied if a pedestrian is on it or, where drivers must yield, about to step on it.
         """
-        place = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
-        index = np.minimum(place.astype(int), self._last - 1)
+        sample = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
+        index = np.minimum(sample.astype(int), self._last - 1)
         flat, rows = self._table.reshape(-1, 3), index + self._begin
         low = flat.take(rows, axis=0)
-        pose = low + (place - index)[:, None] * (flat.take(rows + 1, axis=0) - low)
+        pose = low + (sample - index)[:, None] * (flat.take(rows + 1, axis=0) - low)
         occupied = np.zeros(len(self._conflicts.marked), bool)
-        if t % _LOOK_STEPS == 0:
-            self._into = _walks_into(pose, vehicles, active)
+        if t % _DECISION_STEPS == 0:
+            self._is_blocked = _is_blocked_by_vehicle(pose, vehicles, active)
             self._release(t, vehicles, active, colour)
         if self._any_crosses:
-            users = self._crosses & (self._at < self._across) & (self._at > self._kerb - _CLAIM_M)
-            users &= self._released | self._asking | (self._at > self._kerb)
+            users = self._crosses & (self._at < self._across) & (self._at > self._kerb - _OCCUPY_M)
+            users &= self._released | self._has_priority | (self._at > self._kerb)
             occupied[self._crossing[users]] = True
         result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)
         self._advance()
@@ -161,29 +162,31 @@ class Walkers:
     def _release(
         self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
     ) -> None:
-        """Let walkers at the kerb go where the crossing is safe for long enough."""
-        before = self._kerb - self._at
-        asks = self._crosses & ~self._released & (before >= 0) & (before < _LOOK_M)
-        if not np.count_nonzero(asks):
+        """Release pedestrians at the kerb if the crossing stays safe for long enough."""
+        to_kerb = self._kerb - self._at
+        waiting = self._crosses & ~self._released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
+        if not np.count_nonzero(waiting):
             return
-        conflicts, crossing = self._conflicts, self._crossing[asks]
+        conflicts, crossing = self._conflicts, self._crossing[waiting]
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])[active]
         any_s, hard_s = _arrivals(conflicts, boxes, vehicles.speed[active])
         # Starting from standstill takes v / (2 a) longer.
         start_s = self._free_speed / (2 * _ACCELERATION_MPS2)
-        needed = ((self._across - self._at) / self._free_speed + start_s)[asks]
+        needed = ((self._across - self._at) / self._free_speed + start_s)[waiting]
         # A standing queue blocks the crossing.
         free = ~overlap(conflicts.strip[:, None], boxes[None]).any(axis=1)
         red = ~(conflicts.red & (colour != Colour.RED)).any(axis=1)
-        yielded = conflicts.marked | conflicts.red.any(axis=1)
+        yielding = conflicts.marked | conflicts.red.any(axis=1)
         gap = np.where(
-            yielded[crossing], hard_s[crossing] > needed + _MARGIN_S, any_s[crossing] > needed + _GAP_MARGIN_S
+            yielding[crossing],
+            hard_s[crossing] > needed + _MARGIN_S,
+            any_s[crossing] > needed + _GAP_MARGIN_S,
         )
-        lasting = self._red_left_s[t, crossing] >= needed
-        self._released[asks] = gap & free[crossing] & red[crossing] & lasting
+        red_lasts = self._remaining_red[t, crossing] >= needed
+        self._released[waiting] = gap & free[crossing] & red[crossing] & red_lasts
 
     def _advance(self) -> None:
-        """Advance by one step; walkers stop at the kerb unless released, and before vehicles."""
+        """Advance by one step; pedestrians stop before vehicles, and at the kerb unless released."""
         room = self._last * self._step_m - self._at
         if self._any_crosses:
             waits = self._crosses & ~self._released & (self._at <= self._kerb)
@@ -191,68 +194,68 @@ class Walkers:
             room = np.minimum(np.maximum(kerb, 0.0), room)
         # The stopping distance is v^2 / (2 a), counted from the end of the step.
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
-        after = np.minimum(self._free_speed, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
-        after = np.maximum(after, 0.0)
-        moved = np.minimum((self._speed + after) / 2 * DT_S, np.maximum(room, 0.0))
-        after[self._into], moved[self._into] = 0.0, 0.0
+        speed = np.minimum(self._free_speed, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
+        speed = np.maximum(speed, 0.0)
+        moved = np.minimum((self._speed + speed) / 2 * DT_S, np.maximum(room, 0.0))
+        speed[self._is_blocked], moved[self._is_blocked] = 0.0, 0.0
         self._at = self._at + moved
-        self._speed = after
+        self._speed = speed
 
 
-def _red_left(
+def _remaining_red_s(
     network: RoadNetwork, red: Bool[np.ndarray, "crossing lane"], times_s: Float64[np.ndarray, " time"]
 ) -> Float64[np.ndarray, "time crossing"]:
-    """Remaining time for which the lights hold back all conflicting vehicles, s (infinite: no lights)."""
-    left = np.full((len(times_s), len(red)), math.inf)
+    """Time until a conflicting light turns green, s, by step and crossing (infinite: no lights)."""
+    remaining = np.full((len(times_s), len(red)), math.inf)
     if network.signals is None or not red.any():
-        return left
-    # People know the cycle: the colours are continued by one cycle beyond the last step.
-    beyond = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
-    colour, _ = network.signals.colours(np.concatenate([times_s, beyond]), len(network.lanes))
+        return remaining
+    # Extended by one cycle beyond the last step, because pedestrians know the cycle.
+    next_cycle_s = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
+    colour, _ = network.signals.colours(np.concatenate([times_s, next_cycle_s]), len(network.lanes))
     for crossing in np.flatnonzero(red.any(axis=1)):
-        go = (colour[:, red[crossing]] != Colour.RED).any(axis=1)
-        steps = np.where(go, np.arange(len(go)), len(go))
-        following = np.minimum.accumulate(steps[::-1])[::-1]
-        left[:, crossing] = ((following - np.arange(len(go))) * DT_S)[: len(times_s)]
-    return left
+        is_green = (colour[:, red[crossing]] != Colour.RED).any(axis=1)
+        steps = np.where(is_green, np.arange(len(is_green)), len(is_green))
+        next_green = np.minimum.accumulate(steps[::-1])[::-1]
+        remaining[:, crossing] = ((next_green - np.arange(len(is_green))) * DT_S)[: len(times_s)]
+    return remaining
 
 
 def _arrivals(
     conflicts: _CrossingConflicts, boxes: Float64[np.ndarray, "v 6"], speed: PerVehicle
 ) -> tuple[Float64[np.ndarray, " crossing"], Float64[np.ndarray, " crossing"]]:
-    """Arrival time of the next moving vehicle at each crossing, s: of all, and of those that cannot yield."""
+    """Time until the next vehicle arrives at each crossing, s, among all and among those that cannot yield."""
     any_s, hard_s = np.full((2, len(conflicts.marked)), math.inf)
     if not len(boxes):
         return any_s, hard_s
-    rel = conflicts.xy[:, None] - boxes[None, :, :2]
+    offset = conflicts.xy[:, None] - boxes[None, :, :2]
     cos, sin = boxes[:, 2], boxes[:, 3]
-    ahead = rel[..., 0] * cos + rel[..., 1] * sin
-    aside = np.abs(rel[..., 1] * cos - rel[..., 0] * sin)
-    same = np.cos(conflicts.heading)[:, None] * cos + np.sin(conflicts.heading)[:, None] * sin
-    same = same > math.cos(_ASIDE)
-    coming = (ahead > -1.0) & (aside < 2.0 + math.tan(_BEARING) * np.maximum(ahead, 0.0))
-    coming &= same & (speed > _STANDING_MPS)
-    distance = np.maximum(np.hypot(ahead, aside) - boxes[:, 4] / 2, 0.0)
-    time = np.where(coming, distance / np.maximum(speed, _STANDING_MPS), math.inf)
+    ahead = offset[..., 0] * cos + offset[..., 1] * sin
+    lateral = np.abs(offset[..., 1] * cos - offset[..., 0] * sin)
+    same_direction = np.cos(conflicts.heading)[:, None] * cos + np.sin(conflicts.heading)[:, None] * sin
+    same_direction = same_direction > math.cos(_MAX_HEADING_DIFFERENCE)
+    approaching = (ahead > -1.0) & (lateral < 2.0 + math.tan(_MAX_BEARING) * np.maximum(ahead, 0.0))
+    approaching &= same_direction & (speed > _STANDING_MPS)
+    distance = np.maximum(np.hypot(ahead, lateral) - boxes[:, 4] / 2, 0.0)
+    time = np.where(approaching, distance / np.maximum(speed, _STANDING_MPS), math.inf)
     braking = speed**2 / (2 * np.maximum(distance - _STOP_SHORT_M, 0.05))
     np.minimum.at(any_s, conflicts.crossing, time.min(axis=1))
     np.minimum.at(hard_s, conflicts.crossing, np.where(braking > _YIELDING_MPS2, time, math.inf).min(axis=1))
     return any_s, hard_s
 
 
-def _walks_into(pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask) -> _Mask:
-    """Mask of walkers that are about to come too close to a vehicle and are not close to one yet."""
+def _is_blocked_by_vehicle(pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask) -> _Mask:
+    """Mask of pedestrians that would come too close to a vehicle and are not close to one yet."""
     x, y, angle = pose.T
-    into = _within(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
-    if np.count_nonzero(into):
-        into &= ~_within(x, y, vehicles, active)
-    return into
+    blocked = _is_near_vehicle(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
+    if np.count_nonzero(blocked):
+        blocked &= ~_is_near_vehicle(x, y, vehicles, active)
+    return blocked
 
 
-def _within(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Mask:
-    """Mask of points in a vehicle's box grown by the distance that people keep."""
+def _is_near_vehicle(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Mask:
+    """Mask of points in a vehicle's box grown by the pedestrians' clearance."""
     cos, sin = vehicles.direction
-    half = vehicles.size_m / 2 + _BERTH_M
+    half = vehicles.size_m / 2 + _CLEARANCE_M
     dx, dy = x[:, None] - vehicles.xy[:, 0], y[:, None] - vehicles.xy[:, 1]
     along = np.abs(dx * cos + dy * sin)
     dy *= cos
@@ -262,64 +265,64 @@ def _within(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Ma
     return np.logical_or.reduce(inside, axis=1)
 
 
-def place_walkers(
+def place_pedestrians(
     network: RoadNetwork, per_100m: float, rng: np.random.Generator, times_s: Float64[np.ndarray, " time"]
-) -> tuple[Walker, ...]:
-    """Draw walkers along the sidewalks in both directions, and half as many at each crossing as per 100 m.
+) -> tuple[Pedestrian, ...]:
+    """Draw pedestrians along sidewalks, in both directions, and at crossings, ``per_100m / 2`` on average at each.
 
     They reach the kerbs between 4 s before and 8 s after time 0.
     """
-    people = []
-    for walk in network.walks:
-        length = float(walk.arc_m[-1])
+    pedestrians = []
+    for sidewalk in network.sidewalks:
+        length = float(sidewalk.arc_m[-1])
         for _ in range(int(rng.poisson(per_100m * length / 100.0))):
-            curve = walk if rng.random() < 0.5 else walk.reversed()
-            # People keep to the right of each other.
-            curve = curve.shifted(-float(rng.uniform(0.1, 0.6)))
-            people.append(Walker(curve, float(rng.uniform(0.0, length)), _pace(rng)))
+            curve = sidewalk if rng.random() < 0.5 else sidewalk.reversed()
+            # Pedestrians keep to the right.
+            curve = curve.parallel(-float(rng.uniform(0.1, 0.6)))
+            pedestrians.append(Pedestrian(curve, float(rng.uniform(0.0, length)), _draw_speed(rng)))
     for index, crossing in enumerate(network.crossings):
         for _ in range(int(rng.poisson(per_100m / 2))):
-            people.append(_crosser(network, index, crossing, float(times_s[0]), rng))
-    return tuple(people)
+            pedestrians.append(_draw_crossing_pedestrian(network, index, crossing, float(times_s[0]), rng))
+    return tuple(pedestrians)
 
 
-def _pace(rng: np.random.Generator) -> float:
-    """Free walking speed: 1.34 m/s on average with a deviation of 0.26 (Weidmann 1993)."""
+def _draw_speed(rng: np.random.Generator) -> float:
+    """Draw a free walking speed, 1.34 m/s with a standard deviation of 0.26 m/s (Weidmann 1993)."""
     return float(np.clip(rng.normal(1.34, 0.26), 0.7, 2.0))
 
 
-def _crosser(
+def _draw_crossing_pedestrian(
     network: RoadNetwork, index: int, crossing: Crossing, begin_s: float, rng: np.random.Generator
-) -> Walker:
-    """Draw a walker that comes along the sidewalk, crosses, and continues on the other side."""
+) -> Pedestrian:
+    """Draw a pedestrian that comes along the sidewalk, crosses, and continues on the other side."""
     near, far = crossing.axis if rng.random() < 0.5 else crossing.axis[::-1]
-    aside = rng.uniform(-0.3, 0.3) * crossing.width_m
+    lateral = rng.uniform(-0.3, 0.3) * crossing.width_m
     ahead = (far - near) / np.hypot(*(far - near))
-    shift = aside * np.array([-ahead[1], ahead[0]])
+    shift = lateral * np.array([-ahead[1], ahead[0]])
     near, far = near + shift, far + shift
-    before, after = _along_walk(network, near, -ahead, rng), _along_walk(network, far, ahead, rng)
+    before, after = (_along_sidewalk(network, near, -ahead, rng), _along_sidewalk(network, far, ahead, rng))
     points = np.concatenate([before[::-1], [near, far], after])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    kerb, across = float(arc[len(before)]), float(arc[len(before) + 1])
-    pace = _pace(rng)
-    start = max(0.0, kerb - pace * (rng.uniform(-4.0, 8.0) - begin_s))
-    return Walker(_polyline(points), start, pace, index, kerb, across)
+    kerb_m, across_m = float(arc[len(before)]), float(arc[len(before) + 1])
+    speed = _draw_speed(rng)
+    start = max(0.0, kerb_m - speed * (rng.uniform(-4.0, 8.0) - begin_s))
+    return Pedestrian(_polyline(points), start, speed, index, kerb_m, across_m)
 
 
-def _along_walk(
+def _along_sidewalk(
     network: RoadNetwork, kerb: _Point, out: _Point, rng: np.random.Generator
 ) -> Float64[np.ndarray, "point 2"]:
     """Continue from a kerb: along a nearby sidewalk, in either direction, or straight off the road."""
     best: tuple[float, Curve, int] | None = None
-    for walk in network.walks:
-        gap = np.hypot(*(walk.xy - kerb).T)
-        place = int(np.argmin(gap))
-        if gap[place] < 6.0 and (best is None or gap[place] < best[0]):
-            best = float(gap[place]), walk, place
+    for sidewalk in network.sidewalks:
+        gap = np.hypot(*(sidewalk.xy - kerb).T)
+        index = int(np.argmin(gap))
+        if gap[index] < 6.0 and (best is None or gap[index] < best[0]):
+            best = float(gap[index]), sidewalk, index
     if best is None:
         return kerb + np.outer([2.0, 20.0], out)
-    _, walk, place = best
-    pieces = [piece for piece in (walk.xy[place:], walk.xy[place::-1]) if len(piece) > 4]
+    _, sidewalk, index = best
+    pieces = [piece for piece in (sidewalk.xy[index:], sidewalk.xy[index::-1]) if len(piece) > 4]
     piece = pieces[int(rng.integers(len(pieces)))]
     return piece[1:81]
 

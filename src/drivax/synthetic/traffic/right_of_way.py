@@ -54,7 +54,7 @@ class TrafficState:
         colour, to_red: Colour of each lane's light, and time until it turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
-        committed: Number of connectors that a planned ego enters whatever others do (-1: ego is not planned).
+        committed: Number of connectors that a planned ego enters without yielding (-1: ego is not planned).
     """
 
     tables: PathTables
@@ -128,8 +128,8 @@ class _Request:
         return cls(row, connector, place, line, distance, float(state.speed[row]))
 
     @property
-    def needed_mps2(self) -> float:
-        """Braking that it takes to stop at the line."""
+    def required_mps2(self) -> float:
+        """Deceleration required to stop at the line, m/s2."""
         return self.speed**2 / (2 * max(self.distance_m, 0.05))
 
 
@@ -158,7 +158,7 @@ class RightOfWay:
         self._requested = np.full(count, -1)
         self._denied = np.zeros(count, bool)
 
-    def swapped(self, row: int, tables: PathTables, front_m: float) -> None:
+    def reset_vehicle(self, row: int, tables: PathTables, front_m: float) -> None:
         """Reset a vehicle that has changed to another path: it keeps only the connectors that it has entered."""
         self._granted[row] = int(np.sum(tables.connector_begin[row] < front_m))
         self._stood[row], self._requested[row] = np.inf, -1
@@ -174,16 +174,16 @@ class RightOfWay:
         if state.committed >= 0:
             self._granted[0] = max(state.committed, entered[0])
         near = state.speed**2 / (2 * _ASK_MPS2) + _ASK_S * state.speed + _ASK_M
-        place = np.minimum(self._granted, connectors - 1)
+        index = np.minimum(self._granted, connectors - 1)
         # Without a connector ahead the distance is infinite.
-        distance = begin.ravel().take(place + connectors * self._rows) - state.front_m
-        requests = (distance >= 0) & (distance <= near) & state.active & (halts > place)
+        distance = begin.ravel().take(index + connectors * self._rows) - state.front_m
+        requests = (distance >= 0) & (distance <= near) & state.active & (halts > index)
         if state.committed >= 0:
             requests[0], stop[0] = False, np.inf
         self._denied &= requests
         rows = requests.nonzero()[0]
         if len(rows):
-            self._decide(state, rows, place, stop)
+            self._decide(state, rows, index, stop)
         return stop
 
     def _lights(self, state: TrafficState) -> tuple[PerVehicle, VehicleRows]:
@@ -209,29 +209,29 @@ class RightOfWay:
     def _decide(self, state: TrafficState, rows: _Requests, place: VehicleRows, stop: PerVehicle) -> None:
         """Grant or deny requests, nearest in time first, at all-way stops in the order of arrival."""
         tables = state.tables
-        held = np.arange(tables.connector.shape[1]) < self._granted[:, None]
-        held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
-        row, slot = np.nonzero(held & (tables.connector >= 0))
+        is_held = np.arange(tables.connector.shape[1]) < self._granted[:, None]
+        is_held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
+        row, slot = np.nonzero(is_held & (tables.connector >= 0))
         holders = list(zip(row.tolist(), tables.connector[row, slot].tolist(), strict=True))
         requests = [_Request.at(state, i, int(place[i])) for i in rows.tolist()]
         for request in requests:
             i = request.row
             if self._requested[i] != request.connector:
                 self._requested[i], self._stood[i] = request.connector, np.inf
-            stands = request.speed < _STANDS_MPS and request.distance_m < _STANDS_M
-            if stands and not np.isfinite(self._stood[i]):
+            has_stopped = request.speed < _STANDS_MPS and request.distance_m < _STANDS_M
+            if has_stopped and not np.isfinite(self._stood[i]):
                 self._stood[i] = state.step * DT_S
         waiting: list[int] = []  # connectors of vehicles that stand at an all-way stop and must still wait
         for k in self._order(requests):
             request = requests[k]
             i, connector = request.row, request.connector
-            hard = request.needed_mps2 > _HARDEST_MPS2
-            ok = self._free[connector] or (hard and state.speed[i] > 2.0)
-            ok = ok or self._may_enter(state, request, holders, waiting)
-            if not ok and self._clears_in_time(state, request, holders):
+            cannot_stop = request.required_mps2 > _HARDEST_MPS2
+            granted = self._free[connector] or (cannot_stop and state.speed[i] > 2.0)
+            granted = granted or self._may_enter(state, request, holders, waiting)
+            if not granted and self._clears_in_time(state, request, holders):
                 continue
-            self._denied[i] = not ok
-            if ok:
+            self._denied[i] = not granted
+            if granted:
                 self._granted[i] = place[i] + 1
                 self._stood[i] = np.inf
                 holders.append((i, connector))
@@ -251,9 +251,9 @@ class RightOfWay:
         for k in np.flatnonzero(all_way & np.isfinite(stood)):
             # Of vehicles that arrived simultaneously the one without another to its right goes first.
             tied = all_way & (np.abs(stood - stood[k]) < _TIE_S)
-            here = self._lanes[connectors[k]].curve.heading[0]
-            turned = np.array([wrap(self._lanes[w].curve.heading[0] - here) for w in connectors[tied]])
-            key[k] += 0.5 * _TIE_S * bool(np.any((turned > math.pi / 4) & (turned < 3 * math.pi / 4)))
+            heading = self._lanes[connectors[k]].curve.heading[0]
+            angle = np.array([wrap(self._lanes[w].curve.heading[0] - heading) for w in connectors[tied]])
+            key[k] += 0.5 * _TIE_S * bool(np.any((angle > math.pi / 4) & (angle < 3 * math.pi / 4)))
         return np.lexsort((rows, key)).tolist()
 
     def _may_enter(
@@ -292,7 +292,7 @@ class RightOfWay:
         """Whether a driver with priority need not brake yet because all blockers move and will have cleared."""
         connector, blockers = request.connector, self._blockers(state, request, holders)
         yields = {other for _, other, _ in blockers} & set(self._yields[connector].tolist())
-        gentle = request.needed_mps2 < _LATEST_MPS2
+        gentle = request.required_mps2 < _LATEST_MPS2
         if not blockers or not gentle or self._control[connector] >= _STOP or yields:
             return False
         for j, other, left in blockers:
@@ -319,7 +319,7 @@ class RightOfWay:
         rows, columns = np.nonzero(coming)
         speed, own = state.speed[rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
-        gone = clear[rows, columns] / np.maximum(speed, 0.3)
+        departure = clear[rows, columns] / np.maximum(speed, 0.3)
         top = float(tables.at(np.array([request.line_m + 5.0]), np.array([i]))[0, 3])
         own_speed, push = request.speed, float(self._drivers.acceleration_mps2[i])
         to_zone = request.distance_m + self._zone_begin[connector, own]
@@ -329,4 +329,4 @@ class RightOfWay:
         waited = state.step * DT_S - self._stood[i] if np.isfinite(self._stood[i]) else 0.0
         patience = 1.0 - min(waited / _IMPATIENT_S, 1.0) / 3.0
         needed = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)
-        return not np.any((arrival < needed) & (gone > enter - 0.3))
+        return not np.any((arrival < needed) & (departure > enter - 0.3))

@@ -1,4 +1,4 @@
-"""Draw the roles of a scenario: ego's route, other vehicles and drivers, walkers, parked cars, lights."""
+"""Draw the roles of a scenario: ego's route, other vehicles and drivers, pedestrians, parked cars, lights."""
 
 from __future__ import annotations
 
@@ -23,34 +23,40 @@ from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import SignalPlan
 from drivax.synthetic.traffic.path_arrays import driver_profile
 from drivax.synthetic.traffic.paths import Path, random_lanes
-from drivax.synthetic.traffic.pedestrians import place_walkers
-from drivax.synthetic.traffic.population import draw_drivers, driven_path, join_drivers, parked_cars, placed
+from drivax.synthetic.traffic.pedestrians import place_pedestrians
+from drivax.synthetic.traffic.placement import (
+    draw_drivers,
+    draw_path,
+    join_drivers,
+    parked_cars,
+    place_vehicles,
+)
 from drivax.synthetic.traffic.roles import Drivers, Roles
 
-#: Length of the approaches to a conflict that carry dense traffic, m.
-_BACK_M = 160.0
+#: Length of approaches to a conflict with dense traffic, m.
+_FEEDER_LENGTH_M = 160.0
 #: Time at which an unhindered ego arrives where it gives way, s after the recording begins.
-_WHEN_S = (0.4, 4.0)
+_ARRIVAL_S = (0.4, 4.0)
 #: Ego begins at least this far along its path, m.
-_LEAST_M = 12.0
-#: Further routes drawn for ego until it has to give way.
-_ROUTES = 4
-#: Shares of what the light does for ego: green on arrival, turning green, turning red.
+_MIN_START_M = 12.0
+#: Number of further draws of ego's route until it has to give way.
+_EXTRA_ROUTES = 4
+#: Shares of the phases in which ego meets its next light: green on arrival, turning green, turning red.
 SignalTiming = tuple[float, float, float]
 _Values = Float64[np.ndarray, " n"]
 
 
-def giving_way(network: RoadNetwork) -> tuple[Destination, ...]:
-    """Return destinations on connectors that yield to users with unconditional priority."""
+def yielding_destinations(network: RoadNetwork) -> tuple[Destination, ...]:
+    """Return destinations on connectors that yield to users with priority."""
     return tuple(
-        Destination(index, (0.0, min(3.0, lane.length_m)), _WHEN_S)
+        Destination(index, (0.0, min(3.0, lane.length_m)), _ARRIVAL_S)
         for index, lane in enumerate(network.lanes)
         if lane.control == Control.ALL_WAY_STOP or any(not network.lanes[k].yields_to for k in lane.yields_to)
     )
 
 
 def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
-    """Return connectors that a path yields to (unless they yield themselves) and lanes it changes to."""
+    """Return the connectors that a path yields to, unless these yield too, and the lanes that it changes to."""
     result: set[int] = set()
     for before, span in pairwise((path.spans[0], *path.spans)):
         lane, previous = network.lanes[span.lane], network.lanes[before.lane]
@@ -62,29 +68,23 @@ def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
     return frozenset(result)
 
 
-def with_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
-    """Add the lanes from which some lanes are reached within 160 m."""
+def add_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
+    """Add the lanes that lead to some lanes within 160 m."""
     result: set[int] = set()
     ahead = [(lane, 0.0) for lane in sorted(lanes)]
     while ahead:
         lane, away = ahead.pop()
-        if lane not in result and away < _BACK_M:
+        if lane not in result and away < _FEEDER_LENGTH_M:
             result.add(lane)
-            this = network.lanes[lane]
-            ahead += [(before, away + this.length_m) for before in this.predecessors]
+            current = network.lanes[lane]
+            ahead += [(before, away + current.length_m) for before in current.predecessors]
     return frozenset(result)
 
 
 def assign_roles(
-    network: RoadNetwork,
-    domain: Domain,
-    times_s: _Values,
-    lane_change_share: float,
-    timing: SignalTiming,
-    rng: np.random.Generator,
-    destinations: Sequence[Destination] = (),
-    critical: bool = False,
-) -> Roles:
+    network: RoadNetwork, domain: Domain, times_s: _Values, lane_change_share: float, timing: SignalTiming,
+    rng: np.random.Generator, destinations: Sequence[Destination] = (), critical: bool = False,
+) -> Roles:  # fmt: skip
     """Draw ego, its route and lights, then the others.
 
     Args:
@@ -92,29 +92,31 @@ def assign_roles(
         domain: Density and composition of traffic.
         times_s: Times of all steps; the warm-up of traffic ends at time 0.
         lane_change_share: Share of scenarios, of those with room, in which ego plans a lane change.
-        timing: Shares of what the light does for ego.
+        timing: Shares of the phases in which ego meets its next light.
         rng: Source of randomness.
-        destinations: Places of which ego passes one unhindered; none: ego's route is random.
+        destinations: Candidate places for ego to pass in free traffic; none: ego's route is random.
         critical: Ego must give way to dense traffic, if the roads allow it.
     """
     driver = expert.draw_expert(rng)
-    aimed = draw_route(network, giving_way(network) if critical else destinations, rng)
-    first_s, tries = float(times_s[0]), _ROUTES if critical and aimed is None else 0
-    lanes, path, at = _draw_route(network, driver, first_s, lane_change_share, rng, aimed, tries)
-    rivals = with_feeders(network, conflicts_on(network, path)) if critical else frozenset()
-    network = replace(network, signals=_lights(network, lanes, timing, aimed, rng))
-    here = max((span for span in path.spans if span.begin_m <= at), key=lambda span: span.begin_m)
+    destination_route = draw_route(network, yielding_destinations(network) if critical else destinations, rng)
+    first_s, attempts = float(times_s[0]), _EXTRA_ROUTES if critical and destination_route is None else 0
+    lanes, path, position = _draw_route(
+        network, driver, first_s, lane_change_share, rng, destination_route, attempts
+    )
+    rivals = add_feeders(network, conflicts_on(network, path)) if critical else frozenset()
+    network = replace(network, signals=_lights(network, lanes, timing, destination_route, rng))
+    current = max((span for span in path.spans if span.begin_m <= position), key=lambda span: span.begin_m)
     density, share = domain.density, float(rng.uniform(*domain.parked_share))
     parked = parked_cars(network, share, domain.double_share, rng, len(times_s))
-    others = placed(network, here.lane, at - here.begin_m, density, rng, parked, rivals)
-    if aimed is not None:
-        others = rearrange(others, aimed, (here.lane, at - here.begin_m), rng)
-    begin = [network.lanes[lane] for lane in others.lane]
-    drivers = join_drivers(driver, draw_drivers(len(begin), density, rng, begin))
+    others = place_vehicles(network, current.lane, position - current.begin_m, density, rng, parked, rivals)
+    if destination_route is not None:
+        others = rearrange(others, destination_route, (current.lane, position - current.begin_m), rng)
+    first_lanes = [network.lanes[lane] for lane in others.lane]
+    drivers = join_drivers(driver, draw_drivers(len(first_lanes), density, rng, first_lanes))
     paths = [path]
     for lane, cyclist in zip(others.lane, drivers.cyclist[1:], strict=True):
-        paths.append(driven_path(network, random_lanes(network, lane, rng, rivals), bool(cyclist), rng))
-    distance = np.array([at, *others.along_m])
+        paths.append(draw_path(network, random_lanes(network, lane, rng, rivals), bool(cyclist), rng))
+    distance = np.array([position, *others.along_m])
     return Roles(
         network=network,
         paths=paths,
@@ -122,54 +124,48 @@ def assign_roles(
         distance_m=distance,
         speed_mps=_first_speeds(network, paths, drivers, distance, rng),
         route=lanes,
-        walkers=place_walkers(network, float(rng.uniform(*domain.walkers)), rng, times_s),
+        pedestrians=place_pedestrians(network, float(rng.uniform(*domain.pedestrians)), rng, times_s),
         parked=parked,
     )
 
 
 def _draw_route(
-    network: RoadNetwork,
-    driver: Drivers,
-    first_s: float,
-    lane_change_share: float,
-    rng: np.random.Generator,
-    aimed: DestinationRoute | None,
-    tries: int = 0,
-) -> tuple[tuple[int, ...], Path, float]:
-    """Draw ego's lanes, path and position before the warm-up; draw again, up to ``tries`` times, without conflicts."""
-    if aimed is None:
+    network: RoadNetwork, driver: Drivers, first_s: float, lane_change_share: float, rng: np.random.Generator,
+    destination_route: DestinationRoute | None, attempts: int = 0,
+) -> tuple[tuple[int, ...], Path, float]:  # fmt: skip
+    """Draw ego's lanes, path and position before the warm-up; redraw a route without conflicts ``attempts`` times."""
+    if destination_route is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
         lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
     else:
-        start, lanes, change = aimed.start, aimed.lanes, None
+        start, lanes, change = destination_route.start, destination_route.lanes, None
     path = expert.expert_path(network, lanes, change, rng)
     cruise = 0.9 * float(driver.speed_factor[0]) * network.lanes[start.lane].limit_mps
     first = next(span for span in path.spans if span.lane == start.lane)
-    at = max(_LEAST_M, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + first_s * cruise))
-    if tries and not conflicts_on(network, path):
-        return _draw_route(network, driver, first_s, lane_change_share, rng, aimed, tries - 1)
-    return lanes, path, at
+    position = max(
+        _MIN_START_M, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + first_s * cruise)
+    )
+    if attempts and not conflicts_on(network, path):
+        return _draw_route(network, driver, first_s, lane_change_share, rng, destination_route, attempts - 1)
+    return lanes, path, position
 
 
 def _lights(
-    network: RoadNetwork,
-    lanes: tuple[int, ...],
-    timing: SignalTiming,
-    aimed: DestinationRoute | None,
-    rng: np.random.Generator,
-) -> SignalPlan | None:
+    network: RoadNetwork, lanes: tuple[int, ...], timing: SignalTiming,
+    destination_route: DestinationRoute | None, rng: np.random.Generator,
+) -> SignalPlan | None:  # fmt: skip
     """Set the clock so that ego's next light is green, turns green or turns yellow when the recording begins."""
-    plan, ahead = network.signals, lanes if aimed is None else lanes[aimed.place :]
-    lit = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
-    if plan is None or not lit:
+    plan, ahead = network.signals, lanes if destination_route is None else lanes[destination_route.place :]
+    signalised = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
+    if plan is None or not signalised:
         return plan
-    if aimed is not None and aimed.alone:
-        return green_on_arrival(plan, lit[0])
-    phase = plan.phase_of(lit[0])
-    case = int(rng.choice(3, p=timing))
-    if case == 0:
+    if destination_route is not None and destination_route.alone:
+        return green_on_arrival(plan, signalised[0])
+    phase = plan.phase_of(signalised[0])
+    phase_case = int(rng.choice(3, p=timing))
+    if phase_case == 0:
         green_at = -rng.uniform(0.0, 3.0)
-    elif case == 1:
+    elif phase_case == 1:
         green_at = rng.uniform(0.5, 5.0)
     else:
         green_at = rng.uniform(0.3, 4.5) - plan.green_s[phase]

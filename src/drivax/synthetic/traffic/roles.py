@@ -22,7 +22,7 @@ class Drivers:
         kind: ``AgentKind``: VEHICLE or CYCLIST.
         size_m: Length, width and height.
         speed_factor: Preferred speed as a multiple of the limit.
-        top_speed_mps: Largest speed whatever the limit.
+        top_speed_mps: Maximum speed, independent of the limit.
         lateral_mps2: Largest lateral acceleration in bends.
         slowing_mps2: Deceleration towards slower stretches.
         yellow_mps2: Largest deceleration to stop at yellow.
@@ -62,7 +62,7 @@ class Drivers:
         """Mask of cyclists."""
         return self.kind == AgentKind.CYCLIST
 
-    def chosen(self, rows: np.ndarray) -> Drivers:
+    def select(self, rows: np.ndarray) -> Drivers:
         """Return the drivers of some rows (indices or a mask), in that order."""
         return Drivers(**{name: value[rows] for name, value in vars(self).items()})
 
@@ -74,7 +74,7 @@ class Drivers:
 
 
 @dataclass(frozen=True)
-class Walker:
+class Pedestrian:
     """A pedestrian: walks along a curve and waits at kerbs.
 
     Attributes:
@@ -137,7 +137,7 @@ class Roles:
     distance_m: Float64[np.ndarray, " vehicle"]
     speed_mps: Float64[np.ndarray, " vehicle"]
     route: tuple[int, ...]
-    walkers: tuple[Walker, ...] = ()
+    pedestrians: tuple[Pedestrian, ...] = ()
     parked: tuple[Scripted, ...] = ()
 
 
@@ -181,7 +181,7 @@ class EgoPlan:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of all users, in this order: vehicles and cyclists (ego first), walkers, parked, extras.
+    """Motion of all users, in this order: vehicles and cyclists (ego first), pedestrians, parked, extras.
 
     Attributes:
         xy, heading, speed: Pose of the box centre and signed speed along the heading.
@@ -205,15 +205,15 @@ class Motion:
         """Number of vehicles and cyclists on paths."""
         return len(self.distance_m)
 
-    def since(self, step: int) -> Motion:
+    def from_step(self, step: int) -> Motion:
         """Return the motion from a step on."""
         return self._at(slice(step, None))
 
-    def until(self, step: int) -> Motion:
+    def before_step(self, step: int) -> Motion:
         """Return the motion before a step."""
         return self._at(slice(step))
 
-    def every(self, stride: int) -> Motion:
+    def every_nth(self, stride: int) -> Motion:
         """Return the motion at every n-th step."""
         return self._at(slice(None, None, stride))
 

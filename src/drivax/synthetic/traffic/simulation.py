@@ -23,12 +23,12 @@ from drivax.synthetic.traffic.lateral import (
     Detours,
     change_onto,
     detour_request,
-    followed,
+    positions_along,
 )
-from drivax.synthetic.traffic.obstacles import Boxes, Standing, nearest_obstacles
+from drivax.synthetic.traffic.obstacles import Boxes, StaticObstacles, nearest_obstacles
 from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows
-from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, onward
-from drivax.synthetic.traffic.pedestrians import Walkers
+from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, next_lanes
+from drivax.synthetic.traffic.pedestrians import Pedestrians
 from drivax.synthetic.traffic.right_of_way import RightOfWay, TrafficState
 from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Scripted, Staging
 
@@ -68,31 +68,31 @@ def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
 
 @dataclass(frozen=True)
 class _Log:
-    """What a run records of its vehicles (x, y, heading) and walkers (x, y, heading, speed)."""
+    """Recorded motion of vehicles (x, y, heading) and pedestrians (x, y, heading, speed)."""
 
     pose: Float64[np.ndarray, "v time 3"]
     speed: Float64[np.ndarray, "v time"]
     valid: Bool[np.ndarray, "v time"]
     at_m: Float64[np.ndarray, "v time"]
     acceleration: Float64[np.ndarray, "v time"]
-    walked: Float64[np.ndarray, "walker time 4"]
+    pedestrian_poses: Float64[np.ndarray, "pedestrian time 4"]
 
     def motion(self, roles: Roles, staging: Staging, paths: list[Path]) -> Motion:
         """Return the motion of all users, the scripted ones included."""
         scripted, steps = (*roles.parked, *staging.extras), self.speed.shape[1]
-        users = [*roles.walkers, *scripted]
-        kinds = [AgentKind.PEDESTRIAN] * len(roles.walkers) + [user.kind for user in scripted]
+        users = [*roles.pedestrians, *scripted]
+        kinds = [AgentKind.PEDESTRIAN] * len(roles.pedestrians) + [user.kind for user in scripted]
 
-        def joined(vehicles: np.ndarray, walkers: np.ndarray, name: str) -> np.ndarray:
-            return np.concatenate([vehicles, walkers, *(vars(s)[name][None, :steps] for s in scripted)])
+        def concatenate(vehicles: np.ndarray, pedestrians: np.ndarray, name: str) -> np.ndarray:
+            return np.concatenate([vehicles, pedestrians, *(vars(s)[name][None, :steps] for s in scripted)])
 
         return Motion(
             kind=np.concatenate([roles.drivers.kind, np.array(kinds, np.int8)]),
             size_m=np.concatenate([roles.drivers.size_m, np.array([u.size_m for u in users]).reshape(-1, 3)]),
-            xy=joined(self.pose[..., :2], self.walked[..., :2], "xy"),
-            heading=joined(self.pose[..., 2], self.walked[..., 2], "heading"),
-            speed=joined(self.speed, self.walked[..., 3], "speed"),
-            valid=joined(self.valid, np.ones(self.walked.shape[:2], bool), "valid"),
+            xy=concatenate(self.pose[..., :2], self.pedestrian_poses[..., :2], "xy"),
+            heading=concatenate(self.pose[..., 2], self.pedestrian_poses[..., 2], "heading"),
+            speed=concatenate(self.speed, self.pedestrian_poses[..., 3], "speed"),
+            valid=concatenate(self.valid, np.ones(self.pedestrian_poses.shape[:2], bool), "valid"),
             distance_m=self.at_m,
             acceleration=self.acceleration,
             paths=paths,
@@ -146,7 +146,7 @@ class Traffic:
         self.roles, self.times_s = roles, times_s
         self.tables = PathTables(roles.network, roles.paths, roles.drivers)
         self.parked = boxes_at(roles.parked, 0)
-        self.standing = Standing(self.parked, self.tables, roles.drivers.size_m[:, 1])
+        self.standing = StaticObstacles(self.parked, self.tables, roles.drivers.size_m[:, 1])
         self.right_of_way = RightOfWay(roles.network, roles.drivers)
         self.detours = Detours(roles.network)
         shape = (len(times_s), len(roles.network.lanes))
@@ -154,7 +154,7 @@ class Traffic:
         if roles.network.signals is not None:
             self.colour, self.to_red = roles.network.signals.colours(times_s, shape[1])
 
-    def until(self, steps: int) -> Traffic:
+    def before_step(self, steps: int) -> Traffic:
         """Return the traffic with fewer steps."""
         shorter = copy.copy(self)
         shorter.times_s = self.times_s[:steps]
@@ -165,10 +165,10 @@ class Traffic:
         return _Run(self, staging or Staging(), ego).finish()
 
 
-_Tables = TypeVar("_Tables", PathTables, Standing)
+_Tables = TypeVar("_Tables", PathTables, StaticObstacles)
 
 
-def _copied(tables: _Tables) -> _Tables:
+def _copy_tables(tables: _Tables) -> _Tables:
     """Copy tables with their arrays and lists."""
     result = copy.copy(tables)
     for name, value in vars(tables).items():
@@ -189,15 +189,19 @@ class _Run:
         count = len(roles.paths)
         self._rows = np.arange(count)
         self._idm = self._drivers.idm
-        self._tables = _copied(traffic.tables)
+        self._tables = _copy_tables(traffic.tables)
         static = tuple(user for user in staging.extras if user.is_static)
         self._movers = tuple(user for user in staging.extras if not user.is_static)
-        boxes = traffic.parked.joined(boxes_at(static, 0))
-        self._standing = Standing(boxes, self._tables, self._width_m) if static else _copied(traffic.standing)
+        boxes = traffic.parked.concatenate(boxes_at(static, 0))
+        self._standing = (
+            StaticObstacles(boxes, self._tables, self._width_m) if static else _copy_tables(traffic.standing)
+        )
         self._right_of_way = traffic.right_of_way
         self._right_of_way.reset()
         self._changes = LaneChanges(self._network, roles.drivers, boxes)
-        self._walkers = Walkers(self._network, roles.walkers, traffic.times_s) if roles.walkers else None
+        self._pedestrians = (
+            Pedestrians(self._network, roles.pedestrians, traffic.times_s) if roles.pedestrians else None
+        )
         self._occupied_crossings = np.zeros(len(self._network.crossings), bool)
         self._halting = np.zeros((0, 0), bool)  # per vehicle and crossing on its path
         self._delay = np.rint(roles.drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
@@ -212,12 +216,14 @@ class _Run:
         self._leaders = Leaders(self._network, self._drivers)
         # Gap to and speed of the next leader, line and obstacle.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
-        self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
-        self._people = self._vehicles = boxes_at((), 0)
+        self._plan_at = positions_along(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
+        self._moving_users = self._vehicles = boxes_at((), 0)
         shape = (count, len(traffic.times_s))
-        speed, at, acceleration = np.zeros((3, *shape))
-        walked = np.zeros((len(roles.walkers), shape[1], 4))
-        self._log = _Log(np.zeros((*shape, 3)), speed, np.zeros(shape, bool), at, acceleration, walked)
+        speed, position, acceleration = np.zeros((3, *shape))
+        pedestrian_poses = np.zeros((len(roles.pedestrians), shape[1], 4))
+        self._log = _Log(
+            np.zeros((*shape, 3)), speed, np.zeros(shape, bool), position, acceleration, pedestrian_poses
+        )
 
     def finish(self) -> Motion:
         """Run all steps and collect the motion."""
@@ -242,12 +248,12 @@ class _Run:
             active[0] = True
             pose[0] = (*self._ego.xy[k], self._ego.heading[k])
         self._vehicles = Boxes(pose[:, :2], pose[:, 2], self._speed, self._drivers.size_m[:, :2])
-        self._walk(t, active)
+        self._advance_pedestrians(t, active)
         log.pose[:, t], log.speed[:, t], log.at_m[:, t], log.valid[:, t] = pose, self._speed, self._at, active
         preferred = self._preferred_acceleration(t, fastest, fastest_soon, active)
         if t % _DECIDE_EVERY == 0:
             self._decide(t, preferred, fastest, active)
-        log.acceleration[:, t] = self._advance(self._delayed(t, preferred), active)
+        log.acceleration[:, t] = self._advance(self._apply_reaction_times(t, preferred), active)
 
     def _plan_step(self, t: int) -> int:
         """Step of ego's plan (negative: ego is not planned)."""
@@ -259,16 +265,18 @@ class _Run:
         self._standing.replace(row, path)
         self._at[row] = at
         self._halting[row : row + 1] = False
-        self._right_of_way.swapped(row, self._tables, at + self._half_m[row])
+        self._right_of_way.reset_vehicle(row, self._tables, at + self._half_m[row])
         self._busy_m[row], self._rest[row] = end_m, t + _REST_STEPS
 
-    def _walk(self, t: int, active: VehicleMask) -> None:
-        """Advance the walkers and gather scripted users."""
-        people, colour = boxes_at((), 0), self._fixed.colour[t]
-        if self._walkers is not None:
-            people, self._occupied_crossings = self._walkers.step(t, self._vehicles, active, colour)
-            self._log.walked[:, t] = np.column_stack([people.xy, people.heading, people.speed])
-        self._people = people.joined(boxes_at(tuple(user for user in self._movers if user.valid[t]), t))
+    def _advance_pedestrians(self, t: int, active: VehicleMask) -> None:
+        """Advance the pedestrians and gather scripted users."""
+        users, colour = boxes_at((), 0), self._fixed.colour[t]
+        if self._pedestrians is not None:
+            users, self._occupied_crossings = self._pedestrians.step(t, self._vehicles, active, colour)
+            self._log.pedestrian_poses[:, t] = np.column_stack([users.xy, users.heading, users.speed])
+        self._moving_users = users.concatenate(
+            boxes_at(tuple(user for user in self._movers if user.valid[t]), t)
+        )
 
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_soon: PerVehicle, active: VehicleMask
@@ -284,7 +292,7 @@ class _Run:
             gaps[1] -= self._speed * DT_S
         if t % 2 == 0:
             gaps[2], leads[2] = nearest_obstacles(
-                self._tables, self._vehicles, self._at, active, self._people
+                self._tables, self._vehicles, self._at, active, self._moving_users
             )
         else:
             gaps[2] += (leads[2] - self._speed) * DT_S
@@ -296,14 +304,14 @@ class _Run:
         lines = np.maximum(following[1], -_FIRMLY * needed - 0.5)
         preferred = np.minimum(np.minimum(following[0], lines), following[2])
         preferred = np.minimum(preferred, (fastest_soon - self._speed) / _SPEED_TIME_S)
-        return self._helping(preferred, fastest)
+        return self._open_gaps(preferred, fastest)
 
-    def _helping(self, preferred: PerVehicle, fastest: PerVehicle) -> PerVehicle:
+    def _open_gaps(self, preferred: PerVehicle, fastest: PerVehicle) -> PerVehicle:
         """Open gaps for mandatory lane changes on both lanes."""
         h = self._helped
         if len(h.behind):
             gap = h.gap_m + self._at[h.ahead] - self._at[h.behind]
-            idm = self._drivers.chosen(h.behind).idm
+            idm = self._drivers.select(h.behind).idm
             speed = self._speed[h.behind]
             helpful = idm_acceleration(speed, fastest[h.behind], gap, self._speed[h.ahead], idm)
             # Vehicles that are already past need no gap, and slow ones open none.
@@ -318,7 +326,7 @@ class _Run:
         if k >= 0:
             then = min(k + _FORESEEN, len(self._plan_at) - 1)
             committed = int(np.sum(p.connector_begin[0] < self._plan_at[then] + self._half_m[0]))
-        now = TrafficState(
+        state = TrafficState(
             tables=p,
             step=t,
             colour=self._fixed.colour[t],
@@ -332,7 +340,7 @@ class _Run:
             leader_speed=self._leads[0],
             committed=committed,
         )
-        room = self._right_of_way.lines(now) + 2.0 - _STOP_SHORT_M
+        room = self._right_of_way.lines(state) + 2.0 - _STOP_SHORT_M
         if np.count_nonzero(self._occupied_crossings):
             room = np.minimum(room, self._crossings(front) + 2.0 - _STOP_SHORT_M)
         room = np.minimum(room, p.stop_m - front - _END_M)
@@ -350,7 +358,7 @@ class _Run:
         self._halting = halt & (needed < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
         return np.where(self._halting, away, np.inf).min(axis=1)
 
-    def _delayed(self, t: int, preferred: PerVehicle) -> PerVehicle:
+    def _apply_reaction_times(self, t: int, preferred: PerVehicle) -> PerVehicle:
         """Return the accelerations preferred a reaction time ago, bounded by overrides."""
         depth = len(self._memory)
         if t == 0:
@@ -384,8 +392,8 @@ class _Run:
             calm[override.vehicle] &= t < override.first_step
         free = calm.copy()
         free[0] = False
-        now = Situation(self._at, self._speed, active, free, fastest, preferred)
-        changes, self._helped = self._changes.decide(now, self._tables)
+        state = Situation(self._at, self._speed, active, free, fastest, preferred)
+        changes, self._helped = self._changes.decide(state, self._tables)
         for change in changes:
             self._change(t, change)
             calm[change.vehicle] = False
@@ -398,25 +406,25 @@ class _Run:
         lanes = [change.lane]
         ahead = {span.lane for span in present.spans}
         while self._network.lanes[lanes[-1]].successors:
-            after = onward(self._network, lanes)
-            kept = [lane for lane in after if lane in ahead]
+            after = next_lanes(self._network, lanes)
+            remaining = [lane for lane in after if lane in ahead]
             # Elsewhere branches take turns: no random number is drawn here.
-            lanes.append(kept[0] if kept else after[(row + len(lanes)) % len(after)])
+            lanes.append(remaining[0] if remaining else after[(row + len(lanes)) % len(after)])
         sway = Sway((0.08,), (0.07,), (float(row),))
         target = lane_path(self._network, tuple(lanes), sway)
-        path, at = change_onto(target, present, self._at[row], change.length_m)
-        self._swap(t, row, path, at, at + change.length_m)
+        path, position = change_onto(target, present, self._at[row], change.length_m)
+        self._swap(t, row, path, position, position + change.length_m)
 
     def _pass(self, t: int, calm: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
-        halted = self._people.chosen(np.abs(self._people.speed) < 0.05)
+        halted = self._moving_users.select(np.abs(self._moving_users.speed) < 0.05)
         stuck = np.zeros(len(self._rows), bool)
         for override in self._staging.overrides:
-            now = override.first_step <= t <= override.last_step
-            stuck[override.vehicle] |= now and self._speed[override.vehicle] < 0.05
-        big = halted.chosen(halted.size_m[:, 0] > 1.2)
+            state = override.first_step <= t <= override.last_step
+            stuck[override.vehicle] |= state and self._speed[override.vehicle] < 0.05
+        big = halted.select(halted.size_m[:, 0] > 1.2)
         any_halted = bool(stuck.any()) or len(big) > 0
-        standing = self._standing.boxes.joined(self._vehicles.chosen(stuck)).joined(big)
+        standing = self._standing.boxes.concatenate(self._vehicles.select(stuck)).concatenate(big)
         if stuck.any() or len(halted):
             near = calm & (self._speed < 3.0)
         else:
@@ -426,14 +434,14 @@ class _Run:
         for row in np.flatnonzero(near & (self._speed < 9.0)).tolist():
             front, half = self._at[row] + self._half_m[row], self._width_m[row] / 2
             if any_halted or self._standing.meets(row, front, half + DETOUR_MARGIN_M, LOOK_M):
-                self._pass_by(t, row, standing, stuck)
+                self._start_detour(t, row, standing, stuck)
 
-    def _pass_by(self, t: int, row: int, standing: Boxes, stuck: VehicleMask) -> None:
+    def _start_detour(self, t: int, row: int, standing: Boxes, stuck: VehicleMask) -> None:
         """Start a detour around an obstacle ahead, if there is one."""
-        others = self._vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
-        moving = others.joined(self._people.chosen(np.abs(self._people.speed) >= 0.05))
-        at, size = float(self._at[row]), (float(2 * self._half_m[row]), float(self._width_m[row]))
-        request = detour_request(self._network, self._tables, row, (at, self._speed[row]), size)
+        others = self._vehicles.select((self._rows != row) & ~stuck & (self._at > 0.0))
+        moving = others.concatenate(self._moving_users.select(np.abs(self._moving_users.speed) >= 0.05))
+        position, size = float(self._at[row]), (float(2 * self._half_m[row]), float(self._width_m[row]))
+        request = detour_request(self._network, self._tables, row, (position, self._speed[row]), size)
         detour = self._fixed.detours.find(request, standing, moving)
         if detour is not None:
-            self._swap(t, row, detour[0], at, detour[1])
+            self._swap(t, row, detour[0], position, detour[1])

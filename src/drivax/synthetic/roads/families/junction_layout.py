@@ -22,11 +22,11 @@ from drivax.synthetic.roads.curves import (
     Curve,
     Pose,
     connect_poses,
+    draw_winding_curve,
     join_curves,
     resample,
     straight,
     tangent_lengths,
-    winding,
 )
 from drivax.synthetic.roads.network import Crossing, Draft, Line, Start, points, ring
 from drivax.synthetic.roads.style import RoadStyle
@@ -156,7 +156,7 @@ class Reach:
         """Draw the middle line of an arm."""
         near, bends = straight(start, self.straight_m), self.arm_m - self.straight_m
         shape = {"max_curvature": 1.0 / self.tightest_m, "max_turn": self.widest_turn}
-        return join_curves(near, winding(rng, bends, start=near.end, **shape))
+        return join_curves(near, draw_winding_curve(rng, bends, start=near.end, **shape))
 
 
 @dataclass(frozen=True)
@@ -166,13 +166,13 @@ class Geometry:
     Attributes:
         skew, offset_m: Largest deviation of an arm from its direction, rad, and from the centre.
         corner_m: Radius of the corners' kerbs, low and high.
-        walk_m: Distance of sidewalks from the edge, low and high.
+        sidewalk_m: Distance of sidewalks from the edge, low and high.
     """
 
     skew: float = math.radians(6.0)
     offset_m: float = 0.8
     corner_m: tuple[float, float] = (6.0, 12.0)
-    walk_m: tuple[float, float] = (1.0, 2.5)
+    sidewalk_m: tuple[float, float] = (1.0, 2.5)
     reach: Reach = field(default_factory=Reach)
 
     def arms(
@@ -181,9 +181,9 @@ class Geometry:
         """Draw arms in about these directions, each centred on its lanes."""
         arms = []
         for heading, street in zip(headings, streets, strict=True):
-            at = Pose(0.0, 0.0, heading + float(rng.uniform(-self.skew, self.skew)))
+            pose = Pose(0.0, 0.0, heading + float(rng.uniform(-self.skew, self.skew)))
             centred = (street.outward - street.inward) * street.width_m / 2
-            arms.append(Arm(at.aside(centred + float(rng.uniform(-self.offset_m, self.offset_m))), street))
+            arms.append(Arm(pose.aside(centred + float(rng.uniform(-self.offset_m, self.offset_m))), street))
         return arms
 
     def mouths(self, rng: np.random.Generator, arms: Sequence[Arm]) -> list[float]:
@@ -235,7 +235,7 @@ def lay_lanes(draft: Draft, street: CrossSection, middle: Curve) -> tuple[tuple[
     def lay(count: int, side: float) -> tuple[int, ...]:
         lanes = []
         for j in range(count):
-            curve = middle.shifted(side * (street.gap_m / 2 + (j + 0.5) * street.width_m))
+            curve = middle.parallel(side * (street.gap_m / 2 + (j + 0.5) * street.width_m))
             curve = curve if side < 0 else curve.reversed()
             lanes.append(draft.lane(curve, street.width_m, street.limit_mps))
         for pair in pairwise(lanes):
@@ -320,26 +320,22 @@ Place = tuple[int, int]
 
 
 def finish_sites(
-    rng: np.random.Generator,
-    style: RoadStyle,
-    draft: Draft,
-    sites: Sequence[Site],
-    links: dict[Place, Place],
-    geometry: Geometry,
-) -> None:
+    rng: np.random.Generator, style: RoadStyle, draft: Draft, sites: Sequence[Site],
+    links: dict[Place, Place], geometry: Geometry,
+) -> None:  # fmt: skip
     """Add the boundary around all sites, counter-clockwise, sidewalks along it, markings and crossings.
 
     ``links`` pairs the approaches at the two ends of a street, in both directions; linked sites form a tree.
     """
     first = next((0, i) for i in range(len(sites[0].approaches)) if (0, i) not in links)
-    kerbs, at = [], first
-    while not kerbs or at != first:
-        kerb, at = _kerb_between_ends(sites, links, at)
+    kerbs, end = [], first
+    while not kerbs or end != first:
+        kerb, end = _kerb_between_ends(sites, links, end)
         kerbs.append(kerb)
     draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*kerbs)))
-    walk_m = float(rng.uniform(*geometry.walk_m))
-    if rng.random() < style.walk_share:
-        draft.walks += [kerb.shifted(-walk_m) for kerb in kerbs]
+    sidewalk_m = float(rng.uniform(*geometry.sidewalk_m))
+    if rng.random() < style.sidewalk_share:
+        draft.sidewalks += [kerb.parallel(-sidewalk_m) for kerb in kerbs]
     for number, site in enumerate(sites):
         for i, approach in enumerate(site.approaches):
             if links.get((number, i), (number, i)) >= (number, i):
@@ -353,15 +349,15 @@ def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: 
     def approach(place: Place) -> Approach:
         return sites[place[0]].approaches[place[1]]
 
-    pieces = [approach(begin).side.shifted(approach(begin).arm.street.left_m).reversed()]
-    here = begin
+    pieces = [approach(begin).side.parallel(approach(begin).arm.street.left_m).reversed()]
+    end = begin
     while True:
-        after = (here[0], (here[1] + 1) % len(sites[here[0]].approaches))
-        side = approach(after).side.shifted(-approach(after).arm.street.right_m)
+        after = (end[0], (end[1] + 1) % len(sites[end[0]].approaches))
+        side = approach(after).side.parallel(-approach(after).arm.street.right_m)
         pieces += [connect_poses(pieces[-1].end, side.start), side]
         if after not in links:
             return join_curves(*pieces), after
-        here = links[after]
+        end = links[after]
 
 
 def _paint(draft: Draft, street: CrossSection, middle: Curve) -> None:
@@ -370,7 +366,7 @@ def _paint(draft: Draft, street: CrossSection, middle: Curve) -> None:
     for side, count in ((1.0, street.inward), (-1.0, street.outward)):
         for j in range(1, count + 1):
             kind = RoadKind.LINE_SOLID_SINGLE_WHITE if j == count else RoadKind.LINE_BROKEN_SINGLE_WHITE
-            draft.mark(kind, middle.shifted(side * (street.gap_m / 2 + j * street.width_m)))
+            draft.mark(kind, middle.parallel(side * (street.gap_m / 2 + j * street.width_m)))
 
 
 def _add_crossings(draft: Draft, site: Site) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool
 
-from drivax.synthetic.roads.curves import Curve, Pose, join_curves, straight, winding
+from drivax.synthetic.roads.curves import Curve, Pose, draw_winding_curve, join_curves, straight
 from drivax.synthetic.roads.families.junction_layout import (
     Approach,
     Arm,
@@ -33,7 +33,7 @@ from drivax.synthetic.roads.families.junction_layout import (
     open_site,
     starts,
 )
-from drivax.synthetic.roads.network import Control, Draft, RoadNetwork, conflicting
+from drivax.synthetic.roads.network import Control, Draft, RoadNetwork, conflict_matrix
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan, combine_plans, yellow_time_s
 from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
@@ -58,7 +58,7 @@ Conflicts = Bool[np.ndarray, "lane lane"]
 
 def set_priorities(draft: Draft, site: Site, major: Sequence[int], sign: Control) -> None:
     """Set the rules of a priority road: other approaches have a sign, left turns yield to oncoming traffic."""
-    conflicts = conflicting(draft.lanes)
+    conflicts = conflict_matrix(draft.lanes)
     for move in site.moves:
         yields_to = _yields_to(move, site.moves, conflicts, major)
         unsigned = Control.YIELD if yields_to else Control.NONE
@@ -84,7 +84,7 @@ def set_lights(
 
     ``lefts`` has the left turns of both pairs of approaches, ``green_s`` the least and the largest green time.
     """
-    green, conflicts = [float(g) for g in rng.uniform(*green_s, size=4)], conflicting(draft.lanes)
+    green, conflicts = [float(g) for g in rng.uniform(*green_s, size=4)], conflict_matrix(draft.lanes)
     groups: list[LightGroup] = []
     phases: list[tuple[int, ...]] = []
 
@@ -299,7 +299,7 @@ class _Plot:
         """Beginning of the road to the other junction, looking outwards."""
         return self.arms[0].base.ahead(self.mouths[0] + self.arms[0].street.stop_line_m)
 
-    def moved(self, gate: Pose) -> _Plot:
+    def move_to(self, gate: Pose) -> _Plot:
         """Move the junction so that its gate is at a pose."""
         angle = gate.heading - self.gate.heading
         cos, sin = math.cos(angle), math.sin(angle)
@@ -343,9 +343,9 @@ class Corridor:
         """Draw a network; ego starts before either junction, most often on the main road."""
         lanes = 2 if rng.random() < self.two_lane_share else 1
         main = draw_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
-        first = self._plot(rng, style, main).moved(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
+        first = self._plot(rng, style, main).move_to(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
         middle = self._between(rng, first.gate)
-        second = self._plot(rng, style, main).moved(middle.end.turned())
+        second = self._plot(rng, style, main).move_to(middle.end.turned())
         draft = Draft()
         sites = self._sites(rng, draft, (first, second), middle)
         finish_sites(rng, style, draft, sites, {(0, 0): (1, 0), (1, 0): (0, 0)}, self.geometry)
@@ -363,13 +363,13 @@ class Corridor:
     def _plot(self, rng: np.random.Generator, style: RoadStyle, main: CrossSection) -> _Plot:
         kind = list(_KINDS)[rng.choice(len(_KINDS), p=list(_KINDS.values()))]
         marked = kind == _LIGHTS or bool(rng.random() < 0.4)
-        slower = min(main.limit_mps, float(rng.choice(style.limits_mps)))
-        side = draw_street(rng, style, (1, 1), slower, kind == _LIGHTS or bool(rng.random() < 0.6))
+        side_limit_mps = min(main.limit_mps, float(rng.choice(style.limits_mps)))
+        side = draw_street(rng, style, (1, 1), side_limit_mps, kind == _LIGHTS or bool(rng.random() < 0.6))
         main = replace(main, marked=marked)
         streets, headings = [main, side, main, side], [k * math.pi / 2 for k in range(4)]
         if kind == _SIDE_ROAD:
-            closed = int(rng.choice([1, 3]))
-            del streets[closed], headings[closed]
+            missing_arm = int(rng.choice([1, 3]))
+            del streets[missing_arm], headings[missing_arm]
         arms = self.geometry.arms(rng, headings, streets)
         left_only = kind == _LIGHTS and main.inward > 1 and bool(rng.random() < self.left_lane_share)
         return _Plot(kind, arms, self.geometry.mouths(rng, arms), left_only)
@@ -377,7 +377,7 @@ class Corridor:
     def _between(self, rng: np.random.Generator, gate: Pose) -> Curve:
         near, length = straight(gate, _STRAIGHT_M), float(rng.uniform(*self.between_m)) - 2 * _STRAIGHT_M
         shape = {"max_curvature": 1.0 / self.geometry.reach.tightest_m, "max_turn": math.radians(8.0)}
-        bent = winding(rng, length, start=near.end, **shape)
+        bent = draw_winding_curve(rng, length, start=near.end, **shape)
         return join_curves(near, bent, straight(bent.end, _STRAIGHT_M))
 
     def _sites(
@@ -421,5 +421,5 @@ class Corridor:
             return first or second
         cycle = max(first.cycle_s, second.cycle_s)
         if rng.random() < self.coordinated_share:
-            return combine_plans(first.stretched(cycle), second.stretched(cycle), travel_s)
+            return combine_plans(first.stretch(cycle), second.stretch(cycle), travel_s)
         return combine_plans(first, second, float(rng.uniform(0.0, cycle)))

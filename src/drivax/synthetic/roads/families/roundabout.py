@@ -32,7 +32,7 @@ from drivax.synthetic.roads.network import (
     Line,
     RoadNetwork,
     Start,
-    conflicting,
+    conflict_matrix,
     points,
     ring,
 )
@@ -116,8 +116,8 @@ class Roundabout:
         arms = [self._arm(rng, draft, plan, heading) for heading in self._headings(rng, plan)]
         chains = _go_round(draft, plan, arms, self.circle_mps)
         _set_priorities(draft)
-        walk_m = float(rng.uniform(1.2, 2.0)) if rng.random() < style.walk_share else None
-        _add_boundary(draft, plan, chains, walk_m)
+        sidewalk_m = float(rng.uniform(1.2, 2.0)) if rng.random() < style.sidewalk_share else None
+        _add_boundary(draft, plan, chains, sidewalk_m)
         _add_islands(draft, plan, arms)
         marked = bool(rng.random() < self.marked_share)
         for arm in arms:
@@ -162,27 +162,27 @@ class Roundabout:
         spread = plan.spread_m(middle)
         inward, outward = [], []
         for j in range(len(plan.radius_m)):
-            aside = spread + (j + 0.5) * plan.width_m
-            inward.append(draft.lane(middle.displaced(aside).reversed(), plan.width_m, plan.limit_mps))
-            outward.append(draft.lane(middle.displaced(-aside), plan.width_m, plan.limit_mps))
+            lateral = spread + (j + 0.5) * plan.width_m
+            inward.append(draft.lane(middle.offset_by(lateral).reversed(), plan.width_m, plan.limit_mps))
+            outward.append(draft.lane(middle.offset_by(-lateral), plan.width_m, plan.limit_mps))
         for lanes in (inward, outward):
             if len(lanes) == 2:
                 draft.link_neighbours(*lanes)
         return _Arm(heading, middle, inward, outward)
 
 
-def _join(radius: float, aside: float) -> tuple[float, float]:
+def _join(radius: float, lateral: float) -> tuple[float, float]:
     """Angle from an arm at which its lane joins the circle, and distance from the centre at which the bend begins.
 
-    The arm's lane (at a distance ``aside`` from the arm) and the circle's tangent at angle d intersect at a distance
+    The arm's lane (at a distance ``lateral`` from the arm) and the circle's tangent at angle d intersect at a distance
     ``t = (r sin d - aside) / cos d`` from the circle; a fillet with that tangent has the radius ``t / tan(45 - d/2)``.
     """
     angles = np.linspace(math.radians(24.0), math.pi / 4 - _ARC_M / radius / 2, 40)
-    tangents = (radius * np.sin(angles) - aside) / np.cos(angles)
+    tangents = (radius * np.sin(angles) - lateral) / np.cos(angles)
     wide = tangents / np.tan(math.pi / 4 - angles / 2) >= _FILLET_M
     chosen = int(np.argmax(wide)) if wide.any() else -1
     angle, tangent = float(angles[chosen]), float(tangents[chosen])
-    return angle, (radius - aside * math.sin(angle)) / math.cos(angle) + tangent
+    return angle, (radius - lateral * math.sin(angle)) / math.cos(angle) + tangent
 
 
 def _on_circle(radius: float, angle: float) -> Pose:
@@ -227,7 +227,7 @@ def _go_round(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> list
 
 def _set_priorities(draft: Draft) -> None:
     """Give circulating traffic right of way over entries, and over exits across the outer circle."""
-    lanes, conflicts = draft.lanes, conflicting(draft.lanes)
+    lanes, conflicts = draft.lanes, conflict_matrix(draft.lanes)
     arcs = {i for i, lane in enumerate(lanes) if len(lane.predecessors) == 2}
     passes = {i for i, lane in enumerate(lanes) if {*lane.predecessors, *lane.successors} <= arcs}
     for i in range(len(lanes)):
@@ -236,7 +236,7 @@ def _set_priorities(draft: Draft) -> None:
             draft.change(i, control=Control.YIELD, yields_to=yields_to)
 
 
-def _add_boundary(draft: Draft, plan: _Plan, chains: list[list[Curve]], walk_m: float | None) -> None:
+def _add_boundary(draft: Draft, plan: _Plan, chains: list[list[Curve]], sidewalk_m: float | None) -> None:
     """Add the outer boundary and the sidewalks."""
     sides = []
     for chain in chains:
@@ -245,9 +245,9 @@ def _add_boundary(draft: Draft, plan: _Plan, chains: list[list[Curve]], walk_m: 
         wide = smooth_step((line.arc_m - ends[0]) / (ends[1] - ends[0]))
         wide -= smooth_step((line.arc_m - ends[2]) / (ends[3] - ends[2]))
         reach = plan.width_m / 2 + plan.shoulder_m + wide * (plan.circle_m - plan.width_m) / 2
-        sides.append(line.displaced(-reach))
-        if walk_m is not None:
-            draft.walks.append(line.displaced(-reach - walk_m))
+        sides.append(line.offset_by(-reach))
+        if sidewalk_m is not None:
+            draft.sidewalks.append(line.offset_by(-reach - sidewalk_m))
     draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*sides)))
 
 
@@ -258,30 +258,30 @@ def _add_islands(draft: Draft, plan: _Plan, arms: list[_Arm]) -> None:
     islands = [radius * np.stack([np.cos(angles), -np.sin(angles)], axis=-1)]
     for arm in arms:
         half = plan.spread_m(arm.middle) - _KERB_M
-        here = arm.middle.piece(0, int(np.argmax(half < 0.15)) - 1)
-        half = half[: len(here.xy)]
-        islands.append(ring(here.displaced(half), here.displaced(-half).reversed()))
+        axis_piece = arm.middle.piece(0, int(np.argmax(half < 0.15)) - 1)
+        half = half[: len(axis_piece.xy)]
+        islands.append(ring(axis_piece.offset_by(half), axis_piece.offset_by(-half).reversed()))
     draft.edges += [Line(RoadKind.EDGE_MEDIAN, island) for island in islands]
 
 
 def _paint(draft: Draft, plan: _Plan, arm: _Arm) -> None:
     spread, lanes = plan.spread_m(arm.middle), len(arm.inward)
     for side in (-1.0, 1.0):
-        draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, arm.middle.displaced(side * (spread + 0.08)))
+        draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, arm.middle.offset_by(side * (spread + 0.08)))
         for j in range(1, lanes + 1):
             kind = RoadKind.LINE_SOLID_SINGLE_WHITE if j == lanes else RoadKind.LINE_BROKEN_SINGLE_WHITE
-            draft.mark(kind, arm.middle.displaced(side * (spread + j * plan.width_m)))
+            draft.mark(kind, arm.middle.offset_by(side * (spread + j * plan.width_m)))
 
 
 def _cross(draft: Draft, plan: _Plan, arm: _Arm, marked: bool) -> None:
     """Add the crossing of an arm, a car's length before the yield line."""
     half = plan.gap_m / 2 + len(arm.inward) * plan.width_m + plan.shoulder_m
-    here = arm.middle.start
-    at = here.ahead(_CROSSING_M)
+    mouth = arm.middle.start
+    position = mouth.ahead(_CROSSING_M)
     lanes = [(lane, draft.lanes[lane].length_m - _CROSSING_M) for lane in arm.inward]
     lanes += [(lane, _CROSSING_M) for lane in arm.outward]
-    axis = points(at.aside(-half), at.aside(half))
+    axis = points(position.aside(-half), position.aside(half))
     draft.crossings.append(Crossing(axis, CROSSWALK_M, tuple(lanes), marked))
     if marked:
-        near, far = (here.ahead(_CROSSING_M + sign * CROSSWALK_M / 2) for sign in (-1.0, 1.0))
+        near, far = (mouth.ahead(_CROSSING_M + sign * CROSSWALK_M / 2) for sign in (-1.0, 1.0))
         draft.crosswalk(near.aside(half), far.aside(half), far.aside(-half), near.aside(-half))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import RoadKind
-from drivax.synthetic.roads.curves import STEP_M, Curve, Pose, smooth_step, winding
+from drivax.synthetic.roads.curves import STEP_M, Curve, Pose, draw_winding_curve, smooth_step
 from drivax.synthetic.roads.network import Bay, Crossing, Draft, Line, RoadNetwork, Start, points, ring
 
 #: Width of a crosswalk, m.
@@ -97,8 +97,8 @@ class Street:
     def presence(self, strip: Strip) -> Float64[np.ndarray, " point"]:
         """Share of a strip's width at every sample: it grows along a fork and shrinks on a taper."""
         index = np.arange(len(self.middle.xy))
-        here = (index >= self.cuts[strip.first]) & (index <= self.cuts[strip.last])
-        present = here.astype(float)
+        inside = (index >= self.cuts[strip.first]) & (index <= self.cuts[strip.last])
+        present = inside.astype(float)
         if strip.fork:
             begin, end = self.cuts[strip.first - 1], self.cuts[strip.first]
             present = np.where(index < end, smooth_step((index - begin) / (end - begin)), present)
@@ -111,18 +111,18 @@ class Street:
         """Add the lanes, the edges and the markings."""
         self.lay()
         right, left = self.edge_m
-        outer = ring(self.middle.displaced(-right), self.middle.displaced(left).reversed())
+        outer = ring(self.middle.offset_by(-right), self.middle.offset_by(left).reversed())
         self.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, outer))
         self.divide()
         for side, reach in zip((-1.0, 1.0), self.reach_m, strict=True):
             if reach[0] > self.median_m / 2:
-                self.draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, self.middle.displaced(side * reach))
+                self.draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, self.middle.offset_by(side * reach))
         self.paint_inside()
 
     def lay(self) -> None:
         """Add all lanes with their links."""
         for strip in self.strips:
-            line = self.middle.shifted(self.offset_m(strip.place))
+            line = self.middle.parallel(self.offset_m(strip.place))
             for k in range(strip.first, strip.last):
                 piece = line.piece(self.cuts[k], self.cuts[k + 1])
                 self.lanes[strip.place, k] = self.draft.lane(
@@ -150,12 +150,12 @@ class Street:
 
     def _link_neighbours(self, strip: Strip) -> None:
         """Link a strip with the one to its right as seen along the middle line."""
-        place = strip.place - 1 or -1
-        right = next((s for s in self.strips if s.place == place and s.forward == strip.forward), None)
-        if right is None or (self.median_m and place * strip.place < 0):
+        index = strip.place - 1 or -1
+        right = next((s for s in self.strips if s.place == index and s.forward == strip.forward), None)
+        if right is None or (self.median_m and index * strip.place < 0):
             return
         for k in range(max(strip.first, right.first), min(strip.last, right.last)):
-            pair = self.lanes[strip.place, k], self.lanes[place, k]
+            pair = self.lanes[strip.place, k], self.lanes[index, k]
             self.draft.link_neighbours(*(pair if strip.forward else pair[::-1]))
 
     def _fork(self, strip: Strip) -> None:
@@ -164,7 +164,7 @@ class Street:
         k, offset = strip.first - 1, self.offset_m(inner)
         piece = self.middle.piece(self.cuts[k], self.cuts[k + 1])
         share = smooth_step(np.linspace(0.0, 1.0, len(piece.xy)))
-        curve = piece.displaced(offset + share * (self.offset_m(strip.place) - offset))
+        curve = piece.offset_by(offset + share * (self.offset_m(strip.place) - offset))
         lane = self.draft.lane(curve, self.width_m, self.limit_mps, exit_only=strip.exit_only, kind=self.kind)
         self.draft.link(self.lanes[inner, k - 1], lane)
         self.draft.link(lane, self.lanes[strip.place, strip.first])
@@ -175,7 +175,7 @@ class Street:
         if self.median_m:
             half, end = self.median_m / 2 - _KERB_M, round(2 / STEP_M)
             inner = self.middle.piece(end, len(self.middle.xy) - 1 - end)
-            island = ring(inner.shifted(half), inner.shifted(-half).reversed())
+            island = ring(inner.parallel(half), inner.parallel(-half).reversed())
             self.draft.edges.append(Line(RoadKind.EDGE_MEDIAN, island))
 
     def paint_inside(self) -> None:
@@ -183,8 +183,8 @@ class Street:
         for strip in self.strips:
             inner = strip.place - int(np.sign(strip.place))
             if inner:
-                aside = self.offset_m(strip.place) + (0.5 if inner < 0 else -0.5) * self.width_m
-                line = self.middle.piece(self.cuts[strip.first], self.cuts[strip.last]).shifted(aside)
+                lateral = self.offset_m(strip.place) + (0.5 if inner < 0 else -0.5) * self.width_m
+                line = self.middle.piece(self.cuts[strip.first], self.cuts[strip.last]).parallel(lateral)
                 self.draft.mark(RoadKind.LINE_BROKEN_SINGLE_WHITE, line)
         self._paint_middle()
 
@@ -197,28 +197,28 @@ class Street:
             first, last = max(s.first for s in left), max(s.last for s in left)
             lines = [self.middle.piece(self.cuts[first], self.cuts[last])]
         elif self.median_m and not one_way:
-            lines = [self.middle.shifted(side * self.median_m / 2) for side in (-1, 1)]
+            lines = [self.middle.parallel(side * self.median_m / 2) for side in (-1, 1)]
         elif not one_way:
             broken = len(self.strips) == 2
             kind = RoadKind.LINE_BROKEN_SINGLE_YELLOW if broken else RoadKind.LINE_SOLID_DOUBLE_YELLOW
         for line in lines:
             self.draft.mark(kind, line)
 
-    def walk(self, rng: np.random.Generator) -> None:
+    def add_sidewalks(self, rng: np.random.Generator) -> None:
         """Add a sidewalk on both sides, 1.2 to 2.5 m outside the edges."""
         right, left = self.edge_m
         away = float(rng.uniform(1.2, 2.5))
-        self.draft.walks += [self.middle.displaced(-right - away), self.middle.displaced(left + away)]
+        self.draft.sidewalks += [self.middle.offset_by(-right - away), self.middle.offset_by(left + away)]
 
     def cross(self, at: int, marked: bool) -> None:
         """Add a crossing at a sample of the middle line, with a crosswalk where it is marked."""
-        here, right, left = self.middle.pose(at), -self.edge_m[0][at], self.edge_m[1][at]
+        current, right, left = self.middle.pose(at), -self.edge_m[0][at], self.edge_m[1][at]
         section = self._section(at)
-        lanes = tuple(self._on_lane(place, k, at) for place, k in self.lanes if k == section)
-        axis = points(here.aside(right), here.aside(left))
+        lanes = tuple(self._on_lane(index, k, at) for index, k in self.lanes if k == section)
+        axis = points(current.aside(right), current.aside(left))
         self.draft.crossings.append(Crossing(axis, CROSSWALK_M, lanes, marked))
         if marked:
-            near, far = (here.ahead(CROSSWALK_M / 2 * sign) for sign in (-1.0, 1.0))
+            near, far = (current.ahead(CROSSWALK_M / 2 * sign) for sign in (-1.0, 1.0))
             self.draft.crosswalk(near.aside(right), near.aside(left), far.aside(left), far.aside(right))
 
     def _on_lane(self, place: int, section: int, at: int) -> tuple[int, float]:
@@ -241,27 +241,27 @@ class Street:
             if not row:
                 continue
             outer = max(places, key=abs) if places else -side
-            aside = side * (self.median_m / 2 + len(places) * self.width_m + row / 2)
-            at, pitch = margin_m + float(rng.uniform(0.0, 8.0)), float(rng.uniform(5.8, 6.6))
+            lateral = side * (self.median_m / 2 + len(places) * self.width_m + row / 2)
+            position, pitch = margin_m + float(rng.uniform(0.0, 8.0)), float(rng.uniform(5.8, 6.6))
             # In bends the inner row is shorter than the middle line.
-            stretch = 1.0 - aside * np.gradient(self.middle.heading, STEP_M)
-            while at + 1.5 * pitch < end_m:
+            stretch = 1.0 - lateral * np.gradient(self.middle.heading, STEP_M)
+            while position + 1.5 * pitch < end_m:
                 if rng.random() < 0.08:
-                    at += float(rng.uniform(4.0, 9.0))
+                    position += float(rng.uniform(4.0, 9.0))
                     continue
-                room = pitch / float(stretch[round((at + pitch / 2) / STEP_M)])
-                self._bay(outer, aside, at + room / 2, pitch)
-                at += room
+                room = pitch / float(stretch[round((position + pitch / 2) / STEP_M)])
+                self._bay(outer, lateral, position + room / 2, pitch)
+                position += room
 
-    def _bay(self, place: int, aside: float, at_m: float, length_m: float) -> None:
-        at = round(at_m / STEP_M)
-        pose = self.middle.pose(at).aside(aside)
+    def _bay(self, place: int, lateral: float, at_m: float, length_m: float) -> None:
+        sample = round(at_m / STEP_M)
+        pose = self.middle.pose(sample).aside(lateral)
         # Bays do not hide crossings.
         along = np.array([np.cos(pose.heading), np.sin(pose.heading)])
         to = [crossing.axis.mean(axis=0) - [pose.x, pose.y] for crossing in self.draft.crossings]
         if not any(np.hypot(*d) < 30.0 and abs(d @ along) < _BAY_CLEAR_M for d in to):
             pose = pose if self._forward(place) else pose.turned()
-            self.draft.bays.append(Bay(pose, length_m, *self._on_lane(place, self._section(at), at)))
+            self.draft.bays.append(Bay(pose, length_m, *self._on_lane(place, self._section(sample), sample)))
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,7 @@ class StreetFamily:
 
     def draw_middle(self, rng: np.random.Generator, curvature: float = 1.0) -> Curve:
         """Draw the reference line; ``curvature`` is the style's factor on the tightest bend."""
-        return winding(
+        return draw_winding_curve(
             rng,
             self.length_m,
             max_curvature=curvature / float(rng.uniform(*self.tightest_m)),

@@ -56,8 +56,8 @@ class CurvedRoad(StreetFamily):
             rows_m=(row, row if back else 0.0),
         )
         street.build()
-        if rng.random() < style.walk_share:
-            street.walk(rng)
+        if rng.random() < style.sidewalk_share:
+            street.add_sidewalks(rng)
         street.park(20.0, rng)
         return street.network(self.name)
 
@@ -100,8 +100,8 @@ class LaneDrop(StreetFamily):
             taper_m=float(rng.uniform(*self.taper_m)),
         )
         street.build()
-        if rng.random() < style.walk_share:
-            street.walk(rng)
+        if rng.random() < style.sidewalk_share:
+            street.add_sidewalks(rng)
         return street.network(self.name)
 
     def _strips(self, rng: np.random.Generator, sections: int) -> tuple[Strip, ...]:
@@ -111,9 +111,9 @@ class LaneDrop(StreetFamily):
         gains, left = rng.random() < self.gain_share, rng.random() < self.left_share
         if left and not both_ways and not gains:
             return (Strip(1, True, 0, where, ends=True), *strips(lanes - 1, 0, sections))
-        *rest, outer = strips(lanes, 0, sections)
+        *remainder, outer = strips(lanes, 0, sections)
         outer = replace(outer, first=where, fork=True) if gains else replace(outer, last=where, ends=True)
-        return (*rest, outer, *strips(0, int(both_ways), sections))
+        return (*remainder, outer, *strips(0, int(both_ways), sections))
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,13 @@ class MidblockCrosswalk(StreetFamily):
             rows_m=(row, row if back else 0.0),
         )
         street.build()
-        street.walk(rng)
-        at = float(rng.uniform(*self.crossing_m))
-        stations = [at, at + float(rng.uniform(*self.apart_m))] if rng.random() < self.second_share else [at]
+        street.add_sidewalks(rng)
+        position = float(rng.uniform(*self.crossing_m))
+        stations = (
+            [position, position + float(rng.uniform(*self.apart_m))]
+            if rng.random() < self.second_share
+            else [position]
+        )
         for station in stations:
             street.cross(round(station / STEP_M), marked=bool(rng.random() < self.marked_share))
         street.park(20.0, rng)
@@ -192,10 +196,10 @@ class ParkedStreet(StreetFamily):
             rows_m=(row * sides[0], row * sides[1]),
         )
         street.build()
-        street.walk(rng)
+        street.add_sidewalks(rng)
         if rng.random() < self.crossing_share:
-            at = round(float(rng.uniform(170.0, 250.0)) / STEP_M)
-            street.cross(at, marked=bool(rng.random() < 0.5))
+            sample = round(float(rng.uniform(170.0, 250.0)) / STEP_M)
+            street.cross(sample, marked=bool(rng.random() < 0.5))
         street.park(15.0, rng)
         return street.network(self.name)
 
@@ -272,22 +276,22 @@ class Highway(StreetFamily):
     def _extra(self, rng: np.random.Generator, lanes: int) -> Strip:
         """Draw the auxiliary lane: for entering, for leaving, or for both."""
         purpose = rng.choice(3, p=self.shares)
-        place, length = -lanes - 1, int(rng.integers(2, 4))
+        index, length = -lanes - 1, int(rng.integers(2, 4))
         if purpose == 0:
-            return Strip(place, True, 3, 3 + length, ends=True)
+            return Strip(index, True, 3, 3 + length, ends=True)
         if purpose == 1:
-            return Strip(place, True, 4, 3 + length, fork=True, exit_only=True)
-        return Strip(place, True, 3, 3 + length, exit_only=True)
+            return Strip(index, True, 4, 3 + length, fork=True, exit_only=True)
+        return Strip(index, True, 3, 3 + length, exit_only=True)
 
     def _ramp(self, rng: np.random.Generator, street: Street, extra: Strip, away: int) -> _Ramp:
         """Add a ramp at the beginning of the auxiliary lane (``away`` -1) or at its end (1)."""
         auxiliary = street.lanes[extra.place, extra.first if away < 0 else extra.last - 1]
-        at = street.cuts[extra.first if away < 0 else extra.last]
+        sample = street.cuts[extra.first if away < 0 else extra.last]
         length = self.ramp_m[0 if away < 0 else 1]
         line = street.draft.lanes[auxiliary].curve
         gore = line.start.turned() if away < 0 else line.end
         # Seen from the highway, an on-ramp bends to the left and an off-ramp to the right.
-        side = np.gradient(street.middle.heading, STEP_M)[at::away][: round(length / STEP_M) + 1] * away
+        side = np.gradient(street.middle.heading, STEP_M)[sample::away][: round(length / STEP_M) + 1] * away
         bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
         outward = from_curvature(side - away * bend, STEP_M, gore)
         curve = outward if away > 0 else outward.reversed()
@@ -295,7 +299,7 @@ class Highway(StreetFamily):
         lane = street.draft.lane(curve, street.width_m, limit, kind=street.kind, exit_only=away > 0)
         street.draft.link(*((lane, auxiliary) if away < 0 else (auxiliary, lane)))
         half = street.width_m / 2
-        left, right = curve.shifted(half + _RAMP_SHOULDER_M), curve.shifted(-half - street.shoulder_m)
+        left, right = curve.parallel(half + _RAMP_SHOULDER_M), curve.parallel(-half - street.shoulder_m)
         nose, sample = _nose(street, extra, left if away > 0 else left.reversed())
         last = len(left.xy) - 1
         left = left.piece(nose, last) if away > 0 else left.piece(0, last - nose)
@@ -306,15 +310,15 @@ def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray,
     """Curvature that rises to 1 / radius, holds, and falls, and integrates to an angle."""
     hold = max(0.0, angle * radius_m - _EASING_M)
     knots = np.cumsum([0.0, _EASING_M, hold, _EASING_M])
-    at = STEP_M * np.arange(round(length_m / STEP_M) + 1)
+    position = STEP_M * np.arange(round(length_m / STEP_M) + 1)
     peak = angle / (hold + _EASING_M)
-    return np.interp(at, knots, [0.0, peak, peak, 0.0])
+    return np.interp(position, knots, [0.0, peak, peak, 0.0])
 
 
 def _main_edge(street: Street, extra: Strip) -> Curve:
     """Right edge of the highway without its auxiliary lane."""
     reach = street.reach_m[0] - street.width_m * street.presence(extra) + street.shoulder_m
-    return street.middle.displaced(-reach)
+    return street.middle.offset_by(-reach)
 
 
 def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
@@ -327,15 +331,15 @@ def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
     window = edge.xy[first : gore + span]
     near = first + np.argmin(np.sum((points[:, None] - window[None]) ** 2, axis=-1), axis=1)
     to = points - edge.xy[near]
-    aside = -to[:, 0] * np.sin(edge.heading[near]) + to[:, 1] * np.cos(edge.heading[near])
-    sample = int(np.argmax(aside < -0.05))
+    lateral = -to[:, 0] * np.sin(edge.heading[near]) + to[:, 1] * np.cos(edge.heading[near])
+    sample = int(np.argmax(lateral < -0.05))
     return sample, int(near[sample])
 
 
 def _edges(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) -> None:
     """Add the boundary, counter-clockwise: along the right edge with the ramps, and back along the left edge."""
     right, left = street.edge_m
-    main, full, last = _main_edge(street, extra), street.middle.displaced(-right), len(right) - 1
+    main, full, last = _main_edge(street, extra), street.middle.offset_by(-right), len(right) - 1
     parts, begin = [], 0
     if on is not None:
         begin = street.cuts[extra.first]
@@ -344,7 +348,7 @@ def _edges(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) ->
     parts.append(full.piece(begin, end))
     if off is not None:
         parts += [off.right, off.left.reversed(), main.piece(off.nose + 2, last)]
-    parts.append(street.middle.displaced(left).reversed())
+    parts.append(street.middle.offset_by(left).reversed())
     street.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*parts)))
     street.divide()
 
@@ -357,13 +361,13 @@ def _paint(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) ->
     begin = 0 if on is None else street.cuts[extra.first]
     end = last if off is None else street.cuts[extra.last]
     lines = [] if on is None else [main.piece(0, on.nose)]
-    lines.append(street.middle.displaced(-right).piece(begin, end))
+    lines.append(street.middle.offset_by(-right).piece(begin, end))
     if off is not None:
         lines.append(main.piece(off.nose, last))
     if any(strip.place > 0 for strip in street.strips):
-        lines.append(street.middle.displaced(left))
+        lines.append(street.middle.offset_by(left))
     for ramp in (on, off):
         if ramp is not None:
-            lines += [ramp.left.shifted(-_RAMP_SHOULDER_M), ramp.right.shifted(street.shoulder_m)]
+            lines += [ramp.left.parallel(-_RAMP_SHOULDER_M), ramp.right.parallel(street.shoulder_m)]
     for line in lines:
         street.draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, line)

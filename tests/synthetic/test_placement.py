@@ -8,7 +8,7 @@ import pytest
 from drivax.scenario.schema import AgentKind, RoadKind
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.roads.families import CurvedRoad
-from drivax.synthetic.traffic.population import Density, draw_drivers, driven_path, join_drivers, placed
+from drivax.synthetic.traffic.placement import Density, draw_drivers, draw_path, join_drivers, place_vehicles
 from drivax.synthetic.traffic.roles import Scripted
 
 from .traffic_scenes import drivers, road
@@ -18,7 +18,7 @@ from .traffic_scenes import drivers, road
 def test_placed_vehicles_keep_their_distance(seed):
     rng = np.random.default_rng(seed)
     network = CurvedRoad().build(rng)
-    where = placed(network, 0, 50.0, Density(spacing_m=(5.0, 10.0), vehicles=200), rng)
+    where = place_vehicles(network, 0, 50.0, Density(spacing_m=(5.0, 10.0), vehicles=200), rng)
     points = [(0, 50.0), *zip(where.lane, where.along_m, strict=True)]
     assert len(points) > 20
     for i, (lane, along) in enumerate(points):
@@ -40,7 +40,9 @@ def test_no_vehicle_begins_in_or_behind_an_obstacle_or_at_a_lane_end():
         place
         for seed in range(20)
         for place in zip(
-            *dataclasses.astuple(placed(network, 0, 20.0, density, np.random.default_rng(seed), (stands,))),
+            *dataclasses.astuple(
+                place_vehicles(network, 0, 20.0, density, np.random.default_rng(seed), (stands,))
+            ),
             strict=True,
         )
     ]
@@ -73,8 +75,8 @@ def test_no_cyclists_on_fast_roads_and_only_cyclists_on_bicycle_lanes():
 
 def test_cyclists_ride_at_the_right_side_of_the_lane():
     network, _ = road(300.0, width_m=3.5)
-    rider = driven_path(network, (0,), True, np.random.default_rng(0)).curve.xy[:, 1]
-    car = driven_path(network, (0,), False, np.random.default_rng(0)).curve.xy[:, 1]
+    rider = draw_path(network, (0,), True, np.random.default_rng(0)).curve.xy[:, 1]
+    car = draw_path(network, (0,), False, np.random.default_rng(0)).curve.xy[:, 1]
     assert rider.mean() == pytest.approx(-1.2, abs=0.08) and np.ptp(rider) < 0.21
     assert abs(car).max() < 0.21
 
@@ -83,4 +85,4 @@ def test_tables_of_drivers_are_joined_and_chosen_in_order():
     both = join_drivers(drivers(2, 1), drivers(3, 2))
     assert both.size_m.shape == (5, 3)
     assert np.array_equal(both.headway_s[2:], drivers(3, 2).headway_s)
-    assert np.array_equal(both.chosen(np.array([4, 0])).headway_s, both.headway_s[[4, 0]])
+    assert np.array_equal(both.select(np.array([4, 0])).headway_s, both.headway_s[[4, 0]])

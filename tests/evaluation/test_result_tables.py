@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.episode_table import EpisodeTable
-from drivax.evaluation.tables import (
+from drivax.evaluation.result_tables import (
     COLLISION_KINDS,
     collisions_table,
     differences_table,

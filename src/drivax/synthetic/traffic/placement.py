@@ -1,4 +1,4 @@
-"""Vehicles, drivers and parked cars, placed with safe gaps."""
+"""Initial placement of vehicles with safe gaps, parked cars, and drivers."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from drivax.synthetic.traffic.roles import Drivers, Scripted
 #: Width left next to a double-parked car where it can be passed within the lane, m.
 _PASSAGE_M = 2.3
 #: Free length in an occupied bay, m.
-_MANOEUVRE_M = 0.6
+_MANOEUVRING_ROOM_M = 0.6
 #: Distance of double-parked cars from the ends of lanes, m.
-_FROM_ENDS_M = 15.0
+_MIN_FROM_ENDS_M = 15.0
 #: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time gap added to it, s.
 _GAP_M, _GAP_S = 5.0, 0.9
-#: Free gaps on busy lanes as a share of those elsewhere.
-_BUSY = 0.4
+#: Free gaps on busy lanes relative to those elsewhere.
+_BUSY_GAP_SHARE = 0.4
 #: No cyclists where the speed limit is higher, m/s; their distance from the lane's right side, m.
-_CYCLED_MPS, _KERB_M = 16.0, 0.55
+_MAX_CYCLING_LIMIT_MPS, _KERB_M = 16.0, 0.55
 #: No vehicle is placed within this time of a lane's end, s.
 _MERGE_S = 5.0
 #: No vehicle is placed this far before and behind an obstacle in its lane, m; the widest vehicle, m.
-_BEFORE_M, _BEHIND_M, _WIDEST_M = 30.0, 14.0, 2.55
+_FREE_BEFORE_M, _FREE_BEHIND_M, _MAX_WIDTH_M = 30.0, 14.0, 2.55
 #: Distance between centres of vehicles on different lanes that share space, m.
-_APART_M = 15.0
+_MIN_SEPARATION_M = 15.0
 _CAR, _VAN, _TRUCK, _BUS, _CYCLIST = range(5)
 #: Smallest and largest length, width and height of each type, m.
 _SIZES = np.array(
@@ -45,7 +45,7 @@ _SIZES = np.array(
     ]
 )
 #: Length and width of the largest vehicle, m.
-LONGEST_M: tuple[float, float] = (float(_SIZES[_BUS, 1, 0]), float(_SIZES[_BUS, 1, 1]))
+LARGEST_VEHICLE_M: tuple[float, float] = (float(_SIZES[_BUS, 1, 0]), float(_SIZES[_BUS, 1, 1]))
 
 #: Lane and distance along it, m.
 _Place = tuple[int, float]
@@ -57,25 +57,25 @@ def parked_cars(
 ) -> tuple[Scripted, ...]:
     """Draw parked cars in bays, and sometimes a double-parked one.
 
-    ``share`` bays are occupied. With probability ``double_share`` a car is double-parked next to a bay where others can
-    pass: on an adjacent or oncoming lane, or within the lane.
+    A bay is occupied with probability ``share``. With probability ``double_share`` a car is double-parked next to a bay
+    where others can pass it: on an adjacent or oncoming lane, or within the lane.
     """
     result = []
     for bay in network.bays:
-        # All values are drawn for every bay, so that the share does not change other cars.
+        # Drawn for every bay, so that cars do not depend on the share.
         size = _size(rng, bay.length_m)
-        along, aside = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
+        along, lateral = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
         turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
         occupied = rng.random() < share
         if occupied and size[0] < bay.length_m:
-            play = (bay.length_m - size[0]) / 2
-            pose = bay.pose.ahead(float(np.clip(along, -play, play)))
-            pose = replace(pose.aside(float(np.clip(aside, -0.15, 0.15))), heading=pose.heading + turn)
+            clearance = (bay.length_m - size[0]) / 2
+            pose = bay.pose.ahead(float(np.clip(along, -clearance, clearance)))
+            pose = replace(pose.aside(float(np.clip(lateral, -0.15, 0.15))), heading=pose.heading + turn)
             result.append(Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
-    doubled, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
-    for place in rng.permutation(len(network.bays)).tolist() if doubled else ():
-        bay, size = network.bays[place], _size(rng, network.bays[place].length_m)
-        if _passable(network, bay, size[1], gap_m):
+    has_double_parked, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
+    for index in rng.permutation(len(network.bays)).tolist() if has_double_parked else ():
+        bay, size = network.bays[index], _size(rng, network.bays[index].length_m)
+        if _can_pass(network, bay, size[1], gap_m):
             pose = _double_parked_pose(network, bay, size[1], gap_m)
             return (*result, Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
     return tuple(result)
@@ -85,8 +85,8 @@ def _size(rng: np.random.Generator, room_m: float) -> tuple[float, float, float]
     """Draw the size of a car or, in one case of eight, a van that fits a bay."""
     length = float(np.clip(rng.normal(4.5, 0.35), 3.6, 5.2))
     if rng.random() < 0.125 and room_m > 6.2:
-        return min(length + 0.8, room_m - _MANOEUVRE_M), 2.0, 2.3
-    return min(length, room_m - _MANOEUVRE_M), float(np.clip(rng.normal(1.82, 0.06), 1.65, 1.95)), 1.55
+        return min(length + 0.8, room_m - _MANOEUVRING_ROOM_M), 2.0, 2.3
+    return min(length, room_m - _MANOEUVRING_ROOM_M), float(np.clip(rng.normal(1.82, 0.06), 1.65, 1.95)), 1.55
 
 
 def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> Pose:
@@ -98,23 +98,23 @@ def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: f
     return centre.aside(side * ((lane.width_m - width_m) / 2 - gap_m))
 
 
-def _passable(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
+def _can_pass(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
     lane = network.lanes[bay.lane]
-    if lane.connector or not _FROM_ENDS_M < bay.along_m < lane.length_m - _FROM_ENDS_M:
+    if lane.connector or not _MIN_FROM_ENDS_M < bay.along_m < lane.length_m - _MIN_FROM_ENDS_M:
         return False
     if lane.left >= 0 or lane.right >= 0 or lane.width_m - width_m - gap_m >= _PASSAGE_M:
         return True
-    return _oncoming(network, lane, bay.along_m)
+    return _has_oncoming_lane(network, lane, bay.along_m)
 
 
-def _oncoming(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
+def _has_oncoming_lane(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
     """Whether a lane of the other direction is adjacent."""
-    here = _pose_at(lane, along_m)
+    current = _pose_at(lane, along_m)
     for other in network.lanes:
-        gap = np.hypot(other.curve.xy[:, 0] - here.x, other.curve.xy[:, 1] - here.y)
-        place = int(np.argmin(gap))
-        apart = (lane.width_m + other.width_m) / 2 + 0.5
-        if gap[place] < apart and math.cos(other.curve.heading[place] - here.heading) < -0.9:
+        gap = np.hypot(other.curve.xy[:, 0] - current.x, other.curve.xy[:, 1] - current.y)
+        index = int(np.argmin(gap))
+        separation = (lane.width_m + other.width_m) / 2 + 0.5
+        if gap[index] < separation and math.cos(other.curve.heading[index] - current.heading) < -0.9:
             return True
     return False
 
@@ -131,7 +131,7 @@ class Density:
 
     Attributes:
         spacing_m: Mean free gap between vehicles of a lane, drawn per scenario, low and high.
-        vehicles: Largest number of vehicles without ego; the nearest to ego are kept.
+        vehicles: Maximum number of vehicles without ego; those nearest to ego are kept.
         van_share, truck_share, bus_share: Shares of vehicle types; the rest are cars.
         cyclist_share: Share of cyclists on streets.
         leader_share: Share of scenarios with a vehicle right ahead of ego.
@@ -154,18 +154,13 @@ class Placement:
     along_m: tuple[float, ...]
 
 
-def placed(
-    network: RoadNetwork,
-    ego_lane: int,
-    ego_along_m: float,
-    density: Density,
-    rng: np.random.Generator,
-    parked: tuple[Scripted, ...] = (),
-    busy: Collection[int] = (),
-) -> Placement:
-    """Draw initial positions: none on a connector, none too close to ego, another vehicle or a parked car.
+def place_vehicles(
+    network: RoadNetwork, ego_lane: int, ego_along_m: float, density: Density, rng: np.random.Generator,
+    parked: tuple[Scripted, ...] = (), busy: Collection[int] = (),
+) -> Placement:  # fmt: skip
+    """Draw initial positions off connectors, with safe gaps to ego, other vehicles and parked cars.
 
-    ``busy`` are lanes that are as dense as the network's busy ones.
+    Lanes in ``busy`` are as dense as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
     vehicles: _Places = []
@@ -176,74 +171,75 @@ def placed(
     for index, lane in enumerate(network.lanes):
         if lane.connector:
             continue
-        least = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
+        minimum = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
         occupied = [along for where, along in vehicles if where == index]
         occupied += [ego_along_m] if index == ego_lane else []
-        mean = spacing * (_BUSY if index in network.busy or index in busy else 1.0)
-        at = rng.uniform(6.0, 6.0 + mean)
-        while at < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
-            if all(abs(at - other) > least for other in occupied):
-                vehicles.append((index, float(at)))
-                occupied.append(float(at))
-            at += least + rng.exponential(mean)
-    vehicles = [place for place in vehicles if not _blocked(network, *place, parked)]
-    vehicles = _apart_at_joints(network, vehicles, (ego_lane, ego_along_m))
-    here = network.lanes[ego_lane].curve
-    ego_xy = here.xy[np.searchsorted(here.arc_m, ego_along_m).clip(max=len(here.xy) - 1)]
+        mean = spacing * (_BUSY_GAP_SHARE if index in network.busy or index in busy else 1.0)
+        position = rng.uniform(6.0, 6.0 + mean)
+        while position < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
+            if all(abs(position - other) > minimum for other in occupied):
+                vehicles.append((index, float(position)))
+                occupied.append(float(position))
+            position += minimum + rng.exponential(mean)
+    vehicles = [sample for sample in vehicles if not _is_blocked(network, *sample, parked)]
+    vehicles = _drop_close_followers(network, vehicles, (ego_lane, ego_along_m))
+    current = network.lanes[ego_lane].curve
+    ego_xy = current.xy[np.searchsorted(current.arc_m, ego_along_m).clip(max=len(current.xy) - 1)]
     vehicles.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
-    vehicles = _apart_in_space(network, vehicles, (ego_lane, ego_along_m))[: density.vehicles]
+    vehicles = _drop_overlapping(network, vehicles, (ego_lane, ego_along_m))[: density.vehicles]
     return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
 
 
-def _apart_in_space(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
-    """Drop vehicles that share space with an earlier one on another lane, as where lanes fork or merge."""
-    kept: list[tuple[float, float]] = []
+def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
+    """Drop vehicles that overlap an earlier one on another lane, for example where lanes fork or merge."""
+    remaining: list[tuple[float, float]] = []
     result = []
-    for place in [ego, *vehicles]:
-        lane, along = network.lanes[place[0]], place[1]
-        x, y = _point(network, *place)
+    for index in [ego, *vehicles]:
+        lane, along = network.lanes[index[0]], index[1]
+        x, y = _point(network, *index)
         heading = float(np.interp(along, lane.curve.arc_m, lane.curve.heading))
         cos, sin = np.cos(heading), np.sin(heading)
-        near = (
-            abs((x - a) * cos + (y - b) * sin) < _APART_M and abs((y - b) * cos - (x - a) * sin) < _WIDEST_M
-            for a, b in kept
+        overlaps = (
+            abs((x - a) * cos + (y - b) * sin) < _MIN_SEPARATION_M
+            and abs((y - b) * cos - (x - a) * sin) < _MAX_WIDTH_M
+            for a, b in remaining
         )
-        if not any(near):
-            kept.append((float(x), float(y)))
-            result.append(place)
+        if not any(overlaps):
+            remaining.append((float(x), float(y)))
+            result.append(index)
     return result[1:]
 
 
-def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
+def _is_blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
     """Whether a parked car is in the lane at or close to a position."""
     curve = network.lanes[lane].curve
-    place = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
-    cos, sin = np.cos(curve.heading[place]), np.sin(curve.heading[place])
+    index = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
+    cos, sin = np.cos(curve.heading[index]), np.sin(curve.heading[index])
     for other in parked:
-        dx, dy = other.xy[0] - curve.xy[place]
-        ahead, aside = dx * cos + dy * sin, abs(dy * cos - dx * sin)
-        if -_BEHIND_M < ahead < _BEFORE_M and aside < (_WIDEST_M + other.size_m[1]) / 2:
+        dx, dy = other.xy[0] - curve.xy[index]
+        ahead, lateral = dx * cos + dy * sin, abs(dy * cos - dx * sin)
+        if -_FREE_BEHIND_M < ahead < _FREE_BEFORE_M and lateral < (_MAX_WIDTH_M + other.size_m[1]) / 2:
             return True
     return False
 
 
-def _apart_at_joints(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
+def _drop_close_followers(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
     """Drop vehicles that are too close behind the first vehicle of the next lane."""
-    kept = []
+    remaining = []
     first: dict[int, float] = {}
     last: dict[int, float] = {}
     for lane, along in [*vehicles, ego]:
         first[lane], last[lane] = min(along, first.get(lane, np.inf)), max(along, last.get(lane, 0.0))
     for lane, along in vehicles:
-        this = network.lanes[lane]
-        least = 10.0 + _GAP_M + _GAP_S * this.limit_mps
-        after = min((first.get(b, np.inf) for b in this.successors), default=np.inf)
+        current = network.lanes[lane]
+        minimum = 10.0 + _GAP_M + _GAP_S * current.limit_mps
+        next_along = min((first.get(b, np.inf) for b in current.successors), default=np.inf)
         # Only the last vehicle of a lane can be too close to the next lane's first one. Ego always stays.
-        before_ego = network.lanes[ego[0]].length_m - ego[1] + along
-        gap_to_ego = before_ego if ego[0] in this.predecessors else np.inf
-        if (along < last[lane] or this.length_m - along + after > least) and gap_to_ego > least:
-            kept.append((lane, along))
-    return kept
+        along_before_ego = network.lanes[ego[0]].length_m - ego[1] + along
+        gap_to_ego = along_before_ego if ego[0] in current.predecessors else np.inf
+        if (along < last[lane] or current.length_m - along + next_along > minimum) and gap_to_ego > minimum:
+            remaining.append((lane, along))
+    return remaining
 
 
 def _point(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray, " 2"]:
@@ -256,30 +252,30 @@ def draw_drivers(
 ) -> Drivers:
     """Draw vehicles and drivers.
 
-    With the first lane of each, there are no cyclists on fast roads, and only cyclists on bicycle lanes.
+    Given the first lane of each, no cyclist is on a fast road, and only cyclists are on bicycle lanes.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
-    drawn = np.searchsorted(shares, rng.random(count), side="right")
+    draw = np.searchsorted(shares, rng.random(count), side="right")
     # The types in the order of the shares; the rest are cars.
-    kind = (drawn + 1) % (len(shares) + 1)
+    kind = (draw + 1) % (len(shares) + 1)
     if lanes is not None:
-        fast = np.array([lane.limit_mps > _CYCLED_MPS for lane in lanes], bool)
+        fast = np.array([lane.limit_mps > _MAX_CYCLING_LIMIT_MPS for lane in lanes], bool)
         kind[(kind == _CYCLIST) & fast] = _CAR
         kind[np.array([lane.kind == RoadKind.LANE_BIKE for lane in lanes], bool)] = _CYCLIST
     size = rng.uniform(_SIZES[kind, 0], _SIZES[kind, 1])
-    heavy, cyclist = (kind == _TRUCK) | (kind == _BUS), kind == _CYCLIST
-    slower = np.where(heavy, 0.85, 1.0)
+    is_heavy, cyclist = (kind == _TRUCK) | (kind == _BUS), kind == _CYCLIST
+    speed_scale = np.where(is_heavy, 0.85, 1.0)
     return Drivers(
         kind=np.where(cyclist, AgentKind.CYCLIST, AgentKind.VEHICLE).astype(np.int8),
         size_m=size,
-        speed_factor=slower * rng.normal(0.92, 0.12, count).clip(0.55, 1.1),
+        speed_factor=speed_scale * rng.normal(0.92, 0.12, count).clip(0.55, 1.1),
         top_speed_mps=np.where(cyclist, rng.uniform(4.0, 7.0, count), np.inf),
-        lateral_mps2=np.where(heavy, 0.8, 1.0) * rng.uniform(1.8, 2.5, count),
+        lateral_mps2=np.where(is_heavy, 0.8, 1.0) * rng.uniform(1.8, 2.5, count),
         slowing_mps2=rng.uniform(1.1, 1.8, count),
         yellow_mps2=rng.uniform(2.3, 3.0, count),
         jerk_mps3=rng.uniform(3.0, 5.0, count),
         headway_s=rng.uniform(1.1, 2.0, count),
-        acceleration_mps2=np.where(cyclist, 0.6, np.where(heavy, 0.7, 1.0)) * rng.uniform(1.1, 2.0, count),
+        acceleration_mps2=np.where(cyclist, 0.6, np.where(is_heavy, 0.7, 1.0)) * rng.uniform(1.1, 2.0, count),
         braking_mps2=rng.uniform(2.0, 3.0, count),
         politeness=rng.uniform(0.0, 0.5, count),
         reaction_s=rng.uniform(0.1, 0.6, count),
@@ -287,14 +283,12 @@ def draw_drivers(
     )
 
 
-def driven_path(
-    network: RoadNetwork, lanes: tuple[int, ...], cyclist: bool, rng: np.random.Generator
-) -> Path:
+def draw_path(network: RoadNetwork, lanes: tuple[int, ...], cyclist: bool, rng: np.random.Generator) -> Path:
     """Draw a path along lanes: cars near the centre, cyclists near the right side."""
     if not cyclist:
-        return lane_path(network, lanes, Sway.drawn(rng, 0.2))
+        return lane_path(network, lanes, Sway.draw(rng, 0.2))
     narrowest = min(network.lanes[lane].width_m for lane in lanes)
-    return lane_path(network, lanes, Sway.drawn(rng, 0.1, aside_m=_KERB_M - narrowest / 2))
+    return lane_path(network, lanes, Sway.draw(rng, 0.1, aside_m=_KERB_M - narrowest / 2))
 
 
 def join_drivers(first: Drivers, rest: Drivers) -> Drivers:

@@ -1,4 +1,4 @@
-"""Tables of evaluations: results, differences, kinds of collision, strata, and what was trained where."""
+"""Tables of evaluations: results, differences, kinds of collision, strata, and transfer between data sets."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ import numpy as np
 from drivax.errors import UsageError
 from drivax.evaluation.episode_table import ADDED, NOT_SUMMARISED, RATES, EpisodeTable, Tags, interval_of
 from drivax.evaluation.pairing import Pairs, mismatch
-from drivax.metrics.catalogue import METRICS
-from drivax.metrics.catalogue import headline as headline_metrics
+from drivax.metrics.catalogue import METRICS, headline
 from drivax.scenario.select.tags import TAGS
 from drivax.simulator.contact import CollisionType
-from drivax.stats.intervals import NOTHING, Interval, paired_bootstrap, rate
+from drivax.stats.intervals import UNDEFINED, Interval, paired_bootstrap, rate
 from drivax.table import Cell, Column, Table, interval_cell
 
 CONFIDENCE = 0.95
@@ -26,7 +25,7 @@ SEED = 0
 STRATA = ("difficulty", "type", "density")
 #: The value of a tag in scenarios that lack it.
 UNKNOWN = "unknown"
-#: Kinds of collision: name, and what it says about the planner.
+#: Kinds of collision: name, and typical cause.
 COLLISION_KINDS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
     {
         CollisionType.REAR_END: ("rear end", "hit the agent ahead: distance and braking"),
@@ -45,7 +44,7 @@ _ARROWS = {"high": " ↑", "low": " ↓", "-": ""}
 
 @dataclass(frozen=True)
 class MetricLabel:
-    """How a metric is shown: label with unit, better direction (``-`` for none), unit, and explanation.
+    """Presentation of a metric: label with unit, better direction (``-`` for none), unit, and explanation.
 
     The unit is ``rate`` for a share of episodes, ``share`` for another number without a unit; the explanation of an
     unknown metric is empty.
@@ -69,7 +68,7 @@ class MetricLabel:
 
 
 def metric_label(name: str, runs: Sequence[EpisodeTable] = ()) -> MetricLabel:
-    """Return how to show a metric; ``runs`` describe the user's own metrics."""
+    """Return the label of a metric; ``runs`` describe user-defined metrics."""
     own = (run.own_metrics[name] for run in runs if name in run.own_metrics)
     metric = METRICS.get(name) or ADDED.get(name) or next(own, None)
     if metric is None:
@@ -87,24 +86,24 @@ def metric_names(runs: Sequence[EpisodeTable]) -> list[str]:
     return list(dict.fromkeys(name for run in runs for name in run.metrics))
 
 
-def headline(names: Sequence[str]) -> list[str]:
-    """Return those metrics that belong in the first table, in its order."""
-    return [name for name in headline_metrics(METRICS) if name in names]
+def headline_names(names: Sequence[str]) -> list[str]:
+    """Return the headline metrics among ``names``, in the order of the first table."""
+    return [name for name in headline(METRICS) if name in names]
 
 
-def ordered(names: Sequence[str]) -> list[str]:
-    """Return metrics in the order of their definition, then unknown ones as given; no codes."""
-    rank = {name: place for place, name in enumerate((*METRICS, *ADDED))}
+def sort_metrics(names: Sequence[str]) -> list[str]:
+    """Sort metrics by their definition, with unknown ones last; codes are left out."""
+    rank = {name: index for index, name in enumerate((*METRICS, *ADDED))}
     return sorted((name for name in names if name not in CODES), key=lambda name: rank.get(name, len(rank)))
 
 
 def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interval:
-    """Return the mean of a metric over episodes (``rows``), with the interval that ``summary.json`` gives.
+    """Return the mean of a metric over episodes (``rows``), with its interval as in ``summary.json``.
 
-    It is empty where the evaluation lacks the metric.
+    The interval is undefined if the evaluation lacks the metric.
     """
     if metric not in run.metrics:
-        return NOTHING
+        return UNDEFINED
     return interval_of(metric, run.metrics[metric][rows], np.array(run.clusters)[rows])
 
 
@@ -146,21 +145,21 @@ def _verdict(interval: Interval, better: str) -> str:
 def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
     """Return a table with planners in rows and metrics in columns, the best mean of each column marked."""
     means = [[summarise(run, name) for run in runs] for name in metrics]
-    best = [_best(column, metric_label(name, runs)) for name, column in zip(metrics, means, strict=True)]
+    best = [_best_mean(column, metric_label(name, runs)) for name, column in zip(metrics, means, strict=True)]
     rows = []
-    for place, run in enumerate(runs):
+    for index, run in enumerate(runs):
         label = Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic")
         cells = [
-            _cell(runs, name, column[place], {"run": run.name, "metric": name}, top)
-            for name, column, top in zip(metrics, means, best, strict=True)
+            _cell(runs, name, column[index], {"run": run.name, "metric": name}, best_mean)
+            for name, column, best_mean in zip(metrics, means, best, strict=True)
         ]
         rows.append((label, *cells))
-    heads = (Column("planner", label=True), *_metric_columns(metrics, runs))
-    return Table("planners", heads, tuple(rows))
+    columns = (Column("planner", label=True), *_metric_columns(metrics, runs))
+    return Table("planners", columns, tuple(rows))
 
 
-def _best(intervals: Sequence[Interval], label: MetricLabel) -> float | None:
-    """Return the best mean of a column, None without a direction or a choice."""
+def _best_mean(intervals: Sequence[Interval], label: MetricLabel) -> float | None:
+    """Return the best mean of a column; None without a better direction, or if all means are equal."""
     means = [interval.mean for interval in intervals if interval.mean is not None]
     if label.better == "-" or len(means) < 2 or min(means) == max(means):
         return None
@@ -197,7 +196,7 @@ def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table
     return Table("results", columns, tuple(rows), f"Mean and {CONFIDENCE:.0%} interval", "planner")
 
 
-#: Words of a verdict; the sign repeats in shape what the colour says.
+#: Text of each verdict; its sign carries the same information as the colour.
 _MARKS = {"better": "▲ better", "worse": "▼ worse", "unclear": "unclear", "same": "= same", "none": ""}
 
 
@@ -218,18 +217,18 @@ def _difference_cell(policy: EpisodeTable, other: EpisodeTable, metric: str) -> 
     interval, verdict = difference(policy, other, metric)
     if interval.mean is None:
         return interval_cell(interval, "", metric, signed=True, title="no scenario where both are defined")
-    more = {"style": verdict, "mark": _MARKS[verdict], "link": {"run": policy.name, "metric": metric}}
-    return interval_cell(interval, metric_label(metric, [policy]).unit, metric, signed=True, **more)
+    style = {"style": verdict, "mark": _MARKS[verdict], "link": {"run": policy.name, "metric": metric}}
+    return interval_cell(interval, metric_label(metric, [policy]).unit, metric, signed=True, **style)
 
 
 def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
     """Return a table with kinds of the first collision in rows and runs in columns.
 
-    The numbers are shares of the episodes in which the kind is known; a run without kinds has no column.
+    Shares are of the episodes with a known kind; a run without kinds has no column.
     """
     runs = [run for run in runs if "collision_type" in run.metrics]
     known = not any(np.isnan(run.metrics["collision_type"]).any() for run in runs)
-    of = "all episodes" if known else "the episodes in which they are known (n)"
+    population = "all episodes" if known else "the episodes in which they are known (n)"
     rows = []
     for code, (name, _) in COLLISION_KINDS.items():
         cells = []
@@ -238,7 +237,7 @@ def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
             share = rate(np.where(np.isnan(kinds), np.nan, kinds == code), run.clusters, CONFIDENCE)
             cells.append(_cell(runs, "collision", share, {"run": run.name, "kind": int(code)}))
         rows.append((Cell(name), *cells))
-    caption = f"First collisions by kind: share of {of} with {CONFIDENCE:.0%} interval"
+    caption = f"First collisions by kind: share of {population} with {CONFIDENCE:.0%} interval"
     columns = (Column("first collision", label=True), *(Column(run.name, run.name) for run in runs))
     return Table("collisions", columns, tuple(rows), caption, "planner")
 
@@ -247,14 +246,14 @@ def strata_table(runs: Sequence[EpisodeTable], tags: Tags, tag: str, metrics: Se
     """Return a table with a row per value of a tag and run, metrics in columns; without the tag it is ``unknown``."""
     values = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
     order = {value: place for place, value in enumerate(TAGS.get(tag, ()))}
-    every = {value for of_run in values.values() for value in of_run}
+    present_values = {value for run_values in values.values() for value in run_values}
     rows = []
-    for value in sorted(every, key=lambda value: (order.get(value, len(order)), value)):
+    for value in sorted(present_values, key=lambda value: (order.get(value, len(order)), value)):
         for run in runs:
-            inside = np.flatnonzero(np.array(values[run.name]) == value)
-            if inside.size:
+            episodes = np.flatnonzero(np.array(values[run.name]) == value)
+            if episodes.size:
                 link = {"run": run.name, "tags": {tag: value}}
-                means = ((name, summarise(run, name, inside)) for name in metrics)
+                means = ((name, summarise(run, name, episodes)) for name in metrics)
                 cells = (_cell(runs, name, mean, link | {"metric": name}) for name, mean in means)
                 rows.append((Cell(value), Cell(run.name), *cells))
     caption = f"By {tag}: mean and {CONFIDENCE:.0%} interval"
@@ -267,13 +266,13 @@ def set_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     entries = {
         set_key(entry): entry for run in runs for entry in (run.data, *(run.info.get("trained_on") or ()))
     }
-    named = {key: _set_name(entry) for key, entry in entries.items()}
-    names = list(named.values())
-    return {key: name if names.count(name) == 1 else f"{name} {key[:6]}" for key, name in named.items()}
+    short_names = {key: _set_name(entry) for key, entry in entries.items()}
+    names = list(short_names.values())
+    return {key: name if names.count(name) == 1 else f"{name} {key[:6]}" for key, name in short_names.items()}
 
 
 def set_key(entry: Mapping[str, Any]) -> str:
-    """Return what identifies a data set: its hash, or else its path."""
+    """Return the identifier of a data set: its hash, or else its path."""
     return str(entry.get("hash") or entry.get("path") or "unknown")
 
 
@@ -283,39 +282,39 @@ def _set_name(entry: Mapping[str, Any]) -> str:
 
 
 def _planner_key(run: EpisodeTable) -> str:
-    """Return the planner as the command named it, or else its own name."""
+    """Return the planner as named on the command line, else its own name."""
     return str(run.settings.get("planner") or run.planner)
 
 
 def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
-    """Return a name for each planner by its key: its own, or the shortest end of its path that is unique."""
+    """Return the name of each planner by its key: its own if unique, else the shortest unique end of its path."""
     own = {_planner_key(run): run.planner for run in runs}
-    named = {}
+    names = {}
     for key, name in own.items():
         paths = [Path(other).parts for other in own if other != key and own[other] == name]
         parts = Path(key).parts
         unique = (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in paths))
-        take = next(unique, len(parts))
-        named[key] = "/".join(parts[-take:]) if paths else name
-    return named
+        length = next(unique, len(parts))
+        names[key] = "/".join(parts[-length:]) if paths else name
+    return names
 
 
 def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
     """Return a table of a metric with training data in rows and evaluation data in columns.
 
-    A planner is identified as the command named it, so that policies of one name (``bc/seed-0`` and ``ppo/seed-0``)
-    stay apart. Several runs of one planner on one set (from other starts, say) have a row each.
+    A planner is identified by its command-line name (``bc/seed-0`` and ``ppo/seed-0`` are two). Several runs of one
+    planner on one set, for example with different starts, have a row each.
     """
     planners, names = _planner_names(runs), set_names(runs)
     evaluated = [names[set_key(run.data)] for run in runs]
     cells: dict[tuple[str, ...], dict[str, Cell]] = {}
-    for run, where in zip(runs, evaluated, strict=True):
+    for run, set_name in zip(runs, evaluated, strict=True):
         trained = ", ".join(names[set_key(entry)] for entry in run.info.get("trained_on") or ()) or "–"
         labels = (planners[_planner_key(run)], trained, run.traffic)
-        if where in cells.get(labels, {}):
+        if set_name in cells.get(labels, {}):
             labels = (run.name, *labels[1:])
         link = {"run": run.name, "metric": metric}
-        cells.setdefault(labels, {})[where] = _cell(runs, metric, summarise(run, metric), link)
+        cells.setdefault(labels, {})[set_name] = _cell(runs, metric, summarise(run, metric), link)
     sets = tuple(dict.fromkeys(evaluated))
     rows = tuple(
         (*map(Cell, labels), *(row.get(name, Cell(style="undefined")) for name in sets))
