@@ -28,6 +28,12 @@ LEVEL_M = 3.0
 OFFROAD_TOLERANCE_M = 0.3
 #: Tolerance of lane borders (semantics, ``lane_straddle``).
 LANE_MARGIN_M = 0.2
+#: Largest distance to the nearest lane at which the road is known to go on beyond the box of the map, m; the grid finds
+#: every segment up to there.
+_GOES_ON_M = 8.0
+#: Smallest cosine between the directions of a car and of the lane that it drives (45 deg); segments fit a box whose
+#: centre is at most the second distance beyond their ends, m.
+_FITS, _JOINT_M = 0.5**0.5, 0.5
 #: Largest distance to the centre of a followed lane, m.
 _FOLLOWED_M = 2.5
 #: A car passes to another lane this far beyond the line between them; centres of parallel lanes are at least the second
@@ -125,12 +131,13 @@ class LaneHits:
     """Lanes around a box; values at its centre unless stated otherwise.
 
     Attributes:
-        near, points_near: A lane centre lies within the cut-off; the same for each corner.
+        near, points_near: A lane centre lies within the cut-off; the same for each corner. Corners outside the box of the
+            map are near where the lane next to the centre would go on straight, and where no lane is within 8 m.
         on_corridor: Inside a lane of the corridor of the route.
         wrong_way: Inside a lane against its direction (more than 135 deg), and no other lane is nearer.
         straddling: Some corner is outside all lanes in the direction of the ego.
-        leaving_lane: Some corner is outside the lane of the centre (nuPlan's multiple lanes, for fault).
-        limit: Speed limit of the lane, m/s; -1 unknown.
+        leaving_lane: No lane in the direction of the ego holds all corners (nuPlan's multiple lanes, for fault).
+        limit: Speed limit of the lane that is driven, m/s; -1 unknown.
         lane, offset: Nearest lane in the direction of the ego (-1 without one), and the signed distance to its centre
             line, left positive, m.
         z: Height of the nearest lane, or of the query without one.
@@ -150,17 +157,21 @@ class LaneHits:
 
 def around_lanes(
     bank: ScenarioBank, index: Integer, centre: Vector, heading: Vector,
-    points: Float[Array, "P 2"], z: Scalar,
+    points: Float[Array, "P 2"], z: Scalar, routed: bool | Bool[Array, ""] = True,
 ) -> LaneHits:  # fmt: skip
-    """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height."""
+    """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height.
+
+    Lanes of the route's corridor are driven rather than others if the box is ``routed``.
+    """
     rows, inside = lanes_around(bank, index, centre)
     inside = inside & _level(rows[LaneRow.Z], z)
     squared, side = to_segments(rows, jnp.concatenate([centre[None], points]))
     squared = jnp.where(inside, squared, _FAR)
-    half, limit = rows[LaneRow.HALF_WIDTH], rows[LaneRow.LIMIT]
+    half = rows[LaneRow.HALF_WIDTH]
     ux, uy = _chord(rows)
     aligned_cos = (ux * heading[0] + uy * heading[1]) * jax.lax.rsqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
-    aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
+    aligned, against = aligned_cos > 0.0, aligned_cos < -_FITS
+    corridor = rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])
     own, corner = squared[0], squared[1:]
     reachable = own <= LANE_CUTOFF_M**2
     best = first_smallest(jnp.where(aligned, own, _FAR))
@@ -173,22 +184,31 @@ def around_lanes(
     else:
         points_near = corner.min(axis=1) <= LANE_CUTOFF_M**2
         outside = _outside_lanes(corner, aligned, half)
-    leaving = jnp.abs(side[1:, best]) - (half[best] + LANE_MARGIN_M) > 0.0
+    goes_on = (jnp.abs(side[1:, nearest]) <= LANE_CUTOFF_M) | (own[nearest] > _GOES_ON_M**2)
+    within = jnp.abs(side[1:]).max(axis=0) <= half + LANE_MARGIN_M
+    holds = within & aligned & (own - side[0] * side[0] <= _JOINT_M**2)
+    fits = (aligned_cos > _FITS) & (own <= half * half)
     near = reachable.any()
     return LaneHits(
         near=near,
-        points_near=points_near,
-        on_corridor=(
-            (rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])) & (own <= (half + LANE_MARGIN_M) ** 2)
-        ).any(),
+        points_near=points_near | (_outside_box(bank, index, points, 0.0) & goes_on),
+        on_corridor=(corridor & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
         wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
         straddling=outside.any(),
-        leaving_lane=has_lane & leaving.any(),
-        limit=jnp.where(has_lane, limit[best], -1.0),
+        leaving_lane=has_lane & ~(holds.any() | within[best]),
+        limit=jnp.where(has_lane, _limit(rows[LaneRow.LIMIT], fits & corridor & routed, fits, best), -1.0),
         lane=jnp.where(has_lane, jnp.floor(rows[LaneRow.LANE, best]), -1.0).astype(jnp.int32),
         offset=jnp.where(has_lane, side[0, best], 0.0),
         z=jnp.where(near, rows[LaneRow.Z, nearest], z),
     )
+
+
+def _limit(
+    limit: Float[Array, " K"], on_route: Bool[Array, " K"], fits: Bool[Array, " K"], best: Integer
+) -> Scalar:
+    """Highest limit of the lanes on the route that are driven, else of any driven lanes, else that of the lane ``best``."""
+    first, second = (jnp.where(driven, limit, -2.0).max() for driven in (on_route, fits))
+    return jnp.where(first > -2.0, first, jnp.where(second > -2.0, second, limit[best]))
 
 
 def lane_distance(bank: ScenarioBank, index: Integer, xy: Vector, z: Scalar) -> Scalar:
@@ -273,9 +293,15 @@ def _stored_side(bank: ScenarioBank, index: Integer, points: Float[Array, "P 2"]
 
 
 def left_the_map(bank: ScenarioBank, index: Integer, xy: Vector) -> Bool[Array, ""]:
-    """Return whether a point lies outside the box of all edges and lanes."""
+    """Return whether a point lies outside the box of all edges and lanes, widened by the cut-off of lanes."""
+    return _outside_box(bank, index, xy, LANE_CUTOFF_M) & is_mapped(bank, index)
+
+
+def _outside_box(
+    bank: ScenarioBank, index: Integer, points: Float[Array, "*n 2"], margin_m: float
+) -> Bool[Array, "*n"]:
     box = bank.map_box[index]
-    return ((xy < box[:2]).any() | (xy > box[2:]).any()) & is_mapped(bank, index)
+    return ((points < box[:2] - margin_m) | (points > box[2:] + margin_m)).any(axis=-1)
 
 
 def is_mapped(bank: ScenarioBank, index: Integer) -> Bool[Array, ""]:
