@@ -31,9 +31,9 @@ LANE_MARGIN_M = 0.2
 #: Largest distance to the nearest lane at which the road is known to go on beyond the box of the map, m; the grid finds
 #: every segment up to there.
 _GOES_ON_M = 8.0
-#: Smallest cosine between the directions of a car and of the lane that it drives (45 deg); segments fit a box whose
-#: centre is at most the second distance beyond their ends, m.
-_FITS, _JOINT_M = 0.5**0.5, 0.5
+#: Smallest cosine between the directions of a car and of the lane that it drives (30 deg), and how far beyond the ends of
+#: a segment a car is still next to it, m.
+_FITS, _JOINT_M = 0.75**0.5, 0.5
 #: Largest distance to the centre of a followed lane, m.
 _FOLLOWED_M = 2.5
 #: A car passes to another lane this far beyond the line between them; centres of parallel lanes are at least the second
@@ -170,7 +170,7 @@ def around_lanes(
     half = rows[LaneRow.HALF_WIDTH]
     ux, uy = _chord(rows)
     aligned_cos = (ux * heading[0] + uy * heading[1]) * jax.lax.rsqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
-    aligned, against = aligned_cos > 0.0, aligned_cos < -_FITS
+    aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
     corridor = rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])
     own, corner = squared[0], squared[1:]
     reachable = own <= LANE_CUTOFF_M**2
@@ -186,8 +186,8 @@ def around_lanes(
         outside = _outside_lanes(corner, aligned, half)
     goes_on = (jnp.abs(side[1:, nearest]) <= LANE_CUTOFF_M) | (own[nearest] > _GOES_ON_M**2)
     within = jnp.abs(side[1:]).max(axis=0) <= half + LANE_MARGIN_M
-    holds = within & aligned & (own - side[0] * side[0] <= _JOINT_M**2)
-    fits = (aligned_cos > _FITS) & (own <= half * half)
+    beside = own - side[0] * side[0] <= _JOINT_M**2
+    fits = beside & (aligned_cos > _FITS) & (own <= half * half)
     near = reachable.any()
     return LaneHits(
         near=near,
@@ -195,7 +195,7 @@ def around_lanes(
         on_corridor=(corridor & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
         wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
         straddling=outside.any(),
-        leaving_lane=has_lane & ~(holds.any() | within[best]),
+        leaving_lane=has_lane & ~((within & aligned & beside).any() | within[best]),
         limit=jnp.where(has_lane, _limit(rows[LaneRow.LIMIT], fits & corridor & routed, fits, best), -1.0),
         lane=jnp.where(has_lane, jnp.floor(rows[LaneRow.LANE, best]), -1.0).astype(jnp.int32),
         offset=jnp.where(has_lane, side[0, best], 0.0),
