@@ -8,6 +8,7 @@ grid; ``tests/scenario/test_queries.py`` compares with brute force. Segments mor
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import jax
@@ -138,8 +139,8 @@ class LaneHits:
         straddling: Some corner is outside all lanes in the direction of the ego.
         leaving_lane: No lane in the direction of the ego holds all corners (nuPlan's multiple lanes, for fault).
         limit: Speed limit of the lane that is driven, m/s; -1 unknown.
-        lane, offset: Nearest lane in the direction of the ego (-1 without one), and the signed distance to its centre
-            line, left positive, m.
+        lane, offset: The lane that is driven (-1 without one), and the signed distance to its centre line, left positive,
+            m.
         z: Height of the nearest lane, or of the query without one.
     """
 
@@ -161,22 +162,32 @@ def around_lanes(
 ) -> LaneHits:  # fmt: skip
     """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height.
 
-    Lanes of the route's corridor are driven rather than others if the box is ``routed``.
+    Of the lanes that hold the centre and lead at most 30 degrees away from the heading, the box drives that with the
+    highest limit, those of the route's corridor before others if it is ``routed``; without such lanes the nearest within
+    90 degrees.
     """
     rows, inside = lanes_around(bank, index, centre)
     inside = inside & _level(rows[LaneRow.Z], z)
-    squared, side = to_segments(rows, jnp.concatenate([centre[None], points]))
+    box = jnp.concatenate([centre[None], points])
+    squared, side = to_segments(rows, box)
     squared = jnp.where(inside, squared, _FAR)
     half = rows[LaneRow.HALF_WIDTH]
     ux, uy = _chord(rows)
     aligned_cos = (ux * heading[0] + uy * heading[1]) * jax.lax.rsqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
     aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
-    corridor = rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])
     own, corner = squared[0], squared[1:]
-    reachable = own <= LANE_CUTOFF_M**2
-    best = first_smallest(jnp.where(aligned, own, _FAR))
-    has_lane = aligned[best] & reachable[best]
-    nearest = first_smallest(own)
+    beside = own - side[0] * side[0] <= _JOINT_M**2
+    fits = beside & (aligned_cos > _FITS) & (own <= half * half)
+    corridor = rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])
+    # By limit, on the route first (of nearly equal limits the nearest); without lanes that fit the nearest.
+    rank = jnp.where(corridor & routed, 0.0, 0.2) + 1e-3 * (100.0 - rows[LaneRow.LIMIT]) + 1e-5 * own
+    rank = jnp.where(fits, rank, jnp.where(aligned, 1.0 + own, _FAR))
+    # Only these two lanes are read again, so that nothing else is stored for all of them.
+    two = jnp.stack([first_smallest(rank), first_smallest(own)])
+    driven, nearest = rows[:, two].T
+    away, beyond = to_segments(rows[:, two], box)
+    near_driven, near = inside[two] & (away[0] <= LANE_CUTOFF_M**2)
+    has_lane = near_driven & _runs_along(driven, heading)
     opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
     friendly = jnp.where(aligned, own, _FAR).min()
     if bank.long_ego:
@@ -184,31 +195,21 @@ def around_lanes(
     else:
         points_near = corner.min(axis=1) <= LANE_CUTOFF_M**2
         outside = _outside_lanes(corner, aligned, half)
-    goes_on = (jnp.abs(side[1:, nearest]) <= LANE_CUTOFF_M) | (own[nearest] > _GOES_ON_M**2)
-    within = jnp.abs(side[1:]).max(axis=0) <= half + LANE_MARGIN_M
-    beside = own - side[0] * side[0] <= _JOINT_M**2
-    fits = beside & (aligned_cos > _FITS) & (own <= half * half)
-    near = reachable.any()
+    goes_on = (jnp.abs(beyond[1:, 1]) <= LANE_CUTOFF_M) | ~inside[two[1]] | (away[0, 1] > _GOES_ON_M**2)
+    over = jnp.where(aligned & beside, reduce(jnp.maximum, jnp.abs(side[1:])) - half, _FAR).min()
+    over = jnp.minimum(over, jnp.abs(beyond[1:, 0]).max() - driven[LaneRow.HALF_WIDTH])
     return LaneHits(
         near=near,
         points_near=points_near | (_outside_box(bank, index, points, 0.0) & goes_on),
         on_corridor=(corridor & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
         wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
         straddling=outside.any(),
-        leaving_lane=has_lane & ~((within & aligned & beside).any() | within[best]),
-        limit=jnp.where(has_lane, _limit(rows[LaneRow.LIMIT], fits & corridor & routed, fits, best), -1.0),
-        lane=jnp.where(has_lane, jnp.floor(rows[LaneRow.LANE, best]), -1.0).astype(jnp.int32),
-        offset=jnp.where(has_lane, side[0, best], 0.0),
-        z=jnp.where(near, rows[LaneRow.Z, nearest], z),
+        leaving_lane=has_lane & (over > LANE_MARGIN_M),
+        limit=jnp.where(has_lane, driven[LaneRow.LIMIT], -1.0),
+        lane=jnp.where(has_lane, jnp.floor(driven[LaneRow.LANE]), -1.0).astype(jnp.int32),
+        offset=jnp.where(has_lane, beyond[0, 0], 0.0),
+        z=jnp.where(near, nearest[LaneRow.Z], z),
     )
-
-
-def _limit(
-    limit: Float[Array, " K"], on_route: Bool[Array, " K"], fits: Bool[Array, " K"], best: Integer
-) -> Scalar:
-    """Highest limit of the lanes on the route that are driven, else of any driven lanes, else that of the lane ``best``."""
-    first, second = (jnp.where(driven, limit, -2.0).max() for driven in (on_route, fits))
-    return jnp.where(first > -2.0, first, jnp.where(second > -2.0, second, limit[best]))
 
 
 def lane_distance(bank: ScenarioBank, index: Integer, xy: Vector, z: Scalar) -> Scalar:
