@@ -75,9 +75,7 @@ def fork(cars, limit=4.0, connector=False, route=(1, 3)):
     road = lanes_only(straight_road(cars, light_x=0.0))
     arc = np.linspace(0.0, np.pi / 2, 20)
     bend = np.stack([12 * np.sin(arc), 12 * (np.cos(arc) - 1), 0 * arc], -1)
-    turn = MapFeature(
-        5, RoadKind.LANE_SURFACE, bend, limit, LANE_M, (6,), (1,), interpolating=connector
-    )
+    turn = MapFeature(5, RoadKind.LANE_SURFACE, bend, limit, LANE_M, (6,), (1,), interpolating=connector)
     street = MapFeature(6, RoadKind.LANE_SURFACE, line((12, -12), (12, -150)), 8.0, LANE_M, (), (5,))
     first, second = (replace(f, successors=(3, 5)) if f.feature_id == 1 else f for f in road.features)
     return replace(road, features=(first, second, turn, street), route_lanes=route)
@@ -99,7 +97,9 @@ def turning_right(start, speed):
 def crossing_street(angle, limit=13.4, x=0.0):
     """A lane that crosses y = 0 at ``x`` under an angle (rad)."""
     along = 80 * np.array([np.cos(angle), np.sin(angle)])
-    return MapFeature(7, RoadKind.LANE_SURFACE, line((x, 0) - along, (x, 0) + along), limit, LANE_M)
+    return MapFeature(
+        7, RoadKind.LANE_SURFACE, line((x - along[0], -along[1]), (x + along[0], along[1])), limit, LANE_M
+    )
 
 
 def faster_road(cars, limit):
@@ -574,7 +574,15 @@ def scenes():
     """All scenes by name."""
     by_name = {}
     for group in (
-        _journeys, _collisions, _traffic, _roads, _ends_of_the_map, _lights, _speeds, _junctions, _comforts,
+        _journeys,
+        _collisions,
+        _traffic,
+        _roads,
+        _ends_of_the_map,
+        _lights,
+        _speeds,
+        _junctions,
+        _comforts,
     ):
         for name, scene in group():
             assert name not in by_name, name

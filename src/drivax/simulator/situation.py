@@ -115,9 +115,7 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     me = frame.box[context.slot]
     ground = _ground(bank, context, frame)
     # The route is that of ego.
-    lanes = queries.around_lanes(
-        bank, context.index, me[:2], me[2:4], corners(me), ground, context.slot == 0
-    )
+    lanes = queries.around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground, context.slot == 0)
     ahead_m = 1.5 * _moved(context) + 2.0
     return Surroundings(
         frame, lanes, queries.project_on_route(bank, context.index, me[:2], context.route_m, ahead_m)

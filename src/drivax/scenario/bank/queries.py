@@ -32,8 +32,8 @@ LANE_MARGIN_M = 0.2
 #: Largest distance to the nearest lane at which the road is known to go on beyond the box of the map, m; the grid finds
 #: every segment up to there.
 _GOES_ON_M = 8.0
-#: Smallest cosine between the directions of a car and of the lane that it drives (30 deg), and how far beyond the ends of
-#: a segment a car is still next to it, m.
+#: Smallest cosine between the directions of a car and of the lane that it drives (30 deg), and how far a car may be
+#: beyond the ends of a segment, m.
 _FITS, _JOINT_M = 0.75**0.5, 0.5
 #: Largest distance to the centre of a followed lane, m.
 _FOLLOWED_M = 2.5
@@ -132,15 +132,14 @@ class LaneHits:
     """Lanes around a box; values at its centre unless stated otherwise.
 
     Attributes:
-        near, points_near: A lane centre lies within the cut-off; the same for each corner. Corners outside the box of the
-            map are near where the lane next to the centre would go on straight, and where no lane is within 8 m.
+        near, points_near: A lane centre lies within the cut-off; the same for each corner. Corners outside the map's
+            box are near where the lane nearest to the centre would go on straight, and if that is over 8 m away.
         on_corridor: Inside a lane of the corridor of the route.
         wrong_way: Inside a lane against its direction (more than 135 deg), and no other lane is nearer.
         straddling: Some corner is outside all lanes in the direction of the ego.
         leaving_lane: No lane in the direction of the ego holds all corners (nuPlan's multiple lanes, for fault).
         limit: Speed limit of the lane that is driven, m/s; -1 unknown.
-        lane, offset: The lane that is driven (-1 without one), and the signed distance to its centre line, left positive,
-            m.
+        lane, offset: The lane that is driven (-1 without one); signed distance to its centre line, left positive, m.
         z: Height of the nearest lane, or of the query without one.
     """
 
@@ -163,8 +162,8 @@ def around_lanes(
     """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height.
 
     Of the lanes that hold the centre and lead at most 30 degrees away from the heading, the box drives that with the
-    highest limit, those of the route's corridor before others if it is ``routed``; without such lanes the nearest within
-    90 degrees.
+    highest limit, lanes of the route's corridor before others if it is ``routed``. Without such lanes it drives the
+    nearest within 90 degrees.
     """
     rows, inside = lanes_around(bank, index, centre)
     inside = inside & _level(rows[LaneRow.Z], z)

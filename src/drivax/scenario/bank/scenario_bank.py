@@ -421,7 +421,7 @@ def _lane_values(scenario: Scenario, lane: Int[np.ndarray, " segment"]) -> tuple
 
 
 def _lane_limits(scenario: Scenario) -> Float[np.ndarray, " lane"]:
-    """Limit of each lane, m/s: of connectors the highest of the lanes that they join; where unknown, that of the class."""
+    """Limit of each lane, m/s; of connectors the highest of the lanes that they join, if known; else of the class."""
     limit = scenario.lane_limit
     links = np.concatenate([scenario.lane_predecessor, scenario.lane_successor], axis=1)
     joined = np.where(links >= 0, limit[links], -1.0).max(axis=1)
