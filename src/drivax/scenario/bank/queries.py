@@ -139,7 +139,6 @@ class LaneHits:
         straddling: Some corner is outside all lanes in the direction of the ego.
         leaving_lane: No lane in the direction of the ego holds all corners (nuPlan's multiple lanes, for fault).
         limit: Speed limit of the lane that is driven, m/s; -1 unknown.
-        lane, offset: The lane that is driven (-1 without one); signed distance to its centre line, left positive, m.
         z: Height of the nearest lane, or of the query without one.
     """
 
@@ -150,8 +149,6 @@ class LaneHits:
     straddling: Bool[Array, ""]
     leaving_lane: Bool[Array, ""]
     limit: Scalar
-    lane: Integer
-    offset: Scalar
     z: Scalar
 
 
@@ -178,15 +175,15 @@ def around_lanes(
     beside = own - side[0] * side[0] <= _JOINT_M**2
     fits = beside & (aligned_cos > _FITS) & (own <= half * half)
     corridor = rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])
-    # By limit, on the route first (of nearly equal limits the nearest); without lanes that fit the nearest.
-    rank = jnp.where(corridor & routed, 0.0, 0.2) + 1e-3 * (100.0 - rows[LaneRow.LIMIT]) + 1e-5 * own
+    # By limit, on the route first; without lanes that fit the nearest.
+    rank = jnp.where(corridor & routed, 0.0, 0.2) + 1e-3 * (100.0 - rows[LaneRow.LIMIT])
     rank = jnp.where(fits, rank, jnp.where(aligned, 1.0 + own, _FAR))
     # Only these two lanes are read again, so that nothing else is stored for all of them.
     two = jnp.stack([first_smallest(rank), first_smallest(own)])
-    driven, nearest = rows[:, two].T
-    away, beyond = to_segments(rows[:, two], box)
+    lanes = rows[:, two]
+    (driven, nearest), (away, beyond) = lanes.T, to_segments(lanes, box)
     near_driven, near = inside[two] & (away[0] <= LANE_CUTOFF_M**2)
-    has_lane = near_driven & _runs_along(driven, heading)
+    has_lane = near_driven & _runs_along(lanes, heading)[0]
     opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
     friendly = jnp.where(aligned, own, _FAR).min()
     if bank.long_ego:
@@ -205,8 +202,6 @@ def around_lanes(
         straddling=outside.any(),
         leaving_lane=has_lane & (over > LANE_MARGIN_M),
         limit=jnp.where(has_lane, driven[LaneRow.LIMIT], -1.0),
-        lane=jnp.where(has_lane, jnp.floor(driven[LaneRow.LANE]), -1.0).astype(jnp.int32),
-        offset=jnp.where(has_lane, beyond[0, 0], 0.0),
         z=jnp.where(near, nearest[LaneRow.Z], z),
     )
 
