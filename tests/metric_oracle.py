@@ -1,7 +1,7 @@
 """Metrics once more by other means: float64, shapely, marching in 1 ms steps, SciPy's filter, plain loops.
 
-For the straight roads of :mod:`scenes` and :mod:`metric_scenes`, whose lanes run along y = 0 and y = 3.7. Written from
-the definitions alone; shares no code with the package.
+For the straight roads of :mod:`scenes` and :mod:`metric_scenes`, whose lanes run along y = 0 and y = 3.7, and straight
+lanes that cross them or begin on them. Written from the definitions alone; shares no code with the package.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from scipy.signal import savgol_filter
 from shapely.geometry import LineString, Point, Polygon
 
 START, END, DT = 10, 90, 0.1
-LANES_Y, HALF, EDGE = (0.0, 3.7), 1.85, 1e-3
+HALF, EDGE = 1.85, 1e-3
 VULNERABLE_KINDS = (2, 3)
 #: Metrics that depend on lines along the road.
 LINES = (
@@ -51,6 +51,28 @@ def marched_ttc(me, velocity, boxes, velocities, step_s=1e-3, horizon_s=5.0):
     return result
 
 
+class StraightLane:
+    """A lane of two points, as its centre line and in coordinates along and across it."""
+
+    def __init__(self, begin, end, limit, corridor, loose):
+        self.line, self.begin = LineString([begin, end]), begin
+        self.length = np.hypot(*(end - begin))
+        self.along = (end - begin) / self.length
+        self.limit, self.corridor, self.loose = limit, corridor, loose
+
+    def distance(self, point):
+        return self.line.distance(Point(point))
+
+    def place(self, point):
+        """Arc length and lateral distance of a point."""
+        to = np.asarray(point) - self.begin
+        return to @ self.along, abs(self.along[0] * to[1] - self.along[1] * to[0])
+
+    def turn(self, heading):
+        """Angle to a heading, degrees."""
+        return np.degrees(np.arccos(np.clip(self.along @ [np.cos(heading), np.sin(heading)], -1, 1)))
+
+
 class Judge:
     """Drives ego along ``motion [91, 4]`` through a recording and judges every step."""
 
@@ -59,6 +81,16 @@ class Judge:
         self.recording = recording
         edge = next(f for f in recording.features if f.feature_id == 4)
         self.ring = Polygon(edge.points[:, :2])
+        lanes = {f.feature_id: f for f in recording.features}
+        ends = {number: lane.points[[0, -1], :2] for number, lane in lanes.items()}
+        # Lane 3 goes on where lane 1 ends.
+        ends[1] = np.stack([ends[1][0], ends[3][1]])
+        corridor = (1,) if two_way else (1, 2)
+        self.lanes = [
+            StraightLane(*ends[number], lanes[number].limit_mps, number in corridor, number == 7)
+            for number in (1, 2, 7)
+            if number in lanes
+        ]
         self.size = self.tracks.size[:, 0]
         self.ambiguous = False
 
@@ -81,43 +113,78 @@ class Judge:
             self.ambiguous = True
         return mine.intersection(theirs).area > 0
 
-    def aligned(self, t):
-        """Centre lines of lanes that run ego's way, and of those that run against it."""
-        cos = np.cos(self.motion[t, 2])
-        direction = (1.0, -1.0 if self.two_way else 1.0)
-        same = [y for y, d in zip(LANES_Y, direction, strict=True) if d * cos > 0]
-        against = [y for y, d in zip(LANES_Y, direction, strict=True) if d * cos < -np.sqrt(0.5)]
-        return same, against
-
     def place(self, t):
-        """Off the road, off the map, straddling, in several lanes, against traffic, limit."""
-        x, y = self.motion[t, :2]
+        """Off the road, off the map, straddling, in several lanes, against traffic, limit, off the corridor."""
+        centre, heading = self.motion[t, :2], self.motion[t, 2]
         box = corners(*self.ego(t))
-        same, against = self.aligned(t)
-        west, south, east, north = self.ring.bounds
-        left_map = not (west <= x <= east and south <= y <= north)
+        turns = np.array([lane.turn(heading) for lane in self.lanes])
+        apart = np.array([lane.distance(centre) for lane in self.lanes])
+        for turn, lane in zip(turns, self.lanes, strict=True):
+            for threshold in (30.0, 90.0, 135.0):
+                self.near(turn, threshold, 0.05)
+            for corner in box:
+                self.near(lane.distance(corner), HALF + 0.2)
+                self.near(lane.place(corner)[1], HALF + 0.2)
+        aligned = turns < 90
+        offroad, left_map = self.outside(centre, box)
+        same = [lane for lane, on in zip(self.lanes, aligned, strict=True) if on]
+        outside = [all(lane.distance(corner) > HALF + 0.2 for lane in same) for corner in box]
+        own = apart[aligned].min(initial=9.0)
+        self.near(own, 4.0)
+        several = own <= 4.0 and not any(self.holds(lane, centre, box) for lane in same)
+        opposed = apart[(turns > 135) & (apart <= HALF)].min(initial=np.inf)
+        for distance in apart:
+            self.near(distance, HALF)
+        self.near(opposed, own)
+        on_corridor = apart[[lane.corridor for lane in self.lanes]].min()
+        self.near(on_corridor, HALF + 0.2)
+        limit = self.limit(centre, turns, apart) if own <= 4.0 else None
+        return offroad, left_map, any(outside), several, opposed < own, limit, on_corridor > HALF + 0.2
+
+    def outside(self, centre, box):
+        """Whether the box is off the road, and whether its centre has left the map."""
         beyond = [self.ring.exterior.distance(Point(c)) for c in box if not self.ring.contains(Point(c))]
         for value in beyond:
             self.near(value, 0.3)
-        for low in (south, north):
-            self.near(y, low)
-        self.near(x, east)
-        offroad = any(value > 0.3 for value in beyond) and not left_map
-        outside = [all(abs(c[1] - lane) > HALF + 0.2 for lane in same) for c in box]
-        own = min((abs(y - lane), lane) for lane in same) if same else (9.0, 0.0)
-        for c in box:
-            for lane in LANES_Y:
-                self.near(abs(c[1] - lane), HALF + 0.2)
-        self.near(own[0], 4.0)
-        several = own[0] <= 4.0 and any(abs(c[1] - own[1]) > HALF + 0.2 for c in box)
-        opposed = min((abs(y - lane) for lane in against if abs(y - lane) <= HALF), default=np.inf)
-        self.near(opposed, HALF)
-        self.near(opposed, own[0])
-        wrong = opposed < own[0]
-        limit = 13.4 if own[0] <= 4.0 else None
-        corridor = abs(y) <= HALF + 0.2 or (not self.two_way and abs(y - LANES_Y[1]) <= HALF + 0.2)
-        self.near(abs(y), HALF + 0.2)
-        return offroad, left_map, any(outside), several, wrong, limit, not corridor
+        # Far from the edges other lanes may decide.
+        if max(beyond, default=0.0) > 2.9 and len(self.lanes) > 2:
+            self.ambiguous = True
+        points = [self.ring.exterior, *(lane.line for lane in self.lanes)]
+        low = np.min([part.bounds[:2] for part in points], axis=0) - 4.0
+        high = np.max([part.bounds[2:] for part in points], axis=0) + 4.0
+        for value, bound in zip((*centre, *centre), (*low, *high), strict=True):
+            self.near(value, bound)
+        return any(value > 0.3 for value in beyond), not ((centre >= low) & (centre <= high)).all()
+
+    def on(self, lane, centre):
+        """Whether the centre is between the ends of a lane; next to the ends of loose ones the answer is open."""
+        along, across = lane.place(centre)
+        if lane.loose and across < 5.0:
+            self.near(along, -2.0, 2.6)
+            self.near(along, lane.length + 2.0, 2.6)
+        return 0.0 <= along <= lane.length
+
+    def holds(self, lane, centre, box):
+        """Whether all corners are between the borders of a lane, which go on straight beyond its ends."""
+        return self.on(lane, centre) and max(lane.place(corner)[1] for corner in box) <= HALF + 0.2
+
+    def limit(self, centre, turns, apart):
+        """Limit of the lane that is driven, by area: of the route, else the highest; else that of the nearest."""
+        lanes = list(zip(self.lanes, turns, apart, strict=True))
+        fit = [
+            lane
+            for lane, turn, _ in lanes
+            if turn <= 30 and lane.line.buffer(HALF, cap_style="flat").contains(Point(centre))
+        ]
+        for lane, _, _ in lanes:
+            self.on(lane, centre)
+        if fit:
+            route = [lane for lane in fit if lane.corridor]
+            return max(lane.limit for lane in route or fit)
+        near = sorted((distance, lane.limit) for lane, turn, distance in lanes if turn < 90)
+        if len(near) > 1 and near[0][1] != near[1][1]:
+            self.near(near[1][0], near[0][0])
+        return near[0][1]
 
     def fault_and_kind(self, a, t, unlawful):
         x, y, heading, length, width = self.ego(t)

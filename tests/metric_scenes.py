@@ -63,6 +63,45 @@ def ring_road(cars, radius):
     return replace(straight_road(cars), features=(first, second), route_lanes=(1, 2))
 
 
+def lanes_only(recording, *more, keep=(1, 3)):
+    """The lanes of the ids ``keep`` without edges, and further features."""
+    kept = [f for f in recording.features if f.feature_id in keep]
+    kept = [replace(f, left_neighbours=(), right_neighbours=()) for f in kept]
+    return replace(recording, features=(*kept, *more))
+
+
+def fork(cars, limit=4.0, connector=False, route=(1, 3)):
+    """At the origin, a lane that turns right (12 m) onto a street of 8 m/s begins where lane 1 goes on as lane 3."""
+    road = lanes_only(straight_road(cars, light_x=0.0))
+    arc = np.linspace(0.0, np.pi / 2, 20)
+    bend = np.stack([12 * np.sin(arc), 12 * (np.cos(arc) - 1), 0 * arc], -1)
+    turn = MapFeature(5, RoadKind.LANE_SURFACE, bend, limit, LANE_M, (6,), (1,), interpolating=connector)
+    street = MapFeature(6, RoadKind.LANE_SURFACE, line((12, -12), (12, -150)), 8.0, LANE_M, (), (5,))
+    first, second = (replace(f, successors=(3, 5)) if f.feature_id == 1 else f for f in road.features)
+    return replace(road, features=(first, second, turn, street), route_lanes=route)
+
+
+def turning_right(start, speed):
+    """A car that comes along y = 0 from ``start``, and turns right at the origin on the lane of :func:`fork`."""
+    s = start + speed * T
+    angle = -np.clip(s / 12.0, 0.0, np.pi / 2)
+    beyond = np.maximum(s - 6 * np.pi, 0.0)
+    x = np.where(s < 0, s, -12 * np.sin(angle))
+    return car(speed=speed) | {
+        "xy": np.stack([x, 12 * (np.cos(angle) - 1) - beyond], -1),
+        "heading": angle,
+        "velocity": speed * np.stack([np.cos(angle), np.sin(angle)], -1),
+    }
+
+
+def crossing_street(angle, limit=13.4, x=0.0):
+    """A lane that crosses y = 0 at ``x`` under an angle (rad)."""
+    along = 80 * np.array([np.cos(angle), np.sin(angle)])
+    return MapFeature(
+        7, RoadKind.LANE_SURFACE, line((x - along[0], -along[1]), (x + along[0], along[1])), limit, LANE_M
+    )
+
+
 def faster_road(cars, limit):
     return straight_road(cars, limit=limit)
 
@@ -356,6 +395,76 @@ def _speeds():
     )  # fmt: skip
 
 
+def _junctions():
+    """Lanes that overlap: the one that is driven has the limit, and holds ego."""
+    free = {"speeding_mean": 0, "speeding_max": 0, "speed_compliance": 1}
+    for aside in (-0.3, -0.6):
+        yield f"{-aside} m towards a slow turn lane", Scene(
+            fork([car(-30.0, speed=13.0)]), shifted_left(aside), free | {"nuplan_score": 1}
+        )  # fmt: skip
+    # The slow lane is 6 pi m long; within 0.5 m of its ends the faster lane before or after it holds ego, too.
+    log = turning_right(-10.0, 6.0)
+    way = (-10.0 + 6.0 * T)[11:]
+    slow = np.count_nonzero((way > 0.5) & (way < 6 * np.pi - 0.5))
+    turn = {"speeding_mean": 2.0 * slow / 80, "speeding_max": 2, "off_route": 0}
+    yield "turning on the slow lane", Scene(fork([log], route=(1, 5, 6)), None, turn)
+    yield "turning on a slow connector", Scene(
+        fork([log], connector=True, route=(1, 5, 6)), None, free | {"off_route": 0}
+    )  # fmt: skip
+    # Off the route both lanes hold ego until it is 1.85 m off lane 3, whose limit holds.
+    apart = np.count_nonzero((log["xy"][11:, 1] < -1.85) & (way < 6 * np.pi - 0.5))
+    straight_on = car(-10.0, speed=6.0)
+
+    def right(_):
+        return np.column_stack([log["xy"] - log["xy"][10], log["heading"], 0 * T + 6.0])
+
+    yield "turning against the route", Scene(
+        fork([straight_on]), right, {"speeding_mean": 2.0 * apart / 80, "speeding_max": 2, "off_route": 1}
+    )  # fmt: skip
+    for degrees in (25, 60, 120):
+        street = crossing_street(np.deg2rad(degrees), 5.0, x=40.2)
+        yield f"a slow street crosses at {degrees} deg", Scene(
+            lanes_only(straight_road([EGO]), street), shifted_left(0.3), free | {"nuplan_score": 1}
+        )  # fmt: skip
+    # Side impact after 4 s, ego's centre 0.3 m off its lane's and nearer to that of the street.
+    hit = np.deg2rad(60.0)
+    along = 8.0 * (T - 4.0)
+    other = car(0, 0, hit, 8.0) | {
+        "xy": np.stack([40.0 + (along - 3.4) * np.cos(hit), (along - 3.4) * np.sin(hit)], -1)
+    }
+    for name, lanes in (("in a junction", (crossing_street(hit, x=39.6),)), ("without the street", ())):
+        yield f"hit in the side {name}", Scene(
+            lanes_only(straight_road([EGO, other]), *lanes), shifted_left(0.3),
+            CRASHED | {"at_fault_collision": 0, "collision_type": 3, "accuracy_at_fault": 1, "lane_straddle": 0},
+        )  # fmt: skip
+
+
+def _ends_of_the_map():
+    """Lanes along the scenario's axis without edges: the box around them has no area."""
+    thin = lanes_only(straight_road([EGO]))
+    for aside, off, left in ((-0.2, 0, 0), (0.2, 0, 0), (2.5, 0, 0), (-3.5, 1, 0), (-4.5, 1, 1)):
+        yield f"{aside} m from the only lane", Scene(
+            thin, shifted_left(aside), {"offroad": off, "left_map": left, "accuracy": 1 - off, "steps": 80}
+        )  # fmt: skip
+    # 4 m beyond its last point the road leaves the map, not ego the road.
+    for end, left in ((77.0, 0), (75.0, 1), (30.0, 1)):
+        short = lanes_only(straight_road([EGO], light_x=20.0, end=end))
+        yield f"a road that is mapped for {end} m", Scene(
+            short, None, {"offroad": 0, "left_map": left, "accuracy": 1}
+        )  # fmt: skip
+    short = straight_road([EGO], light_x=20.0, end=30.0)
+    right = MapFeature(8, RoadKind.EDGE_BOUNDARY, line((-150, -2), (30, -2)))
+    left = MapFeature(9, RoadKind.EDGE_BOUNDARY, line((30, 2), (-150, 2)))
+    yield "edges that end", Scene(
+        lanes_only(short, right, left), None, {"offroad": 0, "left_map": 1, "accuracy": 1}
+    )  # fmt: skip
+    # Never on the road, and 1 m outside the widened box.
+    yield "beside the map from the start", Scene(
+        lanes_only(straight_road([EGO]), right), shifted_left(-7.0),
+        {"offroad": 1, "offroad_step": 11, "left_map": 1, "accuracy": 0},
+    )  # fmt: skip
+
+
 def _comforts():
     fast = 40.0
     yield "gentle acceleration", Scene(
@@ -464,7 +573,17 @@ def _journeys():
 def scenes():
     """All scenes by name."""
     by_name = {}
-    for group in (_journeys, _collisions, _traffic, _roads, _lights, _speeds, _comforts):
+    for group in (
+        _journeys,
+        _collisions,
+        _traffic,
+        _roads,
+        _ends_of_the_map,
+        _lights,
+        _speeds,
+        _junctions,
+        _comforts,
+    ):
         for name, scene in group():
             assert name not in by_name, name
             by_name[name] = scene

@@ -96,16 +96,16 @@ def test_leaving_and_entering_the_road_have_their_first_steps():
         across = car(0, y, np.pi / 2, speed)
         return straight_road([{**across, "heading": np.zeros(91)}])
 
-    # Nothing is mapped below the edge: a centre below y = -1.85 has left the map, which is counted apart.
-    # y = -0.525 - 0.05 k: off the road for k = 13 to 26. y = -2.975 + 0.05 k: off it for k = 23 to 36, then on it.
-    leaves, enters = audited(slides(-0.525, -0.5), slides(-2.975, 0.5))
-    assert leaves["first_offroad_step"] == CURRENT_STEP + 13
-    assert leaves["log_offroad_fraction"] == 14 / 80
+    # A centre below y = -5.85 has left the map, and is still off the road.
+    # y = -0.525 - 0.1 k: off the road from k = 7 on, the map from 54 on. y = -2.975 + 0.05 k: on the road from 37 on.
+    leaves, enters = audited(slides(-0.525, -1.0), slides(-2.975, 0.5))
+    assert leaves["first_offroad_step"] == CURRENT_STEP + 7
+    assert leaves["log_offroad_fraction"] == 74 / 80
     assert leaves["first_onroad_step"] == CURRENT_STEP
-    assert enters["first_offroad_step"] == CURRENT_STEP + 23
+    assert enters["first_offroad_step"] == CURRENT_STEP + 1
     assert enters["first_onroad_step"] == CURRENT_STEP + 37
-    assert enters["log_offroad_fraction"] == 14 / 80
-    assert leaves["log_left_map"] is True and enters["log_left_map"] is True
+    assert enters["log_offroad_fraction"] == 36 / 80
+    assert leaves["log_left_map"] is True and enters["log_left_map"] is False
     assert leaves["clean"] is enters["clean"] is False
 
 

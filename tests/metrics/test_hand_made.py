@@ -89,8 +89,8 @@ def test_irrelevant_changes_keep_every_metric(judged, change, every):
     pairs = [change(scene) for scene in some.values()]
     again = judge([recording for recording, _ in pairs], [drive for _, drive in pairs])
     for (name, scene), found in zip(some.items(), again, strict=True):
-        assert differences(scene, found) == [], name
         # The mapped area is a box along the scenario's own axes: turning the world changes its corners.
+        assert {d[0] for d in differences(scene, found)} <= {"left_map"}, name
         for metric in set(METRICS) - {"left_map"}:
             one, other = judged[name][metric], found[metric]
             assert (one is None) == (other is None), (name, metric)

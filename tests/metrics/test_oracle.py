@@ -9,10 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import RoadKind
 from judging import BATCH, judge
 from metric_oracle import Judge
 from metric_scenes import two_way_road
-from scenes import car, straight_road
+from scenes import car, line, straight_road
 
 KINDS = ((1, 4.8, 2.0), (1, 12.0, 2.5), (2, 0.6, 0.6), (3, 1.8, 0.7))
 QUARTER = np.pi / 2
@@ -43,7 +45,17 @@ def random_scene(rng):
         oncoming = next(f for f in two_way_road(cars, end=end).features if f.feature_id == 2)
         kept = [replace(f, left_neighbours=()) for f in road.features if f.feature_id != 2]
         road = replace(road, features=(*kept, oncoming))
+    if rng.random() < 0.5:
+        road = replace(road, features=(*road.features, random_lane(rng)))
     return road, random_drive(rng), two_way
+
+
+def random_lane(rng):
+    """A street that crosses the road, or a lane that leaves it."""
+    angle, limit = rng.choice([-1, 1]) * rng.uniform(0.1, 3.0), rng.choice([4.0, 8.0, 20.0])
+    x, along = rng.uniform(5, 60), 60 * np.array([np.cos(angle), np.sin(angle)])
+    begin = np.array([x, rng.uniform(-1, 4)]) - rng.choice([0, 1]) * along
+    return MapFeature(7, RoadKind.LANE_SURFACE, line(begin, begin + 2 * along), limit, 3.7)
 
 
 def random_drive(rng):

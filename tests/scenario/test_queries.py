@@ -1,10 +1,13 @@
 """The grid answers what brute force answers, on generated maps; signs and lanes answer what numpy in float64 says."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivax.scenario.bank.columns import LaneRow
 from drivax.scenario.bank.queries import (
     EDGE_CUTOFF_M,
     LANE_CUTOFF_M,
@@ -22,6 +25,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.studies.bench import without_grid
 from drivax.synthetic.world import generate_recording
+from metric_scenes import fork
 from scenes import bank_of, car, line, straight_road
 
 
@@ -77,7 +81,7 @@ def test_grid_equals_brute_force(scenarios):
         np.testing.assert_array_equal(grid[2], brute[2])
         np.testing.assert_allclose(grid[1], brute[1], atol=1e-5)
         # The lanes of LaneHits that depend on distance are exact within the cut-off; all of its fields must agree.
-        for name in ("near", "points_near", "on_corridor", "wrong_way", "limit", "lane", "leaving_lane"):
+        for name in ("near", "points_near", "on_corridor", "wrong_way", "limit", "leaving_lane"):
             np.testing.assert_array_equal(getattr(grid[0], name), getattr(brute[0], name), err_msg=name)
         near = np.asarray(grid[0].near)
         np.testing.assert_array_equal(
@@ -142,8 +146,6 @@ def test_distances_to_lanes_and_to_points_against_float64(scenarios):
 def test_side_of_a_sharp_vertex():
     # A wedge of road, drivable to the left of (0,0) -> (10,0) -> (0,4): outside its tip both lines disagree.
     recording = straight_road([car(0, 0, 0, 5)])
-    from dataclasses import replace
-
     from drivax.scenario.recording import MapFeature
     from drivax.scenario.schema import RoadKind
 
@@ -177,7 +179,6 @@ def test_lanes_of_a_two_lane_road():
 
     inside = at(0, 0.2, 0.0)
     assert bool(inside.near) and bool(inside.on_corridor) and not bool(inside.straddling)
-    assert float(inside.offset) == pytest.approx(0.2, abs=1e-4)
     assert float(inside.limit) == pytest.approx(13.4)
     backwards = at(0, 0.2, np.pi)
     assert bool(backwards.wrong_way) and float(backwards.limit) == -1.0
@@ -187,6 +188,35 @@ def test_lanes_of_a_two_lane_road():
     assert not bool(between.straddling) and bool(between.leaving_lane)
     edge = at(0, -1.5, 0.0)  # right corners 2.5 m from the right lane's centre
     assert bool(edge.straddling)
+
+
+def test_driven_lane_of_a_fork():
+    """At its start a lane of 4 m/s and one of 13.4 m/s hold the box; a connector has the limit of what it joins."""
+
+    def limit(recording, routed, heading=0.0):
+        box = jnp.asarray(corners_of(np.array([[1.5, -0.3]]), np.array([heading]))[0])
+        xy, direction = jnp.array([1.5, -0.3]), jnp.array([np.cos(heading), np.sin(heading)])
+        found = lanes_at(bank_of(recording), jnp.asarray(0), xy, direction, box, jnp.zeros(()), routed)
+        assert not bool(found.leaving_lane)
+        return float(found.limit)
+
+    ego = [car(0, 0, 0, 5)]
+    right, ahead = (fork(ego, route=route) for route in ((1, 5, 6), (1, 3)))
+    assert limit(right, True) == pytest.approx(4.0) and limit(ahead, True) == pytest.approx(13.4)
+    assert limit(right, False) == limit(ahead, False) == pytest.approx(13.4)
+    assert limit(fork(ego, connector=True, route=(1, 5, 6)), True) == pytest.approx(13.4)
+    # Of the two lanes only that which turns leads at most 30 degrees away from a heading of -35 degrees.
+    assert limit(ahead, True, -np.deg2rad(35)) == pytest.approx(4.0)
+
+
+def test_limits_of_connectors():
+    """Known limits of joined lanes, else the own one, else that of the class."""
+    for joined, own, expected in ((13.4, 4.0, 13.4), (9.0, 20.0, 9.0), (0.0, 4.0, 4.0), (0.0, 0.0, 13.4)):
+        road = fork([car(0, 0, 0, 5)], limit=own, connector=True)
+        features = [replace(f, limit_mps=joined) if f.feature_id in (1, 6) else f for f in road.features]
+        bank = bank_of(replace(road, features=tuple(features)))
+        turn = np.floor(np.asarray(bank.lanes[0, LaneRow.LANE])) == 2
+        assert np.asarray(bank.lanes[0, LaneRow.LIMIT])[turn] == pytest.approx(expected), (joined, own)
 
 
 def test_followed_lane_fits_position_and_heading():

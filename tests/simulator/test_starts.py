@@ -71,11 +71,11 @@ def test_perturbed_history_uses_one_action(open_road):
     scenes = noisy(open_road, 10, keys(64))
     history = scenes.history
     logged = LogStart().begin(open_road, jnp.int32(0), jnp.int32(0), jnp.int32(0), None)[0]
-    np.testing.assert_allclose(history[:, :6], np.broadcast_to(logged[-6:], (64, 6, 4)), atol=1e-4)
-    between = jax.vmap(jax.vmap(command_between))(history[:, 5:-1], history[:, 6:])
+    np.testing.assert_allclose(history[:, :-10], np.broadcast_to(logged[-13:], (64, 13, 4)), atol=1e-4)
+    between = jax.vmap(jax.vmap(command_between))(history[:, -11:-1], history[:, -10:])
     acceleration, curvature = map(np.asarray, between)
     assert np.ptp(acceleration, axis=1).max() < 1e-2 and (acceleration >= -1e-3).all()
-    grip = GRIP_MPS2 / np.asarray(history[:, 5:-1, 3]) ** 2
+    grip = GRIP_MPS2 / np.asarray(history[:, -11:-1, 3]) ** 2
     free = (np.abs(curvature) < 0.95 * grip).all(axis=1)
     assert free.sum() > 32 and np.ptp(curvature[free], axis=1).max() < 1e-3
     # They are all at step 10 of the log, hardly behind where the log is (some turned), and different.

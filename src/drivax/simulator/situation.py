@@ -114,7 +114,8 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     """Return all agents, the lanes around the driven agent, and its position on its route."""
     me = frame.box[context.slot]
     ground = _ground(bank, context, frame)
-    lanes = queries.around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground)
+    # The route is that of ego.
+    lanes = queries.around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground, context.slot == 0)
     ahead_m = 1.5 * _moved(context) + 2.0
     return Surroundings(
         frame, lanes, queries.project_on_route(bank, context.index, me[:2], context.route_m, ahead_m)
@@ -195,14 +196,10 @@ def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
 def off_the_road(
     bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: queries.LaneHits
 ) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
-    """Return how far the worst corner of a box is off the road (m), whether it left the map, or only the road."""
+    """Return how far the worst corner of a box is off the road (m), whether it left the map, and whether the road."""
     beyond = queries.offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
-    left_map = queries.left_the_map(bank, index, me[:2])
-    return (
-        beyond,
-        left_map,
-        (beyond > queries.OFFROAD_TOLERANCE_M) & ~left_map & queries.is_mapped(bank, index),
-    )
+    off = (beyond > queries.OFFROAD_TOLERANCE_M) & queries.is_mapped(bank, index)
+    return beyond, queries.left_the_map(bank, index, me[:2]), off
 
 
 def _rates(history: Float[Array, "history 4"]) -> tuple[Scalar, Scalar, Scalar]:

@@ -38,7 +38,8 @@ class EdgeRow:
 class LaneRow:
     """Rows of ``ScenarioBank.lanes``: those of :class:`EdgeRow`, half width, limit in m/s (-1 unknown), and lane index.
 
-    The index is raised by a half on lanes of the corridor: the lanes of the route and their same-direction neighbours.
+    The limit of a connector is the highest of the lanes that it joins. The index is raised by a half on lanes of the
+    corridor: the lanes of the route and their same-direction neighbours.
     """
 
     X_A, Y_A, X_B, Y_B, Z, HALF_WIDTH, LIMIT, LANE = range(8)

@@ -8,6 +8,7 @@ grid; ``tests/scenario/test_queries.py`` compares with brute force. Segments mor
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import jax
@@ -28,6 +29,12 @@ LEVEL_M = 3.0
 OFFROAD_TOLERANCE_M = 0.3
 #: Tolerance of lane borders (semantics, ``lane_straddle``).
 LANE_MARGIN_M = 0.2
+#: Largest distance to the nearest lane at which the road is known to go on beyond the box of the map, m; the grid finds
+#: every segment up to there.
+_GOES_ON_M = 8.0
+#: Smallest cosine between the directions of a car and of the lane that it drives (30 deg), and how far a car may be
+#: beyond the ends of a segment, m.
+_FITS, _JOINT_M = 0.75**0.5, 0.5
 #: Largest distance to the centre of a followed lane, m.
 _FOLLOWED_M = 2.5
 #: A car passes to another lane this far beyond the line between them; centres of parallel lanes are at least the second
@@ -125,14 +132,13 @@ class LaneHits:
     """Lanes around a box; values at its centre unless stated otherwise.
 
     Attributes:
-        near, points_near: A lane centre lies within the cut-off; the same for each corner.
+        near, points_near: A lane centre lies within the cut-off; the same for each corner. Corners outside the map's
+            box are near where the lane nearest to the centre would go on straight, and if that is over 8 m away.
         on_corridor: Inside a lane of the corridor of the route.
         wrong_way: Inside a lane against its direction (more than 135 deg), and no other lane is nearer.
         straddling: Some corner is outside all lanes in the direction of the ego.
-        leaving_lane: Some corner is outside the lane of the centre (nuPlan's multiple lanes, for fault).
-        limit: Speed limit of the lane, m/s; -1 unknown.
-        lane, offset: Nearest lane in the direction of the ego (-1 without one), and the signed distance to its centre
-            line, left positive, m.
+        leaving_lane: No lane in the direction of the ego holds all corners (nuPlan's multiple lanes, for fault).
+        limit: Speed limit of the lane that is driven, m/s; -1 unknown.
         z: Height of the nearest lane, or of the query without one.
     """
 
@@ -143,29 +149,41 @@ class LaneHits:
     straddling: Bool[Array, ""]
     leaving_lane: Bool[Array, ""]
     limit: Scalar
-    lane: Integer
-    offset: Scalar
     z: Scalar
 
 
 def around_lanes(
     bank: ScenarioBank, index: Integer, centre: Vector, heading: Vector,
-    points: Float[Array, "P 2"], z: Scalar,
+    points: Float[Array, "P 2"], z: Scalar, routed: bool | Bool[Array, ""] = True,
 ) -> LaneHits:  # fmt: skip
-    """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height."""
+    """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height.
+
+    Of the lanes that hold the centre and lead at most 30 degrees away from the heading, the box drives that with the
+    highest limit, lanes of the route's corridor before others if it is ``routed``. Without such lanes it drives the
+    nearest within 90 degrees.
+    """
     rows, inside = lanes_around(bank, index, centre)
     inside = inside & _level(rows[LaneRow.Z], z)
-    squared, side = to_segments(rows, jnp.concatenate([centre[None], points]))
+    box = jnp.concatenate([centre[None], points])
+    squared, side = to_segments(rows, box)
     squared = jnp.where(inside, squared, _FAR)
-    half, limit = rows[LaneRow.HALF_WIDTH], rows[LaneRow.LIMIT]
+    half = rows[LaneRow.HALF_WIDTH]
     ux, uy = _chord(rows)
     aligned_cos = (ux * heading[0] + uy * heading[1]) * jax.lax.rsqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
     aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
     own, corner = squared[0], squared[1:]
-    reachable = own <= LANE_CUTOFF_M**2
-    best = first_smallest(jnp.where(aligned, own, _FAR))
-    has_lane = aligned[best] & reachable[best]
-    nearest = first_smallest(own)
+    beside = own - side[0] * side[0] <= _JOINT_M**2
+    fits = beside & (aligned_cos > _FITS) & (own <= half * half)
+    corridor = rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])
+    # By limit, on the route first; without lanes that fit the nearest.
+    rank = jnp.where(corridor & routed, 0.0, 0.2) + 1e-3 * (100.0 - rows[LaneRow.LIMIT])
+    rank = jnp.where(fits, rank, jnp.where(aligned, 1.0 + own, _FAR))
+    # Only these two lanes are read again, so that nothing else is stored for all of them.
+    two = jnp.stack([first_smallest(rank), first_smallest(own)])
+    lanes = rows[:, two]
+    (driven, nearest), (away, beyond) = lanes.T, to_segments(lanes, box)
+    near_driven, near = inside[two] & (away[0] <= LANE_CUTOFF_M**2)
+    has_lane = near_driven & _runs_along(lanes, heading)[0]
     opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
     friendly = jnp.where(aligned, own, _FAR).min()
     if bank.long_ego:
@@ -173,21 +191,18 @@ def around_lanes(
     else:
         points_near = corner.min(axis=1) <= LANE_CUTOFF_M**2
         outside = _outside_lanes(corner, aligned, half)
-    leaving = jnp.abs(side[1:, best]) - (half[best] + LANE_MARGIN_M) > 0.0
-    near = reachable.any()
+    goes_on = (jnp.abs(beyond[1:, 1]) <= LANE_CUTOFF_M) | ~inside[two[1]] | (away[0, 1] > _GOES_ON_M**2)
+    over = jnp.where(aligned & beside, reduce(jnp.maximum, jnp.abs(side[1:])) - half, _FAR).min()
+    over = jnp.minimum(over, jnp.abs(beyond[1:, 0]).max() - driven[LaneRow.HALF_WIDTH])
     return LaneHits(
         near=near,
-        points_near=points_near,
-        on_corridor=(
-            (rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])) & (own <= (half + LANE_MARGIN_M) ** 2)
-        ).any(),
+        points_near=points_near | (_outside_box(bank, index, points, 0.0) & goes_on),
+        on_corridor=(corridor & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
         wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
         straddling=outside.any(),
-        leaving_lane=has_lane & leaving.any(),
-        limit=jnp.where(has_lane, limit[best], -1.0),
-        lane=jnp.where(has_lane, jnp.floor(rows[LaneRow.LANE, best]), -1.0).astype(jnp.int32),
-        offset=jnp.where(has_lane, side[0, best], 0.0),
-        z=jnp.where(near, rows[LaneRow.Z, nearest], z),
+        leaving_lane=has_lane & (over > LANE_MARGIN_M),
+        limit=jnp.where(has_lane, driven[LaneRow.LIMIT], -1.0),
+        z=jnp.where(near, nearest[LaneRow.Z], z),
     )
 
 
@@ -273,9 +288,15 @@ def _stored_side(bank: ScenarioBank, index: Integer, points: Float[Array, "P 2"]
 
 
 def left_the_map(bank: ScenarioBank, index: Integer, xy: Vector) -> Bool[Array, ""]:
-    """Return whether a point lies outside the box of all edges and lanes."""
+    """Return whether a point lies outside the box of all edges and lanes, widened by the cut-off of lanes."""
+    return _outside_box(bank, index, xy, LANE_CUTOFF_M) & is_mapped(bank, index)
+
+
+def _outside_box(
+    bank: ScenarioBank, index: Integer, points: Float[Array, "*n 2"], margin_m: float
+) -> Bool[Array, "*n"]:
     box = bank.map_box[index]
-    return ((xy < box[:2]).any() | (xy > box[2:]).any()) & is_mapped(bank, index)
+    return ((points < box[:2] - margin_m) | (points > box[2:] + margin_m)).any(axis=-1)
 
 
 def is_mapped(bank: ScenarioBank, index: Integer) -> Bool[Array, ""]:

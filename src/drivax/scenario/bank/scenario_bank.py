@@ -415,8 +415,17 @@ def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
 
 def _lane_values(scenario: Scenario, lane: Int[np.ndarray, " segment"]) -> tuple[Any, Any, Any]:
     """Half width, limit and number of the lane of each segment, as in :class:`LaneRow`."""
-    width, limit = scenario.lane_width[lane], scenario.lane_limit[lane]
+    width = scenario.lane_width[lane]
     half = np.where(width > 0, width, DEFAULT_LANE_WIDTH_M) / 2
+    return half, _lane_limits(scenario)[lane], lane + 0.5 * corridor_lanes(scenario)[lane]
+
+
+def _lane_limits(scenario: Scenario) -> Float[np.ndarray, " lane"]:
+    """Limit of each lane, m/s; of connectors the highest of the lanes that they join, if known; else of the class."""
+    limit = scenario.lane_limit
+    links = np.concatenate([scenario.lane_predecessor, scenario.lane_successor], axis=1)
+    joined = np.where(links >= 0, limit[links], -1.0).max(axis=1)
+    limit = np.where(scenario.lane_interpolating & (joined > 0), joined, limit)
     for kind, fallback in CLASS_LIMIT_MPS.items():
-        limit = np.where((limit <= 0) & (scenario.lane_kind[lane] == kind), fallback, limit)
-    return half, limit, lane + 0.5 * corridor_lanes(scenario)[lane]
+        limit = np.where((limit <= 0) & (scenario.lane_kind == kind), fallback, limit)
+    return limit
