@@ -116,14 +116,8 @@ class CrossedEffect:
         share_a, share_b = (count / number for count in self.seed_counts)
         interaction = e_a * share_a, e_b * share_b
         scenarios = max(self.scenarios - sum(self.interaction), 0.0) + sum(interaction)
-        return CrossedEffect(
-            self.difference,
-            (a * share_a, b * share_b),
-            scenarios,
-            (number, number),
-            self.clusters,
-            interaction,
-        )
+        seeds, counts = (a * share_a, b * share_b), (number, number)
+        return CrossedEffect(self.difference, seeds, scenarios, counts, self.clusters, interaction)
 
     def _with_clusters(self, number: int) -> CrossedEffect:
         """Extrapolate to ``number`` clusters with the same variance."""
