@@ -239,7 +239,10 @@ def test_the_command(data, tmp_path, capsys):
     for wrong, words in (
         (["--weights", "urgencies", "1"], "unknown component 'urgencies'; did you mean 'urgency'"),
         (["--scenario", "p101"], "unknown aggregator 'p101'"),
-        ([*weights, "--scenario", "urgency", "max"], "missing aggregator for 'braking'; name one for each comp"),
+        (
+            [*weights, "--scenario", "urgency", "max"],
+            "missing aggregator for 'braking'; name one for each comp",
+        ),
         ([*weights, "--scenario", *apart, "densty", "max"], "'densty'; did you mean 'density'"),
         ([*weights, "--scenario", "urgency", "max", "braking", "most"], "unknown aggregator 'most'"),
         (["--scenario", "urgency=max", "braking=p95"], "unknown aggregator 'braking=p95'"),
