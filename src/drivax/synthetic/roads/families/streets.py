@@ -286,12 +286,12 @@ class Highway(StreetFamily):
     def _ramp(self, rng: np.random.Generator, street: Street, extra: Strip, away: int) -> _Ramp:
         """Add a ramp at the beginning of the auxiliary lane (``away`` -1) or at its end (1)."""
         auxiliary = street.lanes[extra.place, extra.first if away < 0 else extra.last - 1]
-        sample = street.cuts[extra.first if away < 0 else extra.last]
+        cut = street.cuts[extra.first if away < 0 else extra.last]
         length = self.ramp_m[0 if away < 0 else 1]
         line = street.draft.lanes[auxiliary].curve
         gore = line.start.turned() if away < 0 else line.end
         # Seen from the highway, an on-ramp bends to the left and an off-ramp to the right.
-        side = np.gradient(street.middle.heading, STEP_M)[sample::away][: round(length / STEP_M) + 1] * away
+        side = np.gradient(street.middle.heading, STEP_M)[cut::away][: round(length / STEP_M) + 1] * away
         bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
         outward = from_curvature(side - away * bend, STEP_M, gore)
         curve = outward if away > 0 else outward.reversed()
