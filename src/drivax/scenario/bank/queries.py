@@ -172,8 +172,8 @@ def around_lanes(
     aligned_cos = (ux * heading[0] + uy * heading[1]) * jax.lax.rsqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
     aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
     own, corner = squared[0], squared[1:]
-    beside = own - side[0] * side[0] <= _JOINT_M**2
-    fits = beside & (aligned_cos > _FITS) & (own <= half * half)
+    alongside = own - side[0] * side[0] <= _JOINT_M**2
+    fits = alongside & (aligned_cos > _FITS) & (own <= half * half)
     corridor = rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])
     # By limit, on the route first; without lanes that fit the nearest.
     rank = jnp.where(corridor & routed, 0.0, 0.2) + 1e-3 * (100.0 - rows[LaneRow.LIMIT])
@@ -192,7 +192,7 @@ def around_lanes(
         points_near = corner.min(axis=1) <= LANE_CUTOFF_M**2
         outside = _outside_lanes(corner, aligned, half)
     goes_on = (jnp.abs(beyond[1:, 1]) <= LANE_CUTOFF_M) | ~inside[two[1]] | (away[0, 1] > _GOES_ON_M**2)
-    over = jnp.where(aligned & beside, reduce(jnp.maximum, jnp.abs(side[1:])) - half, _FAR).min()
+    over = jnp.where(aligned & alongside, reduce(jnp.maximum, jnp.abs(side[1:])) - half, _FAR).min()
     over = jnp.minimum(over, jnp.abs(beyond[1:, 0]).max() - driven[LaneRow.HALF_WIDTH])
     return LaneHits(
         near=near,
