@@ -50,7 +50,7 @@ class FunctionPlanner(Memoryless):
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
         """Return the function's action; NaN where it raised an error."""
         if not self.in_python:
-            return jnp.asarray(self.function(situation, observation), jnp.float32)
+            return jnp.ravel(jnp.asarray(self.function(situation, observation), jnp.float32))
         # The traffic state is internal.
         seen = replace(situation, context=replace(situation.context, traffic=()))
         identity, size = bank.identity[situation.context.index], situation.context.action.shape
@@ -119,9 +119,9 @@ def _answers(function: Drive, identity: Any, seen: tuple[Any, ...], size: tuple[
     for at in np.ndindex(identity.shape):
         try:
             action = np.asarray(function(*jax.tree.map(lambda leaf, at=at: leaf[at], seen)), np.float32)
-            if action.shape != size:
+            if action.size != size[0]:
                 raise ValueError(f"{list(action.shape)} is no action; give {size[0]} numbers")
-            actions[at] = action
+            actions[at] = action.ravel()
         except Exception as error:
             if not _listeners:
                 raise
