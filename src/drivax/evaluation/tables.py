@@ -23,7 +23,7 @@ from drivax.table import Cell, Column, Table, interval_cell
 CONFIDENCE = 0.95
 SEED = 0
 #: Tags by which results are broken down.
-STRATA = ("difficulty", "type", "density")
+STRATA = ("difficulty", "type", "density", "scenario_types")
 #: The value of a tag in scenarios that lack it.
 UNKNOWN = "unknown"
 #: Kinds of collision: name, and what it says about the planner.
@@ -244,14 +244,19 @@ def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
 
 
 def strata_table(runs: Sequence[EpisodeTable], tags: Tags, tag: str, metrics: Sequence[str]) -> Table:
-    """Return a table with a row per value of a tag and run, metrics in columns; without the tag it is ``unknown``."""
-    values = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
+    """Return a table with a row per value of a tag and run, metrics in columns; without the tag it is ``unknown``.
+
+    A scenario with several words (``scenario_types``) counts in the row of each.
+    """
+    values = {
+        run.name: [tags.get(key, {}).get(tag, UNKNOWN).split("|") for key in run.scenarios] for run in runs
+    }
     order = {value: place for place, value in enumerate(TAGS.get(tag, ()))}
-    every = {value for of_run in values.values() for value in of_run}
+    every = {value for of_run in values.values() for words in of_run for value in words}
     rows = []
     for value in sorted(every, key=lambda value: (order.get(value, len(order)), value)):
         for run in runs:
-            inside = np.flatnonzero(np.array(values[run.name]) == value)
+            inside = np.flatnonzero([value in words for words in values[run.name]])
             if inside.size:
                 link = {"run": run.name, "tags": {tag: value}}
                 means = ((name, summarise(run, name, inside)) for name in metrics)

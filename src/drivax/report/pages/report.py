@@ -280,7 +280,7 @@ def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[Scena
 
     ``metrics`` says how each is shown and which value of a rate is a failure; ``runs[].values`` holds one column per
     metric with four significant digits, null where undefined, rows worst first; ``runs[].errors`` by row the step and
-    the error of a crash; ``tags`` holds for each tag its values and for each scenario the index of its value, which is
+    the error of a crash; ``tags`` holds for each tag its words and for each scenario the indices of its own, of
     ``unknown`` where it has none.
     """
     names = tables.ordered(tables.metric_names(runs))
@@ -341,9 +341,10 @@ def _rounded(value: float) -> float:
 def _tags(tagged: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     columns = []
     for name in dict.fromkeys(name for tags in tagged for name in tags):
-        values = [tags.get(name, tables.UNKNOWN) for tags in tagged]
-        distinct = sorted(set(values))
+        values = [tags.get(name, tables.UNKNOWN).split("|") for tags in tagged]
+        distinct = sorted({word for words in values for word in words})
         if 1 < len(distinct) <= MOST_VALUES:
-            number = {value: place for place, value in enumerate(distinct)}
-            columns.append({"name": name, "words": distinct, "of": [number[value] for value in values]})
+            number = {word: place for place, word in enumerate(distinct)}
+            of = [[number[word] for word in words] for words in values]
+            columns.append({"name": name, "words": distinct, "of": of})
     return columns
