@@ -71,50 +71,42 @@ class RouteIdm(AbstractPlanner):
     def initialize(self, initialization):
         self.map, self.route = initialization.map_api, initialization.route_roadblock_ids
 
-    def _path(self, ego):
-        blocks = [
-            self.map.get_map_object(i, ROADBLOCK) or self.map.get_map_object(i, ROADBLOCK_CONNECTOR)
-            for i in self.route
-        ]
-        lanes = [lane for block in blocks for lane in block.interior_edges]
-        lane = min(
-            lanes,
-            key=lambda lane: math.hypot(
-                *np.subtract(
-                    lane.baseline_path.get_nearest_pose_from_position(ego.rear_axle.point).point.array,
-                    ego.rear_axle.point.array,
-                )
-            ),
-        )
-        path, lights = list(lane.baseline_path.discrete_path), []
-        while following := [edge for edge in lane.outgoing_edges if edge.get_roadblock_id() in self.route]:
+    def _path(self, point):
+        """Poses along the nearest lane of the route and those after it, and where the lanes start."""
+        layers = (ROADBLOCK, ROADBLOCK_CONNECTOR)
+        blocks = [self.map.get_map_object(i, layer) for i in self.route for layer in layers]
+        lanes = [lane for block in blocks if block for lane in block.interior_edges]
+        away = lambda lane: lane.baseline_path.get_nearest_pose_from_position(point).point.array - point.array  # noqa: E731
+        lane = min(lanes, key=lambda lane: math.hypot(*away(lane)))
+        here, limit = lane.baseline_path.get_nearest_arc_length_from_position(point), lane.speed_limit_mps
+        path, begins = list(lane.baseline_path.discrete_path), []
+        while len(begins) < 20 and (
+            following := [edge for edge in lane.outgoing_edges if edge.get_roadblock_id() in self.route]
+        ):
             lane = following[0]
-            lights.append((len(path) - 1, lane.id))
+            begins.append((len(path) - 1, lane.id))
             path += lane.baseline_path.discrete_path[1:]
-        return np.array([[pose.x, pose.y, pose.heading] for pose in path]), lights, lane.speed_limit_mps
+        return np.array([[pose.x, pose.y, pose.heading] for pose in path]), begins, here, limit
 
     def compute_planner_trajectory(self, current_input):
         ego, observation = current_input.history.current_state
-        path, lights, limit = self._path(ego)
+        path, begins, here, limit = self._path(ego.rear_axle.point)
         arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))])
-        here = arc[np.argmin(np.hypot(*(path[:, :2] - ego.rear_axle.point.array).T))]
         front = here + ego.car_footprint.vehicle_parameters.front_length
         red = {data.lane_connector_id for data in current_input.traffic_light_data if data.status == RED}
-        gaps = [(arc[row] - front, 0.0) for row, lane in lights if int(lane) in red]
+        gaps = [(arc[row] - front, 0.0) for row, lane in begins if int(lane) in red]
         for agent in observation.tracked_objects.get_agents():
             away = np.hypot(*(path[:, :2] - agent.center.point.array).T)
             if away.min() < 2.0:
                 gaps.append((arc[away.argmin()] - agent.box.half_length - front, agent.velocity.magnitude()))
         gap, ahead = min([gap for gap in gaps if gap[0] > 0.0], default=(1e4, 0.0))
         speed, at, poses = ego.dynamic_car_state.speed, here, []
+        path[:, 2] = np.unwrap(path[:, 2])
         for _ in range(17):
             poses.append([np.interp(at, arc, column) for column in path.T])
             closing = max(0.0, 2.0 + 1.5 * speed + speed * (speed - ahead) / (2 * math.sqrt(3.0)))
-            speed = max(
-                speed
-                + 0.5 * max(1.0 - (speed / (limit or 15.0)) ** 4 - (closing / max(gap, 0.5)) ** 2, -3.0),
-                0.0,
-            )
+            free, near = (speed / (limit or 15.0)) ** 4, (closing / max(gap, 0.5)) ** 2
+            speed = max(speed + 0.5 * max(1.0 - free - near, -3.0), 0.0)
             at, gap = at + 0.5 * speed, gap + 0.5 * (ahead - speed)
         return Trajectory(sampled(current_input.iteration.time_us, poses, 0.5))
 

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import drivax
+from drivax.api import find_planner
 from drivax.errors import UsageError
+from drivax.evaluation.rollout import drive, episode_keys
 from drivax.evaluation.runner import evaluate, format_crashes
 from drivax.planners.catalogue import default_task, make_planner
 from drivax.planners.nuplan.interface import DynamicCarState, StateVector2D, TrackedObjectType
 from drivax.planners.nuplan.map import MapApi, SemanticMapLayer
 from drivax.planners.nuplan.planner import Host, NuplanPlanner, View
-from drivax.scenario.bank.scenario_bank import Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
+from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import DIRECT_STATE, PHYSICAL, Trajectory
 from drivax.tasks.task import Task
 from nuplan_planners import Faulty, Late, Replay
@@ -66,31 +71,42 @@ def axle(scenario):
     return np.column_stack([xy - behind * np.column_stack([np.cos(heading), np.sin(heading)]), heading])
 
 
+def replay(scenario, space):
+    """Motion under a planner that repeats the log, and what it was given."""
+    seen = []
+    planner = NuplanPlanner(Host(Replay(axle(scenario), seen), "tests:Replay"), space)
+    planner.prepare(lambda number: scenario)
+    simulator = Simulator(replace(TASK, actions=space, metrics="none", to_the_end=True))
+    bank, rows = ScenarioBank.from_scenarios([scenario]), jnp.arange(1)
+    episodes = jax.device_get(drive(simulator, planner, bank, rows, episode_keys(bank, rows, 0)))
+    assert episodes.crashed.tolist() == [-1]
+    return episodes.motion[0], seen
+
+
 @pytest.fixture(scope="module")
 def replayed(scenarios):
-    """Two runs of a planner that repeats the log, one per controller, and what it was given."""
-    seen, results = [], {}
-    for space in (SPACE, DIRECT_STATE):
-        planner = NuplanPlanner(Host(Replay(axle(scenarios[3]), seen), "tests:Replay"), space)
-        results[space] = evaluate(planner, scenarios[3:], task=replace(TASK, actions=space))
-    return results, seen
+    return replay(scenarios[3], DIRECT_STATE)
 
 
-def test_a_planner_that_repeats_the_log_is_tracked(replayed, scenarios):
-    """Under perfect tracking it is the log; the LQR starts at the log's steering and stays near."""
-    results, _ = replayed
-    logged = scenarios[3].agent_xy[10:, 0]
-    for space, near in ((DIRECT_STATE, 1e-4), (SPACE, 0.25)):
-        away = np.linalg.norm(results[space].trajectories.ego[0, :, :2] - logged, axis=1)
-        assert away.max() < near, space
-        assert not results[space].crashes
-    assert results[SPACE].planner == "replay"
+def test_a_planner_that_repeats_the_log_drives_it(replayed, scenarios):
+    np.testing.assert_allclose(replayed[0][:, :2], scenarios[3].agent_xy[10:, 0], rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_controller_tracks_the_log(scenarios):
+    motion, seen = replay(scenarios[3], SPACE)
+    assert np.linalg.norm(motion[:, :2] - scenarios[3].agent_xy[10:, 0], axis=1).max() < 0.25
+    # Ego's acceleration and steering are those of the actuators.
+    ego = seen[40].history.ego_states[-1]
+    assert ego.tire_steering_angle == pytest.approx(
+        np.arctan(ego.car_footprint.vehicle_parameters.wheel_base / 60.0), abs=0.02
+    )
+    assert ego.dynamic_car_state.tire_steering_rate != 0.0
 
 
 def test_inputs_are_those_of_the_set(replayed, scenarios):
     """At 1e-6 of the stored log: ego, agents, lights, time, and the history before the start."""
-    _, seen = replayed
-    scenario, direct = scenarios[3], seen[len(seen) // 2 :]
+    scenario, direct = scenarios[3], replayed[1]
     origin = scenario.origin[:2]
     assert len(direct) == 81 and direct[1].iteration.index == 0
     for known in (direct[1], direct[40]):
@@ -158,11 +174,12 @@ def test_a_route_follower_drives_brakes_and_stops(scenarios):
         assert not results.metrics[metric].any(), metric
     driven = results.trajectories.ego
     assert driven[0, -1, 3] > 10.0 and results.metrics["progress_ratio"][0] == 1.0
-    assert (driven[1:, -1, 3] < 1.0).all()
+    assert (driven[1:, -1, 3] < 1.5).all()
     along = np.linalg.norm(driven[:, -1, :2] - driven[:, 0, :2], axis=1)
     assert 36.0 < along[1] < 50.0 - 4.8 and 28.0 < along[2] < 40.0 - 2.4
 
 
+@pytest.mark.slow
 def test_episodes_do_not_depend_on_the_batch(scenarios):
     """Each scenario has an instance of its own, also in a second evaluation."""
     planner = make_planner("nuplan_planners:RouteIdm", SPACE)
@@ -172,6 +189,7 @@ def test_episodes_do_not_depend_on_the_batch(scenarios):
     np.testing.assert_array_equal(alone[0], together[1])
 
 
+@pytest.mark.slow
 def test_errors_of_the_planner_fail_its_episode(scenarios):
     planner = NuplanPlanner(Host(Faulty, "tests:Faulty"), SPACE)
     results = evaluate(planner, scenarios[:1], task=TASK)
@@ -205,6 +223,8 @@ def test_the_planner_has_its_own_action_space_unless_the_task_gives_one(scenario
     assert isinstance(planner, NuplanPlanner) and default_task(planner).actions == Trajectory()
     assert make_planner("nuplan_planners:RouteIdm", PHYSICAL).actions == PHYSICAL
     bank = drivax.load(scenarios[:1]).bank
+    assert find_planner("nuplan_planners:RouteIdm", bank)[1].actions == Trajectory()
+    assert find_planner("nuplan_planners:RouteIdm", bank, task=TASK)[0].actions == SPACE
     with pytest.raises(UsageError, match="route_idm needs stored scenarios"):
         evaluate(
             planner,
@@ -214,6 +234,7 @@ def test_the_planner_has_its_own_action_space_unless_the_task_gives_one(scenario
         )
 
 
+@pytest.mark.slow
 def test_the_first_poses_are_followed_by_the_bicycle(scenarios):
     planner = make_planner("nuplan_planners:RouteIdm", PHYSICAL)
     results = evaluate(planner, scenarios[:1], task=replace(TASK, actions=PHYSICAL))

@@ -90,6 +90,7 @@ class Memory:
 class ScoredProposals:
     """Simulated and scored proposals of a step: speeds of one line after each other, lines in order."""
 
+    plans: Float[Array, "N T 3"]  # Poses along the lines, which cars track
     cars: Car  # Simulated motion, step by step
     metrics: ProposalMetrics  # Metrics of each proposal
     score: Float[Array, " N"]  # In [0, 1]
@@ -140,7 +141,7 @@ class PdmPlanner:
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = self.actions.action(motion, acceleration, curvature, length)
         if tracked:
-            action = jnp.where(brakes, action, tracked.plan(scored.cars.motion[best, :, :3]))
+            action = jnp.where(brakes, action, tracked.plan(scored.plans[best]))
         return action, Memory(touched, acceleration, steering)
 
     def score_proposals(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> ScoredProposals:
@@ -174,7 +175,9 @@ class PdmPlanner:
         metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, 0, None, None, None, 0, 0, None))(
             cars.motion, cars.acceleration, yaw_rate, size, others, ground, ends, config.scoring
         )
-        return ScoredProposals(cars, metrics, scoring.scores(metrics, config.scoring))
+        heading = jnp.arctan2(reference.pose[..., 3:], reference.pose[..., 2:3])
+        plans = jnp.concatenate([reference.pose[..., :2], heading], axis=-1)
+        return ScoredProposals(plans, cars, metrics, scoring.scores(metrics, config.scoring))
 
     def _wheelbase(self, length_m: Float[Array, ""]) -> Float[Array, ""]:
         return self.config.tracking.wheelbase * jnp.maximum(length_m, 1.0)
