@@ -21,7 +21,7 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.plan import ComparisonPlan
 from drivax.evaluation.runner import with_metrics
 from drivax.learning.policies import find_traffic, load_policy
-from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
+from drivax.planners.catalogue import PLANNERS, as_planner, default_task, make_planner
 from drivax.planners.planner import Planner
 from drivax.plugins import is_dotted
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
@@ -123,10 +123,11 @@ def evaluate(
         planner, task = find_planner(str(planner), loaded.bank, sample, task)
     elif sample:
         raise UsageError("only a policy by name can sample", cure="leave out sample=")
+    planner = as_planner(planner, getattr(planner, "__name__", "planner"))
     return runner.evaluate(
-        as_planner(planner, getattr(planner, "__name__", "planner")),
+        planner,
         data.scenarios if isinstance(data, Loaded) else ScenarioSet.open(data),
-        task=with_metrics(task or Task(), tuple(metrics)),
+        task=with_metrics(task or default_task(planner), tuple(metrics)),
         traffic=_traffic(traffic),
         start=start,
         sizes=loaded.sizes,
@@ -149,7 +150,8 @@ def find_planner(
         UsageError: There is no such planner, folder or policy, or a policy was given another task.
     """
     if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
-        return make_planner(name, task and task.actions), task or Task()
+        planner = make_planner(name, task and task.actions)
+        return planner, task or default_task(planner)
     folder, step = run_and_step(name)
     if not is_policy(folder):
         kinds = [*PLANNERS, "package.module:name", "the folder of a training run", *zoo()]

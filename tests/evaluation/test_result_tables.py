@@ -111,6 +111,18 @@ def test_strata_in_the_order_of_their_words():
     assert [numbers(table, row)[0].interval.n for row in table.rows] == [8, 8, 3, 3, 1, 1]
 
 
+def test_scenarios_of_several_types_count_in_each():
+    types = ["stopping_with_lead|near_multiple_vehicles", "stopping_with_lead"] + ["changing_lane"] * (N - 3)
+    tags = {("d", f"s{i}"): {"scenario_types": words} for i, words in enumerate(types)}
+    success = [1, 0] + [1] * (N - 2)
+    table = strata_table([run("a", {"success": success})], tags, "scenario_types", ["success"])
+    assert [label for label, _ in labels(table)] == [
+        "changing_lane", "near_multiple_vehicles", "stopping_with_lead", "unknown",
+    ]  # fmt: skip
+    assert means(table) == [[1.0], [1.0], [0.5], [1.0]]
+    assert [numbers(table, row)[0].interval.n for row in table.rows] == [N - 3, 1, 2, 1]
+
+
 def test_transfer_is_training_by_evaluation():
     runs = [
         run(

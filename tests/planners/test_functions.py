@@ -8,7 +8,7 @@ import pytest
 from drivax.errors import UsageError
 from drivax.evaluation.rollout import drive, episode_keys
 from drivax.planners.catalogue import make_planner
-from drivax.planners.functions import python_planner, raised
+from drivax.planners.functions import python_actions, python_planner, raised
 from drivax.planners.planner import Planner
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
@@ -98,6 +98,18 @@ def test_invalid_actions_are_reported(bank, moments):
             assert np.isnan(actions(planner, bank, moments)).all()
         assert len({who for who, _ in errors}) == 2
         assert all(words in text for text in errors.values()), errors
+
+
+def test_a_plan_may_be_an_array_of_poses():
+    """The function gets numpy arrays of one scenario at a time; its numbers are flattened."""
+
+    def plan(speed):
+        assert isinstance(speed, np.ndarray | np.float32) and np.shape(speed) == ()
+        return np.stack([speed * np.arange(4), np.zeros(4), np.zeros(4)], axis=1)
+
+    steps = jnp.array([10, 11], jnp.int32)
+    batched = jax.jit(jax.vmap(lambda step: python_actions(plan, step, step, (0.5 * step,), 12)))
+    np.testing.assert_allclose(batched(steps).reshape(2, 4, 3)[..., 0], np.outer([5.0, 5.5], np.arange(4)))
 
 
 def test_errors_end_a_custom_loop(bank, moments):

@@ -13,10 +13,10 @@ from drivax.networks.encoders import MlpConfig
 from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.functions import NetworkPlanner
 from drivax.planners.planner import Planner
-from drivax.planners.simple import IdmPlanner, RandomActions, expert_action, logged_motion
+from drivax.planners.simple import IdmPlanner, RandomActions, expert_action, logged_motion, logged_poses
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import PHYSICAL
+from drivax.tasks.actions import PHYSICAL, Trajectory
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from scenes import RED, bank_of, car, straight_road
@@ -96,6 +96,30 @@ def test_expert_follows_the_log_and_stays_where_it_ends(simulator):
     np.testing.assert_allclose(logged_motion(bank, gone, 1), gone.history[-1])
     steady = expert_action(bank, simulator.context(bank, 0, 10), PHYSICAL)
     np.testing.assert_allclose(steady, 0.0, atol=1e-4)
+
+
+def test_logged_poses_go_on_through_gaps_and_after_the_log(simulator):
+    late = car(20, 3.7, 0, 6, steps=[*range(30), *range(35, 60)])
+    bank = bank_of(straight_road([car(0, 0, 0, 9), late]))
+    time = np.arange(41)
+    for slot, step, begin, speed in ((0, 70, 54.0, 9.0), (1, 28, 30.8, 6.0)):
+        poses = logged_poses(bank, simulator.context(bank, 0, step, slot), 40)
+        np.testing.assert_allclose(poses[:, 0], begin + 0.1 * speed * time, atol=1e-3)
+        np.testing.assert_allclose(poses[:, 1:], [[3.7 * slot, 0.0]] * 41, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["expert_actions", "idm", "pdm"])
+def test_planners_plan_trajectories_for_a_controller(name):
+    """From where ego is; behind a standing car the plans of IDM and PDM end before it, the log drives through."""
+    space = Trajectory(steps=40)
+    seen = ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2)
+    tracked = Simulator(Task(actions=space, observation=seen, metrics="none"))
+    bank = bank_of(straight_road([car(0, 0, 0, 9), car(30, 0, 0, 0)]))
+    plan = act(make_planner(name, space), tracked, bank).reshape(-1, 3)
+    assert plan.shape == (41, 3)
+    np.testing.assert_allclose(plan[0], 0.0, atol=1e-5)
+    assert (np.diff(plan[:, 0]) > -1e-4).all() and np.abs(plan[:, 2]).max() < 0.1
+    assert plan[-1, 0] == pytest.approx(36.0, abs=1e-3) if name == "expert_actions" else plan[-1, 0] < 25.2
 
 
 @pytest.mark.slow

@@ -9,15 +9,8 @@ import pytest
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize_scalar
 
-from drivax.planners.pdm.tracking import (
-    Car,
-    Reference,
-    TrackingConfig,
-    acceleration_to,
-    moved,
-    steering_rate,
-    track,
-)
+from drivax.planners.pdm.tracking import Car, Reference, moved, track
+from drivax.simulator.controller import TrackingConfig, acceleration_to, steering_rate
 from drivax.simulator.dynamics import bicycle
 from quick import quick
 

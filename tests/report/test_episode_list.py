@@ -49,7 +49,7 @@ def test_list_holds_every_episode_of_every_run(page, runs):
         and bad["progress_ratio"] is bad["collision_type"] is None
     )
     (difficulty,) = data["tags"]
-    words = [difficulty["words"][word] for word in difficulty["of"]]
+    words = [difficulty["words"][word] for (word,) in difficulty["of"]]
     assert words == ["hard" if int(name[-2:]) % 2 else "easy" for name in data["scenarios"]]
     assert sorted(data["played"].values()) == list(range(8))
 

@@ -50,6 +50,7 @@ def chosen(*filters):
         ("tag.fleet=7", True),
         ("tag.fleet!=7", False),
         ("scenario_types=left_turn", True),
+        ("scenario_types=left_turn|starting_left_turn", True),
         ("scenario_types=u_turn|stop", True),
         ("scenario_types!=left_turn", False),
         ("scenario_types=turn", False),

@@ -26,11 +26,12 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
+from drivax.settings.structure import kind_of
 from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.types import AgentContext, SimState, Traffic
 from drivax.synthetic.world import generate_recording
-from drivax.tasks.actions import DISCRETE, DirectState, Discrete
+from drivax.tasks.actions import DISCRETE, DirectState, Discrete, Trajectory
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
@@ -397,8 +398,9 @@ def _option(options: Mapping[str, Any] | None, name: str) -> Any:
 
 
 def _action_space(task: Task) -> gymnasium.spaces.Space[Any]:
-    if isinstance(task.actions, DirectState):
-        raise UsageError("direct_state is unbounded and has no space", cure="use another action space")
+    if isinstance(task.actions, DirectState | Trajectory):
+        kind = kind_of(type(task.actions))
+        raise UsageError(f"{kind} is unbounded and has no space", cure="use another action space")
     if isinstance(task.actions, Discrete):
         return gymnasium.spaces.Discrete(task.actions.choices)
     return gymnasium.spaces.Box(-1.0, 1.0, (task.actions.size,), np.float32)

@@ -76,8 +76,11 @@ class _Watch:
     def motion(self, motion: Array, action: Array, length: Any) -> Array:
         return PHYSICAL.move(motion, action, length)
 
-    def actuated(self, motion: Array, action: Array, last: Array) -> Array:
-        return PHYSICAL.actuated(motion, action, last)
+    def actuated(self, motion: Array, action: Array, last: Array, length: Any) -> Array:
+        return PHYSICAL.actuated(motion, action, last, length)
+
+    def coast(self, motion: Array, length: Any) -> Array:
+        return jnp.zeros(2)
 
     def first_action(self, history: Array, length: Any) -> Array:
         return PHYSICAL.first(history, length)

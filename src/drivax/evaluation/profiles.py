@@ -26,6 +26,7 @@ from drivax.files import write_text
 from drivax.geometry.boxes import corners
 from drivax.scenario.bank.queries import LEVEL_M, around_lanes, offroad_distance
 from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M, ScenarioBank, Sizes
+from drivax.scenario.roadblocks import lane_lines, roadblocks
 from drivax.scenario.schema import DT_S, AgentKind, Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.contact import REAR_AXLE
@@ -261,17 +262,10 @@ def _corner_distances(
 
 def _objects(scenario: Scenario) -> list[RoadObject]:
     """Lanes and connectors, in the order of the lane graph; those without segments have an empty area."""
-    count = int((scenario.lane_id >= 0).sum())
-    first, last = (int(end) for end in scenario.segment_blocks[1:3])
-    lane, start_m = scenario.segment_lane[first:last], scenario.segment_start_m[first:last]
-    blocks = _blocks(scenario, count)
-    objects = []
-    for index in range(count):
-        segments = first + np.flatnonzero(lane == index)[np.argsort(start_m[lane == index], kind="stable")]
-        points = np.concatenate(
-            [scenario.segment_a[segments, :2], scenario.segment_b[segments[-1:], :2]]
-        ).astype(np.float64)
-        line: Any = shapely.linestrings(points) if len(segments) else shapely.LineString()
+    lines, blocks, objects = lane_lines(scenario), roadblocks(scenario), []
+    count = len(lines)
+    for index, points in enumerate(lines):
+        line: Any = shapely.linestrings(points) if len(points) else shapely.LineString()
         width, limit = float(scenario.lane_width[index]), float(scenario.lane_limit[index])
         half = (width if width > 0 else DEFAULT_LANE_WIDTH_M) / 2
         links = (scenario.lane_successor[index], scenario.lane_predecessor[index])
@@ -283,21 +277,3 @@ def _objects(scenario: Scenario) -> list[RoadObject]:
             )
         )  # fmt: skip
     return objects
-
-
-def _blocks(scenario: Scenario, count: int) -> list[int]:
-    """Return the roadblock of every lane, shared by parallel lanes, and by connectors between the same two blocks."""
-    blocks = list(range(count))
-    for index in range(count):
-        for other in (int(scenario.lane_left[index]), int(scenario.lane_right[index])):
-            if 0 <= other < count and not scenario.lane_interpolating[index]:
-                low, high = sorted((blocks[index], blocks[other]))
-                blocks = [low if block == high else block for block in blocks]
-    pairs: dict[tuple[int, int], int] = {}
-    for index in np.flatnonzero(scenario.lane_interpolating[:count]).tolist():
-        before, after = (
-            int(links[index, 0]) for links in (scenario.lane_predecessor, scenario.lane_successor)
-        )
-        if 0 <= before < count and 0 <= after < count:
-            blocks[index] = pairs.setdefault((blocks[before], blocks[after]), index)
-    return blocks

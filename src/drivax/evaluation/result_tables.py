@@ -22,7 +22,7 @@ from drivax.table import Cell, Column, Table, interval_cell
 CONFIDENCE = 0.95
 SEED = 0
 #: Tags by which results are broken down.
-STRATA = ("difficulty", "type", "density")
+STRATA = ("difficulty", "type", "density", "scenario_types")
 #: The value of a tag in scenarios that lack it.
 UNKNOWN = "unknown"
 #: Kinds of collision: name, and typical cause.
@@ -243,14 +243,19 @@ def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
 
 
 def strata_table(runs: Sequence[EpisodeTable], tags: Tags, tag: str, metrics: Sequence[str]) -> Table:
-    """Return a table with a row per value of a tag and run, metrics in columns; without the tag it is ``unknown``."""
-    values = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
+    """Return a table with a row per value of a tag and run, metrics in columns; without the tag it is ``unknown``.
+
+    A scenario with several words (``scenario_types``) counts in the row of each.
+    """
+    values = {
+        run.name: [tags.get(key, {}).get(tag, UNKNOWN).split("|") for key in run.scenarios] for run in runs
+    }
     order = {value: place for place, value in enumerate(TAGS.get(tag, ()))}
-    present_values = {value for run_values in values.values() for value in run_values}
+    present_values = {value for run_words in values.values() for words in run_words for value in words}
     rows = []
     for value in sorted(present_values, key=lambda value: (order.get(value, len(order)), value)):
         for run in runs:
-            episodes = np.flatnonzero(np.array(values[run.name]) == value)
+            episodes = np.flatnonzero([value in words for words in values[run.name]])
             if episodes.size:
                 link = {"run": run.name, "tags": {tag: value}}
                 means = ((name, summarise(run, name, episodes)) for name in metrics)

@@ -138,19 +138,19 @@ def advance(
 ) -> tuple[SimState, Any, Bool[Array, ""]]:
     """Return state and carry one step later, and whether the action was finite; replaying planners follow the log.
 
-    An action that is not finite is replaced by ``Task.first_action``, so that the state stays finite.
+    An action that is not finite is replaced by ``Task.coast``, so that the state stays finite.
     """
     situation = simulator.situation(bank, state)
     observation = simulator.observe(bank, state.context)
     action, carry = planner.act(carry, bank, state, situation, observation, key)
-    if planner.replays:
-        action = simulator.task.actuated(state.context.history[-1], action, state.context.action)
-        logged = logged_motion(bank, state.context, 1)
-        return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
-    context, is_finite = state.context, jnp.isfinite(action).all()
+    context, motion = state.context, state.context.history[-1]
     length_m = bank.length_m(context.index, context.slot)
-    fallback = simulator.task.first_action(context.history, length_m)
-    return simulator.step(bank, state, jnp.where(is_finite, action, fallback))[0], carry, is_finite
+    if planner.replays:
+        action = simulator.task.actuated(motion, action, context.action, length_m)
+        logged = logged_motion(bank, context, 1)
+        return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
+    is_finite, coast = jnp.isfinite(action).all(), simulator.task.coast(motion, length_m)
+    return simulator.step(bank, state, jnp.where(is_finite, action, coast))[0], carry, is_finite
 
 
 def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:

@@ -226,12 +226,19 @@ def evaluate(
     steps = scenarios.steps if isinstance(scenarios, ScenarioBank) else STEPS
     simulator = Simulator(task or Task(), traffic or LogTraffic(), start or LogStart())
     evaluation = _Evaluation.of(simulator, planner, start_step, seed, steps)
+    prepare: Callable[[Callable[[int], Scenario]], None] | None = getattr(planner, "prepare", None)
     if isinstance(scenarios, ScenarioBank):
+        if prepare is not None:
+            problem = f"planner {planner.name} needs stored scenarios"
+            raise UsageError(problem, cure="pass the set, or what drivax.load returns")
         names, identity = _bank_names(scenarios, names or (), start_step), np.asarray(scenarios.identity)
         size, banks = len(scenarios), iter([scenarios])
     else:
         names = _stored_names(scenarios, start_step)
         identity = identities([(row["dataset"], row["scenario_id"]) for row in names])
+        if prepare is not None:
+            rows = {int(number): row for row, number in enumerate(identity)}
+            prepare(lambda number: scenarios[rows[number]])
         sizes = sizes or Sizes.used(scenarios)
         size = min(batch or _fitting(simulator.traffic, scenarios, sizes), len(scenarios))
         banks = _banks(scenarios, identity, size, sizes)

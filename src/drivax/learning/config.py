@@ -18,12 +18,13 @@ from drivax.learning.driving import Driving
 from drivax.learning.training_log import Rule
 from drivax.plugins import is_dotted
 from drivax.scenario.schema import CURRENT_STEP
+from drivax.settings.structure import kind_of
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import TRAFFIC, make_traffic
 from drivax.simulator.types import Traffic
-from drivax.tasks.actions import DirectState
+from drivax.tasks.actions import DirectState, Trajectory
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, zoo
 
@@ -73,8 +74,9 @@ class TrainConfig:
     devices: int | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.task.actions, DirectState):
-            raise UsageError("policies cannot learn in direct_state", cure="choose a space in [-1, 1]")
+        if isinstance(self.task.actions, DirectState | Trajectory):
+            kind = kind_of(type(self.task.actions))
+            raise UsageError(f"policies cannot learn in {kind}", cure="choose a space in [-1, 1]")
         if self.evaluate_every < 0 or min(self.checkpoint_every, self.keep) < 1 or self.patience < 0:
             problem = "evaluate_every and patience are at least 0, checkpoint_every and keep at least 1"
             raise UsageError(problem, cure="use patience 0 to train to the end")

@@ -175,7 +175,9 @@ class Driving:
         """Return the expert's executed action, and whether it was clipped."""
         space = self.task.actions
         action = expert_action(bank, context, space)
-        return space.actuated(context.history[-1], action, context.action), space.clipped(action)
+        length_m = bank.length_m(context.index, context.slot)
+        executed = space.actuated(context.history[-1], action, context.action, length_m)
+        return executed, space.clipped(action)
 
     def _rollout(self, bank: ScenarioBank, index: Int[Array, ""]) -> tuple[Array, ...]:
         """Action, reward, terminated, truncated and clipped of the expert in one scenario from the current step on."""

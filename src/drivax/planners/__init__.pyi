@@ -5,6 +5,7 @@ from .functions import FunctionPlanner as FunctionPlanner
 from .functions import NetworkPlanner as NetworkPlanner
 from .functions import jax_planner as jax_planner
 from .functions import python_planner as python_planner
+from .nuplan import NuplanPlanner as NuplanPlanner
 from .pdm import EmergencyBrake as EmergencyBrake
 from .pdm import PdmConfig as PdmConfig
 from .pdm import PdmPlanner as PdmPlanner

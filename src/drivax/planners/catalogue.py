@@ -7,11 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 from drivax.errors import UsageError
+from drivax.planners.nuplan.planner import Host, NuplanPlanner, is_nuplan
 from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
 from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner, RandomActions
 from drivax.plugins import check_arguments, find_named, is_dotted
 from drivax.tasks.actions import ActionSpace
+from drivax.tasks.task import Task
 
 PLANNERS: dict[str, Callable[[], Planner]] = {
     "expert": Expert,
@@ -36,21 +38,35 @@ def make_planner(name: str, actions: ActionSpace | None = None) -> Planner:
     return replace(planner, actions=actions) if actions and hasattr(planner, "actions") else planner  # type: ignore
 
 
+def default_task(planner: Planner) -> Task:
+    """Return the default task, with the planner's own action space."""
+    return Task(actions=getattr(planner, "actions", Task().actions))
+
+
 def as_planner(thing: Any, name: str) -> Planner:
     """Return a planner of the user's: ``thing`` itself, or what its class or function makes without arguments.
+
+    Objects and classes with nuPlan's interface are adapted (:mod:`drivax.planners.nuplan`).
 
     Raises:
         UsageError: It is no planner and makes none; the message uses ``name``.
     """
-    if isinstance(thing, Planner) and not isinstance(thing, type):
-        return thing
+    if not isinstance(thing, type) and (is_nuplan(thing) or isinstance(thing, Planner)):
+        return _made(thing, name)
     if callable(thing):
         try:
             check_arguments(thing, name, ())
         except ValueError as error:
             cure = "put @drivax.python_planner or @drivax.jax_planner above a function that drives"
+            cure = f"name a function that makes {name} without arguments" if is_nuplan(thing) else cure
             raise UsageError(str(error), cure=cure) from None
-        thing = thing()
+        return _made(thing if is_nuplan(thing) else thing(), name)
+    return _made(thing, name)
+
+
+def _made(thing: Any, name: str) -> Planner:
+    if is_nuplan(thing):
+        return NuplanPlanner(Host(thing, name))
     if not isinstance(thing, Planner):
         raise UsageError(f"{name!r} makes no planner", cure="see drivax.planners.planner.Planner")
     return thing

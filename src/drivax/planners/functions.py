@@ -26,8 +26,14 @@ from drivax.simulator.types import Action, Situation
 
 Drive = Callable[[Situation, Any], Any]
 
+#: Folder of the package.
+_PACKAGE = Path(__file__).parents[1]
 #: Active collectors of errors; the last one receives them.
 _listeners: list[dict[tuple[int, int], str]] = []
+
+
+class PlannerError(Exception):
+    """A failure of a planner whose text is complete."""
 
 
 @record
@@ -50,16 +56,12 @@ class FunctionPlanner(Memoryless):
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
         """Return the function's action; NaN where it raised an error."""
         if not self.in_python:
-            return jnp.asarray(self.function(situation, observation), jnp.float32)
+            return jnp.ravel(jnp.asarray(self.function(situation, observation), jnp.float32))
         # The traffic state is internal.
         seen = replace(situation, context=replace(situation.context, traffic=()))
-        identity, size = bank.identity[situation.context.index], situation.context.action.shape
-
-        def answer(identity: Any, *seen: Any) -> Any:
-            return _answers(self.function, np.asarray(identity), jax.tree.map(np.asarray, seen), size)
-
-        result = jax.ShapeDtypeStruct(size, jnp.float32)
-        return jax.pure_callback(answer, result, identity, seen, observation, vmap_method="broadcast_all")
+        context = situation.context
+        identity, size = bank.identity[context.index], context.action.shape[0]
+        return python_actions(self.function, identity, context.step, (seen, observation), size)
 
 
 def jax_planner(function: Drive) -> FunctionPlanner:
@@ -77,6 +79,23 @@ def python_planner(function: Drive) -> FunctionPlanner:
     (``evaluation.runner``). It must not call JAX, which waits for it.
     """
     return FunctionPlanner(function, in_python=True)
+
+
+def python_actions(
+    function: Callable[..., Any], identity: Array, step: Array, arguments: tuple[Any, ...], size: int
+) -> Array:
+    """Return ``size`` numbers of a Python function, called outside the compiled program; NaN where it raised an error.
+
+    ``identity`` and ``step`` are those of the scenario, by which errors are collected (:func:`raised`); ``arguments``
+    are pytrees, which the function gets as numpy arrays of one scenario.
+    """
+
+    def answer(identity: Any, steps: Any, arguments: Any) -> Any:
+        identity, steps = np.asarray(identity), np.asarray(steps)
+        return _answers(function, identity, steps, jax.tree.map(np.asarray, arguments), size)
+
+    result = jax.ShapeDtypeStruct((size,), jnp.float32)
+    return jax.pure_callback(answer, result, identity, step, arguments, vmap_method="broadcast_all")
 
 
 @record
@@ -113,24 +132,29 @@ def raised() -> Iterator[dict[tuple[int, int], str]]:
         _listeners.pop()
 
 
-def _answers(function: Drive, identity: Any, seen: tuple[Any, ...], size: tuple[int, ...]) -> Any:
+def _answers(
+    function: Callable[..., Any], identity: Any, steps: Any, seen: tuple[Any, ...], size: int
+) -> Any:
     """Return the function's action for each scenario of a batch of any shape."""
-    actions, steps = np.full((*identity.shape, *size), np.nan, np.float32), seen[0].context.step
+    actions = np.full((*identity.shape, size), np.nan, np.float32)
     for at in np.ndindex(identity.shape):
         try:
             action = np.asarray(function(*jax.tree.map(lambda leaf, at=at: leaf[at], seen)), np.float32)
-            if action.shape != size:
-                raise ValueError(f"{list(action.shape)} is no action; give {size[0]} numbers")
-            actions[at] = action
+            if action.size != size:
+                raise ValueError(f"{list(action.shape)} is no action; give {size} numbers")
+            actions[at] = action.ravel()
         except Exception as error:
             if not _listeners:
                 raise
-            _listeners[-1][int(identity[at]), int(steps[at])] = _message(error)
+            _listeners[-1][int(identity[at]), int(steps[at])] = error_text(error)
     return actions
 
 
-def _message(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """Format an error with its line in the user's function."""
+    if isinstance(error, PlannerError):
+        return str(error)
     text = " ".join(f"{type(error).__name__}: {error}".split())
-    theirs = [place for place in traceback.extract_tb(error.__traceback__) if place.filename != __file__]
+    places = traceback.extract_tb(error.__traceback__)
+    theirs = [place for place in places if not Path(place.filename).is_relative_to(_PACKAGE)]
     return f"{text} ({Path(theirs[0].filename).name}:{theirs[0].lineno})" if theirs else text

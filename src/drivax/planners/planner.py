@@ -17,7 +17,8 @@ class Planner(Protocol):
     """A driver, unbatched and pure.
 
     Register implementations as pytrees (weights are leaves, settings are static): evaluation passes the planner as an
-    argument of its compiled program. What ``act`` does not read is not computed.
+    argument of its compiled program. What ``act`` does not read is not computed. A planner that needs stored scenarios
+    has ``prepare(scenario_of)``, which evaluation calls with a function from a scenario's identity to the scenario.
     """
 
     @property

@@ -13,10 +13,11 @@ from drivax.scenario.bank.columns import AgentColumn, RouteColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
+from drivax.scenario.schema import DT_S
 from drivax.simulator.ahead import ahead
 from drivax.simulator.idm import IdmParameters
 from drivax.simulator.types import MOTION_SPEED, Action, AgentContext, Motion, Situation
-from drivax.tasks.actions import ActionSpace, Physical
+from drivax.tasks.actions import ActionSpace, Physical, Trajectory
 
 
 def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Motion:
@@ -34,8 +35,22 @@ def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Moti
     return jnp.where(logged[AgentColumn.VALID] > 0, motion, context.history[-1])
 
 
+def logged_poses(bank: ScenarioBank, context: AgentContext, steps: int) -> Float[Array, "steps1 3"]:
+    """Return the logged poses from now on; gaps and the time after the log continue at constant velocity."""
+    logged, time = bank.agents[context.index, :, context.slot], jnp.arange(bank.steps)
+    seen = jax.lax.cummax(jnp.where(logged[:, AgentColumn.VALID] > 0, time, 0))
+    at = context.step + jnp.arange(steps + 1)
+    last = seen[jnp.minimum(at, bank.steps - 1)]
+    row = logged[last]
+    xy = row[:, AgentColumn.XY] + ((at - last) * DT_S)[:, None] * row[:, AgentColumn.VELOCITY]
+    heading = jnp.arctan2(row[:, AgentColumn.SIN], row[:, AgentColumn.COS])
+    return jnp.concatenate([xy, heading[:, None]], axis=1)
+
+
 def expert_action(bank: ScenarioBank, context: AgentContext, actions: ActionSpace) -> Action:
     """Return the action that follows the log from here; not clipped, for ``actions.clipped``."""
+    if isinstance(actions, Trajectory):
+        return actions.plan(logged_poses(bank, context, actions.steps))
     ahead, beyond = logged_motion(bank, context, 1), logged_motion(bank, context, 2)
     return actions.expert(context.history[-1], ahead, beyond, bank.length_m(context.index, context.slot))
 

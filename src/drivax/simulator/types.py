@@ -237,8 +237,12 @@ class Task(Protocol):
         """Return the next motion of the driven agent."""
         ...
 
-    def actuated(self, motion: Motion, action: Action, last: Action) -> Action:
+    def actuated(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
         """Return the executed action for a requested ``action``, given the ``last`` executed one."""
+        ...
+
+    def coast(self, motion: Motion, length: Any) -> Action:
+        """Return the action that keeps speed and heading."""
         ...
 
     def first_action(self, history: History, length: Any) -> Action:

@@ -4,6 +4,7 @@ from .actions import DirectState as DirectState
 from .actions import Discrete as Discrete
 from .actions import Physical as Physical
 from .actions import Published as Published
+from .actions import Trajectory as Trajectory
 from .features import Features as Features
 from .features import View as View
 from .observations import ObservationConfig as ObservationConfig

@@ -1,16 +1,17 @@
 """Action spaces: meaning and bounds of actions, the dynamics that they drive, and expert actions.
 
 :class:`Physical` (default), :class:`Published` and :class:`Discrete` drive the kinematic bicycle by acceleration and
-curvature. :class:`DeltaLocal` displaces the agent, :class:`DirectState` sets its state. Except for
-:class:`DirectState`, actions are in [-1, 1] and zero means zero.
+curvature. :class:`DeltaLocal` displaces the agent, :class:`DirectState` sets its state, :class:`Trajectory` has a
+controller follow planned poses. Except for the last two, actions are in [-1, 1] and zero means zero.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -18,6 +19,8 @@ from drivax.errors import UsageError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, Vector
 from drivax.scenario.schema import DT_S
+from drivax.simulator import controller
+from drivax.simulator.controller import TrackingConfig
 from drivax.simulator.dynamics import bicycle, command_between, displace, displacement, follow
 from drivax.simulator.types import History, Motion
 
@@ -62,7 +65,7 @@ class Physical:
         """Whether an action is outside the bounds."""
         return (jnp.abs(action) > 1.0 + _ROUNDING).any()
 
-    def actuated(self, motion: Motion, action: Vector, last: Vector) -> Vector:
+    def actuated(self, motion: Motion, action: Vector, last: Vector, length_m: Any) -> Vector:
         """Clip an action to the bounds, and to the actuator rates given the last executed action.
 
         At standstill, the last acceleration counts as at least zero.
@@ -179,9 +182,9 @@ class Discrete(Physical):
         row = jnp.argmin(jnp.abs(accelerations - action[0]))
         return row * self.curvatures + jnp.argmin(jnp.abs(curvatures - action[1]))
 
-    def actuated(self, motion: Motion, action: Vector, last: Vector) -> Vector:
+    def actuated(self, motion: Motion, action: Vector, last: Vector, length_m: Any) -> Vector:
         """Return the nearest level, limited as in :class:`Physical`."""
-        return super().actuated(motion, self.of_index(self.index(action)), last)
+        return super().actuated(motion, self.of_index(self.index(action)), last, length_m)
 
 
 def _levels(count: int, density: float) -> Float[Array, " count"]:
@@ -220,14 +223,14 @@ class DeltaLocal:
         return (jnp.abs(action) > 1.0 + _ROUNDING).any() | (action[0] * self.ahead_m < -1e-3)
 
     def actuated(
-        self, motion: Motion, action: Float[Array, " 3"], last: Float[Array, " 3"]
+        self, motion: Motion, action: Float[Array, " 3"], last: Float[Array, " 3"], length_m: Any
     ) -> Float[Array, " 3"]:
         """Return the action clipped to its bounds."""
         return jnp.clip(action, jnp.array([0.0, -1.0, -1.0]), 1.0)
 
     def move(self, motion: Motion, action: Float[Array, " 3"], length_m: Any) -> Motion:
         """Return the motion one step later."""
-        action = self.actuated(motion, action, action)
+        action = self.actuated(motion, action, action, length_m)
         shift = action[:2] * jnp.array([self.ahead_m, self.left_m])
         return displace(motion, shift, action[2] * self.turn_rad)
 
@@ -264,13 +267,13 @@ class DirectState:
         """Return False."""
         return jnp.zeros((), bool)
 
-    def actuated(self, motion: Motion, action: Motion, last: Motion) -> Motion:
+    def actuated(self, motion: Motion, action: Motion, last: Motion, length_m: Any) -> Motion:
         """Return the motion with heading in [-pi, pi) and nonnegative speed."""
         return jnp.stack([action[0], action[1], wrap(action[2]), jnp.maximum(action[3], 0.0)])
 
     def move(self, motion: Motion, action: Motion, length_m: Any) -> Motion:
         """Return the motion one step later."""
-        return self.actuated(motion, action, action)
+        return self.actuated(motion, action, action, length_m)
 
     def sharpest(self, length_m: Any) -> Any:
         """Return the largest curvature: unlimited, 1/m."""
@@ -281,9 +284,86 @@ class DirectState:
         return history[-1]
 
 
-#: Types of ``task.actions``; ``kind:`` in YAML is ``physical``, ``published``, ``discrete``, ``delta_local`` or
-#: ``direct_state``.
-ActionSpace = Physical | Published | Discrete | DeltaLocal | DirectState
+@dataclass(frozen=True)
+class Trajectory:
+    """Planned poses of the box centre (x, y in m, heading in rad, in the scenario's frame), tracked by a controller.
+
+    An action is the pose for now and those of the next ``steps`` steps of 0.1 s, one after the other. The executed
+    action has as many numbers: what the actuators did (``simulator.controller.Actuators``), then zeros.
+
+    Attributes:
+        steps: Horizon of a plan, steps.
+        controller: nuPlan's LQR and its bicycle about the rear axle.
+    """
+
+    steps: int = 80
+    controller: TrackingConfig = field(default_factory=TrackingConfig)
+
+    def __post_init__(self) -> None:
+        if self.steps < 3:
+            raise UsageError(f"a plan of {self.steps} steps is too short", cure="use steps: 3 or more")
+
+    @property
+    def size(self) -> int:
+        """Number of numbers."""
+        return 3 * (self.steps + 1)
+
+    def plan(self, poses: Float[Array, "n 3"]) -> Float[Array, " D"]:
+        """Return the action of two or more poses from now on; beyond them the car keeps its last velocity."""
+        moved = poses[-1, :2] - poses[-2, :2]
+        more = jnp.arange(1, max(self.steps + 2 - len(poses), 1))[:, None]
+        beyond = jnp.concatenate(
+            [poses[-1, :2] + more * moved, jnp.full_like(more, poses[-1, 2], poses.dtype)], axis=1
+        )
+        return jnp.concatenate([poses, beyond])[: self.steps + 1].reshape(-1)
+
+    def action(
+        self, motion: Motion, acceleration: Scalar, curvature: Scalar, length_m: Any
+    ) -> Float[Array, " D"]:
+        """Return the plan of the bicycle at this acceleration and curvature."""
+
+        def step(motion: Motion, _: None) -> tuple[Motion, Motion]:
+            motion = bicycle(motion, acceleration, curvature)
+            return motion, motion
+
+        motions = jax.lax.scan(step, motion, None, self.steps)[1]
+        return self.plan(jnp.concatenate([motion[None], motions])[:, :3])
+
+    def expert(self, motion: Motion, target: Motion, beyond: Motion, length_m: Any) -> Float[Array, " D"]:
+        """Return the plan through the present and two logged poses; ``expert_action`` plans the whole log."""
+        return self.plan(jnp.stack([motion, target, beyond])[:, :3])
+
+    def clipped(self, action: Float[Array, " D"]) -> Bool[Array, ""]:
+        """Return False."""
+        return jnp.zeros((), bool)
+
+    def actuated(
+        self, motion: Motion, action: Float[Array, " D"], last: Float[Array, " D"], length_m: Any
+    ) -> Float[Array, " D"]:
+        """Return what the actuators do to follow the plan."""
+        length_m = jnp.maximum(length_m, 1.0)
+        now = controller.track(motion, action.reshape(-1, 3), last[:3], length_m, self.controller)
+        return jnp.zeros(self.size).at[:3].set(now)
+
+    def move(self, motion: Motion, action: Float[Array, " D"], length_m: Any) -> Motion:
+        """Return the motion one step later, from an executed action."""
+        return controller.propagate(motion, action[:3], jnp.maximum(length_m, 1.0), self.controller)
+
+    def sharpest(self, length_m: Any) -> Any:
+        """Return the largest curvature of the rear axle, 1/m."""
+        return math.tan(self.controller.most_steering) / (
+            self.controller.wheelbase * jnp.maximum(length_m, 1.0)
+        )
+
+    def first(self, history: History, length_m: Any) -> Float[Array, " D"]:
+        """Return the acceleration and steering angle of the last half second of the log."""
+        now = controller.recent_actuators(history, jnp.maximum(length_m, 1.0), self.controller)
+        return jnp.zeros(self.size).at[:3].set(now)
+
+
+#: Types of ``task.actions``; ``kind:`` in YAML is ``physical``, ``published``, ``discrete``, ``delta_local``,
+#: ``direct_state`` or ``trajectory``.
+ActionSpace = Physical | Published | Discrete | DeltaLocal | DirectState | Trajectory
 
 PHYSICAL, PUBLISHED, DISCRETE = Physical(), Published(), Discrete()
 DELTA_LOCAL, DIRECT_STATE = DeltaLocal(), DirectState()

@@ -63,9 +63,13 @@ class Task:
         """Return the next motion by the dynamics of the action space."""
         return self.actions.move(motion, action, length)
 
-    def actuated(self, motion: Motion, action: Action, last: Action) -> Action:
+    def actuated(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
         """Return the executed action, within bounds and actuator rates."""
-        return self.actions.actuated(motion, action, last)
+        return self.actions.actuated(motion, action, last, length)
+
+    def coast(self, motion: Motion, length: Any) -> Action:
+        """Return the action that keeps speed and heading."""
+        return self.actions.action(motion, jnp.zeros(()), jnp.zeros(()), length)
 
     def first_action(self, history: History, length: Any) -> Action:
         """Return the last action at the start of an episode."""

@@ -15,24 +15,21 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH
-from drivax.geometry.vectors import wrap
 from drivax.planners.pdm import scoring
 from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unroll_idm
 from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig
-from drivax.planners.pdm.tracking import Car, TrackingConfig, track
+from drivax.planners.pdm.tracking import Car, track
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
-from drivax.scenario.schema import DT_S
 from drivax.simulator.ahead import stop_line_m
 from drivax.simulator.contact import overlaps
+from drivax.simulator.controller import ACCELERATION, STEERING, TrackingConfig, recent_actuators, steering_of
 from drivax.simulator.idm import IdmParameters
-from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, SimState, Situation
-from drivax.tasks.actions import ActionSpace, Physical
+from drivax.simulator.types import MOTION_SPEED, SimState, Situation
+from drivax.tasks.actions import ActionSpace, Physical, Trajectory
 
-#: Steps over which initial acceleration and curvature are measured, and the distance below which ego stands, m.
-_PAST, _STILL_M = 5, 0.5
 #: IDM of the proposals.
 PUBLISHED_DRIVER = IdmParameters(1.0, 1.5, 1.5, 3.0, exponent=10.0, max_braking_mps2=3.0)
 #: Stride of the route points that are compared with forecasts.
@@ -93,6 +90,7 @@ class Memory:
 class ScoredProposals:
     """Simulated and scored proposals of a step: speeds of one line after each other, lines in order."""
 
+    plans: Float[Array, "N T 3"]  # Poses along the lines, which cars track
     cars: Car  # Simulated motion, step by step
     metrics: ProposalMetrics  # Metrics of each proposal
     score: Float[Array, " N"]  # In [0, 1]
@@ -113,27 +111,26 @@ class PdmPlanner:
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Memory:
         """Return a carry without touched agents; acceleration and steering from the last half second."""
         context = state.context
-        before, now = context.history[-1 - _PAST], context.history[-1]
-        moved_m = (before[MOTION_SPEED] + now[MOTION_SPEED]) / 2 * _PAST * DT_S
-        turned = wrap(now[MOTION_HEADING] - before[MOTION_HEADING])
-        curvature = jnp.where(moved_m > _STILL_M, turned / jnp.maximum(moved_m, _STILL_M), 0.0)
-        steering = jnp.arctan(curvature * self._wheelbase(bank.length_m(context.index, context.slot)))
-        most = self.config.tracking.most_steering
-        return Memory(
-            touched=jnp.zeros(bank.agent_box.shape[1], bool),
-            acceleration=(now[MOTION_SPEED] - before[MOTION_SPEED]) / (_PAST * DT_S),
-            steering=jnp.clip(steering, -most, most),
-        )
+        length_m = jnp.maximum(bank.length_m(context.index, context.slot), 1.0)
+        now = recent_actuators(context.history, length_m, self.config.tracking)
+        return Memory(jnp.zeros(bank.agent_box.shape[1], bool), now[ACCELERATION], now[STEERING])
 
     def act(
         self, carry: Memory, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
     ) -> tuple[Float[Array, " D"], Memory]:  # fmt: skip
-        """Return the first action of the best proposal, or brake."""
+        """Return the first action of the best proposal, or brake; the whole proposal where a controller tracks it."""
         context = situation.context
         motion, length = context.history[-1], situation.surroundings.frame.box[context.slot, LENGTH]
         touched = carry.touched | overlaps(situation.surroundings.frame, context.slot)
         carry = replace(carry, touched=touched)
+        tracked = self.actions if isinstance(self.actions, Trajectory) else None
+        if tracked:
+            acceleration, steering = (
+                context.action[ACCELERATION],
+                steering_of(context.action[:3], tracked.controller),
+            )
+            carry = replace(carry, acceleration=acceleration, steering=steering)
         scored = self.score_proposals(carry, bank, situation)
         best = jnp.argmax(scored.score)
         speed, brake = motion[MOTION_SPEED], self.config.brake
@@ -143,6 +140,8 @@ class PdmPlanner:
         steering = jnp.where(brakes, 0.0, scored.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = self.actions.action(motion, acceleration, curvature, length)
+        if tracked:
+            action = jnp.where(brakes, action, tracked.plan(scored.plans[best]))
         return action, Memory(touched, acceleration, steering)
 
     def score_proposals(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> ScoredProposals:
@@ -176,7 +175,9 @@ class PdmPlanner:
         metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, 0, None, None, None, 0, 0, None))(
             cars.motion, cars.acceleration, yaw_rate, size, others, ground, ends, config.scoring
         )
-        return ScoredProposals(cars, metrics, scoring.scores(metrics, config.scoring))
+        heading = jnp.arctan2(reference.pose[..., 3:], reference.pose[..., 2:3])
+        plans = jnp.concatenate([reference.pose[..., :2], heading], axis=-1)
+        return ScoredProposals(plans, cars, metrics, scoring.scores(metrics, config.scoring))
 
     def _wheelbase(self, length_m: Float[Array, ""]) -> Float[Array, ""]:
         return self.config.tracking.wheelbase * jnp.maximum(length_m, 1.0)

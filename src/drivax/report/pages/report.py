@@ -282,7 +282,7 @@ def episode_data(runs: Sequence[EpisodeTable], tags: Tags, playable: Mapping[Sce
 
     ``metrics`` has the label of each metric, and the value of a rate that means failure; ``runs[].values`` one column
     per metric with four significant digits, null where undefined, worst row first; ``runs[].errors`` step and error of
-    each crash by row; ``tags`` the values of each tag, and the index of each scenario's value.
+    each crash by row; ``tags`` the words of each tag, and the indices of each scenario's words.
     """
     names = result_tables.sort_metrics(result_tables.metric_names(runs))
     names += [name for name in result_tables.metric_names(runs) if name in result_tables.CODES]
@@ -342,9 +342,10 @@ def _round_significant(value: float) -> float:
 def _tags(scenario_tags: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     columns = []
     for name in dict.fromkeys(name for tags in scenario_tags for name in tags):
-        values = [tags.get(name, result_tables.UNKNOWN) for tags in scenario_tags]
-        distinct = sorted(set(values))
+        values = [tags.get(name, result_tables.UNKNOWN).split("|") for tags in scenario_tags]
+        distinct = sorted({word for words in values for word in words})
         if 1 < len(distinct) <= MOST_VALUES:
-            number = {value: index for index, value in enumerate(distinct)}
-            columns.append({"name": name, "words": distinct, "of": [number[value] for value in values]})
+            number = {word: index for index, word in enumerate(distinct)}
+            of = [[number[word] for word in words] for words in values]
+            columns.append({"name": name, "words": distinct, "of": of})
     return columns

@@ -47,7 +47,7 @@
     const require = (menu, test) => { if (menu.value !== "") tests.push(test(Number(menu.value))); };
     require(form.outcome, (code) => (row) => outcome[row] === code);
     require(form.failed, (i) => (row) => values[i][row] === data.metrics[i].bad);
-    tags.forEach((menu, i) => require(menu, (code) => (row) => data.tags[i].of[scenario[row]] === code));
+    tags.forEach((menu, i) => require(menu, (code) => (row) => data.tags[i].of[scenario[row]].includes(code)));
     const bound = parseFloat(form.bound.value), compare = {
       ge: (value) => value >= bound, le: (value) => value <= bound, eq: (value) => value === bound,
     }[form.sign.value];

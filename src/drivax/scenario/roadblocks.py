@@ -1,0 +1,44 @@
+"""Centre lines and roadblocks of the lanes of a stored scenario."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from drivax.scenario.schema import Scenario
+
+
+def lane_count(scenario: Scenario) -> int:
+    """Number of lanes of the lane graph."""
+    return int((scenario.lane_id >= 0).sum())
+
+
+def lane_lines(scenario: Scenario) -> list[Float[np.ndarray, "point 2"]]:
+    """Centre line of every car lane in the local frame, in the order of the lane graph; empty without segments."""
+    first, last = (int(end) for end in scenario.segment_blocks[1:3])
+    lane, at = scenario.segment_lane[first:last], scenario.segment_start_m[first:last]
+    lines = []
+    for index in range(lane_count(scenario)):
+        own = first + np.flatnonzero(lane == index)[np.argsort(at[lane == index], kind="stable")]
+        points = np.concatenate([scenario.segment_a[own, :2], scenario.segment_b[own[-1:], :2]])
+        lines.append(points.astype(np.float64))
+    return lines
+
+
+def roadblocks(scenario: Scenario) -> list[int]:
+    """Roadblock of every lane: parallel lanes, and connectors between the same two blocks, share one."""
+    count = lane_count(scenario)
+    blocks = list(range(count))
+    for index in range(count):
+        for other in (int(scenario.lane_left[index]), int(scenario.lane_right[index])):
+            if 0 <= other < count and not scenario.lane_interpolating[index]:
+                low, high = sorted((blocks[index], blocks[other]))
+                blocks = [low if block == high else block for block in blocks]
+    pairs: dict[tuple[int, int], int] = {}
+    for index in np.flatnonzero(scenario.lane_interpolating[:count]).tolist():
+        before, after = (
+            int(links[index, 0]) for links in (scenario.lane_predecessor, scenario.lane_successor)
+        )
+        if 0 <= before < count and 0 <= after < count:
+            blocks[index] = pairs.setdefault((blocks[before], blocks[after]), index)
+    return blocks
