@@ -41,8 +41,8 @@ class Episodes:
     Attributes:
         metrics: Every metric by name.
         events: Step of the first collision, off-road step and red light, -1 for none.
-        motion: x, y, heading, speed of the driven agent from the start step to the end.
-        actions: Executed actions, after bounds and actuators.
+        motion: x, y, heading, speed of the driven agent from the start step to the end; repeated beyond a short log.
+        actions: Executed actions, after bounds and actuators; repeated beyond a short log.
         others: Packed poses of the other agents at each step (:func:`pack_poses`); None in log traffic.
         offroad_steps: Number of steps off the road.
         crashed: First step whose action was not finite, -1 for none; nothing is measured from there on.
@@ -101,11 +101,14 @@ def _episode(
 
     def step(now: Any, key: Array) -> Any:
         state, kept, carry, sound = now
-        state, carry, finite = advance(simulator, planner, bank, state, carry, key)
-        sound &= finite
+        # A log that is shorter than others of its bank ends earlier: its last state stays.
+        ended = state.context.step >= bank.last_step[index]
+        after, carry, finite = advance(simulator, planner, bank, state, carry, key)
+        state = jax.tree.map(partial(jnp.where, ended), state, after)
+        sound &= finite | ended
         kept = state if planner.replays else jax.tree.map(partial(jnp.where, sound), state, kept)
         context = kept.context
-        seen = context.history[-1], context.action, sound & state.facts.offroad, sound, others(state)
+        seen = context.history[-1], context.action, sound & ~ended & state.facts.offroad, sound, others(state)
         return (state, kept, carry, sound), seen
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)

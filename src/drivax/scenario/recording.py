@@ -120,12 +120,12 @@ class Recording:
     split_gap_m: float | None = None
 
 
-def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
-    """Cut a recording into windows of 91 steps that share its segment.
+def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> Iterator[Recording]:
+    """Cut a recording into windows of ``length`` steps that share its segment; step 10 of each is the current one.
 
     Window ``k`` starts at step ``k * stride``; a rest that fills no window is left out (110 steps make one window, 199
     make three). Windows without a valid ego at the current step are left out, and counted in ``lost`` of the others as
-    ``windows_without_ego``. A recording of at most 91 steps is its own window.
+    ``windows_without_ego``. A recording of at most ``length`` steps is its own window.
 
     Raises:
         DataError: No window has a valid ego at its current step.
@@ -133,25 +133,26 @@ def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
     if stride < 1:
         raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
     steps = len(recording.timestamps_s)
-    if steps <= STEPS:
-        yield recording
+    if steps <= length:
+        now = min(CURRENT_STEP, steps - 1)
+        yield recording if recording.current_step == now else replace(recording, current_step=now)
         return
-    starts = range(0, steps - STEPS + 1, stride)
+    starts = range(0, steps - length + 1, stride)
     usable = [start for start in starts if recording.tracks.valid[recording.ego, start + CURRENT_STEP]]
     if not usable:
         problem = f"the ego is not valid at the current step of any of {len(starts)} windows"
         raise DataError(problem, record=recording.scenario_id, cure="skip the recording")
     left_out = {"windows_without_ego": len(starts) - len(usable)} if len(usable) < len(starts) else {}
     for start in usable:
-        yield _window(replace(recording, lost={**recording.lost, **left_out}), start)
+        yield _window(replace(recording, lost={**recording.lost, **left_out}), start, length)
 
 
-def _window(recording: Recording, start: int) -> Recording:
-    """The 91 steps from ``start`` on."""
-    part = slice(start, start + STEPS)
+def _window(recording: Recording, start: int, length: int) -> Recording:
+    """The ``length`` steps from ``start`` on."""
+    part = slice(start, start + length)
     timed = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
     events = (
-        replace(event, start=max(event.start - start, 0), end=min(event.end - start, STEPS - 1))
+        replace(event, start=max(event.start - start, 0), end=min(event.end - start, length - 1))
         for event in recording.events
     )
     return replace(
