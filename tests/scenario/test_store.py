@@ -8,6 +8,7 @@ import pickle
 import subprocess
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import pytest
 from drivax.errors import DataError, UsageError
 from drivax.files import can_resume
 from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Flag, Scenario, SourceCounts, record_dtype
-from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_lengths
 
 SMALL = Capacity(
     name="small", agents=3, parked=2, steps=5, segments=8, features=4, lanes=4, lights=2, stops=1, routes=2,
@@ -504,3 +505,14 @@ def test_a_killed_writer_is_continued_to_the_same_bytes(tmp_path: Path, adds: in
     assert continued(tmp_path / "set") == [number for number in (2, 4, 6) if number <= adds]
     assert contents(tmp_path / "set") == contents(tmp_path / "whole")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "whole"]
+
+
+def test_sets_of_several_lengths_are_refused_in_one_command(scenario_set: Path, tmp_path: Path):
+    longer = replace(SMALL, steps=SMALL.steps + 1)
+    with ScenarioWriter(tmp_path / "longer", longer) as writer:
+        writer.add(make_scenario(0, longer))
+    first, second = ScenarioSet.open(scenario_set), ScenarioSet.open(tmp_path / "longer")
+    check_lengths(first, first)
+    problem = rf"longer: has scenarios of {longer.steps} steps, .*set of {SMALL.steps}; convert both with"
+    with pytest.raises(UsageError, match=problem):
+        check_lengths(first, first, second)
