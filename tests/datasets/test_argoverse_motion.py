@@ -130,8 +130,8 @@ def test_it_becomes_one_scenario(recording):
     assert not scenario.overflow
 
 
-def test_check_list_20_the_test_split_has_no_future(rewritten):
-    """50 observed steps of 110: stored masked."""
+def test_check_list_20_the_test_split_is_shorter(rewritten):
+    """50 observed steps of 110: judged to the last of them."""
 
     def observed(table):
         keep = [i for i, step in enumerate(table["timestep"]) if step < 50]
@@ -141,7 +141,8 @@ def test_check_list_20_the_test_split_has_no_future(rewritten):
     assert recording.tracks.valid.shape == (5, 50) and recording.current_step == 10
     assert recording.timestamps_s[-1] - recording.timestamps_s[0] == pytest.approx(4.9, abs=1e-5)
     (window,) = windows(recording)
-    assert Flag.NO_FUTURE in assemble(window).has
+    scenario = assemble(window)
+    assert scenario.steps == 50 and Flag.NO_FUTURE not in scenario.has
 
 
 def test_ids_that_are_no_numbers_become_row_numbers(rewritten):

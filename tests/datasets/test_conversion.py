@@ -372,6 +372,23 @@ def test_plan_is_announced_before_the_work(thirty, tmp_path):
     assert plan.estimate.free_bytes > 0 and not plan.estimate.sampled
 
 
+def test_length_of_scenarios_is_an_option_and_a_property_of_the_set(wire, tmp_path):
+    recording = wire.frame(wire.scenario(steps=199))
+    (tmp_path / "a.tfrecord").write_bytes(recording)
+    found, plans = {}, []
+    for future_s in (8.0, 15.0, 18.0, 20.0):
+        out, options = tmp_path / f"set-{future_s:g}", Conversion(future_s=future_s)
+        convert(tmp_path / "a.tfrecord", out, options, announce=plans.append)
+        opened = ScenarioSet.open(out)
+        found[opened.capacity.steps] = [int(scenario.steps) for scenario in opened]
+        assert opened.manifest["capacity"]["steps"] == 11 + 10 * future_s
+    assert found == {91: [91] * 3, 161: [161], 191: [191], 211: [199]}
+    assert [plan.estimate.scenarios for plan in plans] == [3, 1, 1, 1]
+    for wrong in (1.0, 61.0):
+        with pytest.raises(UsageError, match=f"future_s is {wrong:g}; use 2 to 60 seconds"):
+            convert(tmp_path / "a.tfrecord", tmp_path / "wrong", Conversion(future_s=wrong))
+
+
 def test_many_files_are_sampled_and_scaled_by_size(wire, tmp_path, monkeypatch):
     monkeypatch.setattr("drivax.datasets.doctor._COUNTED", 4)
     record = wire.frame(wire.scenario(steps=11))

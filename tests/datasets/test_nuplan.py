@@ -316,33 +316,34 @@ def time_line(scenes, gaps=()) -> TimeLine:
     return TimeLine(tuple(range(len(scenes))), np.cumsum(step), tuple(bytes([s]) for s in scenes))
 
 
-def current_sweeps(line: TimeLine) -> list[tuple[bytes, int]]:
-    """(scene, current sweep) of all windows at a stride of one step."""
+def current_sweeps(line: TimeLine, future: int) -> list[tuple[bytes, int]]:
+    """(scene, current sweep) of all windows of this future at a stride of one step."""
     return [
         (piece.scene, int(sweep))
-        for piece in pieces(line)
-        for sweep in piece.sweeps[10 : max(len(piece.sweeps) - 80, 0)]
+        for piece in pieces(line, future + 11)
+        for sweep in piece.sweeps[10 : max(len(piece.sweeps) - future, 0)]
     ]
 
 
 @given(
     st.lists(st.integers(1, 900), min_size=1, max_size=6),
     st.lists(st.integers(1, 2000), max_size=2, unique=True),
+    st.sampled_from([80, 150]),
 )
-def test_every_window_belongs_to_one_scene(lengths, gaps):
-    """Every sweep at 10 Hz with 1 s before and 8 s after it is the current step of one window, of its own scene."""
+def test_every_window_belongs_to_one_scene(lengths, gaps, future):
+    """Every sweep at 10 Hz with 1 s before and a future after it is the current step of one window of its scene."""
     scenes = [number for number, length in enumerate(lengths) for _ in range(length)]
     gaps = sorted(gap for gap in gaps if gap < len(scenes))
     # A log that consists of pauses has no frequency.
     assume(len(scenes) > 2 * len(gaps) + 1)
     line = time_line(scenes, gaps)
     runs = [range(a, b, 2) for a, b in pairwise([0, *gaps, len(scenes)])]
-    expected = [(bytes([scenes[s]]), s) for run in runs for s in run[10 : max(len(run) - 80, 0)]]
-    assert sorted(current_sweeps(line), key=lambda found: found[1]) == expected
-    names = [piece.name for piece in pieces(line)]
-    assert len(set(names)) == len(names)
-    for piece in pieces(line):
-        assert len(piece.sweeps) <= 400 + 90
+    expected = [(bytes([scenes[s]]), s) for run in runs for s in run[10 : max(len(run) - future, 0)]]
+    assert sorted(current_sweeps(line, future), key=lambda found: found[1]) == expected
+    cut = pieces(line, future + 11)
+    assert len({piece.name for piece in cut}) == len(cut)
+    for piece in cut:
+        assert len(piece.sweeps) <= 400 + future + 10
         assert np.isin(line.time_us[piece.sweeps[1:]] - line.time_us[piece.sweeps[:-1]], 100_000).all()
 
 

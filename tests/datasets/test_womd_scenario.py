@@ -398,7 +398,7 @@ def test_describe_and_count(wire, write_records):
     assert reader.describe(write_records("b", older)).version == "1.1 or later"
     told = reader.describe(write_records("c", unlinked))
     assert told.version is None and len(told.notes) == 3 and "no lane graph" in told.notes[2]
-    assert "no future" in reader.describe(write_records("d", wire.scenario(steps=11))).notes[1]
+    assert "fewer than 31 steps" in reader.describe(write_records("d", wire.scenario(steps=11))).notes[1]
     assert "3 windows" in reader.describe(write_records("e", wire.scenario(steps=199))).notes[1]
     (recording,) = reader.read(write_records("f", wire.scenario()))
     gap = recording.timestamps_s + 0.5 * (np.arange(91) > 40)

@@ -273,10 +273,12 @@ def test_scenarios_without_ego_or_future_are_refused_with_a_filter():
     cut = replace(long, tracks=replace(long.tracks, **tracks), timestamps_s=long.timestamps_s[:11])
     short = named(cut, "short")
     assert Flag.NO_FUTURE in short.has
-    with pytest.raises(DataError, match=r"record short: no logged future.*1 of 4.*flag!=NO_FUTURE"):
+    with pytest.raises(
+        DataError, match=r"record short: has 11 steps, fewer than 31.*1 of 4.*flag!=NO_FUTURE"
+    ):
         evaluate(fragile(), [*logs, short], start=NoisyStart())
     bank = ScenarioBank.from_scenarios([logs[0], short], allow_no_future=True)
-    with pytest.raises(DataError, match=r"record short: no logged future.*1 of 2"):
+    with pytest.raises(DataError, match=r"record short: has 11 steps.*1 of 2"):
         evaluate(fragile(), bank, scenario_names([logs[0], short]), start=NoisyStart())
     with pytest.raises(UsageError, match="batch of 0"):
         evaluate(fragile(), logs, start=NoisyStart(), batch=0)

@@ -64,9 +64,10 @@ def test_driving_is_an_environment(bank, driving):
     assert driving.shapes(bank)["moment"] == (1, 4)
     grid = Driving(Simulator(Task(actions=Discrete(accelerations=3, curvatures=5))))
     assert grid.levels == ((-1.0, 0.0, 1.0), (-1.0, -0.25, 0.0, 0.25, 1.0))
-    for step in (9, 89):
-        with pytest.raises(UsageError, match=r"use 10 \(earliest_start\) to 88"):
-            Driving(driving.simulator, step)
+    with pytest.raises(UsageError, match=r"use 10 \(earliest_start\) or more"):
+        Driving(driving.simulator, 9)
+    with pytest.raises(UsageError, match=r"latest_start is 89; use 10 \(earliest_start\) to 88"):
+        Driving(driving.simulator, 89).start(bank, jax.random.key(0), 1)
 
 
 NETWORK = NetworkConfig(encoder=MlpConfig(rows=(8,), hidden=(8,)), distribution="grid")
@@ -140,7 +141,7 @@ def test_episodes_begin_at_requested_steps(bank):
     np.testing.assert_array_equal(step, np.where(index == 1, 10, 0))
     step = _draw(bank, jax.random.key(2), 256, 0, LATEST)[1]
     assert set(np.asarray(step)) == set(range(LATEST + 1))
-    for earliest, latest, words in ((-1, 0, "use 0 or more"), (5, 4, r"use 5 \(earliest_start\) to 88")):
+    for earliest, latest, words in ((-1, 0, "use 0 or more"), (5, 4, r"use 5 \(earliest_start\) or more")):
         with pytest.raises(UsageError, match=words):
             Driving(Simulator(Task()), latest, earliest)
 

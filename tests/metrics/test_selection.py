@@ -236,7 +236,7 @@ def test_evaluation_uses_the_full_set_whatever_the_task_learned_with():
 def test_no_metric_is_defined_before_the_first_step(traced):
     state = replace(zeros(traced["full"].state), episode=episode_start("full"))
     found = jax.jit(episode_metrics)(BANK, state)
-    assert {name for name, value in found.items() if bool(value.defined)} == {"steps"}
+    assert {name for name, value in found.items() if bool(value.defined)} == {"steps", "last_step"}
 
 
 def test_the_guide_lists_every_metric_with_its_unit(repository):

@@ -166,12 +166,13 @@ def test_counts_are_those_of_the_source():
     assert assemble(busy_recording()).source == counts
 
 
-@pytest.mark.parametrize("steps", [1, 11, 40])
-def test_short_recordings_are_stored_masked_without_a_future(steps):
+@pytest.mark.parametrize("steps", [1, 11, 30, 31, 66])
+def test_short_recordings_are_stored_masked(steps):
+    """Those with fewer than 20 steps after the current one are flagged."""
     scenario = assemble(
         make_recording(tracks=make_tracks([driving(steps=steps)], heading=np.zeros((1, steps))))
     )
-    assert Flag.NO_FUTURE in scenario.has
+    assert (Flag.NO_FUTURE in scenario.has) == (steps < 31)
     assert scenario.steps == steps
     assert scenario.agent_valid[:, 0].sum() == steps
     assert Flag.NO_FUTURE not in assemble(make_recording()).has
@@ -391,6 +392,11 @@ def test_long_recordings_must_be_cut_with_windows():
     assert [len(list(windows(long, stride=stride))) for stride in (1, 91, 109, 110)] == [110, 2, 2, 1]
     short = make_recording()
     assert [w is short for w in windows(short)] == [True]
+    assert [w.current_step for w in windows(replace(short, current_step=20))] == [10]
+    assert [(w.scenario_id, len(w.timestamps_s)) for w in windows(long, 20, 161)] == [
+        ("hand-made@0", 161), ("hand-made@20", 161),
+    ]  # fmt: skip
+    assert [(w.scenario_id, w.current_step) for w in windows(long, length=200)] == [("hand-made", 10)]
     eleven_seconds = make_recording(tracks=make_tracks([driving(steps=110)]))  # as in Argoverse 2
     assert [w.scenario_id for w in windows(eleven_seconds)] == ["hand-made@0"]
     with pytest.raises(UsageError, match="a stride of 0 steps"):

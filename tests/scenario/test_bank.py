@@ -12,7 +12,7 @@ from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.schema import Flag, Scenario
+from drivax.scenario.schema import Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task
@@ -21,15 +21,15 @@ from scenes import GLIMPSE, bank_of, car, straight_road
 
 def without_future(scenario: Scenario) -> Scenario:
     record = scenario.record.copy()
-    record["flags"] |= int(Flag.NO_FUTURE)
+    record["steps"] = 30
     return replace(scenario, record=record)
 
 
-def test_bank_refuses_empty_input_and_test_splits():
+def test_bank_refuses_empty_input_and_logs_without_future():
     with pytest.raises(DrivaxError, match="at least one"):
         ScenarioBank.from_scenarios([])
     short = without_future(assemble(straight_road([car(0, 0, 0, 5)])))
-    with pytest.raises(DataError, match=r"hand-made.*no logged future"):
+    with pytest.raises(DataError, match=r"hand-made: has 30 steps, fewer than 31"):
         ScenarioBank.from_scenarios([short])
     assert len(ScenarioBank.from_scenarios([short], allow_no_future=True)) == 1
 

@@ -27,7 +27,7 @@ from drivax.scenario.schema import (
     stored_name,
 )
 from drivax.scenario.select.selection import select_scenarios
-from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_lengths
 
 SMALL = Capacity(
     name="small", agents=3, parked=2, steps=5, segments=8, features=4, lanes=4, lights=2, stops=1, routes=2,
@@ -568,3 +568,14 @@ def test_a_killed_writer_is_continued_to_the_same_bytes(tmp_path: Path, adds: in
     assert continued(tmp_path / "set") == [number for number in (2, 4, 6) if number <= adds]
     assert contents(tmp_path / "set") == contents(tmp_path / "whole")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "whole"]
+
+
+def test_sets_of_several_lengths_are_refused_in_one_command(scenario_set: Path, tmp_path: Path):
+    longer = replace(SMALL, steps=SMALL.steps + 1)
+    with ScenarioWriter(tmp_path / "longer", longer) as writer:
+        writer.add(make_scenario(0, longer))
+    first, second = ScenarioSet.open(scenario_set), ScenarioSet.open(tmp_path / "longer")
+    check_lengths(first, first)
+    problem = rf"longer: has scenarios of {longer.steps} steps, .*set of {SMALL.steps}; convert both with"
+    with pytest.raises(UsageError, match=problem):
+        check_lengths(first, first, second)

@@ -13,6 +13,7 @@ from numpy._core import _multiarray_umath as umath
 
 from drivax.cli.generate import Generate, run, summary
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.audit import audit
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic import generate as generation
@@ -107,6 +108,21 @@ def test_workers_inherit_disabled_features(monkeypatch):
     assert os.environ["NPY_DISABLE_CPU_FEATURES"] == "B"
 
 
+def test_scenarios_of_fifteen_seconds_are_clean_and_have_ids_of_their_own(tmp_path):
+    world = WorldConfig(rare_rate=0.5)
+    result = generate(tmp_path / "set", 8, 3, Generation(future_s=15.0, world=world), audit=audit)
+    made = ScenarioSet.open(result.path)
+    assert made.capacity.steps == 161 and {int(scenario.steps) for scenario in made} == {161}
+    assert all(scenario.audit["clean"] and scenario.id.startswith("w2-grid-s3-t161-") for scenario in made)
+    assert {int(scenario.event_end.max()) <= 90 for scenario in made if scenario.event_kind.any()} == {True}
+    assert max(np.hypot(*(s.agent_xy[160, 0] - s.agent_xy[90, 0])) for s in made) > 20.0
+    for wrong, words in ((4.0, "use 8 to 60"), (61.0, "use 2 to 60")):
+        with pytest.raises(UsageError, match=f"future_s is {wrong:g}; {words}"):
+            generate(tmp_path / "no", 1, 0, Generation(future_s=wrong))
+    with pytest.raises(UsageError, match="the benchmark's world is fixed"):
+        generation.generate_benchmark(tmp_path / "no", Generation(future_s=15.0), 1)
+
+
 def test_counts_and_progress_cover_all_scenarios(one_worker):
     _, result, progress = one_worker
     assert progress == [(done, SCENARIOS) for done in range(1, SCENARIOS + 1)]
@@ -118,8 +134,8 @@ def test_counts_and_progress_cover_all_scenarios(one_worker):
 def test_rejected_draws_count_for_their_family(tmp_path, monkeypatch):
     drawn = []
 
-    def one(seed, index, config):
-        made = generate_one(seed, index, config)
+    def one(*arguments):
+        made = generate_one(*arguments)
         causes = {
             ("nowhere", "ego_collides"): 2,
             ("nowhere", "no_threat"): 3,

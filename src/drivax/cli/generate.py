@@ -62,6 +62,8 @@ class Generate:  # noqa: D101
     """Processes; as many as there are CPU cores by default."""
     capacity: Annotated[str, tyro.conf.arg(metavar="|".join(CAPACITIES))] = "default"
     """Padded sizes; sets that are used together need the same."""
+    future_s: float = 8.0
+    """Seconds of a scenario after its current step, 8 to 60; 15 in nuPlan's challenges."""
     split: str | None = None
     """Write lists for train/validation/test to OUT/splits, by map: percentages, as 80/10/10."""
     overwrite: bool = False
@@ -79,6 +81,7 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
     options = Generation(
         workers=args.workers if args.workers is not None else os.cpu_count() or 1,
         capacity=args.capacity,
+        future_s=args.future_s,
         overwrite=args.overwrite,
         world=world,
     )

@@ -24,7 +24,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.curation.logged import LOG_ROUTE, LoggedScenario
 from drivax.errors import UsageError
@@ -77,7 +77,7 @@ class KinematicConfig:
         return {
             "urgency": _urgencies(self, log),
             "braking": jnp.clip(_required_braking_of_log(bank, log) / self.full_braking_mps2, 0.0, 1.0),
-            "volatility": _volatility(self, log),
+            "volatility": _volatility(self, log, bank.last_step[log.index]),
             "off_road": _edge_nearness(self, bank, log),
             "lane_deviation": _deviation(self, bank, log),
             "density": crowding(log, self.crowd),
@@ -157,8 +157,8 @@ def _required_braking_of_log(bank: ScenarioBank, log: LoggedScenario) -> Float[A
     return jax.vmap(at_step)(log.frame, log.ignored, log.along_m, log.motion[:, 3])
 
 
-def _volatility(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]:
-    """Return the volatility of the action between each step and the next; the last step repeats the one before.
+def _volatility(config: KinematicConfig, log: LoggedScenario, last: Int[Array, ""]) -> Float[Array, " T"]:
+    """Return the volatility of the action between each step and the next; the ``last`` step repeats the one before.
 
     Derivatives are nuPlan's (``metrics.comfort``), of a polynomial fitted to 1.5 s: noise of 1 cm/s in the speed gives
     some hundredths of a m/s3.
@@ -172,7 +172,7 @@ def _volatility(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " 
     yaw = _derivative((heading_change[1:] + heading_change[:-1]) / 2, valid, _YAW_ORDER, 2)
     share = jnp.maximum(jnp.abs(jerk) / config.full_jerk_mps3, jnp.abs(yaw) / config.full_yaw_rps2)
     share = jnp.minimum(share, 1.0)
-    return jnp.concatenate([share, share[-1:]])
+    return jnp.concatenate([share, share[-1:]]).at[last].set(share[last - 1])
 
 
 def _derivative(

@@ -20,13 +20,13 @@ from typing import Any, TypeVar, get_args
 
 from drivax.datasets.doctor import Estimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, reader_named, survey
-from drivax.datasets.reader import BadRecord
+from drivax.datasets.reader import BadRecord, of_length
 from drivax.datasets.spool import converted_ahead
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
 from drivax.scenario.recording import STRIDE, Recording, windows
-from drivax.scenario.schema import CAPACITIES, SCHEMA_VERSION, Scenario
+from drivax.scenario.schema import CAPACITIES, SCHEMA_VERSION, Capacity, Scenario
 from drivax.scenario.select.selection import Selection
 from drivax.scenario.select.splits import Shares, parse_shares
 from drivax.scenario.store import ScenarioWriter, manifest_entry
@@ -52,7 +52,9 @@ class Conversion:
         limit: Stop when the set holds N scenarios; all by default.
         filters: Only scenarios that meet this condition (NAME=A|B, NAME!=A, NAME>=N); repeat it to combine several.
         routes: How to find routes: our generator, or the published breadth-first search.
-        stride: Steps between the starts of two windows of a recording longer than 91 steps.
+        future_s: Seconds of a scenario after its current step, 8 in WOMD, 15 in nuPlan's challenges; longer
+            recordings become windows, shorter ones end earlier.
+        stride: Steps between the starts of two windows of a longer recording.
         split: Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10.
         workers: Processes that read; 1 reads in the main process.
         strict: Stop at the first unreadable record instead of skipping it.
@@ -65,6 +67,7 @@ class Conversion:
     limit: int | None = None
     filters: tuple[str, ...] = ()
     routes: RouteStyle = "graph"
+    future_s: float = 8.0
     stride: int = STRIDE
     split: str | None = None
     workers: int = 1
@@ -88,7 +91,12 @@ class Conversion:
             if value is not None and value < 1:
                 raise UsageError(f"{name} is {value}", cure="use 1 or more")
         Selection.parse(self.filters)
-        _ = self.shares
+        _ = self.shares, self.sizes
+
+    @property
+    def sizes(self) -> Capacity:
+        """Padded sizes of a scenario of this length."""
+        return CAPACITIES[self.capacity].lasting(self.future_s)
 
     @property
     def shares(self) -> Shares | None:
@@ -101,7 +109,8 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
 
     Args:
         path: The file.
-        options: ``format``, ``capacity``, ``routes``, ``stride`` and, without filters, ``limit`` are used.
+        options: ``format``, ``capacity``, ``future_s``, ``routes``, ``stride`` and, without filters, ``limit`` are
+            used.
     """
     try:
         reader = detect(path) if options.format == AUTO else reader_named(options.format)
@@ -109,7 +118,7 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
         yield BadRecord.of(error, path)
         return
     count = 0
-    for item in reader.read(path):
+    for item in of_length(reader, options.sizes.steps).read(path):
         for result in [item] if isinstance(item, BadRecord) else _scenarios(item, path, options):
             yield result
             count += isinstance(result, Scenario)
@@ -118,11 +127,12 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
 
 
 def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterator[Scenario | BadRecord]:
-    parts = _attempt(lambda: list(windows(recording, options.stride)), path, recording.scenario_id)
+    capacity = options.sizes
+    cut = partial(windows, recording, options.stride, capacity.steps)
+    parts = _attempt(lambda: list(cut()), path, recording.scenario_id)
     if isinstance(parts, BadRecord):
         yield parts
         return
-    capacity = CAPACITIES[options.capacity]
     for part in parts:
         yield _attempt(partial(assemble, part, capacity, options.routes), path, part.scenario_id)
 
@@ -183,7 +193,7 @@ def convert(
 ) -> Converted:
     """Convert a file or folder of a public data set to a scenario set.
 
-    Recordings longer than 91 steps become windows. Unreadable records are skipped and reported. The set appears under
+    Recordings longer than a scenario become windows. Unreadable records are skipped and reported. The set appears under
     ``out`` when it is complete. The same call resumes an interrupted conversion after its last closed shard, to the
     same bytes.
 
@@ -205,7 +215,7 @@ def convert(
     options.check()
     begin = time.monotonic()
     data = survey(src, options.format)
-    capacity = CAPACITIES[options.capacity]
+    capacity = options.sizes
     with ScenarioWriter(
         out, capacity, _source(data, options), options.shard_size, options.overwrite, options.shares,
         _identity(data, options, audited=audit is not None),
@@ -244,7 +254,7 @@ def _identity(data: Survey, options: Conversion, audited: bool) -> dict[str, Any
     digest = hashlib.sha256()
     for entry in data.inputs:
         digest.update(f"{data.relative(entry.path)}\t{entry.path.stat().st_size}\t{entry.format}\n".encode())
-    names = ("format", "capacity", "limit", "filters", "routes", "stride", "split", "shard_size")
+    names = ("format", "capacity", "future_s", "limit", "filters", "routes", "stride", "split", "shard_size")
     return {
         "drivax": metadata.version("drivax"),
         "schema": SCHEMA_VERSION,
@@ -401,7 +411,7 @@ def _results(
     if options.workers == 1 or len(tasks) <= 1:
         yield from (convert_file(*task) for task in tasks)
         return
-    yield from converted_ahead(tasks, convert_file, CAPACITIES[options.capacity], options.workers, folder)
+    yield from converted_ahead(tasks, convert_file, options.sizes, options.workers, folder)
 
 
 def _nothing(data: Survey, sink: _Sink) -> DataError:

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivax.datasets import unsupported
 from drivax.datasets.formats import AUTO, Survey, reader_named, survey
-from drivax.datasets.reader import BadRecord, Description, Reader
+from drivax.datasets.reader import BadRecord, Description, Reader, of_length
 from drivax.errors import DataError, UsageError
 from drivax.files import check_space, format_bytes, free_bytes
 from drivax.scenario.recording import STRIDE
@@ -205,25 +205,26 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
         sample = paths[::step]
         sampled |= step > 1
         scale = _size(paths) / max(_size(sample), 1) if step > 1 else 1.0
-        total += scale * sum(count(reader_named(name), path, stride) for path in sample)
+        reader = of_length(reader_named(name), capacity.steps)
+        total += scale * sum(count(reader, path, stride, capacity.steps) for path in sample)
     scenarios = round(total) if limit is None else min(round(total), limit)
     return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out), sampled)
 
 
-def count(reader: Reader, path: Path, stride: int = STRIDE) -> int:
+def count(reader: Reader, path: Path, stride: int = STRIDE, length: int = STEPS) -> int:
     """About how many scenarios a file becomes; 0 if it cannot be read."""
     try:
         scenarios = reader.count(path)
-        if stride == STRIDE or scenarios == 0:
+        if (stride, length) == (STRIDE, STEPS) or scenarios == 0:
             return scenarios
         recordings = reader.describe(path).recordings
     except (DataError, UsageError):
         return 0
     if not recordings or recordings >= scenarios:
         return scenarios
-    # Readers count windows of the usual stride, which tell about how long the recordings are.
+    # Readers count windows of the usual stride and length, which tell about how long the recordings are.
     steps = STEPS + STRIDE * (scenarios / recordings - 1)
-    return round(recordings * ((steps - STEPS) // stride + 1))
+    return round(recordings * max((steps - length) // stride + 1, 1))
 
 
 def counted(number: int, noun: str) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from drivax.errors import DataError, DrivaxError
 from drivax.scenario.recording import Recording
@@ -92,3 +92,9 @@ class Reader(Protocol):
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """The recordings of a file in file order, and a bad record in place of each that cannot be read."""
         ...
+
+
+def of_length(reader: Reader, steps: int) -> Reader:
+    """The reader for scenarios of ``steps`` steps; only those that cut logs into recordings (nuPlan) differ."""
+    cutting: Any = reader
+    return replace(cutting, steps=steps) if hasattr(reader, "steps") else reader

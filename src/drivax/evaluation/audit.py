@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, Scenario
+from drivax.scenario.schema import CURRENT_STEP, DT_S, LEAST_STEPS, AgentKind, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import AgentContext, Facts, Frame, SimState, Situation, Surroundings
 from drivax.tasks.actions import PHYSICAL, PUBLISHED
@@ -48,13 +48,14 @@ def audit(scenarios: Sequence[Scenario]) -> list[Finding]:
 
     Returns:
         Findings by name, one mapping per scenario. None means not applicable (a route deviation without a route);
-        test splits without a future get only findings that need no replay.
+        logs that are too short to evaluate get only findings that need no replay.
     """
-    usable = [scenario for scenario in scenarios if Flag.NO_FUTURE not in scenario.has]
+    futures = [scenario.steps >= LEAST_STEPS for scenario in scenarios]
+    usable = [scenario for scenario, future in zip(scenarios, futures, strict=True) if future]
     batches = (usable[first : first + BATCH] for first in range(0, len(usable), BATCH))
     replayed = iter([row for batch in batches for row in _replayed(batch)])
-    futures = ((scenario, Flag.NO_FUTURE not in scenario.has) for scenario in scenarios)
-    return [(next(replayed) if future else {}) | _known(scenario) for scenario, future in futures]
+    pairs = zip(scenarios, futures, strict=True)
+    return [(next(replayed) if future else {}) | _known(scenario) for scenario, future in pairs]
 
 
 def _known(scenario: Scenario) -> Finding:
@@ -105,7 +106,7 @@ class _Watch:
 
 @partial(jax.jit, static_argnames="driven")
 def replay(bank: ScenarioBank, index: Int[Array, " B"], driven: bool = False) -> dict[str, Array]:
-    """Return facts of scenarios (rows of the bank) at the current step and at every step after it, ``[B, 81]`` each.
+    """Return facts of scenarios (rows of the bank) from the current step on, ``[B, T - 10]`` each.
 
     By the names of ``simulator.types.Facts``; ``clipped_<space>``: the action that follows the log to this step is
     outside of an action space. With ``driven``, ego follows the log through the dynamics instead of being put there.

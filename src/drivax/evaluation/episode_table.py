@@ -66,8 +66,9 @@ class Trajectories:
     """Trajectories of ego and traffic, one row per episode, in each scenario's local frame.
 
     Attributes:
-        ego: x, y [m], heading [rad], speed [m/s] at every step from ``start`` on.
-        action: Executed action at every step from ``start`` on, NaN after a crash; no columns where unknown.
+        ego: x, y [m], heading [rad], speed [m/s] at every step from ``start`` on; repeated beyond a short log.
+        action: Executed action at every step from ``start`` on, NaN after a crash and beyond a short log; no columns
+            where unknown.
         start: Step of the log at which the planner took over.
         events: Step of the first event by name (:data:`EVENTS`), -1 for none.
         others: Packed poses of the other agents (``evaluation.rollout.pack_poses``); None where they replayed the log.

@@ -38,7 +38,8 @@ Values = np.ndarray[Any, Any]
 class SampledStates:
     """Sampled states of episodes, ``[episode, sample]``, with the planner's carry, random key and observation.
 
-    ``hit``: ego has collided by then; ``collides``: it collides before the end of the log, ``[episode]``.
+    ``hit``: ego has collided by then; ``collides``: it collides before the end of the log, ``[episode]``. Beyond the
+    end of a short log its last state is repeated.
     """
 
     state: SimState
@@ -136,17 +137,33 @@ def observation_statistics(
     samples = sample_states(simulator, planner, bank, every, seed)
     observations = {name: np.asarray(leaf) for name, leaf in samples.observation.items()}
     hit, collides = np.asarray(samples.hit), np.asarray(samples.collides)
+    context = samples.state.context
+    driven = np.asarray(context.step < bank.last_step[context.index])
     columns, groups, permuted = {}, {}, 0
     if permute:
-        rows = np.unique(np.linspace(0, hit.size - 1, min(PERMUTED, hit.size)).round().astype(int))
+        steps = np.flatnonzero(driven)
+        rows = np.linspace(0, len(steps) - 1, min(PERMUTED, len(steps))).round().astype(int)
+        rows = steps[np.unique(rows)]
         states, permuted = (samples.state, samples.carry, samples.key, samples.observation), len(rows)
         *rest, inputs = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], states)
         act = partial(_actions, simulator, planner, bank, *rest)
         columns, groups = importances(act, jax.device_get(inputs), seed)
+    observations = _masked(observations, driven)
     features = column_statistics(task.observation.features, observations, hit, collides, columns)
     return ObservationStatistics(
-        planner.name, len(collides), int(collides.sum()), hit.size, permuted, features, groups
+        planner.name, len(collides), int(collides.sum()), int(driven.sum()), permuted, features, groups
     )
+
+
+def _masked(observation: Mapping[str, Values], driven: Values) -> dict[str, Values]:
+    """Return observations ``[episode, look, ...]`` with masks of every group that leave out looks beyond a log."""
+    result = dict(observation)
+    masks = {f"{group}_mask" for group in observation}
+    for group in (name for name in observation if name not in masks):
+        shape = observation[group].shape[:-1]
+        valid = result.get(f"{group}_mask", np.ones(shape, bool))
+        result[f"{group}_mask"] = valid & driven.reshape(*driven.shape, *(1,) * (len(shape) - driven.ndim))
+    return result
 
 
 def column_statistics(
@@ -203,7 +220,9 @@ def _episode(
 
     def step(loop_state: Any, key: Array) -> tuple[Any, None]:
         state, carry, hit = loop_state
-        state, carry, _ = advance(simulator, planner, bank, state, carry, key)
+        ended = state.context.step >= bank.last_step[index]
+        after, carry, _ = advance(simulator, planner, bank, state, carry, key)
+        state = jax.tree.map(partial(jnp.where, ended), state, after)
         return (state, carry, hit | state.facts.collision), None
 
     def sample(loop_state: Any, keys: Array) -> tuple[Any, Any]:

@@ -41,8 +41,8 @@ class Episodes:
     Attributes:
         metrics: Every metric by name.
         events: Step of the first collision, off-road step and red light, -1 for none.
-        motion: x, y, heading, speed of the driven agent from the start step to the end.
-        actions: Executed actions, after bounds and actuators.
+        motion: x, y, heading, speed of the driven agent from the start step to the end; repeated beyond a short log.
+        actions: Executed actions, after bounds and actuators; repeated beyond a short log.
         others: Packed poses of the other agents at each step (:func:`pack_poses`); None in log traffic.
         offroad_steps: Number of steps off the road.
         crashed: First step with a non-finite action, -1 for none; metrics cover the steps before it.
@@ -101,17 +101,14 @@ def _episode(
 
     def step(loop_state: Any, key: Array) -> Any:
         state, measured, carry, is_finite = loop_state
-        state, carry, finite = advance(simulator, planner, bank, state, carry, key)
-        is_finite &= finite
+        # A log that is shorter than others of its bank ends earlier: its last state stays.
+        ended = state.context.step >= bank.last_step[index]
+        after, carry, finite = advance(simulator, planner, bank, state, carry, key)
+        state = jax.tree.map(partial(jnp.where, ended), state, after)
+        is_finite &= finite | ended
         measured = state if planner.replays else jax.tree.map(partial(jnp.where, is_finite), state, measured)
-        context = measured.context
-        outputs = (
-            context.history[-1],
-            context.action,
-            is_finite & state.facts.offroad,
-            is_finite,
-            others(state),
-        )
+        context, offroad = measured.context, is_finite & ~ended & state.facts.offroad
+        outputs = context.history[-1], context.action, offroad, is_finite, others(state)
         return (state, measured, carry, is_finite), outputs
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)

@@ -17,7 +17,7 @@ from typing import Any, TypedDict, Unpack
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int, UInt32
+from jaxtyping import Array, Bool, Float, Float64, Int, UInt32
 
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.evaluation.audit import scenario_names
@@ -30,8 +30,8 @@ from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
-from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities, too_short
+from drivax.scenario.schema import CURRENT_STEP, LEAST_STEPS, STEPS, Scenario
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
@@ -216,14 +216,14 @@ def evaluate(
 
     Raises:
         UsageError: Planner, task, start and scenarios do not fit together.
-        DataError: A scenario has no logged future.
+        DataError: A log is too short.
         DrivaxError: Memory does not suffice, or ego's motion is not finite.
     """
     batch, sizes, progress = options.get("batch"), options.get("sizes"), options.get("progress")
     start_step, seed = options.get("start_step", CURRENT_STEP), options.get("seed", 0)
     if batch is not None and batch < 1:
         raise UsageError(f"batch of {batch} scenarios", cure="use 1 or more")
-    steps = scenarios.steps if isinstance(scenarios, ScenarioBank) else STEPS
+    steps = scenarios.steps if isinstance(scenarios, ScenarioBank) else _steps_of(scenarios)
     simulator = Simulator(task or Task(), traffic or LogTraffic(), start or LogStart())
     evaluation = _Evaluation.of(simulator, planner, start_step, seed, steps)
     prepare: Callable[[Callable[[int], Scenario]], None] | None = getattr(planner, "prepare", None)
@@ -260,17 +260,20 @@ def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
         problem = f"{len(names)} scenario names for a bank of {len(bank)}"
         raise UsageError(problem, cure="name every scenario of the bank")
     present = np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0
-    _check_starts(names, np.asarray(bank.flags) & Flag.NO_FUTURE != 0, present, start_step)
+    _check_starts(names, np.asarray(bank.last_step) + 1, present, start_step)
     return names
+
+
+def _steps_of(scenarios: Sequence[Scenario]) -> int:
+    """Number of steps that the stored scenarios have room for."""
+    return scenarios[0].capacity.steps if len(scenarios) else STEPS
 
 
 def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
     """Return the names of stored scenarios, and check that episodes can start there."""
     names = scenario_names(scenarios)
-    no_future = [Flag.NO_FUTURE in scenario.has for scenario in scenarios]
-    _check_starts(
-        names, no_future, [scenario.agent_valid[start_step, 0] for scenario in scenarios], start_step
-    )
+    steps, present = zip(*((int(s.steps), s.agent_valid[start_step, 0]) for s in scenarios), strict=True)
+    _check_starts(names, np.array(steps), np.array(present), start_step)
     return names
 
 
@@ -339,6 +342,8 @@ class _Evaluation:
         n, planner, traffic = len(names), self.planner.name, self.simulator.traffic.name
         values, crashed = episodes.metrics, np.asarray(episodes.crashed)
         actions = until_crash(np.asarray(episodes.actions), crashed, self.start_step)
+        driven = self.start_step + np.arange(actions.shape[1]) < values["last_step"].value[:, None]
+        actions = np.where(driven[..., None], actions, np.nan)
         metrics = {"action_jerk": action_jerk(actions)} | {
             name: np.where(values[name].defined, values[name].value, np.nan) for name in self.metrics
         }
@@ -401,12 +406,16 @@ def _batch(bank: ScenarioBank, rows: Int[Array, " W"], seed: int) -> tuple[Scena
     return batch, episode_keys(batch, jnp.arange(len(rows)), seed)
 
 
-def _check_starts(names: Names, no_future: Any, present: Any, start_step: int) -> None:
-    """Refuse scenarios without a logged future, and those without ego at the start."""
+def _check_starts(
+    names: Names, steps: Int[np.ndarray, " n"], present: Bool[np.ndarray, " n"], start_step: int
+) -> None:
+    """Refuse logs of too few steps, and those without ego at the start or without an action after it."""
     ids = [row["scenario_id"] for row in names]
-    if short := [name for name, missing in zip(ids, no_future, strict=True) if missing]:
-        problem = f"no logged future (a short log or a test split) in {len(short)} of {len(names)} scenarios"
-        raise DataError(problem, record=short[0], cure="leave them out with --filter flag!=NO_FUTURE")
+    if (short := np.flatnonzero(steps < LEAST_STEPS)).size:
+        problem = f"{too_short(int(steps[short[0]]))}; so have {len(short)} of {len(names)} scenarios"
+        cure = "leave them out with --filter flag!=NO_FUTURE"
+        raise DataError(problem, record=ids[short[0]], cure=cure)
+    present = present & (start_step < steps - 1)
     if absent := [name for name, valid in zip(ids, present, strict=True) if not valid]:
         problem = f"ego is not in the log at step {start_step} in {len(absent)} of {len(names)} scenarios"
         leave_out = f", or leave them out: --filter 'scenario_id!={'|'.join(absent)}'"

@@ -18,7 +18,7 @@ from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.schema import CURRENT_STEP, STEPS
+from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.starts import LogStart
 from drivax.simulator.types import AgentContext, EpisodeStart, Frame, SimState
@@ -35,8 +35,8 @@ class Driving:
 
     Attributes:
         simulator: Task, traffic and kind of start.
-        latest_start, earliest_start: Episodes begin at a random step of the log between the two, or at step 10 where
-            the ego is not valid yet.
+        latest_start, earliest_start: Episodes begin at a random step of the log between the two, at most the third
+            last, or at step 10 where the ego is not valid yet.
     """
 
     simulator: Simulator
@@ -46,8 +46,8 @@ class Driving:
     def __post_init__(self) -> None:
         if self.earliest_start < 0:
             raise UsageError(f"earliest_start is {self.earliest_start}", cure="use 0 or more")
-        if not self.earliest_start <= self.latest_start < STEPS - 2:
-            cure = f"use {self.earliest_start} (earliest_start) to {STEPS - 3}"
+        if self.latest_start < self.earliest_start:
+            cure = f"use {self.earliest_start} (earliest_start) or more"
             raise UsageError(f"latest_start is {self.latest_start}", cure=cure)
 
     @property
@@ -83,8 +83,11 @@ class Driving:
         return {name: tuple(value.shape) for name, value in observation.items()}
 
     def start(self, data: ScenarioBank, key: Array, count: int) -> Environments:
-        """Reset environments to random steps of the log."""
-        index, step, keys = _draw(data, key, count, self.earliest_start, data.steps - 3)
+        """Reset environments to random steps of the log; raises UsageError if no log is as long as ``latest_start``."""
+        if self.latest_start > data.steps - 3:
+            cure = f"use {self.earliest_start} (earliest_start) to {data.steps - 3}"
+            raise UsageError(f"latest_start is {self.latest_start}", cure=cure)
+        index, step, keys = _draw(data, key, count, self.earliest_start)
         state = jax.vmap(self.simulator.reset, (None, 0, 0, None, 0))(data, index, step, 0, keys)
         observation = self.observe_all(data, state.context)
         return Environments(state, jnp.zeros(count, bool), observation)
@@ -128,7 +131,7 @@ class Driving:
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
         """
-        index, step, _ = _draw(data, key, count, CURRENT_STEP, data.steps - 3)
+        index, step, _ = _draw(data, key, count, CURRENT_STEP)
 
         def demonstrate(index: Array, step: Array) -> tuple[dict[str, Array], Array, Array]:
             context = self._logged_context(data, index, step)
@@ -194,14 +197,17 @@ class Driving:
 
 
 def _draw(
-    bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int
+    bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int | None = None
 ) -> tuple[Int[Array, " B"], Int[Array, " B"], Array]:
-    """Draw scenarios, steps with a valid ego (else the current step), and keys for starts."""
+    """Draw scenarios, steps up to the third last at which the ego is valid (else step 10), and keys for starts."""
     index_key, step_key = jax.random.split(key)
     index = jax.random.randint(index_key, (count,), 0, len(bank))
-    step = jax.random.randint(step_key, (count,), earliest, latest + 1)
+    last = bank.last_step[index] - 2
+    last = last if latest is None else jnp.minimum(last, latest)
+    step = jax.random.randint(step_key, (count,), earliest, jnp.maximum(last, earliest) + 1)
     # The ego is always valid at the current step.
-    step = jnp.where(bank.agents[index, step, 0, AgentColumn.VALID] > 0, step, CURRENT_STEP)
+    there = (bank.agents[index, step, 0, AgentColumn.VALID] > 0) & (step <= last)
+    step = jnp.where(there, step, CURRENT_STEP)
     # Unused, and not computed, with logged starts.
     keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
     return index, step, keys

@@ -22,7 +22,7 @@ from drivax.learning.policies import POLICY_FILE, find_traffic, open_policy
 from drivax.learning.program import Program, Seeds
 from drivax.learning.training_log import Preempted, StopSignal, TrainingLog, Validation, validate
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.store import ScenarioSet
+from drivax.scenario.store import ScenarioSet, check_lengths
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
@@ -82,10 +82,9 @@ def train(
         if config.begin_from is not None:
             # With its step, so that resuming finds the same checkpoint.
             config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
-    if config.patience and validation is None:
-        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
     if seeds < 1:
         raise UsageError(f"{seeds} seeds", cure="use 1 or more")
+    _check_validation(config, data, validation)
     environment, bank = _environment(config, data)
     learner = config.algorithm.build(environment, bank, config.iterations)
     held_out = None if validation is None else Validation.of(validation)
@@ -104,6 +103,14 @@ def train(
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         _learn(_Run(config, program, logs, held_out, held_out_data, networks, log))
     return RunFolder.open(out)
+
+
+def _check_validation(config: TrainConfig, data: ScenarioSet, validation: ScenarioSet | None) -> None:
+    """Refuse a validation set of another length, and patience without one."""
+    if validation is not None:
+        check_lengths(data, validation)
+    elif config.patience:
+        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:

@@ -120,6 +120,10 @@ def _steps(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     return Value(end.steps.astype(jnp.float32), jnp.ones((), bool))
 
 
+def _last_step(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    return Value(end.bank.last_step[end.index].astype(jnp.float32), jnp.ones((), bool))
+
+
 def _progress(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     start = end.bank.log_progress[end.index, end.start]
     return Value(jnp.where(end.steps > 0, value.value - start, 0.0), value.defined)
@@ -127,7 +131,7 @@ def _progress(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
 
 def _progress_ratio(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     log = end.bank.log_progress[end.index]
-    logged = log[-1] - log[end.start]
+    logged = log[end.bank.last_step[end.index]] - log[end.start]
     gain = inputs["progress"]
     ratio = jnp.where(logged < 0.5, 1.0, jnp.clip(gain.value / jnp.maximum(logged, 0.5), 0.0, 1.0))
     return Value(ratio, gain.defined)
@@ -309,6 +313,7 @@ METRICS: dict[str, Metric] = {
     "ignored_overlaps": _accumulated(
         "ignored", "max", "-", "-", "agents ignored because they overlapped at the start"),
     "steps": _computed(_steps, (), "-", "steps driven", summarised=False),
+    "last_step": _computed(_last_step, (), "-", "last step of the log", summarised=False),
 }
 # fmt: on
 #: Metrics without a mean.

@@ -25,11 +25,11 @@ def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Moti
 
     Beyond the end of the log its last motion continues at constant velocity.
     """
-    at = context.step + ahead
-    logged = bank.agents[context.index, jnp.minimum(at, bank.steps - 1), context.slot]
+    at, last = context.step + ahead, bank.last_step[context.index]
+    logged = bank.agents[context.index, jnp.minimum(at, last), context.slot]
     heading, velocity = logged[AgentColumn.HEADING], logged[AgentColumn.VELOCITY]
     speed = jnp.maximum(jnp.sum(velocity * heading), 0.0)
-    beyond_s = jnp.maximum(at - (bank.steps - 1), 0) * 0.1
+    beyond_s = jnp.maximum(at - last, 0) * 0.1
     xy = logged[AgentColumn.XY] + beyond_s * velocity
     motion = jnp.stack([xy[0], xy[1], jnp.arctan2(logged[AgentColumn.SIN], logged[AgentColumn.COS]), speed])
     return jnp.where(logged[AgentColumn.VALID] > 0, motion, context.history[-1])

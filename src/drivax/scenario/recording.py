@@ -143,6 +143,8 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
     pieces = [_even(piece) for piece in _between_gaps(recording)]
     if len(pieces) == 1 and len(pieces[0][1]) <= length:
         piece, filled = pieces[0]
+        now = min(CURRENT_STEP, len(filled) - 1)
+        piece = piece if piece.current_step == now else replace(piece, current_step=now)
         yield _counting(piece, interpolated_steps=int(filled.sum()))
         return
     cut = [

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import enum
 import hashlib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int
+
+from drivax.errors import UsageError
 
 SCHEMA_VERSION = 3
 
@@ -22,6 +24,8 @@ SCHEMA_VERSION = 3
 STEPS = 91
 CURRENT_STEP = 10
 DT_S = 0.1
+#: Fewest steps of a log that is evaluated or trained on: 20 follow the current one (semantics, Time).
+LEAST_STEPS = CURRENT_STEP + 1 + 20
 
 
 class AgentKind(enum.IntEnum):
@@ -141,6 +145,19 @@ class Capacity:
     #: Longest contiguous run of grid-sorted segments that a query reads per row of three cells.
     edge_run: int = 96
     lane_run: int = 160
+
+    def lasting(self, future_s: float) -> Capacity:
+        """Return the capacity of scenarios with this many seconds after the current step, 2 to 60 (else UsageError).
+
+        Routes get 40 m of room per second more than 8 s (144 km/h).
+        """
+        if not 2.0 <= future_s <= 60.0:
+            raise UsageError(f"future_s is {future_s:g}", cure="use 2 to 60 seconds")
+        steps = CURRENT_STEP + 1 + round(future_s / DT_S)
+        if steps == self.steps:
+            return self
+        points = self.route_points + 4 * max(steps - self.steps, 0)
+        return replace(self, name=f"{self.name}-{future_s:g}s", steps=steps, route_points=points)
 
 
 CAPACITIES = {

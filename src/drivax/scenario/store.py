@@ -300,6 +300,14 @@ class ScenarioSet(Sequence[Scenario]):
             shard.check_digest()
 
 
+def check_lengths(first: ScenarioSet, *others: ScenarioSet) -> None:
+    """Refuse sets for one command whose scenarios have room for different numbers of steps."""
+    for other in others:
+        if other.capacity.steps != first.capacity.steps:
+            problem = f"has scenarios of {other.capacity.steps} steps, {first.path} of {first.capacity.steps}"
+            raise UsageError(problem, file=other.path, cure="convert both with one --future-s")
+
+
 class Shard:
     """A shard file: expected layout, memory map, and a mask of the records that passed their checksum."""
 

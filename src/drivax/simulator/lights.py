@@ -56,7 +56,7 @@ def check_lights(
     """
     front_before, front = _fronts(context, me[4])[-2:]
     crossed, before_m = light_crossing(bank, context.index, front_before, front, ground)
-    last = bank.steps - 1
+    last = bank.last_step[context.index]
     now = bank.light_state[context.index, jnp.clip(context.step, 0, last)]
     then = bank.light_state[context.index, jnp.clip(context.step - 1, 0, last)]
     red = is_red(now) & is_red(then)

@@ -216,7 +216,7 @@ class Simulator:
         )
         terminated, truncated = self.task.ended(bank, situation.context, situation.facts)
         terms = self.task.reward(before.facts, situation.facts, situation.surroundings)
-        final = terminated | truncated | (situation.context.step >= bank.steps - 1)
+        final = terminated | truncated | (moved.step >= bank.last_step[moved.index])
         episode = self.task.episode_add(before.episode, situation, before.start, final)
         after = SimState(situation.context, situation.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))

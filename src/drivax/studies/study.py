@@ -35,7 +35,7 @@ from drivax.learning.training_log import rank
 from drivax.planners.catalogue import make_planner
 from drivax.report.pages.viewer import criticality_html, write_player
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_lengths
 from drivax.stats.clusters import recordings_of
 from drivax.studies.definition import Study, StudyConfig
 from drivax.studies.report import write_report
@@ -161,6 +161,7 @@ def _open_folder(study: Study) -> None:
     """Create the folder of a study, or check that it holds this one."""
     sets = study.sets
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
+    check_lengths(*data)
     definition = hashlib.sha256(settings.dump(study.definition).encode()).hexdigest()
     if not study.folder.exists() or not any(study.folder.iterdir()):
         unlabelled_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]

@@ -26,7 +26,7 @@ from typing import Any
 from drivax.errors import DrivaxError, UsageError
 from drivax.files import check_space
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.schema import CAPACITIES, Scenario, record_dtype
+from drivax.scenario.schema import CAPACITIES, Capacity, Scenario, record_dtype
 from drivax.scenario.store import ScenarioWriter
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
 from drivax.tracking.workers import await_interrupt, worker_pool
@@ -77,12 +77,14 @@ class Generation:
         workers: Number of worker processes. With 0 this process draws, whose NumPy depends on the processor in its last
             bits: only workers write the same bytes everywhere.
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
+        future_s: Seconds of a scenario after its current step, 8 to 60; events are staged in the first 8.
         overwrite: Replace an existing scenario set.
         world: Settings of the world.
     """
 
     workers: int = 0
     capacity: str = "default"
+    future_s: float = 8.0
     overwrite: bool = False
     world: WorldConfig = field(default_factory=WorldConfig)
 
@@ -98,7 +100,15 @@ class Generation:
             raise UsageError(
                 f"unknown capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
             )
+        if self.future_s < 8.0:
+            raise UsageError(f"future_s is {self.future_s:g}", cure="use 8 to 60 seconds")
+        _ = self.sizes
         self.world.check()
+
+    @property
+    def sizes(self) -> Capacity:
+        """Padded sizes of a scenario of this length."""
+        return CAPACITIES[self.capacity].lasting(self.future_s)
 
 
 @dataclass(frozen=True)
@@ -207,9 +217,7 @@ def write_set(
     counts = _Counts()
     batch: list[Scenario] = []
     with (
-        ScenarioWriter(
-            out, CAPACITIES[options.capacity], source, overwrite=options.overwrite, expected=scenarios
-        ) as writer,
+        ScenarioWriter(out, options.sizes, source, overwrite=options.overwrite, expected=scenarios) as writer,
         closing(_draws(scenarios, seed, options)) as draws,
     ):
         for done, draw in enumerate(draws, start=1):
@@ -227,8 +235,8 @@ def write_set(
 
 def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:
     """Draw scenarios ``first`` to ``last - 1`` (in a worker)."""
-    draws = [generate_one(seed, index, options.world) for index in range(first, last)]
-    capacity = CAPACITIES[options.capacity]
+    capacity = options.sizes
+    draws = [generate_one(seed, index, options.world, capacity.steps) for index in range(first, last)]
     return [_Draw(assemble(draw.recording, capacity), draw.family, draw.rejected) for draw in draws]
 
 
@@ -307,12 +315,12 @@ def generate_benchmark(
     """
     options = options or Generation()
     options.check()
-    if options.world != WorldConfig(domain=options.world.domain):
+    if options.world != WorldConfig(domain=options.world.domain) or options.future_s != 8.0:
         raise UsageError(
             "the benchmark's world is fixed but for its domain", cure="use generate for other settings"
         )
     counts, sets = sizes(train), dict[str, GeneratedSet]()
-    check_space(Path(out), sum(counts.values()) * record_dtype(CAPACITIES[options.capacity]).itemsize)
+    check_space(Path(out), sum(counts.values()) * record_dtype(options.sizes).itemsize)
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:

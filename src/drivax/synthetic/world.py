@@ -124,13 +124,15 @@ class GeneratedRecording:
     rejected: dict[tuple[str, str], int]
 
 
-def generate_recording(seed: int, index: int, config: WorldConfig | None = None) -> Recording:
+def generate_recording(
+    seed: int, index: int, config: WorldConfig | None = None, steps: int = STEPS
+) -> Recording:
     """Generate the recording of a seed and index (both not negative) in a world with some settings."""
-    return generate_one(seed, index, config or WorldConfig()).recording
+    return generate_one(seed, index, config or WorldConfig(), steps).recording
 
 
-def generate_one(seed: int, index: int, config: WorldConfig) -> GeneratedRecording:
-    """Generate a recording with its family and rejected attempts.
+def generate_one(seed: int, index: int, config: WorldConfig, steps: int = STEPS) -> GeneratedRecording:
+    """Generate a recording of at least 91 steps with its family and rejected attempts.
 
     The kind of event is drawn first, so that kinds whose draws fail more often are not rarer. A rare scenario has roads
     of its own, and is redrawn on other roads if these give no occasion for its event.
@@ -149,11 +151,11 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> GeneratedRecordi
         family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *sample))
         rng = np.random.default_rng([seed, 2, index, attempt])
         places = destinations_for(event, network, attempt > 0) if event else ()
-        result = _attempt(_Draw(network, places, event, severity), domain, config, rng)
+        result = _attempt(_Draw(network, places, event, severity, steps), domain, config, rng)
         if isinstance(result, str):
             rejected[family.name, result] += 1
             continue
-        name = f"w{WORLD_VERSION}-{config.domain}-s{seed}"
+        name = f"w{WORLD_VERSION}-{config.domain}-s{seed}" + (f"-t{steps}" if steps != STEPS else "")
         recording = replace(
             result,
             scenario_id=f"{name}-{index:06d}-{family.name}",
@@ -198,12 +200,13 @@ class _Draw:
     destinations: tuple[Destination, ...]
     event: EventKind
     severity_mps2: float
+    steps: int
 
 
 def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Generator) -> Recording | str:
     """Return the recording of one draw, or the cause of its rejection."""
     critical = not draw.event and rng.random() < config.critical_share
-    times = (np.arange(_WARM_UP + STEPS + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
+    times = (np.arange(_WARM_UP + draw.steps + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
     roles = assign_roles(
         draw.network,
         domain,
@@ -220,13 +223,15 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
         if critical:
             first = _critical_step(traffic, motion, rng)
         begin, tags = first or _WARM_UP, {} if first is None else {"critical": "yes"}
-        traffic, motion = traffic.before_step(begin + STEPS), motion.before_step(begin + STEPS)
+        end = begin + draw.steps
+        traffic, motion = traffic.before_step(end), motion.before_step(end)
         motion, cause = expert.drive_ego(
             roles, traffic.times_s, Staging(), begin, traffic.run, unplanned=motion
         )
-        return cause or _add_perception(
-            replace(_to_recording(roles, motion, begin, None), tags=tags), config, rng
-        )
+        if cause:
+            return cause
+        recording = _to_recording(roles, motion, begin, None, draw.steps)
+        return _add_perception(replace(recording, tags=tags), config, rng)
     view, cause = EgoView(roles, traffic.run(), _WARM_UP), UNSUITED[0]
     for _ in range(_STAGINGS):
         staged = stage(draw.event, view, draw.severity_mps2, rng)
@@ -235,7 +240,7 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
         aware = staged.first_step - _FORESEEN
         motion, cause = expert.drive_ego(roles, times, staged.staging, _WARM_UP, traffic.run, aware)
         if not cause and endangers_ego(view, motion, staged):
-            return _add_perception(_to_recording(roles, motion, _WARM_UP, staged), config, rng)
+            return _add_perception(_to_recording(roles, motion, _WARM_UP, staged, draw.steps), config, rng)
         cause = cause or UNSUITED[1]
     return cause
 
@@ -257,16 +262,18 @@ def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -
     return int(steps[rng.choice(candidates)]) if len(candidates) else None
 
 
-def _to_recording(roles: Roles, motion: Motion, first: int, staged: StagedEvent | None) -> Recording:
+def _to_recording(
+    roles: Roles, motion: Motion, first: int, staged: StagedEvent | None, steps: int
+) -> Recording:
     """Return the recording from a step on, without id and segment."""
     network, motion = roles.network, motion.from_step(first)
-    times = np.arange(STEPS) * DT_S
+    times = np.arange(steps) * DT_S
     events, tags = (), {}
     if staged is not None:
         tags = {"event": staged.kind.name.lower(), "severity_mps2": f"{staged.severity_mps2:.1f}"}
         begin, last = staged.first_step - first, staged.last_step - first
         actors = tuple(user + 1 for user in staged.actors)
-        events = (Event(int(staged.kind), begin, min(last, STEPS - 1), actors),)
+        events = (Event(int(staged.kind), begin, min(last, steps - 1), actors),)
     return Recording(
         scenario_id="",
         dataset="drivax",

@@ -70,6 +70,8 @@ class NuPlan:
     name: str = FORMAT
     patterns: tuple[str, ...] = ("*_veh-*.db",)
     companions: tuple[str, ...] = ("map.gpkg", "nuplan-maps-*.json")
+    #: Steps of the scenarios that recordings become; a recording goes on beyond its scene for the last of them.
+    steps: int = STEPS
 
     def recognise(self, path: Path) -> bool:
         """Whether the file is SQLite and has the tables of a nuPlan log."""
@@ -83,7 +85,7 @@ class NuPlan:
         """Describe the content of the log, and whether its map is present."""
         with open_database(path) as database:
             log = _open_log(database, path)
-        parts, times = pieces(log.line), log.line.time_us
+        parts, times = pieces(log.line, self.steps), log.line.time_us
         scenes = len({piece.scene for piece in parts})
         notes = [
             f"map {log.map_name}",
@@ -101,7 +103,9 @@ class NuPlan:
         """Return the number of windows of 91 steps at the usual stride; 0 where the log is unreadable."""
         try:
             with open_database(path) as database:
-                return sum(parsing.windows_of(len(piece.sweeps)) for piece in pieces(time_line(database)))
+                return sum(
+                    parsing.windows_of(len(piece.sweeps)) for piece in pieces(time_line(database), self.steps)
+                )
         except DataError:
             return 0
 
@@ -112,7 +116,7 @@ class NuPlan:
                 log = _open_log(database, path)
                 city = city_map(find_map(path, log.map_name))
                 known = agents(database)
-                for piece in pieces(log.line):
+                for piece in pieces(log.line, self.steps):
                     try:
                         yield _recording(log, piece, known, city)
                     except DataError as error:
@@ -132,7 +136,7 @@ class TimeLine:
 
 @dataclass(frozen=True)
 class Piece:
-    """The steps of one recording: those of a scene, up to 10 before and up to 80 after it.
+    """The steps of one recording: those of a scene, up to 10 before and the future of a scenario (80 steps) after it.
 
     So the current steps of its windows are the steps of the scene, and windows cross the borders of scenes.
 
@@ -185,8 +189,8 @@ def time_line(database: Database) -> TimeLine:
     return TimeLine(tokens, np.array(times, np.int64), scenes)
 
 
-def pieces(line: TimeLine) -> list[Piece]:
-    """Cut a time line at gaps and scenes, and long scenes, into pieces of 10 Hz.
+def pieces(line: TimeLine, steps: int = STEPS) -> list[Piece]:
+    """Cut a time line at gaps and scenes, and long scenes, into pieces of 10 Hz for scenarios of ``steps`` steps.
 
     Of sweeps at 20 Hz every second one is taken, counted from the last gap. A remainder that is too short for a
     window is left out: it is the future of the windows before.
@@ -198,8 +202,8 @@ def pieces(line: TimeLine) -> list[Piece]:
     for first, last in zip((0, *ends), (*ends, len(line.tokens)), strict=True):
         sweeps = np.arange(first, last, step)
         for begin, end in _scenes(line, sweeps):
-            part = slice(max(begin - CURRENT_STEP, 0), min(end + STEPS - CURRENT_STEP - 1, len(sweeps)))
-            if part.stop - part.start < STEPS and (begin > 0 or len(sweeps) >= STEPS):
+            part = slice(max(begin - CURRENT_STEP, 0), min(end + steps - CURRENT_STEP - 1, len(sweeps)))
+            if part.stop - part.start < steps and (begin > 0 or len(sweeps) >= steps):
                 continue
             scene = line.scenes[sweeps[begin]]
             number = counts[scene] = counts.get(scene, 0) + 1

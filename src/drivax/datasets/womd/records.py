@@ -15,7 +15,7 @@ from drivax.datasets.womd.messages import ExampleFeatures, parse
 from drivax.datasets.womd.tfrecord import count_records, looks_framed, read_records
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.recording import Recording, is_even
-from drivax.scenario.schema import AgentKind
+from drivax.scenario.schema import LEAST_STEPS, AgentKind
 
 DATASET = "womd"
 FULL_NAME = "Waymo Open Motion Dataset"
@@ -137,8 +137,8 @@ def notes_of(recording: Recording) -> tuple[str, ...]:
     notes = [f"{steps} steps, current step {now}"]
     if parsing.windows_of(steps) > 1:
         notes.append(f"each recording becomes {parsing.windows_of(steps)} windows of 91 steps")
-    elif now == steps - 1:
-        notes.append("no future (test split): stored, but refused for training and evaluation")
+    elif steps < LEAST_STEPS:
+        notes.append(f"fewer than {LEAST_STEPS} steps: stored, but refused for training and evaluation")
     if not recording.lights:
         notes.append("no traffic lights in the first record")
     if not is_even(recording.timestamps_s):

@@ -25,9 +25,9 @@ from drivax.scenario.record import record, static
 from drivax.scenario.schema import (
     EDGE_KINDS,
     LANE_KINDS,
+    LEAST_STEPS,
     POLYGON_KINDS,
     Capacity,
-    Flag,
     RoadKind,
     Scenario,
     among,
@@ -154,6 +154,7 @@ class ScenarioBank:
         road: Pieces of road to observe, in order of rank, :class:`RoadColumn`.
         road_at, road_curvature: x, y and layer of the same pieces; their curvature, left positive, 1/m.
         flags: ``scenario.schema.Flag`` bits.
+        last_step: Last step of each log; beyond it, up to T, there is only padding.
         identity: Seeds of the random numbers of a scenario (:func:`identities`).
         extension: Points 4 m apart beyond the last logged pose of moving agents, along their lane: x, y.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
@@ -184,6 +185,7 @@ class ScenarioBank:
     road_at: Float[Array, "N 3 O"]
     road_curvature: Float[Array, "N O"]
     flags: UInt[Array, " N"]
+    last_step: Int[Array, " N"]
     identity: UInt[Array, " N"]
     extension: Float[Array, "N A X 2"]
     cell_m: float = static()
@@ -197,7 +199,7 @@ class ScenarioBank:
 
     @property
     def steps(self) -> int:
-        """Number of steps T."""
+        """Number of steps T, of which a short log fills fewer."""
         return self.agents.shape[1]
 
     @property
@@ -224,19 +226,20 @@ class ScenarioBank:
         """Stack scenarios of one capacity.
 
         ``trim`` cuts unused padding, or cuts to given sizes: banks of the same sizes share compiled programs, smaller
-        banks are faster. ``allow_no_future`` accepts scenarios of test splits.
+        banks are faster. ``allow_no_future`` accepts logs with fewer than 20 steps after the current one.
 
         Raises:
-            DrivaxError: There are no scenarios, their capacities differ, or one has no logged future.
+            DrivaxError: There are no scenarios, their capacities differ, or a log is too short.
         """
         kept = list(scenarios)
         for scenario in kept:
-            if Flag.NO_FUTURE in scenario.has and not allow_no_future:
-                problem = "has no logged future (a test split)"
-                raise DataError(problem, record=scenario.id, cure="leave it out (flag!=NO_FUTURE)")
+            if scenario.steps < LEAST_STEPS and not allow_no_future:
+                cure = "leave it out (flag!=NO_FUTURE)"
+                raise DataError(too_short(int(scenario.steps)), record=scenario.id, cure=cure)
             if scenario.capacity != kept[0].capacity:
-                problem = f"has capacity {scenario.capacity.name!r}, others {kept[0].capacity.name!r}"
-                raise DataError(problem, record=scenario.id, cure="convert all sets with one --capacity")
+                own, others = (f"{c.name!r} ({c.steps} steps)" for c in (scenario.capacity, kept[0].capacity))
+                cure = "convert all sets with one --capacity and --future-s"
+                raise DataError(f"has capacity {own}, others {others}", record=scenario.id, cure=cure)
         own = Sizes.used(kept)
         sizes = trim if isinstance(trim, Sizes) else own if trim else Sizes.whole(kept[0].capacity)
         arrays = _stack_agents(kept, sizes) | _stack_routes(kept) | _stack_lights(kept, sizes)
@@ -246,6 +249,11 @@ class ScenarioBank:
             cell_m=kept[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
             long_ego=own.long_ego or sizes.long_ego, trimmed=trim is True,
         )  # fmt: skip
+
+
+def too_short(steps: int) -> str:
+    """Say that a log has fewer steps than one that is evaluated or trained on."""
+    return f"has {steps} steps, fewer than {LEAST_STEPS} (20 after the current one)"
 
 
 def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
@@ -288,6 +296,7 @@ def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
         "agents": agents[:, :, : sizes.agents],
         "extension": _column(scenarios, "agent_extension")[:, : sizes.agents],
         "flags": _column(scenarios, "flags"),
+        "last_step": _column(scenarios, "steps").astype(np.int32) - 1,
         "identity": identities([(scenario.text("dataset"), scenario.id) for scenario in scenarios]),
         **_stack_parked(scenarios, sizes.slots, last_used(valid.any(1)), box),
     }

@@ -49,6 +49,7 @@ from drivax.scenario.schema import (
     CAR_LANE_KINDS,
     EDGE_KINDS,
     LANE_KINDS,
+    LEAST_STEPS,
     LINE_KINDS,
     NAMES,
     Capacity,
@@ -184,7 +185,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     lost = Counter({name: int(count) for name, count in recording.lost.items()})
     lost += Counter({**whole.lost, **unknown})
     overflow = _overflow(parts, recording, capacity, {"lanes": lost_lanes, "features": lost_features})
-    flags = _flags(recording, parts, capacity)
+    flags = _flags(recording, parts)
     flags |= Flag.OVERFLOW if overflow else Flag.NONE
     return Scenario(
         record=fill(parts, recording, capacity, origin, flags),
@@ -275,13 +276,13 @@ def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict
     return dict(+Counter(counts))
 
 
-def _flags(recording: Recording, parts: Parts, capacity: Capacity) -> Flag:
+def _flags(recording: Recording, parts: Parts) -> Flag:
     """Flags of the reader, with those that are measured here, on what is stored."""
     stored, segments = parts.placement, parts.grid.segments
     heights = np.concatenate((segments.a[:, 2], segments.b[:, 2]))
     facts = (
         (Flag.LIGHTS, len(parts.lights.z) > 0),
-        (Flag.NO_FUTURE, len(recording.timestamps_s) < capacity.steps),
+        (Flag.NO_FUTURE, len(recording.timestamps_s) < LEAST_STEPS),
         (Flag.DEFAULT_SIZES, parts.tracks.defaulted[np.append(stored.moving, stored.parked)].any()),
         (Flag.CLOSED_EDGES, parts.roads.rings_closed),
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
