@@ -155,7 +155,7 @@ def test_published_penalty_includes_the_logged_action(part, improved):
     now, following = (
         learner.distribution(trained["policy"], seen) for seen in (part.observation, part.next_observation)
     )
-    action, density = learner._sampled(now, following, part.action, sample_key)
+    action, density = learner._penalty_actions(now, following, part.action, sample_key)
     assert action.shape == (2 * ACTIONS + 1, COUNT, 1) and not np.asarray(density).any()
     np.testing.assert_array_equal(action[-1], part.action)
     q = np.asarray(learner.q_values(trained["critic"], part.observation, action), np.float64)

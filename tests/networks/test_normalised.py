@@ -52,12 +52,12 @@ def test_normalised_features_have_zero_mean_and_unit_deviation(groups):
     near = {**groups, "agents": groups["agents"] / 100, "ego": groups["ego"] / 10}
     np.testing.assert_allclose(made(near), plain(near), rtol=1e-5)
     set_statistics(made, feature_statistics(groups))
-    rows = np.asarray(made._scaled("agents", groups["agents"]))[np.asarray(groups["agents_mask"])]
+    rows = np.asarray(made._normalise("agents", groups["agents"]))[np.asarray(groups["agents_mask"])]
     np.testing.assert_allclose(rows.mean(axis=0), 0.0, atol=1e-3)
     np.testing.assert_allclose(rows.std(axis=0), 1.0, rtol=1e-3)
     # A feature that is always the same stays finite, and one that is far off is clipped.
     assert np.isfinite(made({**groups, "ego": groups["ego"].at[:, 2].set(7.0)})).all()
-    assert float(made._scaled("ego", jnp.array([1e6, 0.0, 0.0]))[0]) == 10.0
+    assert float(made._normalise("ego", jnp.array([1e6, 0.0, 0.0]))[0]) == 10.0
 
 
 def test_no_gradient_reaches_statistics(groups):
