@@ -256,7 +256,7 @@ def test_the_command(data, tmp_path, capsys):
         (["kinematic", "--weights", "urgency", "-1"], "the weight of 'urgency' is -1.0; use 0 or more"),
         (["kinematic", "--scenario", "p101"], "unknown aggregator 'p101'"),
         (["kinematic", "--scenario", "urgency", "max"], "missing aggregator for 'braking'"),
-        (["ensemble", "--weights", "actoin_0", "1"], "no component 'actoin_0'; did you mean 'action_0'"),
+        (["ensemble", "--weights", "actoin_0", "1"], "unknown component 'actoin_0'; did you mean 'action_0'"),
         (["ensemble", *mixture, "--weights", "action_0", "1"], "unknown component 'action_0'"),
     ):
         assert main(["curate", *wrong[:1], *begin, *wrong[1:]]) == 2
