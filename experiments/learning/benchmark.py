@@ -39,6 +39,8 @@ from experiments.repository import DOCS, RESULTS, STATE, fetched
 
 #: Weights of all seeds of the learned planners, and episodes of all planners: fetched from history where they are not.
 POLICIES, EPISODES = STATE / "policies", STATE / "benchmark"
+#: Episodes by the definitions before decisions 0011 and 0012, of the same planners on the same scenarios.
+FORMER = STATE / "benchmark-former"
 RESULT = RESULTS / "benchmark.json"
 PAGE = DOCS / "results" / "benchmark.md"
 TRAFFIC = ("log", "idm")
@@ -53,6 +55,11 @@ COLUMNS = {
 }  # fmt: skip
 #: Whom every learned planner is compared with, and in what.
 AGAINST, COMPARED = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
+#: Metrics that decisions 0011 and 0012 changed.
+CHANGED = {
+    "at_fault_collision": "at fault", "offroad": "off-road", "comfortable": "comfort",
+    "speed_compliance": "speed compliance", "vmax_score": "vmax score", "nuplan_score": "nuplan score",
+}  # fmt: skip
 #: Tags by which accuracy is broken down, and where those of the scenarios are kept.
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
 #: What the table of random actions shows: until the first failure, as published episodes end there.
@@ -145,9 +152,9 @@ def file_of(name: str, kind: str) -> Path:
     return EPISODES / f"{name.replace(' ', '_')}-{kind}.npz"
 
 
-def episodes(name: str, kind: str) -> Driven | None:
+def episodes(name: str, kind: str, folder: Path = EPISODES) -> Driven | None:
     """Return the stored episodes of a planner; None if there are none."""
-    file = file_of(name, kind)
+    file = folder / file_of(name, kind).name
     if not file.is_file():
         return None
     with np.load(file, allow_pickle=False) as found:
@@ -174,6 +181,18 @@ def change(driven: Driven, metric: str, before: Driven) -> Interval:
     if len(apart) == 1:
         return bootstrap_mean(apart[0], driven.segments, seed=0)
     return seeds_interval(apart, driven.segments)
+
+
+def changes(driven: Driven, former: Driven) -> dict[str, dict[str, float]]:
+    """Means of the changed metrics before and after, and the share of episodes whose value differs."""
+    found = {}
+    for metric in CHANGED:
+        before, now = (one.values[metric].astype(np.float64) for one in (former, driven))
+        moved = ~np.isclose(before, now, rtol=0, atol=1e-5, equal_nan=True)
+        found[metric] = {
+            "before": float(np.nanmean(before)), "after": float(np.nanmean(now)), "moved": float(moved.mean())
+        }  # fmt: skip
+    return found
 
 
 def judged() -> dict[str, Any]:
@@ -218,6 +237,11 @@ def judged() -> dict[str, Any]:
             for kind in TRAFFIC
         },
         "strata": strata(driven),
+        "changes": {
+            f"{name}, {kind}": changes(found, former)
+            for (name, kind), found in driven.items()
+            if (former := episodes(name, kind, FORMER)) is not None
+        },
         "driven": {f"{name}, {kind}": dict(found.about) for (name, kind), found in driven.items()},
     }
 
@@ -290,6 +314,15 @@ def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
         if kind in planners.get(name, {})
     ]
     found["random"] = table(("planner", "traffic", *shown.values()), rows)
+    found["changes"] = table(
+        ("planner", "traffic", *CHANGED.values()),
+        [
+            (f"`{name}`", f"`{kind}`", *(changed(result["changes"][f"{name}, {kind}"][m]) for m in CHANGED))
+            for name in order
+            for kind in TRAFFIC
+            if f"{name}, {kind}" in result["changes"]
+        ],
+    )
     names = [name for name in order if name in result["strata"][0]["planners"]]
     found["strata"] = table(
         ("tag", "value", "scenarios", *(f"`{name}`" for name in names)),
@@ -314,6 +347,13 @@ def cells(
         interval(found[metric], signed=signed, digits=1 if "progress" in metric or metric in UNTIL else 3)
         for metric in metrics
     ]
+
+
+def changed(one: Mapping[str, float]) -> str:
+    """Format a mean before and after, and the share of episodes that moved; one number if none did."""
+    if one["moved"] == 0.0:
+        return f"{one['after']:.3f}"
+    return f"{one['before']:.3f} to {one['after']:.3f} ({one['moved']:.1%})"
 
 
 def filled(text: str, result: Mapping[str, Any]) -> str:
@@ -341,7 +381,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.command != "table":
         fetched("benchmarks/policies", POLICIES)
-        fetched("benchmarks/results/benchmark", EPISODES)
+        fetched("benchmarks/results/benchmark", FORMER)
     if args.command == "drive":
         drive(args)
         return

@@ -56,7 +56,7 @@ SCENES = {
     "head on": [car(speed=5.0), car(x=40.0, heading=np.pi, speed=10.0, steps=range(28))],
     "brief": [car(speed=15.0, steps=range(12)), car(x=60.0)],
     "noise": [with_speeds(10.0 + 0.01 * NOISE)],
-    "jerk": [with_speeds(10.0 + 4.13 / 2 * TIME**2)],
+    "jerk": [with_speeds(10.0 + 4.13 / 2 * (TIME - 4.5) ** 2)],
     "bend": [turning(0.3 * TIME**2)],
     "aside": [car(y=0.5, speed=10.0)],
     "kerb": [car(y=-0.5, speed=10.0)],
@@ -169,7 +169,7 @@ BRAKING = 30.0 - 2.0 * (TIME + 1.0)
 
 
 @pytest.mark.parametrize("there", [range(5, 91), range(51), {*range(91)} - {*range(40, 50)}, range(2, 16)])
-@pytest.mark.parametrize(("speeds", "jerk"), [(BRAKING, 0.0), (20.0 + 4.13 / 2 * TIME**2, 0.5)])
+@pytest.mark.parametrize(("speeds", "jerk"), [(BRAKING, 0.0), (20.0 + 4.13 / 2 * (TIME - 4.5) ** 2, 0.5)])
 def test_volatility_ignores_steps_without_ego(there, speeds, jerk):
     """Constant deceleration, or jerk, up to the last step that is known; 0 where there are no 1.5 s on end."""
     valid = np.isin(np.arange(91), list(there))

@@ -209,7 +209,7 @@ def test_invalid_requests_are_refused(tmp_path):
         ((1, 0, Generation(world=WorldConfig(rare_rate=1.5))), "rare_rate is 1.5; use a share from 0 to 1"),
         ((1, 0, Generation(world=WorldConfig(scenarios_per_map=0))), "scenarios_per_map is 0; use 1"),
         ((1, 0, Generation(workers=-1)), "workers is -1; use 0 or more"),
-        ((1, 0, Generation(capacity="tiny")), "no capacity 'tiny'; use one of default, large"),
+        ((1, 0, Generation(capacity="tiny")), "unknown capacity 'tiny'; use one of default, large"),
     ):
         with pytest.raises(UsageError, match=text):
             generate(tmp_path / "set", *arguments)

@@ -50,9 +50,7 @@ def facts(**changes):
 
 def around(near=True):
     no, zero = jnp.zeros((), bool), jnp.zeros(())
-    hits = LaneHits(
-        jnp.asarray(near), jnp.zeros(4, bool), no, no, no, no, zero, jnp.zeros((), jnp.int32), zero, zero
-    )
+    hits = LaneHits(jnp.asarray(near), jnp.zeros(4, bool), no, no, no, no, limit=zero, z=zero)
     frame = Frame(
         jnp.zeros((2, 6)), jnp.zeros((2, 2)), jnp.zeros(2), jnp.zeros(2, bool), jnp.zeros(2, jnp.int32),
         jnp.zeros(0, jnp.int32),

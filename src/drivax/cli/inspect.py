@@ -72,7 +72,7 @@ def run(args: Inspect) -> int:
     if args.observations:
         _observe(args, inspections[0])
     elif args.json:
-        sets = [{"scenarios": inspection.described()} for inspection in inspections]
+        sets = [{"scenarios": inspection.describe()} for inspection in inspections]
         named_sets = [{"set": str(path), **content} for path, content in zip(args.sets, sets, strict=True)]
         json.dump(sets[0] if len(sets) == 1 else named_sets, sys.stdout, indent=1)
         print()

@@ -72,7 +72,7 @@ class Inspection:
         """The manifest entries of the selected scenarios."""
         return [self.scenarios.entries[row] for row in self.rows]
 
-    def described(self) -> list[dict[str, Any]]:
+    def describe(self) -> list[dict[str, Any]]:
         """Return the selected scenarios as ``inspect --json`` prints them: a stable contract.
 
         ``origin`` is the origin of its coordinates in the source's map frame: x, y, z in metres.
