@@ -143,7 +143,7 @@ AHEAD = {
 }  # fmt: skip
 WON = {
     "accuracy": 1, "accuracy_at_fault": 1, "success": 1, "success_moving": 1, "vmax_score": 1, "nuplan_score": 1,
-    "vmax_score_partial": None, "nuplan_score_partial": None, "ignored_overlaps": 0, "steps": 80,
+    "vmax_score_partial": None, "nuplan_score_partial": None, "ignored_overlaps": 0, "steps": 80, "last_step": 90,
 }  # fmt: skip
 PERFECT = SAFE | FREE | SMOOTH | LAWFUL | AHEAD | WON
 CRASHED = {"collision": 1, "accuracy": 0, "success": 0, "success_moving": 0}

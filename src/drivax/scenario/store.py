@@ -48,6 +48,11 @@ _HEADER_LIMIT = 100_000
 _Bytes = np.ndarray[Any, Any]
 
 
+def check_set_space(path: str | Path, capacity: Capacity, scenarios: int) -> None:
+    """Raise a DataError if the disk has no space for a set of some scenarios."""
+    check_space(Path(path), scenarios * record_dtype(capacity).itemsize)
+
+
 class ScenarioWriter:
     """Write a scenario set; it appears as ``path`` when the ``with`` block ends without an exception.
 
@@ -61,7 +66,6 @@ class ScenarioWriter:
         identity: What is written, for a set that can be resumed: closed shards survive an exception or a kill, and the
             next writer with the same identity continues after them (:attr:`notes`).
         further: Writes additional files into the complete folder before it is published.
-        expected: Number of scenarios that the set will have, to check that the disk has space for them.
 
     Raises:
         UsageError: ``path`` exists, another process writes it, or a scenario has another capacity.
@@ -72,7 +76,6 @@ class ScenarioWriter:
         self, path: str | Path, capacity: Capacity, source: Mapping[str, Any] | None = None,
         shard_size: int = 512, overwrite: bool = False, shares: Shares | None = None,
         identity: Mapping[str, Any] | None = None, further: Callable[[Path], None] | None = None,
-        expected: int = 0,
     ) -> None:  # fmt: skip
         if shard_size < 1:
             raise UsageError(f"shard_size is {shard_size}", cure="use 1 or more")
@@ -83,7 +86,6 @@ class ScenarioWriter:
         self.notes: list[Any] = []
         self._shard_size, self._shares, self._further = shard_size, shares, further
         self._buffer = np.zeros(1, record_dtype(capacity))
-        self._needed = max(expected, 1) * self._buffer.dtype.itemsize
         self._entries: list[dict[str, Any]] = []
         self._known: set[tuple[str, str]] = set()
         self._shards: list[dict[str, Any]] = []
@@ -92,8 +94,8 @@ class ScenarioWriter:
         self._partial = PartialFolder(self.path, identity)
 
     def __enter__(self) -> Self:
-        check_space(self.path, self._needed)
-        with explain_full_disk(self.path, self._needed):
+        check_set_space(self.path, self.capacity, 1)
+        with explain_full_disk(self.path):
             parts = self._partial.open(restart=self.overwrite)
         for part in parts:
             if part["shard"]["count"] < self._shard_size:  # The last shard of the data is written again.
@@ -174,7 +176,7 @@ class ScenarioWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         try:
-            with explain_full_disk(self.path, self._needed):
+            with explain_full_disk(self.path, self._buffer.dtype.itemsize):
                 if isinstance(error, OSError | FullDiskError):
                     raise error
                 if kind is None:

@@ -213,7 +213,7 @@ def _test_set(study: Study) -> ScenarioSet:
             selected = [np.flatnonzero(stratum)[:count] for stratum in (with_event, ~with_event)]
             rows = [rows[index] for index in np.sort(np.concatenate(selected))]
         source = {"command": "study", "sets": [part.hash for part in parts]}
-        with ScenarioWriter(study.test, parts[0].capacity, source, expected=len(rows)) as writer:
+        with ScenarioWriter(study.test, parts[0].capacity, source) as writer:
             for part, row in rows:
                 writer.add(part[row])
     return ScenarioSet.open(study.test)

@@ -24,10 +24,9 @@ from types import MappingProxyType
 from typing import Any
 
 from drivax.errors import DrivaxError, UsageError
-from drivax.files import check_space
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.schema import CAPACITIES, Capacity, Scenario, record_dtype
-from drivax.scenario.store import ScenarioWriter
+from drivax.scenario.schema import CAPACITIES, Capacity, Scenario
+from drivax.scenario.store import ScenarioWriter, check_set_space
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
 from drivax.tracking.workers import await_interrupt, worker_pool
 
@@ -216,8 +215,9 @@ def write_set(
     source["config"] = dataclasses.asdict(options.world)
     counts = _Counts()
     batch: list[Scenario] = []
+    check_set_space(out, options.sizes, scenarios)
     with (
-        ScenarioWriter(out, options.sizes, source, overwrite=options.overwrite, expected=scenarios) as writer,
+        ScenarioWriter(out, options.sizes, source, overwrite=options.overwrite) as writer,
         closing(_draws(scenarios, seed, options)) as draws,
     ):
         for done, draw in enumerate(draws, start=1):
@@ -320,7 +320,7 @@ def generate_benchmark(
             "the benchmark's world is fixed but for its domain", cure="use generate for other settings"
         )
     counts, sets = sizes(train), dict[str, GeneratedSet]()
-    check_space(Path(out), sum(counts.values()) * record_dtype(options.sizes).itemsize)
+    check_set_space(out, options.sizes, sum(counts.values()))
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:

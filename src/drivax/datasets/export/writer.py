@@ -16,7 +16,7 @@ from drivax.datasets.womd.tfrecord import example, shard_name, write_record
 from drivax.errors import UsageError
 from drivax.files import PartialFolder, check_output, explain_full_disk, sync_and_close, write_json
 from drivax.scenario.select.selection import select_scenarios
-from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_set_space
 
 #: Description of an export in another format.
 NOTE = "export.json"
@@ -128,9 +128,8 @@ def write_part(
     refuse_part(opened, out)
     part = {"set": opened.path.name, "hash": opened.hash, **(chosen_by or {})}
     source = {**opened.manifest["source"], "part_of": part}
-    with ScenarioWriter(
-        out, opened.capacity, source, overwrite=overwrite, further=further, expected=len(rows)
-    ) as writer:
+    check_set_space(out, opened.capacity, len(rows))
+    with ScenarioWriter(out, opened.capacity, source, overwrite=overwrite, further=further) as writer:
         for done, row in enumerate(rows, start=1):
             writer.add(opened[row])
             if progress is not None:
