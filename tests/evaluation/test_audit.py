@@ -138,7 +138,7 @@ def test_other_agents_with_headings_off_by_pi_are_counted():
     gap = turned(car(120, 3.7, speed=6, steps=[*range(30), *range(70, 91)]))  # seen for 4 s: 23.4 m
     slow = turned(car(150, 3.7, speed=2))  # 16 m
     (finding,) = audited(straight_road([car(speed=6), *others, gap, slow]))
-    assert finding["agents_reversing"] == 3  # whichever way pedestrians look
+    assert finding["agents_reversing"] == 4  # whichever way pedestrians look
     assert (finding["log_reverses"], finding["clean"]) == (False, True)
 
 

@@ -2,7 +2,9 @@
 
 import csv
 import json
+import shutil
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,13 +15,13 @@ from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.episode_table import ADDED, FAILED, KEYS, Crash, EpisodeTable, fail_crashed
 from drivax.evaluation.result_tables import paired_difference, paired_differences, summarise
-from drivax.evaluation.runner import evaluate, format_crashes
+from drivax.evaluation.runner import EvaluationConfig, evaluate, format_crashes, run_evaluation
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Flag
-from drivax.scenario.store import ScenarioWriter
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.simulator.starts import NoisyStart
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.actions import PUBLISHED
@@ -282,3 +284,19 @@ def test_scenarios_without_ego_or_future_are_refused_with_a_filter():
         evaluate(fragile(), bank, scenario_names([logs[0], short]), start=NoisyStart())
     with pytest.raises(UsageError, match="batch of 0"):
         evaluate(fragile(), logs, start=NoisyStart(), batch=0)
+
+
+def test_disk_space_is_checked_before_the_first_episode(scenarios, tmp_path, monkeypatch):
+    with ScenarioWriter(tmp_path / "set", scenarios[0].capacity) as writer:
+        for scenario in scenarios:
+            writer.add(scenario)
+
+    def fail(*_, **__):
+        pytest.fail("an episode was evaluated")
+
+    monkeypatch.setattr("drivax.evaluation.runner.evaluate", fail)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1_000))
+    config = EvaluationConfig(planner="expert", traffic="idm")
+    with pytest.raises(DataError, match=r"run: no space: needs about \d+ kB, the disk has 1 kB left"):
+        run_evaluation(config, Expert(), ScenarioSet.open(tmp_path / "set"), tmp_path / "run")
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]

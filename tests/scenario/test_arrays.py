@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.arrays import differentiate, recording_from_arrays, resample, scenario_from_arrays
+from drivax.scenario.arrays import recording_from_arrays, resample, scenario_from_arrays
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.recording import windows
+from drivax.scenario.recording import differentiate, windows
 from drivax.scenario.schema import AgentKind, Flag, LightState, RoadKind
 
 T = np.arange(91) * 0.1

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError
-from drivax.scenario.arrays import differentiate
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.recording import Event, windows
+from drivax.scenario.recording import Event, differentiate, windows
 from drivax.scenario.schema import STEPS, Flag, LightState
 from scenes import car, straight_road
 
@@ -143,7 +142,8 @@ def with_jump(track, steps, offset=200.0, velocities="measured"):
     tracks.xy[track, steps, 1] += offset
     if velocities == "differentiated":
         velocity = differentiate(tracks.xy, tracks.valid, recording.timestamps_s)
-        recording = replace(recording, tracks=replace(tracks, velocity=velocity))
+        flags = recording.flags | Flag.DIFFERENTIATED_VELOCITY
+        recording = replace(recording, tracks=replace(tracks, velocity=velocity), flags=flags)
     return recording
 
 
@@ -164,6 +164,12 @@ def test_jump_of_a_bystander_costs_its_steps_and_not_the_window(steps, velocitie
     assert scenario.agent_valid[:, 0].all()
     assert not scenario.agent_xy[list(lost), 1].any()
     assert np.abs(scenario.agent_xy[:, 1, 1]).max() < 4.0
+
+
+def test_velocities_next_to_a_jump_are_differentiated_without_it():
+    scenario = assemble(with_jump(1, [50], offset=15.0, velocities="differentiated"))
+    assert np.flatnonzero(~scenario.agent_valid[:, 1]).tolist() == [50]
+    np.testing.assert_allclose(scenario.agent_velocity[[49, 51], 1], [[12.0, 0.0]] * 2, atol=1e-5)
 
 
 @pytest.mark.parametrize(("name", "value"), [("xy", 1e30), ("z", -1e30), ("velocity", 1e30), ("xy", 2e5)])

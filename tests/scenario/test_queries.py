@@ -23,10 +23,12 @@ from drivax.scenario.bank.queries import (
 )
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import RoadKind
 from drivax.studies.bench import without_grid
 from drivax.synthetic.world import generate_recording
 from metric_scenes import fork
-from scenes import bank_of, car, line, straight_road
+from scenes import LANE_M, bank_of, car, line, straight_road
 
 
 @pytest.fixture(scope="module")
@@ -207,6 +209,17 @@ def test_driven_lane_of_a_fork():
     assert limit(fork(ego, connector=True, route=(1, 5, 6)), True) == pytest.approx(13.4)
     # Of the two lanes only that which turns leads at most 30 degrees away from a heading of -35 degrees.
     assert limit(ahead, True, -np.deg2rad(35)) == pytest.approx(4.0)
+
+
+def test_crossing_street_is_not_driven_next_to_a_lane():
+    """0.1 m beside its lane a car is nearer to a street that crosses at 60 degrees."""
+    road = straight_road([car(0, 0, 0, 5)])
+    street = MapFeature(9, RoadKind.LANE_SURFACE, line((-50, -90), (50, 83.2)), 5.0, LANE_M, (), ())
+    bank = bank_of(replace(road, features=(*road.features, street)))
+    xy = np.array([0.5, -1.95])
+    box = jnp.asarray(corners_of(xy[None], np.zeros(1))[0])
+    found = lanes_at(bank, jnp.asarray(0), jnp.asarray(xy), jnp.array([1.0, 0.0]), box, jnp.zeros(()))
+    assert float(found.limit) == pytest.approx(13.4)
 
 
 def test_limits_of_connectors():

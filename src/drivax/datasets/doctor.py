@@ -220,10 +220,10 @@ def count(reader: Reader, path: Path, stride: int = STRIDE, length: int = STEPS)
         recordings = reader.describe(path).recordings
     except (DataError, UsageError):
         return 0
-    if not recordings or recordings >= scenarios:
+    if not recordings:
         return scenarios
     # Readers count windows of the usual stride and length, which tell about how long the recordings are.
-    steps = STEPS + STRIDE * (scenarios / recordings - 1)
+    steps = STEPS + STRIDE * max(scenarios / recordings - 1, 0)
     return round(recordings * max((steps - length) // stride + 1, 1))
 
 

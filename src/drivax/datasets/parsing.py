@@ -15,7 +15,6 @@ from jaxtyping import Float, Float64
 
 from drivax.errors import DataError, missing_package
 from drivax.geometry.polylines import Polylines, cut_counts
-from drivax.scenario.arrays import differentiate as differentiate
 from drivax.scenario.build.tracks import DEFAULT_SIZES
 from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
@@ -62,7 +61,7 @@ def import_extra(package: str) -> Any:
 
 
 #: Names of windows of a drive: of nuScenes' scenes by tokens, drivax' own by their first step and another ego.
-_WINDOW = re.compile(r"(scene-\d+)(?:_[0-9a-f]{32}){1,2}|(.+)(?:@\d+(?:#\d+)?|#\d+)")
+_WINDOW = re.compile(r"(scene-\d+)(?:_[0-9a-f]{32}){1,2}|(.+)@\d+(?:#\d+)?")
 
 
 def segment_of(scenario_id: str) -> str:

@@ -17,7 +17,7 @@ from drivax.datasets.reader import Description
 from drivax.datasets.womd import example_reader as tf_example
 from drivax.datasets.womd import records as womd
 from drivax.datasets.womd.tfrecord import count_records
-from drivax.scenario.recording import Recording
+from drivax.scenario.recording import Recording, differentiate
 from drivax.scenario.schema import Flag, LightState
 
 
@@ -60,7 +60,7 @@ def decode(payload: bytes) -> Recording:
     recording = tf_example.recording(table, payload, used, womd.SCENARIOMAX_FORMAT, womd.SCENARIOMAX_FORMAT)
     tracks, flags = recording.tracks, recording.flags
     if tracks.valid.any() and (tracks.velocity[tracks.valid] == -1.0).all():
-        velocity = parsing.differentiate(tracks.xy, tracks.valid, recording.timestamps_s)
+        velocity = differentiate(tracks.xy, tracks.valid, recording.timestamps_s)
         tracks, flags = replace(tracks, velocity=velocity), flags | Flag.DIFFERENTIATED_VELOCITY
     lights = tuple(light for light in recording.lights if (light.states > LightState.UNKNOWN).any())
     unknown = parsing.nonzero(lights_without_state=len(recording.lights) - len(lights))

@@ -25,8 +25,9 @@ Finding = dict[str, float | int | bool | str | None]
 
 #: Logs per batch.
 BATCH = 64
-#: Agents that drive further backwards do not manoeuvre: their headings are wrong by pi. Slower motion is jitter.
-REVERSE_M, CREEP_MPS = 20.0, 0.5
+#: Agents that drive further backwards, or this far and hardly forwards, do not manoeuvre: their headings are wrong by
+#: pi. Slower motion is jitter.
+REVERSE_M, MOSTLY_REVERSE_M, MOSTLY, CREEP_MPS = 20.0, 5.0, 0.9, 0.5
 _DRIVERS = (AgentKind.VEHICLE, AgentKind.CYCLIST)
 #: A route leads to the goal when the log ends within this distance of it (semantics, ``reached_goal``).
 GOAL_M = 3.0
@@ -159,8 +160,9 @@ def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) ->
     deviation = series["route_deviation_m"][evaluated] if Flag.ROUTE in flags else np.zeros(0)
     ran_red = bool(red.any()) if Flag.LIGHTS in flags else None
     reached = bool((series["goal_distance_m"][evaluated][-1:] <= GOAL_M).all())
-    backwards = _reverse_m(scenario)
-    reverses = backwards > REVERSE_M
+    backwards, forwards = _driven_m(scenario)
+    mostly = backwards > np.maximum(MOSTLY_REVERSE_M, MOSTLY * (backwards + forwards))
+    reverses = (backwards > REVERSE_M) | mostly
     return {
         "log_collides": bool(hit.any()),
         "first_collision_step": _first(hit),
@@ -182,14 +184,19 @@ def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) ->
     }
 
 
-def _reverse_m(scenario: Scenario) -> Float[np.ndarray, " agent"]:
-    """Return the distance that vehicles and cyclists drive against their heading after the current step, metres."""
+def _driven_m(scenario: Scenario) -> Float[np.ndarray, "2 agent"]:
+    """Return how far vehicles and cyclists drive against and along their heading after the current step, metres."""
     now = slice(CURRENT_STEP, int(scenario.steps))
     valid, heading = scenario.agent_valid[now], scenario.agent_heading[now][:-1]
     step = np.diff(scenario.agent_xy[now].astype(np.float64), axis=0)
     along = step[..., 0] * np.cos(heading) + step[..., 1] * np.sin(heading)
-    counted = valid[1:] & valid[:-1] & (along < -CREEP_MPS * DT_S) & np.isin(scenario.agent_kind, _DRIVERS)
-    return np.where(counted, -along, 0.0).sum(axis=0)
+    counted = valid[1:] & valid[:-1] & np.isin(scenario.agent_kind, _DRIVERS)
+    return np.stack(
+        [
+            np.where(counted & (sign * along > CREEP_MPS * DT_S), sign * along, 0.0).sum(axis=0)
+            for sign in (-1, 1)
+        ]
+    )
 
 
 def _share(clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:

@@ -156,7 +156,7 @@ def observation_statistics(
 
 
 def _masked(observation: Mapping[str, Values], driven: Values) -> dict[str, Values]:
-    """Return observations ``[episode, look, ...]`` with masks of every group that leave out looks beyond a log."""
+    """Return observations ``[episode, sample, ...]``, masked in every group beyond the end of a log."""
     result = dict(observation)
     masks = {f"{group}_mask" for group in observation}
     for group in (name for name in observation if name not in masks):

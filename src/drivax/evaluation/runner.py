@@ -24,7 +24,7 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import ADDED, KEYS, Crash, EpisodeTable, Trajectories, fail_crashed
 from drivax.evaluation.memory import free_memory, report_out_of_memory, scenarios_at_a_time
 from drivax.evaluation.rollout import Episodes, check_actions, drive, episode_keys, evaluation_task
-from drivax.files import check_space, replace_folder
+from drivax.files import check_space, explain_full_disk, replace_folder
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.planners.functions import raised
@@ -115,7 +115,8 @@ def run_evaluation(
     RunFolder.check(Path(out), overwrite, "evaluation")
     # The scenarios to evaluate have been verified; of the others only the sizes are read.
     sizes = sizes or Sizes.used(ScenarioSet.open(data.path, verify=False))
-    check_space(Path(out), len(scenarios) * _episode_bytes(config.traffic, sizes))
+    needed = len(scenarios) * _episode_bytes(config.traffic, sizes, data.capacity.steps)
+    check_space(Path(out), needed)
     with ProgressBar(f"evaluating {planner.name}", "scenarios", len(scenarios)) as bar:
         table = evaluate(
             planner,
@@ -132,15 +133,15 @@ def run_evaluation(
     info: dict[str, Any] = {"kind": "evaluation", **table.info}
     if trained := learned_from(config.planner):
         info["trained_on"] = trained
-    with replace_folder(Path(out)) as partial_folder:
+    with explain_full_disk(Path(out), needed), replace_folder(Path(out)) as partial_folder:
         RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)
         table.write(partial_folder)
     return table
 
 
-def _episode_bytes(traffic: str, sizes: Sizes) -> int:
+def _episode_bytes(traffic: str, sizes: Sizes, steps: int) -> int:
     """Return about how many bytes an episode takes in a run folder, as measured on the built-in world."""
-    return 2_000 if traffic == "log" else 2_000 + STEPS * sizes.agents * 3
+    return 22 * steps if traffic == "log" else steps * (22 + 3 * sizes.agents)
 
 
 def with_metrics(task: Task, more: tuple[str, ...]) -> Task:

@@ -83,7 +83,7 @@ class Driving:
         return {name: tuple(value.shape) for name, value in observation.items()}
 
     def start(self, data: ScenarioBank, key: Array, count: int) -> Environments:
-        """Reset environments to random steps of the log; raises UsageError if no log is as long as ``latest_start``."""
+        """Reset environments to random steps of their logs; UsageError if ``latest_start`` is too late."""
         if self.latest_start > data.steps - 3:
             cure = f"use {self.earliest_start} (earliest_start) to {data.steps - 3}"
             raise UsageError(f"latest_start is {self.latest_start}", cure=cure)

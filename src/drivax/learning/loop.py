@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from drivax.errors import DataError, UsageError
+from drivax.files import explain_full_disk
 from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
@@ -101,6 +102,7 @@ def train(
     with contextlib.ExitStack() as stack:
         rules = (config.checkpoint_rule, config.keep, config.patience)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
+        stack.enter_context(explain_full_disk(out))
         _learn(_Run(config, program, logs, held_out, held_out_data, networks, log))
     return RunFolder.open(out)
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int8
+from jaxtyping import Int8
 
 from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.tracks import DEFAULT_SIZES
-from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, interpolate
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate, interpolate
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind, Scenario
 
 Array = np.ndarray[Any, Any]
@@ -120,25 +120,6 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     widths |= {"size": (3,)} if np.ndim(agents.get("size", ())) == 3 else {}
     result = {name: agents[name] for name in ("kind", "id", "size") if name in agents} | {"valid": seen}
     return result | {name: between(name, columns) for name, columns in widths.items()}
-
-
-def differentiate(
-    xy: Float64[np.ndarray, "track time 2"],
-    valid: Bool[np.ndarray, "track time"],
-    timestamps_s: Float64[np.ndarray, " time"],
-) -> Float64[np.ndarray, "track time 2"]:
-    """Velocities from positions, m/s: central differences, one-sided at the ends of observed intervals.
-
-    No difference spans a gap; invalid steps and those without a valid neighbour get zero.
-    """
-    step = np.arange(len(timestamps_s))
-    behind = np.pad(valid[:, 1:] & valid[:, :-1], ((0, 0), (1, 0)))
-    ahead = np.pad(behind[:, 1:], ((0, 0), (0, 1)))
-    first, last = np.maximum(step - behind, 0), np.minimum(step + ahead, len(step) - 1)
-    rows = np.arange(len(xy))[:, None]
-    seconds_apart = (timestamps_s[last] - timestamps_s[first])[..., None]
-    moved = xy[rows, last] - xy[rows, first]
-    return np.divide(moved, seconds_apart, out=np.zeros_like(moved), where=(behind | ahead)[..., None])
 
 
 def _check_keys(given: Any, keys: Sequence[str], what: str) -> None:

@@ -151,13 +151,20 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
         _window(piece, filled, start, length, recording)
         for piece, filled in pieces
         for start in range(0, len(filled) - length + 1, stride)
-    ] or [_window(*max(pieces, key=lambda piece: len(piece[1])), 0, length, recording)]
+    ] or [_window(*max(pieces, key=_usable_steps), 0, length, recording)]
     usable = [window for window in cut if window.tracks.valid[window.ego, window.current_step]]
     if not usable:
         problem = f"the ego is not valid at the current step of any of {len(cut)} windows"
         raise DataError(problem, record=recording.scenario_id, cure="skip the recording")
     left_out = {"windows_without_ego": len(cut) - len(usable), "time_gaps": len(pieces) - 1}
     yield from (_counting(window, **left_out) for window in usable)
+
+
+def _usable_steps(piece: tuple[Recording, Array]) -> tuple[bool, int]:
+    """Whether the ego of a piece is valid at its current step, and its length."""
+    recording, filled = piece
+    now = min(CURRENT_STEP, len(filled) - 1)
+    return bool(recording.tracks.valid[recording.ego, now]), len(filled)
 
 
 def _counting(recording: Recording, **lost: int) -> Recording:
@@ -225,6 +232,25 @@ def interpolate(
     step = values[:, after] - values[:, before]
     result = values[:, before] + (at - before)[widen] * (wrap(step) if angle else step)
     return np.where((valid[:, before] & valid[:, after])[widen], result, 0.0)
+
+
+def differentiate(
+    xy: Float64[np.ndarray, "track time 2"],
+    valid: Bool[np.ndarray, "track time"],
+    timestamps_s: Float64[np.ndarray, " time"],
+) -> Float64[np.ndarray, "track time 2"]:
+    """Velocities from positions, m/s: central differences, one-sided at the ends of observed intervals.
+
+    No difference spans a gap; invalid steps and those without a valid neighbour get zero.
+    """
+    step = np.arange(len(timestamps_s))
+    behind = np.pad(valid[:, 1:] & valid[:, :-1], ((0, 0), (1, 0)))
+    ahead = np.pad(behind[:, 1:], ((0, 0), (0, 1)))
+    first, last = np.maximum(step - behind, 0), np.minimum(step + ahead, len(step) - 1)
+    rows = np.arange(len(xy))[:, None]
+    seconds_apart = (timestamps_s[last] - timestamps_s[first])[..., None]
+    moved = xy[rows, last] - xy[rows, first]
+    return np.divide(moved, seconds_apart, out=np.zeros_like(moved), where=(behind | ahead)[..., None])
 
 
 def _window(

@@ -157,7 +157,8 @@ class Capacity:
         if steps == self.steps:
             return self
         points = self.route_points + 4 * max(steps - self.steps, 0)
-        return replace(self, name=f"{self.name}-{future_s:g}s", steps=steps, route_points=points)
+        name = f"{self.name}-{(steps - CURRENT_STEP - 1) * DT_S:g}s"
+        return replace(self, name=name, steps=steps, route_points=points)
 
 
 CAPACITIES = {

@@ -155,11 +155,11 @@ def generate_one(seed: int, index: int, config: WorldConfig, steps: int = STEPS)
         if isinstance(result, str):
             rejected[family.name, result] += 1
             continue
-        name = f"w{WORLD_VERSION}-{config.domain}-s{seed}" + (f"-t{steps}" if steps != STEPS else "")
+        world, length = f"w{WORLD_VERSION}-{config.domain}-s{seed}", f"-t{steps}" if steps != STEPS else ""
         recording = replace(
             result,
-            scenario_id=f"{name}-{index:06d}-{family.name}",
-            segment=f"{name}-{'r' if event else 'm'}{sample[0]:06d}.{sample[1]}",
+            scenario_id=f"{world}{length}-{index:06d}-{family.name}",
+            segment=f"{world}-{'r' if event else 'm'}{sample[0]:06d}.{sample[1]}",
             tags={"family": family.name, "domain": config.domain, **result.tags},
         )
         return GeneratedRecording(recording, family.name, config.domain, dict(rejected))

@@ -17,7 +17,7 @@ from drivax.datasets.argoverse.tables import Kind, Table, read_table
 from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
-from drivax.scenario.recording import Recording, Tracks
+from drivax.scenario.recording import Recording, Tracks, differentiate
 from drivax.scenario.schema import CURRENT_STEP, AgentKind, Flag
 
 Array = np.ndarray[Any, Any]
@@ -170,7 +170,7 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
         xy=states[..., :2].copy(),
         z=states[..., 2].copy(),
         heading=states[..., 3].copy(),
-        velocity=parsing.differentiate(states[..., :2], valid, clock * 1e-9),
+        velocity=differentiate(states[..., :2], valid, clock * 1e-9),
         size=states[..., 4:].copy(),
         valid=valid,
         kind=np.array([AgentKind.VEHICLE, *kinds], np.int8),

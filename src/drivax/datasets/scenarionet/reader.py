@@ -35,7 +35,7 @@ from drivax.datasets.scenarionet.pickles import (
 )
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
-from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, is_even
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate, is_even
 from drivax.scenario.schema import CURRENT_STEP, DT_S, LANE_KINDS, AgentKind, Flag, LightState
 
 Array = np.ndarray[Any, Any]
@@ -340,7 +340,7 @@ def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int)
         tracks = replace(tracks, xy=xy)
     if velocity_is_missing(tracks):
         times = _timestamps(metadata, tracks.valid.shape[1])
-        tracks = replace(tracks, velocity=parsing.differentiate(tracks.xy, tracks.valid, times))
+        tracks = replace(tracks, velocity=differentiate(tracks.xy, tracks.valid, times))
         flags |= Flag.DIFFERENTIATED_VELOCITY
     return tracks, flags
 

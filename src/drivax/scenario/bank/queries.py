@@ -160,7 +160,7 @@ def around_lanes(
 
     Of the lanes that hold the centre and lead at most 30 degrees away from the heading, the box drives that with the
     highest limit, lanes of the route's corridor before others if it is ``routed``. Without such lanes it drives the
-    nearest within 90 degrees.
+    nearest within 30 degrees, else the nearest within 90 degrees.
     """
     rows, inside = lanes_around(bank, index, centre)
     inside = inside & _level(rows[LaneRow.Z], z)
@@ -173,11 +173,13 @@ def around_lanes(
     aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
     own, corner = squared[0], squared[1:]
     alongside = own - side[0] * side[0] <= _JOINT_M**2
-    fits = alongside & (aligned_cos > _FITS) & (own <= half * half)
+    parallel = alongside & (aligned_cos > _FITS)
+    fits = parallel & (own <= half * half)
     corridor = rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])
-    # By limit, on the route first; without lanes that fit the nearest.
+    # By limit, on the route first; without lanes that hold the centre the nearest, parallel ones first.
     rank = jnp.where(corridor & routed, 0.0, 0.2) + 1e-3 * (100.0 - rows[LaneRow.LIMIT])
-    rank = jnp.where(fits, rank, jnp.where(aligned, 1.0 + own, _FAR))
+    others = jnp.where(parallel & (own <= LANE_CUTOFF_M**2), 1.0 + own, 100.0 + own)
+    rank = jnp.where(fits, rank, jnp.where(aligned, others, _FAR))
     # Only these two lanes are read again, so that nothing else is stored for all of them.
     two = jnp.stack([first_smallest(rank), first_smallest(own)])
     lanes = rows[:, two]

@@ -43,7 +43,7 @@ from drivax.scenario.build.tracks import (
     local_tracks,
     place,
 )
-from drivax.scenario.recording import Recording, check, plausible, step_seconds
+from drivax.scenario.recording import Recording, check, differentiate, plausible, step_seconds
 from drivax.scenario.schema import (
     CAPACITIES,
     CAR_LANE_KINDS,
@@ -201,9 +201,14 @@ def _without_jumps(recording: Recording) -> Recording:
     """The recording without the steps of tracks that are not plausible; counts tracks that lose some."""
     tracks = recording.tracks
     valid = np.stack([plausible(recording, track) for track in range(len(tracks.kind))])
-    jumping = int((valid != tracks.valid).any(axis=1).sum())
-    lost = {**recording.lost, "jumping_tracks": jumping} if jumping else recording.lost
-    return replace(recording, tracks=replace(tracks, valid=valid), lost=lost)
+    jumping = (valid != tracks.valid).any(axis=1)
+    if not jumping.any():
+        return recording
+    velocity = tracks.velocity.copy()
+    if Flag.DIFFERENTIATED_VELOCITY in recording.flags:  # those next to a jump are of the jump
+        velocity[jumping] = differentiate(tracks.xy[jumping], valid[jumping], recording.timestamps_s)
+    lost = {**recording.lost, "jumping_tracks": int(jumping.sum())}
+    return replace(recording, tracks=replace(tracks, valid=valid, velocity=velocity), lost=lost)
 
 
 def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
