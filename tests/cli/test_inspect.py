@@ -66,9 +66,9 @@ def test_one_set_in_full(sets, inspect):
     assert cells(out, "scenarios") == "4 (recorded segments: 2, shards: 1)"
     assert cells(out, "place") == "boston (2 of 4), pittsburgh (1 of 4)"
     assert cells(out, "duration") == "0.60 min at 10 Hz"  # 4 times 9.0 s
-    assert cells(out, "integrity") == "every checksum is right"
+    assert cells(out, "integrity") == "all checksums match"
     assert cells(out, "log_collides") == "1 of 4 (25 %) 4"
-    assert cells(out, "distance_m") == "mean 12, median 12, most 24 4"
+    assert cells(out, "distance_m") == "mean 12, median 12, max 24 4"
     assert "first_offroad_step" not in out
     assert cells(out, "s3").split()[:3] == ["91", "4", "4"]
 
@@ -88,7 +88,7 @@ def test_skipped_and_filtered_records_are_reported(tmp_path, inspect):
 
 
 def test_distances_are_not_summed():
-    assert finding_text([1.0, 2.0, 6.0]) == "mean 3, median 2, most 6"
+    assert finding_text([1.0, 2.0, 6.0]) == "mean 3, median 2, max 6"
     assert finding_text([True, False, True, True]) == "3 of 4 (75 %)"
     assert (
         finding_text(["measured", "measured", "differentiated"])
@@ -122,7 +122,7 @@ def test_filters(sets, inspect):
     out = inspect(sets[0], "--filter", "place=boston|pittsburgh", "--filter", "audit.distance_m>0")
     assert cells(out, "scenarios") == "2 of 4 (recorded segments: 2, shards: 1)"
     assert "1 lack the value of 'place=boston|pittsburgh'" in out
-    assert cells(out, "distance_m") == "mean 12, median 12, most 16 2"
+    assert cells(out, "distance_m") == "mean 12, median 12, max 16 2"
     chosen = json.loads(inspect(sets[0], "--json", "--filter", "agents>=3"))
     assert [row["scenario_id"] for row in chosen["scenarios"]] == ["s2", "s3"]
     line = inspect(sets[0], "--filter", "place=singapore", status=1)

@@ -677,7 +677,7 @@ def test_inspect_tables_fit_a_hundred_columns(folder, tmp_path, capsys):
     assert main(["inspect", str(tmp_path / "set")]) == 0
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 100
-    for words in ("4 (recorded segments: 4", "every checksum is right", "LANE_GRAPH", "b2"):
+    for words in ("4 (recorded segments: 4", "all checksums match", "LANE_GRAPH", "b2"):
         assert words in out
 
 

@@ -51,7 +51,7 @@ def test_bar_heights_are_shares():
     heights = [float(height) for height in re.findall(r'<rect [^>]*height="([\d.]+)"', text)]
     assert len(heights) == 2 and heights[0] == pytest.approx(3 * heights[1], abs=0.2)
     assert "75 %" in text and "25 %" in text
-    assert "median 1, most 2, n 4" in text
+    assert "median 1, max 2, n 4" in text
 
 
 def test_series_share_their_bins():

@@ -245,7 +245,7 @@ def _shares(values: Values, edges: Values) -> Values:
 def _facts(values: Values) -> str:
     if not len(values):
         return "n 0"
-    return f"median {short(np.median(values))}, most {short(values.max())}, n {len(values):,}"
+    return f"median {short(np.median(values))}, max {short(values.max())}, n {len(values):,}"
 
 
 def _bars(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:

@@ -239,7 +239,7 @@ def overview(inspection: Inspection) -> Table:
         ("flags", _counts_text(inspection.value_counts(lambda entry: entry["flags"]), count)),
         ("did not fit", _totals_text(inspection.totals(lambda entry: entry["overflow"]))),
         ("left out", _totals_text(inspection.totals(lambda entry: entry["source"].get("lost", {})))),
-        ("integrity", "every checksum is right" if inspection.checked else "not tested (--no-check)"),
+        ("integrity", "all checksums match" if inspection.checked else "not tested (--no-check)"),
     ]
     return _table("overview", ["", ""], [(label, [text]) for label, text in rows], left=True)
 
@@ -282,7 +282,7 @@ def finding_text(values: Sequence[Any]) -> str:
     if all(isinstance(value, str) for value in values):
         return _counts_text({word: values.count(word) for word in sorted(set(values))}, len(values))
     numbers = np.array(values, np.float64)
-    return f"mean {short(numbers.mean())}, median {short(np.median(numbers))}, most {short(numbers.max())}"
+    return f"mean {short(numbers.mean())}, median {short(np.median(numbers))}, max {short(numbers.max())}"
 
 
 def scenarios_table(inspection: Inspection) -> Table:
