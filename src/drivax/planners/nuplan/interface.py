@@ -1,28 +1,77 @@
 """What planners with nuPlan's interface are given: states, boxes, tracked objects, history and lights.
 
-Names and meanings are those of nuplan-devkit 1.2 (Apache-2.0); its enumerations compare equal to these. SI units;
-positions in the source's frame.
+Names and meanings are those of nuplan-devkit 1.2 (Apache-2.0). Its enumerations compare equal to these, and objects
+pass ``isinstance`` for its classes once it is imported. SI units; positions in the source's frame.
 """
 
 from __future__ import annotations
 
 import enum
 import math
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, total_ordering
 from typing import Any
 
 import numpy as np
 
 from drivax.errors import missing_package
-from drivax.geometry.boxes import corners
 from drivax.scenario.schema import DT_S, AgentKind, LightState
 from drivax.simulator.contact import REAR_AXLE
 from drivax.simulator.controller import TrackingConfig
 
 #: Centre of gravity ahead of the rear axle, as a share of the length (nuPlan's vehicle: 1.67 m of 5.176 m).
 _GRAVITY = 1.67 / 5.176
+#: Steps of history that planners get, as in nuPlan's simulation (2 s); time counts from so long before the log.
+BUFFER = 20
+_STATE, _PLANNING, _MAPS = "nuplan.common.actor_state", "nuplan.planning.simulation", "nuplan.common.maps"
+#: Modules of the devkit by the classes that are looked for there.
+_MODULES = {
+    name: module
+    for module, names in {
+        f"{_STATE}.state_representation": "Point2D StateVector2D StateSE2 TimePoint TimeDuration",
+        f"{_STATE}.oriented_box": "OrientedBox",
+        f"{_STATE}.vehicle_parameters": "VehicleParameters",
+        f"{_STATE}.car_footprint": "CarFootprint",
+        f"{_STATE}.dynamic_car_state": "DynamicCarState",
+        f"{_STATE}.ego_state": "EgoState",
+        f"{_STATE}.waypoint": "Waypoint",
+        f"{_STATE}.agent": "Agent",
+        f"{_STATE}.static_object": "StaticObject",
+        f"{_STATE}.tracked_objects": "TrackedObjects",
+        "nuplan.common.utils.split_state": "SplitState",
+        f"{_PLANNING}.observation.observation_type": "DetectionsTracks",
+        f"{_PLANNING}.history.simulation_history_buffer": "SimulationHistoryBuffer",
+        f"{_PLANNING}.planner.abstract_planner": "PlannerInitialization PlannerInput",
+        f"{_PLANNING}.simulation_time_controller.simulation_iteration": "SimulationIteration",
+        f"{_MAPS}.maps_datatypes": "TrafficLightStatusData",
+        f"{_MAPS}.abstract_map": "AbstractMap",
+        f"{_MAPS}.abstract_map_objects": "Lane LaneConnector RoadBlockGraphEdgeMapObject PolylineMapObject",
+        f"{_MAPS}.nuplan_map.lane": "NuPlanLane",
+        f"{_MAPS}.nuplan_map.lane_connector": "NuPlanLaneConnector",
+        f"{_MAPS}.nuplan_map.roadblock": "NuPlanRoadBlock",
+        f"{_MAPS}.nuplan_map.roadblock_connector": "NuPlanRoadBlockConnector",
+    }.items()
+    for name in names.split()
+}
+
+
+class DevkitObject:
+    """Base of classes whose ``__class__`` is the devkit's where that is imported, which ``isinstance`` honours."""
+
+    def devkit_names(self) -> tuple[str, ...]:
+        """Return names of the devkit's classes, the first choice first."""
+        return (type(self).__name__,)
+
+    @property
+    def __class__(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        modules = ((name, sys.modules.get(_MODULES.get(name, ""))) for name in self.devkit_names())
+        return next((found for name, module in modules if (found := getattr(module, name, None))), type(self))
+
+    def __reduce__(self) -> Any:
+        # The default refuses an object whose __class__ is another than its type.
+        return object.__new__, (type(self),), self.__dict__
 
 
 class TrackedObjectType(enum.Enum):
@@ -83,7 +132,7 @@ STATUS_OF_LIGHT = {
 
 
 @dataclass(frozen=True)
-class Point2D:
+class Point2D(DevkitObject):
     """A point, m."""
 
     x: float
@@ -123,13 +172,43 @@ class StateSE2(Point2D):
         dx, dy = distance_m * math.cos(self.heading), distance_m * math.sin(self.heading)
         return StateSE2(self.x + dx, self.y + dy, self.heading)
 
+    def beside(self, distance_m: float) -> StateSE2:
+        """Return the pose moved to its left."""
+        dx, dy = -distance_m * math.sin(self.heading), distance_m * math.cos(self.heading)
+        return StateSE2(self.x + dx, self.y + dy, self.heading)
+
+    def distance_to(self, state: Any) -> float:
+        """Return the distance to another pose or point, m."""
+        return math.hypot(self.x - state.x, self.y - state.y)
+
+    def as_matrix(self) -> np.ndarray[Any, Any]:
+        """Return the 3 x 3 matrix that maps points of this frame to the source's."""
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        return np.array([[cos, -sin, self.x], [sin, cos, self.y], [0.0, 0.0, 1.0]])
+
+    @staticmethod
+    def from_matrix(matrix: Any) -> StateSE2:
+        """Return the pose of such a matrix."""
+        x, y = matrix[:2, 2].tolist()
+        return StateSE2(x, y, math.atan2(matrix[1, 0], matrix[0, 0]))
+
+    def serialize(self) -> list[float]:
+        """Return x, y and heading."""
+        return list(self)
+
+    @staticmethod
+    def deserialize(vector: Sequence[float]) -> StateSE2:
+        """Return the pose of x, y and heading."""
+        return StateSE2(*vector)
+
     def __iter__(self) -> Iterator[float]:
         return iter((self.x, self.y, self.heading))
 
 
-@dataclass(frozen=True, order=True)
-class TimePoint:
-    """Time since the start of the scenario."""
+@total_ordering
+@dataclass(frozen=True, eq=False)
+class TimePoint(DevkitObject):
+    """Time since 2 s before the log; compares and adds with whatever has ``time_us``."""
 
     time_us: int
 
@@ -141,17 +220,48 @@ class TimePoint:
     @classmethod
     def of_step(cls, step: int) -> TimePoint:
         """Return the time of a step of the log."""
-        return cls(round(step * DT_S * 1e6))
+        return cls(round((step + BUFFER) * DT_S * 1e6))
+
+    def diff(self, other: Any) -> TimeDuration:
+        """Return the time since another."""
+        return TimeDuration(self.time_us - _microseconds(other))
 
     def __add__(self, other: Any) -> TimePoint:
-        return TimePoint(self.time_us + int(getattr(other, "time_us", other)))
+        return TimePoint(self.time_us + _microseconds(other))
+
+    __radd__ = __add__
 
     def __sub__(self, other: Any) -> TimePoint:
-        return TimePoint(self.time_us - int(getattr(other, "time_us", other)))
+        return TimePoint(self.time_us - _microseconds(other))
+
+    def __rsub__(self, other: Any) -> TimePoint:
+        return TimePoint(_microseconds(other) - self.time_us)
+
+    def __eq__(self, other: object) -> bool:
+        return self.time_us == getattr(other, "time_us", None)
+
+    def __lt__(self, other: Any) -> bool:
+        return self.time_us < other.time_us
+
+    def __hash__(self) -> int:
+        return hash(self.time_us)
+
+
+class TimeDuration(TimePoint):
+    """Time between two points."""
+
+
+def _microseconds(time: Any) -> int:
+    return int(getattr(time, "time_us", time))
+
+
+#: Share of half the length ahead and of half the width to the left: front, rear, front left, front right, rear left,
+#: rear right, centre, left, right.
+_POINTS = dict(enumerate(((1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0), (0, 1), (0, -1)), 1))
 
 
 @dataclass(frozen=True)
-class OrientedBox:
+class OrientedBox(DevkitObject):
     """A box around its centre."""
 
     center: StateSE2
@@ -169,12 +279,19 @@ class OrientedBox:
         """Half the width."""
         return self.width / 2
 
+    @property
+    def half_height(self) -> float:
+        """Half the height."""
+        return self.height / 2
+
+    def corner(self, point: Any) -> Point2D:
+        """Return a point of the box by the devkit's ``OrientedBoxPointType`` (1: front, ... 9: right)."""
+        ahead, left = _POINTS[int(point)]
+        return self.center.ahead(ahead * self.half_length).beside(left * self.half_width).point
+
     def all_corners(self) -> list[Point2D]:
         """Front left, rear left, rear right, front right."""
-        cos, sin = math.cos(self.center.heading), math.sin(self.center.heading)
-        box = np.array([self.center.x, self.center.y, cos, sin, self.length, self.width])
-        points = corners(box)[[0, 3, 2, 1]].tolist()
-        return [Point2D(*point) for point in points]
+        return [self.corner(point) for point in (3, 5, 6, 4)]
 
     @cached_property
     def geometry(self) -> Any:
@@ -183,7 +300,7 @@ class OrientedBox:
 
 
 @dataclass(frozen=True)
-class VehicleParameters:
+class VehicleParameters(DevkitObject):
     """Ego's dimensions, in nuPlan's proportions (5.176 m long, 1.461 m from rear axle to centre, wheelbase 3.089 m)."""
 
     length: float
@@ -237,6 +354,10 @@ class CarFootprint(OrientedBox):
         """The box itself."""
         return self
 
+    def get_point_of_interest(self, point: Any) -> Point2D:
+        """Return a point of the box."""
+        return self.corner(point)
+
     @property
     def rear_axle_to_center_dist(self) -> float:
         """Distance of the box centre from the rear axle."""
@@ -249,7 +370,7 @@ class CarFootprint(OrientedBox):
 
 
 @dataclass(frozen=True)
-class DynamicCarState:
+class DynamicCarState(DevkitObject):
     """Ego's motion; vectors along and across its heading."""
 
     rear_axle_velocity_2d: StateVector2D
@@ -277,16 +398,45 @@ class DynamicCarState:
 
     @property
     def center_acceleration_2d(self) -> StateVector2D:
-        """Acceleration of the box centre, a rigid body's."""
-        away, acceleration = self.rear_axle_to_center_dist, self.rear_axle_acceleration_2d
-        return StateVector2D(
-            acceleration.x - away * self.angular_velocity**2,
-            acceleration.y + away * self.angular_acceleration,
-        )
+        """Acceleration of the box centre."""
+        # As the devkit's get_acceleration_shifted, which is not a rigid body's (x - d w^2, y + d alpha).
+        shift = self.rear_axle_to_center_dist * (self.angular_velocity**2 + self.angular_acceleration)
+        return StateVector2D(self.rear_axle_acceleration_2d.x + shift, self.rear_axle_acceleration_2d.y)
 
 
 @dataclass(frozen=True)
-class EgoState:
+class SplitState(DevkitObject):
+    """Numbers of a state by the way they are interpolated."""
+
+    linear_states: list[float]
+    angular_states: list[float]
+    fixed_states: list[Any]
+
+    def __len__(self) -> int:
+        return len(self.linear_states) + len(self.angular_states) + len(self.fixed_states)
+
+
+@dataclass(frozen=True)
+class Waypoint(DevkitObject):
+    """A box and its velocity at a time."""
+
+    time_point: TimePoint
+    oriented_box: OrientedBox
+    velocity: StateVector2D | None = None
+
+    @property
+    def center(self) -> StateSE2:
+        """Pose of the box centre."""
+        return self.oriented_box.center
+
+    @property
+    def time_us(self) -> int:
+        """Time, microseconds."""
+        return self.time_point.time_us
+
+
+@dataclass(frozen=True)
+class EgoState(DevkitObject):
     """Ego at a time."""
 
     car_footprint: CarFootprint
@@ -317,15 +467,41 @@ class EgoState:
 
     @property
     def agent(self) -> TrackedObject:
-        """Ego as a tracked object."""
-        velocity, heading = self.dynamic_car_state.center_velocity_2d, self.center.heading
-        cos, sin = math.cos(heading), math.sin(heading)
-        turned = StateVector2D(velocity.x * cos - velocity.y * sin, velocity.x * sin + velocity.y * cos)
-        return TrackedObject(TrackedObjectType.EGO, self.car_footprint, turned, "ego", -1, self.time_us)
+        """Ego as a tracked object; its velocity is along and across its heading, as the devkit's."""
+        velocity = self.dynamic_car_state.center_velocity_2d
+        return TrackedObject(TrackedObjectType.EGO, self.car_footprint, velocity, "ego", -1, self.time_us)
+
+    @property
+    def waypoint(self) -> Waypoint:
+        """Ego's box and velocity."""
+        return Waypoint(self.time_point, self.car_footprint, self.dynamic_car_state.rear_axle_velocity_2d)
+
+    def __iter__(self) -> Iterator[float]:
+        """Time, pose, velocity and acceleration of the rear axle, and steering angle."""
+        split = self.to_split_state()
+        return iter([*split.linear_states[:3], *split.angular_states, *split.linear_states[3:]])
+
+    def to_split_state(self) -> SplitState:
+        """Return the state as the devkit interpolates it."""
+        axle, car = self.rear_axle, self.dynamic_car_state
+        vectors = *car.rear_axle_velocity_2d, *car.rear_axle_acceleration_2d
+        linear = [self.time_us, axle.x, axle.y, *vectors, self.tire_steering_angle]
+        return SplitState(linear, [axle.heading], [self.car_footprint.vehicle_parameters])
+
+    @staticmethod
+    def from_split_state(split: Any) -> EgoState:
+        """Return the state of interpolated numbers; it does not turn, as in the devkit."""
+        time_us, x, y, vx, vy, ax, ay, steering = split.linear_states
+        vehicle = split.fixed_states[0]
+        ahead = vehicle.rear_axle_to_center
+        centre = StateSE2(x, y, split.angular_states[0]).ahead(ahead)
+        box = CarFootprint(centre, vehicle.length, vehicle.width, vehicle.height, vehicle)
+        car = DynamicCarState(StateVector2D(vx, vy), StateVector2D(ax, ay), 0.0, 0.0, 0.0, ahead)
+        return EgoState(box, car, steering, TimePoint(int(time_us)))
 
 
 @dataclass(frozen=True)
-class TrackedObject:
+class TrackedObject(DevkitObject):
     """Another road user or thing; its velocity is in the source's frame. Also stands for its own ``metadata``."""
 
     tracked_object_type: TrackedObjectType
@@ -334,6 +510,15 @@ class TrackedObject:
     track_token: str
     track_id: int
     timestamp_us: int
+    angular_velocity: float | None = None
+    predictions: None = None
+    past_trajectory: None = None
+    category_name: None = None
+
+    def devkit_names(self) -> tuple[str, ...]:
+        """Return the devkit's class for the type."""
+        moves = self.tracked_object_type in (*AGENT_TYPES, TrackedObjectType.EGO)
+        return ("Agent",) if moves else ("StaticObject",)
 
     @property
     def center(self) -> StateSE2:
@@ -352,7 +537,7 @@ class TrackedObject:
 
 
 @dataclass(frozen=True)
-class TrackedObjects:
+class TrackedObjects(DevkitObject):
     """Tracked objects, ordered by type."""
 
     tracked_objects: list[TrackedObject]
@@ -381,14 +566,18 @@ class TrackedObjects:
 
 
 @dataclass(frozen=True)
-class DetectionsTracks:
+class DetectionsTracks(DevkitObject):
     """The observation."""
 
     tracked_objects: TrackedObjects
 
+    def detection_type(self) -> str:
+        """Return the name of the observation."""
+        return "DetectionsTracks"
+
 
 @dataclass(frozen=True)
-class TrafficLightStatusData:
+class TrafficLightStatusData(DevkitObject):
     """Observed state of the traffic light of a lane (connector)."""
 
     status: TrafficLightStatusType
@@ -397,7 +586,7 @@ class TrafficLightStatusData:
 
 
 @dataclass(frozen=True)
-class SimulationIteration:
+class SimulationIteration(DevkitObject):
     """Number of the simulated step, from 0, and its time."""
 
     time_point: TimePoint
@@ -415,7 +604,7 @@ class SimulationIteration:
 
 
 @dataclass(frozen=True)
-class SimulationHistoryBuffer:
+class SimulationHistoryBuffer(DevkitObject):
     """States and observations of the last seconds, the present ones last."""
 
     ego_states: Sequence[EgoState]
@@ -452,7 +641,7 @@ class SimulationHistoryBuffer:
 
 
 @dataclass(frozen=True)
-class PlannerInitialization:
+class PlannerInitialization(DevkitObject):
     """What a planner knows of a scenario before it starts."""
 
     route_roadblock_ids: list[str]
@@ -461,7 +650,7 @@ class PlannerInitialization:
 
 
 @dataclass(frozen=True)
-class PlannerInput:
+class PlannerInput(DevkitObject):
     """What a planner knows at a step."""
 
     iteration: SimulationIteration
