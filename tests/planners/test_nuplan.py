@@ -438,9 +438,9 @@ def test_points_of_a_box_and_neighbours_of_a_lane(scenarios):
     assert not lanes["1"].is_left_of(lanes["2"])
 
 
-def junction(**changes):
+def junction(*others, light=RED, **changes):
     """A recording in which lane 1 leads into connector 3 at 40 m; lane 2 is to the left of lane 1."""
-    recording = straight_road([car(0, 0, 0, 8)], RED, 40.0)
+    recording = straight_road([car(0, 0, 0, 8), *others], light, 40.0)
     changed = {2: {"right_neighbours": (1,)}, 3: {"interpolating": True, "left_neighbours": ()}}
     features = [replace(item, **changed.get(item.feature_id, {})) for item in recording.features]
     return replace(recording, features=tuple(features), **changes)
@@ -464,8 +464,10 @@ def test_layers_are_answered_or_refused(scenarios):
 def test_routes_are_extended_or_refused():
     short = assemble(junction(route_lanes=(1,)), SMALL)
     assert View(short).initialization().route_roadblock_ids == ["1", "3"]
-    lost = assemble(junction(scenario_id="lost", route_lanes=()), SMALL)
-    with pytest.raises(PlannerError, match="scenario lost has no route"):
+    record = short.record.copy()
+    record["route_points"] = 0
+    lost = replace(short, record=record)
+    with pytest.raises(PlannerError, match="scenario hand-made has no route"):
         View(lost).initialization()
 
 
@@ -473,7 +475,7 @@ def test_the_call_sequence_of_the_devkits_idm_planner_works(monkeypatch):
     """It sees the leader's speed along its own heading, and a car that starts with straight wheels."""
     for name, module in devkit.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
-    recording = straight_road([car(0, 0, 0, 8), car(20, 0, 0, 5), car(90, 0, 0, 0, kind=AgentKind.STATIC)])
+    recording = junction(car(20, 0, 0, 5), car(90, 0, 0, 0, kind=AgentKind.STATIC), light=GREEN)
     scenario, seen = assemble(far_away(recording, "leader"), SMALL), []
     planner = NuplanPlanner(Host(DevkitIdm(seen), "tests:DevkitIdm"), SPACE)
     results = evaluate(planner, [scenario], task=TASK)
