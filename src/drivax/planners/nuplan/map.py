@@ -17,7 +17,7 @@ from jaxtyping import Float
 from drivax.errors import did_you_mean
 from drivax.geometry.polylines import arc_lengths, headings, left_normals, project
 from drivax.geometry.vectors import wrap
-from drivax.planners.nuplan.interface import DevkitObject, StateSE2, shapely
+from drivax.planners.nuplan.poses import DevkitObject, StateSE2, shapely
 from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M
 from drivax.scenario.roadblocks import lane_lines, roadblocks
 from drivax.scenario.schema import Scenario

@@ -23,6 +23,7 @@ from drivax.geometry.vectors import wrap
 from drivax.planners.functions import PlannerError, error_text, python_actions
 from drivax.planners.nuplan import interface as nuplan
 from drivax.planners.nuplan.map import MapApi
+from drivax.planners.nuplan.poses import BUFFER
 from drivax.scenario.bank.columns import SizeColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank, last_used
 from drivax.scenario.record import record, static
@@ -155,7 +156,7 @@ class Host:
         self._episodes = {key: old for key, old in self._episodes.items() if old.step <= step}
         self._failures.pop(number, None)
         view, planner = View(self.scenario_of(number)), self._make()
-        earlier, size = range(step - nuplan.BUFFER, step), nuplan.BUFFER + 1
+        earlier, size = range(step - BUFFER, step), BUFFER + 1
         egos = [view.ego(past, history[: HISTORY - step + past]) for past in earlier]
         seen = [view.logged(past) for past in earlier]
         _call(planner.initialize, view.initialization())
