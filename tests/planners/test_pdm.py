@@ -283,8 +283,8 @@ def test_emergency_brake_equals_hand_computation():
     assert bool(is_emergency(jnp.asarray(2.5), jnp.asarray(9.0), BrakeConfig(within_s=3.0, up_to_mps=10.0)))
 
 
-def first_action(planner, simulator, bank):
-    state, key = simulator.reset(bank, 0, 10, 0), jax.random.key(0)
+def first_action(planner, simulator, bank, step=10):
+    state, key = simulator.reset(bank, 0, step, 0), jax.random.key(0)
     carry, situation = planner.init(bank, state, key), simulator.situation(bank, state)
     return planner.act(carry, bank, state, situation, None, key)[0]
 
@@ -303,14 +303,17 @@ def test_any_planner_accepts_the_emergency_brake():
 
 
 def test_emergency_brake_forecasts_along_planned_poses():
-    """As above for a plan at 4 m/s; the brake's poses are 1.1 (4 - 4.05) m/s apart."""
+    """As above for a plan at 4 m/s, 4 m from the origin; the brake's poses are 1.1 (4 - 4.05) m/s apart.
+
+    Taken for actuators, the first pose would be 4 m/s2.
+    """
     space = Trajectory(steps=10)
     simulator = Simulator(replace(TASK, actions=space))
     planner = EmergencyBrake(ConstantVelocity(space), space)
-    run = jax.jit(partial(first_action, planner, simulator))
+    run = jax.jit(partial(first_action, planner, simulator, step=20))
     near, far = (
         np.asarray(run(bank_of(straight_road([car(0, 0, 0, 4), car(x, 0, 0, 0)])))).reshape(-1, 3)
-        for x in (10.8, 13.8)
+        for x in (14.8, 17.8)
     )
     np.testing.assert_allclose(np.diff(near[:, 0] - near[0, 0]), -0.0055, atol=1e-5)
     np.testing.assert_allclose(np.diff(far[:, 0] - far[0, 0]), 0.4, atol=1e-5)
