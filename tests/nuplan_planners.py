@@ -8,6 +8,8 @@ from collections import namedtuple
 
 import numpy as np
 
+import nuplan_devkit as devkit
+
 Pose = namedtuple("Pose", "x y heading")
 Time = namedtuple("Time", "time_us")
 State = namedtuple("State", "rear_axle time_point")
@@ -111,6 +113,101 @@ class RouteIdm(AbstractPlanner):
         return Trajectory(sampled(current_input.iteration.time_us, poses, 0.5))
 
 
+class DevkitIdm(AbstractPlanner):
+    """Calls what the devkit's IDM planner calls, in its order, and keeps what it saw."""
+
+    def __init__(self, seen):
+        self.seen, self.path = seen, None
+
+    def __deepcopy__(self, memo):
+        return DevkitIdm(self.seen)
+
+    def name(self):
+        return "devkit_idm"
+
+    def observation_type(self):
+        return devkit.DetectionsTracks
+
+    def initialize(self, initialization):
+        assert isinstance(initialization.map_api, devkit.AbstractMap)
+        self.map, self.blocks = initialization.map_api, []
+        for name in initialization.route_roadblock_ids:
+            block = self.map.get_map_object(name, ROADBLOCK)
+            self.blocks.append(block or self.map.get_map_object(name, ROADBLOCK_CONNECTOR))
+        assert len(self.blocks) >= 2
+        self.edges = [edge.id for block in self.blocks for edge in block.interior_edges]
+
+    def _plan_path(self, ego):
+        """Lanes from the first one under ego, by breadth-first search."""
+        edges = self.blocks[0].interior_edges + self.blocks[1].interior_edges
+        away = lambda edge: edge.polygon.distance(ego.car_footprint.geometry)  # noqa: E731
+        start = next((edge for edge in edges if edge.contains_point(ego.center)), min(edges, key=away))
+        plans = [[start]]
+        for plan in plans:
+            plans += [[*plan, edge] for edge in plan[-1].outgoing_edges if edge.id in self.edges]
+        ends = [plan for plan in plans if plan[-1].get_roadblock_id() == self.blocks[-1].id]
+        self.limit = start.speed_limit_mps or 15.0
+        poses = [pose for edge in (ends or plans)[-1] for pose in edge.baseline_path.discrete_path]
+        self.path = np.array([pose.serialize() for pose in poses])
+
+    def _leader(self, ego, observation, lights):
+        """Gap and speed of the nearest agent, object or red light on the path ahead."""
+        if not isinstance(observation, devkit.DetectionsTracks):
+            raise ValueError(observation.detection_type())
+        tracks = {item.track_token: item for item in observation.tracked_objects.tracked_objects}
+        ahead = lambda point: np.array([*point]) - ego.center.array  # noqa: E731
+        near = {key: item for key, item in tracks.items() if np.linalg.norm(ahead(item.center.point)) < 40.0}
+        found = []
+        for item in near.values():
+            local = np.linalg.inv(ego.center.as_matrix()) @ [item.center.x, item.center.y, 1.0]
+            if local[0] > 0.0 and abs(local[1]) < 2.0:
+                speed = 0.0
+                if isinstance(item, devkit.Agent):
+                    turn = item.center.heading - ego.center.heading
+                    speed = item.velocity.magnitude() * math.cos(turn)
+                gap = ego.car_footprint.geometry.distance(item.box.geometry)
+                found.append((gap, speed, isinstance(item, devkit.StaticObject)))
+        for data in lights:
+            if data.status == RED and str(data.lane_connector_id) in self.edges:
+                lane = self.map.get_map_object(str(data.lane_connector_id), LANE_CONNECTOR)
+                if lane:
+                    found.append((ego.car_footprint.geometry.distance(lane.polygon), 0.0, True))
+        return min(found, default=(100.0, self.limit, False))
+
+    def compute_planner_trajectory(self, current_input):
+        ego, observation = current_input.history.current_state
+        if self.path is None:
+            self._plan_path(ego)
+        leader = self._leader(ego, observation, current_input.traffic_light_data)
+        self.seen.append((ego, leader))
+        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.path[:, :2], axis=0).T))])
+        at = arc[np.argmin(np.hypot(*(self.path[:, :2] - ego.center.array).T))]
+        speed, time, vehicle = (
+            ego.dynamic_car_state.center_velocity_2d.x,
+            ego.time_point,
+            ego.car_footprint.vehicle_parameters,
+        )
+        along = np.array([math.cos(ego.center.heading), math.sin(ego.center.heading)])
+        row = np.array([np.interp(at, arc, column) for column in self.path.T])
+        at, states, gap = at + (ego.center.array - row[:2]) @ along, [ego], leader[0]
+        for _ in range(16):
+            wish = 1.0 + 1.5 * speed + speed * (speed - leader[1]) / (2 * math.sqrt(3.0))
+            push = 1.0 - (speed / self.limit) ** 4 - (max(wish, 0.0) / max(gap, 0.5)) ** 2
+            speed = max(speed + 0.5 * max(push, -3.0), 0.0)
+            at, gap, time = (
+                at + 0.5 * speed,
+                gap + 0.5 * (leader[1] - speed),
+                time + devkit.TimePoint(500_000),
+            )
+            pose = devkit.StateSE2(*(np.interp(at, arc, column) for column in self.path.T))
+            states.append(devkit.EgoState.build_from_center(pose, speed, time, vehicle))
+        trajectory = devkit.InterpolatedTrajectory(states)
+        # The simulator of the devkit asks for the state a step later.
+        after = trajectory.get_state_at_time(ego.time_point + devkit.TimePoint(100_000))
+        assert isinstance(after, devkit.EgoState) and after.time_us == ego.time_us + 100_000
+        return trajectory
+
+
 class Replay(AbstractPlanner):
     """Repeats given poses of the rear axle, a row per step of the log, and keeps what it was given."""
 
@@ -131,7 +228,8 @@ class Replay(AbstractPlanner):
 
     def compute_planner_trajectory(self, current_input):
         self.seen.append(current_input)
-        step = round(current_input.iteration.time_s / 0.1)
+        # Time counts from 2 s before the log.
+        step = round(current_input.iteration.time_s / 0.1) - 20
         return sampled(current_input.iteration.time_us, self.axle[step:].tolist(), 0.1)
 
 

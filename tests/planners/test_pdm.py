@@ -13,7 +13,7 @@ import pytest
 from drivax.errors import UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
-from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking, is_emergency
+from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking, is_emergency, stop
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.planner import PUBLISHED_DRIVER, PdmConfig, PdmPlanner
 from drivax.planners.pdm.proposals import LINE_BEND, LINE_PLACE, Lines, unroll_idm
@@ -24,6 +24,7 @@ from drivax.scenario.build.assemble import assemble
 from drivax.scenario.record import record
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
+from drivax.tasks.actions import Trajectory
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from drivax.testing.worlds import other_future, scattered
@@ -282,16 +283,16 @@ def test_emergency_brake_equals_hand_computation():
     assert bool(is_emergency(jnp.asarray(2.5), jnp.asarray(9.0), BrakeConfig(within_s=3.0, up_to_mps=10.0)))
 
 
+def first_action(planner, simulator, bank, step=10):
+    state, key = simulator.reset(bank, 0, step, 0), jax.random.key(0)
+    carry, situation = planner.init(bank, state, key), simulator.situation(bank, state)
+    return planner.act(carry, bank, state, situation, None, key)[0]
+
+
 def test_any_planner_accepts_the_emergency_brake():
     """At 4 m/s: 6 m to the bumper of who stands are 1.5 s, 9 m are more than 2 s."""
     planner = EmergencyBrake(ConstantVelocity())
-
-    def first(bank):
-        state, key = SIMULATOR.reset(bank, 0, 10, 0), jax.random.key(0)
-        carry, situation = planner.init(bank, state, key), SIMULATOR.situation(bank, state)
-        return planner.act(carry, bank, state, situation, None, key)[0]
-
-    run = jax.jit(first)
+    run = jax.jit(partial(first_action, planner, SIMULATOR))
     near, far, beside = (
         np.asarray(run(bank_of(straight_road([car(0, 0, 0, 4), other]))))
         for other in (car(10.8, 0, 0, 0), car(13.8, 0, 0, 0), car(10.8, 3.7, 0, 0))
@@ -299,6 +300,38 @@ def test_any_planner_accepts_the_emergency_brake():
     assert near[0] * 6.0 == pytest.approx(-4.05)
     assert far.tolist() == beside.tolist() == [0.0, 0.0]
     assert planner.name == "constant_velocity+brake"
+
+
+def test_emergency_brake_forecasts_along_planned_poses():
+    """As above for a plan at 4 m/s, 4 m from the origin; the brake's poses are 1.1 (4 - 4.05) m/s apart.
+
+    Taken for actuators, the first pose would be 4 m/s2.
+    """
+    space = Trajectory(steps=10)
+    simulator = Simulator(replace(TASK, actions=space))
+    planner = EmergencyBrake(ConstantVelocity(space), space)
+    run = jax.jit(partial(first_action, planner, simulator, step=20))
+    near, far = (
+        np.asarray(run(bank_of(straight_road([car(0, 0, 0, 4), car(x, 0, 0, 0)])))).reshape(-1, 3)
+        for x in (14.8, 17.8)
+    )
+    np.testing.assert_allclose(np.diff(near[:, 0] - near[0, 0]), -0.0055, atol=1e-5)
+    np.testing.assert_allclose(np.diff(far[:, 0] - far[0, 0]), 0.4, atol=1e-5)
+
+
+def test_controller_stops_as_with_the_published_poses():
+    """From 5 m/s in 4.5 m, measured with the published brake, nuPlan's tracker and its vehicle model."""
+    space, length = Trajectory(steps=40), jnp.float32(5.176)
+
+    def step(now, _):
+        motion, last = now
+        plan = stop(space, motion, braking(motion[3], last[0]), length)
+        last = space.actuated(motion, plan, last, length)
+        return (space.move(motion, last, length), last), motion
+
+    start = jnp.array([0.0, 0.0, 0.0, 5.0]), jnp.zeros(space.size)
+    motions = quick(lambda now: jax.lax.scan(step, now, None, 60)[1], start)
+    assert motions[-1, 0] == pytest.approx(4.5, abs=0.05) and motions[-1, 3] == 0.0
 
 
 @pytest.mark.slow

@@ -249,6 +249,25 @@ def test_car_converges_to_a_line_and_to_a_circle():
     np.testing.assert_allclose(actuators[-20:, 1], np.arctan(WHEELBASE_M / radius), atol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("speed", "radius", "zero_m", "logged_m"), [(6.0, 15.0, 1.17, 0.16), (10.0, 30.0, 1.23, 0.22)]
+)
+def test_straight_wheels_at_the_start_leave_a_circle(speed, radius, zero_m, logged_m):
+    """Largest distance from the circle of the rear axle; the devkit's controller leaves it by 1.16 m and 1.23 m."""
+    reference = circle(speed, radius, 141)
+    angle = speed * 0.1 * np.arange(-22, 1) / radius
+    poses = np.stack([radius * np.sin(angle), radius - radius * np.cos(angle), angle], -1)
+    history = jnp.asarray(np.column_stack([centre(poses), np.full(23, speed)]), jnp.float32)
+    for name, right in (("zero", zero_m), ("logged", logged_m)):
+        first = Trajectory(initial_steering=name).first(history, LENGTH_M)[:3]
+        motions, _ = closed_loop(
+            lambda n: centre(reference[n : n + 41]), [AXLE_M, 0.0, 0.0, speed], np.asarray(first), 100
+        )
+        axle = motions[:, :2] - AXLE_M * np.stack([np.cos(motions[:, 2]), np.sin(motions[:, 2])], -1)
+        away = np.abs(np.linalg.norm(axle - [0.0, radius], axis=-1) - radius).max()
+        assert away == pytest.approx(right, abs=0.01)
+
+
 def test_gradients_are_finite():
     def loss(poses):
         last = track(jnp.array([0.0, 0.0, 0.0, 0.0]), poses, jnp.zeros(3), jnp.float32(LENGTH_M), CONFIG)

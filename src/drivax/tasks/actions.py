@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -294,10 +294,12 @@ class Trajectory:
     Attributes:
         steps: Horizon of a plan, steps.
         controller: nuPlan's LQR and its bicycle about the rear axle.
+        initial_steering: Steering angle at the start: zero as in nuPlan, or that of the log's last half second.
     """
 
     steps: int = 80
     controller: TrackingConfig = field(default_factory=TrackingConfig)
+    initial_steering: Literal["zero", "logged"] = "zero"
 
     def __post_init__(self) -> None:
         if self.steps < 3:
@@ -356,8 +358,10 @@ class Trajectory:
         )
 
     def first(self, history: History, length_m: Any) -> Float[Array, " D"]:
-        """Return the acceleration and steering angle of the last half second of the log."""
+        """Return the acceleration of the log's last half second, and the initial steering angle."""
         now = controller.recent_actuators(history, jnp.maximum(length_m, 1.0), self.controller)
+        if self.initial_steering == "zero":
+            now = now.at[controller.STEERING].set(0.0)
         return jnp.zeros(self.size).at[:3].set(now)
 
 

@@ -1,22 +1,24 @@
-"""What planners with nuPlan's interface are given: states, boxes, tracked objects, history and lights.
+"""What planners with nuPlan's interface are given: ego, tracked objects, history and lights.
 
-Names and meanings are those of nuplan-devkit 1.2 (Apache-2.0); its enumerations compare equal to these. SI units;
-positions in the source's frame.
+Names and meanings are those of nuplan-devkit 1.2 (Apache-2.0). Its enumerations compare equal to these, and objects
+pass ``isinstance`` for its classes once it is imported. SI units; positions in the source's frame.
 """
 
 from __future__ import annotations
 
 import enum
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
-import numpy as np
-
-from drivax.errors import missing_package
-from drivax.geometry.boxes import corners
+from drivax.planners.nuplan.poses import (
+    DevkitObject,
+    OrientedBox,
+    Point2D,
+    StateSE2,
+    StateVector2D,
+    TimePoint,
+)
 from drivax.scenario.schema import DT_S, AgentKind, LightState
 from drivax.simulator.contact import REAR_AXLE
 from drivax.simulator.controller import TrackingConfig
@@ -83,107 +85,7 @@ STATUS_OF_LIGHT = {
 
 
 @dataclass(frozen=True)
-class Point2D:
-    """A point, m."""
-
-    x: float
-    y: float
-
-    @property
-    def array(self) -> np.ndarray[Any, Any]:
-        """Both numbers."""
-        return np.array([self.x, self.y])
-
-    def __iter__(self) -> Iterator[float]:
-        return iter((self.x, self.y))
-
-
-@dataclass(frozen=True)
-class StateVector2D(Point2D):
-    """A vector along and across the car's heading, or of an object in the source's frame."""
-
-    def magnitude(self) -> float:
-        """Length of the vector."""
-        return math.hypot(self.x, self.y)
-
-
-@dataclass(frozen=True)
-class StateSE2(Point2D):
-    """A pose."""
-
-    heading: float
-
-    @property
-    def point(self) -> Point2D:
-        """The position."""
-        return Point2D(self.x, self.y)
-
-    def ahead(self, distance_m: float) -> StateSE2:
-        """Return the pose moved along its heading."""
-        dx, dy = distance_m * math.cos(self.heading), distance_m * math.sin(self.heading)
-        return StateSE2(self.x + dx, self.y + dy, self.heading)
-
-    def __iter__(self) -> Iterator[float]:
-        return iter((self.x, self.y, self.heading))
-
-
-@dataclass(frozen=True, order=True)
-class TimePoint:
-    """Time since the start of the scenario."""
-
-    time_us: int
-
-    @property
-    def time_s(self) -> float:
-        """Seconds."""
-        return self.time_us * 1e-6
-
-    @classmethod
-    def of_step(cls, step: int) -> TimePoint:
-        """Return the time of a step of the log."""
-        return cls(round(step * DT_S * 1e6))
-
-    def __add__(self, other: Any) -> TimePoint:
-        return TimePoint(self.time_us + int(getattr(other, "time_us", other)))
-
-    def __sub__(self, other: Any) -> TimePoint:
-        return TimePoint(self.time_us - int(getattr(other, "time_us", other)))
-
-
-@dataclass(frozen=True)
-class OrientedBox:
-    """A box around its centre."""
-
-    center: StateSE2
-    length: float
-    width: float
-    height: float
-
-    @property
-    def half_length(self) -> float:
-        """Half the length."""
-        return self.length / 2
-
-    @property
-    def half_width(self) -> float:
-        """Half the width."""
-        return self.width / 2
-
-    def all_corners(self) -> list[Point2D]:
-        """Front left, rear left, rear right, front right."""
-        cos, sin = math.cos(self.center.heading), math.sin(self.center.heading)
-        box = np.array([self.center.x, self.center.y, cos, sin, self.length, self.width])
-        points = corners(box)[[0, 3, 2, 1]].tolist()
-        return [Point2D(*point) for point in points]
-
-    @cached_property
-    def geometry(self) -> Any:
-        """The box as a polygon of shapely."""
-        return shapely().Polygon([tuple(corner) for corner in self.all_corners()])
-
-
-@dataclass(frozen=True)
-class VehicleParameters:
+class VehicleParameters(DevkitObject):
     """Ego's dimensions, in nuPlan's proportions (5.176 m long, 1.461 m from rear axle to centre, wheelbase 3.089 m)."""
 
     length: float
@@ -237,6 +139,10 @@ class CarFootprint(OrientedBox):
         """The box itself."""
         return self
 
+    def get_point_of_interest(self, point: Any) -> Point2D:
+        """Return a point of the box."""
+        return self.corner(point)
+
     @property
     def rear_axle_to_center_dist(self) -> float:
         """Distance of the box centre from the rear axle."""
@@ -249,7 +155,7 @@ class CarFootprint(OrientedBox):
 
 
 @dataclass(frozen=True)
-class DynamicCarState:
+class DynamicCarState(DevkitObject):
     """Ego's motion; vectors along and across its heading."""
 
     rear_axle_velocity_2d: StateVector2D
@@ -277,16 +183,45 @@ class DynamicCarState:
 
     @property
     def center_acceleration_2d(self) -> StateVector2D:
-        """Acceleration of the box centre, a rigid body's."""
-        away, acceleration = self.rear_axle_to_center_dist, self.rear_axle_acceleration_2d
-        return StateVector2D(
-            acceleration.x - away * self.angular_velocity**2,
-            acceleration.y + away * self.angular_acceleration,
-        )
+        """Acceleration of the box centre."""
+        # As the devkit's get_acceleration_shifted, which is not a rigid body's (x - d w^2, y + d alpha).
+        shift = self.rear_axle_to_center_dist * (self.angular_velocity**2 + self.angular_acceleration)
+        return StateVector2D(self.rear_axle_acceleration_2d.x + shift, self.rear_axle_acceleration_2d.y)
 
 
 @dataclass(frozen=True)
-class EgoState:
+class SplitState(DevkitObject):
+    """Numbers of a state by the way they are interpolated."""
+
+    linear_states: list[float]
+    angular_states: list[float]
+    fixed_states: list[Any]
+
+    def __len__(self) -> int:
+        return len(self.linear_states) + len(self.angular_states) + len(self.fixed_states)
+
+
+@dataclass(frozen=True)
+class Waypoint(DevkitObject):
+    """A box and its velocity at a time."""
+
+    time_point: TimePoint
+    oriented_box: OrientedBox
+    velocity: StateVector2D | None = None
+
+    @property
+    def center(self) -> StateSE2:
+        """Pose of the box centre."""
+        return self.oriented_box.center
+
+    @property
+    def time_us(self) -> int:
+        """Time, microseconds."""
+        return self.time_point.time_us
+
+
+@dataclass(frozen=True)
+class EgoState(DevkitObject):
     """Ego at a time."""
 
     car_footprint: CarFootprint
@@ -317,15 +252,41 @@ class EgoState:
 
     @property
     def agent(self) -> TrackedObject:
-        """Ego as a tracked object."""
-        velocity, heading = self.dynamic_car_state.center_velocity_2d, self.center.heading
-        cos, sin = math.cos(heading), math.sin(heading)
-        turned = StateVector2D(velocity.x * cos - velocity.y * sin, velocity.x * sin + velocity.y * cos)
-        return TrackedObject(TrackedObjectType.EGO, self.car_footprint, turned, "ego", -1, self.time_us)
+        """Ego as a tracked object; its velocity is along and across its heading, as the devkit's."""
+        velocity = self.dynamic_car_state.center_velocity_2d
+        return TrackedObject(TrackedObjectType.EGO, self.car_footprint, velocity, "ego", -1, self.time_us)
+
+    @property
+    def waypoint(self) -> Waypoint:
+        """Ego's box and velocity."""
+        return Waypoint(self.time_point, self.car_footprint, self.dynamic_car_state.rear_axle_velocity_2d)
+
+    def __iter__(self) -> Iterator[float]:
+        """Time, pose, velocity and acceleration of the rear axle, and steering angle."""
+        split = self.to_split_state()
+        return iter([*split.linear_states[:3], *split.angular_states, *split.linear_states[3:]])
+
+    def to_split_state(self) -> SplitState:
+        """Return the state as the devkit interpolates it."""
+        axle, car = self.rear_axle, self.dynamic_car_state
+        vectors = *car.rear_axle_velocity_2d, *car.rear_axle_acceleration_2d
+        linear = [self.time_us, axle.x, axle.y, *vectors, self.tire_steering_angle]
+        return SplitState(linear, [axle.heading], [self.car_footprint.vehicle_parameters])
+
+    @staticmethod
+    def from_split_state(split: Any) -> EgoState:
+        """Return the state of interpolated numbers; it does not turn, as in the devkit."""
+        time_us, x, y, vx, vy, ax, ay, steering = split.linear_states
+        vehicle = split.fixed_states[0]
+        ahead = vehicle.rear_axle_to_center
+        centre = StateSE2(x, y, split.angular_states[0]).ahead(ahead)
+        box = CarFootprint(centre, vehicle.length, vehicle.width, vehicle.height, vehicle)
+        car = DynamicCarState(StateVector2D(vx, vy), StateVector2D(ax, ay), 0.0, 0.0, 0.0, ahead)
+        return EgoState(box, car, steering, TimePoint(int(time_us)))
 
 
 @dataclass(frozen=True)
-class TrackedObject:
+class TrackedObject(DevkitObject):
     """Another road user or thing; its velocity is in the source's frame. Also stands for its own ``metadata``."""
 
     tracked_object_type: TrackedObjectType
@@ -334,6 +295,15 @@ class TrackedObject:
     track_token: str
     track_id: int
     timestamp_us: int
+    angular_velocity: float | None = None
+    predictions: None = None
+    past_trajectory: None = None
+    category_name: None = None
+
+    def devkit_names(self) -> tuple[str, ...]:
+        """Return the devkit's class for the type."""
+        moves = self.tracked_object_type in (*AGENT_TYPES, TrackedObjectType.EGO)
+        return ("Agent",) if moves else ("StaticObject",)
 
     @property
     def center(self) -> StateSE2:
@@ -352,7 +322,7 @@ class TrackedObject:
 
 
 @dataclass(frozen=True)
-class TrackedObjects:
+class TrackedObjects(DevkitObject):
     """Tracked objects, ordered by type."""
 
     tracked_objects: list[TrackedObject]
@@ -381,14 +351,18 @@ class TrackedObjects:
 
 
 @dataclass(frozen=True)
-class DetectionsTracks:
+class DetectionsTracks(DevkitObject):
     """The observation."""
 
     tracked_objects: TrackedObjects
 
+    def detection_type(self) -> str:
+        """Return the name of the observation."""
+        return "DetectionsTracks"
+
 
 @dataclass(frozen=True)
-class TrafficLightStatusData:
+class TrafficLightStatusData(DevkitObject):
     """Observed state of the traffic light of a lane (connector)."""
 
     status: TrafficLightStatusType
@@ -397,7 +371,7 @@ class TrafficLightStatusData:
 
 
 @dataclass(frozen=True)
-class SimulationIteration:
+class SimulationIteration(DevkitObject):
     """Number of the simulated step, from 0, and its time."""
 
     time_point: TimePoint
@@ -415,7 +389,7 @@ class SimulationIteration:
 
 
 @dataclass(frozen=True)
-class SimulationHistoryBuffer:
+class SimulationHistoryBuffer(DevkitObject):
     """States and observations of the last seconds, the present ones last."""
 
     ego_states: Sequence[EgoState]
@@ -452,7 +426,7 @@ class SimulationHistoryBuffer:
 
 
 @dataclass(frozen=True)
-class PlannerInitialization:
+class PlannerInitialization(DevkitObject):
     """What a planner knows of a scenario before it starts."""
 
     route_roadblock_ids: list[str]
@@ -461,22 +435,9 @@ class PlannerInitialization:
 
 
 @dataclass(frozen=True)
-class PlannerInput:
+class PlannerInput(DevkitObject):
     """What a planner knows at a step."""
 
     iteration: SimulationIteration
     history: SimulationHistoryBuffer
     traffic_light_data: list[TrafficLightStatusData]
-
-
-def shapely() -> Any:
-    """Return the package shapely.
-
-    Raises:
-        UsageError: It is not installed.
-    """
-    try:
-        import shapely as package
-    except ModuleNotFoundError as error:
-        raise missing_package(error) or error from error
-    return package

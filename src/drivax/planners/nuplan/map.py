@@ -1,13 +1,14 @@
 """A map with nuPlan's interface, from the lanes of a stored scenario: lanes, lane connectors and roadblocks.
 
-Lanes are strips of their width around the centre line; there are no polygons, crosswalks, stop lines or rasters.
+Lanes are strips of their width around the centre line. The drivable area is that of all lanes, an intersection that
+of a roadblock connector. There are no surveyed polygons, crosswalks, stop lines or rasters.
 """
 
 from __future__ import annotations
 
 import enum
 from collections.abc import Iterable, Sequence
-from functools import cached_property
+from functools import cached_property, partialmethod
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from drivax.errors import did_you_mean
 from drivax.geometry.polylines import arc_lengths, headings, left_normals, project
 from drivax.geometry.vectors import wrap
-from drivax.planners.nuplan.interface import StateSE2, shapely
+from drivax.planners.nuplan.poses import DevkitObject, StateSE2, shapely
 from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M
 from drivax.scenario.roadblocks import lane_lines, roadblocks
 from drivax.scenario.schema import Scenario
@@ -25,16 +26,26 @@ Points = Float[np.ndarray, "point 2"]
 
 
 class SemanticMapLayer(enum.IntEnum):
-    """Layers of the map; the others of the devkit are empty here."""
+    """Layers of the map; car parks are not known, so that layer is empty."""
 
     LANE = 0
+    INTERSECTION = 1
+    DRIVABLE_AREA = 5
     LANE_CONNECTOR = 11
+    CARPARK_AREA = 15
     ROADBLOCK = 17
     ROADBLOCK_CONNECTOR = 18
 
 
-class Polyline:
+_LAYERS = [layer.name for layer in SemanticMapLayer]
+
+
+class Polyline(DevkitObject):
     """A line of the map."""
+
+    def devkit_names(self) -> tuple[str, ...]:
+        """Return the devkit's interface of lines."""
+        return ("PolylineMapObject",)
 
     def __init__(self, name: str, points: Points) -> None:
         self.id, self.points = name, points
@@ -79,8 +90,14 @@ class Polyline:
         return self.get_curvature_at_arc_length(self.get_nearest_arc_length_from_position(point))
 
 
-class _Edge:
+class _Edge(DevkitObject):
     """A node of the graph with an area: a lane, a connector or a roadblock."""
+
+    _interface = ""
+
+    def devkit_names(self) -> tuple[str, ...]:
+        """Return the devkit's class, or its interface where only that is imported."""
+        return type(self).__name__, self._interface
 
     def __init__(self, map_api: MapApi, name: str, connector: bool) -> None:
         self.id, self.is_connector, self._map = name, connector, map_api
@@ -91,8 +108,10 @@ class _Edge:
         return []
 
 
-class Lane(_Edge):
-    """A lane, or a lane connector through a junction."""
+class NuPlanLane(_Edge):
+    """A lane."""
+
+    _interface = "Lane"
 
     def __init__(self, map_api: MapApi, row: int, points: Points) -> None:
         scenario = map_api.scenario
@@ -119,36 +138,52 @@ class Lane(_Edge):
         return self._boundary(-1)
 
     @property
-    def incoming_edges(self) -> list[Lane]:
+    def incoming_edges(self) -> list[NuPlanLane]:
         """Lanes that lead into this one."""
         return self._map.linked(self._map.scenario.lane_predecessor[self.row])
 
     @property
-    def outgoing_edges(self) -> list[Lane]:
+    def outgoing_edges(self) -> list[NuPlanLane]:
         """Lanes that this one leads into."""
         return self._map.linked(self._map.scenario.lane_successor[self.row])
 
     @property
-    def adjacent_edges(self) -> tuple[Lane | None, Lane | None]:
+    def adjacent_edges(self) -> tuple[NuPlanLane | None, NuPlanLane | None]:
         """The neighbours of the same direction, on the left and on the right."""
         left, right = self._map.scenario.lane_left[self.row], self._map.scenario.lane_right[self.row]
         return next(iter(self._map.linked([left])), None), next(iter(self._map.linked([right])), None)
 
     @property
-    def parallel_edges(self) -> list[Lane]:
+    def parallel_edges(self) -> list[NuPlanLane]:
         """All lanes of the roadblock."""
         return self.parent.interior_edges
 
     @property
-    def parent(self) -> RoadBlock:
+    def parent(self) -> NuPlanRoadBlock:
         """The roadblock."""
         return self._map.blocks[self.get_roadblock_id()]
+
+    @property
+    def index(self) -> int:
+        """Number of lanes of the roadblock to the left."""
+        seen, lane = {self.row}, self
+        while (lane := lane.adjacent_edges[0]) is not None and lane.row not in seen:
+            seen.add(lane.row)
+        return len(seen) - 1
+
+    def is_left_of(self, other: NuPlanLane) -> bool:
+        """Return whether the lane is to the left of another one of its roadblock."""
+        return self.is_same_roadblock(other) and self.index < other.index
+
+    def is_right_of(self, other: NuPlanLane) -> bool:
+        """Return whether the lane is to the right of another one of its roadblock."""
+        return other.is_left_of(self)
 
     def get_roadblock_id(self) -> str:
         """Return the id of the roadblock."""
         return self._map.block_of[self.row]
 
-    def is_same_roadblock(self, other: Lane) -> bool:
+    def is_same_roadblock(self, other: NuPlanLane) -> bool:
         """Return whether another lane is in the same roadblock."""
         return self.get_roadblock_id() == other.get_roadblock_id()
 
@@ -179,22 +214,17 @@ class Lane(_Edge):
         return apart - self.half_width_m
 
 
-class RoadBlock(_Edge):
-    """Lanes next to each other in one direction, or connectors between the same two roadblocks."""
+class NuPlanLaneConnector(NuPlanLane):
+    """A lane through a junction."""
 
-    def __init__(self, map_api: MapApi, name: str, lanes: Sequence[Lane]) -> None:
-        super().__init__(map_api, name, lanes[0].is_connector)
-        self.interior_edges = list(lanes)
+    _interface = "LaneConnector"
 
-    @property
-    def incoming_edges(self) -> list[RoadBlock]:
-        """Roadblocks that lead into this one."""
-        return _unique(other.parent for lane in self.interior_edges for other in lane.incoming_edges)
 
-    @property
-    def outgoing_edges(self) -> list[RoadBlock]:
-        """Roadblocks that this one leads into."""
-        return _unique(other.parent for lane in self.interior_edges for other in lane.outgoing_edges)
+class Area:
+    """Strips of some lanes."""
+
+    def __init__(self, name: str, lanes: Sequence[NuPlanLane]) -> None:
+        self.id, self.interior_edges = name, list(lanes)
 
     @cached_property
     def polygon(self) -> Any:
@@ -210,15 +240,46 @@ class RoadBlock(_Edge):
         return min(lane.distance_m(point) for lane in self.interior_edges)
 
 
-class MapApi:
+class NuPlanRoadBlock(Area, _Edge):
+    """Lanes next to each other in one direction."""
+
+    _interface = "RoadBlockGraphEdgeMapObject"
+
+    def __init__(self, map_api: MapApi, name: str, lanes: Sequence[NuPlanLane]) -> None:
+        _Edge.__init__(self, map_api, name, lanes[0].is_connector)
+        Area.__init__(self, name, lanes)
+
+    @property
+    def incoming_edges(self) -> list[NuPlanRoadBlock]:
+        """Roadblocks that lead into this one."""
+        return _unique(other.parent for lane in self.interior_edges for other in lane.incoming_edges)
+
+    @property
+    def outgoing_edges(self) -> list[NuPlanRoadBlock]:
+        """Roadblocks that this one leads into."""
+        return _unique(other.parent for lane in self.interior_edges for other in lane.outgoing_edges)
+
+
+class NuPlanRoadBlockConnector(NuPlanRoadBlock):
+    """Connectors between the same two roadblocks."""
+
+
+class MapApi(DevkitObject):
     """The lanes, lane connectors and roadblocks of a scenario, in the source's frame."""
+
+    def devkit_names(self) -> tuple[str, ...]:
+        """Return the devkit's interface of maps."""
+        return ("AbstractMap",)
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         lines = lane_lines(scenario)
         origin = np.asarray(scenario.origin, np.float64)[:2]
+        inner = scenario.lane_interpolating
         self.lanes = {
-            row: Lane(self, row, points + origin) for row, points in enumerate(lines) if len(points)
+            row: (NuPlanLaneConnector if inner[row] else NuPlanLane)(self, row, points + origin)
+            for row, points in enumerate(lines)
+            if len(points)
         }
         numbers = roadblocks(scenario)
         self.block_of = {row: str(int(scenario.lane_id[numbers[row]])) for row in self.lanes}
@@ -226,14 +287,17 @@ class MapApi:
         members = {
             name: [lane for row, lane in self.lanes.items() if self.block_of[row] == name] for name in names
         }
-        self.blocks = {name: RoadBlock(self, name, lanes) for name, lanes in members.items()}
+        self.blocks = {
+            name: (NuPlanRoadBlockConnector if lanes[0].is_connector else NuPlanRoadBlock)(self, name, lanes)
+            for name, lanes in members.items()
+        }
 
     @property
     def map_name(self) -> str:
         """Name of the place, or of the data set."""
         return self.scenario.tags.get("location", self.scenario.text("dataset"))
 
-    def linked(self, rows: Iterable[Any]) -> list[Lane]:
+    def linked(self, rows: Iterable[Any]) -> list[NuPlanLane]:
         """Return the lanes of some rows of the lane graph; those without a line are left out."""
         return [self.lanes[int(row)] for row in rows if int(row) in self.lanes]
 
@@ -267,6 +331,11 @@ class MapApi:
         """Return an object by its id; None if the layer has none."""
         return next((item for item in self._objects(layer) if item.id == str(object_id)), None)
 
+    _get_lane = partialmethod(get_map_object, layer=SemanticMapLayer.LANE)
+    _get_lane_connector = partialmethod(get_map_object, layer=SemanticMapLayer.LANE_CONNECTOR)
+    _get_roadblock = partialmethod(get_map_object, layer=SemanticMapLayer.ROADBLOCK)
+    _get_roadblock_connector = partialmethod(get_map_object, layer=SemanticMapLayer.ROADBLOCK_CONNECTOR)
+
     def get_distance_to_nearest_map_object(self, point: Any, layer: Any) -> tuple[str | None, float | None]:
         """Return id and distance of the nearest object of a layer; (None, None) without one."""
         apart = [(max(item.distance_m(point), 0.0), item.id) for item in self._objects(layer)]
@@ -279,17 +348,28 @@ class MapApi:
         raise NotImplementedError(f"the map has no {name}; {did_you_mean(name, known)}")
 
     def _objects(self, layer: Any) -> list[Any]:
-        number = int(layer)
-        edges: list[Any] = []
-        if number in (SemanticMapLayer.LANE, SemanticMapLayer.LANE_CONNECTOR):
-            edges = list(self.lanes.values())
-        elif number in (SemanticMapLayer.ROADBLOCK, SemanticMapLayer.ROADBLOCK_CONNECTOR):
-            edges = list(self.blocks.values())
-        connectors = number in (SemanticMapLayer.LANE_CONNECTOR, SemanticMapLayer.ROADBLOCK_CONNECTOR)
-        return [edge for edge in edges if edge.is_connector == connectors]
+        try:
+            known = SemanticMapLayer(int(layer))
+        except ValueError:
+            name = getattr(layer, "name", layer)
+            raise NotImplementedError(f"the map has no layer {name}; it has {', '.join(_LAYERS)}") from None
+        return self._layers.get(known, [])
+
+    @cached_property
+    def _layers(self) -> dict[SemanticMapLayer, list[Any]]:
+        lanes, blocks = list(self.lanes.values()), list(self.blocks.values())
+        junctions = [block for block in blocks if block.is_connector]
+        return {
+            SemanticMapLayer.LANE: [lane for lane in lanes if not lane.is_connector],
+            SemanticMapLayer.LANE_CONNECTOR: [lane for lane in lanes if lane.is_connector],
+            SemanticMapLayer.ROADBLOCK: [block for block in blocks if not block.is_connector],
+            SemanticMapLayer.ROADBLOCK_CONNECTOR: junctions,
+            SemanticMapLayer.INTERSECTION: [Area(block.id, block.interior_edges) for block in junctions],
+            SemanticMapLayer.DRIVABLE_AREA: [Area("drivable_area", lanes)] if lanes else [],
+        }
 
 
-def _unique(blocks: Iterable[RoadBlock]) -> list[RoadBlock]:
+def _unique(blocks: Iterable[NuPlanRoadBlock]) -> list[NuPlanRoadBlock]:
     """Roadblocks without repetitions, in order."""
     return list({block.id: block for block in blocks}.values())
 

@@ -23,18 +23,16 @@ from drivax.geometry.vectors import wrap
 from drivax.planners.functions import PlannerError, error_text, python_actions
 from drivax.planners.nuplan import interface as nuplan
 from drivax.planners.nuplan.map import MapApi
+from drivax.planners.nuplan.poses import BUFFER
 from drivax.scenario.bank.columns import SizeColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank, last_used
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S, AgentKind, LightState, Scenario
-from drivax.simulator.controller import RATE, STEERING
 from drivax.simulator.types import HISTORY, MOTION_SPEED, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Trajectory
 
-#: Steps of history that planners get, as in nuPlan's simulation: 2 s, where the log has them.
-_BUFFER = 20
-#: Speed below which the steering angle of a logged motion is taken as zero, m/s.
-_STILL_MPS = 0.5
+#: Below these the steering angle of a logged motion (m/s), and its slip (m in a step), are taken as zero.
+_STILL_MPS, _STILL_M = 0.5, 0.02
 #: Latest time at which a plan may start, after the present one, s.
 _LATE_S = 1e-3
 _PLANS = "compute_planner_trajectory"
@@ -158,11 +156,11 @@ class Host:
         self._episodes = {key: old for key, old in self._episodes.items() if old.step <= step}
         self._failures.pop(number, None)
         view, planner = View(self.scenario_of(number)), self._make()
-        first = max(step - _BUFFER, 0)
-        egos = [view.ego(past, history[: HISTORY - step + past]) for past in range(first, step)]
-        seen = [view.logged(past) for past in range(first, step)]
+        earlier, size = range(step - BUFFER, step), BUFFER + 1
+        egos = [view.ego(past, history[: HISTORY - step + past]) for past in earlier]
+        seen = [view.logged(past) for past in earlier]
         _call(planner.initialize, view.initialization())
-        episode = _Episode(planner, view, deque(egos, _BUFFER + 1), deque(seen, _BUFFER + 1), step - 1)
+        episode = _Episode(planner, view, deque(egos, size), deque(seen, size), step - 1)
         self._episodes[number] = episode
         return episode
 
@@ -170,7 +168,8 @@ class Host:
         self, episode: _Episode, steps: int, step: int, start: int, history: Any, actuators: Any, frame: Any
     ) -> Float[np.ndarray, "n 3"]:
         view = episode.view
-        episode.egos.append(view.ego(step, history, actuators))
+        last = episode.egos[-1].dynamic_car_state if step > start else None
+        episode.egos.append(view.ego(step, history, actuators, last))
         episode.seen.append(view.tracks(step, frame.box, frame.velocity, frame.valid, frame.kind))
         iteration = nuplan.SimulationIteration(nuplan.TimePoint.of_step(step), step - start)
         buffer = nuplan.SimulationHistoryBuffer(list(episode.egos), list(episode.seen))
@@ -199,6 +198,12 @@ class View:
         rows = dict.fromkeys(int(row) for row in scenario.route_lane[0, :count] if int(row) in self.map.lanes)
         blocks = [self.map.block_of[row] for row in rows]
         route = [name for k, name in enumerate(blocks) if k == 0 or name != blocks[k - 1]]
+        if not route:
+            raise PlannerError(f"scenario {scenario.text('scenario_id')} has no route")
+        # The devkit's planners take two roadblocks for granted.
+        if len(route) < 2:
+            following = self.map.blocks[route[0]].outgoing_edges
+            route += [block.id for block in following if block.id not in route][:1]
         goal = np.asarray(scenario.goal_xy, np.float64)
         heading = float(scenario.agent_heading[scenario.current_step, 0])
         if count:
@@ -207,20 +212,30 @@ class View:
         x, y = (goal + self.origin).tolist()
         return nuplan.PlannerInitialization(route, nuplan.StateSE2(x, y, heading), self.map)
 
-    def ego(self, step: int, history: Any, actuators: Any = None) -> nuplan.EgoState:
-        """Return ego at a step from its motions until then; steering is measured where ``actuators`` are unknown."""
+    def ego(
+        self, step: int, history: Any, actuators: Any = None, last: nuplan.DynamicCarState | None = None
+    ) -> nuplan.EgoState:
+        """Return ego at a step, measured from its motions until then.
+
+        ``actuators`` (if finite) give acceleration and steering; with the ``last`` driven state, speed and steering
+        give the yaw rate, as in nuPlan's vehicle model.
+        """
         now, before, earlier = (np.asarray(history[-k], np.float64) for k in (1, 2, 3))
         x, y, heading, speed = now.tolist()
         turn = [float(wrap(b[2] - a[2])) / DT_S for a, b in ((earlier, before), (before, now))]
-        steering = math.atan(turn[1] * self.vehicle.wheel_base / speed) if speed > _STILL_MPS else 0.0
-        rate = 0.0
+        speeds = _axle_speed(earlier, before), _axle_speed(before, now)
+        wheelbase, yaw_rate, rate = self.vehicle.wheel_base, turn[1], 0.0
+        acceleration, change = (speeds[1] - speeds[0]) / DT_S, (turn[1] - turn[0]) / DT_S
+        steering = math.atan(turn[1] * wheelbase / speed) if speed > _STILL_MPS else 0.0
         if actuators is not None and np.isfinite(actuators).all():
-            rate = float(actuators[RATE])
-            steering = float(actuators[STEERING]) + rate * DT_S
+            acceleration, steering, rate = (float(value) for value in actuators)
+            steering += rate * DT_S
+            if last is not None:
+                speeds, yaw_rate = (0.0, speed), speed * math.tan(steering) / wheelbase
+                change = (yaw_rate - last.angular_velocity) / DT_S
         dynamic = nuplan.DynamicCarState(
-            nuplan.StateVector2D(speed, 0.0),
-            nuplan.StateVector2D((speed - float(before[MOTION_SPEED])) / DT_S, 0.0),
-            turn[1], (turn[1] - turn[0]) / DT_S, rate, self.vehicle.rear_axle_to_center,
+            nuplan.StateVector2D(speeds[1], 0.0), nuplan.StateVector2D(acceleration, 0.0),
+            yaw_rate, change, rate, self.vehicle.rear_axle_to_center,
         )  # fmt: skip
         centre = nuplan.StateSE2(x + float(self.origin[0]), y + float(self.origin[1]), heading)
         vehicle = self.vehicle
@@ -244,15 +259,16 @@ class View:
         return nuplan.DetectionsTracks(nuplan.TrackedObjects(tracked))
 
     def logged(self, step: int) -> nuplan.DetectionsTracks:
-        """Return the other agents as logged."""
-        s, a, p = self.scenario, self._moving, self._parked
-        xy = np.concatenate([s.agent_xy[step, :a], s.parked_xy[:p]])
+        """Return the other agents as logged; before the log they keep their first velocity."""
+        s, a, p, time, step = self.scenario, self._moving, self._parked, step, max(step, 0)
+        early_s = (time - step) * DT_S
+        xy = np.concatenate([s.agent_xy[step, :a] + early_s * s.agent_velocity[step, :a], s.parked_xy[:p]])
         heading = np.concatenate([s.agent_heading[step, :a], s.parked_heading[:p]])
         size = np.concatenate([s.agent_size[:a, :2], s.parked_size[:p, :2]])
         box = np.concatenate([xy, np.cos(heading)[:, None], np.sin(heading)[:, None], size], axis=1)
         velocity = np.concatenate([s.agent_velocity[step, :a], np.zeros((p, 2))])
         valid = np.concatenate([s.agent_valid[step, :a], s.parked_valid[step, :p]])
-        return self.tracks(step, box, velocity, valid, np.concatenate([s.agent_kind[:a], s.parked_kind[:p]]))
+        return self.tracks(time, box, velocity, valid, np.concatenate([s.agent_kind[:a], s.parked_kind[:p]]))
 
     def lights(self, step: int, states: Any) -> list[nuplan.TrafficLightStatusData]:
         """Return the observed traffic lights of lanes of the map."""
@@ -274,7 +290,7 @@ class View:
         if len(rows) < 2:
             raise PlannerError(f"a trajectory of {len(rows)} states; return two or more")
         time, x, y, heading = np.array(rows).T
-        now = step * DT_S
+        now = nuplan.TimePoint.of_step(step).time_s
         if time[0] > now + _LATE_S or time[-1] <= now:
             raise PlannerError(f"the trajectory is from {time[0]:g} to {time[-1]:g} s, and it is {now:g} s")
         if (np.diff(time) <= 0).any():
@@ -300,6 +316,15 @@ def _rows(trajectory: Any) -> list[tuple[float, float, float, float]]:
     states = trajectory if sampled is None else sampled()
     poses = [(state.time_point.time_us * 1e-6, state.rear_axle) for state in states]
     return [(time_s, float(pose.x), float(pose.y), float(pose.heading)) for time_s, pose in poses]
+
+
+def _axle_speed(before: Any, now: Any) -> float:
+    """Speed of the rear axle: that of the centre, along the heading."""
+    dx, dy = now[:2] - before[:2]
+    if math.hypot(dx, dy) < _STILL_M:
+        return float(now[MOTION_SPEED])
+    slip = math.atan2(dy, dx) - before[2] - float(wrap(now[2] - before[2])) / 2
+    return float(now[MOTION_SPEED]) * math.cos(slip)
 
 
 def _interpolated(at: Any, time: Any, values: Any) -> Any:

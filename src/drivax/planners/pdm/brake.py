@@ -6,7 +6,7 @@ Planning" (CoRL 2023) and its published implementation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -20,11 +20,13 @@ from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import overlaps
-from drivax.simulator.types import MOTION_SPEED, SimState, Situation
-from drivax.tasks.actions import ActionSpace, Physical
+from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, Motion, SimState, Situation
+from drivax.tasks.actions import ActionSpace, Physical, Trajectory
 
 #: Number of agents considered, those nearest to the path within this radius, m.
 _OTHERS, _RADIUS_M = 24, 50.0
+#: Factor on the speed of the poses that a controller brakes by.
+_OVERSHOOT = 1.1
 
 
 @dataclass(frozen=True)
@@ -63,9 +65,28 @@ def braking(speed: Scalar, acceleration: Scalar, config: BrakeConfig = BrakeConf
     return jnp.clip(unclipped, config.least_mps2, config.most_mps2)
 
 
+def stop(
+    actions: ActionSpace, motion: Motion, acceleration: Scalar, length_m: Scalar,
+    config: BrakeConfig = BrakeConfig(),
+) -> Float[Array, " D"]:  # fmt: skip
+    """Return the action that brakes straight ahead.
+
+    A controller gets poses at the constant speed ``1.1 (v + a)``, at low speed ``a``, as published: they may lead
+    backwards, so the car stops before them.
+    """
+    if not isinstance(actions, Trajectory):
+        return actions.action(motion, acceleration, jnp.zeros(()), length_m)
+    speed, heading = motion[MOTION_SPEED], motion[MOTION_HEADING]
+    pace = jnp.where(speed > config.slow_mps, _OVERSHOOT * (speed + acceleration), acceleration)
+    ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading), jnp.zeros(())]) * pace * DT_S
+    return actions.plan(jnp.stack([motion[:3], motion[:3] + ahead]))
+
+
 @record
 class EmergencyBrake:
     """Wrap a planner: brake if its action, held constant, leads to an at-fault collision.
+
+    Planned poses are taken as driven.
 
     Other agents keep their velocities; agents that already touch ego are ignored.
 
@@ -98,12 +119,7 @@ class EmergencyBrake:
         context, around = situation.context, situation.surroundings
         motion, me = context.history[-1], around.frame.box[context.slot]
 
-        def on(motion: Array, _: None) -> tuple[Array, Array]:
-            return self.actions.move(motion, action, me[LENGTH]), motion
-
-        steps = round(self.config.within_s / DT_S)
-        last, drive = jax.lax.scan(on, motion, None, steps)
-        drive = jnp.concatenate([drive, last[None]])
+        drive = self._forecast(motion, action, context.action, me[LENGTH])
         touched = overlaps(around.frame, context.slot)
         others = Forecast.of(around.frame, context.slot, touched, drive[::5, :2], _OTHERS, _RADIUS_M)
         size = me[LENGTH : WIDTH + 1]
@@ -112,6 +128,24 @@ class EmergencyBrake:
         fault_s = jnp.min(fault_times(drive, size, others, soon, unlawful))
         speed = motion[MOTION_SPEED]
         unclipped = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
-        brake = self.actions.action(motion, unclipped, jnp.zeros(()), me[LENGTH])
+        brake = stop(self.actions, motion, unclipped, me[LENGTH], self.config)
         chosen = jnp.where(is_emergency(fault_s, speed, self.config), brake, action)
         return chosen, carry
+
+    def _forecast(
+        self, motion: Motion, action: Float[Array, " D"], last: Float[Array, " D"], length_m: Scalar
+    ) -> Float[Array, "n 4"]:
+        """Motions from now on while the action is held, or along planned poses."""
+        steps = round(self.config.within_s / DT_S)
+        if isinstance(self.actions, Trajectory):
+            poses = replace(self.actions, steps=steps).plan(action.reshape(-1, 3)).reshape(-1, 3)
+            speeds = jnp.linalg.norm(jnp.diff(poses[:, :2], axis=0), axis=-1) / DT_S
+            return jnp.column_stack([poses, jnp.concatenate([motion[MOTION_SPEED:], speeds])])
+
+        def on(now: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+            motion, last = now
+            executed = self.actions.actuated(motion, action, last, length_m)
+            return (self.actions.move(motion, executed, length_m), executed), motion
+
+        (end, _), drive = jax.lax.scan(on, (motion, last), None, steps)
+        return jnp.concatenate([drive, end[None]])

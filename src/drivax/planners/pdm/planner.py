@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH
 from drivax.planners.pdm import scoring
-from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency
+from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency, stop
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unroll_idm
 from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig
@@ -135,13 +135,14 @@ class PdmPlanner:
         best = jnp.argmax(scored.score)
         speed, brake = motion[MOTION_SPEED], self.config.brake
         brakes = is_emergency(scored.metrics.fault_s[best], speed, brake)
-        stop = braking(speed, carry.acceleration, brake)
-        acceleration = jnp.where(brakes, stop, scored.cars.acceleration[best, 1])
+        hard = braking(speed, carry.acceleration, brake)
+        acceleration = jnp.where(brakes, hard, scored.cars.acceleration[best, 1])
         steering = jnp.where(brakes, 0.0, scored.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = self.actions.action(motion, acceleration, curvature, length)
         if tracked:
-            action = jnp.where(brakes, action, tracked.plan(scored.plans[best]))
+            stopped = stop(tracked, motion, hard, length, brake)
+            action = jnp.where(brakes, stopped, tracked.plan(scored.plans[best]))
         return action, Memory(touched, acceleration, steering)
 
     def score_proposals(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> ScoredProposals:

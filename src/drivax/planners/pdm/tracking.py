@@ -1,7 +1,8 @@
 """Track a trajectory with two one-step linear-quadratic regulators and a bicycle model with actuator lags.
 
 The tracker of ``simulator.controller``, with the speeds and curvatures of a proposal instead of fitted ones. The car
-moves by ``simulator.dynamics.bicycle``, so the first step of a tracked proposal equals the simulator's.
+moves by ``simulator.dynamics.bicycle``, so the first step of a tracked proposal equals the simulator's, except in the
+action space ``trajectory``, whose controller and car are others.
 """
 
 from __future__ import annotations

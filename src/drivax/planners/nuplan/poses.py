@@ -1,0 +1,246 @@
+"""Poses, vectors, times and boxes with nuPlan's interface, which pass ``isinstance`` for the devkit's classes.
+
+SI units; positions in the source's frame.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, total_ordering
+from typing import Any
+
+import numpy as np
+
+from drivax.errors import missing_package
+from drivax.scenario.schema import DT_S
+
+#: Steps of history that planners get, as in nuPlan's simulation (2 s); time counts from so long before the log.
+BUFFER = 20
+_STATE, _PLANNING, _MAPS = "nuplan.common.actor_state", "nuplan.planning.simulation", "nuplan.common.maps"
+#: Modules of the devkit by the classes that are looked for there.
+_MODULES = {
+    name: module
+    for module, names in {
+        f"{_STATE}.state_representation": "Point2D StateVector2D StateSE2 TimePoint TimeDuration",
+        f"{_STATE}.oriented_box": "OrientedBox",
+        f"{_STATE}.vehicle_parameters": "VehicleParameters",
+        f"{_STATE}.car_footprint": "CarFootprint",
+        f"{_STATE}.dynamic_car_state": "DynamicCarState",
+        f"{_STATE}.ego_state": "EgoState",
+        f"{_STATE}.waypoint": "Waypoint",
+        f"{_STATE}.agent": "Agent",
+        f"{_STATE}.static_object": "StaticObject",
+        f"{_STATE}.tracked_objects": "TrackedObjects",
+        "nuplan.common.utils.split_state": "SplitState",
+        f"{_PLANNING}.observation.observation_type": "DetectionsTracks",
+        f"{_PLANNING}.history.simulation_history_buffer": "SimulationHistoryBuffer",
+        f"{_PLANNING}.planner.abstract_planner": "PlannerInitialization PlannerInput",
+        f"{_PLANNING}.simulation_time_controller.simulation_iteration": "SimulationIteration",
+        f"{_MAPS}.maps_datatypes": "TrafficLightStatusData",
+        f"{_MAPS}.abstract_map": "AbstractMap",
+        f"{_MAPS}.abstract_map_objects": "Lane LaneConnector RoadBlockGraphEdgeMapObject PolylineMapObject",
+        f"{_MAPS}.nuplan_map.lane": "NuPlanLane",
+        f"{_MAPS}.nuplan_map.lane_connector": "NuPlanLaneConnector",
+        f"{_MAPS}.nuplan_map.roadblock": "NuPlanRoadBlock",
+        f"{_MAPS}.nuplan_map.roadblock_connector": "NuPlanRoadBlockConnector",
+    }.items()
+    for name in names.split()
+}
+
+
+class DevkitObject:
+    """Base of classes whose ``__class__`` is the devkit's where that is imported, which ``isinstance`` honours."""
+
+    def devkit_names(self) -> tuple[str, ...]:
+        """Return names of the devkit's classes, the first choice first."""
+        return (type(self).__name__,)
+
+    @property
+    def __class__(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        names = self.devkit_names()
+        theirs = (getattr(sys.modules.get(_MODULES.get(name, "")), name, None) for name in names)
+        return next(filter(None, theirs), type(self))
+
+    def __reduce__(self) -> Any:
+        # The default refuses an object whose __class__ is another than its type.
+        return object.__new__, (type(self),), self.__dict__
+
+
+@dataclass(frozen=True)
+class Point2D(DevkitObject):
+    """A point, m."""
+
+    x: float
+    y: float
+
+    @property
+    def array(self) -> np.ndarray[Any, Any]:
+        """Both numbers."""
+        return np.array([self.x, self.y])
+
+    def __iter__(self) -> Iterator[float]:
+        return iter((self.x, self.y))
+
+
+@dataclass(frozen=True)
+class StateVector2D(Point2D):
+    """A vector along and across the car's heading, or of an object in the source's frame."""
+
+    def magnitude(self) -> float:
+        """Length of the vector."""
+        return math.hypot(self.x, self.y)
+
+
+@dataclass(frozen=True)
+class StateSE2(Point2D):
+    """A pose."""
+
+    heading: float
+
+    @property
+    def point(self) -> Point2D:
+        """The position."""
+        return Point2D(self.x, self.y)
+
+    def ahead(self, distance_m: float, left_m: float = 0.0) -> StateSE2:
+        """Return the pose moved along its heading, and to its left."""
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        x, y = self.x + distance_m * cos - left_m * sin, self.y + distance_m * sin + left_m * cos
+        return StateSE2(x, y, self.heading)
+
+    def distance_to(self, state: Any) -> float:
+        """Return the distance to another pose or point, m."""
+        return math.hypot(self.x - state.x, self.y - state.y)
+
+    def as_matrix(self) -> np.ndarray[Any, Any]:
+        """Return the 3 x 3 matrix that maps points of this frame to the source's."""
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        return np.array([[cos, -sin, self.x], [sin, cos, self.y], [0.0, 0.0, 1.0]])
+
+    @staticmethod
+    def from_matrix(matrix: Any) -> StateSE2:
+        """Return the pose of such a matrix."""
+        x, y = matrix[:2, 2].tolist()
+        return StateSE2(x, y, math.atan2(matrix[1, 0], matrix[0, 0]))
+
+    def serialize(self) -> list[float]:
+        """Return x, y and heading."""
+        return list(self)
+
+    @staticmethod
+    def deserialize(vector: Sequence[float]) -> StateSE2:
+        """Return the pose of x, y and heading."""
+        return StateSE2(*vector)
+
+    def __iter__(self) -> Iterator[float]:
+        return iter((self.x, self.y, self.heading))
+
+
+@total_ordering
+@dataclass(frozen=True, eq=False)
+class TimePoint(DevkitObject):
+    """Time since 2 s before the log; compares and adds with whatever has ``time_us``."""
+
+    time_us: int
+
+    @property
+    def time_s(self) -> float:
+        """Seconds."""
+        return self.time_us * 1e-6
+
+    @classmethod
+    def of_step(cls, step: int) -> TimePoint:
+        """Return the time of a step of the log."""
+        return cls(round((step + BUFFER) * DT_S * 1e6))
+
+    def diff(self, other: Any) -> TimeDuration:
+        """Return the time since another."""
+        return TimeDuration(self.time_us - _microseconds(other))
+
+    def __add__(self, other: Any) -> TimePoint:
+        return TimePoint(self.time_us + _microseconds(other))
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> TimePoint:
+        return TimePoint(self.time_us - _microseconds(other))
+
+    def __rsub__(self, other: Any) -> TimePoint:
+        return TimePoint(_microseconds(other) - self.time_us)
+
+    def __eq__(self, other: object) -> bool:
+        return self.time_us == getattr(other, "time_us", None)
+
+    def __lt__(self, other: Any) -> bool:
+        return self.time_us < other.time_us
+
+    def __hash__(self) -> int:
+        return hash(self.time_us)
+
+
+class TimeDuration(TimePoint):
+    """Time between two points."""
+
+
+def _microseconds(time: Any) -> int:
+    return int(getattr(time, "time_us", time))
+
+
+#: Share of half the length ahead and of half the width to the left: front, rear, front left, front right, rear left,
+#: rear right, centre, left, right.
+_POINTS = dict(enumerate(((1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0), (0, 1), (0, -1)), 1))
+
+
+@dataclass(frozen=True)
+class OrientedBox(DevkitObject):
+    """A box around its centre."""
+
+    center: StateSE2
+    length: float
+    width: float
+    height: float
+
+    @property
+    def half_length(self) -> float:
+        """Half the length."""
+        return self.length / 2
+
+    @property
+    def half_width(self) -> float:
+        """Half the width."""
+        return self.width / 2
+
+    @property
+    def half_height(self) -> float:
+        """Half the height."""
+        return self.height / 2
+
+    def corner(self, point: Any) -> Point2D:
+        """Return a point of the box by the devkit's ``OrientedBoxPointType`` (1: front, ... 9: right)."""
+        ahead, left = _POINTS[int(point)]
+        return self.center.ahead(ahead * self.half_length, left * self.half_width).point
+
+    def all_corners(self) -> list[Point2D]:
+        """Front left, rear left, rear right, front right."""
+        return [self.corner(point) for point in (3, 5, 6, 4)]
+
+    @cached_property
+    def geometry(self) -> Any:
+        """The box as a polygon of shapely."""
+        return shapely().Polygon([tuple(corner) for corner in self.all_corners()])
+
+
+def shapely() -> Any:
+    """Return the package shapely.
+
+    Raises:
+        UsageError: It is not installed.
+    """
+    try:
+        import shapely as package
+    except ModuleNotFoundError as error:
+        raise missing_package(error) or error from error
+    return package
