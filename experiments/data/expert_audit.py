@@ -226,7 +226,7 @@ def draw(row: Mapping[str, Any], scenario: Scenario, folder: Path) -> None:
 
     steps = [row[name] for name in ("collision_step", "first_offroad_step", "red_light_step")]
     step = min(step for step in steps if step is not None)
-    name = f"{row['group']}-{row['scenario']}-{step}".replace("/", "_").replace(": ", "-")
+    name = f"{row['scenario']}-{step}".replace("/", "_")
     draw_scenario(scenario, step, reach_m=40.0).savefig(folder / f"{name}.png")
 
 
