@@ -152,9 +152,9 @@ def file_of(name: str, kind: str) -> Path:
     return EPISODES / f"{name.replace(' ', '_')}-{kind}.npz"
 
 
-def episodes(name: str, kind: str, folder: Path = EPISODES) -> Driven | None:
+def episodes(name: str, kind: str, folder: Path | None = None) -> Driven | None:
     """Return the stored episodes of a planner; None if there are none."""
-    file = folder / file_of(name, kind).name
+    file = (folder or EPISODES) / file_of(name, kind).name
     if not file.is_file():
         return None
     with np.load(file, allow_pickle=False) as found:
