@@ -58,7 +58,7 @@ def test_every_format_is_described_and_convertible(name, tmp_path, capsys):
         "after convert about ",
     ):
         assert words in out, out
-    assert "missing" not in out and "of no known format" not in out
+    assert "missing" not in out and "of unknown format" not in out
 
 
 def test_a_folder_of_everything(tmp_path, capsys):
@@ -71,7 +71,7 @@ def test_a_folder_of_everything(tmp_path, capsys):
     found = diagnose(tmp_path / "data")
     assert found.files == {name.replace("_", "-"): 1 for name in FORMATS}
     assert found.ignored == 1 and found.companions >= 12
-    assert "1 of no known format, ignored" in out
+    assert "1 of unknown format, ignored" in out
     assert {part.format for part in found.parts} == set(found.files)
 
 

@@ -394,7 +394,7 @@ def test_recordings_are_read_lazily(log, monkeypatch):
 @pytest.mark.parametrize(
     ("statement", "problem"),
     [
-        ("UPDATE lidar_box SET x = 'east'", "lidar_box holds something that is no number"),
+        ("UPDATE lidar_box SET x = 'east'", "lidar_box contains a value that is not a number"),
         ("UPDATE lidar_box SET y = NULL", "position of a box is missing or absurd"),
         ("UPDATE lidar_box SET x = 1e300", "position of a box is missing or absurd"),
         ("UPDATE lidar_box SET width = 9e9", "size of a box is missing or absurd"),

@@ -212,7 +212,7 @@ def test_driven_lane_of_a_fork():
 
 
 def test_crossing_street_is_not_driven_next_to_a_lane():
-    """0.1 m beside its lane a car is nearer to a street that crosses at 60 degrees."""
+    """0.1 m outside its lane a car is nearer to a street that crosses at 60 degrees."""
     road = straight_road([car(0, 0, 0, 5)])
     street = MapFeature(9, RoadKind.LANE_SURFACE, line((-50, -90), (50, 83.2)), 5.0, LANE_M, (), ())
     bank = bank_of(replace(road, features=(*road.features, street)))

@@ -162,10 +162,10 @@ def decode(scene: Any) -> Recording:
     lights, unplaced = _lights(scene.get("tl_states"), steps, features)
     spacing = parsing.spacing_m(features)
     rows = {int(track): row for row, track in enumerate(tracks.track_id)}
-    interest = [_whole(track, "objects_of_interest") for track in _listed(metadata, "objects_of_interest")]
+    interest = [_whole(track, "objects_of_interest") for track in _read_list(metadata, "objects_of_interest")]
     predicted = [
         entry.get("track_index") if isinstance(entry, Mapping) else entry
-        for entry in _listed(metadata, "tracks_to_predict")
+        for entry in _read_list(metadata, "tracks_to_predict")
     ]
     return Recording(
         scenario_id=scenario_id,
@@ -199,7 +199,7 @@ def _rows(scene: Mapping[str, Any], name: str) -> Sequence[Mapping[str, Any]]:
     return rows
 
 
-def _listed(metadata: Mapping[str, Any], name: str) -> list[Any]:
+def _read_list(metadata: Mapping[str, Any], name: str) -> list[Any]:
     values = metadata.get(name)
     if values is not None and not isinstance(values, list):
         raise DataError(f"metadata.{name} is no list", cure=_SKIP)
@@ -208,7 +208,7 @@ def _listed(metadata: Mapping[str, Any], name: str) -> list[Any]:
 
 def _whole(value: Any, what: str) -> int:
     if type(value) is not int:
-        raise DataError(f"{what} holds {str(value)[:40]!r}, which is no whole number", cure=_SKIP)
+        raise DataError(f"{what} contains {str(value)[:40]!r}, which is not an integer", cure=_SKIP)
     return value
 
 
@@ -255,7 +255,7 @@ def _tracks(objects: Sequence[Mapping[str, Any]]) -> Tracks:
     valid &= ~(table[..., :2] == _INVALID).all(axis=-1)
     table = np.where(valid[..., None], table, 0.0)
     if not (np.abs(table) <= _LARGEST).all():
-        raise DataError("valid states hold numbers that are not finite or beyond reason", cure=_SKIP)
+        raise DataError("valid states contain numbers that are not finite or beyond reason", cure=_SKIP)
     size = _table(objects, ("length", "width", "height"), "the size of objects")
     size = np.where((size >= _SMALLEST_SIZE_M) & (size <= _LARGEST_SIZE_M), size, 0.0)
     kinds = [str(row.get("type")) for row in objects]

@@ -112,7 +112,7 @@ def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
 def check_finite(*measured: np.ndarray[Any, Any]) -> None:
     """Refuse NaN and infinities in valid states."""
     if not all(np.isfinite(values).all() for values in measured):
-        raise DataError("valid states hold numbers that are not finite", cure="skip this record")
+        raise DataError("valid states contain numbers that are not finite", cure="skip this record")
 
 
 def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " time"]:
@@ -187,7 +187,7 @@ def one_point_features(features: Sequence[MapFeature]) -> int:
 def check_within(most: float, *measured: np.ndarray[Any, Any]) -> None:
     """Refuse NaN, infinities, and what is further from 0 than ``most``."""
     if not all((np.abs(values) <= most).all() for values in measured):  # NaN compares false
-        raise DataError(f"holds numbers that are not finite or beyond {most:g}", cure="skip this record")
+        raise DataError(f"contains numbers that are not finite or beyond {most:g}", cure="skip this record")
 
 
 #: Map lines are sampled at least this densely before the nearest point is looked up, unless that took too many.

@@ -161,11 +161,11 @@ def _inside(folder: Path, *patterns: str) -> bool:
 
 
 _OWN_FOLDERS: _Folders = (
-    (_is_scenario_set, "a scenario set of drivax already", "look at it with drivax inspect"),
+    (_is_scenario_set, "a scenario set of drivax already", "run drivax inspect on it"),
     (
         lambda folder, names: "run.json" in names,
         "a run folder of drivax, not recordings",
-        "look at it with drivax report",
+        "run drivax report on it",
     ),
 )
 _FOLDERS: _Folders = (

@@ -179,7 +179,9 @@ def _resumed_folders(
             raise UsageError(problem, file=out, cure=f"resume with the same {option}")
     folders = [RunFolder.open(path) for path in seed_folders(out)]
     if seeds not in (1, len(folders)):
-        raise UsageError(f"holds {len(folders)} seeds, not {seeds}", file=out, cure="resume without --seeds")
+        raise UsageError(
+            f"contains {len(folders)} seeds, not {seeds}", file=out, cure="resume without --seeds"
+        )
     return folder.config(TrainConfig), folders
 
 

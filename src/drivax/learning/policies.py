@@ -39,7 +39,7 @@ def open_policy(run: str | Path) -> tuple[RunFolder, TrainConfig]:
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":
         inside = seed_folders(folder.path)
-        raise UsageError(f"holds {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
+        raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
     return folder, folder.config(TrainConfig, _AS_LOGGED)
 
 

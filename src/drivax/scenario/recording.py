@@ -326,8 +326,8 @@ def _check_names(recording: Recording) -> Finding:
         text = getattr(recording, name)
         if not text or any(character < " " for character in text):
             return (
-                f"{name} {text[:80]!r} is empty or holds control characters",
-                f"name the {name} in the reader",
+                f"{name} {text[:80]!r} is empty or contains control characters",
+                f"set {name} in the reader",
             )
     if len(recording.dataset.encode()) > DATASET_BYTES:
         problem = f"dataset {recording.dataset[:80]!r} is longer than {DATASET_BYTES} bytes"

@@ -236,7 +236,7 @@ class ScenarioSet(Sequence[Scenario]):
         """Open a set; raise DataError if its manifest or the size or layout of a shard is wrong."""
         opened = cls(path, read_manifest(Path(path)), verify)
         if len(opened) != int(opened._starts[-1]):
-            problem = f"lists {len(opened)} scenarios but its shards hold {opened._starts[-1]}"
+            problem = f"lists {len(opened)} scenarios but its shards contain {opened._starts[-1]}"
             raise DataError(problem, file=opened.path / MANIFEST, cure=AGAIN)
         for shard in opened._shards:
             shard.check_files()

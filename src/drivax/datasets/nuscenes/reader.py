@@ -247,7 +247,7 @@ class Tables:
         """Read the tables of one version (``v1.0-mini``, ...), the large ones row by row."""
         if not has_annotations(folder):
             raise DataError(
-                "holds no annotations: the ego would be the only agent",
+                "contains no annotations: the ego would be the only agent",
                 file=folder / "sample_annotation.json",
                 cure="convert v1.0-trainval or v1.0-mini; the test split has none",
             )

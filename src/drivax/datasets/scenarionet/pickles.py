@@ -144,7 +144,7 @@ class _Machine:
         # Calls copy their arguments, and the memo can repeat the same argument.
         self._called_with += sum(len(part) for part in arguments if isinstance(part, Sized))
         if self._called_with > MOST_BYTES:
-            raise ValueError("calls with more than the file holds")
+            raise ValueError("calls with more than the file contains")
         try:
             self.stack.append(make(*arguments))
         except (TypeError, AttributeError) as error:

@@ -125,7 +125,7 @@ class Filter:
         if form is None or form[3].startswith("="):
             raise _refusal(text, "is no filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
         name, sign, words = form[1], form[2], tuple(word.strip() for word in form[3].split("|"))
-        quantity = _known(text, name)
+        quantity = _find_quantity(text, name)
         if not all(words):
             raise _refusal(text, "names no value", "write NAME=VALUE or NAME=VALUE|VALUE")
         if sign in _COMPARED and (quantity.kind != "number" or len(words) > 1):
@@ -293,7 +293,7 @@ def _nothing_left(data: Listing, selection: Selection) -> DrivaxError:
     return DataError("no scenario is selected", file=data.path, cure="loosen the filters, or name others")
 
 
-def _known(text: str, name: str) -> Quantity:
+def _find_quantity(text: str, name: str) -> Quantity:
     """Return the quantity of a name."""
     if name.startswith("tag.") and len(name) > len("tag."):
         return Quantity("word", "a tag of the user's own")
