@@ -130,7 +130,7 @@ WRONG = {
     "empty.tfrecord": (lambda: b"", "empty", "again"),
     "log.db": (lambda: b"SQLite format 3\0" + bytes(4096), "without nuPlan's tables", "logs of nuPlan"),
     "part-0.parquet": (lambda: b"PAR1" + bytes(99) + b"PAR1", "without the columns of Argoverse 2", "motion"),
-    "table.feather": (lambda: b"ARROW1\0\0" + bytes(99), "no table of annotations", "folder of the log"),
+    "table.feather": (lambda: b"ARROW1\0\0" + bytes(99), "not a table of annotations", "folder of the log"),
     "sd_x.pkl": (lambda: pickle.dumps({"id": 1}), "no ScenarioNet scenario", "sd_*.pkl"),
     "tfrecord-1_1.json": (
         lambda: json.dumps({"name": "x", "objects": [], "roads": []}).encode(), "no metadata", "writes metadata"

@@ -99,7 +99,7 @@ class Runs:
 @pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_18_any_other_global_is_refused_with_its_name(called, name, protocol, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(DataError, match="which is no data") as error:
+    with pytest.raises(DataError, match="which is not data") as error:
         pickles.load(pickle.dumps({"a": Runs(called, "touch trace")}, protocol))
     known_as = {"io.open": ("io.open", "_io.open"), f"{os.name}.system": ("posix.system", "nt.system")}
     assert any(word in error.value.problem for word in known_as.get(name, (name,)))

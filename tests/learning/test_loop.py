@@ -122,7 +122,7 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
             r"parameters is float32\[3\] in the checkpoint, not float32\[4\]; start from a run with the same net",
         ),
         (replace(onward, begin_from=str(tmp_path / "run")), "contains 2 seeds; name one"),
-        (replace(onward, begin_from=str(tmp_path)), "is no run folder"),
+        (replace(onward, begin_from=str(tmp_path)), "not a run folder"),
         (replace(onward, begin_from=f"{former}@7"), "no checkpoint of step 7"),
         (replace(onward, begin_from="zoo:aggressive"), "is an exported policy, which cannot be fine-tuned"),
     ):

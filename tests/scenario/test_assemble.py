@@ -429,5 +429,5 @@ def test_another_vehicle_can_be_the_ego():
     assert scenario.origin.tolist() == [30, 0, 0]
     assert with_ego(recording, 0) is recording
     for row in (3, 4, -1):  # a pedestrian that is not there yet, and no rows
-        with pytest.raises(UsageError, match=f"track row {row} is no vehicle"):
+        with pytest.raises(UsageError, match=f"track row {row} is not a vehicle"):
             with_ego(recording, row)

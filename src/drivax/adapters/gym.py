@@ -174,7 +174,7 @@ class _Worlds:
             valid = chosen.dtype.kind in "iu" and chosen.shape == lead
             if not valid or ((chosen < 0) | (chosen >= space.choices)).any():
                 cure = f"give choices from 0 to {space.choices - 1}"
-                raise UsageError(f"{actions!r} is no action", cure=cure)
+                raise UsageError(f"{actions!r} is not an action", cure=cure)
             accelerations, curvatures = (np.asarray(level) for level in space.levels())
             row, column = np.divmod(chosen, space.curvatures)
             return np.stack([accelerations[row], curvatures[column]], axis=-1).astype(np.float32)
@@ -182,7 +182,9 @@ class _Worlds:
         shape = (*lead, space.size)
         if commands.shape != shape or not np.isfinite(commands).all():
             numbers = " x ".join(map(str, shape))
-            raise UsageError(f"{actions!r} is no action", cure=f"give {numbers} finite numbers in [-1, 1]")
+            raise UsageError(
+                f"{actions!r} is not an action", cure=f"give {numbers} finite numbers in [-1, 1]"
+            )
         return commands
 
 

@@ -86,7 +86,7 @@ class Lights:
             states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
     def collected(self, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
-        """The lights in order of first observation, and the number of those without a place, which are left out.
+        """The lights in order of first observation, and the number of those without a position, which are left out.
 
         States are -1 where a light is not observed. A stop point of zeros is none: the light then stands where its lane
         begins.
@@ -162,7 +162,7 @@ def load_json(path: Path) -> Any:
     except FileNotFoundError as error:
         raise DataError("is missing", file=path, cure="download it again") from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"is no valid JSON ({error})", file=path, cure="download it again") from error
+        raise DataError(f"is not valid JSON ({error})", file=path, cure="download it again") from error
 
 
 def windows_of(steps: int) -> int:

@@ -34,7 +34,7 @@ _MAGIC = {
         "use scenario_*.parquet of Argoverse 2, or the motion data set of Waymo (TFRecord)",
     ),
     b"ARROW1": (
-        "a feather file that is no table of annotations of Argoverse 2",
+        "a feather file that is not a table of annotations of Argoverse 2",
         "give the folder of the log (annotations.feather next to city_SE3_egovehicle.feather and map/)",
     ),
     b"SQLite format 3": (

@@ -34,7 +34,9 @@ def open_policy(run: str | Path) -> tuple[RunFolder, TrainConfig]:
 
     ``run`` is a run folder of ``drivax train``, a folder of :func:`export_policy`, or ``zoo:NAME``.
 
-    Raises UsageError if the folder holds several seeds or the zoo has no such policy, DataError if it is no run.
+    Raises:
+        UsageError: The folder contains several seeds, or the zoo has no such policy.
+        DataError: It is not a run folder.
     """
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":

@@ -290,7 +290,7 @@ def with_ego(recording: Recording, row: int) -> Recording:
     tracks = recording.tracks
     is_vehicle = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
     if not is_vehicle or not tracks.valid[row, recording.current_step]:
-        problem = f"track row {row} is no vehicle that is valid at step {recording.current_step}"
+        problem = f"track row {row} is not a vehicle that is valid at step {recording.current_step}"
         cure = "choose a vehicle that is valid at the current step"
         raise UsageError(problem, record=recording.scenario_id, cure=cure)
     if row == recording.ego:

@@ -405,7 +405,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
     if not file.is_file():
         cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
-        raise DataError("no manifest.json, so this is no complete scenario set", file=path, cure=cure)
+        raise DataError("no manifest.json, so this is not a complete scenario set", file=path, cure=cure)
     try:
         manifest = json.loads(file.read_bytes())
         version = manifest["schema_version"]

@@ -26,7 +26,7 @@ _UNIONS = (Union, types.UnionType)
 #: Types of values that are accepted for a scalar, and its name in messages.
 _SCALARS: dict[Any, tuple[Any, str]] = {
     bool: (bool, "true or false"),
-    int: (int, "a whole number"),
+    int: (int, "an integer"),
     float: (int | float, "a number"),
     type(None): (type(None), "null"),
 }

@@ -66,7 +66,7 @@ def has_magic(path: Path, magic: bytes) -> bool:
 
 
 def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
-    """Read columns of a parquet or feather file, by name and kind: any number, whole numbers, or text.
+    """Read columns of a parquet or feather file, by name and kind: any number, integers, or text.
 
     Columns that not every version of the format has are left out where they are missing.
     """
@@ -84,7 +84,7 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
     except DataError as error:
         raise DataError(error.problem, file=path, cure=error.cure) from error
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
-        raise DataError(f"is no sound table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
+        raise DataError(f"is not a valid table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
     return Table(table.num_rows, numbers, texts)
 
 

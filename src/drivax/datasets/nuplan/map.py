@@ -368,7 +368,7 @@ def _transformer(source: int, target: int) -> Any:
     try:
         systems = pyproj.CRS.from_epsg(source), pyproj.CRS.from_epsg(target)
         if not systems[1].is_projected:
-            raise DataError(f"EPSG:{target} is no projected coordinate system", cure=CURE)
+            raise DataError(f"EPSG:{target} is not a projected coordinate system", cure=CURE)
         return pyproj.Transformer.from_crs(*systems, always_xy=True)
     except pyproj.exceptions.ProjError as error:
         problem = f"a coordinate system (EPSG:{source}, EPSG:{target}) is unknown"

@@ -318,7 +318,7 @@ def yaw_of(quaternion: Float64[np.ndarray, "pose 4"]) -> Float64[np.ndarray, " p
     """Return the yaw of quaternions (w, x, y, z), radians."""
     w, x, y, z = quaternion.T
     if not (np.abs(np.linalg.norm(np.clip(quaternion, -2.0, 2.0), axis=1) - 1.0) < 0.01).all():
-        raise DataError("an ego orientation is no unit quaternion", cure=_CURE)
+        raise DataError("an ego orientation is not a unit quaternion", cure=_CURE)
     return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 

@@ -275,7 +275,7 @@ class ExampleFeatures:
         except ValueError:
             origin = np.zeros(0)
         if origin.shape != (3,) or not (np.abs(origin) < _FARTHEST_M).all():
-            raise DataError(f"{ORIGIN} is no position", cure=SKIP)
+            raise DataError(f"{ORIGIN} is not a position", cure=SKIP)
         return origin
 
     @cached_property

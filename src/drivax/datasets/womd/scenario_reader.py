@@ -87,7 +87,7 @@ def decode(payload: bytes) -> Recording:
 
 def _check(message: Any, steps: int) -> None:
     if not isinstance(message.scenario_id, str):  # protobuf gives bytes where a string is no UTF-8
-        raise DataError("scenario_id is no text", cure=SKIP)
+        raise DataError("scenario_id is not text", cure=SKIP)
     if steps == 0 or not message.tracks:
         raise DataError("the scenario has no steps or no tracks", cure=SKIP)
     if not 0 <= message.current_time_index < steps:

@@ -102,7 +102,7 @@ class _Option:
 def plan_ego(
     roles: Roles, motion: Motion, times_s: _Series, first_step: int, unreactive: frozenset[int] = frozenset()
 ) -> EgoPlan:
-    """Plan ego's motion from a step on, given all users' motion in the last run.
+    """Plan ego's motion from a given step on, given all users' motion in the last run.
 
     ``unreactive`` users hit ego in an earlier run and are not expected to react; ``times_s`` are on the lights' clock.
     """
