@@ -1,6 +1,7 @@
 """Reset and step as pure functions of a bank, a state and an action.
 
-``dynamics`` holds the kinematic bicycle, ``controller`` nuPlan's LQR tracker, ``contact`` collisions and time to collision.
+``dynamics`` contains the kinematic bicycle, ``controller`` nuPlan's LQR tracker, ``contact`` collisions and time to
+collision.
 """
 
 import lazy_loader
