@@ -58,7 +58,7 @@ def test_every_format_is_described_and_convertible(name, tmp_path, capsys):
         "after convert about ",
     ):
         assert words in out, out
-    assert "missing" not in out and "of no known format" not in out
+    assert "missing" not in out and "of unknown format" not in out
 
 
 def test_a_folder_of_everything(tmp_path, capsys):
@@ -71,7 +71,7 @@ def test_a_folder_of_everything(tmp_path, capsys):
     found = diagnose(tmp_path / "data")
     assert found.files == {name.replace("_", "-"): 1 for name in FORMATS}
     assert found.ignored == 1 and found.companions >= 12
-    assert "1 of no known format, ignored" in out
+    assert "1 of unknown format, ignored" in out
     assert {part.format for part in found.parts} == set(found.files)
 
 
@@ -130,7 +130,7 @@ WRONG = {
     "empty.tfrecord": (lambda: b"", "empty", "again"),
     "log.db": (lambda: b"SQLite format 3\0" + bytes(4096), "without nuPlan's tables", "logs of nuPlan"),
     "part-0.parquet": (lambda: b"PAR1" + bytes(99) + b"PAR1", "without the columns of Argoverse 2", "motion"),
-    "table.feather": (lambda: b"ARROW1\0\0" + bytes(99), "no table of annotations", "folder of the log"),
+    "table.feather": (lambda: b"ARROW1\0\0" + bytes(99), "not a table of annotations", "folder of the log"),
     "sd_x.pkl": (lambda: pickle.dumps({"id": 1}), "no ScenarioNet scenario", "sd_*.pkl"),
     "tfrecord-1_1.json": (
         lambda: json.dumps({"name": "x", "objects": [], "roads": []}).encode(), "no metadata", "writes metadata"

@@ -193,14 +193,14 @@ def _set(path, value):
 
 SLOW = ("lane_segments", str(IDS["slow1"]))
 BROKEN = {
-    "is no Argoverse 2 map": _set(("drivable_areas",), KeyError),
-    "left_lane_boundary is no list of points": _set((*SLOW, "left_lane_boundary"), [{"x": 1.0}]),
-    "right_lane_boundary is no list": _set((*SLOW, "right_lane_boundary"), None),
-    "area_boundary is no list": _set(("drivable_areas", "11055391", "area_boundary"), "x"),
-    "edge2 is no list": _set(("pedestrian_crossings", "13294505", "edge2"), KeyError),
-    "successors is no list": _set((*SLOW, "successors"), 17),
-    "is no id": _set((*SLOW, "id"), 10**30),
-    "'x' is no id": _set((*SLOW, "left_neighbor_id"), "x"),
+    "is not an Argoverse 2 map": _set(("drivable_areas",), KeyError),
+    "left_lane_boundary is not a list of points": _set((*SLOW, "left_lane_boundary"), [{"x": 1.0}]),
+    "right_lane_boundary is not a list": _set((*SLOW, "right_lane_boundary"), None),
+    "area_boundary is not a list": _set(("drivable_areas", "11055391", "area_boundary"), "x"),
+    "edge2 is not a list": _set(("pedestrian_crossings", "13294505", "edge2"), KeyError),
+    "successors is not a list": _set((*SLOW, "successors"), 17),
+    "is not an id": _set((*SLOW, "id"), 10**30),
+    "'x' is not an id": _set((*SLOW, "left_neighbor_id"), "x"),
     "not finite": _set((*SLOW, "centerline", 3, "x"), math.nan),
     "beyond 1e+06": _set((*SLOW, "left_lane_boundary", 1, "y"), 1e300),
     "nowhere near": _set((*SLOW, "left_lane_boundary", 1, "y"), 9e5),
@@ -220,7 +220,7 @@ def test_damage_is_refused_in_one_line(read, tmp_path, problem):
 
 def test_other_json_and_missing_files_are_refused(read, tmp_path):
     for content in ([], 3, {}, {"lane_segments": [], "drivable_areas": {}, "pedestrian_crossings": {}}):
-        with pytest.raises(DataError, match="is no Argoverse 2 map"):
+        with pytest.raises(DataError, match="is not an Argoverse 2 map"):
             read(content)
     with pytest.raises(DataError, match="is missing"):
         read_map(tmp_path / "log_map_archive_y.json")

@@ -197,9 +197,9 @@ BROKEN = {
     "beyond 200": change("velocity_x", 1e5),
     "timesteps run from -1": change("timestep", -1),
     "timesteps run from 0 to 1000000": change("timestep", 1_000_000),
-    "column heading holds string": lambda t: t | {"heading": ["x"] * len(t["heading"])},
-    "with 1 gaps": change("heading", None),
-    "holds no rows": lambda t: {n: pa.array([], pa.array(v).type) for n, v in t.items()},
+    "column heading contains string": lambda t: t | {"heading": ["x"] * len(t["heading"])},
+    "with 1 null values": change("heading", None),
+    "contains no rows": lambda t: {n: pa.array([], pa.array(v).type) for n, v in t.items()},
 }
 
 

@@ -180,10 +180,10 @@ def change(name, value):
 
 BROKEN = {
     "has no column qw": (lambda t: {k: v for k, v in t.items() if k != "qw"}, None),
-    "column tx_m holds": (change("tx_m", None), None),
+    "column tx_m contains": (change("tx_m", None), None),
     "not finite": (change("ty_m", math.nan), None),
     "beyond 100": (change("length_m", 1e300), None),
-    "is no quaternion": (lambda t: t | {n: [0.0] * len(t[n]) for n in ("qw", "qx", "qy", "qz")}, None),
+    "is not a quaternion": (lambda t: t | {n: [0.0] * len(t[n]) for n in ("qw", "qx", "qy", "qz")}, None),
     "beyond 2": (change("qz", 1e200), None),
     "beyond 1e+06": (None, lambda t: t | {"tx_m": t["tx_m"] * 1e9}),
     "no frame has a pose": (None, lambda t: t | {"timestamp_ns": t["timestamp_ns"] + 1}),

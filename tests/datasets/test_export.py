@@ -83,7 +83,7 @@ def test_ids(stored, tmp_path, text, expected_ids):
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("a\nzz\nyy\n", "line 2 names 'zz'"), ("two\tb\n", "line 1 names 'b'"), (b"\xff\xfe", "is no text")],
+    [("a\nzz\nyy\n", "line 2 names 'zz'"), ("two\tb\n", "line 1 names 'b'"), (b"\xff\xfe", "is not text")],
 )
 def test_ids_that_are_unknown(stored, tmp_path, text, said):
     file = tmp_path / "ids.txt"

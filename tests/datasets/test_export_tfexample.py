@@ -374,7 +374,7 @@ def test_coordinates_beyond_float32_become_local():
     np.testing.assert_allclose(back.tracks.xy[0], driving() + FAR[:2], atol=1e-3)
     for text in (b"1 2", b"1 2 nan", b"x y z"):
         features = tf_example(assemble(make_recording()))[0] | {ORIGIN: text}
-        with pytest.raises(DataError, match=f"{ORIGIN} is no position"):
+        with pytest.raises(DataError, match=f"{ORIGIN} is not a position"):
             womd_example.decode(example(features))
     near = table(assemble(moved(make_recording(), np.array([8000.0, -9000.0, 12.0]))))
     np.testing.assert_allclose(over_time(near, "x")[0], driving()[:, 0] + 8000.0, atol=1e-3)

@@ -394,7 +394,7 @@ def test_recordings_are_read_lazily(log, monkeypatch):
 @pytest.mark.parametrize(
     ("statement", "problem"),
     [
-        ("UPDATE lidar_box SET x = 'east'", "lidar_box holds something that is no number"),
+        ("UPDATE lidar_box SET x = 'east'", "lidar_box contains a value that is not a number"),
         ("UPDATE lidar_box SET y = NULL", "position of a box is missing or absurd"),
         ("UPDATE lidar_box SET x = 1e300", "position of a box is missing or absurd"),
         ("UPDATE lidar_box SET width = 9e9", "size of a box is missing or absurd"),
@@ -402,8 +402,8 @@ def test_recordings_are_read_lazily(log, monkeypatch):
         ("UPDATE lidar_box SET yaw = 9e999", "yaw of a box is missing or absurd"),
         ("UPDATE ego_pose SET x = NULL", "ego position is missing or absurd"),
         ("UPDATE ego_pose SET vx = 1e6", "ego velocity is missing or absurd"),
-        ("UPDATE ego_pose SET qw = 7", "no unit quaternion"),
-        ("UPDATE ego_pose SET qz = NULL", "no unit quaternion"),
+        ("UPDATE ego_pose SET qw = 7", "not a unit quaternion"),
+        ("UPDATE ego_pose SET qz = NULL", "not a unit quaternion"),
         ("UPDATE ego_pose SET x = x + (rowid % 4 / 2) * 500", "the ego jumps"),
         ("UPDATE ego_pose SET y = y + 90000", "no lane of the map"),
         ("DELETE FROM ego_pose", "96 sweeps have no ego pose"),

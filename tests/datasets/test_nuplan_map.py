@@ -325,7 +325,7 @@ def test_baselines_in_parts_are_joined(tmp_path):
         ("DROP TABLE meta", "has no table meta"),
         ("DELETE FROM meta", "names no projected coordinate system"),
         ("UPDATE meta SET value = '+proj=utm'", "names no projected coordinate system"),
-        ("UPDATE meta SET value = 'epsg:4326'", "EPSG:4326 is no projected coordinate system"),
+        ("UPDATE meta SET value = 'epsg:4326'", "EPSG:4326 is not a projected coordinate system"),
         ("UPDATE meta SET value = 'epsg:99999'", "EPSG:99999.* is unknown"),
         ("DROP TABLE gpkg_geometry_columns", "has no table gpkg_geometry_columns"),
         ("UPDATE meta SET value = 'epsg:32719'", "no lane of the map"),

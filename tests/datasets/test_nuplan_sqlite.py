@@ -140,7 +140,7 @@ def test_damaged_files_are_reported(tmp_path):
         pass
     other = tmp_path / "other.gpkg"
     other.write_bytes(b"PK\3\4" * 100)
-    with pytest.raises(DataError, match="is no SQLite file"), open_database(other):
+    with pytest.raises(DataError, match="is not an SQLite file"), open_database(other):
         pass
     path = package(tmp_path / "map.gpkg")
     data = bytearray(path.read_bytes())

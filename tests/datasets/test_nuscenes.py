@@ -273,7 +273,7 @@ def test_large_tables_are_read_in_pieces(tmp_path):
         ("{}", "not a table"),
         ("", "not a table"),
         ('[{"a": 1}, {"b": ', "damaged after 1 rows"),
-        ("[1]", "is no object"),
+        ("[1]", "is not an object"),
     ],
 )
 def test_damaged_tables_are_refused(tmp_path, content, problem):

@@ -178,19 +178,19 @@ BROKEN = {
     "numeric feature state/past/x is missing": lambda w: {"state/past/x": None},
     "numeric feature state/type is missing": lambda w: {"state/type": w.blob(1, w.blob(1, b"text"))},
     "feature state/future/y has 3 values, not 480": lambda w: {"state/future/y": w.floats([1, 2, 3])},
-    "state/current holds 0 steps": lambda w: {"state/current/valid": None},
+    "state/current has 0 steps": lambda w: {"state/current/valid": None},
     "marks 0 rows": lambda w: {"state/is_sdc": w.integers([0] * 6)},
     "marks 2 rows": lambda w: {"state/is_sdc": w.integers([1, 1, 0, 0, -1, -1])},
     "feature roadgraph_samples/xyz has 6 values": lambda w: {"roadgraph_samples/xyz": w.floats([0] * 6)},
     "not finite": lambda w: {"state/current/x": w.floats([math.nan] * 6)},
-    "feature roadgraph_samples/id holds floats": lambda w: {
+    "feature roadgraph_samples/id contains floats": lambda w: {
         "roadgraph_samples/id": w.floats([i for i, _, _ in w.example_points()] + [-1.0] * 7)
     },
     "names a track twice": lambda w: {"state/id": w.floats([17, 17, 2406, 900, -1, -1])},
     "negatively": lambda w: {"state/id": w.floats([17, -5, 2406, 900, -1, -1])},
-    "no exact whole numbers": lambda w: {"state/id": w.floats([17, 2**24 + 2, 2406, 900, -1, -1])},
+    "not exact integers": lambda w: {"state/id": w.floats([17, 2**24 + 2, 2406, 900, -1, -1])},
     "exact": lambda w: {"state/id": w.floats([17, 0.5, 2406, 900, -1, -1])},
-    "state/id holds": lambda w: {"state/id": w.floats([17, math.inf, 2406, 900, -1, -1])},
+    "state/id contains": lambda w: {"state/id": w.floats([17, math.inf, 2406, 900, -1, -1])},
 }
 
 

@@ -311,7 +311,7 @@ def test_sensor_fields_are_skipped(wire, tmp_path):
 
 BROKEN = {
     "no id": {"id": b""},
-    "scenario_id is no text": lambda w: {"id": w.blob(5, b"\xff\xfe")},
+    "scenario_id is not text": lambda w: {"id": w.blob(5, b"\xff\xfe")},
     "no tracks": {"tracks": b""},
     "no steps": {"times": b""},
     "current": lambda w: {"now": w.whole(10, 91)},

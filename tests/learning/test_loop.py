@@ -69,7 +69,7 @@ def test_seeds_are_runs_of_their_own(data, config, tmp_path):
             np.testing.assert_allclose(one, other, rtol=1e-6)
     bank = ScenarioBank.from_scenarios(data)
     assert load_policy(inside[0], bank)[1] == config.task
-    with pytest.raises(UsageError, match=r"holds 3 seeds; name one, as .*seed-4"):
+    with pytest.raises(UsageError, match=r"contains 3 seeds; name one, as .*seed-4"):
         load_policy(folder.path, bank)
     _, trainings = read_runs([folder.path])
     assert [training.name for training in trainings] == ["seed-4", "seed-5", "seed-6"]
@@ -85,7 +85,7 @@ def test_seeds_resume_from_their_newest_common_checkpoint(data, config, tmp_path
         assert [row["step"] for row in read_rows(other / "metrics.jsonl")] == [10, 20, 30, 40, 50, 60]
         for one, again in zip(numbers(last_state(path)), numbers(last_state(other)), strict=True):
             np.testing.assert_array_equal(one, again)
-    with pytest.raises(UsageError, match="holds 2 seeds, not 3; resume without --seeds"):
+    with pytest.raises(UsageError, match="contains 2 seeds, not 3; resume without --seeds"):
         train(config, data, tmp_path / "cut", resume=True, seeds=3)
 
 
@@ -121,8 +121,8 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
             wide,
             r"parameters is float32\[3\] in the checkpoint, not float32\[4\]; start from a run with the same net",
         ),
-        (replace(onward, begin_from=str(tmp_path / "run")), "holds 2 seeds; name one"),
-        (replace(onward, begin_from=str(tmp_path)), "is no run folder"),
+        (replace(onward, begin_from=str(tmp_path / "run")), "contains 2 seeds; name one"),
+        (replace(onward, begin_from=str(tmp_path)), "not a run folder"),
         (replace(onward, begin_from=f"{former}@7"), "no checkpoint of step 7"),
         (replace(onward, begin_from="zoo:aggressive"), "is an exported policy, which cannot be fine-tuned"),
     ):

@@ -93,7 +93,7 @@ def test_invalid_actions_are_reported(bank, moments):
     def none(situation, observation):
         pass
 
-    for planner, words in ((three, "[3] is no action; give 2 numbers"), (none, "[] is no action")):
+    for planner, words in ((three, "[3] is not an action; give 2 numbers"), (none, "[] is not an action")):
         with raised() as errors:
             assert np.isnan(actions(planner, bank, moments)).all()
         assert len({who for who, _ in errors}) == 2

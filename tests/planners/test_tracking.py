@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize_scalar
 
-from drivax.planners.pdm.tracking import Car, Reference, moved, track
+from drivax.planners.pdm.tracking import Car, Reference, step_car, track
 from drivax.simulator.controller import TrackingConfig, acceleration_to, steering_rate
 from drivax.simulator.dynamics import bicycle
 from quick import quick
@@ -79,11 +79,11 @@ def test_gains_equal_the_riccati_recursion_for_one_step():
 def test_actuators_lag():
     car = Car(jnp.asarray([0.0, 0.0, 0.0, 10.0]), jnp.zeros(()), jnp.zeros(()))
     for n in range(1, 6):
-        car = moved(car, jnp.asarray(2.0), jnp.asarray(0.3), jnp.asarray(WHEELBASE), CONFIG)
+        car = step_car(car, jnp.asarray(2.0), jnp.asarray(0.3), jnp.asarray(WHEELBASE), CONFIG)
         assert float(car.acceleration) == pytest.approx(2.0 * (1.0 - (2 / 3) ** n), rel=1e-5)
         assert float(car.steering) == pytest.approx(n * 0.03 * 2 / 3, rel=1e-5)
     hard = Car(car.motion, car.acceleration, jnp.asarray(1.04))
-    turned = moved(hard, jnp.zeros(()), jnp.asarray(9.0), jnp.asarray(WHEELBASE), CONFIG)
+    turned = step_car(hard, jnp.zeros(()), jnp.asarray(9.0), jnp.asarray(WHEELBASE), CONFIG)
     assert float(turned.steering) == pytest.approx(np.pi / 3)
 
 

@@ -139,7 +139,7 @@ WRONG = {
     'roads["lanes"][1] has no \'speed\'': lambda a, r: r["lanes"][1].update(speed=3),
     'roads["lanes"][0]["successors"] names lane 3, there are 3': lambda a, r: r["lanes"][0].update(successors=[3]),
     'roads["lanes"][0]["points"] has shape (1, 2)': lambda a, r: r["lanes"][0].update(points=[(0, 0)]),
-    'roads["lanes"][2]["points"] is no array': lambda a, r: r["lanes"][2].update(points="abc"),
+    'roads["lanes"][2]["points"] is not an array': lambda a, r: r["lanes"][2].update(points="abc"),
     'roads["edges"][0] has a point that is not finite': lambda a, r: r["edges"].insert(0, [(0, 0), (0, np.nan)]),
     'roads["stop_signs"][0] names lane 9': lambda a, r: r["stop_signs"][0].update(lanes=[9]),
 }  # fmt: skip

@@ -333,7 +333,7 @@ REFUSED = [
     (broken(current_step=91), "current step 91 of 91 steps"),
     (broken(timestamps_s=np.zeros(91)), "timestamps do not increase"),
     (broken(timestamps_s=np.arange(91) * 0.5), "steps of 0.500 s instead of 0.1 s; resample"),
-    (broken(scenario_id="a\nb"), r"scenario_id 'a\\nb' is empty or holds control characters"),
+    (broken(scenario_id="a\nb"), r"scenario_id 'a\\nb' is empty or contains control characters"),
     (broken(dataset="d" * 17), "dataset .* longer than 16 bytes"),
     (broken(dataset=""), "dataset '' is empty"),
     (broken(features=(unchecked(SIGN, points=np.zeros((3, 2))),)), r"points of feature 41 have shape \(3, 2\)"),
@@ -429,5 +429,5 @@ def test_another_vehicle_can_be_the_ego():
     assert scenario.origin.tolist() == [30, 0, 0]
     assert with_ego(recording, 0) is recording
     for row in (3, 4, -1):  # a pedestrian that is not there yet, and no rows
-        with pytest.raises(UsageError, match=f"track row {row} is no vehicle"):
+        with pytest.raises(UsageError, match=f"track row {row} is not a vehicle"):
             with_ego(recording, row)

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.build.grid import CUTOFF_M, DRIVABLE, SPLIT, Grid, cell_sides, packed
+from drivax.scenario.build.grid import CUTOFF_M, DRIVABLE, SPLIT, Grid, cell_sides, pack_sides
 from drivax.scenario.build.segments import cut, road_lines
 from drivax.scenario.schema import CAPACITIES
 
@@ -121,4 +121,4 @@ def test_sides_far_from_edges_are_unknown_where_rings_contradict():
 def test_packing_keeps_every_side():
     side = np.random.default_rng(0).integers(-1, 2, (12, 12))
     grid = Grid(np.zeros(2), 10.0, 4)
-    assert (unpacked(grid, packed(side)) == side.ravel()).all()
+    assert (unpacked(grid, pack_sides(side)) == side.ravel()).all()

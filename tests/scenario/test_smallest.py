@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from drivax.scenario.bank.smallest import first_smallest, number_of, numbered
+from drivax.scenario.bank.smallest import embed_number, first_smallest, number_of
 
 smallest = jax.jit(first_smallest, static_argnames=("axis", "least"))
 
@@ -47,7 +47,7 @@ def test_nan_values_give_a_valid_index():
 
 def test_low_bits_hold_the_number():
     values = jnp.array([1.0, 2.5, 1e6])
-    keys = numbered(values, jnp.array([0, 5, 7]), 3)
+    keys = embed_number(values, jnp.array([0, 5, 7]), 3)
     np.testing.assert_array_equal(number_of(keys, 3), [0, 5, 7])
     np.testing.assert_allclose(keys, values, rtol=2.0**-20)
 

@@ -41,7 +41,7 @@ def test_shares(text, shares):
     "text", ["", "80", "80/20", "80/10/20", "90/-10/20", "a/b/c", "nan/50/50", "1/1/1/97"]
 )
 def test_invalid_shares_are_refused(text):
-    with pytest.raises(UsageError, match="is no split; give percentages"):
+    with pytest.raises(UsageError, match="is not a split; give percentages"):
         parse_shares(text)
 
 

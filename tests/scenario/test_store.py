@@ -426,7 +426,7 @@ def test_damaged_manifest(scenario_set: Path, content: str):
         ({"capacity": {"agnets": 3}}, "manifest is damaged"),
         ({"scenarios": [{"scenario_id": "x"}]}, "manifest is damaged"),
         ({"shards": [{"file": "shard-00000.npy"}]}, "manifest is damaged"),
-        ({"shards": []}, "lists 7 scenarios but its shards hold 0"),
+        ({"shards": []}, "lists 7 scenarios but its shards contain 0"),
     ],
 )
 def test_manifest_of_another_kind(scenario_set: Path, changes: dict[str, object], message: str):

@@ -347,7 +347,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     assert main([*arguments, "--anyway"]) == 2
     assert "is older than the run that it evaluates" in capsys.readouterr().err
     assert main([*arguments, "--anyway", "--rare", "0.3"]) == 2
-    assert "holds a study with other settings" in capsys.readouterr().err
+    assert "contains a study with other settings" in capsys.readouterr().err
 
 
 def test_invalid_studies_are_refused(data, tmp_path):
@@ -385,7 +385,7 @@ def test_changed_claims_are_refused_when_a_study_resumes(data, tmp_path):
     runner._open_folder(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
     runner._open_folder(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
     fewer = replace(LONGTAIL, claims=LONGTAIL.claims[:-1])
-    with pytest.raises(UsageError, match="holds a study with other arms or claims"):
+    with pytest.raises(UsageError, match="contains a study with other arms or claims"):
         runner._open_folder(Study(fewer, StudyConfig(), sets, tmp_path / "study"))
 
 

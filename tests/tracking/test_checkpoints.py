@@ -155,7 +155,7 @@ def test_left_overs_of_a_killed_process_are_no_checkpoints(tmp_path: Path):
     ("template", "message"),
     [
         ({"w": jnp.zeros(3), "b": 0}, r"has no \['b'\]"),
-        ({}, r"holds \['w'\], which the template lacks"),
+        ({}, r"contains \['w'\], which the template lacks"),
         ({"w": jnp.zeros(4)}, r"\['w'\] is float32\[3\] in the checkpoint, not float32\[4\]"),
         ({"w": jnp.zeros(3, jnp.int32)}, r"\['w'\] is float32\[3\] in the checkpoint, not int32\[3\]"),
         ({"w": jax.random.split(jax.random.key(0), 3)}, r"not key<fry>\[3\]"),
@@ -231,7 +231,7 @@ def test_a_packed_tree_comes_back_and_is_plain_numpy(tmp_path: Path):
         ({"w": jnp.zeros(3)}, r"\['w'\] is float32\[2\] in the checkpoint, not float32\[3\]"),
         ({"w": jnp.zeros(2, jnp.int32)}, r"not int32\[2\]"),
         ({"w": jnp.zeros(2), "v": jnp.zeros(1)}, r"has no \['v'\]"),
-        ({}, r"holds \['w'\], which the template lacks"),
+        ({}, r"contains \['w'\], which the template lacks"),
     ],
 )
 def test_a_packed_tree_that_does_not_fit_is_reported_by_leaf(tmp_path: Path, template: Any, words: str):

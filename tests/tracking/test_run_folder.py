@@ -70,7 +70,7 @@ def test_existing_folders(tmp_path: Path):
     RunFolder.create(tmp_path / "run", Config(), overwrite=True)
     assert not (run.path / "metrics.jsonl").exists()
     RunFolder.create(tmp_path / "days", Config(), kind="training")
-    with pytest.raises(UsageError, match="holds a run of kind training, not evaluation"):
+    with pytest.raises(UsageError, match="contains a run of kind training, not evaluation"):
         RunFolder.create(tmp_path / "days", Config(), overwrite=True, kind="evaluation")
     RunFolder.create(tmp_path / "days", Config(), overwrite=True, kind="seeds")
     (tmp_path / "thesis").mkdir()

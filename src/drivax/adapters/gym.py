@@ -174,7 +174,7 @@ class _Worlds:
             valid = chosen.dtype.kind in "iu" and chosen.shape == lead
             if not valid or ((chosen < 0) | (chosen >= space.choices)).any():
                 cure = f"give choices from 0 to {space.choices - 1}"
-                raise UsageError(f"{actions!r} is no action", cure=cure)
+                raise UsageError(f"{actions!r} is not an action", cure=cure)
             accelerations, curvatures = (np.asarray(level) for level in space.levels())
             row, column = np.divmod(chosen, space.curvatures)
             return np.stack([accelerations[row], curvatures[column]], axis=-1).astype(np.float32)
@@ -182,7 +182,9 @@ class _Worlds:
         shape = (*lead, space.size)
         if commands.shape != shape or not np.isfinite(commands).all():
             numbers = " x ".join(map(str, shape))
-            raise UsageError(f"{actions!r} is no action", cure=f"give {numbers} finite numbers in [-1, 1]")
+            raise UsageError(
+                f"{actions!r} is not an action", cure=f"give {numbers} finite numbers in [-1, 1]"
+            )
         return commands
 
 
@@ -211,7 +213,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         self._worlds = _Worlds(data, task, traffic)
         self._state: SimState | None = None
         self._row, self._path = 0, np.zeros((0, 4), np.float32)
-        self.render_mode = _known(render_mode)
+        self.render_mode = _check_render_mode(render_mode)
         self.action_space = self._worlds.actions
         self.observation_space = self._worlds.observations
 
@@ -284,7 +286,7 @@ class VectorDrivingEnv(VectorEnv):
     ) -> None:  # fmt: skip
         self._worlds = _Worlds(data, task, traffic)
         self.num_envs = num_envs
-        self.render_mode = _known(render_mode)
+        self.render_mode = _check_render_mode(render_mode)
         self.single_action_space = self._worlds.actions
         self.single_observation_space = self._worlds.observations
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -384,7 +386,7 @@ def make(
     return VectorDrivingEnv(num_envs, data, task, render_mode, traffic)
 
 
-def _known(render_mode: str | None) -> Any:
+def _check_render_mode(render_mode: str | None) -> Any:
     if render_mode not in (None, "rgb_array"):
         raise UsageError(f"there is no render mode {render_mode!r}", cure="the only one is 'rgb_array'")
     return render_mode

@@ -72,7 +72,7 @@ def run(args: Convert) -> int:
 def _announce(plan: Plan) -> None:
     parts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
     unknown = len(plan.data.inputs) - plan.data.formats.total()
-    parts += [f"{counted(unknown, 'file')} of no known format"] if unknown else []
+    parts += [f"{counted(unknown, 'file')} of unknown format"] if unknown else []
     print(f"found {', '.join(parts)}: {plan.estimate}", flush=True)
     if plan.written:
         print(f"continuing after {counted(plan.written, 'scenario')}", flush=True)

@@ -112,7 +112,7 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
         if diagnosis.companions:
             others.append(f"{diagnosis.companions:,} that belong to them (maps, poses, tables)")
         if diagnosis.ignored:
-            others.append(f"{diagnosis.ignored:,} of no known format, ignored")
+            others.append(f"{diagnosis.ignored:,} of unknown format, ignored")
         if others:
             yield "other files", ", ".join(others)
         yield "input", format_bytes(diagnosis.input_bytes)

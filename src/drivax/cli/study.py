@@ -40,11 +40,11 @@ class Study:
     test: tuple[Path, ...] = ()
     """Scenario sets of the test; if events are labelled, half of the scenarios taken have one."""
     seeds: int | None = None
-    """Trainings of each arm; 5 unless the configuration says otherwise."""
+    """Training runs of each arm; 5 unless the configuration says otherwise."""
     config: Path | None = None
     """YAML file with settings."""
     cores: int | None = None
-    """Trainings side by side, one core each; all cores by default."""
+    """Parallel training runs, one core each; all cores by default."""
     anyway: bool = False
     """Go on even if the baselines do not drive well enough for a comparison."""
 

@@ -119,7 +119,9 @@ def score_bank(score: Any, bank: ScenarioBank) -> dict[str, Array]:
 
 
 def score_steps(data: ScenarioSet, score: Any, progress: Progress | None = None) -> dict[str, Numbers]:
-    """Apply a hashable ``(bank, log) -> {name: [T, ...]}`` to every log of a set, in batches: ``{name: [N, T, ...]}``.
+    """Return ``{name: [N, T, ...]}``, the step scores of every log of a set, computed in batches.
+
+    ``score`` is a hashable function ``(bank, log) -> {name: [T, ...]}``.
 
     Raises:
         DataError: A scenario has no future.

@@ -229,7 +229,7 @@ def convert(
             expected.check(Path(out), written)
         done = _drain(data, options, sink, writer, progress)
         if not len(writer):
-            raise _nothing(data, sink)
+            raise _empty_error(data, sink)
         writer.source |= sink.left_out()
     return Converted(
         Path(out), len(writer), written, done, data.ignored, dict(data.formats), tuple(sink.skipped),
@@ -414,13 +414,13 @@ def _results(
     yield from converted_ahead(tasks, convert_file, options.sizes, options.workers, folder)
 
 
-def _nothing(data: Survey, sink: _Sink) -> DataError:
-    """The error for a conversion without scenarios."""
+def _empty_error(data: Survey, sink: _Sink) -> DataError:
+    """Return the error for a conversion that yields no scenario."""
     if sink.filtered:
         problem = f"none of the {sink.filtered} scenarios satisfies the filters"
         return DataError(problem, file=data.root, cure="use wider filters")
     if not sink.skipped:
-        return DataError("holds no recording", file=data.root, cure="look at it with drivax doctor")
+        return DataError("contains no recording", file=data.root, cure="run drivax doctor on it")
     first, *others = sink.skipped
     if not others:
         return first.error()

@@ -148,7 +148,7 @@ def decode(scene: Any) -> Recording:
     if not isinstance(metadata, Mapping) or "sdc_track_index" not in metadata:
         raise DataError(
             "has no metadata with sdc_track_index, so nothing tells which object is the ego",
-            cure="use files of GPUDrive's present converter; its small hand-made test scenes are no recordings",
+            cure="use files of GPUDrive's present converter; its small hand-made test scenes are not recordings",
         )
     if not isinstance(scenario_id, str) or not scenario_id.isprintable():
         raise DataError("has no scenario_id", cure=_SKIP)
@@ -157,15 +157,15 @@ def decode(scene: Any) -> Recording:
     count, steps = tracks.valid.shape
     ego = _row_numbers([metadata["sdc_track_index"]], count, "sdc_track_index")[0]
     if tracks.kind[ego] != AgentKind.VEHICLE:
-        raise DataError(f"sdc_track_index names object {ego}, which is no vehicle", cure=_SKIP)
+        raise DataError(f"sdc_track_index names object {ego}, which is not a vehicle", cure=_SKIP)
     features, unknown = _features(roads)
     lights, unplaced = _lights(scene.get("tl_states"), steps, features)
     spacing = parsing.spacing_m(features)
     rows = {int(track): row for row, track in enumerate(tracks.track_id)}
-    interest = [_whole(track, "objects_of_interest") for track in _listed(metadata, "objects_of_interest")]
+    interest = [_whole(track, "objects_of_interest") for track in _read_list(metadata, "objects_of_interest")]
     predicted = [
         entry.get("track_index") if isinstance(entry, Mapping) else entry
-        for entry in _listed(metadata, "tracks_to_predict")
+        for entry in _read_list(metadata, "tracks_to_predict")
     ]
     return Recording(
         scenario_id=scenario_id,
@@ -199,16 +199,16 @@ def _rows(scene: Mapping[str, Any], name: str) -> Sequence[Mapping[str, Any]]:
     return rows
 
 
-def _listed(metadata: Mapping[str, Any], name: str) -> list[Any]:
+def _read_list(metadata: Mapping[str, Any], name: str) -> list[Any]:
     values = metadata.get(name)
     if values is not None and not isinstance(values, list):
-        raise DataError(f"metadata.{name} is no list", cure=_SKIP)
+        raise DataError(f"metadata.{name} is not a list", cure=_SKIP)
     return values or []
 
 
 def _whole(value: Any, what: str) -> int:
     if type(value) is not int:
-        raise DataError(f"{what} holds {str(value)[:40]!r}, which is no whole number", cure=_SKIP)
+        raise DataError(f"{what} contains {str(value)[:40]!r}, which is not an integer", cure=_SKIP)
     return value
 
 
@@ -224,7 +224,7 @@ def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
         if values.size and values.shape != (len(rows), len(here)):
             raise ValueError("values are lists")
     except (TypeError, KeyError, ValueError, OverflowError) as error:
-        raise DataError(f"{what} is no list of numbers {', '.join(keys)}", cure=_SKIP) from error
+        raise DataError(f"{what} is not a list of numbers {', '.join(keys)}", cure=_SKIP) from error
     table = np.zeros((len(rows), len(keys)))
     table[:, [keys.index(key) for key in here]] = values.reshape(-1, len(here))
     return table
@@ -255,7 +255,7 @@ def _tracks(objects: Sequence[Mapping[str, Any]]) -> Tracks:
     valid &= ~(table[..., :2] == _INVALID).all(axis=-1)
     table = np.where(valid[..., None], table, 0.0)
     if not (np.abs(table) <= _LARGEST).all():
-        raise DataError("valid states hold numbers that are not finite or beyond reason", cure=_SKIP)
+        raise DataError("valid states contain numbers that are not finite or implausibly large", cure=_SKIP)
     size = _table(objects, ("length", "width", "height"), "the size of objects")
     size = np.where((size >= _SMALLEST_SIZE_M) & (size <= _LARGEST_SIZE_M), size, 0.0)
     kinds = [str(row.get("type")) for row in objects]
@@ -309,21 +309,21 @@ def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...
             unknown += 1
             continue
         if not (np.abs(points) <= _LARGEST).all():
-            raise DataError(f"the geometry of road {number} is not finite or beyond reason", cure=_SKIP)
+            raise DataError(f"the geometry of road {number} is not finite or implausibly large", cure=_SKIP)
         features.append(MapFeature(number, kind, points))
     return tuple(features), unknown
 
 
 def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
-    """Lights by lane, from lists with one entry per observation, and the number of those without a place."""
+    """Lights by lane, from lists with one entry per observation, and the number of those without a position."""
     if not states:
         return (), 0
     if not isinstance(states, Mapping):
-        raise DataError("tl_states is no dictionary of lanes", cure=_SKIP)
+        raise DataError("tl_states is not a dictionary of lanes", cure=_SKIP)
     lights = parsing.Lights(steps)
     for lane, seen in states.items():
         if not (lane.isascii() and lane.isdigit() and len(lane) < 11):
-            raise DataError(f"tl_states names lane {lane[:40]!r}, which is no id", cure=_SKIP)
+            raise DataError(f"tl_states names lane {lane[:40]!r}, which is not an id", cure=_SKIP)
         what = f"tl_states of lane {lane[:40]}"
         times, seen_states, *place = _columns(seen, ("time_index", "state", "x", "y", "z"), what)
         when = parsing.rows_within([_whole(step, what) for step in times], steps, what)

@@ -86,7 +86,7 @@ class Lights:
             states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
     def collected(self, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
-        """The lights in order of first observation, and the number of those without a place, which are left out.
+        """The lights in order of first observation, and the number of those without a position, which are left out.
 
         States are -1 where a light is not observed. A stop point of zeros is none: the light then stands where its lane
         begins.
@@ -112,7 +112,7 @@ def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
 def check_finite(*measured: np.ndarray[Any, Any]) -> None:
     """Refuse NaN and infinities in valid states."""
     if not all(np.isfinite(values).all() for values in measured):
-        raise DataError("valid states hold numbers that are not finite", cure="skip this record")
+        raise DataError("valid states contain numbers that are not finite", cure="skip this record")
 
 
 def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " time"]:
@@ -162,7 +162,7 @@ def load_json(path: Path) -> Any:
     except FileNotFoundError as error:
         raise DataError("is missing", file=path, cure="download it again") from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"is no valid JSON ({error})", file=path, cure="download it again") from error
+        raise DataError(f"is not valid JSON ({error})", file=path, cure="download it again") from error
 
 
 def windows_of(steps: int) -> int:
@@ -187,7 +187,7 @@ def one_point_features(features: Sequence[MapFeature]) -> int:
 def check_within(most: float, *measured: np.ndarray[Any, Any]) -> None:
     """Refuse NaN, infinities, and what is further from 0 than ``most``."""
     if not all((np.abs(values) <= most).all() for values in measured):  # NaN compares false
-        raise DataError(f"holds numbers that are not finite or beyond {most:g}", cure="skip this record")
+        raise DataError(f"contains numbers that are not finite or beyond {most:g}", cure="skip this record")
 
 
 #: Map lines are sampled at least this densely before the nearest point is looked up, unless that took too many.

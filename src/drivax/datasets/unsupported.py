@@ -34,7 +34,7 @@ _MAGIC = {
         "use scenario_*.parquet of Argoverse 2, or the motion data set of Waymo (TFRecord)",
     ),
     b"ARROW1": (
-        "a feather file that is no table of annotations of Argoverse 2",
+        "a feather file that is not a table of annotations of Argoverse 2",
         "give the folder of the log (annotations.feather next to city_SE3_egovehicle.feather and map/)",
     ),
     b"SQLite format 3": (
@@ -161,11 +161,11 @@ def _inside(folder: Path, *patterns: str) -> bool:
 
 
 _OWN_FOLDERS: _Folders = (
-    (_is_scenario_set, "a scenario set of drivax already", "look at it with drivax inspect"),
+    (_is_scenario_set, "a scenario set of drivax already", "run drivax inspect on it"),
     (
         lambda folder, names: "run.json" in names,
         "a run folder of drivax, not recordings",
-        "look at it with drivax report",
+        "run drivax report on it",
     ),
 )
 _FOLDERS: _Folders = (

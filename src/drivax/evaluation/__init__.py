@@ -1,4 +1,4 @@
-"""Evaluate planners, compare evaluations, and audit scenarios."""
+"""Evaluate planners (``episode_table`` writes ``episodes.csv``), compare evaluations, and audit scenarios."""
 
 import lazy_loader
 

@@ -54,12 +54,12 @@ def audit(scenarios: Sequence[Scenario]) -> list[Finding]:
     futures = [scenario.steps >= LEAST_STEPS for scenario in scenarios]
     usable = [scenario for scenario, future in zip(scenarios, futures, strict=True) if future]
     batches = (usable[first : first + BATCH] for first in range(0, len(usable), BATCH))
-    replayed = iter([row for batch in batches for row in _replayed(batch)])
+    replayed = iter([row for batch in batches for row in _replay_batch(batch)])
     pairs = zip(scenarios, futures, strict=True)
-    return [(next(replayed) if future else {}) | _known(scenario) for scenario, future in pairs]
+    return [(next(replayed) if future else {}) | _static_findings(scenario) for scenario, future in pairs]
 
 
-def _known(scenario: Scenario) -> Finding:
+def _static_findings(scenario: Scenario) -> Finding:
     """Return findings that need no replay."""
     flags = scenario.has
     return {
@@ -139,7 +139,7 @@ def _read(facts: Facts) -> dict[str, Array]:
     return {name: getattr(facts, name) for name in _READ}
 
 
-def _replayed(scenarios: Sequence[Scenario]) -> list[Finding]:
+def _replay_batch(scenarios: Sequence[Scenario]) -> list[Finding]:
     """Return findings of one batch, padded and not trimmed, so that one compiled program serves every batch."""
     filled = [*scenarios, *[scenarios[-1]] * (BATCH - len(scenarios))]
     bank = ScenarioBank.from_scenarios(filled, trim=False)

@@ -302,7 +302,7 @@ def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Arr
         problem = f"lacks the column {missing[0]!r}" if missing else "names a column twice"
         raise DataError(problem, file=path, record="header", cure=_RERUN)
     if len(rows) < 2:
-        raise DataError("holds no episodes", file=path, cure=_RERUN)
+        raise DataError("contains no episodes", file=path, cure=_RERUN)
     for number, row in enumerate(rows[1:], start=1):
         if len(row) != len(header):
             raise DataError(f"has {len(row)} cells, not {len(header)}", file=path, record=number, cure=_RERUN)

@@ -148,15 +148,15 @@ def observation_statistics(
         *rest, inputs = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], states)
         act = partial(_actions, simulator, planner, bank, *rest)
         columns, groups = importances(act, jax.device_get(inputs), seed)
-    observations = _masked(observations, driven)
+    observations = _mask_beyond_log(observations, driven)
     features = column_statistics(task.observation.features, observations, hit, collides, columns)
     return ObservationStatistics(
         planner.name, len(collides), int(collides.sum()), int(driven.sum()), permuted, features, groups
     )
 
 
-def _masked(observation: Mapping[str, Values], driven: Values) -> dict[str, Values]:
-    """Return observations ``[episode, sample, ...]``, masked in every group beyond the end of a log."""
+def _mask_beyond_log(observation: Mapping[str, Values], driven: Values) -> dict[str, Values]:
+    """Return observations ``[episode, sample, ...]`` with every group masked after the end of the log."""
     result = dict(observation)
     masks = {f"{group}_mask" for group in observation}
     for group in (name for name in observation if name not in masks):
@@ -172,7 +172,7 @@ def column_statistics(
 ) -> tuple[FeatureStatistics, ...]:  # fmt: skip
     """Return statistics of every column of :class:`SampledStates` observations ``[episode, sample, ...]``, by group.
 
-    ``importance`` has permuted columns by group and number.
+    ``importance`` maps group and column number to the permutation importance.
     """
     names = feature_names(features, {name: values.shape[2:] for name, values in observation.items()})
     statistics = []

@@ -79,7 +79,7 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
         # Seeds are numbered at the end of the name, before the checkpoint; two checkpoints are two planners.
         planners = {re.sub(r"^(.*?)[0-9]*(@[0-9]+)?$", r"\1\2", table.name): table.name for table in side}
         if len(planners) > 1:
-            problem = f"holds evaluations of several planners ({', '.join(sorted(planners.values()))})"
+            problem = f"contains evaluations of several planners ({', '.join(sorted(planners.values()))})"
             folder = side[0].folder
             file = None if folder is None else folder.parent
             raise UsageError(problem, file=file, cure=f"name one of them, as {folder}")

@@ -1,4 +1,7 @@
-"""Training of policies: algorithms, their environment, the training loop, and trained policies."""
+"""Training of policies: algorithms, their environment, the training loop, and trained policies.
+
+``replay`` stores the transitions of a run; ``experience`` samples minibatches of logged steps for offline learning.
+"""
 
 import lazy_loader
 

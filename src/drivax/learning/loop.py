@@ -70,7 +70,7 @@ def train(
 
     Raises:
         UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
-        DataError: The run to fine-tune is no training run, or its networks do not fit.
+        DataError: The run to fine-tune is not a training run, or its networks do not fit.
         Preempted: SIGTERM stopped it, after a checkpoint.
     """
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
@@ -179,7 +179,9 @@ def _resumed_folders(
             raise UsageError(problem, file=out, cure=f"resume with the same {option}")
     folders = [RunFolder.open(path) for path in seed_folders(out)]
     if seeds not in (1, len(folders)):
-        raise UsageError(f"holds {len(folders)} seeds, not {seeds}", file=out, cure="resume without --seeds")
+        raise UsageError(
+            f"contains {len(folders)} seeds, not {seeds}", file=out, cure="resume without --seeds"
+        )
     return folder.config(TrainConfig), folders
 
 
@@ -295,8 +297,9 @@ class PretrainedRun:
     def of(cls, name: str) -> PretrainedRun:
         """Find the checkpoint ``RUN@STEP``; for ``RUN`` the best one, or the newest without validation.
 
-        Raises UsageError if the folder holds several seeds or an exported policy, DataError if it is no training run or
-        has no checkpoint.
+        Raises:
+            UsageError: The folder contains several seeds or an exported policy.
+            DataError: It is not a training run, or has no checkpoint.
         """
         run, step = run_and_step(name)
         folder, _ = open_policy(run)

@@ -34,12 +34,14 @@ def open_policy(run: str | Path) -> tuple[RunFolder, TrainConfig]:
 
     ``run`` is a run folder of ``drivax train``, a folder of :func:`export_policy`, or ``zoo:NAME``.
 
-    Raises UsageError if the folder holds several seeds or the zoo has no such policy, DataError if it is no run.
+    Raises:
+        UsageError: The folder contains several seeds, or the zoo has no such policy.
+        DataError: It is not a run folder.
     """
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":
         inside = seed_folders(folder.path)
-        raise UsageError(f"holds {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
+        raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
     return folder, folder.config(TrainConfig, _AS_LOGGED)
 
 

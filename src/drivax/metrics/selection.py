@@ -59,7 +59,7 @@ def select_metrics(names: MetricNames) -> MetricSelection:
             own[name] = _own_metric(entry, name, own)
             requested[name] = None
         else:
-            requested |= dict.fromkeys(SETS[entry] if entry in SETS else (_known(entry),))
+            requested |= dict.fromkeys(SETS[entry] if entry in SETS else (_check_name(entry),))
     metrics: dict[str, Metric] = {}
     for name in requested:
         _add_with_inputs(name, METRICS | own, metrics)
@@ -77,7 +77,7 @@ def metric_specs(names: MetricNames) -> Mapping[str, Metric]:
     return MappingProxyType({name: specs[name] for name in selection.names})
 
 
-def _known(name: str) -> str:
+def _check_name(name: str) -> str:
     if name not in METRICS:
         raise UsageError(f"unknown metric {name!r}", cure=did_you_mean(name, [*SETS, *METRICS]))
     return name

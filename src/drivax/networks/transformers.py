@@ -70,7 +70,7 @@ class TransformerConfig:
         sizes = self.sizes
         counts = (sizes.width, sizes.heads, sizes.layers, sizes.latents, *sizes.embedding)
         if min(counts) < 1:
-            raise ValueError(f"sizes of the encoder are {counts}; use at least 1")
+            raise ValueError(f"encoder sizes must be at least 1, not {counts}")
         if sizes.width % sizes.heads:
             raise ValueError(f"width {sizes.width} is not a multiple of {sizes.heads} heads")
 

@@ -49,7 +49,7 @@ def as_planner(thing: Any, name: str) -> Planner:
     Objects and classes with nuPlan's interface are adapted (:mod:`drivax.planners.nuplan`).
 
     Raises:
-        UsageError: It is no planner and makes none; the message uses ``name``.
+        UsageError: The value is not a planner and does not make one; the message uses ``name``.
     """
     if not isinstance(thing, type) and (is_nuplan(thing) or isinstance(thing, Planner)):
         return _made(thing, name)

@@ -141,7 +141,7 @@ def _answers(
         try:
             action = np.asarray(function(*jax.tree.map(lambda leaf, at=at: leaf[at], seen)), np.float32)
             if action.size != size:
-                raise ValueError(f"{list(action.shape)} is no action; give {size} numbers")
+                raise ValueError(f"{list(action.shape)} is not an action; give {size} numbers")
             actions[at] = action.ravel()
         except Exception as error:
             if not _listeners:

@@ -1,4 +1,4 @@
-"""Run folders for a report: evaluations (episodes, trajectories) and trainings (learning curves)."""
+"""Run folders for a report: evaluations (episodes, trajectories) and training runs (learning curves)."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
 def _check_keys(given: Any, keys: Sequence[str], what: str) -> None:
     """Refuse unknown keys."""
     if not isinstance(given, Mapping):
-        raise UsageError(f"{what} is no mapping", cure=f"give a dictionary with {', '.join(keys)}")
+        raise UsageError(f"{what} is not a mapping", cure=f"give a dictionary with {', '.join(keys)}")
     for key in given:
         if key not in keys:
             raise UsageError(f"{what} has no {key!r}", cure=f"use {', '.join(keys)}")
@@ -138,7 +138,9 @@ def _array(given: Mapping[str, Any], name: str, kind: type, shape: tuple[int | N
     try:
         values = np.array(given[name], dtype=kind)
     except (TypeError, ValueError) as error:
-        raise UsageError(f'agents["{name}"] is no array of numbers', cure="give one row per agent") from error
+        raise UsageError(
+            f'agents["{name}"] is not an array of numbers', cure="give one row per agent"
+        ) from error
     if values.ndim != len(shape) or any(
         size not in (None, given_size) for size, given_size in zip(shape, values.shape, strict=True)
     ):
@@ -224,7 +226,7 @@ def _points(given: Any, what: str, least: int) -> Array:
         points = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
         cure = "give (x, y) or (x, y, z) per point"
-        raise UsageError(f"{what} is no array of points", cure=cure) from error
+        raise UsageError(f"{what} is not an array of points", cure=cure) from error
     if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) < least:
         cure = f"give at least {least} rows of x, y or x, y, z"
         raise UsageError(f"{what} has shape {points.shape}", cure=cure)

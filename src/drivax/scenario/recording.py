@@ -290,7 +290,7 @@ def with_ego(recording: Recording, row: int) -> Recording:
     tracks = recording.tracks
     is_vehicle = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
     if not is_vehicle or not tracks.valid[row, recording.current_step]:
-        problem = f"track row {row} is no vehicle that is valid at step {recording.current_step}"
+        problem = f"track row {row} is not a vehicle that is valid at step {recording.current_step}"
         cure = "choose a vehicle that is valid at the current step"
         raise UsageError(problem, record=recording.scenario_id, cure=cure)
     if row == recording.ego:
@@ -326,8 +326,8 @@ def _check_names(recording: Recording) -> Finding:
         text = getattr(recording, name)
         if not text or any(character < " " for character in text):
             return (
-                f"{name} {text[:80]!r} is empty or holds control characters",
-                f"name the {name} in the reader",
+                f"{name} {text[:80]!r} is empty or contains control characters",
+                f"set {name} in the reader",
             )
     if len(recording.dataset.encode()) > DATASET_BYTES:
         problem = f"dataset {recording.dataset[:80]!r} is longer than {DATASET_BYTES} bytes"

@@ -236,7 +236,7 @@ class ScenarioSet(Sequence[Scenario]):
         """Open a set; raise DataError if its manifest or the size or layout of a shard is wrong."""
         opened = cls(path, read_manifest(Path(path)), verify)
         if len(opened) != int(opened._starts[-1]):
-            problem = f"lists {len(opened)} scenarios but its shards hold {opened._starts[-1]}"
+            problem = f"lists {len(opened)} scenarios but its shards contain {opened._starts[-1]}"
             raise DataError(problem, file=opened.path / MANIFEST, cure=AGAIN)
         for shard in opened._shards:
             shard.check_files()
@@ -405,7 +405,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
     if not file.is_file():
         cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
-        raise DataError("no manifest.json, so this is no complete scenario set", file=path, cure=cure)
+        raise DataError("no manifest.json, so this is not a complete scenario set", file=path, cure=cure)
     try:
         manifest = json.loads(file.read_bytes())
         version = manifest["schema_version"]

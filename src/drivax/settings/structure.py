@@ -26,7 +26,7 @@ _UNIONS = (Union, types.UnionType)
 #: Types of values that are accepted for a scalar, and its name in messages.
 _SCALARS: dict[Any, tuple[Any, str]] = {
     bool: (bool, "true or false"),
-    int: (int, "a whole number"),
+    int: (int, "an integer"),
     float: (int | float, "a number"),
     type(None): (type(None), "null"),
 }
@@ -58,7 +58,7 @@ def structure(values: Any, cls: Any) -> Any:
 
 def plain(record: Any) -> Any:
     """Return a record as mappings, lists and scalars; members of unions carry ``kind``."""
-    return _plain(record, type(record))
+    return _to_plain(record, type(record))
 
 
 def kind_of(cls: type) -> str:
@@ -222,7 +222,7 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
         if _names_preset(cls, value):
             base = cls.preset(str(value["preset"]))
             rest = {name: given for name, given in value.items() if name != "preset"}
-            value = _merge_defaults(_plain(base, cls), base, rest)
+            value = _merge_defaults(_to_plain(base, cls), base, rest)
         return build(_on_defaults(cls, value), cls)
 
     return hook
@@ -238,7 +238,7 @@ def _on_defaults(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
             default = field.default_factory()
         section = _value(given.get(field.name)) if _is_record(type(default)) else None
         if isinstance(section, Mapping):
-            result[field.name] = _merge_defaults(_plain(default, hints[field.name]), default, section)
+            result[field.name] = _merge_defaults(_to_plain(default, hints[field.name]), default, section)
     return result
 
 
@@ -319,19 +319,20 @@ def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _plain(value: Any, declared: Any) -> Any:
+def _to_plain(value: Any, declared: Any) -> Any:
+    """Convert a value to the mappings, lists and scalars of YAML."""
     if _is_record(type(value)):
         hints = typing.get_type_hints(type(value))
-        inside = {f.name: _plain(getattr(value, f.name), hints[f.name]) for f in dataclasses.fields(value)}
+        fields = {f.name: _to_plain(getattr(value, f.name), hints[f.name]) for f in dataclasses.fields(value)}
         if any(map(_is_open, (declared, *_members(declared)))) and type(value) not in _members(declared):
-            return {"kind": dotted_name(type(value))} | {k: v for k, v in inside.items() if k != "kind"}
-        tagged = "kind" not in inside and any(_is_record(member) for member in _members(declared))
-        return {"kind": kind_of(type(value))} | inside if tagged else inside
+            return {"kind": dotted_name(type(value))} | {k: v for k, v in fields.items() if k != "kind"}
+        tagged = "kind" not in fields and any(_is_record(member) for member in _members(declared))
+        return {"kind": kind_of(type(value))} | fields if tagged else fields
     if isinstance(value, Mapping):
         member = get_args(declared)[-1] if get_args(declared) else Any
-        return {str(key): _plain(item, member) for key, item in value.items()}
+        return {str(key): _to_plain(item, member) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item, _item_type(declared, number)) for number, item in enumerate(value)]
+        return [_to_plain(item, _item_type(declared, number)) for number, item in enumerate(value)]
     if callable(value):
         return dotted_name(value)
     return str(value) if isinstance(value, Path) else value

@@ -1,4 +1,8 @@
-"""Reset and step as pure functions of a bank, a state and an action."""
+"""Reset and step as pure functions of a bank, a state and an action.
+
+``dynamics`` contains the kinematic bicycle, ``controller`` nuPlan's LQR tracker, ``contact`` collisions and time to
+collision.
+"""
 
 import lazy_loader
 

@@ -87,7 +87,7 @@ def measure(
         ignored=(codes == Contact.IGNORED).sum().astype(jnp.int16),
         wrong_way=lanes.wrong_way,
         straddling=lanes.straddling,
-        moved_m=_moved(context),
+        moved_m=_step_length(context),
         progress_m=context.route_m,
         route_deviation_m=route.distance_m,
         off_route=~lanes.on_corridor & routed,
@@ -96,9 +96,9 @@ def measure(
         lateral_acceleration_mps2=lateral,
         acceleration_mps2=acceleration,
         jerk_mps3=jerk,
-        **_requested(bank, context, frame, codes, reads, strand),
+        **_requested_facts(bank, context, frame, codes, reads, strand),
     )
-    return Situation(context, _kept(facts, reads), around), codes, lights
+    return Situation(context, _drop_unread(facts, reads), around), codes, lights
 
 
 def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
@@ -116,7 +116,7 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     ground = _ground(bank, context, frame)
     # The route is that of ego.
     lanes = queries.around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground, context.slot == 0)
-    ahead_m = 1.5 * _moved(context) + 2.0
+    ahead_m = 1.5 * _step_length(context) + 2.0
     return Surroundings(
         frame, lanes, queries.project_on_route(bank, context.index, me[:2], context.route_m, ahead_m)
     )
@@ -127,7 +127,7 @@ def _ground(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
     return frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
 
 
-def _moved(context: AgentContext) -> Scalar:
+def _step_length(context: AgentContext) -> Scalar:
     """Distance that the driven agent moved in the last step, m."""
     return norm(context.history[-1, :2] - context.history[-2, :2])
 
@@ -158,7 +158,7 @@ def _touch(
     return codes, fault.any(), kind, ttc
 
 
-def _requested(
+def _requested_facts(
     bank: ScenarioBank, context: AgentContext, frame: Frame, codes: Int[Array, " S"], reads: frozenset[str],
     strand: Any,
 ) -> dict[str, Array]:  # fmt: skip
@@ -182,7 +182,7 @@ def _requested(
     return facts
 
 
-def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
+def _drop_unread(facts: Facts, reads: frozenset[str]) -> Facts:
     """Return the facts with None in place of those that are not requested."""
     # The next passage is evaluated from the strand of this one.
     desired = reads | ({"strand"} if reads & _PASSAGES else frozenset())

@@ -165,7 +165,7 @@ class StudyConfig:
 
     Attributes:
         arms: Names of its arms, its baselines among them; empty: all.
-        seeds: Number of trainings of each arm.
+        seeds: Number of training runs of each arm.
         total_steps: Logged steps that each training draws; null: those of its preset.
         training: Further settings of every training, as on the command line: ``[--algorithm.batch, "128"]``.
         validations: Number of validations in closed loop; the best checkpoint is tested.

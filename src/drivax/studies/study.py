@@ -88,7 +88,7 @@ def run_study(
 
     Args:
         study: The study.
-        cores: Number of parallel trainings; None: one per core.
+        cores: Number of parallel training runs; None: one per core.
         anyway: Continue even if the baselines do not meet their conditions; the report says so.
         log: Called with one line per step.
 
@@ -177,14 +177,14 @@ def _open_folder(study: Study) -> None:
     sources = [entry["hash"] for entry in folder.info.get("data", [])]
     if folder.config(StudyConfig) != study.config or sources != [part.hash for part in data]:
         raise UsageError(
-            "holds a study with other settings, or of other scenarios",
+            "contains a study with other settings, or of other scenarios",
             file=study.folder,
             cure="choose another name",
         )
     # Claims are fixed before the evaluation. Studies of earlier versions do not name their definition.
     if folder.info.get("definition", definition) != definition:
         raise UsageError(
-            "holds a study with other arms or claims", file=study.folder, cure="choose another name"
+            "contains a study with other arms or claims", file=study.folder, cure="choose another name"
         )
 
 
@@ -309,7 +309,7 @@ def _run_job(job: Job) -> float:
 
 
 def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:
-    """Raise UsageError if an evaluated run has lost its checkpoints: training again would mix two trainings."""
+    """Raise UsageError if an evaluated run has lost its checkpoints: training again would mix two training runs."""
     names = job.study.evaluations(job.arm)
     evaluated = [folder for name in names if (folder := job.study.evaluation(name, job.seed)).is_dir()]
     if not steps and evaluated:

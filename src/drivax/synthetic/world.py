@@ -265,7 +265,7 @@ def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -
 def _to_recording(
     roles: Roles, motion: Motion, first: int, staged: StagedEvent | None, steps: int
 ) -> Recording:
-    """Return the recording from a step on, without id and segment."""
+    """Return the recording from a given step on, without id and segment."""
     network, motion = roles.network, motion.from_step(first)
     times = np.arange(steps) * DT_S
     events, tags = (), {}

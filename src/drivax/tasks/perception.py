@@ -1,4 +1,4 @@
-"""Perception of ego: range, occlusion, drop-out and noise. It affects observations only; metrics use the truth.
+"""Perception of ego: range, occlusion, drop-out and noise. It affects observations only; metrics use the true state.
 
 At every step a sensor on ego detects the agents in range, in view and not dropped, each with that step's position
 error; a tracker keeps the detections. A past step of an agent is therefore the same in every observation that holds it;

@@ -137,7 +137,7 @@ def check_algorithm(config: AlgorithmConfig | str) -> None:
     expect(valid, f"{what} lacks build or steps_per_iteration", "see AlgorithmConfig")
     steps = settings.steps_per_iteration
     valid = isinstance(steps, int) and steps > 0
-    expect(valid, f"{what} counts {steps!r} steps per iteration", "count environment steps as a whole number")
+    expect(valid, f"{what} counts {steps!r} steps per iteration", "count environment steps as an integer")
     bank, simulator = worlds.worlds(), Simulator(_TASK)
     environment = Driving(simulator)
     learner = settings.build(environment, bank, _ITERATIONS)

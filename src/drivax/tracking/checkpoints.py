@@ -60,7 +60,11 @@ class Checkpoints:
         return max(self.steps(), default=None) if best is None else best
 
     def about(self, step: int) -> dict[str, Any]:
-        """Return step, score and leaves of a checkpoint; raises DataError if it is missing or damaged."""
+        """Return the step, score and leaves of a checkpoint.
+
+        Raises:
+            DataError: The checkpoint is missing or damaged.
+        """
         file = self._path(step) / ABOUT
         if not file.is_file():
             cure = f"available steps: {', '.join(map(str, self.steps())) or 'none'}"
@@ -214,7 +218,7 @@ def _compare(path: Path, stored: list[dict[str, Any]], requested: list[tuple[str
         if name not in have:
             raise DataError(f"the checkpoint has no {name}", file=path, cure=cure)
         if name not in need:
-            raise DataError(f"the checkpoint holds {name}, which the template lacks", file=path, cure=cure)
+            raise DataError(f"the checkpoint contains {name}, which the template lacks", file=path, cure=cure)
         if have[name] != need[name]:
             stored_as, requested_as = (f"{kind}{list(shape)}" for kind, shape in (have[name], need[name]))
             raise DataError(

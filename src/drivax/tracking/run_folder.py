@@ -78,7 +78,7 @@ class RunFolder:
             raise UsageError("output exists and is not a run folder", file=path, cure="choose another name")
         present = _kind(path)
         if kind is not None and present is not None and (present in _TRAININGS) != (kind in _TRAININGS):
-            problem = f"output folder holds a run of kind {present}, not {kind}"
+            problem = f"output folder contains a run of kind {present}, not {kind}"
             raise UsageError(problem, file=path, cure="choose another name")
         check_output(path, overwrite, folder=True)
 

@@ -64,7 +64,7 @@ def read_map(path: Path) -> ArgoverseMap:
 def _decode(content: Any) -> ArgoverseMap:
     groups = ("lane_segments", "drivable_areas", "pedestrian_crossings")
     if not isinstance(content, dict) or not all(isinstance(content.get(group), dict) for group in groups):
-        raise DataError(f"is no Argoverse 2 map with {', '.join(groups)}", cure=_AGAIN)
+        raise DataError(f"is not an Argoverse 2 map with {', '.join(groups)}", cure=_AGAIN)
     segments, areas, crossings = ([*content[group].values()] for group in groups)
     lanes = [lane for segment in segments if (lane := _lane(segment)) is not None]
     lines = _lines(segments)
@@ -148,7 +148,7 @@ def _points(record: Any, name: str) -> Float[Array, "point 3"]:
         points = np.array(rows, np.float64).reshape(-1, 3)
         parsing.check_within(FARTHEST_M, points)
     except (TypeError, KeyError, ValueError, OverflowError, IndexError) as error:
-        raise DataError(f"{name} is no list of points", record=_name(record), cure=_AGAIN) from error
+        raise DataError(f"{name} is not a list of points", record=_name(record), cure=_AGAIN) from error
     return points
 
 
@@ -159,7 +159,7 @@ def _name(record: Any) -> str | None:
 def _ids(record: Any, name: str) -> tuple[int, ...]:
     links = record.get(name)
     if not isinstance(links, list):
-        raise DataError(f"{name} is no list of ids", record=_name(record), cure=_AGAIN)
+        raise DataError(f"{name} is not a list of ids", record=_name(record), cure=_AGAIN)
     return tuple(_id(link) for link in links)
 
 
@@ -169,7 +169,7 @@ def _neighbour(record: Any, name: str) -> tuple[int, ...]:
 
 def _id(value: Any) -> int:
     if not isinstance(value, int) or not 0 <= value < 2**62:
-        raise DataError(f"{str(value)[:40]!r} is no id of a map element", cure=_AGAIN)
+        raise DataError(f"{str(value)[:40]!r} is not an id of a map element", cure=_AGAIN)
     return value
 
 

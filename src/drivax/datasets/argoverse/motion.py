@@ -175,7 +175,7 @@ def _classes(types: Words, names: Words, ego: int) -> tuple[Array, Float64[Array
 
 
 def _track_ids(words: tuple[str, ...]) -> Int[Array, " track"]:
-    """The ids as numbers, the ego's as 0; row numbers if some id is no number or not unique."""
+    """The ids as numbers, the ego's as 0; row numbers if some id is not a number or not unique."""
     texts = ["0" if word == EGO else word for word in words]
     if all(text.isascii() and text.isdecimal() and len(text) < 10 for text in texts):
         ids = [int(text) for text in texts]

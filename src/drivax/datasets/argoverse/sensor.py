@@ -220,5 +220,5 @@ def _unit(quaternion: Float[Array, "row 4"]) -> Float[Array, "row 4"]:
     parsing.check_within(2.0, quaternion)
     length = np.linalg.norm(quaternion, axis=1, keepdims=True)
     if not (length > 0.5).all():
-        raise DataError("a rotation is no quaternion")
+        raise DataError("a rotation is not a quaternion")
     return quaternion / length

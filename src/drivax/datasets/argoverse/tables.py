@@ -66,7 +66,7 @@ def has_magic(path: Path, magic: bytes) -> bool:
 
 
 def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
-    """Read columns of a parquet or feather file, by name and kind: any number, whole numbers, or text.
+    """Read columns of a parquet or feather file, by name and kind: any number, integers, or text.
 
     Columns that not every version of the format has are left out where they are missing.
     """
@@ -74,7 +74,7 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
     try:
         table = _load(path, list(columns), optional)
         if table.num_rows == 0:
-            raise DataError("holds no rows", file=path, cure=_AGAIN)
+            raise DataError("contains no rows", file=path, cure=_AGAIN)
         kinds = [(name, columns[name]) for name in table.column_names]
         texts = {name: _words(table.column(name)) for name, kind in kinds if kind == "text"}
         others = [(name, kind) for name, kind in kinds if kind != "text"]
@@ -84,7 +84,7 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
     except DataError as error:
         raise DataError(error.problem, file=path, cure=error.cure) from error
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
-        raise DataError(f"is no sound table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
+        raise DataError(f"is not a valid table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
     return Table(table.num_rows, numbers, texts)
 
 
@@ -115,7 +115,7 @@ def _check(names: Sequence[str], columns: Sequence[str], rows: int) -> None:
         if names.count(name) != 1:
             raise DataError(f"has no column {name}", cure="this is another kind of table, or a damaged one")
     if not 0 <= rows <= MOST_ROWS:
-        raise DataError(f"claims to hold {rows} rows", cure=_AGAIN)
+        raise DataError(f"invalid row count {rows}", cure=_AGAIN)
 
 
 def _numbers(column: Any, whole: bool, name: str) -> Array:
@@ -123,7 +123,9 @@ def _numbers(column: Any, whole: bool, name: str) -> Array:
 
     fits = pa.types.is_integer(column.type) or (not whole and pa.types.is_floating(column.type))
     if not fits or column.null_count:
-        raise DataError(f"column {name} holds {column.type} with {column.null_count} gaps", cure=_AGAIN)
+        raise DataError(
+            f"column {name} contains {column.type} with {column.null_count} null values", cure=_AGAIN
+        )
     return column.to_numpy().astype(np.int64 if whole else np.float64)
 
 

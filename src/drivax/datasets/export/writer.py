@@ -208,5 +208,5 @@ def _refuse_existing(out: Path, options: Export) -> None:
     if empty or not (out.exists() or out.is_symlink()):
         return
     if not (out / NOTE).is_file():
-        raise UsageError("exists and is no export", file=out, cure="choose another name")
+        raise UsageError("exists and is not an export", file=out, cure="choose another name")
     check_output(out, options.overwrite, folder=True)

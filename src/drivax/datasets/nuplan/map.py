@@ -149,7 +149,7 @@ def _city(path: Path, mtime_ns: int, size: int) -> City:
         layers = {name: layer for name in LAYERS if (layer := read_layer(database, name, LAYERS[name]))}
         if missing := [name for name in _NEEDED if name not in layers]:
             raise DataError(f"has no layer {missing[0]}", file=path, cure=CURE)
-        epsg = _projected(database)
+        epsg = _read_epsg(database)
     lanes = _lanes(layers)
     blocks: dict[tuple[str, int], list[int]] = {}
     for lane_id, lane in lanes.items():
@@ -160,7 +160,7 @@ def _city(path: Path, mtime_ns: int, size: int) -> City:
     return City(path, epsg, layers, lanes, blocks, {fid: row for row, fid in enumerate(fids)})
 
 
-def _projected(database: Database) -> int:
+def _read_epsg(database: Database) -> int:
     """EPSG number of the system of the logs, from the table ``meta``."""
     database.require("meta", "key", "value")
     rows = database.rows("SELECT value FROM meta WHERE key = 'projectedCoordSystem'")
@@ -368,7 +368,7 @@ def _transformer(source: int, target: int) -> Any:
     try:
         systems = pyproj.CRS.from_epsg(source), pyproj.CRS.from_epsg(target)
         if not systems[1].is_projected:
-            raise DataError(f"EPSG:{target} is no projected coordinate system", cure=CURE)
+            raise DataError(f"EPSG:{target} is not a projected coordinate system", cure=CURE)
         return pyproj.Transformer.from_crs(*systems, always_xy=True)
     except pyproj.exceptions.ProjError as error:
         problem = f"a coordinate system (EPSG:{source}, EPSG:{target}) is unknown"

@@ -241,7 +241,7 @@ def _numbers(rows: Sequence[Sequence[Any]], width: int, what: str) -> Float64[np
     try:
         return np.array(rows, dtype=np.float64).reshape(len(rows), width)
     except (ValueError, TypeError, OverflowError) as error:
-        raise DataError(f"{what} holds something that is no number", cure=_CURE) from error
+        raise DataError(f"{what} contains a value that is not a number", cure=_CURE) from error
 
 
 def _check(values: Float64[np.ndarray, "*shape"], most: float, what: str) -> None:
@@ -318,11 +318,11 @@ def yaw_of(quaternion: Float64[np.ndarray, "pose 4"]) -> Float64[np.ndarray, " p
     """Return the yaw of quaternions (w, x, y, z), radians."""
     w, x, y, z = quaternion.T
     if not (np.abs(np.linalg.norm(np.clip(quaternion, -2.0, 2.0), axis=1) - 1.0) < 0.01).all():
-        raise DataError("an ego orientation is no unit quaternion", cure=_CURE)
+        raise DataError("an ego orientation is not a unit quaternion", cure=_CURE)
     return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-def _observed(log: Log, piece: Piece, table: str, columns: str) -> list[tuple[Any, ...]]:
+def _read_observations(log: Log, piece: Piece, table: str, columns: str) -> list[tuple[Any, ...]]:
     """Step and columns of all rows of a table that belong to sweeps of a piece, in order of steps."""
     steps = {log.line.tokens[sweep]: step for step, sweep in enumerate(piece.sweeps)}
     query = f"SELECT lidar_pc_token, {columns} FROM {table} WHERE lidar_pc_token IN"
@@ -337,7 +337,7 @@ def _boxes(
 ) -> tuple[Float64[np.ndarray, "box 9"], list[tuple[int, Any]], int]:
     """Boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track), and how many have no track."""
     columns = "track_token, x, y, z, yaw, length, width, height, vx, vy"
-    rows = _observed(log, piece, "lidar_box", columns)
+    rows = _read_observations(log, piece, "lidar_box", columns)
     kept = [row for row in rows if row[1] in known]
     boxes = _numbers([row[2:] for row in kept], 9, "lidar_box")
     # Static things have no velocity, and the size of a few is unknown.
@@ -400,7 +400,9 @@ def _lights(
     starts = {feature.feature_id: feature.points[0].tolist() for feature in features}
     lights = parsing.Lights(len(piece.sweeps))
     unknown = set()
-    for step, connector, status in _observed(log, piece, "traffic_light_status", "lane_connector_id, status"):
+    for step, connector, status in _read_observations(
+        log, piece, "traffic_light_status", "lane_connector_id, status"
+    ):
         good = isinstance(connector, int) and 0 <= connector < 2**32
         lane = feature_id("lane_connectors", connector) if good else -1
         if lane in starts:

@@ -92,7 +92,7 @@ def open_database(path: Path) -> Iterator[Database]:
     except OSError as error:
         raise DataError(f"cannot be read ({error.strerror})", file=path, cure="check the path") from error
     if head != _MAGIC:
-        raise DataError("is no SQLite file", file=path, cure=_CURE)
+        raise DataError("is not an SQLite file", file=path, cure=_CURE)
     try:
         connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
     except sqlite3.Error as error:

@@ -145,7 +145,7 @@ class _Layers:
     def _lanes(self) -> list[MapFeature]:
         """Lanes and lane connectors along their arc lines, with links and neighbours."""
         if not {"arcline_path_3", "connectivity"} <= self._content.keys():
-            raise DataError("holds no centre lines of lanes", cure="download the map expansion v1.3")
+            raise DataError("contains no centre lines of lanes", cure="download the map expansion v1.3")
         paths, links = self._content["arcline_path_3"], self._content["connectivity"]
         rows = [(row, name) for name in ("lane", "lane_connector") for row in self._layer(name)]
         lines = {row["token"]: arc_line(paths[row["token"]]) for row, _ in rows if row["token"] in paths}

@@ -247,7 +247,7 @@ class Tables:
         """Read the tables of one version (``v1.0-mini``, ...), the large ones row by row."""
         if not has_annotations(folder):
             raise DataError(
-                "holds no annotations: the ego would be the only agent",
+                "contains no annotations: the ego would be the only agent",
                 file=folder / "sample_annotation.json",
                 cure="convert v1.0-trainval or v1.0-mini; the test split has none",
             )
@@ -378,7 +378,7 @@ class _Row:
     def number(self, name: str) -> float:
         value = self.values.get(name)
         if not _is_number(value):
-            raise DataError(f"a row whose {name} is no number", file=self._file, cure=_AGAIN)
+            raise DataError(f"a row whose {name} is not a number", file=self._file, cure=_AGAIN)
         return float(value)  # type: ignore[arg-type]
 
     def vector(self, name: str, size: int) -> list[float]:
@@ -422,7 +422,7 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
                     text, place = text[place:] + more, 0
                     continue
                 if not isinstance(row, dict):
-                    raise DataError("is no object", file=path, record=number, cure="download it again")
+                    raise DataError("is not an object", file=path, record=number, cure="download it again")
                 yield row
                 place, number = end, number + 1
     except FileNotFoundError as error:

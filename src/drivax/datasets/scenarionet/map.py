@@ -200,7 +200,7 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
 
 
 def _feature(name: str, body: Mapping[Any, Any], reading: _Reading) -> MapFeature | None:
-    """One feature with the third column as the file has it; None where it is left out."""
+    """Return a map feature with z as stored in the file; None if it is skipped."""
     kind = _KINDS.get(body["type"]) if isinstance(body.get("type"), str) else None
     feature_id = reading.names.get(name)
     if kind is None or feature_id is None:

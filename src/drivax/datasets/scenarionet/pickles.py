@@ -130,10 +130,10 @@ class _Machine:
     def _name(self, argument: str | None) -> None:
         module, name = self._take(2) if argument is None else argument.partition(" ")[::2]
         if not isinstance(module, str) or not isinstance(name, str):
-            raise ValueError("a name that is no text")
+            raise ValueError("a name that is not text")
         full = f"{_MODULES.get(module, module)}.{name}"
         if full not in _NAMED and full not in _CALLED:
-            raise DataError(f"names {full[:100]}, which is no data", cure=_DISTRUST)
+            raise DataError(f"names {full[:100]}, which is not data", cure=_DISTRUST)
         self.stack.append(_Global(full))
 
     def _call(self, argument: Any) -> None:
@@ -144,7 +144,7 @@ class _Machine:
         # Calls copy their arguments, and the memo can repeat the same argument.
         self._called_with += sum(len(part) for part in arguments if isinstance(part, Sized))
         if self._called_with > MOST_BYTES:
-            raise ValueError("calls with more than the file holds")
+            raise ValueError("calls with more than the file contains")
         try:
             self.stack.append(make(*arguments))
         except (TypeError, AttributeError) as error:
@@ -313,7 +313,7 @@ def mapping(parent: Any, name: str, what: str = "the file") -> Mapping[Any, Any]
 
 
 def as_text(value: Any) -> str | None:
-    """Return a text that can be written as UTF-8, also of a whole number; None for anything else."""
+    """Return a text that can be written as UTF-8, also of an integer; None for anything else."""
     if not isinstance(value, bool) and isinstance(value, str | int):
         with contextlib.suppress(ValueError):  # a lone surrogate, or an integer of thousands of digits
             return str(value).encode().decode()
@@ -321,7 +321,7 @@ def as_text(value: Any) -> str | None:
 
 
 def as_int(value: Any) -> int | None:
-    """Return a whole number, also from a text; None for anything else."""
+    """Return an integer, also from a text; None for anything else."""
     written = as_text(value)
     return int(written) if written and written.isascii() and written.isdigit() and len(written) < 19 else None
 
@@ -377,7 +377,7 @@ def _row(row: Any) -> Any:
 
 
 class Names:
-    """Distinct integers for the names of one file: their own where all are whole numbers, else their order.
+    """Distinct integers for the names of one file: their own where all are integers, else their order.
 
     Args:
         names: All names, as texts.

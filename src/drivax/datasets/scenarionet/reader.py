@@ -145,7 +145,9 @@ def _head(path: Path) -> bytes:
 def _load(path: Path) -> Any:
     try:
         if path.stat().st_size > pickles.MOST_BYTES:
-            raise DataError(f"larger than {pickles.MOST_BYTES >> 20} MB", file=path, cure="it is no scenario")
+            raise DataError(
+                f"larger than {pickles.MOST_BYTES >> 20} MB", file=path, cure="it is not a scenario"
+            )
         return pickles.load(path.read_bytes())
     except OSError as error:
         raise DataError(f"cannot be read ({error.strerror})", file=path, cure="check the path") from error
@@ -228,7 +230,7 @@ def _position(metadata: Mapping[Any, Any], name: str) -> Array:
     value = metadata.get(name)
     position = np.zeros(2) if value is None else floats(value, name)
     if position.shape not in ((2,), (3,)) or not (np.abs(position) < _FARTHEST_M).all():
-        raise DataError(f"{name} is no position", cure=SKIP)
+        raise DataError(f"{name} is not a position", cure=SKIP)
     return position[:2]
 
 

@@ -110,7 +110,7 @@ def _track_ids(features: ExampleFeatures, used: Array) -> Array:
     """Ids of the rows used: stored as floats, but WOMD's are far below 2**24."""
     ids = features.numbers("state/id")[used]
     if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
-        raise DataError("state/id holds numbers that are no exact whole numbers", cure=SKIP)
+        raise DataError("state/id contains numbers that are not exact integers", cure=SKIP)
     if (ids < 0).any() or len(np.unique(ids)) < len(ids):
         raise DataError("state/id names a track twice, or negatively", cure=SKIP)
     return ids.astype(np.int64)
@@ -154,7 +154,7 @@ def _ego_row(features: ExampleFeatures, used: Array) -> int:
 
 
 def _lights(features: ExampleFeatures, mapped: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
-    """Lights by lane, and the number of those without a place."""
+    """Return the lights by lane, and the number of lights without a position."""
     collector = parsing.Lights(sum(features.spans.values()))
     start = 0
     for span, steps in features.spans.items():

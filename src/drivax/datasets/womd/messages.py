@@ -246,7 +246,7 @@ class ExampleFeatures:
         """A feature that must be stored as integers: floats would round the ids of lanes."""
         values = self.numbers(name, shape)
         if values.dtype != np.int64:
-            raise DataError(f"feature {name} holds floats, not integers", cure=SKIP)
+            raise DataError(f"feature {name} contains floats, not integers", cure=SKIP)
         return values
 
     def marked(self, name: str, used: _Array) -> tuple[int, ...]:
@@ -275,7 +275,7 @@ class ExampleFeatures:
         except ValueError:
             origin = np.zeros(0)
         if origin.shape != (3,) or not (np.abs(origin) < _FARTHEST_M).all():
-            raise DataError(f"{ORIGIN} is no position", cure=SKIP)
+            raise DataError(f"{ORIGIN} is not a position", cure=SKIP)
         return origin
 
     @cached_property
@@ -288,7 +288,7 @@ class ExampleFeatures:
             present = self.has(name) and (span != "future" or bool((self.numbers(name) == 1).any()))
             steps[span] = self.numbers(name).size // tracks if present else 0
         if steps["current"] != 1:
-            raise DataError(f"state/current holds {steps['current']} steps, not 1", cure=SKIP)
+            raise DataError(f"state/current has {steps['current']} steps, not 1", cure=SKIP)
         return steps
 
     def over_time(self, name: str, used: _Array) -> _Array:

@@ -122,7 +122,7 @@ class TfRecordReader:
         other = flavour(payload)
         if other in (None, self.name):
             return error
-        problem = f"holds {_CONTENTS[other]}, not {_CONTENTS[self.name]}"
+        problem = f"contains {_CONTENTS[other]}, not {_CONTENTS[self.name]}"
         return DataError(problem, cure=f"use --format {other}")
 
 

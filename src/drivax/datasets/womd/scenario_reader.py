@@ -87,7 +87,7 @@ def decode(payload: bytes) -> Recording:
 
 def _check(message: Any, steps: int) -> None:
     if not isinstance(message.scenario_id, str):  # protobuf gives bytes where a string is no UTF-8
-        raise DataError("scenario_id is no text", cure=SKIP)
+        raise DataError("scenario_id is not text", cure=SKIP)
     if steps == 0 or not message.tracks:
         raise DataError("the scenario has no steps or no tracks", cure=SKIP)
     if not 0 <= message.current_time_index < steps:
@@ -132,9 +132,9 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
 
 
 def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
-    """The map's features, and how many were left out for what reason."""
+    """Return the map features, and the number of skipped ones by reason."""
     kept: dict[int, tuple[str, Any, Sequence[bytes]]] = {}
-    unknown = twice = empty = 0
+    unknown = duplicate = empty = 0
     for message in messages:
         kind = message.WhichOneof("kind")
         if kind is None:  # a kind of feature that later versions may add
@@ -145,7 +145,7 @@ def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
         if not blobs:
             empty += 1
         elif message.id in kept:
-            twice += 1
+            duplicate += 1
         else:
             kept[message.id] = kind, body, blobs
     points = read_table([blob for *_, blobs in kept.values() for blob in blobs], POINTS)
@@ -157,7 +157,7 @@ def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
     lost = parsing.nonzero(
         unknown_features=unknown,
         empty_features=empty,
-        duplicate_features=twice,
+        duplicate_features=duplicate,
         one_point_features=parsing.one_point_features(features),
     )
     return features, lost

@@ -68,7 +68,9 @@ class PpoConfig:
             raise ValueError("environments, unroll and minibatches are at least 1")
         steps, minibatches = self.steps_per_iteration, self.minibatches
         if steps % minibatches:
-            raise ValueError(f"environments x unroll = {steps} is no multiple of {minibatches} minibatches")
+            raise ValueError(
+                f"environments x unroll = {steps} is not a multiple of {minibatches} minibatches"
+            )
 
     @property
     def steps_per_iteration(self) -> int:

@@ -1,4 +1,4 @@
-"""PDM-Closed (Dauner et al. 2023): proposals, forecast, scoring and emergency brake."""
+"""PDM-Closed (Dauner et al. 2023): proposals, LQR tracking, forecast, scoring and emergency brake."""
 
 import lazy_loader
 

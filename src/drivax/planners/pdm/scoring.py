@@ -185,7 +185,7 @@ def _foreseen(
 def is_comfortable(
     motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar
 ) -> Bool[Array, ""]:
-    """Whether a motion keeps nuPlan's limits at every step, by the windows of ``metrics.comfort``."""
+    """Whether a motion stays within nuPlan's comfort limits at every step, with the windows of ``metrics.comfort``."""
     steps = motion.shape[0]
     turned = wrap(jnp.diff(motion[:, MOTION_HEADING]))
     heading = jnp.concatenate([jnp.zeros(1), jnp.cumsum(turned)])
@@ -198,7 +198,7 @@ def is_comfortable(
 
     low, high = comfort.LONGITUDINAL_MPS2
     smooth = filtered(acceleration, comfort.SMOOTH)
-    fine = ((smooth >= low) & (smooth <= high)).all()
+    within = ((smooth >= low) & (smooth <= high)).all()
     for values, limit in (
         (filtered(lateral, comfort.SMOOTH), comfort.LATERAL_MPS2),
         (filtered(smooth, comfort.JERK), comfort.JERK_MPS3),
@@ -206,5 +206,5 @@ def is_comfortable(
         (filtered(heading, comfort.YAW_RATE), comfort.YAW_RATE_RPS),
         (filtered(heading, comfort.YAW_ACCELERATION), comfort.YAW_ACCELERATION_RPS2),
     ):
-        fine &= (jnp.abs(values) <= limit).all()
-    return fine
+        within &= (jnp.abs(values) <= limit).all()
+    return within

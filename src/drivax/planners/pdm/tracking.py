@@ -41,11 +41,11 @@ class Reference:
     curvature: Float[Array, "*batch T"]  # Of the path, 1/m
 
 
-def moved(car: Car, acceleration: Array, rate: Array, wheelbase: Scalar, config: TrackingConfig) -> Car:
+def step_car(car: Car, acceleration: Array, rate: Array, wheelbase: Scalar, config: TrackingConfig) -> Car:
     """Return the car one step after a command; each actuator closes ``dt / (dt + lag)`` of its error."""
-    share = DT_S / (DT_S + config.acceleration_lag_s), DT_S / (DT_S + config.steering_lag_s)
-    acceleration = car.acceleration + share[0] * (acceleration - car.acceleration)
-    steering = car.steering + share[1] * rate * DT_S
+    gains = DT_S / (DT_S + config.acceleration_lag_s), DT_S / (DT_S + config.steering_lag_s)
+    acceleration = car.acceleration + gains[0] * (acceleration - car.acceleration)
+    steering = car.steering + gains[1] * rate * DT_S
     steering = jnp.clip(steering, -config.most_steering, config.most_steering)
     motion = bicycle(car.motion, acceleration, jnp.tan(steering) / wheelbase)
     return Car(motion, acceleration, steering)
@@ -55,7 +55,7 @@ def track(car: Car, reference: Reference, wheelbase: Scalar, config: TrackingCon
     """Return the car at every step of a reference, the present one included."""
     last = reference.speed.shape[0] - 1
     ahead = np.minimum(np.arange(last)[:, None] + np.arange(config.horizon), last)
-    to_have = reference.speed[np.minimum(np.arange(last) + config.horizon, last)]
+    target_speed = reference.speed[np.minimum(np.arange(last) + config.horizon, last)]
 
     def step(car: Car, now: tuple[Any, Array, Array]) -> Any:
         (x, y, cos, sin), desired, curvatures = now
@@ -67,9 +67,9 @@ def track(car: Car, reference: Reference, wheelbase: Scalar, config: TrackingCon
         heading = wrap(motion[MOTION_HEADING] - jnp.arctan2(sin, cos))
         speeds = jnp.maximum(speed + acceleration * DT_S * np.arange(config.horizon), 0.0)
         rate = steering_rate((lateral, heading, car.steering), speeds, curvatures, wheelbase, config)
-        car = moved(car, acceleration, jnp.where(stops, 0.0, rate), wheelbase, config)
+        car = step_car(car, acceleration, jnp.where(stops, 0.0, rate), wheelbase, config)
         return car, car
 
     poses = tuple(reference.pose[:last].T)
-    _, cars = jax.lax.scan(step, car, (poses, to_have, reference.curvature[ahead]))
+    _, cars = jax.lax.scan(step, car, (poses, target_speed, reference.curvature[ahead]))
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), car, cars)

@@ -243,10 +243,10 @@ def _plan(comparison: Comparison) -> str:
     plan = comparison.plan
     return section(
         "The rule",
-        f"<p>Nothing is decided with fewer than {plan.minimum_scenarios:,} scenarios. A p-value below "
-        f"{1 - plan.confidence:.2g} gives the better planner. Otherwise there is no difference if the smallest "
-        f"difference that matters would have been detected with a power of {100 * plan.power:.0f} %, and if not, "
-        "there are not enough scenarios.</p>"
+        f"<p>With fewer than {plan.minimum_scenarios:,} scenarios there is no verdict. If the p-value is below "
+        f"{1 - plan.confidence:.2g}, the verdict is the better planner. Otherwise it is no difference if the "
+        f"comparison had a power of {100 * plan.power:.0f} % to detect the smallest difference that matters, and "
+        "not enough scenarios if not.</p>"
         f"<details><summary>the plan</summary><pre>{escape(settings.dump(plan))}</pre></details>",
     )
 

@@ -18,7 +18,7 @@ _TINY = 1e-6
 _FAR = 1e30
 
 
-def numbered(values: Float[Array, "..."], number: Any, bits: int) -> Float[Array, "..."]:
+def embed_number(values: Float[Array, "..."], number: Any, bits: int) -> Float[Array, "..."]:
     """Replace the low bits of positive floats by a number below ``2**bits``.
 
     Minima of floats vectorise; those of integers do not. Values below the smallest normal float may count as zero.
@@ -30,7 +30,7 @@ def numbered(values: Float[Array, "..."], number: Any, bits: int) -> Float[Array
 
 
 def number_of(key: Float[Array, "..."], bits: int) -> Int[Array, "..."]:
-    """Return the number in a key of :func:`numbered`."""
+    """Return the number in a key of :func:`embed_number`."""
     return jax.lax.bitcast_convert_type(key, jnp.int32) & ((1 << bits) - 1)
 
 
@@ -42,5 +42,5 @@ def first_smallest(values: Float[Array, "..."], axis: int = -1, least: float = 0
     count = values.shape[axis]
     bits = (count - 1).bit_length()
     place = jax.lax.broadcasted_iota(jnp.int32, values.shape, axis % values.ndim)
-    key = numbered(jnp.clip(values - least, 0.0, _FAR) + _TINY, place, bits)
+    key = embed_number(jnp.clip(values - least, 0.0, _FAR) + _TINY, place, bits)
     return jnp.minimum(number_of(jnp.min(key, axis=axis), bits), count - 1)

@@ -59,7 +59,7 @@ def lane_strands(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
     comes_in = (other >= 0) & (np.abs(wrap(courses.before - courses.before[other])) <= _MERGING_RAD)
     onto = np.where(comes_in, strand[ahead], -1)
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
-    stops = (successor < 0).all(axis=1) & _known(scenario, stop)
+    stops = (successor < 0).all(axis=1) & _is_map_known(scenario, stop)
     sides = (StrandColumn.RIGHT, scenario.lane_right), (StrandColumn.LEFT, scenario.lane_left)
     for column, neighbour in sides:
         adjacent = neighbour[:count].astype(np.int64)
@@ -140,7 +140,7 @@ def _strands(follows: Int[Array, " lane"]) -> tuple[Int[Array, " lane"], Int[Arr
     return np.where(follows[last] >= 0, highest, last), last
 
 
-def _known(scenario: Scenario, xy: Float[Array, "lane 2"]) -> Array:
+def _is_map_known(scenario: Scenario, xy: Float[Array, "lane 2"]) -> Array:
     """Mask of points so near to the log of the ego that the map around them is stored."""
     log = scenario.agent_xy[scenario.agent_valid[:, 0], 0]
     return inside_box(xy, log, _KNOWN_M) if len(log) else np.zeros(len(xy), bool)

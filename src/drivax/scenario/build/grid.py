@@ -148,7 +148,7 @@ def arrange(
 def cell_sides(
     grid: Grid, edges: Segments, lanes: Float[Array, "point 2"], rings_closed: bool
 ) -> Int32[Array, " cell"]:
-    """Sides of the 3 x 3 side cells of every grid cell, packed by :func:`packed`.
+    """Sides of the 3 x 3 side cells of every grid cell, packed by :func:`pack_sides`.
 
     The nearest of ``edges`` (all of the source, also those outside the crop) decides: its left is drivable; beyond the
     end of an open edge the side is unknown. Side cells with a lane centre (``lanes``) are never off the road. Cells out
@@ -168,13 +168,13 @@ def cell_sides(
         square = _sides_within_rings(grid, edges).reshape(grid.side, grid.side)
         within = square.repeat(SPLIT, axis=0).repeat(SPLIT, axis=1).ravel()
         side = np.where(within != 0, within, side)
-    return packed(side.reshape(fine.side, fine.side))
+    return pack_sides(side.reshape(fine.side, fine.side))
 
 
-def packed(side: Int[Array, "row column"]) -> Int32[Array, " cell"]:
-    """Pack the sides (1 drivable, -1 not, 0 unknown) of the 3 x 3 side cells of every grid cell into a number.
+def pack_sides(side: Int[Array, "row column"]) -> Int32[Array, " cell"]:
+    """Pack the sides (1 drivable, -1 not, 0 unknown) of each grid cell's 3 x 3 side cells into one integer.
 
-    Each takes two bits, row by row from the lowest: 0 unknown, 1 drivable, 2 not drivable.
+    Each side takes two bits, row by row from the lowest bits: 0 unknown, 1 drivable, 2 not drivable.
     """
     count = len(side) // SPLIT
     blocks = side.reshape(count, SPLIT, count, SPLIT).swapaxes(1, 2).reshape(count * count, SPLIT * SPLIT)

@@ -337,7 +337,7 @@ class LaneSegments:
 
 
 def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:
-    """Return the dense lane index of source features, -1 for those that are no lane of the graph."""
+    """Return the dense lane index of source features, -1 for those that are not in the lane graph."""
     size = max(int(graph.feature.max(initial=-1)), int(feature.max(initial=-1))) + 2
     table = np.full(size, -1)
     table[graph.feature] = np.arange(graph.count)

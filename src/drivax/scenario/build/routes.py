@@ -134,9 +134,9 @@ def find_routes(
     """Find all routes of a scenario; ``published`` candidates ignore the intended route."""
     log = log_route(on, ego, most_points)
     if style == "published":
-        best, others = _published(on, ego, most_points)
+        best, others = _published_routes(on, ego, most_points)
     else:
-        best, others = _searched(on, ego, intent, most_routes - 1, most_points)
+        best, others = _search_routes(on, ego, intent, most_routes - 1, most_points)
     first = log if best is None else best
     rest = [route for route in others if not _same(route, first)]
     progress = log_progress(first, ego)
@@ -145,7 +145,7 @@ def find_routes(
     return RouteSet((first, log, *rest)[:most_routes], best is not None, goal, progress)
 
 
-def _searched(
+def _search_routes(
     on: LaneSegments, ego: EgoLog, intent: Intent, most_routes: int, most_points: int
 ) -> tuple[Route | None, list[Route]]:
     """Route to the goal, if any, and alternatives, by best-first search from the current step."""
@@ -160,7 +160,7 @@ def _searched(
     return _best(ego, [*drawer.variants(search.to_goal(*end)), *others], GOAL_M), others
 
 
-def _published(on: LaneSegments, ego: EgoLog, most_points: int) -> tuple[Route | None, list[Route]]:
+def _published_routes(on: LaneSegments, ego: EgoLog, most_points: int) -> tuple[Route | None, list[Route]]:
     """Published candidate that leads to the goal, if any, and all candidates, the best score first."""
     ego = replace(ego, current=int(np.argmax(ego.valid)))
     search = LaneSearch.start(on, ego.xyz[ego.current], float(ego.heading[ego.current]), LEAST_M)

@@ -123,9 +123,9 @@ class Filter:
         """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison; raise UsageError if any part is invalid."""
         form = _FILTER.fullmatch(text)
         if form is None or form[3].startswith("="):
-            raise _refusal(text, "is no filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
+            raise _refusal(text, "is not a filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
         name, sign, words = form[1], form[2], tuple(word.strip() for word in form[3].split("|"))
-        quantity = _known(text, name)
+        quantity = _find_quantity(text, name)
         if not all(words):
             raise _refusal(text, "names no value", "write NAME=VALUE or NAME=VALUE|VALUE")
         if sign in _COMPARED and (quantity.kind != "number" or len(words) > 1):
@@ -136,7 +136,7 @@ class Filter:
         if len({isinstance(value, str) for value in values}) > 1:
             raise _refusal(text, "mixes words and numbers", "write two filters or ask for one of them")
         if sign in _COMPARED and isinstance(values[0], str):
-            raise _refusal(text, f"{values[0]!r} is no number", f"give a number after {sign}")
+            raise _refusal(text, f"{values[0]!r} is not a number", f"give a number after {sign}")
         return cls(text, name, sign, values)
 
     def matches(self, entry: Mapping[str, Any]) -> bool:
@@ -248,7 +248,7 @@ def read_names(file: Path) -> list[_Name]:
     except OSError as error:
         raise DataError(error.strerror or "cannot be read", file=file, cure="check the path") from error
     except UnicodeDecodeError as error:
-        raise DataError("is no text", file=file, cure="give one scenario id per line") from error
+        raise DataError("is not text", file=file, cure="give one scenario id per line") from error
     return [_Name(text, file, row) for row, line in enumerate(lines, start=1) if (text := line.strip())]
 
 
@@ -293,7 +293,7 @@ def _nothing_left(data: Listing, selection: Selection) -> DrivaxError:
     return DataError("no scenario is selected", file=data.path, cure="loosen the filters, or name others")
 
 
-def _known(text: str, name: str) -> Quantity:
+def _find_quantity(text: str, name: str) -> Quantity:
     """Return the quantity of a name."""
     if name.startswith("tag.") and len(name) > len("tag."):
         return Quantity("word", "a tag of the user's own")
@@ -318,7 +318,7 @@ def _value(text: str, name: str, quantity: Quantity, word: str) -> str | float |
             if math.isfinite(number := float(word)):
                 return number
         if word not in quantity.words:
-            raise _refusal(text, f"{word!r} is no number", f"write {name}>=10, say")
+            raise _refusal(text, f"{word!r} is not a number", f"write, for example, {name}>=10")
     if quantity.words and word not in quantity.words:
         raise _refusal(text, f"{name} is never {word!r}", did_you_mean(word, quantity.words))
     return word

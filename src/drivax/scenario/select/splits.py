@@ -30,7 +30,7 @@ def parse_shares(text: str) -> Shares:
     shares = train, validation, test
     if not all(share >= 0 for share in shares) or abs(sum(shares) - 100.0) > 1e-6:
         cure = "give percentages of train/validation/test that add up to 100: 80/10/10"
-        raise UsageError(f"{text!r} is no split", cure=cure)
+        raise UsageError(f"{text!r} is not a split", cure=cure)
     return shares
 
 

@@ -113,7 +113,7 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
         result[at] = values
         return jnp.asarray(result)
 
-    points, profile, spacing = _sampled(
+    points, profile, spacing = _sample_paths(
         lines, np.max(np.where(logs.valid, logs.speed, 0.0), axis=1, initial=0.0)
     )
     at_points = np.concatenate([points, profile], axis=-1)
@@ -251,7 +251,7 @@ def _ground(segments: Numbers, xy: Numbers, ground: Numbers) -> Float[np.ndarray
     return np.where(far.min(axis=1) <= LANE_CUTOFF_M, z[far.argmin(axis=1)], ground)
 
 
-def _sampled(
+def _sample_paths(
     lines: Polylines, peak: Numbers
 ) -> tuple[Float[np.ndarray, "V M 4"], Float[np.ndarray, "V M 2"], Float[np.ndarray, " V"]]:
     """Return evenly spaced points of paths, their heights and speed limits, and the spacing."""

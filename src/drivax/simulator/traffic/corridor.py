@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y
 from drivax.scenario.bank.queries import LEVEL_M
-from drivax.scenario.bank.smallest import first_smallest, number_of, numbered
+from drivax.scenario.bank.smallest import embed_number, first_smallest, number_of
 from drivax.scenario.record import record
 from drivax.simulator.traffic.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, AgentPaths
 from drivax.simulator.types import Frame
@@ -102,7 +102,7 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     keys = []
     for number in range(PIECES):
         ends = x[:, number], y[:, number], x[:, number + 1], y[:, number + 1]
-        keys.append(numbered(1.0 + _from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
+        keys.append(embed_number(1.0 + _from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
     best = number_of(reduce(jnp.minimum, keys), _PIECE_BITS)
     # Written out once: XLA would compute it again for each of the columns that are read.
     best = jnp.zeros_like(best).at[jnp.arange(len(best))].set(best)
@@ -203,7 +203,9 @@ def closest(
 ) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
     """Return the C boxes (:func:`columns`) with the closest centres among ``near``, and the mask of valid ones."""
     dx, dy = box[X] - me[:, X : X + 1], box[Y] - me[:, Y : Y + 1]
-    key = jnp.where(near, numbered(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
+    key = jnp.where(
+        near, embed_number(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf
+    )
     # Computed once: without the barrier XLA computes it again for each of the minima.
     key = jax.lax.optimization_barrier(key)
     minima = [jnp.min(key, axis=1, keepdims=True)]

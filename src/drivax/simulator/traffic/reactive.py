@@ -113,7 +113,7 @@ class IdmTraffic:
         ahead = leaders(paths, context.index, movers, frame)
         driver = self._parameters(bank, context.index, slot)
         acceleration = _acceleration(bank, context, movers, most, ahead, driver)
-        arc, speed = _driven(movers.arc, movers.speed, acceleration)
+        arc, speed = _drive_step(movers.arc, movers.speed, acceleration)
         enters = waits & _may_enter(context, movers, ahead, frame)
         arrived = arc >= paths.spacing[context.index] * (agent_paths.PATH_POINTS - 1)
         phase = jnp.where(enters, DRIVES, jnp.where(drives & arrived, LEFT, now.phase))
@@ -198,7 +198,7 @@ def _stop_gap(
     return jnp.min(jnp.where(can | (red & over), jnp.maximum(front, 0.0), FREE_M), axis=1)
 
 
-def _driven(
+def _drive_step(
     arc: Float[Array, " R"], speed: Float[Array, " R"], acceleration: Float[Array, " R"]
 ) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
     """Return arc length and speed one step later; a vehicle that would reverse stops within the step."""

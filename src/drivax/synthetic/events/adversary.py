@@ -93,7 +93,7 @@ def first_blocked_station(view: EgoView, adversary: Scripted, step: int) -> Floa
 
 
 def severity(view: EgoView, adversary: Scripted, step: int) -> float:
-    """Constant deceleration from a step on with which ego just avoids the actor, m/s2."""
+    """Constant deceleration from a given step on with which ego just avoids the actor, m/s2."""
     room = first_blocked_station(view, adversary, step) - view.track.at[step]
     return required_by_samples(float(view.motion.speed[0, step]), room)
 

@@ -115,7 +115,7 @@ class LeadBrakes(EventScript):
             return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
         lead = float(motion.speed[leader, step])
         draw = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
-        last = view.last_step if draw is None else step + _stands_until(speed, draw[1])
+        last = view.last_step if draw is None else step + _stop_steps(speed, draw[1])
         if draw is None or last > view.last_step:
             return None
         staging = Staging(overrides=(Override(leader, step, last, -draw[0]),), tailgates=tailgates)
@@ -140,19 +140,19 @@ class StalledVehicle(EventScript):
         return None if step is None else _propose_leader(view, step, headway, rng, None, ())
 
 
-def _stands_until(speed_mps: float, severity_mps2: float) -> int:
-    """Steps that a leader stands: until ego would reach it at constant speed, v / (2 a), and a moment more."""
+def _stop_steps(speed_mps: float, severity_mps2: float) -> int:
+    """Steps for which a leader stands still: ego's time to reach it at constant speed, v / (2 a), plus a margin."""
     return round((speed_mps / (2 * severity_mps2) + _HOLD_S) / DT_S)
 
 
 def _propose_leader(
-    view: EgoView, step: int, headway_s: float, rng: np.random.Generator, drives_on: Staging | None,
+    view: EgoView, step: int, headway_s: float, rng: np.random.Generator, departure: Staging | None,
     others: tuple[int, ...],
 ) -> Proposal | None:  # fmt: skip
-    """Propose a new leader at ego's speed that brakes to a halt; None near junctions, or where it requires too little.
+    """Propose a new leader at ego's speed that brakes to a halt.
 
-    ``headway_s`` is its time gap to an ego in free traffic; it drives on later, with this further staging, or stays
-    (None).
+    ``headway_s`` is its time gap to an ego in free traffic. With ``departure`` it drives on later, and that staging is
+    added; otherwise it stays. Return None near junctions, and if even hard braking would require too little of ego.
     """
     track, ego_mps = view.track, float(view.motion.speed[0, step])
     lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
@@ -170,14 +170,14 @@ def _propose_leader(
         return None
     times = DT_S * (np.arange(view.steps) - step)
     braked_m, _ = speed_change(ego_mps, 0.0, draw[0], times)
-    last = view.last_step if drives_on is None else step + _stands_until(speed, draw[1])
-    next_lanes, _ = speed_change(0.0, ego_mps, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
-    station = np.where(times < 0, cruising, cruising[step] + braked_m + next_lanes)
+    last = view.last_step if departure is None else step + _stop_steps(speed, draw[1])
+    resumed_m, _ = speed_change(0.0, ego_mps, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
+    station = np.where(times < 0, cruising, cruising[step] + braked_m + resumed_m)
     if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
         return None
     valid, left = np.arange(view.steps) >= first_valid, np.zeros(view.steps)
     adversary = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid)
-    staging = replace(drives_on or Staging(), extras=(adversary,))
+    staging = replace(departure or Staging(), extras=(adversary,))
     required = severity(behind, adversary, step + NOTICED)
     return Proposal(staging, required, adversary, step, last, None, others, behind)
 

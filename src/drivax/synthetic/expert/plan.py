@@ -102,7 +102,7 @@ class _Option:
 def plan_ego(
     roles: Roles, motion: Motion, times_s: _Series, first_step: int, unreactive: frozenset[int] = frozenset()
 ) -> EgoPlan:
-    """Plan ego's motion from a step on, given all users' motion in the last run.
+    """Plan ego's motion from a given step on, given all users' motion in the last run.
 
     ``unreactive`` users hit ego in an earlier run and are not expected to react; ``times_s`` are on the lights' clock.
     """
@@ -157,7 +157,7 @@ def _repeat_last_step(values: np.ndarray) -> np.ndarray:
 def _extrapolate(
     motion: Motion, first_step: int
 ) -> tuple[Float64[np.ndarray, "user time 6"], Bool[np.ndarray, "user time"]]:
-    """Boxes of the others from a step on, extrapolated at constant velocity."""
+    """Boxes of the other road users from ``first_step`` on, extrapolated beyond the end at constant velocity."""
     box, valid = user_boxes(motion)[1:, first_step:], motion.valid[1:, first_step:]
     longer = np.repeat(box[:, -1:], _BEYOND_STEPS, axis=1)
     travelled = motion.speed[1:, -1:] * DT_S * np.arange(1, _BEYOND_STEPS + 1)

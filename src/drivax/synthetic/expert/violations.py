@@ -69,7 +69,7 @@ def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
 def find_violation(
     roles: Roles, motion: Motion, times_s: _Series, first_step: int, staging: Staging, hardest_mps2: float
 ) -> Violation:
-    """Find the first violation of a motion from a step on; a staged event excuses driving against traffic.
+    """Find the first violation of a motion from a given step on; a staged event excuses driving against traffic.
 
     ``times_s`` are on the clock of the lights.
     """

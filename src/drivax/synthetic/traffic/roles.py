@@ -171,7 +171,7 @@ class Staging:
 
 @dataclass(frozen=True)
 class EgoPlan:
-    """Ego's planned pose and signed speed from a step on."""
+    """Ego's planned pose and signed speed from a given step on."""
 
     first_step: int
     xy: Float64[np.ndarray, "time 2"]
@@ -206,7 +206,7 @@ class Motion:
         return len(self.distance_m)
 
     def from_step(self, step: int) -> Motion:
-        """Return the motion from a step on."""
+        """Return the motion from a given step on."""
         return self._at(slice(step, None))
 
     def before_step(self, step: int) -> Motion:

@@ -350,7 +350,7 @@ class Corridor:
         sites = self._sites(rng, draft, (first, second), middle)
         finish_sites(rng, style, draft, sites, {(0, 0): (1, 0), (1, 0): (0, 0)}, self.geometry)
         pairs = list(zip((first, second), sites, strict=True))
-        plans = [self._rules(rng, draft, *pair) for pair in pairs]
+        plans = [self._set_right_of_way(rng, draft, *pair) for pair in pairs]
         chosen = [
             lane
             for plot, site in pairs
@@ -405,7 +405,10 @@ class Corridor:
             sites.append(connect(draft, Site(tuple(approaches)), left_only))
         return sites
 
-    def _rules(self, rng: np.random.Generator, draft: Draft, plot: _Plot, site: Site) -> SignalPlan | None:
+    def _set_right_of_way(
+        self, rng: np.random.Generator, draft: Draft, plot: _Plot, site: Site
+    ) -> SignalPlan | None:
+        """Set the signals or the stop signs of a junction; return its signal plan, if it has one."""
         if plot.kind != _LIGHTS:
             set_priorities(draft, site, plot.main, Control.STOP)
             return None

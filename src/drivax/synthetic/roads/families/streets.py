@@ -251,7 +251,7 @@ class Highway(StreetFamily):
         lanes = int(rng.integers(2, 5))
         # At most five lanes in total fit the map of a stored scenario.
         back = int(rng.integers(2, 6 - lanes)) if lanes < 4 and rng.random() < self.two_way_share else 0
-        extra = self._extra(rng, lanes)
+        extra = self._draw_auxiliary_lane(rng, lanes)
         street = Street(
             middle=middle,
             cuts=self.cuts,
@@ -273,7 +273,7 @@ class Highway(StreetFamily):
             starts += [Start(on.lane, self.ramp_m[0] - 110.0, self.ramp_m[0] - 30.0)] * 2
         return street.draft.network(self.name, tuple(starts))
 
-    def _extra(self, rng: np.random.Generator, lanes: int) -> Strip:
+    def _draw_auxiliary_lane(self, rng: np.random.Generator, lanes: int) -> Strip:
         """Draw the auxiliary lane: for entering, for leaving, or for both."""
         purpose = rng.choice(3, p=self.shares)
         index, length = -lanes - 1, int(rng.integers(2, 4))
