@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,18 @@ def missing_package(error: ImportError) -> UsageError | None:
         return None
     name = "protobuf" if package == "google" else package
     return UsageError(f"{name} is not installed", cure=f"pip install 'drivax[{_EXTRAS[package]}]'")
+
+
+def import_extra(package: str) -> Any:
+    """Return a package that an extra installs.
+
+    Raises:
+        UsageError: It is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise missing_package(error) or error from error
 
 
 def did_you_mean(

@@ -12,8 +12,7 @@ import tyro
 from drivax import settings
 from drivax.api import find_planner, load
 from drivax.cli import judge, record_of
-from drivax.datasets.parsing import import_extra
-from drivax.errors import UsageError, did_you_mean
+from drivax.errors import UsageError, did_you_mean, import_extra
 from drivax.evaluation.runner import (
     EvaluationConfig,
     format_crashes,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64
 
-from drivax.errors import DataError, missing_package
+from drivax.errors import DataError
 from drivax.geometry.polylines import Polylines, cut_counts
 from drivax.scenario.build.tracks import DEFAULT_SIZES
 from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording, Tracks
@@ -50,14 +49,6 @@ def place_tags(location: str | None) -> dict[str, str]:
 MPS_PER_MPH = 0.44704
 _UNOBSERVED, _UNKNOWN = int(LightState.UNOBSERVED), int(LightState.UNKNOWN)
 _LAST_STATE = int(max(LightState))
-
-
-def import_extra(package: str) -> Any:
-    """Return a package that an extra installs."""
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise missing_package(error) or error from error
 
 
 #: Names of windows of a drive: of nuScenes' scenes by tokens, drivax' own by their first step and another ego.

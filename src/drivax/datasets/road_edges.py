@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.datasets.parsing import import_extra
-from drivax.errors import DataError
+from drivax.errors import DataError, import_extra
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
 

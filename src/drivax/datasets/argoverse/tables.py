@@ -10,8 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Int
 
-from drivax.datasets.parsing import import_extra
-from drivax.errors import DataError
+from drivax.errors import DataError, import_extra
 
 DATASET = "av2"
 #: The recording car, a Ford Fusion: length, width and height of its box in the sensor logs, metres.

@@ -19,9 +19,8 @@ from jaxtyping import Float64
 
 from drivax.datasets import parsing
 from drivax.datasets.nuplan.sqlite import Database, Layer, geometries, open_database, read_layer
-from drivax.datasets.parsing import import_extra
 from drivax.datasets.road_edges import Area, road_edges
-from drivax.errors import DataError
+from drivax.errors import DataError, import_extra
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
 

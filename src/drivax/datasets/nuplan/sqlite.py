@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.datasets.parsing import import_extra
-from drivax.errors import DataError
+from drivax.errors import DataError, import_extra
 
 Array = np.ndarray[Any, Any]
 

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from drivax.datasets.parsing import import_extra
-from drivax.errors import DataError
+from drivax.errors import DataError, import_extra
 
 #: Feature of drivax' own examples: where the origin of their coordinates lies in the source's map frame.
 ORIGIN = "scenario/origin"

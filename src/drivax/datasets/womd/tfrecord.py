@@ -15,8 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from drivax.datasets.parsing import import_extra
-from drivax.errors import DataError
+from drivax.errors import DataError, import_extra
 
 _Array = np.ndarray[Any, Any]
 

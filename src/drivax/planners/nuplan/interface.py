@@ -15,6 +15,7 @@ from drivax.planners.nuplan.poses import (
     DevkitObject,
     OrientedBox,
     Point2D,
+    Sized,
     StateSE2,
     StateVector2D,
     TimePoint,
@@ -85,22 +86,12 @@ STATUS_OF_LIGHT = {
 
 
 @dataclass(frozen=True)
-class VehicleParameters(DevkitObject):
+class VehicleParameters(Sized):
     """Ego's dimensions, in nuPlan's proportions (5.176 m long, 1.461 m from rear axle to centre, wheelbase 3.089 m)."""
 
     length: float
     width: float
     height: float
-
-    @property
-    def half_length(self) -> float:
-        """Half the length."""
-        return self.length / 2
-
-    @property
-    def half_width(self) -> float:
-        """Half the width."""
-        return self.width / 2
 
     @property
     def rear_axle_to_center(self) -> float:

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.errors import did_you_mean
+from drivax.errors import did_you_mean, import_extra
 from drivax.geometry.polylines import arc_lengths, headings, left_normals, project
 from drivax.geometry.vectors import wrap
-from drivax.planners.nuplan.poses import DevkitObject, StateSE2, shapely
+from drivax.planners.nuplan.poses import DevkitObject, StateSE2
 from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M
 from drivax.scenario.roadblocks import lane_lines, roadblocks
 from drivax.scenario.schema import Scenario
@@ -59,7 +59,7 @@ class Polyline(DevkitObject):
     @cached_property
     def linestring(self) -> Any:
         """The line as shapely has it."""
-        return shapely().LineString(self.points)
+        return import_extra("shapely").LineString(self.points)
 
     @cached_property
     def discrete_path(self) -> list[StateSE2]:
@@ -229,7 +229,7 @@ class Area:
     @cached_property
     def polygon(self) -> Any:
         """The strips of all lanes as shapely has them."""
-        return shapely().unary_union([lane.polygon for lane in self.interior_edges])
+        return import_extra("shapely").unary_union([lane.polygon for lane in self.interior_edges])
 
     def contains_point(self, point: Any) -> bool:
         """Return whether a point is on one of the lanes."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.errors import missing_package
+from drivax.errors import import_extra
 from drivax.scenario.schema import DT_S
 
 #: Steps of history that planners get, as in nuPlan's simulation (2 s); time counts from so long before the log.
@@ -194,14 +194,11 @@ def _microseconds(time: Any) -> int:
 _POINTS = dict(enumerate(((1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0), (0, 1), (0, -1)), 1))
 
 
-@dataclass(frozen=True)
-class OrientedBox(DevkitObject):
-    """A box around its centre."""
+class Sized(DevkitObject):
+    """Half sizes of what has a length and a width."""
 
-    center: StateSE2
     length: float
     width: float
-    height: float
 
     @property
     def half_length(self) -> float:
@@ -212,6 +209,16 @@ class OrientedBox(DevkitObject):
     def half_width(self) -> float:
         """Half the width."""
         return self.width / 2
+
+
+@dataclass(frozen=True)
+class OrientedBox(Sized):
+    """A box around its centre."""
+
+    center: StateSE2
+    length: float
+    width: float
+    height: float
 
     @property
     def half_height(self) -> float:
@@ -230,17 +237,4 @@ class OrientedBox(DevkitObject):
     @cached_property
     def geometry(self) -> Any:
         """The box as a polygon of shapely."""
-        return shapely().Polygon([tuple(corner) for corner in self.all_corners()])
-
-
-def shapely() -> Any:
-    """Return the package shapely.
-
-    Raises:
-        UsageError: It is not installed.
-    """
-    try:
-        import shapely as package
-    except ModuleNotFoundError as error:
-        raise missing_package(error) or error from error
-    return package
+        return import_extra("shapely").Polygon([tuple(corner) for corner in self.all_corners()])
