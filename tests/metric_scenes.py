@@ -459,7 +459,7 @@ def _ends_of_the_map():
         lanes_only(short, right, left), None, {"offroad": 0, "left_map": 1, "accuracy": 1}
     )  # fmt: skip
     # Never on the road, and 1 m outside the widened box.
-    yield "beside the map from the start", Scene(
+    yield "off the map from the start", Scene(
         lanes_only(straight_road([EGO]), right), shifted_left(-7.0),
         {"offroad": 1, "offroad_step": 11, "left_map": 1, "accuracy": 0},
     )  # fmt: skip

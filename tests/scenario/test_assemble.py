@@ -236,17 +236,17 @@ def city(x):
 
 def test_overflow_and_flags_do_not_speak_of_the_city_outside_the_crop():
     """The crop ends 100 m ahead of the log, at x = 180 m."""
-    beside, near = (
+    outside, inside = (
         assemble(
             replace(busy_recording(straight_road()), features=(*straight_road(), *features), lights=lights)
         )
         for features, lights in (city(400.0), city(120.0))
     )
-    assert beside.overflow == {} and beside.source.map_features["lane"] == 9
+    assert outside.overflow == {} and outside.source.map_features["lane"] == 9
     of_city = Flag.OVERFLOW | Flag.ELEVATION | Flag.DEFAULT_LIMITS | Flag.LANE_GRAPH
-    assert not beside.has & of_city
-    assert near.overflow == {"lane_links": 2, "lights_without_lane": 40, "stops": 1}
-    assert near.has & of_city == of_city
+    assert not outside.has & of_city
+    assert inside.overflow == {"lane_links": 2, "lights_without_lane": 40, "stops": 1}
+    assert inside.has & of_city == of_city
 
 
 def test_default_sizes_speak_of_stored_agents():
