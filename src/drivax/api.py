@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from drivax.curation.methods import Request
-from drivax.curation.methods import curate as curate_set
-from drivax.curation.scores import ScoreTable
-from drivax.datasets.conversion import Conversion, Converted
-from drivax.datasets.conversion import convert as convert_set
+# Packages import their modules on first use, so that a command loads no more than it needs.
+from drivax import curation, datasets, learning, synthetic
 from drivax.errors import UsageError
 from drivax.evaluation import runner
 from drivax.evaluation.audit import audit, scenario_names
@@ -20,7 +17,6 @@ from drivax.evaluation.comparison import compare as compare_evaluations
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.plan import ComparisonPlan
 from drivax.evaluation.runner import with_metrics
-from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.catalogue import PLANNERS, as_planner, default_task, make_planner
 from drivax.planners.planner import Planner
 from drivax.plugins import is_dotted
@@ -30,9 +26,8 @@ from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import Start
+from drivax.simulator.traffic.reactive import TRAFFIC, make_traffic
 from drivax.simulator.types import Traffic
-from drivax.synthetic.generate import Generation
-from drivax.synthetic.generate import generate as generate_set
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import is_policy, run_and_step, zoo
 
@@ -94,11 +89,14 @@ def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> 
             ``zoo:NAME``), or a traffic object. All but ``log`` may need a prepared bank:
             ``bank = simulator.traffic.bank_data.prepare_bank(simulator.traffic, bank)``.
     """
-    return Simulator(task or Task(), _traffic(traffic))
+    return Simulator(task or Task(), as_traffic(traffic))
 
 
-def _traffic(traffic: str | Traffic) -> Traffic:
-    return find_traffic(traffic) if isinstance(traffic, str) else traffic
+def as_traffic(traffic: str | Traffic) -> Traffic:
+    """Return the traffic of a name (:func:`make_simulator`); a traffic object stays as it is."""
+    if not isinstance(traffic, str):
+        return traffic
+    return make_traffic(traffic) if traffic in TRAFFIC else learning.find_traffic(traffic)
 
 
 def evaluate(
@@ -128,7 +126,7 @@ def evaluate(
         planner,
         data.scenarios if isinstance(data, Loaded) else ScenarioSet.open(data),
         task=with_metrics(task or default_task(planner), tuple(metrics)),
-        traffic=_traffic(traffic),
+        traffic=as_traffic(traffic),
         start=start,
         sizes=loaded.sizes,
         **options,
@@ -158,11 +156,11 @@ def find_planner(
         raise UsageError(f"unknown planner {name!r}", cure=f"use {', '.join(kinds)}")
     if task is not None:
         raise UsageError(f"trained policy {name!r} has its own task", cure="leave out --task (task=)")
-    return load_policy(folder, bank, step=step, samples=sample)
+    return learning.load_policy(folder, bank, step=step, samples=sample)
 
 
 def generate(
-    out: str | Path, scenarios: int = 256, seed: int = 0, *, options: Generation | None = None
+    out: str | Path, scenarios: int = 256, seed: int = 0, *, options: synthetic.Generation | None = None
 ) -> ScenarioSet:
     """Generate a scenario set of the built-in world, audited, and open it.
 
@@ -175,10 +173,12 @@ def generate(
     Raises:
         UsageError: ``out`` exists, or an option is impossible.
     """
+    from drivax.synthetic.generate import generate as generate_set
+
     return ScenarioSet.open(generate_set(out, scenarios, seed, options, audit=audit).path)
 
 
-def convert(src: str | Path, out: str | Path, **options: Any) -> Converted:
+def convert(src: str | Path, out: str | Path, **options: Any) -> datasets.Converted:
     """Convert recordings of a public data set to a scenario set, audited.
 
     Args:
@@ -190,7 +190,7 @@ def convert(src: str | Path, out: str | Path, **options: Any) -> Converted:
         DataError: ``src`` holds nothing that can be converted.
         UsageError: ``out`` exists, an option is impossible, or a package is missing.
     """
-    return convert_set(src, out, Conversion(**options), audit=audit)
+    return datasets.convert(src, out, datasets.Conversion(**options), audit=audit)
 
 
 def compare(
@@ -216,7 +216,7 @@ def compare(
     return compare_evaluations(plan, first, second, entries)
 
 
-def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> ScoreTable:
+def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> curation.ScoreTable:
     """Score how critical each step and scenario of a set is.
 
     Args:
@@ -229,4 +229,4 @@ def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> Score
         UsageError: Unknown method or impossible settings.
     """
     scenarios = data if isinstance(data, ScenarioSet) else ScenarioSet.open(data)
-    return curate_set(method, Request(scenarios, **options))
+    return curation.curate(method, curation.Request(scenarios, **options))

@@ -19,9 +19,9 @@ from dataclasses import dataclass, fields
 from functools import partial
 from importlib import metadata
 from inspect import getdoc
-from pathlib import Path
 from typing import Any, TypeVar
 
+from drivax.compilation import report_compilation, use_compilation_cache
 from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
 
 
@@ -93,10 +93,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 failed, 2 usage, 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    debug = "--debug" in arguments
-    arguments = [argument for argument in arguments if argument != "--debug"]
+    debug, cached = "--debug" in arguments, "--no-cache" not in arguments
+    arguments = [argument for argument in arguments if argument not in ("--debug", "--no-cache")]
     try:
-        status = _dispatch(arguments)
+        status = _dispatch(arguments, cached)
         sys.stdout.flush()
     except SystemExit as stop:  # tyro's --help (0) and its usage errors (2)
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
@@ -140,11 +140,12 @@ def overview() -> str:
             *rows,
             "",
             "  --version  print the version      --debug  show the traceback of an error",
+            "  --no-cache  compile all programs again, and store none",
         )
     )
 
 
-def _dispatch(arguments: list[str]) -> int:
+def _dispatch(arguments: list[str], cached: bool) -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(overview())
         return 0
@@ -157,16 +158,16 @@ def _dispatch(arguments: list[str]) -> int:
         raise UsageError(
             f"unknown {kind} {name!r}", cure=did_you_mean(name, COMMANDS, otherwise="see drivax --help")
         )
-    return _run(name, COMMANDS[name], rest)
+    return _run(name, COMMANDS[name], rest, cached)
 
 
-def _run(name: str, command: Command, arguments: list[str]) -> int:
+def _run(name: str, command: Command, arguments: list[str], cached: bool) -> int:
     import tyro
 
-    # Most of a short command's time is compilation, so compiled programs are kept.
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "drivax" / "jax"))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    cache = use_compilation_cache() if cached else None
     module = importlib.import_module(command.module)
+    if cache and "jax" in sys.modules:
+        report_compilation(partial(print, file=sys.stderr, flush=True))
     config = getattr(module, command.config)
     parse: Any = partial(tyro.cli, return_unknown_args=True) if command.overrides else tyro.cli
     parsed = parse(

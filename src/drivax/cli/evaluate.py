@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from drivax import settings
-from drivax.api import find_planner, load
+from drivax.api import as_traffic, find_planner, load
 from drivax.cli import judge, record_of
 from drivax.errors import UsageError, did_you_mean, import_extra
 from drivax.evaluation.runner import (
@@ -20,7 +20,6 @@ from drivax.evaluation.runner import (
     format_summary,
     run_evaluation,
 )
-from drivax.learning.policies import find_traffic
 from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.store import ScenarioSet
@@ -64,7 +63,7 @@ class Evaluate(EvaluationConfig):  # noqa: D101
 def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     """Evaluate, then print the headline metrics and crashes."""
     # Check names before the evaluation starts.
-    traffic = find_traffic(args.traffic)
+    traffic = as_traffic(args.traffic)
     metrics = tuple(name for name in args.metrics if name != _DEVKIT)
     select_metrics(metrics)
     if _DEVKIT in args.metrics:

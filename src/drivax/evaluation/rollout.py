@@ -23,7 +23,7 @@ from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.log import LogTraffic
-from drivax.simulator.types import SimState
+from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.task import Task
 
 #: Number folded into the key of an episode to draw its start.
@@ -57,6 +57,27 @@ class Episodes:
     crashed: Int[Array, "*batch"]
 
 
+@record
+class _Loop:
+    """An episode between two steps; ``measured`` stays at the last state before a non-finite action."""
+
+    state: SimState
+    measured: SimState
+    carry: Any
+    is_finite: Bool[Array, ""]
+
+
+@record
+class _StepOutput:
+    """What :class:`Episodes` keeps of a step."""
+
+    motion: Float[Array, "4"]
+    action: Float[Array, " D"]
+    offroad: Bool[Array, ""]
+    is_finite: Bool[Array, ""]
+    others: Int16[Array, "A 3"] | None
+
+
 def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Array:
     """Return a random key for each scenario; it depends on the seed and the scenario's identity, not on its row."""
     return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), bank.identity[index])
@@ -84,49 +105,63 @@ def drive(
 
     The task's episodes must not end early (:func:`evaluation_task`); ``slot`` is the driven agent.
     """
-    episode = partial(_episode, simulator, planner, bank, start_step, slot)
-    return jax.vmap(episode)(index, keys)
+    step = partial(_step, simulator, planner, bank)
+    first, step_keys = jax.vmap(partial(_start, simulator, planner, bank, start_step, slot))(index, keys)
+    # A mapped step inside the loop: to map the loop itself, JAX traces its body several times.
+    last, outputs = jax.lax.scan(lambda loop, key: jax.vmap(step)(loop, key), first, step_keys.T)
+    outputs = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), outputs)
+    return jax.vmap(partial(_outcome, simulator.traffic, bank, start_step))(first, last, outputs)
 
 
-def _episode(
+def _start(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, start_step: int, slot: Any, index: Array, key: Array
-) -> Episodes:  # fmt: skip
+) -> tuple[_Loop, Array]:  # fmt: skip
+    """Reset one episode; return also a key for each of its steps."""
     state = simulator.reset(bank, index, start_step, slot, jax.random.fold_in(key, _START_STREAM))
-    begin_key, key = jax.random.split(key)
-    carry = planner.init(bank, state, begin_key)
+    planner_key, key = jax.random.split(key)
+    loop = _Loop(state, state, planner.init(bank, state, planner_key), jnp.ones((), bool))
+    return loop, jax.random.split(key, bank.steps - 1 - start_step)
 
-    def others(state: SimState) -> Int16[Array, "A 3"] | None:
-        traffic = simulator.traffic
-        return None if traffic.name == LogTraffic.name else pack_poses(traffic.agents(bank, state.context, 0))
 
-    def step(loop_state: Any, key: Array) -> Any:
-        state, measured, carry, is_finite = loop_state
-        # A log that is shorter than others of its bank ends earlier: its last state stays.
-        ended = state.context.step >= bank.last_step[index]
-        after, carry, finite = advance(simulator, planner, bank, state, carry, key)
-        state = jax.tree.map(partial(jnp.where, ended), state, after)
-        is_finite &= finite | ended
-        measured = state if planner.replays else jax.tree.map(partial(jnp.where, is_finite), state, measured)
-        context, offroad = measured.context, is_finite & ~ended & state.facts.offroad
-        outputs = context.history[-1], context.action, offroad, is_finite, others(state)
-        return (state, measured, carry, is_finite), outputs
+def _step(
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, loop: _Loop, key: Array
+) -> tuple[_Loop, _StepOutput]:
+    """Advance one episode; after the last step of its log, its state stays."""
+    state, context = loop.state, loop.state.context
+    over = context.step >= bank.last_step[context.index]
+    after, carry, finite = advance(simulator, planner, bank, state, loop.carry, key)
+    state = jax.tree.map(partial(jnp.where, over), state, after)
+    is_finite = loop.is_finite & (finite | over)
+    measured = loop.measured
+    measured = state if planner.replays else jax.tree.map(partial(jnp.where, is_finite), state, measured)
+    context, offroad = measured.context, is_finite & ~over & state.facts.offroad
+    others = _others(simulator.traffic, bank, state)
+    output = _StepOutput(context.history[-1], context.action, offroad, is_finite, others)
+    return _Loop(state, measured, carry, is_finite), output
 
-    keys = jax.random.split(key, bank.steps - 1 - start_step)
-    first = (state, state, carry, jnp.ones((), bool))
-    (last, final, _, _), (motion, actions, offroad, is_finite, later_others) = jax.lax.scan(step, first, keys)
-    others_first = others(state)
-    metrics, uncut_metrics = episode_metrics(bank, final), episode_metrics(bank, last)
+
+def _others(traffic: Traffic, bank: ScenarioBank, state: SimState) -> Int16[Array, "A 3"] | None:
+    """Return packed poses of the other agents; None in log traffic."""
+    return None if traffic.name == LogTraffic.name else pack_poses(traffic.agents(bank, state.context, 0))
+
+
+def _outcome(
+    traffic: Traffic, bank: ScenarioBank, start_step: int, first: _Loop, last: _Loop, steps: _StepOutput
+) -> Episodes:
+    """Return the outcome of one episode from its first and last state and the outputs of its steps."""
+    metrics, uncut_metrics = episode_metrics(bank, last.measured), episode_metrics(bank, last.state)
     # Whether a metric is defined must not depend on when the planner crashed.
     names = [name for name in FAILED if name in metrics]
     failed = {name: replace(metrics[name], defined=uncut_metrics[name].defined) for name in names}
+    first_others = _others(traffic, bank, first.state)
     return Episodes(
         metrics=metrics | failed,
-        events=event_steps(final.episode),
-        motion=jnp.concatenate([state.context.history[-1][None], motion]),
-        actions=actions,
-        others=None if others_first is None else jnp.concatenate([others_first[None], later_others]),
-        offroad_steps=offroad.sum().astype(jnp.int32),
-        crashed=jnp.where(is_finite.all(), -1, start_step + jnp.argmin(is_finite)),
+        events=event_steps(last.measured.episode),
+        motion=jnp.concatenate([first.state.context.history[-1][None], steps.motion]),
+        actions=steps.action,
+        others=None if first_others is None else jnp.concatenate([first_others[None], steps.others]),
+        offroad_steps=steps.offroad.sum().astype(jnp.int32),
+        crashed=jnp.where(steps.is_finite.all(), -1, start_step + jnp.argmin(steps.is_finite)),
     )
 
 

@@ -16,7 +16,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import nnx
 from jaxtyping import Array
 
 from drivax.planners.planner import Memoryless
@@ -115,6 +114,9 @@ class NetworkPlanner(Memoryless):
 
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
         """Return the policy's action for the observation."""
+        # Flax takes longer to import than the rest of this package; most planners have no network.
+        from flax import nnx
+
         distribution = nnx.merge(self.graph, self.parameters)(observation)
         return distribution.action(distribution.sample(key)) if self.samples else distribution.mode()
 

@@ -1,0 +1,124 @@
+"""The cache of compiled programs on disk: a command that ran before starts without compiling.
+
+JAX stores each compiled program under a key of the program itself, its options and the version of jaxlib; this module
+chooses the folder. A folder belongs to one version of jaxlib and one kind of processor. Its entries are machine code:
+only the user may read and write them, and no folder of another user is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+
+#: Compilation of one program takes this long before it is reported (s).
+_PATIENCE_S = 2.0
+#: Programs that compile faster are not stored (s): reading them takes as long.
+_LEAST_COMPILE_S = 0.1
+#: Largest total size of the cache, and the age from which a file is complete (another process may be writing it).
+_MAX_BYTES, _SETTLED_S = 2 << 30, 600.0
+
+
+def use_compilation_cache(folder: str | Path | None = None, *, max_bytes: int = _MAX_BYTES) -> Path | None:
+    """Store compiled programs on disk, and read those that are there; call it before the first computation.
+
+    Every command does so unless it gets ``--no-cache``. Processes may share the folder. At most ``max_bytes`` stay:
+    the least recently used programs are deleted here. JAX warns of a damaged entry and compiles again.
+
+    Args:
+        folder: Folder of the cache; ``$XDG_CACHE_HOME/drivax`` or ``~/.cache/drivax`` by default. It is created with
+            mode 0700.
+        max_bytes: Largest total size of the cache.
+
+    Returns:
+        The folder of this version and processor; None if it cannot be used (read-only, or owned by another user) or
+        if ``JAX_COMPILATION_CACHE_DIR`` is set, which JAX itself follows.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return None
+    top = _default_folder() if folder is None else Path(folder)
+    programs = top / f"jax-{metadata.version('jaxlib')}-{_processor()}"
+    try:
+        top.mkdir(0o700, parents=True, exist_ok=True)
+        _prune(top, max_bytes)
+        programs.mkdir(0o700, exist_ok=True)
+        for private in (top, programs):
+            if private.stat().st_uid != os.getuid():
+                return None
+            private.chmod(0o700)
+    except OSError:
+        return None
+    # JAX may not have been imported yet: the environment reaches it, and the processes that this one starts.
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(programs)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_LEAST_COMPILE_S))
+    if jax := sys.modules.get("jax"):
+        jax.config.update("jax_compilation_cache_dir", str(programs))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST_COMPILE_S)
+    return programs
+
+
+def report_compilation(report: Callable[[str], None]) -> None:
+    """Report once, in one line, that a program that is not in the cache takes long to compile."""
+    import jax
+
+    reported = threading.Event()
+    waiting: list[threading.Timer] = []
+
+    def start(event: str, **_: object) -> None:
+        if event == "/jax/compilation_cache/compile_requests_use_cache":
+            waiting.append(threading.Timer(_PATIENCE_S, report_once))
+            waiting[-1].daemon = True
+            waiting[-1].start()
+
+    def stop(event: str, duration: float, **_: object) -> None:
+        if event == "/jax/core/compile/backend_compile_duration" and waiting:
+            waiting.pop().cancel()
+
+    def report_once() -> None:
+        if not reported.is_set():
+            reported.set()
+            report("compiling (the first time only; may take half a minute)")
+
+    jax.monitoring.register_event_listener(start)
+    jax.monitoring.register_event_duration_secs_listener(stop)
+
+
+def _default_folder() -> Path:
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (base if base.is_absolute() else Path.home() / ".cache") / "drivax"
+
+
+def _processor() -> str:
+    """Return eight hexadecimal digits of the processor's kind: XLA compiles for the instructions that it has."""
+    kind = f"{platform.machine()} {platform.processor()}"
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+        kind += " ".join(
+            sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
+        )
+    return hashlib.sha256(kind.encode()).hexdigest()[:8]
+
+
+def _prune(top: Path, max_bytes: int) -> None:
+    """Delete the least recently used files of all versions until the rest fits in ``max_bytes``."""
+    files = []
+    for path in top.glob("jax-*/*"):
+        with suppress(OSError):  # another process deletes as well
+            status = path.stat()
+            files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+    total = sum(size for _, size, _ in files)
+    for used_s, size, path in sorted(files):
+        if total <= max_bytes or used_s > time.time() - _SETTLED_S:
+            break
+        path.unlink(missing_ok=True)
+        total -= size
+    for version in top.glob("jax-*"):
+        with suppress(OSError):  # not empty, or in use
+            version.rmdir()
