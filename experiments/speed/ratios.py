@@ -1,0 +1,372 @@
+"""Time this tree against another, by turns, in one run; the ratios go into the page on speed.
+
+    git worktree add ../before COMMIT
+    python -m experiments.speed.ratios --data SET --against ../before [--only NAME ...] [--write]
+
+SET has at least 1,024 scenarios. Each tree runs in processes of its own. A repeated measurement keeps one process per
+tree alive, runs both by turns, and quotes the median of the ratios of neighbouring runs; the first run of each, which
+compiles, does not count. A command is started anew, with an empty compilation cache (``first``) or with that of an
+earlier run (``again``). Nothing else may run on the machine. Each row has the time of a fixed program and the load
+before and after it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from drivax.files import write_json
+from drivax.tracking.run_folder import versions
+from experiments.repository import DOCS, RESULTS, ROOT
+from experiments.speed.simulator import machine_ms
+
+RESULT = RESULTS / "speed_ratios.json"
+PAGE = DOCS / "results" / "speed.md"
+BEGIN, END = "<!-- ratios.py: begin -->", "<!-- ratios.py: end -->"
+
+#: Setup that several programs share: the first scenarios of the set, as a bank.
+_BANK = """
+import jax
+from drivax.evaluation.audit import scenario_names
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+stored = ScenarioSet.open(DATA)
+def first(count):
+    return [stored[row] for row in range(count)]
+"""
+_TRAINING = (
+    _BANK
+    + """
+from drivax import settings
+from drivax.learning.config import TrainConfig
+from drivax.learning.program import Program, Seeds
+from drivax.simulator.traffic.log import LogTraffic
+def trainer(preset, *overrides):
+    config = settings.load(TrainConfig, preset, list(overrides))
+    bank = ScenarioBank.from_scenarios(first(1024))
+    learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
+    program = Program(Seeds(learner, (0,)), bank, config.devices)
+    state = [program.initial_state()]
+    def call():
+        state[0], logs = program.step(state[0])
+        jax.block_until_ready((state[0], logs))
+        return config.algorithm.steps_per_iteration
+    return call
+"""
+)
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """A program that defines ``call()``, which returns the amount of work that it did."""
+
+    unit: str
+    program: str
+    goal: str
+    warm_up: int = 1
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the command line, timed to its end, or to the first line of a file."""
+
+    words: Sequence[str]
+    until: str | None
+    goal: str
+
+
+_EVALUATE = ("evaluate", "--planner", "idm", "--data", "DATA", "--limit", "4", "--out", "OUT")
+_TRAIN = ("train", "ppo", "--data", "DATA", "--out", "OUT")
+#: What is timed, with the goal: what must be reached, and the aim in parentheses.
+MEASUREMENTS: dict[str, Repeated | Command] = {
+    "PPO training": Repeated("steps/s", _TRAINING + "call = trainer('ppo')", "1.4 x (1.8 x)"),
+    # Updates begin after 512 steps instead of 10,000.
+    "SAC training": Repeated(
+        "steps/s",
+        _TRAINING + "call = trainer('sac', '--algorithm.warm_up', '512')",
+        "1.2 x (1.5 x)",
+        warm_up=3,
+    ),
+    "simulator, full, log": Repeated(
+        "steps/s",
+        """
+from drivax.studies import bench
+bench.use_all_cores()
+"""
+        + _BANK
+        + """
+program = bench.compile_program(ScenarioBank.from_scenarios(first(1024)), bench.BenchConfig())
+def call():
+    jax.block_until_ready(program.run())
+    return program.steps
+""",
+        "1.1 x (1.3 x)",
+    ),
+    "PDM-Closed evaluation": Repeated(
+        "scenarios/s",
+        _BANK
+        + """
+from drivax.evaluation.runner import evaluate
+from drivax.planners.catalogue import make_planner
+scenarios = first(64)
+bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
+planner = make_planner("pdm", None)
+def call():
+    return len(evaluate(planner, bank, names))
+""",
+        "3 x (10 x)",
+    ),
+    "generation, one core": Repeated(
+        "scenarios/s",
+        """
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.schema import CAPACITIES
+from drivax.synthetic.world import WorldConfig, generate_one
+index = [0]
+def call():
+    for _ in range(4):
+        assemble(generate_one(5, index[0], WorldConfig()).recording, CAPACITIES["default"])
+        index[0] += 1
+    return 4
+""",
+        "2 x (4 x)",
+    ),
+    "bank building": Repeated(
+        "scenarios/s",
+        _BANK
+        + """
+scenarios = first(1024)
+def call():
+    jax.block_until_ready(ScenarioBank.from_scenarios(scenarios))
+    return len(scenarios)
+""",
+        "2,000/s (5,000/s)",
+    ),
+    "evaluate, 4 scenarios, first": Command(_EVALUATE, None, "12 s (8 s)"),
+    "evaluate, 4 scenarios, again": Command(_EVALUATE, None, "5 s (3 s)"),
+    "train to its first iteration, first": Command(_TRAIN, "metrics.jsonl", ""),
+    "train to its first iteration, again": Command(_TRAIN, "metrics.jsonl", "15 s (8 s)"),
+}
+#: Runs what it was given for each line of input; prints the work done and the seconds.
+_LOOP = """
+import sys, time
+for line in sys.stdin:
+    begin = time.perf_counter()
+    work = call()
+    print("done", work, time.perf_counter() - begin, flush=True)
+"""
+
+
+def environment(tree: Path, **variables: str) -> dict[str, str]:
+    """Environment of a process of a tree."""
+    return {**os.environ, "PYTHONPATH": str(tree / "src"), "JAX_PLATFORMS": "cpu", **variables}
+
+
+class Worker:
+    """A process of a tree that runs a program again and again."""
+
+    def __init__(self, tree: Path, program: str, data: Path, cache: str) -> None:
+        command = [sys.executable, "-c", f"DATA = {str(data)!r}\n{program}\n{_LOOP}"]
+        self._process = subprocess.Popen(
+            command,
+            env=environment(tree, JAX_COMPILATION_CACHE_DIR=cache),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def run(self) -> float:
+        """Run once and return work per second.
+
+        Raises:
+            SystemExit: The program failed.
+        """
+        source, target = self._process.stdout, self._process.stdin
+        assert source is not None and target is not None
+        print("run", file=target, flush=True)
+        for line in source:
+            if line.startswith("done "):
+                _, work, seconds = line.split()
+                return float(work) / float(seconds)
+        raise SystemExit("the timed program failed")
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def repeated(measurement: Repeated, trees: Sequence[Path], data: Path, repeats: int) -> dict[str, Any]:
+    """Work per second of both trees, by turns; medians."""
+    with tempfile.TemporaryDirectory() as cache:
+        workers = [Worker(tree, measurement.program, data, f"{cache}/{k}") for k, tree in enumerate(trees)]
+        for worker in workers:
+            for _ in range(measurement.warm_up):
+                worker.run()
+        pairs = []
+        for turn in range(repeats):
+            order = (0, 1) if turn % 2 == 0 else (1, 0)
+            speeds = {k: workers[k].run() for k in order}
+            pairs.append((speeds[0], speeds[1]))
+        for worker in workers:
+            worker.close()
+    before, after = (statistics.median(side) for side in zip(*pairs, strict=True))
+    ratios = [after / before for before, after in pairs]
+    return {
+        "unit": measurement.unit,
+        "before": round(before, 3 if before < 100 else 0),
+        "after": round(after, 3 if after < 100 else 0),
+        "ratio": round(statistics.median(ratios), 2),
+        "smallest": round(min(ratios), 2),
+        "largest": round(max(ratios), 2),
+    }
+
+
+def command_seconds(command: Command, tree: Path, data: Path, folder: Path, cache: Path) -> float:
+    """Seconds to the end of a command, or to the first line of its file ``until``."""
+    out = Path(tempfile.mkdtemp(dir=folder)) / "out"
+    words = [{"DATA": str(data), "OUT": str(out)}.get(word, word) for word in command.words]
+    begin = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "drivax", *words],
+        env=environment(tree, JAX_COMPILATION_CACHE_DIR=str(cache)),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    while process.poll() is None:
+        log = out / (command.until or "")
+        if command.until and log.is_file() and log.stat().st_size:
+            break
+        time.sleep(0.02)
+    seconds = time.perf_counter() - begin
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+    elif process.returncode:
+        raise SystemExit(f"failed: drivax {' '.join(words)}")
+    return seconds
+
+
+def timed_command(
+    name: str, command: Command, trees: Sequence[Path], data: Path, repeats: int
+) -> dict[str, Any]:
+    """Seconds of a command of both trees, by turns; medians."""
+    pairs = []
+    with tempfile.TemporaryDirectory() as top:
+        folder = Path(top)
+        for turn in range(repeats + 1):
+            kept = not name.endswith("first")
+            caches = [folder / f"cache-{k}{'' if kept else f'-{turn}'}" for k in (0, 1)]
+            seconds = [
+                command_seconds(command, tree, data, folder, cache)
+                for tree, cache in zip(trees, caches, strict=True)
+            ]
+            # The first turn fills the caches, and the page cache.
+            if turn or not kept:
+                pairs.append((seconds[0], seconds[1]))
+    before, after = (statistics.median(side) for side in zip(*pairs, strict=True))
+    return {
+        "unit": "s",
+        "before": round(before, 1),
+        "after": round(after, 1),
+        "ratio": round(statistics.median([before / after for before, after in pairs]), 2),
+    }
+
+
+def measure(names: Sequence[str], trees: Sequence[Path], data: Path, repeats: int) -> dict[str, Any]:
+    """Return a row for each measurement, with the machine's speed and load."""
+    rows = {}
+    for name in names:
+        measurement = MEASUREMENTS[name]
+        machine = [round(machine_ms(), 1)]
+        load = [round(os.getloadavg()[0], 1)]
+        if isinstance(measurement, Repeated):
+            row = repeated(measurement, trees, data, repeats)
+        else:
+            row = timed_command(name, measurement, trees, data, max(1, repeats // 3))
+        machine.append(round(machine_ms(), 1))
+        row |= {"machine_ms": machine, "load": [*load, round(os.getloadavg()[0], 1)]}
+        row["when"] = datetime.now(UTC).isoformat(timespec="minutes")
+        rows[name] = row
+        print(f"{name}: {json.dumps(row)}", flush=True)
+    return rows
+
+
+def processor() -> str:
+    """Name of the processor, and the number of cores that this process may use."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    name = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "unknown")
+    return f"{name}, {len(os.sched_getaffinity(0))} cores"
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """Return the Markdown table of stored ratios."""
+    lines = [
+        "| what | ratio | goal (aim) | before | after | unit | fixed program (ms) | load |",
+        "|---|---:|---|---:|---:|---|---|---|",
+    ]
+    for name, row in result["rows"].items():
+        machine, load = (f"{row[key][0]} to {row[key][1]}" for key in ("machine_ms", "load"))
+        lines.append(
+            f"| {name} | {row['ratio']} | {MEASUREMENTS[name].goal} | {row['before']:,} "
+            f"| {row['after']:,} | {row['unit']} | {machine} | {load} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure, print, and with ``--write`` store the result and the table of the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--against", type=Path, help="root of the other tree")
+    parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=tuple(MEASUREMENTS))
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--write", action="store_true", help="store the rows; others stay")
+    parser.add_argument("--table", action="store_true", help="write the stored rows into the page")
+    args = parser.parse_args()
+    if not args.table:
+        trees = (args.against.resolve(), ROOT)
+        rows = measure(args.only, trees, args.data.resolve(), args.repeats)
+        if args.write:
+            stored = json.loads(RESULT.read_text())["rows"] if RESULT.exists() else {}
+            stored |= rows
+            commits = [
+                subprocess.run(
+                    ["git", "-C", str(tree), "rev-parse", "--short=7", "HEAD"],
+                    check=True,
+                    capture_output=True,
+                    text=True,
+                ).stdout.strip()
+                for tree in trees
+            ]
+            result = {
+                "command": "python -m experiments.speed.ratios --data SET --against TREE --write",
+                "commits": {"before": commits[0], "after": commits[1]},
+                "processor": processor(),
+                "rows": {name: stored[name] for name in MEASUREMENTS if name in stored},
+                "versions": versions(),
+            }
+            write_json(RESULT, result)
+    if args.write or args.table:
+        text = PAGE.read_text()
+        before, rest = text.split(BEGIN)
+        inserted = f"{BEGIN}\n\n{table(json.loads(RESULT.read_text()))}\n\n{END}"
+        PAGE.write_text(before + inserted + rest.split(END)[1])
+
+
+if __name__ == "__main__":
+    main()
