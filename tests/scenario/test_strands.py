@@ -21,7 +21,7 @@ def codes(*features, path=None):
     tracks = make_tracks([driving() if path is None else path])
     scenario = assemble(make_recording(features, tracks), SMALL)
     assert not scenario.overflow
-    table, ids = lane_strands(scenario), scenario.lane_id
+    table, ids = lane_strands([scenario.record])[0], scenario.lane_id
     used = scenario.lane_length > 0
     assert (table[~used] == [-1, -1, -1, -1, NOWHERE_M, NOWHERE_M]).all()
     named = {}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import enum
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any
@@ -248,6 +249,14 @@ def record_dtype(capacity: Capacity) -> np.dtype[Any]:
         end = offsets[-1] + np.dtype(form).itemsize
     names, formats, itemsize = list(fields), list(fields.values()), -(-end // 4096) * 4096
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
+
+
+def stack_field(records: Sequence[np.ndarray[Any, Any]], name: str, *part: Any) -> np.ndarray[Any, Any]:
+    """Stack a field of some records, or the same part of it, along a new first axis."""
+    values = [record[name][part] for record in records]
+    if not values[0].ndim:
+        return np.array(values)
+    return np.concatenate(values).reshape(len(values), *values[0].shape)  # faster than np.stack
 
 
 @dataclass(frozen=True)
