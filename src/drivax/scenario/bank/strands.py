@@ -165,8 +165,12 @@ class _Segments:
         )
         first = np.repeat(lanes.first, [part.stop - part.start for part in parts])
         known = np.flatnonzero(index >= 0)
-        order = known[np.lexsort((start[known], first[known] + index[known]))]
-        lane = first[order] + index[order]
+        lane = (first[known] + index[known]).astype(np.min_scalar_type(len(lanes.scenario)))
+        # Floats of one sign are ordered as their bits. Whole numbers sort several times faster than np.lexsort.
+        by_start = np.abs(start[known]).view(np.uint32).astype(np.uint64) << 32 | np.arange(len(known), dtype=np.uint64)
+        order = (np.sort(by_start) & 0xFFFFFFFF).astype(np.int64)
+        order = order[np.argsort(lane[order], kind="stable")]
+        lane, order = lane[order], known[order]
         bounds = np.searchsorted(lane, np.arange(len(lanes.scenario) + 1))
         return cls(lane, start[order].astype(float), a[order, :2], b[order, :2], bounds)
 
