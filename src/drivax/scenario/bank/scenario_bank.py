@@ -7,8 +7,10 @@ contiguous read), map segments are feature-major (a grid query is three contiguo
 from __future__ import annotations
 
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from itertools import islice
 from typing import Any
@@ -19,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped, UInt, UInt32
 
 from drivax.errors import DataError, DrivaxError
 from drivax.geometry.vectors import wrap
-from drivax.scenario.bank.columns import RoadLayer, SizeColumn
+from drivax.scenario.bank.columns import AgentColumn, RoadLayer, SizeColumn
 from drivax.scenario.bank.strands import corridor_lanes, lane_strands
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import (
@@ -51,6 +53,8 @@ WORD = 32
 _FAR_M = 1e6
 #: Scenarios that are stacked at a time: their columns fit in the cache of a core.
 _BATCH = 32
+#: Threads that stack; NumPy releases the lock of the interpreter in its loops.
+_THREADS = min(os.cpu_count() or 1, 8)
 #: Alignment of arrays that JAX takes over without a copy, bytes.
 _ALIGNMENT = 64
 #: Layer of a kind of road; the last entry is that of -1.
@@ -271,15 +275,25 @@ def too_short(steps: int) -> str:
 
 def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     """Return the arrays of a bank by name, aligned so that JAX shares their memory."""
-    result: _Arrays = {}
-    for first in range(0, len(scenarios), _BATCH):
-        rows = slice(first, first + _BATCH)
-        for name, values in _stack_batch([scenario.record for scenario in scenarios[rows]], sizes).items():
-            if name not in result:
-                result[name] = _aligned((len(scenarios), *values.shape[1:]), values.dtype)
-            result[name][rows] = values
+    records = [scenario.record for scenario in scenarios]
+    arrays = {
+        name: _aligned((len(records), *values.shape[1:]), values.dtype)
+        for name, values in _stack_batch(records[:1], sizes).items()
+    }
+    arrays["agents"] = _aligned(
+        (len(records), len(scenarios[0].agent_z), sizes.agents, 8), np.dtype(np.float32)
+    )
+
+    def fill(rows: slice) -> None:
+        for agents, log in zip(arrays["agents"][rows], records[rows], strict=True):
+            _fill_agents(agents, log)
+        for name, values in _stack_batch(records[rows], sizes).items():
+            arrays[name][rows] = values
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(fill, (slice(first, first + _BATCH) for first in range(0, len(records), _BATCH))))
     names = [(scenario.text("dataset"), scenario.id) for scenario in scenarios]
-    return result | {"identity": identities(names)}
+    return arrays | {"identity": identities(names)}
 
 
 def _aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray[Any, Any]:
@@ -327,21 +341,28 @@ def _stack_batch(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
     )
 
 
+def _fill_agents(agents: Float[np.ndarray, "time agent 8"], log: _Record) -> None:
+    """Write the moving agents of a record, without copies: most bytes of a bank are theirs."""
+    xy, z, heading, velocity, valid = (
+        log[f"agent_{name}"][:, : agents.shape[1]] for name in ("xy", "z", "heading", "velocity", "valid")
+    )
+    agents[..., AgentColumn.X], agents[..., AgentColumn.Y] = xy[..., 0], xy[..., 1]
+    agents[..., AgentColumn.Z], agents[..., AgentColumn.VALID] = z, valid
+    agents[..., AgentColumn.VX], agents[..., AgentColumn.VY] = velocity[..., 0], velocity[..., 1]
+    np.cos(heading, out=agents[..., AgentColumn.COS])
+    np.sin(heading, out=agents[..., AgentColumn.SIN])
+
+
 def _stack_agents(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
     agents = slice(0, sizes.agents)
-    xy, z, heading, velocity = (
-        stack_field(records, f"agent_{name}", slice(None), agents)
-        for name in ("xy", "z", "heading", "velocity")
-    )
-    valid = stack_field(records, "agent_valid")
-    box = [stack_field(records, f"agent_{name}", agents) for name in ("size", "kind")]
+    size, kind = (stack_field(records, f"agent_{name}", agents) for name in ("size", "kind"))
+    xy, valid = stack_field(records, "agent_xy", slice(None), 0), stack_field(records, "agent_valid")
     return {
-        "agents": _interleave(xy, z, np.cos(heading), np.sin(heading), velocity, valid[:, :, agents]),
         "extension": stack_field(records, "agent_extension", agents),
         "flags": stack_field(records, "flags"),
         "last_step": stack_field(records, "steps").astype(np.int32) - 1,
-        "log_ahead": _log_ahead(xy[:, :, 0], valid[:, :, 0]),
-        **_stack_parked(records, sizes.slots, last_used(valid.any(1)), _interleave(*box)),
+        "log_ahead": _log_ahead(xy, valid[:, :, 0]),
+        **_stack_parked(records, sizes.slots, last_used(valid.any(1)), _interleave(size, kind)),
     }
 
 

@@ -167,7 +167,9 @@ class _Segments:
         known = np.flatnonzero(index >= 0)
         lane = (first[known] + index[known]).astype(np.min_scalar_type(len(lanes.scenario)))
         # Floats of one sign are ordered as their bits. Whole numbers sort several times faster than np.lexsort.
-        by_start = np.abs(start[known]).view(np.uint32).astype(np.uint64) << 32 | np.arange(len(known), dtype=np.uint64)
+        by_start = np.abs(start[known]).view(np.uint32).astype(np.uint64) << 32 | np.arange(
+            len(known), dtype=np.uint64
+        )
         order = (np.sort(by_start) & 0xFFFFFFFF).astype(np.int64)
         order = order[np.argsort(lane[order], kind="stable")]
         lane, order = lane[order], known[order]
