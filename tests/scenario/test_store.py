@@ -329,8 +329,10 @@ def test_flipped_bit(scenario_set: Path):
             DataError, match=r"shard-00001\.npy: record 1: checksum mismatch.*; copy the file"
         ):
             read()
-    with pytest.raises(DataError, match="checksum mismatch"):
-        opened.check()
+    for read in (opened.check, lambda: list(opened), lambda: opened[2:], lambda: opened.take([0, 4])):
+        with pytest.raises(DataError, match="checksum mismatch"):
+            read()
+    assert [scenario.id for scenario in opened.take([6, 0, 3])] == ["scenario-6", "scenario-0", "scenario-3"]
     assert ScenarioSet.open(scenario_set, verify=False)[4].id == "scenario-4"
 
 

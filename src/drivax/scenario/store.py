@@ -20,7 +20,8 @@ import json
 import math
 import shutil
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from operator import itemgetter
 from pathlib import Path
@@ -45,6 +46,8 @@ MANIFEST = "manifest.json"
 #: The cure for a set that cannot be repaired.
 AGAIN = "convert or generate the set again"
 _HEADER_LIMIT = 100_000
+#: Scenarios that an iteration reads at a time.
+_BATCH = 64
 _Bytes = np.ndarray[Any, Any]
 
 
@@ -245,10 +248,21 @@ class ScenarioSet(Sequence[Scenario]):
     def __len__(self) -> int:
         return len(self.entries)
 
+    def __iter__(self) -> Iterator[Scenario]:
+        for first in range(0, len(self), _BATCH):
+            yield from self[first : first + _BATCH]
+
+    def take(self, indices: Iterable[int]) -> list[Scenario]:
+        """Return scenarios; threads test the checksums of the ones that were not read before."""
+        with ThreadPoolExecutor() as pool:  # zlib releases the lock of the interpreter
+            return list(
+                pool.map(self.__getitem__, indices) if self.verify else map(self.__getitem__, indices)
+            )
+
     def __getitem__(self, index: Any) -> Any:
         """Return a scenario (a view of the file), or a list for a slice."""
         if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
+            return self.take(range(*index.indices(len(self))))
         if not -len(self) <= index < len(self):
             raise IndexError(f"scenario {index} of {len(self)}")
         number = int(index) % len(self)
@@ -357,15 +371,16 @@ class Shard:
 
     def _map(self) -> _Bytes:
         offset = self.check_files()
-        shape = (self.count, self._dtype.itemsize)
-        # A plain view: indexing a memmap costs Python time.
-        self._data = np.asarray(np.memmap(self.path, np.uint8, "r", offset, shape))
         with self.crc_path.open("rb") as file:
             shape, dtype = read_header(file, self.crc_path)
             crcs = file.read()
         if shape != (self.count,) or dtype != np.uint32 or len(crcs) != 4 * self.count:
             raise DataError("checksum file does not fit its shard", file=self.crc_path, cure=AGAIN)
         self._crcs = np.frombuffer(crcs, np.uint32)
+        # A plain view: indexing a memmap costs Python time. Set last, since several threads may read.
+        self._data = np.asarray(
+            np.memmap(self.path, np.uint8, "r", offset, (self.count, self._dtype.itemsize))
+        )
         return self._data
 
     def _damage(self, problem: str, record: int) -> DataError:
