@@ -1,8 +1,8 @@
 """Driving scenarios: kinds, flags, capacities, and the padded record that is stored.
 
 A reader or the built-in world produces a :class:`~drivax.scenario.recording.Recording`: ragged, float64, in the map
-frame of the source. ``scenario.build.assemble`` makes it a :class:`Scenario`: local frame, float32, with shapes given
-by :class:`Capacity`, map segments, grid and routes. This module needs no JAX.
+frame of the source. ``scenario.build.assemble`` makes it a :class:`Scenario`: local frame, float32, with the shapes
+of :class:`Capacity`, map segments, grid and routes. This module needs no JAX.
 """
 
 from __future__ import annotations
@@ -148,9 +148,12 @@ class Capacity:
     lane_run: int = 160
 
     def lasting(self, future_s: float) -> Capacity:
-        """Return the capacity of scenarios with this many seconds after the current step, 2 to 60 (else UsageError).
+        """Return the capacity of scenarios with this many seconds after the current step, 2 to 60.
 
         Routes get 40 m of room per second more than 8 s (144 km/h).
+
+        Raises:
+            UsageError: ``future_s`` is out of range.
         """
         if not 2.0 <= future_s <= 60.0:
             raise UsageError(f"future_s is {future_s:g}", cure="use 2 to 60 seconds")
@@ -269,7 +272,7 @@ class SourceCounts:
     map_features: dict[str, int]
     map_points: int
     lights: int
-    #: Nonzero numbers of items that the reader or the assembly left out, by name (``dangling_links``, ...).
+    #: Nonzero numbers of items that the reader or the assembly dropped, by name (``dangling_links``, ...).
     lost: dict[str, int] = field(default_factory=dict)
 
 

@@ -66,8 +66,8 @@ class ScenarioWriter:
         shard_size: Records per shard.
         overwrite: Replace an existing scenario set; other folders are never replaced.
         shares: Percentages of train, validation and test for the files of ``splits/``; None writes no files.
-        identity: What is written, for a set that can be resumed: closed shards survive an exception or a kill, and the
-            next writer with the same identity continues after them (:attr:`notes`).
+        identity: Description of the content, for a set that can be resumed: closed shards survive an exception or a
+            kill, and the next writer with the same identity continues after them (:attr:`notes`).
         further: Writes additional files into the complete folder before it is published.
 
     Raises:
@@ -172,8 +172,8 @@ class ScenarioWriter:
         with (folder / name).open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         shard = {"file": name, "count": count, "sha256": digest}
-        finished = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
-        self._partial.note(len(self._shards), finished)
+        summary = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
+        self._partial.note(len(self._shards), summary)
         self._shards.append(shard)
         self._crcs = []
 
@@ -236,14 +236,18 @@ class ScenarioSet(Sequence[Scenario]):
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = True) -> ScenarioSet:
-        """Open a set; raise DataError if its manifest or the size or layout of a shard is wrong."""
-        opened = cls(path, read_manifest(Path(path)), verify)
-        if len(opened) != int(opened._starts[-1]):
-            problem = f"lists {len(opened)} scenarios but its shards contain {opened._starts[-1]}"
-            raise DataError(problem, file=opened.path / MANIFEST, cure=AGAIN)
-        for shard in opened._shards:
+        """Open a set.
+
+        Raises:
+            DataError: The manifest, or the size or layout of a shard, is wrong.
+        """
+        result = cls(path, read_manifest(Path(path)), verify)
+        if len(result) != int(result._starts[-1]):
+            problem = f"lists {len(result)} scenarios but its shards contain {result._starts[-1]}"
+            raise DataError(problem, file=result.path / MANIFEST, cure=AGAIN)
+        for shard in result._shards:
             shard.check_files()
-        return opened
+        return result
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -270,9 +274,9 @@ class ScenarioSet(Sequence[Scenario]):
         shard = int(np.searchsorted(self._starts, number, side="right")) - 1
         record = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
         findings = {name: dict(entry[name]) for name in ("overflow", "audit", "tags")}
-        stored = record.view(self._dtype).reshape(())
+        fields = record.view(self._dtype).reshape(())
         names = {name: str(entry[name]) for name in NAMES}
-        return Scenario(stored, self.capacity, SourceCounts(**entry["source"]), **findings, names=names)
+        return Scenario(fields, self.capacity, SourceCounts(**entry["source"]), **findings, names=names)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return ScenarioSet.open, (self.path, self.verify)  # Each process maps the files itself.
@@ -309,7 +313,11 @@ class ScenarioSet(Sequence[Scenario]):
         return out
 
     def check(self) -> None:
-        """Test the CRC of every record and the SHA-256 of every shard; raise DataError where one differs."""
+        """Test the CRC of every record and the SHA-256 of every shard.
+
+        Raises:
+            DataError: One of them differs.
+        """
         for shard in self._shards:
             for row in range(shard.count):
                 shard.record(row, verify=True)
@@ -413,7 +421,11 @@ def field_table(capacity: Capacity) -> list[dict[str, Any]]:
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """Read the manifest of the set at ``path``; raise DataError if it is missing, damaged or of another version."""
+    """Read the manifest of the set at ``path``.
+
+    Raises:
+        DataError: It is missing, damaged or of another version.
+    """
     file = path / MANIFEST
     if not path.is_dir():
         problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"

@@ -101,13 +101,13 @@ class Sizes:
     def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
         """Return the sizes that one or more scenarios of one capacity use."""
         batches = iter(scenarios)
-        needed = [_used(batch) for batch in iter(lambda: list(islice(batches, _BATCH)), [])]
-        if not needed:
+        each = [_batch_sizes(batch) for batch in iter(lambda: list(islice(batches, _BATCH)), [])]
+        if not each:
             raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
-        return cls(*(max(getattr(sizes, field.name) for sizes in needed) for field in fields(cls)))
+        return cls(*(max(getattr(sizes, field.name) for sizes in each) for field in fields(cls)))
 
 
-def _used(scenarios: Sequence[Scenario]) -> Sizes:
+def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
     """Return the sizes that a batch of scenarios of one capacity uses."""
     capacity, records = scenarios[0].capacity, [scenario.record for scenario in scenarios]
     agents, parked, lights, lanes = (
@@ -165,7 +165,7 @@ class ScenarioBank:
             :class:`EdgeRow` and :class:`LaneRow`.
         lane_strands: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
         grid_edge, grid_lane: Start of the run of each cell in ``edges`` and ``lanes`` (row-major, plus the end).
-        grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.packed``).
+        grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.pack_sides``).
         map_box: Smallest and largest x, y of edges and lanes.
         routes: Points 1 m apart, :class:`RouteColumn`; route 0 leads to the goal, route 1 is the log's own.
         log_progress, log_ahead: Arc length of the logged ego along route 0; distance that it still drives, m.
@@ -243,27 +243,27 @@ class ScenarioBank:
     ) -> ScenarioBank:
         """Stack scenarios of one capacity.
 
-        ``trim`` cuts unused padding, or cuts to given sizes: banks of the same sizes share compiled programs, smaller
+        ``trim`` cuts unused padding, or cuts to these sizes: banks of the same sizes share compiled programs, smaller
         banks are faster. ``allow_no_future`` accepts logs with fewer than 20 steps after the current one.
 
         Raises:
             DrivaxError: There are no scenarios, their capacities differ, or a log is too short.
         """
-        kept = list(scenarios)
-        for scenario in kept:
+        logs = list(scenarios)
+        for scenario in logs:
             if scenario.steps < LEAST_STEPS and not allow_no_future:
                 cure = "leave it out (flag!=NO_FUTURE)"
                 raise DataError(too_short(int(scenario.steps)), record=scenario.id, cure=cure)
-            if scenario.capacity != kept[0].capacity:
-                own, others = (f"{c.name!r} ({c.steps} steps)" for c in (scenario.capacity, kept[0].capacity))
+            if scenario.capacity != logs[0].capacity:
+                own, others = (f"{c.name!r} ({c.steps} steps)" for c in (scenario.capacity, logs[0].capacity))
                 cure = "convert all sets with one --capacity and --future-s"
                 raise DataError(f"has capacity {own}, others {others}", record=scenario.id, cure=cure)
-        own = Sizes.used(kept)
-        sizes = trim if isinstance(trim, Sizes) else own if trim else Sizes.whole(kept[0].capacity)
-        arrays = _stack(kept, sizes)
+        own = Sizes.used(logs)
+        sizes = trim if isinstance(trim, Sizes) else own if trim else Sizes.whole(logs[0].capacity)
+        arrays = _stack(logs, sizes)
         return cls(
             **{name: jax.device_put(value, may_alias=True) for name, value in arrays.items()},
-            cell_m=kept[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
+            cell_m=logs[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
             long_ego=own.long_ego or sizes.long_ego, trimmed=trim is True,
         )  # fmt: skip
 
@@ -342,7 +342,7 @@ def _stack_batch(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
 
 
 def _fill_agents(agents: Float[np.ndarray, "time agent 8"], log: _Record) -> None:
-    """Write the moving agents of a record, without copies: most bytes of a bank are theirs."""
+    """Write the moving agents of a record in place. They hold most bytes of a bank."""
     xy, z, heading, velocity, valid = (
         log[f"agent_{name}"][:, : agents.shape[1]] for name in ("xy", "z", "heading", "velocity", "valid")
     )
@@ -385,15 +385,15 @@ def _stack_parked(
     xy, z, heading, size, kind = (
         stack_field(records, f"parked_{name}", parked) for name in ("xy", "z", "heading", "size", "kind")
     )
-    stored = np.arange(parked.stop) < count[:, None]
-    scenario, number = np.nonzero(stored)
+    mask = np.arange(parked.stop) < count[:, None]
+    scenario, number = np.nonzero(mask)
     at = scenario, first[scenario] + number
     poses = np.zeros((len(records), slots, 8), np.float32)
-    zeros, ones = np.zeros((*z.shape, 2)), np.ones(z.shape)
-    poses[at] = _interleave(xy, z, np.cos(heading), np.sin(heading), zeros, ones)[stored]
+    velocity, is_observed = np.zeros((*z.shape, 2)), np.ones(z.shape)
+    poses[at] = _interleave(xy, z, np.cos(heading), np.sin(heading), velocity, is_observed)[mask]
     boxes = np.zeros((len(records), slots, 4), np.float32)
     boxes[:, : box.shape[1]] = box
-    boxes[at] = _interleave(size, kind)[stored]
+    boxes[at] = _interleave(size, kind)[mask]
     words = as_words(valid[:, :, parked])
     when = np.zeros((len(records), words.shape[1], slots), np.uint32)
     when[scenario, :, at[1]] = words[scenario, :, number]
@@ -466,8 +466,8 @@ def _stack_road(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
     xy, direction, length, kind, limit, curvature = (
         stack_field(records, f"road_{name}", slice(0, sizes.road)) for name in names
     )
-    used = np.arange(kind.shape[1]) < stack_field(records, "road_rows")[:, None]
-    layer = np.where(used, _LAYERS[np.minimum(kind, len(_LAYERS) - 1)], np.float32(RoadLayer.NONE))
+    is_piece = np.arange(kind.shape[1]) < stack_field(records, "road_rows")[:, None]
+    layer = np.where(is_piece, _LAYERS[np.minimum(kind, len(_LAYERS) - 1)], np.float32(RoadLayer.NONE))
     return {
         "road": _interleave(xy, direction, length, layer, limit),
         "road_at": np.stack([xy[..., 0], xy[..., 1], layer], axis=1),

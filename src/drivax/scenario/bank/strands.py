@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, Integer
 
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import StrandColumn
@@ -43,20 +43,20 @@ def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
     that join a lane at a junction do not merge.
     """
     lanes = _Lanes.of(records)
-    tables = np.full((*lanes.stored.shape, 6), -1.0, np.float32)
+    tables = np.full((*lanes.mask.shape, 6), -1.0, np.float32)
     tables[..., StrandColumn.END] = NOWHERE_M
     if not len(lanes.scenario):
         return tables
     row = np.arange(len(lanes.scenario))
     successor, predecessor = lanes.links(records, "successor"), lanes.links(records, "predecessor")
     courses, each = _Courses.of(records, lanes), np.repeat(row[:, None], 4, axis=1)
-    ahead = _straightest(successor, courses.turn(each, successor))
-    behind = _straightest(predecessor, courses.turn(predecessor, each))
+    ahead = _straightest_link(successor, courses.turn(each, successor))
+    behind = _straightest_link(predecessor, courses.turn(predecessor, each))
     follows = np.where((ahead >= 0) & (behind[ahead] == row), ahead, -1)
     strand, last = _strands(follows)
     other = np.where((ahead >= 0) & (follows < 0), behind[ahead], -1)
-    comes_in = (other >= 0) & (np.abs(wrap(courses.before - courses.before[other])) <= _MERGING_RAD)
-    onto = np.where(comes_in, strand[ahead], -1)
+    merges = (other >= 0) & (np.abs(wrap(courses.before - courses.before[other])) <= _MERGING_RAD)
+    onto = np.where(merges, strand[ahead], -1)
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
     stops = (successor < 0).all(axis=1) & _is_map_known(records, lanes.scenario, stop)
     table = np.empty((len(row), 6))
@@ -64,13 +64,13 @@ def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
         adjacent = lanes.links(records, name)
         further = ((stop[last[adjacent]] - stop) * course).sum(axis=1)
         # Lanes that are not stored lie beyond the crop.
-        goes_on = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | ~(further <= _ON_M))
-        onto = np.where(stops & goes_on, strand[adjacent], onto)
+        continues = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | ~(further <= _ON_M))
+        onto = np.where(stops & continues, strand[adjacent], onto)
         table[:, column] = lanes.index(np.where(adjacent >= 0, strand[adjacent], -1))
     onto = np.where(follows[last] < 0, onto[last], -1)
     table[:, StrandColumn.STRAND], table[:, StrandColumn.ONTO] = lanes.index(strand), lanes.index(onto)
     table[:, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
-    tables[lanes.stored] = table
+    tables[lanes.mask] = table
     return tables
 
 
@@ -79,13 +79,13 @@ class _Lanes:
     """Stored lanes of some scenarios, in one sequence.
 
     Attributes:
-        stored: Mask of the lanes of each record.
+        mask: Mask of the lanes of each record.
         first: First lane of each scenario in the sequence.
         scenario: Scenario of each lane.
         length: Length of each lane, m.
     """
 
-    stored: Bool[Array, "n capacity"]
+    mask: Bool[Array, "n capacity"]
     first: Int[Array, " n"]
     scenario: Int[Array, " lane"]
     length: Float[Array, " lane"]
@@ -95,13 +95,13 @@ class _Lanes:
         """Return the lanes of records."""
         length = stack_field(records, "lane_length")
         count = (length > 0).sum(axis=1)
-        stored = np.arange(length.shape[1]) < count[:, None]
+        mask = np.arange(length.shape[1]) < count[:, None]
         scenario = np.repeat(np.arange(len(records)), count)
-        return cls(stored, np.cumsum(count) - count, scenario, length[stored].astype(float))
+        return cls(mask, np.cumsum(count) - count, scenario, length[mask].astype(float))
 
     def links(self, records: Sequence[Array], name: str) -> Int[Array, "lane *link"]:
         """Return links of lanes as places in the sequence, -1 for none."""
-        link = stack_field(records, f"lane_{name}")[self.stored].astype(np.int64)
+        link = stack_field(records, f"lane_{name}")[self.mask].astype(np.int64)
         first = self.first[self.scenario].reshape(-1, *[1] * (link.ndim - 1))
         return np.where(link >= 0, link + first, -1)
 
@@ -112,7 +112,7 @@ class _Lanes:
 
 @dataclass(frozen=True)
 class _Courses:
-    """Courses of lanes at their ends; NaN where that stretch is not stored.
+    """Courses of lanes at their ends; NaN if that stretch is not stored.
 
     Headings (rad) at the beginning, at the end and 20 m ``before`` the end; mean curvature (1/m) over the first and the
     last 20 m; and the last point (m).
@@ -147,7 +147,7 @@ class _Courses:
 class _Segments:
     """Segments of lanes by lane and arc length; those of lane i are ``first[i]`` to ``first[i + 1]``."""
 
-    lane: Int[Array, " segment"]
+    lane: Integer[Array, " segment"]
     start: Float[Array, " segment"]
     a: Float[Array, "segment 2"]
     b: Float[Array, "segment 2"]
@@ -164,33 +164,33 @@ class _Segments:
             for name in ("lane", "start_m", "a", "b")
         )
         first = np.repeat(lanes.first, [part.stop - part.start for part in parts])
-        known = np.flatnonzero(index >= 0)
-        lane = (first[known] + index[known]).astype(np.min_scalar_type(len(lanes.scenario)))
+        of_lanes = np.flatnonzero(index >= 0)
+        lane = (first[of_lanes] + index[of_lanes]).astype(np.min_scalar_type(len(lanes.scenario)))
         # Floats of one sign are ordered as their bits. Whole numbers sort several times faster than np.lexsort.
-        by_start = np.abs(start[known]).view(np.uint32).astype(np.uint64) << 32 | np.arange(
-            len(known), dtype=np.uint64
+        by_start = np.abs(start[of_lanes]).view(np.uint32).astype(np.uint64) << 32 | np.arange(
+            len(of_lanes), dtype=np.uint64
         )
         order = (np.sort(by_start) & 0xFFFFFFFF).astype(np.int64)
         order = order[np.argsort(lane[order], kind="stable")]
-        lane, order = lane[order], known[order]
+        lane, order = lane[order], of_lanes[order]
         bounds = np.searchsorted(lane, np.arange(len(lanes.scenario) + 1))
         return cls(lane, start[order].astype(float), a[order, :2], b[order, :2], bounds)
 
     def at(self, arc: Float[Array, " lane"]) -> tuple[Float[Array, " lane"], Float[Array, "lane 2"]]:
-        """Heading and end of the segment at an arc length of each lane, NaN where it is not stored."""
+        """Heading and end of the segment at an arc length of each lane, NaN without one."""
         before = np.append(0, np.cumsum(self.start <= arc[self.lane]))[self.first]
         last = self.first[:-1] + np.diff(before) - 1
-        stored = np.flatnonzero(np.diff(before))
-        start, a, b = (values[last[stored]].astype(float) for values in (self.start, self.a, self.b))
+        row = np.flatnonzero(np.diff(before))
+        start, a, b = (values[last[row]].astype(float) for values in (self.start, self.a, self.b))
         span = np.hypot(*(b - a).T)
-        reaches = arc[stored] - start <= span + _SLACK_M
+        reaches = arc[row] - start <= span + _SLACK_M
         heading, end = np.full(len(arc), np.nan), np.full((len(arc), 2), np.nan)
-        heading[stored[reaches]] = np.arctan2(*(b - a)[reaches].T[::-1])
-        end[stored[reaches]] = b[reaches]
+        heading[row[reaches]] = np.arctan2(*(b - a)[reaches].T[::-1])
+        end[row[reaches]] = b[reaches]
         return heading, end
 
 
-def _straightest(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"]) -> Int[Array, " lane"]:
+def _straightest_link(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"]) -> Int[Array, " lane"]:
     """Link of each lane with the smallest turn, the first if equal or unknown; -1 for none."""
     turn = np.where(links >= 0, np.where(np.isnan(turn), _UNKNOWN, np.round(turn, 2)), np.inf)
     return links[np.arange(len(links)), np.argmin(turn, axis=1)]
@@ -227,9 +227,9 @@ def corridor_lanes(records: Sequence[Array]) -> Bool[np.ndarray, "n lane"]:
     member = np.zeros(neighbours[0].shape, bool)
     while len(lane):
         member[scenario, lane] = True
-        beside = np.zeros_like(member)
+        adjacent_lanes = np.zeros_like(member)
         for neighbour in neighbours:
             adjacent = neighbour[scenario, lane]
-            beside[scenario[adjacent >= 0], adjacent[adjacent >= 0]] = True
-        scenario, lane = np.nonzero(beside & ~member)
+            adjacent_lanes[scenario[adjacent >= 0], adjacent[adjacent >= 0]] = True
+        scenario, lane = np.nonzero(adjacent_lanes & ~member)
     return member
