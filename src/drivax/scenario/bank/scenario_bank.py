@@ -119,19 +119,19 @@ def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
             stack_field(records, "lane_length") > 0,
         )
     )
-    moving = max(1, _rounded(agents.max(), capacity.agents))
-    slots = _rounded((agents + parked).max(), capacity.agents + capacity.parked)
+    moving = max(1, _rounded(int(agents.max()), capacity.agents))
+    slots = _rounded(int((agents + parked).max()), capacity.agents + capacity.parked)
     _, edges, segments, _ = stack_field(records, "segment_blocks").T
     half_m = np.hypot(*stack_field(records, "agent_size", 0).T[:2]).astype(np.float64) / 2
     return Sizes(
         agents=moving,
         slots=max(slots, moving),
-        lights=max(1, _rounded(lights.max(), capacity.lights)),
+        lights=max(1, _rounded(int(lights.max()), capacity.lights)),
         edges=int(edges.max()),
         lanes=int((segments - edges).max()),
         edge_run=_longest_run(stack_field(records, "grid_edge"), capacity.grid),
         lane_run=_longest_run(stack_field(records, "grid_lane"), capacity.grid),
-        graphs=max(1, _rounded(lanes.max(), capacity.lanes)),
+        graphs=max(1, _rounded(int(lanes.max()), capacity.lanes)),
         road=max(1, int(stack_field(records, "road_rows").max())),
         # Edges count up to 3 m from a corner; the 3 x 3 block is exact within a cell less half a segment.
         long_ego=bool((half_m + 3.0 > capacity.cell_m - 2.0).any()),
@@ -139,7 +139,7 @@ def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
 
 
 def _rounded(count: int, most: int) -> int:
-    return min(most, -(-int(count) // _MULTIPLE) * _MULTIPLE)
+    return min(most, -(-count // _MULTIPLE) * _MULTIPLE)
 
 
 def _longest_run(start: Int[np.ndarray, "n cells1"], grid: int) -> int:
