@@ -317,8 +317,8 @@ def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
     return np.array(numbers, np.uint32)
 
 
-def last_used(mask: Bool[np.ndarray, "n column"]) -> Int[np.ndarray, " n"]:
-    """Return the number of columns up to the last true one, per row."""
+def last_used(mask: Any) -> Int[np.ndarray, " n"]:
+    """Return the number of columns of ``mask [n, column]`` up to the last true one, per row."""
     return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
 
 
