@@ -48,7 +48,7 @@ def measure(tree: Path, data: Path) -> dict[str, float]:
     """Return scenarios per second (wall, and of CPU time) and memory of a process of a tree."""
     environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", _PROGRAM, str(data)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     result = json.loads(done.stdout)
     count = result["scenarios"]
     for clock in ("", "_cpu"):

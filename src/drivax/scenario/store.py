@@ -19,10 +19,12 @@ import hashlib
 import json
 import math
 import shutil
+import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any, Self
@@ -46,8 +48,10 @@ MANIFEST = "manifest.json"
 #: The cure for a set that cannot be repaired.
 AGAIN = "convert or generate the set again"
 _HEADER_LIMIT = 100_000
-#: Scenarios that an iteration reads at a time.
-_BATCH = 64
+#: Scenarios that an iteration reads at a time, and those of a task of a thread.
+_BATCH, _PART = 64, 8
+#: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
+_HEADERS = threading.Lock()
 _Bytes = np.ndarray[Any, Any]
 
 
@@ -258,10 +262,11 @@ class ScenarioSet(Sequence[Scenario]):
 
     def take(self, indices: Iterable[int]) -> list[Scenario]:
         """Return scenarios; threads test the checksums of the ones that were not read before."""
+        numbers = list(indices)
+        parts = [numbers[first : first + _PART] for first in range(0, len(numbers), _PART)]
         with ThreadPoolExecutor() as pool:  # zlib releases the lock of the interpreter
-            return list(
-                pool.map(self.__getitem__, indices) if self.verify else map(self.__getitem__, indices)
-            )
+            read = pool.map if self.verify else map
+            return list(chain.from_iterable(read(lambda part: [self[number] for number in part], parts)))
 
     def __getitem__(self, index: Any) -> Any:
         """Return a scenario (a view of the file), or a list for a slice."""
@@ -378,6 +383,10 @@ class Shard:
                 raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
 
     def _map(self) -> _Bytes:
+        with _HEADERS:
+            return self._read_map() if self._data is None else self._data
+
+    def _read_map(self) -> _Bytes:
         offset = self.check_files()
         with self.crc_path.open("rb") as file:
             shape, dtype = read_header(file, self.crc_path)

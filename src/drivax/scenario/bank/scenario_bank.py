@@ -276,24 +276,33 @@ def too_short(steps: int) -> str:
 def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     """Return the arrays of a bank by name, aligned so that JAX shares their memory."""
     records = [scenario.record for scenario in scenarios]
+    shapes = {
+        "agents": (len(scenarios[0].agent_z), sizes.agents, 8),
+        # Queries read whole runs, so a run must fit behind the last start.
+        "edges": (5, sizes.edges + sizes.edge_run),
+        "lanes": (8, sizes.lanes + sizes.lane_run),
+        "map_box": (4,),
+    }
+    large = [_aligned((len(records), *shape), np.dtype(np.float32)) for shape in shapes.values()]
     arrays = {
         name: _aligned((len(records), *values.shape[1:]), values.dtype)
         for name, values in _stack_batch(records[:1], sizes).items()
     }
-    arrays["agents"] = _aligned(
-        (len(records), len(scenarios[0].agent_z), sizes.agents, 8), np.dtype(np.float32)
-    )
 
     def fill(rows: slice) -> None:
-        for agents, log in zip(arrays["agents"][rows], records[rows], strict=True):
+        batch = records[rows]
+        targets = zip(*(array[rows] for array in large), strict=True)
+        for log, values, target in zip(batch, _lane_values(batch), targets, strict=True):
+            agents, edges, lanes, box = target
             _fill_agents(agents, log)
-        for name, values in _stack_batch(records[rows], sizes).items():
+            _fill_segments(edges, lanes, box, values, log)
+        for name, values in _stack_batch(batch, sizes).items():
             arrays[name][rows] = values
 
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(fill, (slice(first, first + _BATCH) for first in range(0, len(records), _BATCH))))
     names = [(scenario.text("dataset"), scenario.id) for scenario in scenarios]
-    return arrays | {"identity": identities(names)}
+    return arrays | dict(zip(shapes, large, strict=True)) | {"identity": identities(names)}
 
 
 def _aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray[Any, Any]:
@@ -336,9 +345,7 @@ def _interleave(*columns: np.ndarray[Any, Any]) -> Float[np.ndarray, "*n column"
 
 def _stack_batch(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
     arrays = _stack_agents(records, sizes) | _stack_routes(records) | _stack_lights(records, sizes)
-    return (
-        arrays | _stack_road(records, sizes) | _stack_segments(records, sizes) | _stack_grid(records, sizes)
-    )
+    return arrays | _stack_road(records, sizes) | _stack_grid(records, sizes)
 
 
 def _fill_agents(agents: Float[np.ndarray, "time agent 8"], log: _Record) -> None:
@@ -475,22 +482,21 @@ def _stack_road(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
     }
 
 
-def _stack_segments(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
-    # Queries read whole runs, so a run must fit behind the last start.
-    edges = np.full((len(records), 5, sizes.edges + sizes.edge_run), _FAR_M, np.float32)
-    lanes = np.full((len(records), 8, sizes.lanes + sizes.lane_run), _FAR_M, np.float32)
-    low, high = np.zeros((2, len(records), 4), np.float32)
-    for i, (source, values) in enumerate(zip(records, _lane_values(records), strict=True)):
-        e, end = source["segment_blocks"][1:3].tolist()
-        a, b = source["segment_a"][:end].T, source["segment_b"][:end].T
-        ends = np.empty((5, end), np.float32)
-        ends[0:2], ends[2:4], ends[4] = a[:2], b[:2], (a[2] + b[2]) / 2
-        edges[i, :, :e], lanes[i, :5, : end - e] = ends[:, :e], ends[:, e:]
-        lanes[i, 5:, : end - e] = values[:, source["segment_lane"][e:end]]
-        if end:
-            low[i], high[i] = ends[:4].min(axis=1), ends[:4].max(axis=1)
-    box = np.minimum(low[:, :2], low[:, 2:]), np.maximum(high[:, :2], high[:, 2:])
-    return {"edges": edges, "lanes": lanes, "map_box": np.concatenate(box, axis=1)}
+def _fill_segments(
+    edges: Float[np.ndarray, "5 edge"], lanes: Float[np.ndarray, "8 lane"], box: Float[np.ndarray, "4"],
+    values: Float[np.ndarray, "3 lane1"], log: _Record,
+) -> None:  # fmt: skip
+    """Write the edges and lanes of a record in place, and the box around them."""
+    e, end = log["segment_blocks"][1:3].tolist()
+    a, b, count = log["segment_a"][:end].T, log["segment_b"][:end].T, end - e
+    ends = np.empty((5, end), np.float32)
+    ends[0:2], ends[2:4], ends[4] = a[:2], b[:2], (a[2] + b[2]) / 2
+    edges[:, :e], edges[:, e:] = ends[:, :e], _FAR_M
+    lanes[:5, :count], lanes[5:, :count] = ends[:, e:], values[:, log["segment_lane"][e:end]]
+    lanes[:, count:] = _FAR_M
+    low, high = (ends[:4].min(axis=1), ends[:4].max(axis=1)) if end else np.zeros((2, 4), np.float32)
+    np.minimum(low[:2], low[2:], out=box[:2])
+    np.maximum(high[:2], high[2:], out=box[2:])
 
 
 def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
