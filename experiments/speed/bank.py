@@ -22,7 +22,7 @@ _TREE = Path(__file__).resolve().parents[2]
 _PROGRAM = """
 import json, resource, sys, time
 import jax
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 
 jax.device_put(0).block_until_ready()
@@ -39,8 +39,8 @@ scenarios = list(data)
 start = lap("read", start)
 bank = jax.block_until_ready(ScenarioBank.from_scenarios(scenarios))
 lap("build", start)
-used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-print(json.dumps({"scenarios": len(bank), **seconds, "resident_mb": used, "bank_mb": bank.nbytes / 1e6}))
+resident_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+print(json.dumps({"scenarios": len(bank), **seconds, "resident_mb": resident_mb, "bank_mb": bank.nbytes / 1e6}))
 """
 
 
@@ -48,8 +48,8 @@ def measure(tree: Path, data: Path) -> dict[str, float]:
     """Return scenarios per second (wall, and of CPU time) and memory of a process of a tree."""
     environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", _PROGRAM, str(data)]
-    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    result = json.loads(done.stdout)
+    process = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    result = json.loads(process.stdout)
     count = result["scenarios"]
     for clock in ("", "_cpu"):
         read, build = result["read" + clock], result["build" + clock]
