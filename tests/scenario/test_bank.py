@@ -1,6 +1,6 @@
 """The bank: what it refuses, how large it is, and that padding costs nothing but memory."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,8 @@ import pytest
 from drivax.errors import DataError, DrivaxError
 from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import IdmPlanner
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank import scenario_bank
+from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank, Sizes, as_words
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Scenario
 from drivax.simulator.simulator import Simulator
@@ -93,3 +94,41 @@ def test_limits_fall_back_to_the_class_of_the_lane():
     bank = bank_of(straight_road([car(0, 0, 0, 5)], limit=None))
     used = np.asarray(bank.lanes)[0, 6]
     np.testing.assert_allclose(used[used < 1e5], 13.4, rtol=1e-6)
+
+
+@pytest.mark.parametrize("batch", [2, 3])
+def test_batches_of_scenarios_stack_as_single_scenarios(monkeypatch, batch):
+    scenarios = [assemble(generate_recording(5, i)) for i in range(5)]
+    scenarios.insert(2, assemble(straight_road([car(0, 0, 0, 5)], limit=None)))
+    sizes = Sizes.used(scenarios)
+    alone = [ScenarioBank.from_scenarios([scenario], trim=sizes) for scenario in scenarios]
+    monkeypatch.setattr(scenario_bank, "_BATCH", batch)
+    assert Sizes.used(iter(scenarios)) == sizes
+    bank = ScenarioBank.from_scenarios(scenarios, trim=sizes)
+    for name in (field.name for field in fields(ScenarioBank) if not field.metadata):
+        each = np.concatenate([np.asarray(getattr(single, name)) for single in alone])
+        np.testing.assert_array_equal(np.asarray(getattr(bank, name)), each, err_msg=name)
+
+
+def test_sizes_cover_the_largest_scenario():
+    scenarios = [assemble(generate_recording(6, i)) for i in range(3)]
+    each = [Sizes.used([scenario]) for scenario in scenarios]
+    largest = {field.name: max(getattr(sizes, field.name) for sizes in each) for field in fields(Sizes)}
+    assert Sizes.used(scenarios) == Sizes(**largest)
+
+
+@pytest.mark.parametrize("steps", [1, 31, 32, 91])
+def test_words_hold_a_bit_per_step(steps):
+    when = np.random.default_rng(steps).random((2, steps, 5)) < 0.5
+    words = as_words(when)
+    assert words.dtype == np.uint32 and words.shape == (2, -(-steps // WORD), 5)
+    for n, t, slot in np.ndindex(when.shape):
+        assert (int(words[n, t // WORD, slot]) >> (t % WORD) & 1) == when[n, t, slot]
+    assert as_words(when[..., :0]).shape == (2, -(-steps // WORD), 0)
+
+
+def test_bank_shares_memory_without_losing_it_to_donation():
+    bank = bank_of(straight_road([car(0, 0, 0, 5)]))
+    agents = np.array(bank.agents)
+    moved = jax.jit(lambda values: values + 1.0, donate_argnums=0)(bank.agents)
+    np.testing.assert_array_equal(moved, agents + 1.0)

@@ -360,7 +360,7 @@ def brute_force(search: LaneSearch) -> dict[tuple[int, ...], float]:
         if search.reach(lane_path) >= LEAST_M:
             complete.append((len(number), number, lane_path))
             return
-        children = search.following(lane_path)
+        children = search.expand(lane_path)
         if not any(child.changes == lane_path.changes for child in children):
             ended.append((len(number), number, lane_path))
         for i, child in enumerate(children):

@@ -7,6 +7,7 @@ import json
 import pickle
 import subprocess
 import sys
+import time
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 from drivax.datasets.export.writer import write_part
 from drivax.errors import DataError, UsageError
 from drivax.files import can_resume
+from drivax.scenario import store
 from drivax.scenario.schema import (
     SCHEMA_VERSION,
     Capacity,
@@ -329,9 +331,31 @@ def test_flipped_bit(scenario_set: Path):
             DataError, match=r"shard-00001\.npy: record 1: checksum mismatch.*; copy the file"
         ):
             read()
-    with pytest.raises(DataError, match="checksum mismatch"):
-        opened.check()
+    for read in (opened.check, lambda: list(opened), lambda: opened[2:], lambda: opened.take([0, 4])):
+        with pytest.raises(DataError, match="checksum mismatch"):
+            read()
+    assert [scenario.id for scenario in opened.take([6, 0, 3])] == ["scenario-6", "scenario-0", "scenario-3"]
     assert ScenarioSet.open(scenario_set, verify=False)[4].id == "scenario-4"
+
+
+def test_threads_map_each_shard_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Headers that several threads parse at a time raise SystemError on Python 3.11."""
+    with ScenarioWriter(tmp_path / "set", SMALL, shard_size=1) as writer:
+        for number in range(24):
+            writer.add(make_scenario(number))
+    parsing, reading = [], store.Shard._read_map
+
+    def read_alone(shard: store.Shard):
+        parsing.append(shard)
+        assert len(parsing) == 1
+        time.sleep(0.001)
+        result = reading(shard)
+        parsing.pop()
+        return result
+
+    monkeypatch.setattr(store.Shard, "_read_map", read_alone)
+    ids = [scenario.id for scenario in ScenarioSet.open(tmp_path / "set")]
+    assert ids == [f"scenario-{number}" for number in range(24)] and not parsing
 
 
 def test_every_single_flipped_bit_is_found(scenario_set: Path):

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.scenario.bank.strands import NOWHERE_M, lane_strands
+from drivax.scenario.bank.strands import NOWHERE_M, corridor_lanes, lane_strands
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES
+from drivax.synthetic.world import generate_recording
 
 from .recordings import arc, driving, edge, lane, line, make_recording, make_tracks
 
@@ -21,7 +22,7 @@ def codes(*features, path=None):
     tracks = make_tracks([driving() if path is None else path])
     scenario = assemble(make_recording(features, tracks), SMALL)
     assert not scenario.overflow
-    table, ids = lane_strands(scenario), scenario.lane_id
+    table, ids = lane_strands([scenario.record])[0], scenario.lane_id
     used = scenario.lane_length > 0
     assert (table[~used] == [-1, -1, -1, -1, NOWHERE_M, NOWHERE_M]).all()
     named = {}
@@ -132,6 +133,18 @@ def test_lanes_cut_by_the_crop_do_not_end():
 
 def test_a_scenario_without_lanes_has_an_empty_table():
     assert codes(BOX) == {}
+
+
+def test_corridor_reaches_all_neighbours_of_the_route():
+    scenarios = [assemble(generate_recording(8, i)) for i in range(6)]
+    corridors = corridor_lanes([scenario.record for scenario in scenarios])
+    for scenario, corridor in zip(scenarios, corridors, strict=True):
+        member, queue = set(), set(scenario.route_lane[0, : scenario.route_points[0]].tolist())
+        while queue := {lane for lane in queue if lane >= 0} - member:
+            member |= queue
+            queue = {int(side[lane]) for lane in queue for side in (scenario.lane_left, scenario.lane_right)}
+        assert set(np.flatnonzero(corridor).tolist()) == member
+    assert len({corridor.sum() for corridor in corridors}) > 1
 
 
 @pytest.mark.parametrize("turn", [0.0, 2.0])

@@ -60,7 +60,7 @@ def test_sizes_are_medians_and_defaults_are_counted():
     assert local.size[1].tolist() == list(DEFAULT_SIZES[AgentKind.PEDESTRIAN])
     assert local.size[2].tolist() == [9.9, 1.9, 1.5]
     assert local.size[3].tolist() == [4.6, 1.9, 1.7]
-    assert local.defaulted.tolist() == [True, True, False, True]
+    assert local.has_default_size.tolist() == [True, True, False, True]
 
 
 def test_parked_means_within_thirty_centimetres_and_a_tenth_of_a_radian():

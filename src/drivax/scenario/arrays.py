@@ -100,7 +100,7 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     """Resample agents, as for :func:`recording_from_arrays` but ``dt_s`` apart, to 10 Hz by linear interpolation.
 
     Headings turn along the shorter arc. A new step is valid if it falls on a valid step or between two neighbouring
-    valid steps. Velocities are left out, to be differentiated from the new positions.
+    valid steps. The result has no velocities: they follow from the new positions.
     """
     _check_keys(agents, _AGENT_KEYS, "agents")
     if not 0.0 < dt_s <= 10.0:
@@ -109,7 +109,7 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     count, steps = valid.shape
     at = np.arange(int((steps - 1) * dt_s / DT_S + 1e-6) + 1) * (DT_S / dt_s)
     at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
-    seen = valid[:, np.floor(at).astype(np.int64)] & valid[:, np.ceil(at).astype(np.int64)]
+    is_observed = valid[:, np.floor(at).astype(np.int64)] & valid[:, np.ceil(at).astype(np.int64)]
 
     def between(name: str, columns: tuple[int, ...]) -> Array:
         values = _array(agents, name, float, (count, steps, *columns))
@@ -118,31 +118,33 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     widths: dict[str, tuple[int, ...]] = {"xy": (2,), "heading": ()}
     widths |= {"z": ()} if "z" in agents else {}
     widths |= {"size": (3,)} if np.ndim(agents.get("size", ())) == 3 else {}
-    result = {name: agents[name] for name in ("kind", "id", "size") if name in agents} | {"valid": seen}
-    return result | {name: between(name, columns) for name, columns in widths.items()}
+    result = {name: agents[name] for name in ("kind", "id", "size") if name in agents}
+    return (
+        result | {"valid": is_observed} | {name: between(name, columns) for name, columns in widths.items()}
+    )
 
 
-def _check_keys(given: Any, keys: Sequence[str], what: str) -> None:
+def _check_keys(mapping: Any, keys: Sequence[str], what: str) -> None:
     """Refuse unknown keys."""
-    if not isinstance(given, Mapping):
+    if not isinstance(mapping, Mapping):
         raise UsageError(f"{what} is not a mapping", cure=f"give a dictionary with {', '.join(keys)}")
-    for key in given:
+    for key in mapping:
         if key not in keys:
             raise UsageError(f"{what} has no {key!r}", cure=f"use {', '.join(keys)}")
 
 
-def _array(given: Mapping[str, Any], name: str, kind: type, shape: tuple[int | None, ...]) -> Array:
+def _array(agents: Mapping[str, Any], name: str, kind: type, shape: tuple[int | None, ...]) -> Array:
     """Return an array of the agents, of a shape in which None is any size."""
-    if name not in given:
+    if name not in agents:
         raise UsageError(f'agents["{name}"] is missing', cure="see recording_from_arrays")
     try:
-        values = np.array(given[name], dtype=kind)
+        values = np.array(agents[name], dtype=kind)
     except (TypeError, ValueError) as error:
         raise UsageError(
             f'agents["{name}"] is not an array of numbers', cure="give one row per agent"
         ) from error
     if values.ndim != len(shape) or any(
-        size not in (None, given_size) for size, given_size in zip(shape, values.shape, strict=True)
+        size not in (None, own_size) for size, own_size in zip(shape, values.shape, strict=True)
     ):
         problem = f"has shape {values.shape}, not {tuple('any' if size is None else size for size in shape)}"
         raise UsageError(f'agents["{name}"] {problem}', cure="see recording_from_arrays")
@@ -179,11 +181,11 @@ def _tracks(agents: Mapping[str, Any], ego: int, needs_height: bool) -> Tracks:
 
 
 def _kinds(agents: Mapping[str, Any], count: int) -> Int8[np.ndarray, " agent"]:
-    given = agents.get("kind", ["vehicle"] * count)
-    if isinstance(given, str) or len(given) != count:
-        raise UsageError(f'agents["kind"] has {len(given)} entries, not {count}', cure="give one per agent")
-    kinds = [_named(kind, _KINDS, AgentKind, f'agents["kind"][{row}]') for row, kind in enumerate(given)]
-    return np.array(kinds, np.int8)
+    kinds = agents.get("kind", ["vehicle"] * count)
+    if isinstance(kinds, str) or len(kinds) != count:
+        raise UsageError(f'agents["kind"] has {len(kinds)} entries, not {count}', cure="give one per agent")
+    codes = [_member(kind, _KINDS, AgentKind, f'agents["kind"][{row}]') for row, kind in enumerate(kinds)]
+    return np.array(codes, np.int8)
 
 
 def _sizes(agents: Mapping[str, Any], count: int, steps: int) -> Array:
@@ -195,8 +197,8 @@ def _sizes(agents: Mapping[str, Any], count: int, steps: int) -> Array:
     return np.repeat(_array(agents, "size", float, (count, 3))[:, None], steps, axis=1)
 
 
-def _named(value: Any, names: Mapping[Any, Any], kinds: type[Any], what: str) -> Any:
-    """Return a member of an enumeration, given as member, number or word."""
+def _member(value: Any, names: Mapping[Any, Any], kinds: type[Any], what: str) -> Any:
+    """Return a member of an enumeration, from a member, number or word."""
     try:
         return names[value] if isinstance(value, str) or value is None else kinds(value)
     except (KeyError, ValueError, TypeError) as error:
@@ -207,23 +209,23 @@ def _named(value: Any, names: Mapping[Any, Any], kinds: type[Any], what: str) ->
 def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
     """Lanes, edges, crosswalks and stop signs, numbered in this order."""
     lanes, number = len(roads.get("lanes", ())), itertools.count()
-    for row, given in enumerate(roads.get("lanes", ())):
-        yield _lane(next(number), given, f'roads["lanes"][{row}]', lanes)
+    for row, lane in enumerate(roads.get("lanes", ())):
+        yield _lane(next(number), lane, f'roads["lanes"][{row}]', lanes)
     for name, kind, least in (("edges", RoadKind.EDGE_BOUNDARY, 2), ("crosswalks", RoadKind.CROSSWALK, 3)):
-        for row, given in enumerate(roads.get(name, ())):
-            yield MapFeature(next(number), kind, _points(given, f'roads["{name}"][{row}]', least))
-    for row, given in enumerate(roads.get("stop_signs", ())):
+        for row, line in enumerate(roads.get(name, ())):
+            yield MapFeature(next(number), kind, _points(line, f'roads["{name}"][{row}]', least))
+    for row, sign in enumerate(roads.get("stop_signs", ())):
         what = f'roads["stop_signs"][{row}]'
-        _check_keys(given, ("point", "lanes"), what)
-        point = _points([given.get("point")], f'{what}["point"]', 1)
-        controlled = _lane_indices(given.get("lanes", ()), lanes, what)
-        yield MapFeature(next(number), RoadKind.STOP_SIGN, point, lanes=controlled)
+        _check_keys(sign, ("point", "lanes"), what)
+        point = _points([sign.get("point")], f'{what}["point"]', 1)
+        controls = _lane_indices(sign.get("lanes", ()), lanes, what)
+        yield MapFeature(next(number), RoadKind.STOP_SIGN, point, lanes=controls)
 
 
-def _points(given: Any, what: str, least: int) -> Array:
-    """Points with heights, 0 if not given."""
+def _points(line: Any, what: str, least: int) -> Array:
+    """Points with heights, 0 without them."""
     try:
-        points = np.array(given, dtype=np.float64)
+        points = np.array(line, dtype=np.float64)
     except (TypeError, ValueError) as error:
         cure = "give (x, y) or (x, y, z) per point"
         raise UsageError(f"{what} is not an array of points", cure=cure) from error
@@ -235,37 +237,37 @@ def _points(given: Any, what: str, least: int) -> Array:
     return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
 
 
-def _lane(number: int, given: Any, what: str, lanes: int) -> MapFeature:
-    _check_keys(given, _LANE_KEYS, what)
-    limit, width = given.get("limit_mps"), given.get("width_m")
+def _lane(number: int, lane: Any, what: str, lanes: int) -> MapFeature:
+    _check_keys(lane, _LANE_KEYS, what)
+    limit, width = lane.get("limit_mps"), lane.get("width_m")
     return MapFeature(
         feature_id=number,
-        kind=_named(given.get("kind", "surface"), _LANE_KINDS, RoadKind, f'{what}["kind"]'),
-        points=_points(given.get("points"), f'{what}["points"]', 2),
+        kind=_member(lane.get("kind", "surface"), _LANE_KINDS, RoadKind, f'{what}["kind"]'),
+        points=_points(lane.get("points"), f'{what}["points"]', 2),
         limit_mps=None if limit is None else float(limit),
         width_m=None if width is None else float(width),
-        successors=_lane_indices(given.get("successors", ()), lanes, f'{what}["successors"]'),
-        left_neighbours=_lane_indices(given.get("left", ()), lanes, f'{what}["left"]'),
-        right_neighbours=_lane_indices(given.get("right", ()), lanes, f'{what}["right"]'),
+        successors=_lane_indices(lane.get("successors", ()), lanes, f'{what}["successors"]'),
+        left_neighbours=_lane_indices(lane.get("left", ()), lanes, f'{what}["left"]'),
+        right_neighbours=_lane_indices(lane.get("right", ()), lanes, f'{what}["right"]'),
     )
 
 
-def _lane_indices(given: Any, lanes: int, what: str) -> tuple[int, ...]:
+def _lane_indices(indices: Any, lanes: int, what: str) -> tuple[int, ...]:
     """Return indices of lanes."""
-    rows = [given] if isinstance(given, int | np.integer) else list(given)
+    rows = [indices] if isinstance(indices, int | np.integer) else list(indices)
     for row in rows:
         if not isinstance(row, int | np.integer) or not 0 <= row < lanes:
             raise UsageError(f"{what} names lane {row!r}, there are {lanes}", cure="count lanes from 0")
     return tuple(int(row) for row in rows)
 
 
-def _light(given: Any, what: str, lanes: Sequence[MapFeature], steps: int) -> Light:
-    _check_keys(given, _LIGHT_KEYS, what)
-    (lane,) = _lane_indices(given.get("lane", -1), len(lanes), f'{what}["lane"]')
-    states = list(given.get("states", ()))
+def _light(light: Any, what: str, lanes: Sequence[MapFeature], steps: int) -> Light:
+    _check_keys(light, _LIGHT_KEYS, what)
+    (lane,) = _lane_indices(light.get("lane", -1), len(lanes), f'{what}["lane"]')
+    states = list(light.get("states", ()))
     if len(states) != steps:
         raise UsageError(f'{what}["states"] has {len(states)} entries, not {steps}', cure="give one per step")
-    codes = [_named(state, _COLOURS, LightState, f'{what}["states"]') for state in states]
-    stop = given.get("stop_point")
+    codes = [_member(state, _COLOURS, LightState, f'{what}["states"]') for state in states]
+    stop = light.get("stop_point")
     point = lanes[lane].points[0] if stop is None else _points([stop], f'{what}["stop_point"]', 1)[0]
     return Light(lane, point, np.array(codes, np.int8))

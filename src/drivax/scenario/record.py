@@ -23,9 +23,9 @@ def record(cls: type[Record]) -> type[Record]:
     Unflattening bypasses ``__init__``: transformations put other objects than arrays into leaves, which a constructor
     that checks shapes would refuse.
     """
-    made = dataclass(frozen=True)(cls)
-    leaves = tuple(f.name for f in fields(cast(Any, made)) if not f.metadata.get("static"))
-    statics = tuple(f.name for f in fields(cast(Any, made)) if f.metadata.get("static"))
+    data_class = dataclass(frozen=True)(cls)
+    leaves = tuple(f.name for f in fields(cast(Any, data_class)) if not f.metadata.get("static"))
+    statics = tuple(f.name for f in fields(cast(Any, data_class)) if f.metadata.get("static"))
 
     def flatten(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         return tuple(getattr(value, n) for n in leaves), tuple(getattr(value, n) for n in statics)
@@ -35,10 +35,10 @@ def record(cls: type[Record]) -> type[Record]:
         return keyed, tuple(getattr(value, n) for n in statics)
 
     def unflatten(aux: tuple[Any, ...], children: Iterable[Any]) -> Any:
-        value = object.__new__(made)
+        value = object.__new__(data_class)
         for name, child in (*zip(leaves, children, strict=True), *zip(statics, aux, strict=True)):
             object.__setattr__(value, name, child)
         return value
 
-    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
-    return made
+    jax.tree_util.register_pytree_with_keys(data_class, flatten_with_keys, unflatten, flatten)
+    return data_class

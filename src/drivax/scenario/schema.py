@@ -1,14 +1,15 @@
 """Driving scenarios: kinds, flags, capacities, and the padded record that is stored.
 
 A reader or the built-in world produces a :class:`~drivax.scenario.recording.Recording`: ragged, float64, in the map
-frame of the source. ``scenario.build.assemble`` makes it a :class:`Scenario`: local frame, float32, with shapes given
-by :class:`Capacity`, map segments, grid and routes. This module needs no JAX.
+frame of the source. ``scenario.build.assemble`` makes it a :class:`Scenario`: local frame, float32, with the shapes
+of :class:`Capacity`, map segments, grid and routes. This module needs no JAX.
 """
 
 from __future__ import annotations
 
 import enum
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any
@@ -147,9 +148,12 @@ class Capacity:
     lane_run: int = 160
 
     def lasting(self, future_s: float) -> Capacity:
-        """Return the capacity of scenarios with this many seconds after the current step, 2 to 60 (else UsageError).
+        """Return the capacity of scenarios with this many seconds after the current step, 2 to 60.
 
         Routes get 40 m of room per second more than 8 s (144 km/h).
+
+        Raises:
+            UsageError: ``future_s`` is out of range.
         """
         if not 2.0 <= future_s <= 60.0:
             raise UsageError(f"future_s is {future_s:g}", cure="use 2 to 60 seconds")
@@ -250,6 +254,14 @@ def record_dtype(capacity: Capacity) -> np.dtype[Any]:
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
 
 
+def stack_field(records: Sequence[np.ndarray[Any, Any]], name: str, *part: Any) -> np.ndarray[Any, Any]:
+    """Stack a field of some records, or the same part of it, along a new first axis."""
+    values = [record[name][part] for record in records]
+    if not values[0].ndim:
+        return np.array(values)
+    return np.concatenate(values).reshape(len(values), *values[0].shape)  # faster than np.stack
+
+
 @dataclass(frozen=True)
 class SourceCounts:
     """Counts of the source before capping and cropping; ``drivax inspect`` shows them."""
@@ -260,7 +272,7 @@ class SourceCounts:
     map_features: dict[str, int]
     map_points: int
     lights: int
-    #: Nonzero numbers of items that the reader or the assembly left out, by name (``dangling_links``, ...).
+    #: Nonzero numbers of items that the reader or the assembly dropped, by name (``dangling_links``, ...).
     lost: dict[str, int] = field(default_factory=dict)
 
 

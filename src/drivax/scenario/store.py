@@ -19,9 +19,12 @@ import hashlib
 import json
 import math
 import shutil
+import threading
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any, Self
@@ -45,6 +48,10 @@ MANIFEST = "manifest.json"
 #: The cure for a set that cannot be repaired.
 AGAIN = "convert or generate the set again"
 _HEADER_LIMIT = 100_000
+#: Scenarios that an iteration reads at a time, and those of a task of a thread.
+_BATCH, _PART = 64, 8
+#: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
+_HEADERS = threading.Lock()
 _Bytes = np.ndarray[Any, Any]
 
 
@@ -63,8 +70,8 @@ class ScenarioWriter:
         shard_size: Records per shard.
         overwrite: Replace an existing scenario set; other folders are never replaced.
         shares: Percentages of train, validation and test for the files of ``splits/``; None writes no files.
-        identity: What is written, for a set that can be resumed: closed shards survive an exception or a kill, and the
-            next writer with the same identity continues after them (:attr:`notes`).
+        identity: Description of the content, for a set that can be resumed: closed shards survive an exception or a
+            kill, and the next writer with the same identity continues after them (:attr:`notes`).
         further: Writes additional files into the complete folder before it is published.
 
     Raises:
@@ -169,8 +176,8 @@ class ScenarioWriter:
         with (folder / name).open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         shard = {"file": name, "count": count, "sha256": digest}
-        finished = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
-        self._partial.note(len(self._shards), finished)
+        summary = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
+        self._partial.note(len(self._shards), summary)
         self._shards.append(shard)
         self._crcs = []
 
@@ -233,22 +240,38 @@ class ScenarioSet(Sequence[Scenario]):
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = True) -> ScenarioSet:
-        """Open a set; raise DataError if its manifest or the size or layout of a shard is wrong."""
-        opened = cls(path, read_manifest(Path(path)), verify)
-        if len(opened) != int(opened._starts[-1]):
-            problem = f"lists {len(opened)} scenarios but its shards contain {opened._starts[-1]}"
-            raise DataError(problem, file=opened.path / MANIFEST, cure=AGAIN)
-        for shard in opened._shards:
+        """Open a set.
+
+        Raises:
+            DataError: The manifest, or the size or layout of a shard, is wrong.
+        """
+        result = cls(path, read_manifest(Path(path)), verify)
+        if len(result) != int(result._starts[-1]):
+            problem = f"lists {len(result)} scenarios but its shards contain {result._starts[-1]}"
+            raise DataError(problem, file=result.path / MANIFEST, cure=AGAIN)
+        for shard in result._shards:
             shard.check_files()
-        return opened
+        return result
 
     def __len__(self) -> int:
         return len(self.entries)
 
+    def __iter__(self) -> Iterator[Scenario]:
+        for first in range(0, len(self), _BATCH):
+            yield from self[first : first + _BATCH]
+
+    def take(self, indices: Iterable[int]) -> list[Scenario]:
+        """Return scenarios; threads test the checksums of the ones that were not read before."""
+        numbers = list(indices)
+        parts = [numbers[first : first + _PART] for first in range(0, len(numbers), _PART)]
+        with ThreadPoolExecutor() as pool:  # zlib releases the lock of the interpreter
+            read = pool.map if self.verify else map
+            return list(chain.from_iterable(read(lambda part: [self[number] for number in part], parts)))
+
     def __getitem__(self, index: Any) -> Any:
         """Return a scenario (a view of the file), or a list for a slice."""
         if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
+            return self.take(range(*index.indices(len(self))))
         if not -len(self) <= index < len(self):
             raise IndexError(f"scenario {index} of {len(self)}")
         number = int(index) % len(self)
@@ -256,9 +279,9 @@ class ScenarioSet(Sequence[Scenario]):
         shard = int(np.searchsorted(self._starts, number, side="right")) - 1
         record = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
         findings = {name: dict(entry[name]) for name in ("overflow", "audit", "tags")}
-        stored = record.view(self._dtype).reshape(())
+        fields = record.view(self._dtype).reshape(())
         names = {name: str(entry[name]) for name in NAMES}
-        return Scenario(stored, self.capacity, SourceCounts(**entry["source"]), **findings, names=names)
+        return Scenario(fields, self.capacity, SourceCounts(**entry["source"]), **findings, names=names)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return ScenarioSet.open, (self.path, self.verify)  # Each process maps the files itself.
@@ -295,7 +318,11 @@ class ScenarioSet(Sequence[Scenario]):
         return out
 
     def check(self) -> None:
-        """Test the CRC of every record and the SHA-256 of every shard; raise DataError where one differs."""
+        """Test the CRC of every record and the SHA-256 of every shard.
+
+        Raises:
+            DataError: One of them differs.
+        """
         for shard in self._shards:
             for row in range(shard.count):
                 shard.record(row, verify=True)
@@ -356,16 +383,21 @@ class Shard:
                 raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
 
     def _map(self) -> _Bytes:
+        with _HEADERS:
+            return self._read_map() if self._data is None else self._data
+
+    def _read_map(self) -> _Bytes:
         offset = self.check_files()
-        shape = (self.count, self._dtype.itemsize)
-        # A plain view: indexing a memmap costs Python time.
-        self._data = np.asarray(np.memmap(self.path, np.uint8, "r", offset, shape))
         with self.crc_path.open("rb") as file:
             shape, dtype = read_header(file, self.crc_path)
             crcs = file.read()
         if shape != (self.count,) or dtype != np.uint32 or len(crcs) != 4 * self.count:
             raise DataError("checksum file does not fit its shard", file=self.crc_path, cure=AGAIN)
         self._crcs = np.frombuffer(crcs, np.uint32)
+        # A plain view: indexing a memmap costs Python time. Set last, since several threads may read.
+        self._data = np.asarray(
+            np.memmap(self.path, np.uint8, "r", offset, (self.count, self._dtype.itemsize))
+        )
         return self._data
 
     def _damage(self, problem: str, record: int) -> DataError:
@@ -398,7 +430,11 @@ def field_table(capacity: Capacity) -> list[dict[str, Any]]:
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """Read the manifest of the set at ``path``; raise DataError if it is missing, damaged or of another version."""
+    """Read the manifest of the set at ``path``.
+
+    Raises:
+        DataError: It is missing, damaged or of another version.
+    """
     file = path / MANIFEST
     if not path.is_dir():
         problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"

@@ -7,19 +7,21 @@ contiguous read), map segments are feature-major (a grid query is three contiguo
 from __future__ import annotations
 
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from itertools import islice
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt, UInt32
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt, UInt32
 
 from drivax.errors import DataError, DrivaxError
 from drivax.geometry.vectors import wrap
-from drivax.scenario.bank.columns import RoadLayer, SizeColumn
+from drivax.scenario.bank.columns import AgentColumn, RoadLayer, SizeColumn
 from drivax.scenario.bank.strands import corridor_lanes, lane_strands
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import (
@@ -30,7 +32,7 @@ from drivax.scenario.schema import (
     Capacity,
     RoadKind,
     Scenario,
-    among,
+    stack_field,
 )
 
 #: Types of map queries: a number, an index, and a point or direction.
@@ -47,6 +49,21 @@ CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE):
 NEVER_M = 1e6
 #: Steps in a word of ``parked_when``.
 WORD = 32
+#: Coordinates of unused segments, m.
+_FAR_M = 1e6
+#: Scenarios that are stacked at a time: their columns fit in the cache of a core.
+_BATCH = 32
+#: Threads that stack; NumPy releases the lock of the interpreter in its loops.
+_THREADS = min(os.cpu_count() or 1, 8)
+#: Alignment of arrays that JAX takes over without a copy, bytes.
+_ALIGNMENT = 64
+#: Layer of a kind of road; the last entry is that of -1.
+_LAYERS = np.full(max(RoadKind) + 2, RoadLayer.NONE, np.float32)
+for _layer, _kinds in enumerate((LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)):
+    _LAYERS[list(_kinds)] = _layer
+
+_Record = Shaped[np.ndarray, ""]
+_Arrays = dict[str, np.ndarray[Any, Any]]
 
 
 @dataclass(frozen=True)
@@ -83,40 +100,41 @@ class Sizes:
     @classmethod
     def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
         """Return the sizes that one or more scenarios of one capacity use."""
-        needed = [_needed(scenario) for scenario in scenarios]
-        if not needed:
+        batches = iter(scenarios)
+        each = [_batch_sizes(batch) for batch in iter(lambda: list(islice(batches, _BATCH)), [])]
+        if not each:
             raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
-        return cls(*(max(getattr(sizes, field.name) for sizes in needed) for field in fields(cls)))
+        return cls(*(max(getattr(sizes, field.name) for sizes in each) for field in fields(cls)))
 
 
-def last_used(mask: Any) -> np.ndarray[Any, Any]:
-    """Number of columns of ``mask [N, columns]`` up to the last true one, per row."""
-    return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
-
-
-def _needed(scenario: Scenario) -> Sizes:
-    capacity, record = scenario.capacity, scenario.record
-    masks = {
-        "agents": record["agent_valid"].any(0), "parked": record["parked_valid"].any(0),
-        "lights": (record["light_state"] >= 0).any(0), "graphs": record["lane_length"] > 0,
-    }  # fmt: skip
-    ends = {name: int(last_used(np.asarray(mask)[None])[0]) for name, mask in masks.items()}
-    agents = max(1, _rounded(ends["agents"], capacity.agents))
-    slots = _rounded(ends["agents"] + ends["parked"], capacity.agents + capacity.parked)
-    _, edges, segments = (int(number) for number in record["segment_blocks"][:3])
-    half_m = float(np.hypot(*record["agent_size"][0, :2])) / 2
+def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
+    """Return the sizes that a batch of scenarios of one capacity uses."""
+    capacity, records = scenarios[0].capacity, [scenario.record for scenario in scenarios]
+    agents, parked, lights, lanes = (
+        last_used(mask)
+        for mask in (
+            stack_field(records, "agent_valid").any(1),
+            stack_field(records, "parked_valid").any(1),
+            (stack_field(records, "light_state") >= 0).any(1),
+            stack_field(records, "lane_length") > 0,
+        )
+    )
+    moving = max(1, _rounded(int(agents.max()), capacity.agents))
+    slots = _rounded(int((agents + parked).max()), capacity.agents + capacity.parked)
+    _, edges, segments, _ = stack_field(records, "segment_blocks").T
+    half_m = np.hypot(*stack_field(records, "agent_size", 0).T[:2]).astype(np.float64) / 2
     return Sizes(
-        agents=agents,
-        slots=max(slots, agents),
-        lights=max(1, _rounded(ends["lights"], capacity.lights)),
-        edges=edges,
-        lanes=segments - edges,
-        edge_run=_longest_run(record["grid_edge"], capacity.grid),
-        lane_run=_longest_run(record["grid_lane"], capacity.grid),
-        graphs=max(1, _rounded(ends["graphs"], capacity.lanes)),
-        road=max(1, int(record["road_rows"])),
+        agents=moving,
+        slots=max(slots, moving),
+        lights=max(1, _rounded(int(lights.max()), capacity.lights)),
+        edges=int(edges.max()),
+        lanes=int((segments - edges).max()),
+        edge_run=_longest_run(stack_field(records, "grid_edge"), capacity.grid),
+        lane_run=_longest_run(stack_field(records, "grid_lane"), capacity.grid),
+        graphs=max(1, _rounded(int(lanes.max()), capacity.lanes)),
+        road=max(1, int(stack_field(records, "road_rows").max())),
         # Edges count up to 3 m from a corner; the 3 x 3 block is exact within a cell less half a segment.
-        long_ego=half_m + 3.0 > capacity.cell_m - 2.0,
+        long_ego=bool((half_m + 3.0 > capacity.cell_m - 2.0).any()),
     )
 
 
@@ -124,10 +142,10 @@ def _rounded(count: int, most: int) -> int:
     return min(most, -(-count // _MULTIPLE) * _MULTIPLE)
 
 
-def _longest_run(start: np.ndarray[Any, Any], grid: int) -> int:
+def _longest_run(start: Int[np.ndarray, "n cells1"], grid: int) -> int:
     """Longest run over three neighbouring cells of a grid row, rounded up to a multiple of 8."""
-    begin, end = (part.reshape(grid, grid).astype(np.int64) for part in (start[:-1], start[1:]))
-    return -(-max(int((end[:, 2:] - begin[:, :-2]).max()), 1) // _MULTIPLE) * _MULTIPLE
+    begin, end = (part.reshape(-1, grid, grid) for part in (start[:, :-1], start[:, 1:]))
+    return -(-max(int((end[..., 2:] - begin[..., :-2]).max()), 1) // _MULTIPLE) * _MULTIPLE
 
 
 @record
@@ -147,7 +165,7 @@ class ScenarioBank:
             :class:`EdgeRow` and :class:`LaneRow`.
         lane_strands: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
         grid_edge, grid_lane: Start of the run of each cell in ``edges`` and ``lanes`` (row-major, plus the end).
-        grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.packed``).
+        grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.pack_sides``).
         map_box: Smallest and largest x, y of edges and lanes.
         routes: Points 1 m apart, :class:`RouteColumn`; route 0 leads to the goal, route 1 is the log's own.
         log_progress, log_ahead: Arc length of the logged ego along route 0; distance that it still drives, m.
@@ -225,28 +243,27 @@ class ScenarioBank:
     ) -> ScenarioBank:
         """Stack scenarios of one capacity.
 
-        ``trim`` cuts unused padding, or cuts to given sizes: banks of the same sizes share compiled programs, smaller
+        ``trim`` cuts unused padding, or cuts to these sizes: banks of the same sizes share compiled programs, smaller
         banks are faster. ``allow_no_future`` accepts logs with fewer than 20 steps after the current one.
 
         Raises:
             DrivaxError: There are no scenarios, their capacities differ, or a log is too short.
         """
-        kept = list(scenarios)
-        for scenario in kept:
+        logs = list(scenarios)
+        for scenario in logs:
             if scenario.steps < LEAST_STEPS and not allow_no_future:
                 cure = "leave it out (flag!=NO_FUTURE)"
                 raise DataError(too_short(int(scenario.steps)), record=scenario.id, cure=cure)
-            if scenario.capacity != kept[0].capacity:
-                own, others = (f"{c.name!r} ({c.steps} steps)" for c in (scenario.capacity, kept[0].capacity))
+            if scenario.capacity != logs[0].capacity:
+                own, others = (f"{c.name!r} ({c.steps} steps)" for c in (scenario.capacity, logs[0].capacity))
                 cure = "convert all sets with one --capacity and --future-s"
                 raise DataError(f"has capacity {own}, others {others}", record=scenario.id, cure=cure)
-        own = Sizes.used(kept)
-        sizes = trim if isinstance(trim, Sizes) else own if trim else Sizes.whole(kept[0].capacity)
-        arrays = _stack_agents(kept, sizes) | _stack_routes(kept) | _stack_lights(kept, sizes)
-        arrays |= _stack_road(kept, sizes) | _stack_maps(kept, sizes)
+        own = Sizes.used(logs)
+        sizes = trim if isinstance(trim, Sizes) else own if trim else Sizes.whole(logs[0].capacity)
+        arrays = _stack(logs, sizes)
         return cls(
-            **{name: jnp.asarray(value) for name, value in arrays.items()},
-            cell_m=kept[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
+            **{name: jax.device_put(value, may_alias=True) for name, value in arrays.items()},
+            cell_m=logs[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
             long_ego=own.long_ego or sizes.long_ego, trimmed=trim is True,
         )  # fmt: skip
 
@@ -254,6 +271,45 @@ class ScenarioBank:
 def too_short(steps: int) -> str:
     """Say that a log has fewer steps than one that is evaluated or trained on."""
     return f"has {steps} steps, fewer than {LEAST_STEPS} (20 after the current one)"
+
+
+def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
+    """Return the arrays of a bank by name, aligned so that JAX shares their memory."""
+    records = [scenario.record for scenario in scenarios]
+    shapes = {
+        "agents": (len(scenarios[0].agent_z), sizes.agents, 8),
+        # Queries read whole runs, so a run must fit behind the last start.
+        "edges": (5, sizes.edges + sizes.edge_run),
+        "lanes": (8, sizes.lanes + sizes.lane_run),
+        "map_box": (4,),
+    }
+    large = [_aligned((len(records), *shape), np.dtype(np.float32)) for shape in shapes.values()]
+    arrays = {
+        name: _aligned((len(records), *values.shape[1:]), values.dtype)
+        for name, values in _stack_batch(records[:1], sizes).items()
+    }
+
+    def fill(rows: slice) -> None:
+        batch = records[rows]
+        targets = zip(*(array[rows] for array in large), strict=True)
+        for log, values, target in zip(batch, _lane_values(batch), targets, strict=True):
+            agents, edges, lanes, box = target
+            _fill_agents(agents, log)
+            _fill_segments(edges, lanes, box, values, log)
+        for name, values in _stack_batch(batch, sizes).items():
+            arrays[name][rows] = values
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(fill, (slice(first, first + _BATCH) for first in range(0, len(records), _BATCH))))
+    names = [(scenario.text("dataset"), scenario.id) for scenario in scenarios]
+    return arrays | dict(zip(shapes, large, strict=True)) | {"identity": identities(names)}
+
+
+def _aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray[Any, Any]:
+    size = int(np.prod(shape)) * dtype.itemsize
+    memory = np.empty(size + _ALIGNMENT, np.uint8)
+    begin = -memory.ctypes.data % _ALIGNMENT
+    return memory[begin : begin + size].view(dtype).reshape(shape)
 
 
 def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
@@ -270,171 +326,210 @@ def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
     return np.array(numbers, np.uint32)
 
 
-_Arrays = dict[str, np.ndarray[Any, Any]]
+def last_used(mask: Any) -> Int[np.ndarray, " n"]:
+    """Return the number of columns of ``mask [n, column]`` up to the last true one, per row."""
+    return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
 
 
-def _column(scenarios: Sequence[Scenario], name: str) -> np.ndarray[Any, Any]:
-    return np.stack([scenario.record[name] for scenario in scenarios])
+def _interleave(*columns: np.ndarray[Any, Any]) -> Float[np.ndarray, "*n column"]:
+    """Interleave columns in float32; those with one dimension more than the last hold several."""
+    rank = columns[-1].ndim
+    flat: list[np.ndarray[Any, Any]] = []
+    for values in columns:
+        flat += [values] if values.ndim == rank else [values[..., i] for i in range(values.shape[-1])]
+    result = np.empty((*columns[-1].shape, len(flat)), np.float32)
+    for i, values in enumerate(flat):
+        result[..., i] = values
+    return result
 
 
-def _columns(scenarios: Sequence[Scenario], prefix: str, *names: str) -> list[np.ndarray[Any, Any]]:
-    return [_column(scenarios, f"{prefix}_{name}") for name in names]
+def _stack_batch(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
+    arrays = _stack_agents(records, sizes) | _stack_routes(records) | _stack_lights(records, sizes)
+    return arrays | _stack_road(records, sizes) | _stack_grid(records, sizes)
 
 
-def _join(*parts: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Concatenate columns in float32; parts with one dimension less than the first are single columns."""
-    rank = parts[0].ndim
-    return np.concatenate([p if p.ndim == rank else p[..., None] for p in parts], -1, dtype=np.float32)
+def _fill_agents(agents: Float[np.ndarray, "time agent 8"], log: _Record) -> None:
+    """Write the moving agents of a record in place. They hold most bytes of a bank."""
+    xy, z, heading, velocity, valid = (
+        log[f"agent_{name}"][:, : agents.shape[1]] for name in ("xy", "z", "heading", "velocity", "valid")
+    )
+    agents[..., AgentColumn.X], agents[..., AgentColumn.Y] = xy[..., 0], xy[..., 1]
+    agents[..., AgentColumn.Z], agents[..., AgentColumn.VALID] = z, valid
+    agents[..., AgentColumn.VX], agents[..., AgentColumn.VY] = velocity[..., 0], velocity[..., 1]
+    np.cos(heading, out=agents[..., AgentColumn.COS])
+    np.sin(heading, out=agents[..., AgentColumn.SIN])
 
 
-def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
-    names = ("xy", "z", "heading", "velocity", "valid", "size", "kind")
-    xy, z, heading, velocity, valid, size, kind = _columns(scenarios, "agent", *names)
-    agents = _join(xy, z, np.cos(heading), np.sin(heading), velocity, valid)
-    box = _join(size, kind)[:, : sizes.agents]
+def _stack_agents(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
+    agents = slice(0, sizes.agents)
+    size, kind = (stack_field(records, f"agent_{name}", agents) for name in ("size", "kind"))
+    xy, valid = stack_field(records, "agent_xy", slice(None), 0), stack_field(records, "agent_valid")
     return {
-        "agents": agents[:, :, : sizes.agents],
-        "extension": _column(scenarios, "agent_extension")[:, : sizes.agents],
-        "flags": _column(scenarios, "flags"),
-        "last_step": _column(scenarios, "steps").astype(np.int32) - 1,
-        "identity": identities([(scenario.text("dataset"), scenario.id) for scenario in scenarios]),
-        **_stack_parked(scenarios, sizes.slots, last_used(valid.any(1)), box),
+        "extension": stack_field(records, "agent_extension", agents),
+        "flags": stack_field(records, "flags"),
+        "last_step": stack_field(records, "steps").astype(np.int32) - 1,
+        "log_ahead": _log_ahead(xy, valid[:, :, 0]),
+        **_stack_parked(records, sizes.slots, last_used(valid.any(1)), _interleave(size, kind)),
     }
 
 
+def _log_ahead(
+    xy: Float[np.ndarray, "n time 2"], valid: Bool[np.ndarray, "n time"]
+) -> Float[np.ndarray, "n time"]:
+    """Distance that each logged ego drives from every step on, without gaps of the log."""
+    moved = np.hypot(*np.moveaxis(np.diff(xy, axis=1), -1, 0)) * (valid[:, 1:] & valid[:, :-1])
+    ahead = np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
+    return np.concatenate([ahead, np.zeros_like(ahead[:, :1])], axis=1)
+
+
 def _stack_parked(
-    scenarios: Sequence[Scenario], slots: int, first: np.ndarray[Any, Any], box: np.ndarray[Any, Any]
+    records: Sequence[_Record], slots: int, first: Int[np.ndarray, " n"], box: Float[np.ndarray, "n agent 4"]
 ) -> _Arrays:
     """Parked agents, from slot ``first`` of their scenario on, and the boxes of all agents."""
-    names = ("xy", "z", "heading", "valid", "size", "kind")
-    xy, z, heading, valid, size, kind = _columns(scenarios, "parked", *names)
+    valid = stack_field(records, "parked_valid")
     count = last_used(valid.any(1))
-    scenario, place = chosen = np.nonzero(np.arange(valid.shape[2]) < count[:, None])
-    at = scenario, first[scenario] + place
-    rows = np.zeros((len(scenarios), slots, 8), np.float32)
-    xy, z, heading = xy[chosen], z[chosen], heading[chosen]
-    rows[at] = _join(xy, z, np.cos(heading), np.sin(heading), np.zeros((len(z), 2)), np.ones(len(z)))
-    boxes = np.zeros((len(scenarios), slots, 4), np.float32)
+    parked = slice(0, int(count.max()))
+    xy, z, heading, size, kind = (
+        stack_field(records, f"parked_{name}", parked) for name in ("xy", "z", "heading", "size", "kind")
+    )
+    mask = np.arange(parked.stop) < count[:, None]
+    scenario, number = np.nonzero(mask)
+    at = scenario, first[scenario] + number
+    poses = np.zeros((len(records), slots, 8), np.float32)
+    velocity, is_observed = np.zeros((*z.shape, 2)), np.ones(z.shape)
+    poses[at] = _interleave(xy, z, np.cos(heading), np.sin(heading), velocity, is_observed)[mask]
+    boxes = np.zeros((len(records), slots, 4), np.float32)
     boxes[:, : box.shape[1]] = box
-    boxes[at] = np.concatenate([size, kind[..., None]], -1)[chosen]
-    when = np.zeros((len(scenarios), valid.shape[1], slots), bool)
-    when[scenario, :, at[1]] = valid[scenario, :, place]
-    return {"agent_box": boxes, "parked": rows, "parked_when": as_words(when)}
+    boxes[at] = _interleave(size, kind)[mask]
+    words = as_words(valid[:, :, parked])
+    when = np.zeros((len(records), words.shape[1], slots), np.uint32)
+    when[scenario, :, at[1]] = words[scenario, :, number]
+    return {"agent_box": boxes, "parked": poses, "parked_when": when}
 
 
 def as_words(when: Bool[np.ndarray, "N T S"]) -> UInt[np.ndarray, "N W S"]:
     """Pack steps into bits of words, as in ``ScenarioBank.parked_when``."""
-    steps = when.shape[1]
-    padded = np.pad(when, ((0, 0), (0, -steps % WORD), (0, 0)))
-    bits = padded.reshape(len(when), -1, WORD, when.shape[2]).astype(np.uint32)
-    return (bits << np.arange(WORD, dtype=np.uint32)[:, None]).sum(axis=2, dtype=np.uint32)
+    padded = np.pad(when, ((0, 0), (0, -when.shape[1] % WORD), (0, 0)))
+    parts = np.packbits(padded, axis=1, bitorder="little").astype(np.uint32)
+    parts = parts.reshape(len(when), padded.shape[1] // WORD, WORD // 8, when.shape[2])
+    return np.bitwise_or.reduce(parts << np.arange(0, WORD, 8, dtype=np.uint32)[:, None], axis=2)
 
 
-def _stack_routes(scenarios: Sequence[Scenario]) -> _Arrays:
+def _stack_routes(records: Sequence[_Record]) -> _Arrays:
     names = ("xy", "z", "heading", "limit", "lane")
-    xy, z, heading, limit, lane = (column[:, :2] for column in _columns(scenarios, "route", *names))
+    xy, z, heading, limit, lane = (stack_field(records, f"route_{name}", slice(0, 2)) for name in names)
     return {
-        "routes": _join(xy, z, np.cos(heading), np.sin(heading), limit, lane),
-        "route_points": _column(scenarios, "route_points")[:, :2].astype(np.int32),
-        "goal": _column(scenarios, "goal_xy"),
-        "log_progress": _column(scenarios, "log_progress"),
-        "log_ahead": _log_ahead(scenarios),
+        "routes": _interleave(xy, z, np.cos(heading), np.sin(heading), limit, lane),
+        "route_points": stack_field(records, "route_points", slice(0, 2)).astype(np.int32),
+        "goal": stack_field(records, "goal_xy"),
+        "log_progress": stack_field(records, "log_progress"),
     }
 
 
-def _log_ahead(scenarios: Sequence[Scenario]) -> np.ndarray[Any, Any]:
-    """Distance that each logged ego drives from every step on, without gaps of the log."""
-    xy, valid = _column(scenarios, "agent_xy")[:, :, 0], _column(scenarios, "agent_valid")[:, :, 0]
-    moved = np.hypot(*np.moveaxis(np.diff(xy, axis=1), -1, 0)) * (valid[:, 1:] & valid[:, :-1])
-    ahead = np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
-    return np.concatenate([ahead, np.zeros_like(ahead[:, :1])], axis=1).astype(np.float32)
-
-
-def _stack_lights(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
-    line, state = _column(scenarios, "light_line").astype(np.float64), _column(scenarios, "light_state")
-    z, heading, exits = _columns(scenarios, "light", "z", "heading", "exit_heading")
+def _stack_lights(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
+    lights = slice(0, sizes.lights)
+    line = stack_field(records, "light_line", lights).astype(np.float64)
+    z, heading, exits, lane = (
+        stack_field(records, f"light_{name}", lights) for name in ("z", "heading", "exit_heading", "lane")
+    )
     middle, along = (line[..., :2] + line[..., 2:]) / 2, line[..., 2:] - line[..., :2]
     half = np.hypot(*np.moveaxis(along, -1, 0)) / 2
-    x, y = np.moveaxis(middle, -1, 0)
     right = wrap(exits.astype(np.float64) - heading) < -np.pi / 4
-    arc = np.stack([_stop_arcs(scenario, at) for scenario, at in zip(scenarios, middle, strict=True)])
+    x, y = np.moveaxis(middle, -1, 0)
+    arc = _stop_arcs(records, lane, middle)
     rows = [x, y, np.cos(heading), np.sin(heading), half, z, np.cos(exits), np.sin(exits), right, arc]
     return {
-        "light_line": np.stack(rows, axis=1, dtype=np.float32)[:, :, : sizes.lights],
-        "light_state": state[:, :, : sizes.lights],
+        "light_line": np.stack(rows, axis=1, dtype=np.float32),
+        "light_state": stack_field(records, "light_state", slice(None), lights),
     }
 
 
-def _stop_arcs(scenario: Scenario, middle: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def _stop_arcs(
+    records: Sequence[_Record], lane: Int[np.ndarray, "n light"], middle: Float[np.ndarray, "n light 2"]
+) -> Float[np.ndarray, "n light"]:
     """Arc length along the route to the goal where it is nearest to the stop lines of its lanes."""
-    count = int(scenario.route_points[0])
-    lanes = scenario.light_lane
-    mine = np.flatnonzero((lanes >= 0) & np.isin(lanes, scenario.route_lane[0]))
-    arcs = np.full(len(lanes), NEVER_M)
-    if count and len(mine):
-        x, y = scenario.route_xy[0, :count].T.astype(np.float64)
-        heading = scenario.route_heading[0, :count].astype(np.float64)
-        dx, dy = middle[mine, 0, None] - x, middle[mine, 1, None] - y
-        near = np.argmin(dx * dx + dy * dy, axis=1)
-        row = np.arange(len(mine))
-        arcs[mine] = near + dx[row, near] * np.cos(heading[near]) + dy[row, near] * np.sin(heading[near])
+    arcs = np.full(lane.shape, NEVER_M)
+    count = stack_field(records, "route_points", 0)
+    route_lane = stack_field(records, "route_lane", 0)
+    on_route = np.zeros((len(records), 2 + max(int(lane.max()), int(route_lane.max()))), bool)
+    on_route[np.arange(len(records))[:, None], route_lane] = True
+    on_route[:, -1] = False  # that of -1, no lane
+    on_route &= count[:, None] > 0
+    scenario, light = stops = np.nonzero(on_route[np.arange(len(records))[:, None], lane])
+    if len(light):
+        xy, heading = (
+            stack_field(records, f"route_{name}", 0).astype(np.float64) for name in ("xy", "heading")
+        )
+        dx, dy = np.moveaxis(middle[stops][:, None] - xy[scenario], -1, 0)
+        away = np.where(np.arange(xy.shape[1]) < count[scenario, None], dx * dx + dy * dy, np.inf)
+        near = np.argmin(away, axis=1)
+        nearest, course = (np.arange(len(near)), near), heading[scenario, near]
+        arcs[stops] = near + dx[nearest] * np.cos(course) + dy[nearest] * np.sin(course)
     return arcs
 
 
-def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
-    blocks = _column(scenarios, "segment_blocks").astype(np.int64)
-    # Queries read whole runs, so a run must fit behind the last start.
-    edges = np.full((len(scenarios), 5, sizes.edges + sizes.edge_run), 1e6, np.float32)
-    lanes = np.full((len(scenarios), 8, sizes.lanes + sizes.lane_run), 1e6, np.float32)
-    box = np.zeros((len(scenarios), 4), np.float32)
-    for row, scenario in enumerate(scenarios):
-        e, end = blocks[row, 1:3]
-        a, b = scenario.segment_a[:end], scenario.segment_b[:end]
-        ends = np.stack([*a[:, :2].T, *b[:, :2].T, (a[:, 2] + b[:, 2]) / 2])
-        edges[row, :, :e] = ends[:, :e]
-        lanes[row, :, : end - e] = [*ends[:, e:], *_lane_values(scenario, scenario.segment_lane[e:end])]
-        points = np.concatenate([a[:, :2], b[:, :2]])
-        if len(points):
-            box[row] = [*points.min(0), *points.max(0)]
-    return {
-        "edges": edges,
-        "lanes": lanes,
-        "lane_strands": np.stack([lane_strands(scenario) for scenario in scenarios])[:, : sizes.graphs],
-        "grid_edge": _column(scenarios, "grid_edge").astype(np.int16),
-        "grid_lane": (_column(scenarios, "grid_lane") - blocks[:, 1:2]).astype(np.int16),
-        "grid_side": _column(scenarios, "grid_side"),
-        "grid_origin": _column(scenarios, "grid_origin"),
-        "map_box": box,
-    }
-
-
-def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
+def _stack_road(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
     names = ("xy", "direction", "length", "kind", "limit", "curvature")
-    columns = (column[:, : sizes.road] for column in _columns(scenarios, "road", *names))
-    xy, direction, length, kind, limit, curvature = columns
-    layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
-    there = np.arange(sizes.road) < _column(scenarios, "road_rows")[:, None]
-    layer = np.where(there & layers.any(-1), np.argmax(layers, axis=-1), RoadLayer.NONE)
+    xy, direction, length, kind, limit, curvature = (
+        stack_field(records, f"road_{name}", slice(0, sizes.road)) for name in names
+    )
+    is_piece = np.arange(kind.shape[1]) < stack_field(records, "road_rows")[:, None]
+    layer = np.where(is_piece, _LAYERS[np.minimum(kind, len(_LAYERS) - 1)], np.float32(RoadLayer.NONE))
     return {
-        "road": _join(xy, direction, length, layer, limit),
-        "road_at": np.stack([xy[..., 0], xy[..., 1], layer], axis=1, dtype=np.float32),
-        "road_curvature": curvature.astype(np.float32),
+        "road": _interleave(xy, direction, length, layer, limit),
+        "road_at": np.stack([xy[..., 0], xy[..., 1], layer], axis=1),
+        "road_curvature": curvature,
     }
 
 
-def _lane_values(scenario: Scenario, lane: Int[np.ndarray, " segment"]) -> tuple[Any, Any, Any]:
-    """Half width, limit and number of the lane of each segment, as in :class:`LaneRow`."""
-    width = scenario.lane_width[lane]
+def _fill_segments(
+    edges: Float[np.ndarray, "5 edge"], lanes: Float[np.ndarray, "8 lane"], box: Float[np.ndarray, "4"],
+    values: Float[np.ndarray, "3 lane1"], log: _Record,
+) -> None:  # fmt: skip
+    """Write the edges and lanes of a record in place, and the box around them."""
+    e, end = log["segment_blocks"][1:3].tolist()
+    a, b, count = log["segment_a"][:end].T, log["segment_b"][:end].T, end - e
+    ends = np.empty((5, end), np.float32)
+    ends[0:2], ends[2:4], ends[4] = a[:2], b[:2], (a[2] + b[2]) / 2
+    edges[:, :e], edges[:, e:] = ends[:, :e], _FAR_M
+    lanes[:5, :count], lanes[5:, :count] = ends[:, e:], values[:, log["segment_lane"][e:end]]
+    lanes[:, count:] = _FAR_M
+    low, high = (ends[:4].min(axis=1), ends[:4].max(axis=1)) if end else np.zeros((2, 4), np.float32)
+    np.minimum(low[:2], low[2:], out=box[:2])
+    np.maximum(high[:2], high[2:], out=box[2:])
+
+
+def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
+    """Half width, limit and number of each lane, as in :class:`LaneRow`, and for segments without a lane (-1)."""
+    count = int(last_used(stack_field(records, "lane_id") >= 0).max())
+    lanes = np.append(np.arange(count), -1)
+    width = stack_field(records, "lane_width", lanes)
     half = np.where(width > 0, width, DEFAULT_LANE_WIDTH_M) / 2
-    return half, _lane_limits(scenario)[lane], lane + 0.5 * corridor_lanes(scenario)[lane]
+    number = lanes + 0.5 * corridor_lanes(records)[:, lanes]
+    return np.stack([half, _lane_limits(records, lanes), number], axis=1, dtype=np.float32)
 
 
-def _lane_limits(scenario: Scenario) -> Float[np.ndarray, " lane"]:
+def _lane_limits(records: Sequence[_Record], lanes: Int[np.ndarray, " lane"]) -> Float[np.ndarray, "n lane"]:
     """Limit of each lane, m/s; of connectors the highest of the lanes that they join, if known; else of the class."""
-    limit = scenario.lane_limit
-    links = np.concatenate([scenario.lane_predecessor, scenario.lane_successor], axis=1)
-    joined = np.where(links >= 0, limit[links], -1.0).max(axis=1)
-    limit = np.where(scenario.lane_interpolating & (joined > 0), joined, limit)
-    for kind, fallback in CLASS_LIMIT_MPS.items():
-        limit = np.where((limit <= 0) & (scenario.lane_kind == kind), fallback, limit)
+    limit, kind, is_connector, *links = (
+        stack_field(records, f"lane_{name}", lanes)
+        for name in ("limit", "kind", "interpolating", "predecessor", "successor")
+    )
+    link = np.concatenate(links, axis=2)
+    scenario = np.arange(len(records))[:, None, None]
+    joined = np.where(link >= 0, limit[scenario, link], -1.0).max(axis=2)
+    limit = np.where(is_connector & (joined > 0), joined, limit)
+    for number, fallback in CLASS_LIMIT_MPS.items():
+        limit = np.where((limit <= 0) & (kind == number), fallback, limit)
     return limit
+
+
+def _stack_grid(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
+    edges = stack_field(records, "segment_blocks", 1).astype(np.int16)
+    return {
+        "lane_strands": lane_strands(records)[:, : sizes.graphs],
+        "grid_edge": stack_field(records, "grid_edge"),
+        "grid_lane": stack_field(records, "grid_lane") - edges[:, None],
+        "grid_side": stack_field(records, "grid_side"),
+        "grid_origin": stack_field(records, "grid_origin"),
+    }

@@ -7,16 +7,16 @@ change (``scenario.bank.queries.lane_passage``).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, Integer
 
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import StrandColumn
-from drivax.scenario.build.segments import inside_box
-from drivax.scenario.schema import Scenario
+from drivax.scenario.schema import stack_field
 
 Array = np.ndarray[Any, Any]
 
@@ -31,52 +31,88 @@ _MERGING_RAD = np.deg2rad(30.0)
 #: An adjacent lane continues beyond the end of a lane if it reaches further than the first distance. Lanes may end at
 #: the crop of the map beyond the second distance from the box of the ego's log, m.
 _ON_M, _KNOWN_M = 10.0, 95.0
-#: Largest excess of the length of a lane over its drawing (height, rounding), and upper bound of lengths, m.
-_SLACK_M, _KEY_M = 1.0, 1e6
+#: Largest excess of the length of a lane over its drawing (height, rounding), m.
+_SLACK_M = 1.0
 
 
-def lane_strands(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
-    """Return the table :class:`StrandColumn` of a scenario, a row per stored lane.
+def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
+    """Return the tables :class:`StrandColumn` of scenarios, a row per stored lane.
 
     A strand is named by its last lane, or by the highest lane of a ring. It merges if its last lane leads onto another
     strand at a small angle (a ramp, two lanes that join), or ends next to a lane that continues (a lane drop). Turns
     that join a lane at a junction do not merge.
     """
-    table = np.full((len(scenario.lane_id), 6), -1.0, np.float32)
-    table[:, StrandColumn.END] = NOWHERE_M
-    count = int((scenario.lane_length > 0).sum())
-    if not count:
-        return table
-    row = np.arange(count)
-    successor = scenario.lane_successor[:count].astype(np.int64)
-    predecessor = scenario.lane_predecessor[:count].astype(np.int64)
-    courses, each = _Courses.of(scenario, count), np.repeat(row[:, None], 4, axis=1)
-    ahead = _straightest(successor, courses.turn(each, successor))
-    behind = _straightest(predecessor, courses.turn(predecessor, each))
+    lanes = _Lanes.of(records)
+    tables = np.full((*lanes.mask.shape, 6), -1.0, np.float32)
+    tables[..., StrandColumn.END] = NOWHERE_M
+    if not len(lanes.scenario):
+        return tables
+    row = np.arange(len(lanes.scenario))
+    successor, predecessor = lanes.links(records, "successor"), lanes.links(records, "predecessor")
+    courses, each = _Courses.of(records, lanes), np.repeat(row[:, None], 4, axis=1)
+    ahead = _straightest_link(successor, courses.turn(each, successor))
+    behind = _straightest_link(predecessor, courses.turn(predecessor, each))
     follows = np.where((ahead >= 0) & (behind[ahead] == row), ahead, -1)
     strand, last = _strands(follows)
     other = np.where((ahead >= 0) & (follows < 0), behind[ahead], -1)
-    comes_in = (other >= 0) & (np.abs(wrap(courses.before - courses.before[other])) <= _MERGING_RAD)
-    onto = np.where(comes_in, strand[ahead], -1)
+    merges = (other >= 0) & (np.abs(wrap(courses.before - courses.before[other])) <= _MERGING_RAD)
+    onto = np.where(merges, strand[ahead], -1)
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
-    stops = (successor < 0).all(axis=1) & _is_map_known(scenario, stop)
-    sides = (StrandColumn.RIGHT, scenario.lane_right), (StrandColumn.LEFT, scenario.lane_left)
-    for column, neighbour in sides:
-        adjacent = neighbour[:count].astype(np.int64)
+    stops = (successor < 0).all(axis=1) & _is_map_known(records, lanes.scenario, stop)
+    table = np.empty((len(row), 6))
+    for column, name in ((StrandColumn.RIGHT, "right"), (StrandColumn.LEFT, "left")):
+        adjacent = lanes.links(records, name)
         further = ((stop[last[adjacent]] - stop) * course).sum(axis=1)
         # Lanes that are not stored lie beyond the crop.
-        goes_on = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | ~(further <= _ON_M))
-        onto = np.where(stops & goes_on, strand[adjacent], onto)
-        table[:count, column] = np.where(adjacent >= 0, strand[adjacent], -1)
+        continues = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | ~(further <= _ON_M))
+        onto = np.where(stops & continues, strand[adjacent], onto)
+        table[:, column] = lanes.index(np.where(adjacent >= 0, strand[adjacent], -1))
     onto = np.where(follows[last] < 0, onto[last], -1)
-    table[:count, StrandColumn.STRAND], table[:count, StrandColumn.ONTO] = strand, onto
-    table[:count, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
-    return table
+    table[:, StrandColumn.STRAND], table[:, StrandColumn.ONTO] = lanes.index(strand), lanes.index(onto)
+    table[:, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
+    tables[lanes.mask] = table
+    return tables
+
+
+@dataclass(frozen=True)
+class _Lanes:
+    """Stored lanes of some scenarios, in one sequence.
+
+    Attributes:
+        mask: Mask of the lanes of each record.
+        first: First lane of each scenario in the sequence.
+        scenario: Scenario of each lane.
+        length: Length of each lane, m.
+    """
+
+    mask: Bool[Array, "n capacity"]
+    first: Int[Array, " n"]
+    scenario: Int[Array, " lane"]
+    length: Float[Array, " lane"]
+
+    @classmethod
+    def of(cls, records: Sequence[Array]) -> _Lanes:
+        """Return the lanes of records."""
+        length = stack_field(records, "lane_length")
+        count = (length > 0).sum(axis=1)
+        mask = np.arange(length.shape[1]) < count[:, None]
+        scenario = np.repeat(np.arange(len(records)), count)
+        return cls(mask, np.cumsum(count) - count, scenario, length[mask].astype(float))
+
+    def links(self, records: Sequence[Array], name: str) -> Int[Array, "lane *link"]:
+        """Return links of lanes as places in the sequence, -1 for none."""
+        link = stack_field(records, f"lane_{name}")[self.mask].astype(np.int64)
+        first = self.first[self.scenario].reshape(-1, *[1] * (link.ndim - 1))
+        return np.where(link >= 0, link + first, -1)
+
+    def index(self, lane: Int[Array, " lane"]) -> Int[Array, " lane"]:
+        """Return the indices of lanes, one per lane of the sequence, in its scenario."""
+        return np.where(lane >= 0, lane - self.first[self.scenario], -1)
 
 
 @dataclass(frozen=True)
 class _Courses:
-    """Courses of lanes at their ends; NaN where that stretch is not stored.
+    """Courses of lanes at their ends; NaN if that stretch is not stored.
 
     Headings (rad) at the beginning, at the end and 20 m ``before`` the end; mean curvature (1/m) over the first and the
     last 20 m; and the last point (m).
@@ -90,33 +126,16 @@ class _Courses:
     stop: Float[Array, "lane 2"]
 
     @classmethod
-    def of(cls, scenario: Scenario, count: int) -> _Courses:
-        """Return the courses of the first ``count`` lanes."""
-        part = slice(int(scenario.segment_blocks[1]), int(scenario.segment_blocks[2]))
-        lane = scenario.segment_lane[part].astype(np.int64)
-        start = scenario.segment_start_m[part].astype(float)
-        order = np.lexsort((start, lane))
-        lane, start = lane[order], start[order]
-        a, b = (x[part, :2].astype(float)[order] for x in (scenario.segment_a, scenario.segment_b))
-        span, heading = np.hypot(*(b - a).T), np.arctan2(*(b - a).T[::-1])
-        row, length = np.arange(count), scenario.lane_length[:count].astype(float)
-
-        def values(of: Array, arc: Array) -> Array:
-            """Values of the segments at an arc length of each lane."""
-            at = np.searchsorted(lane * _KEY_M + start, row * _KEY_M + arc, side="right") - 1
-            stored = at >= 0
-            stored[stored] = (lane[at] == row)[stored] & (arc - start[at] <= span[at] + _SLACK_M)[stored]
-            result = np.full((count, *of.shape[1:]), np.nan)
-            result[stored] = of[at[stored]]
-            return result
-
-        if not len(lane):
-            return cls(*[np.full(count, np.nan)] * 5, stop=np.full((count, 2), np.nan))
+    def of(cls, records: Sequence[Array], lanes: _Lanes) -> _Courses:
+        """Return the courses of stored lanes."""
+        segments, length = _Segments.of(records, lanes), lanes.length
         look = np.minimum(_BEND_M, length)
-        begin, end = (values(heading, np.clip(m, 0.0, length)) for m in (_END_M, length - _END_M))
-        before = values(heading, length - look)
-        early, late = wrap(values(heading, look) - begin) / look, wrap(end - before) / look
-        return cls(begin, end, early, late, before, values(b, length))
+        begin, _ = segments.at(np.minimum(_END_M, length))
+        end, _ = segments.at(np.maximum(length - _END_M, 0.0))
+        bend, _ = segments.at(look)
+        before, _ = segments.at(length - look)
+        _, stop = segments.at(length)
+        return cls(begin, end, wrap(bend - begin) / look, wrap(end - before) / look, before, stop)
 
     def turn(self, lane: Int[Array, "*n"], onto: Int[Array, "*n"]) -> Float[Array, "*n"]:
         """Turn and change of curvature from a lane onto another, rad over 20 m."""
@@ -124,7 +143,54 @@ class _Courses:
         return kink + _BEND_M * np.abs(self.early[onto] - self.late[lane])
 
 
-def _straightest(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"]) -> Int[Array, " lane"]:
+@dataclass(frozen=True)
+class _Segments:
+    """Segments of lanes by lane and arc length; those of lane i are ``first[i]`` to ``first[i + 1]``."""
+
+    lane: Integer[Array, " segment"]
+    start: Float[Array, " segment"]
+    a: Float[Array, "segment 2"]
+    b: Float[Array, "segment 2"]
+    first: Int[Array, " lane1"]
+
+    @classmethod
+    def of(cls, records: Sequence[Array], lanes: _Lanes) -> _Segments:
+        """Return the segments of stored lanes."""
+        parts = [slice(*record["segment_blocks"][1:3].tolist()) for record in records]
+        index, start, a, b = (
+            np.concatenate(
+                [record[f"segment_{name}"][part] for record, part in zip(records, parts, strict=True)]
+            )
+            for name in ("lane", "start_m", "a", "b")
+        )
+        first = np.repeat(lanes.first, [part.stop - part.start for part in parts])
+        of_lanes = np.flatnonzero(index >= 0)
+        lane = (first[of_lanes] + index[of_lanes]).astype(np.min_scalar_type(len(lanes.scenario)))
+        # Floats of one sign are ordered as their bits. Whole numbers sort several times faster than np.lexsort.
+        by_start = np.abs(start[of_lanes]).view(np.uint32).astype(np.uint64) << 32 | np.arange(
+            len(of_lanes), dtype=np.uint64
+        )
+        order = (np.sort(by_start) & 0xFFFFFFFF).astype(np.int64)
+        order = order[np.argsort(lane[order], kind="stable")]
+        lane, order = lane[order], of_lanes[order]
+        bounds = np.searchsorted(lane, np.arange(len(lanes.scenario) + 1))
+        return cls(lane, start[order].astype(float), a[order, :2], b[order, :2], bounds)
+
+    def at(self, arc: Float[Array, " lane"]) -> tuple[Float[Array, " lane"], Float[Array, "lane 2"]]:
+        """Heading and end of the segment at an arc length of each lane, NaN without one."""
+        before = np.append(0, np.cumsum(self.start <= arc[self.lane]))[self.first]
+        last = self.first[:-1] + np.diff(before) - 1
+        row = np.flatnonzero(np.diff(before))
+        start, a, b = (values[last[row]].astype(float) for values in (self.start, self.a, self.b))
+        span = np.hypot(*(b - a).T)
+        reaches = arc[row] - start <= span + _SLACK_M
+        heading, end = np.full(len(arc), np.nan), np.full((len(arc), 2), np.nan)
+        heading[row[reaches]] = np.arctan2(*(b - a)[reaches].T[::-1])
+        end[row[reaches]] = b[reaches]
+        return heading, end
+
+
+def _straightest_link(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"]) -> Int[Array, " lane"]:
     """Link of each lane with the smallest turn, the first if equal or unknown; -1 for none."""
     turn = np.where(links >= 0, np.where(np.isnan(turn), _UNKNOWN, np.round(turn, 2)), np.inf)
     return links[np.arange(len(links)), np.argmin(turn, axis=1)]
@@ -140,20 +206,30 @@ def _strands(follows: Int[Array, " lane"]) -> tuple[Int[Array, " lane"], Int[Arr
     return np.where(follows[last] >= 0, highest, last), last
 
 
-def _is_map_known(scenario: Scenario, xy: Float[Array, "lane 2"]) -> Array:
+def _is_map_known(
+    records: Sequence[Array], scenario: Int[Array, " lane"], xy: Float[Array, "lane 2"]
+) -> Bool[Array, " lane"]:
     """Mask of points so near to the log of the ego that the map around them is stored."""
-    log = scenario.agent_xy[scenario.agent_valid[:, 0], 0]
-    return inside_box(xy, log, _KNOWN_M) if len(log) else np.zeros(len(xy), bool)
+    valid = stack_field(records, "agent_valid", slice(None), 0)[..., None]
+    log = stack_field(records, "agent_xy", slice(None), 0)
+    low = np.where(valid, log, np.inf).min(axis=1) - _KNOWN_M
+    high = np.where(valid, log, -np.inf).max(axis=1) + _KNOWN_M
+    return np.all((xy >= low[scenario]) & (xy <= high[scenario]), axis=1)
 
 
-def corridor_lanes(scenario: Scenario) -> Bool[np.ndarray, " lane"]:
+def corridor_lanes(records: Sequence[Array]) -> Bool[np.ndarray, "n lane"]:
     """Mask of lanes of the route and of their same-direction neighbours (at any distance sideways)."""
-    member = np.zeros(len(scenario.lane_id), bool)
-    todo = list(np.unique(scenario.route_lane[0][: int(scenario.route_points[0])]))
-    while todo:
-        lane = int(todo.pop())
-        if lane < 0 or member[lane]:
-            continue
-        member[lane] = True
-        todo += [int(scenario.lane_left[lane]), int(scenario.lane_right[lane])]
+    neighbours = [stack_field(records, f"lane_{side}") for side in ("left", "right")]
+    route = stack_field(records, "route_lane", 0)
+    on_route = (route >= 0) & (np.arange(route.shape[1]) < stack_field(records, "route_points", 0)[:, None])
+    scenario, point = np.nonzero(on_route)
+    lane = route[scenario, point]
+    member = np.zeros(neighbours[0].shape, bool)
+    while len(lane):
+        member[scenario, lane] = True
+        adjacent_lanes = np.zeros_like(member)
+        for neighbour in neighbours:
+            adjacent = neighbour[scenario, lane]
+            adjacent_lanes[scenario[adjacent >= 0], adjacent[adjacent >= 0]] = True
+        scenario, lane = np.nonzero(adjacent_lanes & ~member)
     return member

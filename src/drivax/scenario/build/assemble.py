@@ -70,7 +70,7 @@ Record = np.ndarray[Any, Any]
 MARGIN_M, MAP_M = 100.0, 500_000.0
 #: Largest deviation from the median step without ``JITTERED_TIME``, and largest range of heights without ``ELEVATION``.
 JITTER_S, FLAT_M = 0.002, 0.01
-#: Flags that are measured here and override those of the reader. ``LIGHTS`` is not among them: a source may know that
+#: Flags that assembly measures; they override those of the reader. ``LIGHTS`` is not among them: a source may know that
 #: there are no lights.
 MEASURED = (
     Flag.LANE_GRAPH | Flag.DEFAULT_LIMITS | Flag.SPEED_LIMITS | Flag.CHAINED_GRAPH
@@ -86,7 +86,7 @@ MISSING = (
 )  # fmt: skip
 #: Lanes whose class has a limit (``scenario.bank.scenario_bank.CLASS_LIMIT_MPS``).
 _LIMITED_KINDS = (RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE)
-_COUNTED = {
+_FEATURE_GROUPS = {
     "lane": LANE_KINDS, "road_line": LINE_KINDS, "road_edge": EDGE_KINDS, "crosswalk": (RoadKind.CROSSWALK,),
     "speed_bump": (RoadKind.SPEED_BUMP,), "stop_sign": (RoadKind.STOP_SIGN,), "driveway": (RoadKind.DRIVEWAY,),
 }  # fmt: skip
@@ -118,7 +118,7 @@ def count_source(recording: Recording) -> SourceCounts:
         steps=len(recording.timestamps_s),
         tracks=len(tracks.track_id),
         tracks_valid_now=int(tracks.valid[:, recording.current_step].sum()),
-        map_features={name: int(among(kinds, group).sum()) for name, group in _COUNTED.items()},
+        map_features={name: int(among(kinds, group).sum()) for name, group in _FEATURE_GROUPS.items()},
         map_points=sum(len(feature.points) for feature in recording.features),
         lights=len({light.lane_id for light in recording.lights}),
     )
@@ -129,7 +129,7 @@ def assemble(
 ) -> Scenario:
     """Assemble a scenario from a recording of at most ``capacity.steps`` steps (cut longer ones with ``windows``).
 
-    Items that do not fit the capacity, those farthest from the ego's log, are left out and counted in ``overflow``.
+    Items that do not fit the capacity, the farthest from the ego's log first, are dropped and counted in ``overflow``.
     ``routes`` is the source of candidate routes (``scenario.build.routes``).
 
     Raises:
@@ -143,7 +143,7 @@ def assemble(
 
 
 def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Scenario:
-    recording = _without_jumps(recording)
+    recording = _drop_jumps(recording)
     now, ego = recording.current_step, recording.ego
     origin = np.append(recording.tracks.xy[ego, now], recording.tracks.z[ego, now]).astype(np.float64)
     tracks = local_tracks(recording.tracks, ego, origin)
@@ -161,13 +161,13 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     inside = inside_box(segments.middle, path, MARGIN_M)
     inside |= np.isin(segments.feature, whole.feature[on_route])
     grid = arrange(segments.take(inside), path, MARGIN_M, capacity)
-    keep, lost_lanes = _kept_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
+    keep, lost_lanes = _select_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
     graph = select(whole, keep)
-    polylines, lost_features = _kept_polylines(roads, grid, path, capacity.features)
-    marked = (*recording.to_predict, *recording.of_interest)
-    placement = place(tracks, marked, capacity.agents, capacity.parked)
+    polylines, lost_features = _select_polylines(roads, grid, path, capacity.features)
+    preferred = (*recording.to_predict, *recording.of_interest)
+    placement = place(tracks, preferred, capacity.agents, capacity.parked)
     edges, lanes = (segments.take(segments.block == block) for block in (EDGE_BLOCK, LANE_BLOCK))
-    on_stored = LaneSegments.of(segments, graph)
+    on_graph = LaneSegments.of(segments, graph)
     parts = Parts(
         tracks=tracks,
         placement=placement,
@@ -179,7 +179,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
         roads=roads,
         polylines=polylines,
         rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),
-        lights=place_lights(recording.lights, on_stored, origin, path, MARGIN_M, capacity.lights),
+        lights=place_lights(recording.lights, on_graph, origin, path, MARGIN_M, capacity.lights),
         stops=place_stops(recording.features, graph, origin, path, MARGIN_M, capacity.stops),
     )
     lost = Counter({name: int(count) for name, count in recording.lost.items()})
@@ -197,8 +197,8 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     )
 
 
-def _without_jumps(recording: Recording) -> Recording:
-    """The recording without the steps of tracks that are not plausible; counts tracks that lose some."""
+def _drop_jumps(recording: Recording) -> Recording:
+    """Drop steps of tracks that are not plausible, and count the tracks that lose some."""
     tracks = recording.tracks
     valid = np.stack([plausible(recording, track) for track in range(len(tracks.kind))])
     jumping = (valid != tracks.valid).any(axis=1)
@@ -213,9 +213,9 @@ def _without_jumps(recording: Recording) -> Recording:
 
 def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
     """Intended route in dense indices, and the numbers of its missing lanes."""
-    index, named = graph.index(), (recording.route_lanes, recording.route_corridor)
-    known = [tuple(index[lane] for lane in lanes if lane in index) for lanes in named]
-    missing = [len(lanes) - len(dense) for lanes, dense in zip(named, known, strict=True)]
+    index, sources = graph.index(), (recording.route_lanes, recording.route_corridor)
+    known = [tuple(index[lane] for lane in lanes if lane in index) for lanes in sources]
+    missing = [len(lanes) - len(dense) for lanes, dense in zip(sources, known, strict=True)]
     return Intent(*known), {"route_lanes_missing": missing[0], "route_corridor_missing": missing[1]}
 
 
@@ -233,13 +233,13 @@ def ego_log(tracks: LocalTracks, current_step: int) -> EgoLog:
     return EgoLog(tracks.xyz[row], tracks.heading[row], speed, tracks.valid[row], current_step)
 
 
-def _kept_lanes(
+def _select_lanes(
     graph: LaneGraph,
     near: Int[Array, " segment"],
-    on_route: Int[Array, " routed"],
+    on_route: Int[Array, " route_lane"],
     path: Float[Array, "step 2"],
     most: int,
-) -> tuple[Int[Array, " kept"], int]:
+) -> tuple[Int[Array, " lane"], int]:
     """Return the lanes to store, in order of the source, and the number that did not fit.
 
     These are the lanes with a segment in the crop; routes come first, bike lanes and distant lanes last.
@@ -252,7 +252,7 @@ def _kept_lanes(
     return np.sort(order[:most]), max(len(rows) - most, 0)
 
 
-def _kept_polylines(
+def _select_polylines(
     roads: RoadLines, grid: GridSegments, path: Float[Array, "step 2"], most: int
 ) -> tuple[Int[Array, " polyline"], int]:
     """Return the nearest polylines with a stored segment, and the number that did not fit."""
@@ -276,19 +276,19 @@ def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict
         counts |= part.overflow
     counts["lane_links"] = parts.graph.dropped_links
     counts["events"] = len(recording.events) - capacity.events
-    stored = recording.events[: capacity.events]
-    counts["event_actors"] = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in stored)
+    events = recording.events[: capacity.events]
+    counts["event_actors"] = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in events)
     return dict(+Counter(counts))
 
 
 def _flags(recording: Recording, parts: Parts) -> Flag:
-    """Flags of the reader, with those that are measured here, on what is stored."""
-    stored, segments = parts.placement, parts.grid.segments
+    """Flags of the reader, with those of ``MEASURED``, which describe the record."""
+    slots, segments = parts.placement, parts.grid.segments
     heights = np.concatenate((segments.a[:, 2], segments.b[:, 2]))
     facts = (
         (Flag.LIGHTS, len(parts.lights.z) > 0),
         (Flag.NO_FUTURE, len(recording.timestamps_s) < LEAST_STEPS),
-        (Flag.DEFAULT_SIZES, parts.tracks.defaulted[np.append(stored.moving, stored.parked)].any()),
+        (Flag.DEFAULT_SIZES, parts.tracks.has_default_size[np.append(slots.moving, slots.parked)].any()),
         (Flag.CLOSED_EDGES, parts.roads.rings_closed),
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
         (Flag.ROUTE, parts.routes.on_lanes),
@@ -348,14 +348,14 @@ def _copy(record: Record, prefix: str, part: Any, *names: str) -> None:
 def _fill_agents(record: Record, parts: Parts, recording: Recording) -> None:
     tracks, moving, parked = parts.tracks, parts.placement.moving, parts.placement.parked
     seen = tracks.valid if recording.seen is None else tracks.valid & recording.seen
-    timed = {
+    series = {
         "xy": tracks.xyz[moving, :, :2],
         "z": tracks.xyz[moving, :, 2],
         "heading": tracks.heading[moving],
         "velocity": tracks.velocity[moving],
     }
     steps = tracks.valid.shape[1]
-    for name, value in timed.items():
+    for name, value in series.items():
         record[f"agent_{name}"][:steps, : len(moving)] = np.swapaxes(value, 0, 1)
     for block, rows in (("agent", moving), ("parked", parked)):
         record[f"{block}_valid"][:steps, : len(rows)] = tracks.valid[rows].T
@@ -372,9 +372,9 @@ def _fill_agents(record: Record, parts: Parts, recording: Recording) -> None:
 
 
 def _fill_map(record: Record, parts: Parts, recording: Recording) -> None:
-    grid, roads, kept, lights = parts.grid, parts.roads, parts.polylines, parts.lights
+    grid, roads, polylines, lights = parts.grid, parts.roads, parts.polylines, parts.lights
     row_of = np.full(roads.lines.count + 1, -1)
-    row_of[kept] = np.arange(len(kept))
+    row_of[polylines] = np.arange(len(polylines))
     source_ids = np.array([feature.feature_id for feature in recording.features], dtype=np.int64)
     _copy(record, "segment", grid.segments, "a", "b", "kind", "start_m")
     _put(
@@ -382,9 +382,9 @@ def _fill_map(record: Record, parts: Parts, recording: Recording) -> None:
         segment_feature=row_of[grid.segments.polyline],
         segment_lane=lane_of_feature(parts.graph, grid.segments.feature),
         segment_blocks=grid.blocks,
-        feature_id=source_ids[roads.feature[kept]],
-        feature_kind=roads.kind[kept],
-        feature_closed=roads.closed[kept],
+        feature_id=source_ids[roads.feature[polylines]],
+        feature_kind=roads.kind[polylines],
+        feature_closed=roads.closed[polylines],
         grid_edge=grid.edge_start,
         grid_lane=grid.lane_start,
         grid_side=parts.sides,

@@ -1,4 +1,4 @@
-"""The uniform grid over the map of a scenario: segments near a place, and the drivable side of every cell."""
+"""The uniform grid over the map of a scenario: segments near a pose, and the drivable side of every cell."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SPLIT = 3
 #: Codes of a packed side cell; 0 is unknown.
 DRIVABLE, NOT_DRIVABLE = 1, 2
 #: Edges decide the side of cells up to the first distance; end points within the second are one vertex, m.
-_REACH_M, _JOINED_M = 20.0, 0.01
+_REACH_M, _VERTEX_M = 20.0, 0.01
 Array = np.ndarray[Any, Any]
 EDGE_BLOCK, LANE_BLOCK, REST_BLOCK = 0, 1, 2
 #: A scenario is refused if an edge this near to the logged ego does not fit: off-road tests would be wrong.
@@ -67,19 +67,19 @@ class Grid:
         table = np.pad(counts.reshape(self.side, self.side), ((0, 0), (1, 1)))
         return table[:, :-2] + table[:, 1:-1] + table[:, 2:]
 
-    def crowded(self, cell: Int[Array, " entry"], far: Float[Array, " entry"], cap: int) -> Array:
+    def excess_entries(self, cell: Int[Array, " entry"], far: Float[Array, " entry"], cap: int) -> Array:
         """Return the farthest entries to drop so that no run of three cells is longer than ``cap``."""
-        dropped = np.zeros(len(cell), dtype=bool)
+        drop = np.zeros(len(cell), dtype=bool)
         while True:
-            counts = np.bincount(cell[~dropped], minlength=self.side**2)
+            counts = np.bincount(cell[~drop], minlength=self.side**2)
             runs = self.runs(counts)
             row, column = np.unravel_index(runs.argmax(), runs.shape)
             excess = runs[row, column] - cap
             if excess <= 0:
-                return np.flatnonzero(dropped)
+                return np.flatnonzero(drop)
             near = np.abs(cell % self.side - column) <= 1
-            members = np.flatnonzero(~dropped & (cell // self.side == row) & near)
-            dropped[members[np.argsort(far[members], kind="stable")[-excess:]]] = True
+            members = np.flatnonzero(~drop & (cell // self.side == row) & near)
+            drop[members[np.argsort(far[members], kind="stable")[-excess:]]] = True
 
     def starts(self, cell: Int[Array, " entry"], offset: int) -> Int[Array, " cell_plus_1"]:
         """CSR row starts of entries sorted by cell, ``offset`` added."""
@@ -107,23 +107,25 @@ def arrange(
 ) -> GridSegments:
     """Sort segments into the grid; drop those that do not fit the square, the table or the runs of a query.
 
-    Those farthest from ``path``, the log of the ego, are dropped first; dropped road edges near it raise DataError.
-    Lanes of routes may leave the square: what is also outside the box of ``path`` widened by ``margin_m`` is not
-    counted.
+    Those farthest from ``path``, the log of the ego, are dropped first. Lanes of routes may leave the square: what is
+    also outside the box of ``path`` widened by ``margin_m`` is not counted.
+
+    Raises:
+        DataError: A road edge near ``path`` does not fit.
     """
     middle = segments.middle
     grid = Grid.around(middle, path, capacity)
     far = path_distance(middle, path)
     keep = grid.contains(middle)
-    counted = keep | inside_box(middle, path, margin_m)
+    in_scope = keep | inside_box(middle, path, margin_m)
     if keep.sum() > capacity.segments:
         inside = np.flatnonzero(keep)
         keep[inside[np.argsort(far[inside], kind="stable")[capacity.segments :]]] = False
-    overflow = Counter(segments=int((counted & ~keep).sum()))
+    overflow = Counter(segments=int((in_scope & ~keep).sum()))
     block = segments.block
     for name, number in (("edge_run", EDGE_BLOCK), ("lane_run", LANE_BLOCK)):
         rows = np.flatnonzero(keep & (block == number))
-        drop = rows[grid.crowded(grid.cell(middle[rows]), far[rows], getattr(capacity, name))]
+        drop = rows[grid.excess_entries(grid.cell(middle[rows]), far[rows], getattr(capacity, name))]
         keep[drop] = False
         overflow[name] = len(drop)
     if lost := int((~keep & (block == EDGE_BLOCK) & (far < UNSAFE_M)).sum()):
@@ -162,8 +164,8 @@ def cell_sides(
     near = np.all((middle >= -reach) & (middle <= grid.side * grid.cell_m + reach), axis=1)
     side, distance = _nearest_sides(fine, edges.take(near))
     lane_cells = fine.cell(lanes[fine.contains(lanes)])
-    contradicted = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
-    side[contradicted] = 0
+    on_road = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
+    side[on_road] = 0
     if rings_closed:
         square = _sides_within_rings(grid, edges).reshape(grid.side, grid.side)
         within = square.repeat(SPLIT, axis=0).repeat(SPLIT, axis=1).ravel()
@@ -205,12 +207,12 @@ def _nearest_sides(fine: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Fl
     along = (u * w).sum(axis=1) / length**2
     left = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / length
     begins, ends = _open_ends(a, b)
-    beyond = (begins[segment] & (along <= 0.0)) | (ends[segment] & (along >= 1.0))
+    past_end = (begins[segment] & (along <= 0.0)) | (ends[segment] & (along >= 1.0))
     # At a vertex the segment whose line is further away decides.
     most, least, cut = np.zeros(size * size), np.zeros(size * size), np.zeros(size * size, dtype=bool)
     np.maximum.at(most, at, left)
     np.minimum.at(least, at, left)
-    cut[at[beyond]] = True
+    cut[at[past_end]] = True
     sign, distance = np.where(most >= -least, 1, -1), np.sqrt(nearest[:-1])
     return np.where(cut | (distance > _REACH_M), 0, sign), distance
 
@@ -233,7 +235,7 @@ def _squared_distances(x: Array, y: Array, a: Array, b: Array) -> Float[Array, "
 
 def _open_ends(a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> tuple[Array, Array]:
     """Masks of segments that begin at an open end, and that end at one."""
-    ends = (np.round(end / _JOINED_M).astype(np.int64) for end in (a, b))
+    ends = (np.round(end / _VERTEX_M).astype(np.int64) for end in (a, b))
     first, last = (end[:, 0] * 2**32 + end[:, 1] for end in ends)
     return ~np.isin(first, last), ~np.isin(last, first)
 
@@ -270,9 +272,9 @@ def _winding_at_centres(grid: Grid, edges: Segments) -> Int[Array, "row column"]
     x = a[:, 0] + (line - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
     up = np.where(row_b[crossing] > row_a[crossing], 1, -1)
     last = np.clip(np.ceil(x) - 1, -1, grid.side - 1).astype(np.int64)  # last column left of the crossing
-    seen = (line >= 0) & (line < grid.side) & (last >= 0)
+    inside = (line >= 0) & (line < grid.side) & (last >= 0)
     table = np.zeros((grid.side, grid.side), dtype=np.int64)
-    np.add.at(table, (line[seen].astype(np.int64), last[seen]), up[seen])
+    np.add.at(table, (line[inside].astype(np.int64), last[inside]), up[inside])
     return np.cumsum(table[:, ::-1], axis=1)[:, ::-1]
 
 

@@ -112,7 +112,7 @@ class LaneSearch:
             if not heap or len(complete) >= most:
                 break
             lane_path = heapq.heappop(heap)[2]
-            following = [] if self.reach(lane_path) >= self.need_m else self.following(lane_path)
+            following = [] if self.reach(lane_path) >= self.need_m else self.expand(lane_path)
             if not self.goes_on(following):
                 complete.setdefault(self._signature(lane_path), lane_path)
             for child in following:
@@ -132,13 +132,13 @@ class LaneSearch:
             done.add(lane)
             if lane in goals:
                 complete.append(replace(lane_path, until=lane_path.ahead + goals[lane]))
-            for child in self.following(lane_path):
+            for child in self.expand(lane_path):
                 if child.lanes[-1] not in done:
                     heapq.heappush(heap, (child.penalty + child.ahead + child.entry, next(serial), child))
         return complete
 
     def along(self, lanes: Sequence[int], xyz: Float[Array, "3"], heading: float) -> LanePath:
-        """Path along given lanes to a goal, from the lane that fits the ego best (the first where none does)."""
+        """Path along lanes to a goal, from the lane that fits the ego best (the first without one)."""
         first = next((start for start in self.starts if start.lanes[0] in lanes), None)
         lane_path = LanePath(tuple(lanes), 0.0, 0.0, 0.0, 0.0, 0)
         if first is not None:
@@ -163,7 +163,7 @@ class LaneSearch:
     def _urgency(self, lane_path: LanePath) -> float:
         return lane_path.penalty + EAGERNESS * max(self.need_m - self.reach(lane_path), 0.0)
 
-    def following(self, lane_path: LanePath) -> list[LanePath]:
+    def expand(self, lane_path: LanePath) -> list[LanePath]:
         """Paths with one more lane: successors, and neighbours where there is room for a lane change."""
         graph, lane, lanes = self.graph, lane_path.lanes[-1], lane_path.lanes
         result = []
@@ -240,7 +240,7 @@ def trace(
     xyz = np.concatenate([part[0] for part in parts])
     label = np.concatenate([part[1] for part in parts])
     step = np.hypot(*np.diff(xyz[:, :2], axis=0).T)
-    # Of two equal points keep the later one, which has the lane of what lies ahead.
+    # Of two equal points keep the later one, which has the lane ahead.
     keep = np.concatenate((step > 0.01, [True]))
     return xyz[keep], label[keep]
 
@@ -312,22 +312,22 @@ def walk(
     arc = distance - np.take_along_axis(np.stack(begin, axis=-1), hop, axis=1)
     inside = np.minimum(arc, graph.lines.length[row])
     heading = graph.lines.heading(row, inside, END_SPAN_M)
-    beyond = (arc - inside)[..., None] * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
-    return graph.lines.at(row, inside)[..., :2] + beyond, heading
+    overrun = (arc - inside)[..., None] * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
+    return graph.lines.at(row, inside)[..., :2] + overrun, heading
 
 
 def precede(
-    graph: LaneGraph, lane: int, need_m: float, driven: Float[Array, "step 2"]
+    graph: LaneGraph, lane: int, need_m: float, history: Float[Array, "step 2"]
 ) -> tuple[tuple[int, ...], float]:
-    """Predecessors of a lane along the driven positions, ``need_m`` long where there are as many, and their length."""
+    """Predecessors of a lane along the ego's ``history``, up to ``need_m`` long, and their length."""
     result, total = list[int](), 0.0
     while total < need_m:
         first = result[0] if result else lane
         options = [int(p) for p in graph.predecessor[first] if p >= 0 and p != lane and p not in result]
         if not options:
             break
-        apart = [project(graph.lines.line(option), driven)[1].mean() for option in options]
-        best = options[int(np.argmin([round(float(metres)) for metres in apart]))]
+        distances = [project(graph.lines.line(option), history)[1].mean() for option in options]
+        best = options[int(np.argmin([round(float(metres)) for metres in distances]))]
         result.insert(0, best)
         total += float(graph.lines.length[best])
     return tuple(result), total
@@ -348,8 +348,8 @@ def continue_straight(line: Line, behind_m: float, ahead_m: float) -> Line:
 
 def _end_direction(xyz: Float[Array, "point 3"]) -> Float[Array, "3"]:
     """Unit vector in the plane of the last two metres of a line."""
-    apart = np.hypot(*(xyz[:, :2] - xyz[-1, :2]).T)
-    before = np.flatnonzero(apart >= min(END_SPAN_M, apart.max()))
+    distance = np.hypot(*(xyz[:, :2] - xyz[-1, :2]).T)
+    before = np.flatnonzero(distance >= min(END_SPAN_M, distance.max()))
     step = xyz[-1] - xyz[before[-1]]
     size = float(np.hypot(step[0], step[1]))
     return np.array([step[0] / size, step[1] / size, 0.0]) if size > 0.0 else np.array([1.0, 0.0, 0.0])

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Int8
 from drivax.errors import DataError
 from drivax.geometry.polylines import Polylines, left_normals, point_to_segment
 from drivax.geometry.vectors import wrap
-from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box, known_limit, path_distance
+from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box, path_distance, plausible_limit
 from drivax.scenario.recording import Light, MapFeature
 from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among
 
@@ -56,7 +56,7 @@ class LaneGraph:
         left, right: Neighbours in the same direction, -1 none.
         left_shift, right_shift: Arc length on the neighbour at arc length s, minus s, metres.
         chained: Whether the links were made from geometry.
-        dropped_links: Links between these lanes that ``select`` left out, beyond four per lane and direction.
+        dropped_links: Links between these lanes that ``select`` dropped: more than four per lane and direction.
         lost: Numbers of ``dangling_links`` (successors and predecessors) and ``dangling_neighbours`` of the source.
     """
 
@@ -115,10 +115,10 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     lines = Polylines.of([np.asarray(lane.points, dtype=np.float64) - origin for lane in lanes])
     begin, end = end_headings(lines)
     kind = np.array([lane.kind for lane in lanes], dtype=np.int64)
-    pairs = _linked_pairs(lanes, index)
+    pairs = _source_pairs(lanes, index)
     has_links = any(f.successors or f.predecessors for f in lanes)
     if not has_links:
-        pairs = _chained_pairs(lines, begin, end, kind)
+        pairs = _geometric_pairs(lines, begin, end, kind)
     samples = _samples(lines)
     left, left_shift, left_gap = _adjacent(lanes, index, samples, lines.length, "left_neighbours")
     right, right_shift, right_gap = _adjacent(lanes, index, samples, lines.length, "right_neighbours")
@@ -129,7 +129,7 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
         lane_id=np.array(ids, dtype=np.int64),
         kind=kind,
         width=_widths(lanes, np.fmin(left_gap, right_gap)),
-        limit=np.array([known_limit(lane) for lane in lanes], dtype=np.float64),
+        limit=np.array([plausible_limit(lane) for lane in lanes], dtype=np.float64),
         interpolating=np.array([lane.interpolating for lane in lanes], dtype=bool),
         successor=_link_table(pairs, end, begin),
         predecessor=_link_table([(b, a) for a, b in pairs], begin, end),
@@ -156,7 +156,7 @@ def end_headings(lines: Polylines) -> tuple[Float[Array, " lane"], Float[Array, 
     return lines.heading(row, np.zeros(lines.count), END_SPAN_M), lines.heading(row, lines.length, END_SPAN_M)
 
 
-def _linked_pairs(lanes: Sequence[MapFeature], index: Mapping[int, int]) -> list[tuple[int, int]]:
+def _source_pairs(lanes: Sequence[MapFeature], index: Mapping[int, int]) -> list[tuple[int, int]]:
     """(lane, successor) pairs named by either side; dangling and self links dropped, order kept."""
     pairs: dict[tuple[int, int], None] = {}
     for i, lane in enumerate(lanes):
@@ -165,17 +165,17 @@ def _linked_pairs(lanes: Sequence[MapFeature], index: Mapping[int, int]) -> list
     return list(pairs)
 
 
-def _chained_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) -> list[tuple[int, int]]:
+def _geometric_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) -> list[tuple[int, int]]:
     """Pairs of lanes where the end of the first meets the beginning of the second, in place and heading."""
     first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
     bike = kind == RoadKind.LANE_BIKE
     pairs: list[tuple[int, int]] = []
     for row in range(0, lines.count, _CHUNK):  # maps of thousands of lanes would need gigabytes at once
         part = slice(row, row + _CHUNK)
-        apart = np.hypot(*np.moveaxis((last[part, None] - first[None])[..., :2], -1, 0))
+        gap = np.hypot(*np.moveaxis((last[part, None] - first[None])[..., :2], -1, 0))
         level = np.abs(last[part, None, 2] - first[None, :, 2]) < LEVEL_M
         bend = np.abs(wrap(end[part, None] - begin[None]))
-        fits = (apart <= CHAIN_GAP_M) & level & (bend <= CHAIN_HEADING_RAD) & (bike[part, None] == bike[None])
+        fits = (gap <= CHAIN_GAP_M) & level & (bend <= CHAIN_HEADING_RAD) & (bike[part, None] == bike[None])
         pairs += [(int(i) + row, int(j)) for i, j in np.argwhere(fits) if i + row != j]
     return pairs
 
@@ -240,14 +240,14 @@ def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tupl
     turn = np.arctan2(other[..., 1], other[..., 0]) - np.arctan2(direction[..., 1], direction[..., 0])
     position = (nearest + along) / (_SAMPLES - 1)
     interior = (np.abs(wrap(turn)) < SAME_WAY_RAD) & (position > 1e-6) & (position < 1.0 - 1e-6)
-    here = at / (_SAMPLES - 1) * length[a][:, None]
-    return interior, distance, position * length[b][:, None] - here
+    arc = at / (_SAMPLES - 1) * length[a][:, None]
+    return interior, distance, position * length[b][:, None] - arc
 
 
-def select(graph: LaneGraph, rows: Int[Array, " kept"]) -> LaneGraph:
+def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
     """Return the graph of these lanes with new dense indices and at most four links per lane and direction.
 
-    Links to other lanes go uncounted: they lead out of the map that is kept.
+    Links to other lanes go uncounted: they lead out of the crop.
     """
     new = np.full(graph.count + 1, -1)
     new[rows] = np.arange(len(rows))
@@ -290,9 +290,9 @@ class LaneSegments:
         """Select the segments of the car lanes of a graph."""
         rows = np.flatnonzero(among(segments.kind, CAR_LANE_KINDS))
         lane = lane_of_feature(graph, segments.feature[rows])
-        kept = segments.take(rows[lane >= 0])
-        step = kept.b - kept.a
-        return cls(graph, kept, lane[lane >= 0], np.arctan2(step[:, 1], step[:, 0]))
+        of_lanes = segments.take(rows[lane >= 0])
+        step = of_lanes.b - of_lanes.a
+        return cls(graph, of_lanes, lane[lane >= 0], np.arctan2(step[:, 1], step[:, 0]))
 
     def nearest(
         self, xyz: Float[Array, "pose 3"], heading: Float[Array, " pose"], reach_m: float, turn_rad: float
@@ -303,8 +303,8 @@ class LaneSegments:
             return np.full(len(xyz), -1), np.zeros(len(xyz)), np.full(len(xyz), np.inf)
         distance, s = near._measure(xyz, heading, turn_rad)
         best = distance.argmin(axis=1)
-        here = np.arange(len(xyz)), best
-        return np.where(distance[here] <= reach_m, near.lane[best], -1), s[here], distance[here]
+        pick = np.arange(len(xyz)), best
+        return np.where(distance[pick] <= reach_m, near.lane[best], -1), s[pick], distance[pick]
 
     def around(
         self, xyz: Float[Array, " 3"], heading: float, reach_m: float, turn_rad: float
@@ -327,13 +327,13 @@ class LaneSegments:
         return LaneSegments(self.graph, self.segments.take(rows), self.lane[rows], self.heading[rows])
 
     def _measure(self, xyz: Array, heading: Array, turn_rad: float) -> tuple[Array, Array]:
-        """Distance (infinite where gated) and arc length of every pose on every segment."""
+        """Distance (infinite if turn or level exclude it) and arc length of every pose on every segment."""
         seg = self.segments
         distance, along = point_to_segment(xyz[:, None, :2], seg.a[None, :, :2], seg.b[None, :, :2])
         z = seg.a[:, 2] + along * (seg.b[:, 2] - seg.a[:, 2])
-        gated = np.abs(wrap(self.heading - heading[:, None])) > turn_rad
-        gated |= np.abs(z - xyz[:, 2:3]) > LEVEL_M
-        return np.where(gated, np.inf, distance), seg.start_m + along * seg.span_m
+        excluded = np.abs(wrap(self.heading - heading[:, None])) > turn_rad
+        excluded |= np.abs(z - xyz[:, 2:3]) > LEVEL_M
+        return np.where(excluded, np.inf, distance), seg.start_m + along * seg.span_m
 
 
 def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:
@@ -371,7 +371,7 @@ def place_lights(
 ) -> Lights:
     """Place stop lines across the lanes at the stop points; keep the ``most`` lights nearest to ``path``.
 
-    Lights near no lane have no direction and are left out. They are counted in the box of ``path`` widened by
+    Lights near no lane have no direction and are dropped. They are counted in the box of ``path`` widened by
     ``margin_m``: elsewhere the lanes are cropped too.
     """
     graph, steps = on.graph, len(lights[0].states) if lights else 0
@@ -387,10 +387,10 @@ def place_lights(
         heading[i] = exit_heading[i] = _heading_near(on, stop[i])
     width = np.append(graph.width, -1.0)[lane]
     half = np.where(width > 0, width / 2, HALF_WIDTH_M)
-    directed = np.flatnonzero(~np.isnan(heading))
-    rows = directed[np.argsort(path_distance(stop[directed, :2], path), kind="stable")]
-    undirected = int((np.isnan(heading) & inside_box(stop[:, :2], path, margin_m)).sum())
-    overflow, rows = +Counter(lights=len(rows) - most, lights_without_lane=undirected), rows[:most]
+    has_heading = np.flatnonzero(~np.isnan(heading))
+    rows = has_heading[np.argsort(path_distance(stop[has_heading, :2], path), kind="stable")]
+    without_heading = int((np.isnan(heading) & inside_box(stop[:, :2], path, margin_m)).sum())
+    overflow, rows = +Counter(lights=len(rows) - most, lights_without_lane=without_heading), rows[:most]
     left = half[rows, None] * left_normals(heading[rows])
     states = [np.asarray(lights[i].states, dtype=np.int8) for i in rows]
     return Lights(

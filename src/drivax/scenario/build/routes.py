@@ -31,13 +31,13 @@ from drivax.scenario.build.lane_paths import (
     walk,
 )
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments
-from drivax.scenario.build.segments import spaced, thin_path
+from drivax.scenario.build.segments import space_out, thin_path
 
 Array = np.ndarray[Any, Any]
 #: Source of candidates: the search of this project, or the published one.
 RouteStyle = Literal["graph", "published"]
 #: Largest offset of a route from the driven path, and least distance between driven poses that are compared with it.
-OFFSET_M, _APART_M = 1.0, 1.0
+OFFSET_M, _POSE_SPACING_M = 1.0, 1.0
 #: Largest drift of the ego across a line, metres per metre (a change of 3.5 m within 12 m).
 _MOST_SLOPE = 0.3
 #: The line goes over to the ego's poses within this distance behind the first of them.
@@ -101,7 +101,7 @@ class EgoLog:
         return self.xyz[self.valid]
 
     @property
-    def driven(self) -> Float[Array, "step 3"]:
+    def history(self) -> Float[Array, "step 3"]:
         """Valid positions up to the current step."""
         return self.xyz[: self.current + 1][self.valid[: self.current + 1]]
 
@@ -178,7 +178,7 @@ def published_paths(search: LaneSearch) -> list[LanePath]:
     The search begins at the first logged pose, on lanes within 2.5 m.
     """
     queue = deque(lane_path for lane_path in search.starts if lane_path.lateral <= PUBLISHED_REACH_M)
-    complete, ended = list[LanePath](), list[LanePath]()
+    complete, dead_ends = list[LanePath](), list[LanePath]()
     for _ in range(MOST_EXPANSIONS):
         if not queue or len(complete) >= MOST_PATHS:
             break
@@ -186,11 +186,11 @@ def published_paths(search: LaneSearch) -> list[LanePath]:
         if search.reach(lane_path) >= search.need_m:
             complete.append(lane_path)
             continue
-        following = search.following(lane_path)
+        following = search.expand(lane_path)
         if not search.goes_on(following):
-            ended.append(lane_path)
+            dead_ends.append(lane_path)
         queue.extend(following)
-    return sorted([*complete, *ended][:MOST_PATHS], key=lambda lane_path: -score(search, lane_path))
+    return sorted([*complete, *dead_ends][:MOST_PATHS], key=lambda lane_path: -score(search, lane_path))
 
 
 def score(search: LaneSearch, lane_path: LanePath) -> float:
@@ -211,7 +211,7 @@ def _same(route: Route, other: Route) -> bool:
 
 
 def _best(ego: EgoLog, routes: Sequence[Route], reach_m: float) -> Route | None:
-    """Route that passes nearest to the goal region, then nearest to the log; None without one in reach."""
+    """Route that passes nearest to the goal region, then nearest to the log; None if no route is in reach."""
     if not routes:
         return None
     path = thin_path(ego.seen[:, :2])
@@ -245,9 +245,9 @@ class _Drawer:
     def draw(self, lane_path: LanePath, place: float) -> Route:
         """Route along a lane path and the straightest successors of its last lane."""
         graph, ego = self.graph, self.ego
-        driven = ego.driven[:, :2]
-        behind = 0.0 if self.plain else BEHIND_M + float(arc_lengths(driven)[-1])
-        prefix, length = precede(graph, lane_path.lanes[0], behind - lane_path.s, driven)
+        history = ego.history[:, :2]
+        behind = 0.0 if self.plain else BEHIND_M + float(arc_lengths(history)[-1])
+        prefix, length = precede(graph, lane_path.lanes[0], behind - lane_path.s, history)
         begin = lane_path.s + length - behind
         ends = float(graph.lines.length[list(lane_path.lanes)].sum()) - lane_path.s
         lanes = (*prefix, *follow(graph, lane_path.lanes, ends, self.most * SPACING_M))
@@ -259,11 +259,11 @@ class _Drawer:
         missing = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
         xyz, label = continue_straight(line, 0.0, missing)
         points, index = resample(xyz, SPACING_M, self.most)
-        return Route.along(points if self.plain else join(points, driven, change_m), label[index], self.most)
+        return Route.along(points if self.plain else join(points, history, change_m), label[index], self.most)
 
 
 def join(
-    xyz: Float[Array, "point 3"], driven: Float[Array, "step 2"], ahead_m: float
+    xyz: Float[Array, "point 3"], history: Float[Array, "step 2"], ahead_m: float
 ) -> Float[Array, "point 3"]:
     """Bend a line so that it passes within a metre of the driven path.
 
@@ -271,8 +271,8 @@ def join(
     interpolated between the poses and fades out ahead of the last one by a cubic polynomial that continues in the ego's
     direction (Hermite: shift and slope at the ego, zero both ``ahead_m`` ahead). Points of ``xyz`` are about 1 m apart.
     """
-    near = int(arc_lengths(driven)[-1] + 2 * _BEHIND_M) + 2
-    s, shift = _shifts(xyz[:near], driven)
+    near = int(arc_lengths(history)[-1] + 2 * _BEHIND_M) + 2
+    s, shift = _shifts(xyz[:near], history)
     if not shift.any():
         return xyz
     arc = arc_lengths(xyz)
@@ -285,22 +285,22 @@ def join(
     return result
 
 
-def _shifts(xyz: Float[Array, "point 3"], driven: Float[Array, "step 2"]) -> tuple[Array, Array]:
+def _shifts(xyz: Float[Array, "point 3"], history: Float[Array, "step 2"]) -> tuple[Array, Array]:
     """Increasing arc lengths of driven poses along a line, and the shift of the line to its left there."""
-    s, _ = project(xyz, driven)
+    s, _ = project(xyz, history)
     keep = [len(s) - 1]
     for i in range(len(s) - 2, -1, -1):
-        if s[i] <= s[keep[-1]] - _APART_M:
+        if s[i] <= s[keep[-1]] - _POSE_SPACING_M:
             keep.append(i)
     rows = np.array(keep[::-1])
     arc, course = arc_lengths(xyz), np.unwrap(headings(xyz))
     foot = np.stack([np.interp(s[rows], arc, xyz[:, axis]) for axis in (0, 1)], axis=-1)
-    offset = np.einsum("ij,ij->i", driven[rows] - foot, left_normals(np.interp(s[rows], arc, course)))
+    offset = np.einsum("ij,ij->i", history[rows] - foot, left_normals(np.interp(s[rows], arc, course)))
     return s[rows], np.sign(offset) * np.maximum(np.abs(offset) - OFFSET_M, 0.0)
 
 
 def _fade(distance: Array, shift: float, slope: float, length: float) -> Array:
-    """Cubic from a shift and its slope to zero and level at ``length``, zero beyond."""
+    """Cubic from a shift and its slope to zero and level at ``length``, then zero."""
     t = np.clip(distance / length, 0.0, 1.0)
     return shift * (1.0 + t**2 * (2.0 * t - 3.0)) + slope * length * t * (1.0 - t) ** 2
 
@@ -311,7 +311,7 @@ def log_route(on: LaneSegments, ego: EgoLog, most_points: int) -> Route:
     Positions within half a metre of the previous one are jitter; a log that stays within 2 m has only its last pose.
     """
     seen, heading = ego.seen, ego.heading[ego.valid]
-    keep = spaced(seen[:, :2], STEP_M)
+    keep = space_out(seen[:, :2], STEP_M)
     if np.hypot(*(seen - seen[0])[:, :2].T).max() < STANDS_M:
         keep = keep[-1:]
     pose, course = seen[keep[-1]], float(heading[keep[-1]])

@@ -120,7 +120,7 @@ def _outline(feature: MapFeature) -> Array:
 
 
 def _long_enough(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " point"]]:
-    """Polylines that begin at these points, and the mask of their points; those without length are left out."""
+    """Polylines that begin at these points, and the mask of their points; those without length are dropped."""
     start = np.append(begin, len(points))
     counts = np.diff(start)
     arc = arc_lengths(points, start)
@@ -160,7 +160,7 @@ def path_distance(xy: Float[Array, "point 2"], path: Float[Array, "step 2"]) -> 
     return best
 
 
-def thin_path(xy: Float[Array, "step 2"], spacing_m: float = 5.0) -> Float[Array, "kept 2"]:
+def thin_path(xy: Float[Array, "step 2"], spacing_m: float = 5.0) -> Float[Array, "point 2"]:
     """Thin a trajectory to points about ``spacing_m`` apart, with its first and last point."""
     bin_number = np.floor(arc_lengths(xy) / spacing_m)
     keep = np.diff(bin_number, prepend=-1.0) > 0
@@ -168,8 +168,8 @@ def thin_path(xy: Float[Array, "step 2"], spacing_m: float = 5.0) -> Float[Array
     return xy[keep]
 
 
-def spaced(xy: Float[Array, "step 2"], least_m: float) -> list[int]:
-    """Return the first position and those at least ``least_m`` from the one kept before."""
+def space_out(xy: Float[Array, "step 2"], least_m: float) -> list[int]:
+    """Return the indices of the first position and of those at least ``least_m`` from the previous one."""
     keep = [0]
     for i in range(1, len(xy)):
         if np.hypot(*(xy[i] - xy[keep[-1]])) >= least_m:
@@ -185,7 +185,7 @@ def inside_box(
     return np.all((xy >= low) & (xy <= high), axis=1)
 
 
-def known_limit(feature: MapFeature) -> float:
+def plausible_limit(feature: MapFeature) -> float:
     """Plausible speed limit of a lane in m/s, else -1."""
     limit = feature.limit_mps if feature.kind in LANE_KINDS else None
     return limit if limit is not None and 0.0 < limit <= MOST_LIMIT_MPS else -1.0
@@ -213,7 +213,7 @@ def road_rows(
 ) -> RoadRows:
     """Cut lanes, road edges and crosswalks into pieces and keep the ``most`` highest ranks.
 
-    Pieces whose midpoint lies more than ``margin_m`` outside the box of ``path``, the log of the ego, are left out.
+    Pieces whose midpoint lies more than ``margin_m`` outside the box of ``path``, the log of the ego, are dropped.
     """
     line = np.flatnonzero(np.isin(roads.kind, (*LANE_KINDS, *EDGE_KINDS, RoadKind.CROSSWALK)))
     length = roads.lines.length[line]
@@ -233,7 +233,7 @@ def road_rows(
     angle = _angle(roads, owner, begin, begin + span)
     first, last = _angle(roads, owner, begin, begin + span / 3), begin + span * 2 / 3
     turn = wrap(_angle(roads, owner, last, begin + span) - first)
-    limits = np.array([known_limit(feature) for feature in features], dtype=np.float64)
+    limits = np.array([plausible_limit(feature) for feature in features], dtype=np.float64)
     return RoadRows(
         xy=middle,
         direction=np.stack((np.cos(angle), np.sin(angle)), axis=-1),

@@ -40,7 +40,8 @@ MOST_SIZE_M = 100.0  # larger measurements are ignored
 class LocalTracks:
     """Tracks in the local frame, float64: box centres, headings in [-pi, pi), m/s; zeros where not valid.
 
-    ``size`` is the median length, width and height over the valid steps, metres; ``defaulted`` masks default sizes.
+    ``size`` is the median length, width and height over the valid steps, metres; ``has_default_size``
+    masks tracks that have the size of their class.
     """
 
     xyz: Float[Array, "track time 3"]
@@ -51,7 +52,7 @@ class LocalTracks:
     kind: Int[Array, " track"]
     track_id: Int[Array, " track"]
     ego: int
-    defaulted: Bool[Array, " track"]
+    has_default_size: Bool[Array, " track"]
 
 
 def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTracks:
@@ -63,9 +64,9 @@ def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTr
     valid, mask = tracks.valid, tracks.valid[..., None]
     xyz = np.where(mask, np.concatenate((tracks.xy, tracks.z[..., None]), axis=-1) - origin, 0.0)
     heading, velocity = np.where(valid, wrap(tracks.heading), 0.0), np.where(mask, tracks.velocity, 0.0)
-    size, defaulted = _sizes(tracks, ego)
+    size, has_default_size = _sizes(tracks, ego)
     kind, track_id = tracks.kind.astype(np.int64), tracks.track_id.astype(np.int64)
-    return LocalTracks(xyz, heading, velocity, size, valid, kind, track_id, ego, defaulted)
+    return LocalTracks(xyz, heading, velocity, size, valid, kind, track_id, ego, has_default_size)
 
 
 def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], Bool[Array, " track"]]:
@@ -80,13 +81,13 @@ def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], Bool[Arra
 
 
 def masked_median(values: Float[Array, "*row time"], valid: Bool[Array, "*row time"]) -> Float[Array, "*row"]:
-    """Median over the valid entries of the last axis; 0 where none is valid."""
-    ordered = np.sort(np.where(valid, values, np.inf), axis=-1)
+    """Median over the valid entries of the last axis; 0 without one."""
+    sorted_values = np.sort(np.where(valid, values, np.inf), axis=-1)
     count = valid.sum(axis=-1)
     middle = np.stack(
         (np.maximum((count - 1) // 2, 0), np.minimum(count // 2, values.shape[-1] - 1)), axis=-1
     )
-    low, high = np.moveaxis(np.take_along_axis(ordered, middle, axis=-1), -1, 0)
+    low, high = np.moveaxis(np.take_along_axis(sorted_values, middle, axis=-1), -1, 0)
     with np.errstate(invalid="ignore"):
         return np.where(count > 0, (low + high) / 2, 0.0)
 
@@ -104,25 +105,25 @@ class Placement:
     overflow: dict[str, int]
 
 
-def place(tracks: LocalTracks, marked: Sequence[int], agents: int, parked: int) -> Placement:
+def place(tracks: LocalTracks, preferred: Sequence[int], agents: int, parked: int) -> Placement:
     """Sort tracks into the moving and the parked block, the most relevant first.
 
     A track is parked if every valid pose is within 0.3 m and 0.1 rad of its median pose. The ego comes first, then
-    ``marked`` tracks (to predict, of interest), then tracks by their smallest distance to the ego over the log, where
-    those that move rank 50 m nearer. Tracks without a valid step are left out.
+    ``preferred`` tracks (to predict, of interest), then tracks by their smallest distance to the ego during the log,
+    where those that move rank 50 m nearer. Tracks without a valid step are dropped.
     """
     pose = median_pose(tracks)
     away = np.hypot(*np.moveaxis(tracks.xyz[..., :2] - pose[:, None, :2], -1, 0))
-    turned = np.abs(wrap(tracks.heading - pose[:, None, 3]))
-    still = ((away <= PARKED_M) & (turned <= PARKED_RAD)) | ~tracks.valid
+    turn = np.abs(wrap(tracks.heading - pose[:, None, 3]))
+    still = ((away <= PARKED_M) & (turn <= PARKED_RAD)) | ~tracks.valid
     seen = tracks.valid.any(axis=1)
     parks = still.all(axis=1) & seen
     parks[tracks.ego] = False
-    rank = _rank(tracks, np.where(tracks.valid, away, 0.0).max(axis=1), marked)
+    rank = _rank(tracks, np.where(tracks.valid, away, 0.0).max(axis=1), preferred)
     order = np.argsort(rank, kind="stable")
-    moving, standing = order[(seen & ~parks)[order]], order[parks[order]]
-    overflow = +Counter(agents=len(moving) - agents, parked=len(standing) - parked)
-    return Placement(moving[:agents], standing[:parked], pose, overflow)
+    moving_rows, parked_rows = order[(seen & ~parks)[order]], order[parks[order]]
+    overflow = +Counter(agents=len(moving_rows) - agents, parked=len(parked_rows) - parked)
+    return Placement(moving_rows[:agents], parked_rows[:parked], pose, overflow)
 
 
 def median_pose(tracks: LocalTracks) -> Float[Array, "track 4"]:
@@ -135,12 +136,12 @@ def median_pose(tracks: LocalTracks) -> Float[Array, "track 4"]:
     return np.concatenate((xyz, wrap(mean + turn)[:, None]), axis=1)
 
 
-def _rank(tracks: LocalTracks, moved: Array, marked: Sequence[int]) -> Float[Array, " track"]:
-    """Sort key of every track, smaller is more relevant; ``moved`` is its largest distance from its median pose."""
+def _rank(tracks: LocalTracks, reach_m: Array, preferred: Sequence[int]) -> Float[Array, " track"]:
+    """Sort key of every track, smaller is more relevant; ``reach_m`` is its largest distance from its median pose."""
     both = tracks.valid & tracks.valid[tracks.ego]
-    apart = np.hypot(*np.moveaxis((tracks.xyz - tracks.xyz[tracks.ego])[..., :2], -1, 0))
-    rank = np.where(both, apart, 1e6).min(axis=1) - MOVER_BONUS_M * (moved > MOVER_M)
-    rank[list(marked)] -= 1e7
+    distance = np.hypot(*np.moveaxis((tracks.xyz - tracks.xyz[tracks.ego])[..., :2], -1, 0))
+    rank = np.where(both, distance, 1e6).min(axis=1) - MOVER_BONUS_M * (reach_m > MOVER_M)
+    rank[list(preferred)] -= 1e7
     rank[tracks.ego] = -np.inf
     return rank
 

@@ -23,7 +23,7 @@ from drivax.scenario.schema import Flag
 from drivax.scenario.select.tags import TAGS
 
 #: Number of missing names in an error message.
-_SHOWN = 3
+_MOST_NAMES = 3
 _Kind = Literal["number", "truth", "word"]
 #: Counters of overflow; zeros are not stored.
 OVERFLOWS = (
@@ -42,7 +42,7 @@ _COUNTS: Mapping[str, tuple[str, ...]] = {
     "segments": ("segments",),
 }
 _FILTER = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(>=|<=|!=|=|>|<)\s*(.*?)\s*", re.DOTALL)
-_COMPARED: Mapping[str, Callable[[Any, Any], bool]] = {
+_COMPARISONS: Mapping[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
 }  # fmt: skip
 _TRUTHS = {"true": True, "false": False}
@@ -110,7 +110,7 @@ def vocabulary() -> dict[str, Quantity]:
 class Filter:
     """One condition on a quantity: ``text`` as written by the user, and its parts.
 
-    ``values`` are alternatives (words, numbers or truths); there is one number where the operator compares.
+    ``values`` are alternatives (words, numbers or truths); a comparison has one number.
     """
 
     text: str
@@ -120,7 +120,11 @@ class Filter:
 
     @classmethod
     def parse(cls, text: str) -> Filter:
-        """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison; raise UsageError if any part is invalid."""
+        """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison.
+
+        Raises:
+            UsageError: A part is invalid.
+        """
         form = _FILTER.fullmatch(text)
         if form is None or form[3].startswith("="):
             raise _refusal(text, "is not a filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
@@ -128,14 +132,14 @@ class Filter:
         quantity = _find_quantity(text, name)
         if not all(words):
             raise _refusal(text, "names no value", "write NAME=VALUE or NAME=VALUE|VALUE")
-        if sign in _COMPARED and (quantity.kind != "number" or len(words) > 1):
+        if sign in _COMPARISONS and (quantity.kind != "number" or len(words) > 1):
             raise _refusal(text, f"cannot be compared with {sign}", "use = or !=, or a number of something")
         if name == "flag":
             words = tuple(word.upper() for word in words)
         values = tuple(_value(text, name, quantity, word) for word in words)
         if len({isinstance(value, str) for value in values}) > 1:
             raise _refusal(text, "mixes words and numbers", "write two filters or ask for one of them")
-        if sign in _COMPARED and isinstance(values[0], str):
+        if sign in _COMPARISONS and isinstance(values[0], str):
             raise _refusal(text, f"{values[0]!r} is not a number", f"give a number after {sign}")
         return cls(text, name, sign, values)
 
@@ -144,8 +148,8 @@ class Filter:
         value = self.find(entry)
         if value is None:
             return False
-        if self.operator in _COMPARED:
-            return _COMPARED[self.operator](value, self.values[0])
+        if self.operator in _COMPARISONS:
+            return _COMPARISONS[self.operator](value, self.values[0])
         values = value if isinstance(value, frozenset) else {value}
         return values.isdisjoint(self.values) == (self.operator == "!=")
 
@@ -215,7 +219,7 @@ class _Name:
     line: int = 0
 
     @property
-    def shown(self) -> str:
+    def label(self) -> str:
         """The id for messages."""
         return repr(self.text.rpartition("\t")[2])
 
@@ -234,8 +238,8 @@ def select_scenarios(
     if limit is not None and limit < 1:
         raise UsageError(f"--limit {limit} leaves no scenario", cure="use 1 or more")
     selection = Selection.parse(filters)
-    named = _named_rows(data, names) if names else None
-    rows = [row for row in selection.rows(data.entries) if named is None or row in named]
+    by_name = _rows_by_name(data, names) if names else None
+    rows = [row for row in selection.rows(data.entries) if by_name is None or row in by_name]
     if not rows:
         raise _nothing_left(data, selection)
     return rows[:limit]
@@ -252,20 +256,20 @@ def read_names(file: Path) -> list[_Name]:
     return [_Name(text, file, row) for row, line in enumerate(lines, start=1) if (text := line.strip())]
 
 
-def _named_rows(data: Listing, names: Sequence[str | Path]) -> set[int]:
-    """Indices of named scenarios; an id without a data set selects it in all of them."""
+def _rows_by_name(data: Listing, names: Sequence[str | Path]) -> set[int]:
+    """Indices of scenarios by name; an id without a data set selects it in all of them."""
     rows: dict[str, set[int]] = {}
     for row, entry in enumerate(data.entries):
         for text in (entry["scenario_id"], f"{entry['dataset']}\t{entry['scenario_id']}"):
             rows.setdefault(text, set()).add(row)
-    requested: list[_Name] = []
+    requests: list[_Name] = []
     for name in names:
         is_id = isinstance(name, str) and (name in rows or not Path(name).exists())
-        requested += [_Name(str(name))] if is_id else read_names(Path(name))
-    missing = [name for name in requested if name.text not in rows]
+        requests += [_Name(str(name))] if is_id else read_names(Path(name))
+    missing = [name for name in requests if name.text not in rows]
     if missing:
         raise _missing(data, missing)
-    return set[int]().union(*(rows[name.text] for name in requested))
+    return set[int]().union(*(rows[name.text] for name in requests))
 
 
 def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
@@ -273,12 +277,12 @@ def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
     ids = [str(entry["scenario_id"]) for entry in data.entries]
     near = difflib.get_close_matches(first.text.rpartition("\t")[2], ids, n=1)
     cure = f"did you mean {near[0]!r}?" if near and not others else "use ids that drivax inspect --json lists"
-    more = "".join(f", {name.shown}" for name in others[: _SHOWN - 1])
-    more += f" and {len(others) - _SHOWN + 1} more" if len(others) >= _SHOWN else ""
+    more = "".join(f", {name.label}" for name in others[: _MOST_NAMES - 1])
+    more += f" and {len(others) - _MOST_NAMES + 1} more" if len(others) >= _MOST_NAMES else ""
     which = "are" if others else "is"
     if first.file is None:
-        return DataError(f"{first.shown}{more} {which} not in the set", file=data.path, cure=cure)
-    problem = f"line {first.line} names {first.shown}{more}, which {which} not in the set {data.path}"
+        return DataError(f"{first.label}{more} {which} not in the set", file=data.path, cure=cure)
+    problem = f"line {first.line} names {first.label}{more}, which {which} not in the set {data.path}"
     return DataError(problem, file=first.file, cure=cure)
 
 

@@ -17,7 +17,7 @@ from drivax.geometry.polylines import arc_lengths
 from drivax.geometry.vectors import wrap
 from drivax.scenario.build.lanes import LaneGraph, Lights, end_headings
 from drivax.scenario.build.routes import STEP_M, RouteSet
-from drivax.scenario.build.segments import spaced
+from drivax.scenario.build.segments import space_out
 from drivax.scenario.build.tracks import LocalTracks
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import DT_S, AgentKind, Flag, among
@@ -56,7 +56,7 @@ BRAKING_MPS = 2.0
 
 
 @dataclass(frozen=True)
-class Driven:
+class EgoPath:
     """Log of the ego as poses at least half a metre apart: distance driven, unwrapped headings.
 
     ``lane`` is the dense index of the lane under every metre of the log, -1 without one.
@@ -67,11 +67,11 @@ class Driven:
     lane: Int[Array, " metre"]
 
     @classmethod
-    def of(cls, tracks: LocalTracks, routes: RouteSet) -> Driven:
+    def of(cls, tracks: LocalTracks, routes: RouteSet) -> EgoPath:
         """Build from the track of the ego and the route of its log (row 1, if stored)."""
         valid = tracks.valid[tracks.ego]
         xy, heading = tracks.xyz[tracks.ego, valid, :2], tracks.heading[tracks.ego, valid]
-        keep = spaced(xy, STEP_M)
+        keep = space_out(xy, STEP_M)
         arc = arc_lengths(xy[keep])
         lane = routes.routes[1].lane if len(routes.routes) > 1 else np.zeros(0, dtype=np.int64)
         return cls(arc, np.unwrap(heading[keep]), lane[: int(arc[-1]) + 1])
@@ -82,8 +82,8 @@ def scenario_tags(
     flags: Flag, style: str,
 ) -> dict[str, str]:  # fmt: skip
     """Return all tags of a scenario; ``style`` names the source of its candidate routes."""
-    driven = Driven.of(tracks, routes)
-    kind = type_of(driven, graph)
+    path = EgoPath.of(tracks, routes)
+    kind = type_of(path, graph)
     density = density_of(tracks, recording.current_step)
     limits = "measured" if Flag.SPEED_LIMITS in flags else "none"
     links = "chained" if Flag.CHAINED_GRAPH in flags else "given"
@@ -93,7 +93,7 @@ def scenario_tags(
         "type": kind,
         "difficulty": difficulty_of(tracks, kind, density),
         "density": density,
-        "moves": "yes" if driven.arc[-1] >= MOVES_M else "no",
+        "moves": "yes" if path.arc[-1] >= MOVES_M else "no",
         "lights": "yes" if len(lights.z) else "no",
         "limits": "default" if Flag.DEFAULT_LIMITS in flags else limits,
         "lane_graph": links if Flag.LANE_GRAPH in flags else "none",
@@ -101,7 +101,7 @@ def scenario_tags(
     }
 
 
-def type_of(driven: Driven, graph: LaneGraph) -> str:
+def type_of(path: EgoPath, graph: LaneGraph) -> str:
     """Return the most specific manoeuvre of the ego.
 
     - ``u_turn``, ``turn_left``, ``turn_right``: the heading changes by 135 or 45 degrees within 40 m of driving, and
@@ -112,13 +112,13 @@ def type_of(driven: Driven, graph: LaneGraph) -> str:
 
     A log that drives less than 5 m is ``straight``.
     """
-    if driven.arc[-1] < MOVES_M:
+    if path.arc[-1] < MOVES_M:
         return "straight"
     junction = junction_lanes(graph)
-    on = driven.lane[driven.lane >= 0]
+    on = path.lane[path.lane >= 0]
     crosses = bool(junction[on].any())
-    turn = _sharpest(driven)
-    if abs(turn) >= TURN_RAD and (crosses or len(on) < len(driven.lane)):
+    turn = _sharpest(path)
+    if abs(turn) >= TURN_RAD and (crosses or len(on) < len(path.lane)):
         if abs(turn) >= U_TURN_RAD:
             return "u_turn"
         return "turn_left" if turn > 0 else "turn_right"
@@ -126,13 +126,13 @@ def type_of(driven: Driven, graph: LaneGraph) -> str:
         return "merge"
     if crosses:
         return "junction"
-    return "straight" if np.ptp(driven.heading) < STRAIGHT_RAD else "lane_follow"
+    return "straight" if np.ptp(path.heading) < STRAIGHT_RAD else "lane_follow"
 
 
-def _sharpest(driven: Driven) -> float:
+def _sharpest(path: EgoPath) -> float:
     """Largest change of heading within 40 m of driving, left positive, radians."""
-    within = np.abs(driven.arc[:, None] - driven.arc) <= TURN_WITHIN_M
-    turn = np.where(np.triu(within), driven.heading - driven.heading[:, None], 0.0)
+    within = np.abs(path.arc[:, None] - path.arc) <= TURN_WITHIN_M
+    turn = np.where(np.triu(within), path.heading - path.heading[:, None], 0.0)
     return float(turn.flat[np.abs(turn).argmax()])
 
 
@@ -162,8 +162,8 @@ def density_of(tracks: LocalTracks, current_step: int) -> str:
     """Return the density of road users within 50 m at the current step: below 5, 5 to 19, 20 or more."""
     users = among(tracks.kind, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST))
     users[tracks.ego] = False
-    apart = _apart(tracks, np.flatnonzero(users))[:, current_step]
-    return TAGS["density"][int(np.searchsorted(DENSITY, (apart <= NEAR_M).sum(), side="right"))]
+    distance = _ego_distance(tracks, np.flatnonzero(users))[:, current_step]
+    return TAGS["density"][int(np.searchsorted(DENSITY, (distance <= NEAR_M).sum(), side="right"))]
 
 
 def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
@@ -177,15 +177,15 @@ def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
     demands = (
         kind not in ("straight", "lane_follow"),
         density == "high",
-        bool((_apart(tracks, vulnerable) <= VULNERABLE_M).any()),
+        bool((_ego_distance(tracks, vulnerable) <= VULNERABLE_M).any()),
         _meets_crossing(tracks),
         _brakes(tracks),
     )
     return TAGS["difficulty"][int(np.searchsorted(DIFFICULTY, sum(demands), side="right"))]
 
 
-def _apart(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array, "row time"]:
-    """Distance of tracks from the ego at every step, infinite where either is invalid."""
+def _ego_distance(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array, "row time"]:
+    """Distance of tracks from the ego at every step, infinite if either is invalid."""
     offset = tracks.xyz[rows, :, :2] - tracks.xyz[tracks.ego, :, :2]
     both = tracks.valid[rows] & tracks.valid[tracks.ego]
     return np.where(both, np.hypot(offset[..., 0], offset[..., 1]), np.inf)
@@ -197,7 +197,7 @@ def _meets_crossing(tracks: LocalTracks) -> bool:
     angle = np.abs(wrap(tracks.heading[rows] - tracks.heading[tracks.ego]))
     crosses = (angle >= CROSSING_RAD[0]) & (angle <= CROSSING_RAD[1])
     speed = np.hypot(tracks.velocity[rows, :, 0], tracks.velocity[rows, :, 1])
-    return bool((crosses & (speed >= CROSSING_MPS) & (_apart(tracks, rows) <= CROSSING_M)).any())
+    return bool((crosses & (speed >= CROSSING_MPS) & (_ego_distance(tracks, rows) <= CROSSING_M)).any())
 
 
 def _brakes(tracks: LocalTracks) -> bool:
