@@ -70,7 +70,7 @@ def load(
     """
     if isinstance(data, str | Path):
         scenario_set = ScenarioSet.open(data)
-        loaded = [scenario_set[row] for row in select_scenarios(scenario_set, filters, scenarios, limit)]
+        loaded = scenario_set.take(select_scenarios(scenario_set, filters, scenarios, limit))
         # Loaded scenarios have been verified; only the sizes of all others are read.
         sizes = Sizes.used(ScenarioSet.open(data, verify=False))
     elif filters or scenarios:

@@ -111,7 +111,7 @@ def run_evaluation(
     The folder appears once all episodes are done. The traffic model is by default the built-in one named
     ``config.traffic``; ``sizes`` are those that the whole set uses, if they are known already.
     """
-    scenarios = [data[row] for row in select_scenarios(data, config.filter, config.scenarios, config.limit)]
+    scenarios = data.take(select_scenarios(data, config.filter, config.scenarios, config.limit))
     RunFolder.check(Path(out), overwrite, "evaluation")
     # The scenarios to evaluate have been verified; of the others only the sizes are read.
     sizes = sizes or Sizes.used(ScenarioSet.open(data.path, verify=False))
