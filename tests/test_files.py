@@ -5,6 +5,9 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -161,11 +164,41 @@ def test_a_full_disk_is_reported_with_path_need_and_cure(tmp_path: Path, code: i
 
 def test_of_nested_blocks_the_outermost_names_the_output(tmp_path: Path):
     with (
-        pytest.raises(DataError, match=r"^\S+/set: no space left on device \([^,]+ free\)"),
+        pytest.raises(DataError, match=r"^\S+/set: no space left on device \([^,]+ free, more needed\)"),
         explain_full_disk(tmp_path / "set"),
         atomic_write(tmp_path / "set" / "manifest.json"),
     ):
         raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_the_need_of_a_file_is_told_for_the_output_around_it(tmp_path: Path):
+    with (
+        pytest.raises(
+            DataError, match=r"^\S+/run: no space left on device \(.+ free, of about 12 kB needed\)"
+        ),
+        explain_full_disk(tmp_path / "run"),
+        replace_folder(tmp_path / "run" / "checkpoint"),
+        atomic_write(tmp_path / "run" / "checkpoint" / "weights", 12_000),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_write_larger_than_its_limit_tells_the_size_of_the_file(tmp_path: Path):
+    """A text of 100 kB where files may have 10 kB: the system's own error, with EFBIG in place of ENOSPC."""
+    code = """
+import errno, resource, signal, sys
+from pathlib import Path
+from drivax import files
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+errno.ENOSPC = errno.EFBIG
+files.write_text(Path(sys.argv[1]), "x" * 100_000)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "log"], capture_output=True, text=True, check=False
+    )
+    assert re.search(r"log: no space left on device \(.+ free, of about 100 kB needed\); make", done.stderr)
+    assert names(tmp_path) == set()
 
 
 def test_a_partial_folder_that_cannot_start_leaves_nothing_behind(tmp_path: Path, monkeypatch):
