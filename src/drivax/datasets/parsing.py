@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -165,9 +166,9 @@ def windows_of(steps: int) -> int:
 UNEVEN = "frames are missing or off their time: steps are interpolated by time, and cut at gaps"
 
 
-def nonzero(**counts: int) -> dict[str, int]:
-    """Counts that are not zero, for ``Recording.lost``."""
-    return {name: int(count) for name, count in counts.items() if count}
+def nonzero(*lost: Mapping[str, int], **counts: int) -> dict[str, int]:
+    """Return the sums of counts by name that are not zero, for ``Recording.lost``."""
+    return {name: int(count) for name, count in sum(map(Counter, lost), Counter(counts)).items() if count}
 
 
 def one_point_features(features: Sequence[MapFeature]) -> int:

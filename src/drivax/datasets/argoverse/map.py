@@ -41,6 +41,11 @@ _MARKS = {
     "DOUBLE_SOLID_YELLOW": RoadKind.LINE_SOLID_DOUBLE_YELLOW,
     **dict.fromkeys(("DASH_SOLID_YELLOW", "SOLID_DASH_YELLOW"), RoadKind.LINE_PASSING_DOUBLE_YELLOW),
 }
+#: Names of elements of a map that are read.
+_FIELDS = frozenset((
+    "id", "is_intersection", "lane_type", "centerline", "predecessors", "successors", "area_boundary", "edge1", "edge2",
+    *(f"{side}_{name}" for side in ("left", "right") for name in ("lane_boundary", "lane_mark_type", "neighbor_id")),
+))  # fmt: skip
 
 
 class ArgoverseMap(NamedTuple):
@@ -80,7 +85,8 @@ def _decode(content: Any) -> ArgoverseMap:
     rest = [
         MapFeature(number, kind, points) for number, (kind, points) in enumerate(drawn, free + len(edges))
     ]
-    lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes))
+    unknown = (content.keys() - {*groups}).union(*segments, *areas, *crossings) - _FIELDS
+    lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes), unknown_fields=len(unknown))
     return ArgoverseMap((*lanes, *edges, *rest), lost)
 
 

@@ -31,6 +31,8 @@ _POSE_COLUMNS: dict[str, Kind] = {"timestamp_ns": "whole", **dict.fromkeys(_POSE
 _BOX_COLUMNS: dict[str, Kind] = {
     **_POSE_COLUMNS, **dict.fromkeys(_SIZE, "number"), "track_uuid": "text", "category": "text"
 }  # fmt: skip
+#: Columns that are not needed.
+_NOT_NEEDED = {"num_interior_pts"}
 _VEHICLES = (
     EGO, "REGULAR_VEHICLE", "LARGE_VEHICLE", "BUS", "SCHOOL_BUS", "ARTICULATED_BUS", "BOX_TRUCK", "TRUCK",
     "TRUCK_CAB", "VEHICULAR_TRAILER", "RAILED_VEHICLE",
@@ -135,7 +137,11 @@ def decode(path: Path) -> Recording:
         tracks=tracks,
         features=local_map.features,
         tags={"source_format": "av2-sensor"} | _places(map_path),
-        lost=local_map.lost | parsing.nonzero(frames_without_pose=lost_frames),
+        lost=parsing.nonzero(
+            local_map.lost,
+            frames_without_pose=lost_frames,
+            unknown_fields=len((boxes.others - _NOT_NEEDED) | poses.others),
+        ),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )
 

@@ -40,6 +40,10 @@ LAYERS: Mapping[str, tuple[str, ...]] = {
     "gen_lane_connectors_scaled_width_polygons": ("lane_connector_fid", "left_boundary_fid", "right_boundary_fid"),
     **dict.fromkeys(_DRIVABLE, ()),
 }  # fmt: skip
+#: Layers that are not read.
+_NOT_NEEDED = frozenset((
+    "lane_groups_polygons", "lane_group_connectors", "walkways", "traffic_lights", "dubins_nodes",
+))  # fmt: skip
 _NEEDED = ("baseline_paths", "lanes_polygons", "lane_connectors")
 NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), start=1)}
 #: Folder in the archive of the maps, which the documentation renames to ``maps``.
@@ -126,6 +130,7 @@ class City:
         lanes: Lanes and connectors by packed id.
         roadblocks: Packed ids of the lanes of each roadblock, by (``lane`` or ``connector``, fid).
         boundary_rows: Row in the layer of boundaries by fid.
+        unknown_layers: Number of layers with unknown names.
     """
 
     path: Path
@@ -134,6 +139,7 @@ class City:
     lanes: Mapping[int, Lane]
     roadblocks: Mapping[tuple[str, int], list[int]]
     boundary_rows: Mapping[int | None, int]
+    unknown_layers: int
 
 
 def city_map(path: Path) -> City:
@@ -149,6 +155,7 @@ def _city(path: Path, mtime_ns: int, size: int) -> City:
         if missing := [name for name in _NEEDED if name not in layers]:
             raise DataError(f"has no layer {missing[0]}", file=path, cure=CURE)
         epsg = _read_epsg(database)
+        names = {name for (name,) in database.rows("SELECT table_name FROM gpkg_geometry_columns")}
     lanes = _lanes(layers)
     blocks: dict[tuple[str, int], list[int]] = {}
     for lane_id, lane in lanes.items():
@@ -156,7 +163,8 @@ def _city(path: Path, mtime_ns: int, size: int) -> City:
             blocks.setdefault(lane.roadblock, []).append(lane_id)
     boundaries = layers.get("boundaries")
     fids = () if boundaries is None else boundaries.fid.tolist()
-    return City(path, epsg, layers, lanes, blocks, {fid: row for row, fid in enumerate(fids)})
+    rows = {fid: row for row, fid in enumerate(fids)}
+    return City(path, epsg, layers, lanes, blocks, rows, len(names - LAYERS.keys() - _NOT_NEEDED))
 
 
 def _read_epsg(database: Database) -> int:

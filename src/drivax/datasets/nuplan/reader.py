@@ -40,6 +40,13 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "scenario_tag": ("lidar_pc_token", "type"),
     "traffic_light_status": ("lidar_pc_token", "lane_connector_id", "status"),
 }  # fmt: skip
+#: Tables, and columns of those that are read, that are not needed; their names hardly repeat with another meaning.
+_NOT_NEEDED = frozenset((
+    "lidar", "camera", "image", "token", "vehicle_name", "date", "timestamp", "location", "log_token", "lidar_token",
+    "next_token", "prev_token", "filename", "z", "vz", "acceleration_x", "acceleration_y", "acceleration_z",
+    "angular_rate_x", "angular_rate_y", "epsg", "confidence", "width", "length", "height", "description", "name",
+    "goal_ego_pose_token", "agent_track_token",
+))  # fmt: skip
 #: Length, width and height of the ego (Chrysler Pacifica), metres.
 EGO_SIZE_M = (5.176, 2.297, 1.777)
 #: From the rear axle, where ego poses are, to the middle of the box: (front 4.049 m - rear 1.127 m) / 2.
@@ -159,12 +166,13 @@ _Agents = Mapping[Any, tuple[int, AgentKind]]
 
 @dataclass(frozen=True)
 class Log:
-    """An open log: its name (the file's where it has none), the name of its map, its time line."""
+    """An open log: its name (else the file's), the name of its map, its time line, its number of unknown fields."""
 
     database: Database
     name: str
     map_name: str
     line: TimeLine
+    unknown_fields: int
 
 
 def _open_log(database: Database, path: Path) -> Log:
@@ -175,7 +183,17 @@ def _open_log(database: Database, path: Path) -> Log:
         raise DataError("its table log names no map", file=path, cure="download the file again")
     name, map_name = rows[0]
     name = name if isinstance(name, str) and name else path.stem
-    return Log(database, name, map_name.removesuffix(".gpkg"), time_line(database))
+    return Log(database, name, map_name.removesuffix(".gpkg"), time_line(database), _unknown_fields(database))
+
+
+def _unknown_fields(database: Database) -> int:
+    """Number of tables, and of columns of the tables that are read, with unknown names."""
+    columns = {
+        (table, column)
+        for table, known in TABLES.items()
+        for column in database.columns(table) - _NOT_NEEDED.union(known)
+    }
+    return len(database.tables() - TABLES.keys() - _NOT_NEEDED) + len(columns)
 
 
 def time_line(database: Database) -> TimeLine:
@@ -389,7 +407,13 @@ def _recording(log: Log, piece: Piece, known: _Agents, city: City) -> Recording:
         lights=lights,
         route_corridor=tuple(lane for lane in route if lane in lanes),
         tags=tags | ({"scenario_types": "|".join(types)} if types else {}),
-        lost=parsing.nonzero(boxes_without_track=boxes, **lost, lights=unlit, roadblocks=unknown),
+        lost=parsing.nonzero(
+            lost,
+            boxes_without_track=boxes,
+            lights=unlit,
+            roadblocks=unknown,
+            unknown_fields=log.unknown_fields + city.unknown_layers,
+        ),
     )
 
 

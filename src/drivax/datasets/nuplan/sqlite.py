@@ -65,6 +65,11 @@ class Database:
             rows += self.rows(f"{query} ({', '.join('?' * len(batch))})", batch)
         return rows
 
+    def tables(self) -> frozenset[str]:
+        """Return the names of all tables but those of SQLite itself."""
+        names = self.rows("SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite%'")
+        return frozenset(str(name) for (name,) in names)
+
     def columns(self, table: str) -> frozenset[str]:
         """Return the names of a table's columns; none where there is no such table (a view is none)."""
         real = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"

@@ -48,6 +48,22 @@ class Box:
 
 
 _AGAIN = "unpack the map expansion again"
+#: Layers that are read, row by row, and others of the map expansion.
+_LAYERS = (
+    "line", "polygon", "drivable_area", "lane", "lane_connector", "lane_divider", "road_divider", "ped_crossing",
+    "stop_line",
+)  # fmt: skip
+_OTHERS = (
+    "version", "node", "arcline_path_3", "connectivity", "road_segment", "road_block", "walkway", "carpark_area",
+    "traffic_light", "canvas_edge",
+)  # fmt: skip
+#: Names of fields of the rows of these layers that are read, or need not be.
+_FIELDS = (
+    "token", "node_tokens", "exterior_node_tokens", "holes", "polygon_token", "polygon_tokens", "line_token",
+    "lane_divider_segments", "stop_line_type", "lane_type", "from_edge_line_token", "to_edge_line_token",
+    "left_lane_divider_segments", "right_lane_divider_segments", "road_segment_token", "ped_crossing_tokens",
+    "traffic_light_tokens", "road_block_token",
+)  # fmt: skip
 #: Points of centre lines.
 SPACING_M = 0.5
 #: No lane is longer.
@@ -109,6 +125,9 @@ class _Layers:
         self._lines = {line["token"]: line["node_tokens"] for line in content["line"]}
         self._polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
         self._lost: dict[str, int] = {}
+        fields = {name for layer in _LAYERS for row in self._layer(layer) for name in row}
+        unknown = content.keys() - {*_LAYERS, *_OTHERS} | fields.difference(_FIELDS)
+        self._count("unknown_fields", len(unknown))
 
     def city(self) -> City:
         """All features, lanes first, numbered in this order."""

@@ -1,16 +1,17 @@
 """Protocol-buffer messages of the Waymo Open Motion Dataset and of tf.Example, built when first used.
 
-Only what drivax reads is declared (field numbers of ``waymo_open_dataset/protos/{scenario,map}.proto`` and
-``tensorflow/core/example``); undeclared fields, camera tokens and compressed lidar among them, are skipped. Enums
-are declared as int32, which is the same on the wire, so that values of later versions are kept. The messages live
-in a descriptor pool of their own and so never clash with an installed ``waymo-open-dataset`` package.
+Declared are the fields of ``waymo_open_dataset/protos/{scenario,map}.proto`` and ``tensorflow/core/example``; those
+that drivax does not need, camera tokens and compressed lidar among them, as bytes. Others are dropped and counted
+(:func:`unknown_fields`). Enums are declared as int32, which is the same on the wire, so that values of later versions
+are kept. The messages live in a descriptor pool of their own and so never clash with an installed
+``waymo-open-dataset`` package.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
@@ -48,7 +49,8 @@ _MESSAGES: dict[str, tuple[_Field, ...]] = {
     "Scenario": _fields(
         "timestamps_seconds 1 double*, tracks 2 Track*, objects_of_interest 4 int32*, scenario_id 5 string,"
         "sdc_track_index 6 int32, dynamic_map_states 7 DynamicMapState*, map_features 8 MapFeature*,"
-        "current_time_index 10 int32, tracks_to_predict 11 RequiredPrediction*"
+        "current_time_index 10 int32, tracks_to_predict 11 RequiredPrediction*, compressed_frame_laser_data 12 bytes*,"
+        "frame_camera_tokens 13 bytes*"
     ),
     "RequiredPrediction": _fields("track_index 1 int32, difficulty 2 int32"),
     "Track": _fields("id 1 int32, object_type 2 int32, states 3 bytes*"),
@@ -65,9 +67,13 @@ _MESSAGES: dict[str, tuple[_Field, ...]] = {
     ),
     "Lane": _fields(
         "speed_limit_mph 1 double, type 2 int32, interpolating 3 bool, polyline 8 bytes*, entry_lanes 9 int64*,"
-        "exit_lanes 10 int64*, left_neighbors 11 LaneNeighbor*, right_neighbors 12 LaneNeighbor*"
+        "exit_lanes 10 int64*, left_neighbors 11 LaneNeighbor*, right_neighbors 12 LaneNeighbor*,"
+        "left_boundaries 13 bytes*, right_boundaries 14 bytes*"
     ),
-    "LaneNeighbor": _fields("feature_id 1 int64"),
+    "LaneNeighbor": _fields(
+        "feature_id 1 int64, self_start_index 2 int32, self_end_index 3 int32, neighbor_start_index 4 int32,"
+        "neighbor_end_index 5 int32, boundaries 6 bytes*"
+    ),
     "Polyline": _fields("type 1 int32, polyline 2 bytes*"),
     "StopSign": _fields("lane 1 int64*, position 2 bytes"),
     "Polygon": _fields("polygon 1 bytes*"),
@@ -99,6 +105,22 @@ def parse(name: str, payload: bytes) -> Any | None:
         return message.FromString(payload)
     except DecodeError:
         return None
+
+
+def unknown_fields(message: Any, payload: bytes) -> set[tuple[str, int]]:
+    """Drop the undeclared fields of a message and its parts; return their message and number, read from ``payload``."""
+    size = message.ByteSize()
+    message.DiscardUnknownFields()
+    return set() if message.ByteSize() == size else set(_undeclared(message.FromString(payload)))
+
+
+def _undeclared(message: Any) -> Iterator[tuple[str, int]]:
+    fields = import_extra("google.protobuf.unknown_fields").UnknownFieldSet(message)
+    yield from ((message.DESCRIPTOR.name, field.field_number) for field in fields)
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for part in (value,) if hasattr(value, "ListFields") else value:
+                yield from _undeclared(part)
 
 
 @cache

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd.messages import POINTS, SKIP, STATES, parse, read_table
+from drivax.datasets.womd.messages import POINTS, SKIP, STATES, parse, read_table, unknown_fields
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -80,9 +80,19 @@ def decode(payload: bytes) -> Recording:
         # These are track ids, tracks_to_predict are rows.
         of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
         tags={"source_format": womd.SCENARIO_FORMAT},
-        lost=lost | parsing.nonzero(lights_without_place=unplaced),
+        lost=parsing.nonzero(
+            lost, lights_without_place=unplaced, unknown_fields=_unknown_fields(message, payload)
+        ),
         split_gap_m=_SPLIT_GAP_M,
     )
+
+
+def _unknown_fields(message: Any, payload: bytes) -> int:
+    """Number of fields of unknown numbers; states, which are kept as bytes, are examined once per length."""
+    states = {len(state): state for track in message.tracks for state in track.states}
+    parsed = ((parse(STATES.name, state), state) for state in states.values())
+    in_states = (unknown_fields(state, blob) for state, blob in parsed if state is not None)
+    return len(unknown_fields(message, payload).union(*in_states))
 
 
 def _check(message: Any, steps: int) -> None:
