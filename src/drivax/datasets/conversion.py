@@ -21,7 +21,7 @@ from typing import Any, TypeVar, get_args
 from drivax.datasets.doctor import Estimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, reader_named, survey
 from drivax.datasets.reader import BadRecord, of_length
-from drivax.datasets.spool import converted_ahead
+from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
@@ -168,7 +168,7 @@ class Converted:
         ignored: Number of files of unknown format in the folder.
         formats: Number of files by format.
         skipped: Records that could not be read or converted, and duplicates.
-        filtered: Number of scenarios that the filters left out.
+        filtered: Number of scenarios that the filters rejected.
         seconds: Wall time.
     """
 
@@ -230,7 +230,7 @@ def convert(
         done = _drain(data, options, sink, writer, progress)
         if not len(writer):
             raise _empty_error(data, sink)
-        writer.source |= sink.left_out()
+        writer.source |= sink.skipped_rows()
     return Converted(
         Path(out), len(writer), written, done, data.ignored, dict(data.formats), tuple(sink.skipped),
         sink.filtered, time.monotonic() - begin,
@@ -265,7 +265,7 @@ def _identity(data: Survey, options: Conversion, audited: bool) -> dict[str, Any
 
 
 class _Sink:
-    """Takes results in order: leaves out duplicates, audits in batches, filters, writes, and collects bad records.
+    """Takes results in order: drops duplicates, audits in batches, filters, writes, and collects bad records.
 
     Batches end where a shard ends, as they would after an interruption.
     """
@@ -317,7 +317,7 @@ class _Sink:
         while self._waiting and not self.full:
             self._write_batch()
 
-    def left_out(self) -> dict[str, Any]:
+    def skipped_rows(self) -> dict[str, Any]:
         """Records that are not in the set, for its manifest."""
         rows = [_row(self._data, bad) for bad in self.skipped]
         rows = [{name: value for name, value in row.items() if name != "cure"} for row in rows]
@@ -411,7 +411,7 @@ def _results(
     if options.workers == 1 or len(tasks) <= 1:
         yield from (convert_file(*task) for task in tasks)
         return
-    yield from converted_ahead(tasks, convert_file, options.sizes, options.workers, folder)
+    yield from convert_ahead(tasks, convert_file, options.sizes, options.workers, folder)
 
 
 def _empty_error(data: Survey, sink: _Sink) -> DataError:

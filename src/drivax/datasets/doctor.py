@@ -34,7 +34,7 @@ _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 class Part:
     """Files of one format, data set and version: ``looked`` of them were described, ``whole`` if those are all.
 
-    ``recordings`` of the description is the sum over these files, None if some file does not tell; ``notes`` and
+    ``recordings`` of the description is the sum over these files, or None if it is unknown for some file; ``notes`` and
     ``missing`` are those of all of them.
     """
 
@@ -164,8 +164,8 @@ def gaps(paths: Sequence[Path]) -> list[str]:
             continue
         runs = np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1)
         names = (f"{run[0]:05d}" if len(run) == 1 else f"{run[0]:05d} to {run[-1]:05d}" for run in runs)
-        named = f", missing {', '.join(names)}" if len(runs) <= 8 else ""
-        sentences.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{named}")
+        names_text = f", missing {', '.join(names)}" if len(runs) <= 8 else ""
+        sentences.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{names_text}")
     return sentences
 
 

@@ -100,8 +100,8 @@ def _is_frame(payload: bytes) -> bool:
     frame = parse("Frame", payload)
     if frame is None or not frame.HasField("timestamp_micros"):
         return False
-    named = frame.context.HasField("name") and frame.context.name.isascii()
-    return named and bool(frame.HasField("pose") or frame.images or frame.lasers)
+    has_name = frame.context.HasField("name") and frame.context.name.isascii()
+    return has_name and bool(frame.HasField("pose") or frame.images or frame.lasers)
 
 
 def _is_end_to_end(payload: bytes) -> bool:

@@ -49,7 +49,7 @@ _FIELDS = frozenset((
 
 
 class ArgoverseMap(NamedTuple):
-    """A map's features, and numbers of what was left out."""
+    """A map's features, and counts of what is lost."""
 
     features: tuple[MapFeature, ...]
     lost: dict[str, int]
@@ -81,9 +81,9 @@ def _decode(content: Any) -> ArgoverseMap:
     )
     free = 1 + max((lane.feature_id for lane in lanes), default=0)
     edges = road_edges(rings, free)
-    drawn = [*lines, *((RoadKind.CROSSWALK, walk) for walk in walks)]
+    shapes = [*lines, *((RoadKind.CROSSWALK, walk) for walk in walks)]
     rest = [
-        MapFeature(number, kind, points) for number, (kind, points) in enumerate(drawn, free + len(edges))
+        MapFeature(number, kind, points) for number, (kind, points) in enumerate(shapes, free + len(edges))
     ]
     unknown = (content.keys() - {*groups}).union(*segments, *areas, *crossings) - _FIELDS
     lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes), unknown_fields=len(unknown))
@@ -91,7 +91,7 @@ def _decode(content: Any) -> ArgoverseMap:
 
 
 def _lane(segment: Any) -> MapFeature | None:
-    """A lane, or None if a boundary has no length."""
+    """Build a lane; None for a segment with a boundary of no length."""
     left, right = _points(segment, "left_lane_boundary"), _points(segment, "right_lane_boundary")
     lengths = [arc_lengths(line).max(initial=0.0) for line in (left, right)]
     if min(lengths) < 1e-3:

@@ -157,8 +157,8 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
     parsing.check_within(tables.FASTEST_MPS, states[..., 3:])
     heading = np.where(valid, wrap(states[..., 2]), 0.0)
     xy = states[..., :2].copy()
-    there = ego, valid[ego]
-    xy[there] = parsing.box_centre(xy[there], heading[there], tables.CENTRE_AHEAD_M)
+    at_ego = ego, valid[ego]
+    xy[at_ego] = parsing.box_centre(xy[at_ego], heading[at_ego], tables.CENTRE_AHEAD_M)
     kinds, sizes = _classes(table.texts["object_type"], names, ego)
     return Tracks(
         xy=xy,

@@ -68,7 +68,7 @@ def has_magic(path: Path, magic: bytes) -> bool:
 def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
     """Read columns of a parquet or feather file, by name and kind: any number, integers, or text.
 
-    Columns that not every version of the format has are left out where they are missing.
+    ``optional`` columns, which not every version of the format has, may be missing.
     """
     pa = import_extra("pyarrow")
     try:
@@ -139,5 +139,5 @@ def _numbers(column: Any, whole: bool, name: str) -> Array:
 def _words(column: Any) -> Words:
     import pyarrow as pa
 
-    encoded = column.cast(pa.string()).combine_chunks().fill_null("").dictionary_encode()
-    return Words(tuple(encoded.dictionary.to_pylist()), encoded.indices.to_numpy().astype(np.int64))
+    codes = column.cast(pa.string()).combine_chunks().fill_null("").dictionary_encode()
+    return Words(tuple(codes.dictionary.to_pylist()), codes.indices.to_numpy().astype(np.int64))

@@ -187,7 +187,7 @@ def whole(value: Any) -> int | None:
 
 
 def _limit(value: Any) -> float | None:
-    """A limit in m/s, also from a text; None where it is missing or not plausible."""
+    """A limit in m/s, also from a text; None for a missing or implausible one."""
     if isinstance(value, str) and re.fullmatch(r"\d{1,3}(\.\d{1,20})?", value):
         value = float(value)
     good = isinstance(value, int | float) and math.isfinite(value) and 0.0 < value <= _FASTEST_MPS
@@ -339,7 +339,7 @@ class _Around:
         return [owners[row] for row in rows], self.shapes("baseline_paths", rows)
 
     def shapes(self, name: str, rows: Sequence[int]) -> Array:
-        """Projected geometries of rows; None where one is damaged, empty or too far away."""
+        """Projected geometries of rows; None for one that is damaged, empty or too far away."""
         shapely = import_extra("shapely")
         if not len(rows):
             return np.zeros(0, dtype=object)
@@ -361,7 +361,7 @@ class _Around:
     def outlines(
         self, name: str, rows: Sequence[int], outline: Callable[[Any], Array | None]
     ) -> Iterator[tuple[int, int, Array]]:
-        """Row, packed id and points of geometries; those that have no outline are left out."""
+        """Row, packed id and points of the geometries that have an outline."""
         for row, shape in zip(rows, self.shapes(name, rows), strict=True):
             points, fid = outline(shape), whole(int(self.city.layers[name].fid[row]))
             if points is not None and fid is not None:
@@ -383,7 +383,7 @@ def _transformer(source: int, target: int) -> Any:
 
 
 def _line(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
-    """Points of a line, z = 0, without repeated ones; None where there are fewer than two or the line is in parts."""
+    """Points of a line, z = 0, without repeated ones; None for fewer than two points or a line in parts."""
     shapely = import_extra("shapely")
     if shape is not None and shape.geom_type == "MultiLineString":
         shape = shapely.line_merge(shape)
@@ -442,10 +442,10 @@ def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float
     known = around.city.boundary_rows
     pairs = [[known.get(fid, -1) for fid in lane.boundaries] for lane in lanes]
     rows = np.array(pairs, np.int64).reshape(-1, 2)
-    used = np.unique(rows[rows >= 0])
+    side_rows = np.unique(rows[rows >= 0])
     nothing = np.array(None, dtype=object)
-    lines = np.append(around.shapes("boundaries", used.tolist()), nothing)
-    sides = lines[np.where(rows >= 0, np.searchsorted(used, rows), -1)]
+    lines = np.append(around.shapes("boundaries", side_rows.tolist()), nothing)
+    sides = lines[np.where(rows >= 0, np.searchsorted(side_rows, rows), -1)]
     along = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, nothing)
     places = shapely.line_interpolate_point(along[:, None], _WIDTH_PLACES, normalized=True)
     gaps = shapely.distance(places[:, None], sides[:, :, None])

@@ -211,7 +211,7 @@ def pieces(line: TimeLine, steps: int = STEPS) -> list[Piece]:
     """Cut a time line at gaps and scenes, and long scenes, into pieces of 10 Hz for scenarios of ``steps`` steps.
 
     Of sweeps at 20 Hz every second one is taken, counted from the last gap. A remainder that is too short for a
-    window is left out: it is the future of the windows before.
+    window is dropped: it is the future of the windows before.
     """
     recordings: list[Piece] = []
     counts: dict[Any, int] = {}
@@ -280,7 +280,7 @@ def agents(database: Database) -> _Agents:
 def tracks(log: Log, piece: Piece, known: _Agents) -> tuple[Tracks, int]:
     """Return the tracks of a piece, ego in row 0, and the number of boxes without a track."""
     steps = len(piece.sweeps)
-    boxes, owners, left_out = _boxes(log, piece, known)
+    boxes, owners, lost = _boxes(log, piece, known)
     tokens = sorted({owner for _, owner in owners}, key=lambda token: known[token][0])
     if (len(tokens) + 1) * steps > _MOST_CELLS:
         raise DataError(f"{len(tokens)} tracks in {steps} steps", cure=_CURE)
@@ -302,7 +302,7 @@ def tracks(log: Log, piece: Piece, known: _Agents) -> tuple[Tracks, int]:
         kind=np.array([kind for _, kind in entries], np.int8),
         track_id=np.array([number for number, _ in entries], np.int64),
     )
-    return states, left_out
+    return states, lost
 
 
 def _ego(log: Log, piece: Piece) -> Float64[np.ndarray, "step 9"]:
@@ -433,4 +433,4 @@ def _lights(
             lights.observe(step, lane, _LIGHT_STATES.get(status, LightState.UNKNOWN), starts[lane])
         elif lane not in city.lanes:
             unknown.add(connector)
-    return lights.collected(features)[0], len(unknown)
+    return lights.collect(features)[0], len(unknown)

@@ -119,7 +119,7 @@ class Layer:
         epsg: Coordinate reference system of the geometries.
         fid: Feature ids (row ids).
         bounds: West, south, east, north in that system; NaN where a geometry is unreadable.
-        columns: Values of the requested columns, None where the layer lacks a column.
+        columns: Values of the requested columns; None for columns that the layer lacks.
     """
 
     name: str
@@ -137,7 +137,7 @@ class Layer:
 
 
 def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> Layer | None:
-    """Read a layer without its geometries; None where the GeoPackage has no such layer."""
+    """Read a layer without its geometries; None for one that the GeoPackage lacks."""
     present = database.columns(name)
     database.require("gpkg_geometry_columns", "table_name", "column_name", "srs_id")
     described = database.rows(
@@ -178,7 +178,7 @@ def _envelope(head: Any) -> tuple[float, float, float, float]:
 
 
 def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]) -> Array:
-    """Return the geometries of rows as an array of shapely objects; None where one is unreadable."""
+    """Return the geometries of rows as an array of shapely objects; None for unreadable ones."""
     shapely = import_extra("shapely")
     fids = layer.fid[rows].tolist()
     query = f"SELECT rowid, {layer.geometry} FROM {layer.name} WHERE rowid IN"
@@ -192,14 +192,14 @@ def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]
 
 
 def _decoded(blob: bytes | None) -> Any:
-    """One geometry; None where it is unreadable or a curve."""
+    """Decode a geometry; None for a curve or an unreadable one."""
     with contextlib.suppress(NotImplementedError):
         return import_extra("shapely").from_wkb(blob, on_invalid="ignore")
     return None
 
 
 def _wkb(blob: Any) -> bytes | None:
-    """The WKB in a geometry BLOB; None where it is none, empty, or of an extension."""
+    """The WKB in a geometry BLOB; None for anything else, empty ones and extensions."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None
     code = blob[3] >> 1 & 7

@@ -133,17 +133,17 @@ class _Layers:
         """All features, lanes first, numbered in this order."""
         lanes = self._lanes()
         lines = [*self._dividers(), *self._crossings()]
-        numbered = [replace(line, feature_id=len(lanes) + i) for i, line in enumerate(lines)]
-        stops = self._stops(lanes, len(lanes) + len(numbered))
+        features = [replace(line, feature_id=len(lanes) + i) for i, line in enumerate(lines)]
+        stops = self._stops(lanes, len(lanes) + len(features))
         areas = [area for row in self._layer("drivable_area") for area in self._areas(row["polygon_tokens"])]
-        edges = road_edges(areas, len(lanes) + len(numbered) + len(stops))
-        return City((*lanes, *numbered, *stops, *edges), self._lost)
+        edges = road_edges(areas, len(lanes) + len(features) + len(stops))
+        return City((*lanes, *features, *stops, *edges), self._lost)
 
     def _layer(self, name: str) -> Sequence[Mapping[str, Any]]:
         return self._content.get(name, ())
 
     def _points(self, tokens: Sequence[str]) -> Float[Array, "point 3"]:
-        """Nodes by token; missing ones are left out and counted."""
+        """Nodes by token; missing ones are counted."""
         nodes = [self._nodes[token] for token in tokens if token in self._nodes]
         self._count("nodes", len(tokens) - len(nodes))
         return np.column_stack((np.array(nodes, np.float64).reshape(-1, 2), np.zeros(len(nodes))))
@@ -168,11 +168,11 @@ class _Layers:
         paths, links = self._content["arcline_path_3"], self._content["connectivity"]
         rows = [(row, name) for name in ("lane", "lane_connector") for row in self._layer(name)]
         lines = {row["token"]: arc_line(paths[row["token"]]) for row, _ in rows if row["token"] in paths}
-        drawn = [(row, name) for row, name in rows if len(lines.get(row["token"], ())) > 1]
-        self._count("lanes_without_path", len(rows) - len(drawn))
-        index = {row["token"]: i for i, (row, _) in enumerate(drawn)}
+        with_path = [(row, name) for row, name in rows if len(lines.get(row["token"], ())) > 1]
+        self._count("lanes_without_path", len(rows) - len(with_path))
+        index = {row["token"]: i for i, (row, _) in enumerate(with_path)}
         lanes: list[MapFeature] = []
-        for i, (row, name) in enumerate(drawn):
+        for i, (row, name) in enumerate(with_path):
             connects, line = name == "lane_connector", lines[row["token"]]
             link = links.get(row["token"], {})
             after, before = ([*link.get(way, ())] for way in ("outgoing", "incoming"))
@@ -191,7 +191,7 @@ class _Layers:
         return with_neighbours(lanes)
 
     def _width(self, row: Mapping[str, Any], line: Float[Array, "point 2"]) -> float | None:
-        """Area of the lane's polygon over the length of its centre line; None if that is no lane's width."""
+        """Area of the lane's polygon over the length of its centre line; None for an implausible width."""
         length = float(np.hypot(*np.diff(line, axis=0).T).sum())
         for exterior, _ in self._areas([row["polygon_token"]]):
             x, y = exterior[:, 0], exterior[:, 1]
@@ -273,7 +273,7 @@ def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
 
 
 def marking(name: str) -> RoadKind | None:
-    """The kind of a painted divider by its nuScenes name; None if nothing is painted (NIL)."""
+    """The kind of a painted divider by its nuScenes name; None for no paint (NIL)."""
     if name == "NIL":
         return None
     style = "BROKEN" if "DASHED" in name else "SOLID"

@@ -137,8 +137,8 @@ class _Machine:
         self.stack.append(_Global(full))
 
     def _call(self, argument: Any) -> None:
-        named, arguments = self._take(2)
-        make = _CALLED.get(named.name) if isinstance(named, _Global) else None
+        function, arguments = self._take(2)
+        make = _CALLED.get(function.name) if isinstance(function, _Global) else None
         if make is None or not isinstance(arguments, tuple):
             raise ValueError("a call of something else than a constructor")
         # Calls copy their arguments, and the memo can repeat the same argument.
@@ -213,7 +213,7 @@ def _new_dictionary(*arguments: Any) -> dict[Any, Any]:
     return {_hashable(key): value for items in pairs for key, value in _members(items)}
 
 
-def _encoded(text: Any, encoding: Any = "latin1") -> bytes:
+def _encode(text: Any, encoding: Any = "latin1") -> bytes:
     """Bytes, as protocols up to 2 hold them."""
     if not isinstance(text, str):
         raise ValueError("bytes of something else")
@@ -291,14 +291,14 @@ _CALLED: dict[str, Callable[..., Any]] = {
     "builtins.frozenset": lambda items=(): frozenset(map(_hashable, _members(items))),
     "builtins.bytearray": lambda content=b"", encoding="latin1": _content(content),
     "builtins.bytes": lambda content=b"": _content(content),
-    "_codecs.encode": _encoded,
+    "_codecs.encode": _encode,
 }
 
 
 def _content(content: Any) -> bytes:
     """Bytes of a bytes-like value; an integer, which would allocate that many, is refused."""
     if isinstance(content, str):
-        return _encoded(content)
+        return _encode(content)
     if not isinstance(content, bytes | bytearray):
         raise ValueError("bytes of something else")
     return bytes(content)
@@ -391,6 +391,6 @@ class Names:
         self._numbers = dict(zip(names, numbers, strict=True))
 
     def get(self, value: Any) -> int | None:
-        """Return the number of a name; None where the file has no such name."""
+        """Return the number of a name; None for one that the file lacks."""
         name = as_text(value)
         return None if name is None else self._numbers.get(name)

@@ -97,7 +97,7 @@ _PACKAGE = "drivax"
 
 
 def parse(name: str, payload: bytes) -> Any | None:
-    """The message of this name in a payload, or None if the payload is no such message."""
+    """Parse a payload as the message of this name; None for anything else."""
     message = message_class(name)
     from google.protobuf.message import DecodeError
 
@@ -270,11 +270,11 @@ class ExampleFeatures:
             raise DataError(f"feature {name} contains floats, not integers", cure=SKIP)
         return values
 
-    def marked(self, name: str, used: _Array) -> tuple[int, ...]:
-        """Rows among those used whose value is 1; none if the file lacks the feature."""
+    def marked(self, name: str, rows: _Array) -> tuple[int, ...]:
+        """Places in ``rows`` with the value 1; none if the file lacks the feature."""
         if not self.has(name):
             return ()
-        values = self.numbers(name, (self.numbers("state/id").size,))[used]
+        values = self.numbers(name, (self.numbers("state/id").size,))[rows]
         return tuple(np.flatnonzero(values == 1).tolist())
 
     def scenario_id(self, payload: bytes) -> str:
@@ -312,10 +312,10 @@ class ExampleFeatures:
             raise DataError(f"state/current has {steps['current']} steps, not 1", cure=SKIP)
         return steps
 
-    def over_time(self, name: str, used: _Array) -> _Array:
-        """``state/{past,current,future}/<name>`` joined, of the rows used: ``[track, time]``."""
+    def over_time(self, name: str, rows: _Array) -> _Array:
+        """``state/{past,current,future}/<name>`` joined, of the rows: ``[track, time]``."""
         count = self.numbers("state/id").size
         spans = [(span, steps) for span, steps in self.spans.items() if steps]
         return np.concatenate(
-            [self.numbers(f"state/{span}/{name}", (count, steps))[used] for span, steps in spans], axis=1
+            [self.numbers(f"state/{span}/{name}", (count, steps))[rows] for span, steps in spans], axis=1
         )

@@ -32,7 +32,7 @@ _SIGNS = 2
 
 
 def flavour(payload: bytes) -> str | None:
-    """The format of a record's payload by its content, None if it is no known motion data."""
+    """Detect the format of a payload by its content; None for anything but motion data."""
     example = parse("Example", payload)
     if example is not None and any(entry.key == "state/current/x" for entry in example.features.feature):
         return SCENARIOMAX_FORMAT if scenariomax_signs(ExampleFeatures(example)) >= _SIGNS else EXAMPLE_FORMAT

@@ -54,7 +54,7 @@ def decode(payload: bytes) -> Recording:
     """The recording in a serialised ``Scenario``.
 
     Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad), invalid
-    states are zeros (files keep a z there), speed limits are m/s, None for 0. Dangling links are kept.
+    states are zeros (files keep a z there), speed limits are m/s (0 in the file is unknown). Dangling links are kept.
     """
     message = parse("Scenario", payload)
     if message is None or not message.scenario_id:
@@ -138,7 +138,7 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
         for lane in state.lane_states:
             point = lane.stop_point
             lights.observe(step, lane.lane, lane.state, (point.x, point.y, point.z))
-    return lights.collected(features)
+    return lights.collect(features)
 
 
 def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:

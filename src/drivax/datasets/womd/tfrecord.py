@@ -59,9 +59,9 @@ def varints(values: _Array) -> bytes:
     bits = values.reshape(-1, 1).astype(np.int64).view(np.uint64)
     groups = bits >> (np.uint64(7) * _GROUPS)
     more = groups >= 128
-    used = np.concatenate((np.ones_like(more[:, :1]), more[:, :-1]), axis=1)
-    encoded = (groups & np.uint64(127)) | (more.astype(np.uint64) << np.uint64(7))
-    return encoded.astype(np.uint8)[used].tobytes()
+    is_written = np.concatenate((np.ones_like(more[:, :1]), more[:, :-1]), axis=1)
+    content = (groups & np.uint64(127)) | (more.astype(np.uint64) << np.uint64(7))
+    return content.astype(np.uint8)[is_written].tobytes()
 
 
 def shard_name(name: str, number: int, shards: int) -> str:
@@ -122,7 +122,7 @@ class _Lost(DataError):
 
 
 def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> bytes | None:
-    """The payload of the next record, None if its checksum differs."""
+    """Read the payload of the next record; None for a wrong checksum."""
     start = file.tell()
     header = file.read(_HEADER_BYTES)
     if len(header) < _HEADER_BYTES:
