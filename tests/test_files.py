@@ -171,7 +171,7 @@ def test_of_nested_blocks_the_outermost_names_the_output(tmp_path: Path):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_the_need_of_a_file_is_told_for_the_output_around_it(tmp_path: Path):
+def test_an_output_reports_the_need_of_a_file_in_it(tmp_path: Path):
     with (
         pytest.raises(
             DataError, match=r"^\S+/run: no space left on device \(.+ free, of about 12 kB needed\)"
@@ -183,7 +183,7 @@ def test_the_need_of_a_file_is_told_for_the_output_around_it(tmp_path: Path):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_write_larger_than_its_limit_tells_the_size_of_the_file(tmp_path: Path):
+def test_a_write_larger_than_its_limit_reports_the_size_of_the_file(tmp_path: Path):
     """A text of 100 kB where files may have 10 kB: the system's own error, with EFBIG in place of ENOSPC."""
     code = """
 import errno, resource, signal, sys

@@ -35,7 +35,7 @@ _Result = TypeVar("_Result")
 #: Scenarios that are audited together.
 _BATCH = 64
 #: A scenario or bad record, and the place after it: file number, items read of that file.
-_Placed = tuple[Scenario | BadRecord, tuple[int, int]]
+_Item = tuple[Scenario | BadRecord, tuple[int, int]]
 #: Called with (files done, files, scenarios so far).
 Progress = Callable[[int, int, int], None]
 #: Returns the audit of each scenario as a dictionary.
@@ -278,7 +278,7 @@ class _Sink:
         self._options = options
         self._audit = audit
         self._selection = Selection.parse(options.filters)
-        self._waiting: list[_Placed] = []
+        self._waiting: list[_Item] = []
         self._scenarios_waiting = 0
         self.skipped: list[BadRecord] = []
         self.filtered = 0
@@ -289,7 +289,7 @@ class _Sink:
             for row in note["skipped"]:
                 file = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
                 self.skipped.append(BadRecord(file, row["record"], row["problem"], row["cure"]))
-        self._noted = len(self.skipped)
+        self._notes = len(self.skipped)
         if options.strict and self.skipped:
             raise self.skipped[0].error()
 
@@ -333,7 +333,7 @@ class _Sink:
 
     def _write_batch(self) -> None:
         batch, self._waiting, self._scenarios_waiting = self._waiting, [], 0
-        items = self._without_duplicates(batch)
+        items = self._drop_duplicates(batch)
         scenarios = [item for item in items if isinstance(item, Scenario)]
         findings = [{} for _ in scenarios] if self._audit is None else self._audit(scenarios)
         pairs = zip(scenarios, findings, strict=True)
@@ -349,7 +349,7 @@ class _Sink:
                 self._scenarios_waiting = sum(isinstance(item, Scenario) for item, _ in self._waiting)
                 return
 
-    def _without_duplicates(self, batch: list[_Placed]) -> list[Scenario | BadRecord]:
+    def _drop_duplicates(self, batch: list[_Item]) -> list[Scenario | BadRecord]:
         """The items of a batch, with bad records in place of duplicates."""
         items: list[Scenario | BadRecord] = []
         seen: set[tuple[str, str]] = set()
@@ -371,8 +371,8 @@ class _Sink:
         if self._writer.room > 1:
             self._writer.add(scenario)
             return False
-        rows = [_row(self._data, bad) for bad in self.skipped[self._noted :]]
-        self._noted = len(self.skipped)
+        rows = [_row(self._data, bad) for bad in self.skipped[self._notes :]]
+        self._notes = len(self.skipped)
         self._writer.add(scenario, {"place": place, "filtered": self.filtered, "skipped": rows})
         return True
 

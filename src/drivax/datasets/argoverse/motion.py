@@ -33,7 +33,7 @@ _COLUMNS: dict[str, Kind] = {
     **dict.fromkeys((*_STATE, "start_timestamp", "end_timestamp"), "number"),
 }
 #: Columns that are not needed: the split at step 50, and the number of the city.
-_NOT_NEEDED = {"observed", "map_id"}
+_OTHERS = {"observed", "map_id"}
 #: Kind and size (length, width, height in metres) of each ``object_type``: the files hold no sizes. Medians of the
 #: boxes of sensor logs; cyclists with the length of their vehicle and the height of a person.
 _TYPES: dict[str, tuple[AgentKind, tuple[float, float, float]]] = {
@@ -128,7 +128,7 @@ def decode(path: Path) -> Recording:
         lost=parsing.nonzero(
             local_map.lost,
             repeated_rows=table.rows - int(tracks.valid.sum()),
-            unknown_fields=len(table.others - _NOT_NEEDED),
+            unknown_fields=len(table.others - _OTHERS),
         ),
         flags=Flag.DEFAULT_SIZES,
     )

@@ -32,7 +32,7 @@ _BOX_COLUMNS: dict[str, Kind] = {
     **_POSE_COLUMNS, **dict.fromkeys(_SIZE, "number"), "track_uuid": "text", "category": "text"
 }  # fmt: skip
 #: Columns that are not needed.
-_NOT_NEEDED = {"num_interior_pts"}
+_OTHERS = {"num_interior_pts"}
 _VEHICLES = (
     EGO, "REGULAR_VEHICLE", "LARGE_VEHICLE", "BUS", "SCHOOL_BUS", "ARTICULATED_BUS", "BOX_TRUCK", "TRUCK",
     "TRUCK_CAB", "VEHICULAR_TRAILER", "RAILED_VEHICLE",
@@ -140,7 +140,7 @@ def decode(path: Path) -> Recording:
         lost=parsing.nonzero(
             local_map.lost,
             frames_without_pose=lost_frames,
-            unknown_fields=len((boxes.others - _NOT_NEEDED) | poses.others),
+            unknown_fields=len((boxes.others - _OTHERS) | poses.others),
         ),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )

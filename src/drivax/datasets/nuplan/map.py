@@ -41,13 +41,13 @@ LAYERS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(_DRIVABLE, ()),
 }  # fmt: skip
 #: Layers that are not read.
-_NOT_NEEDED = frozenset((
+_OTHERS = frozenset((
     "lane_groups_polygons", "lane_group_connectors", "walkways", "traffic_lights", "dubins_nodes",
 ))  # fmt: skip
-_NEEDED = ("baseline_paths", "lanes_polygons", "lane_connectors")
+_BASE_LAYERS = ("baseline_paths", "lanes_polygons", "lane_connectors")
 NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), start=1)}
 #: Folder in the archive of the maps, which the documentation renames to ``maps``.
-_UNPACKED, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
+_ARCHIVE, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
 _FASTEST_MPS = 60.0
 CURE = "download the nuPlan maps again"
 #: Decoded around ego's drive: 100 m that are kept, and space for routes that lead further.
@@ -62,7 +62,7 @@ _LINES: Mapping[int | None, RoadKind] = {
     0: RoadKind.LINE_BROKEN_SINGLE_WHITE,
     2: RoadKind.LINE_SOLID_SINGLE_WHITE,
 }
-_UNPAINTED = (1, 3)
+_NO_PAINT = (1, 3)
 _STOP_SIGN = 1
 
 
@@ -95,7 +95,7 @@ def _listing(log: Path) -> Path:
     if os.environ.get("NUPLAN_MAPS_ROOT"):
         roots.append(Path(os.environ["NUPLAN_MAPS_ROOT"]))
     for root in roots:
-        for pattern in (_LISTING, f"{_UNPACKED}/{_LISTING}"):
+        for pattern in (_LISTING, f"{_ARCHIVE}/{_LISTING}"):
             if listings := sorted(root.glob(pattern)):
                 return listings[-1]
     raise DataError(
@@ -152,7 +152,7 @@ def city_map(path: Path) -> City:
 def _city(path: Path, mtime_ns: int, size: int) -> City:
     with open_database(path) as database:
         layers = {name: layer for name in LAYERS if (layer := read_layer(database, name, LAYERS[name]))}
-        if missing := [name for name in _NEEDED if name not in layers]:
+        if missing := [name for name in _BASE_LAYERS if name not in layers]:
             raise DataError(f"has no layer {missing[0]}", file=path, cure=CURE)
         epsg = _read_epsg(database)
         names = {name for (name,) in database.rows("SELECT table_name FROM gpkg_geometry_columns")}
@@ -164,7 +164,7 @@ def _city(path: Path, mtime_ns: int, size: int) -> City:
     boundaries = layers.get("boundaries")
     fids = () if boundaries is None else boundaries.fid.tolist()
     rows = {fid: row for row, fid in enumerate(fids)}
-    return City(path, epsg, layers, lanes, blocks, rows, len(names - LAYERS.keys() - _NOT_NEEDED))
+    return City(path, epsg, layers, lanes, blocks, rows, len(names - LAYERS.keys() - _OTHERS))
 
 
 def _read_epsg(database: Database) -> int:
@@ -456,7 +456,7 @@ def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float
 
 def _line_features(around: _Around) -> Iterator[MapFeature]:
     """Painted boundaries of lanes."""
-    types = {row: kind for row, kind in around.types("boundaries").items() if kind not in _UNPAINTED}
+    types = {row: kind for row, kind in around.types("boundaries").items() if kind not in _NO_PAINT}
     for row, number, points in around.outlines("boundaries", list(types), _line):
         yield MapFeature(number, _LINES.get(types[row], RoadKind.LINE_UNKNOWN), points)
 

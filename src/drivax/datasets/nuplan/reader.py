@@ -41,7 +41,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "traffic_light_status": ("lidar_pc_token", "lane_connector_id", "status"),
 }  # fmt: skip
 #: Tables, and columns of those that are read, that are not needed; their names hardly repeat with another meaning.
-_NOT_NEEDED = frozenset((
+_OTHERS = frozenset((
     "lidar", "camera", "image", "token", "vehicle_name", "date", "timestamp", "location", "log_token", "lidar_token",
     "next_token", "prev_token", "filename", "z", "vz", "acceleration_x", "acceleration_y", "acceleration_z",
     "angular_rate_x", "angular_rate_y", "epsg", "confidence", "width", "length", "height", "description", "name",
@@ -191,9 +191,9 @@ def _unknown_fields(database: Database) -> int:
     columns = {
         (table, column)
         for table, known in TABLES.items()
-        for column in database.columns(table) - _NOT_NEEDED.union(known)
+        for column in database.columns(table) - _OTHERS.union(known)
     }
-    return len(database.tables() - TABLES.keys() - _NOT_NEEDED) + len(columns)
+    return len(database.tables() - TABLES.keys() - _OTHERS) + len(columns)
 
 
 def time_line(database: Database) -> TimeLine:

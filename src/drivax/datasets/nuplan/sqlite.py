@@ -188,10 +188,10 @@ def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]
         try:
             return np.asarray(shapely.from_wkb(blobs, on_invalid="ignore"))
         except NotImplementedError:  # one of them is a curve
-            return np.array([_decoded(blob) for blob in blobs], dtype=object)
+            return np.array([_decode(blob) for blob in blobs], dtype=object)
 
 
-def _decoded(blob: bytes | None) -> Any:
+def _decode(blob: bytes | None) -> Any:
     """Decode a geometry; None for a curve or an unreadable one."""
     with contextlib.suppress(NotImplementedError):
         return import_extra("shapely").from_wkb(blob, on_invalid="ignore")

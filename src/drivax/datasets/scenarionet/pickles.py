@@ -132,13 +132,13 @@ class _Machine:
         if not isinstance(module, str) or not isinstance(name, str):
             raise ValueError("a name that is not text")
         full = f"{_MODULES.get(module, module)}.{name}"
-        if full not in _NAMED and full not in _CALLED:
+        if full not in _NAMES and full not in _FUNCTIONS:
             raise DataError(f"names {full[:100]}, which is not data", cure=_DISTRUST)
         self.stack.append(_Global(full))
 
     def _call(self, argument: Any) -> None:
         function, arguments = self._take(2)
-        make = _CALLED.get(function.name) if isinstance(function, _Global) else None
+        make = _FUNCTIONS.get(function.name) if isinstance(function, _Global) else None
         if make is None or not isinstance(arguments, tuple):
             raise ValueError("a call of something else than a constructor")
         # Calls copy their arguments, and the memo can repeat the same argument.
@@ -275,12 +275,12 @@ def _scalar(dtype: Any, content: Any = b"") -> Any:
 
 
 #: Names that may occur uncalled.
-_NAMED = frozenset((
+_NAMES = frozenset((
     "numpy.ndarray", "builtins.int", "builtins.long", "builtins.float", "builtins.str", "builtins.unicode",
     "builtins.bool", "builtins.list", "builtins.dict", "builtins.tuple",
 ))  # fmt: skip
 #: Constructors that may be called, and their substitutes.
-_CALLED: dict[str, Callable[..., Any]] = {
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "numpy._core.multiarray._reconstruct": _empty_array,
     "numpy._core.multiarray.scalar": _scalar,
     "numpy._core.numeric._frombuffer": _array,

@@ -79,7 +79,7 @@ _COLUMNS = {
     "valid": ((1,), np.inf),
 }
 #: States of tracks and lights that are not needed: what MetaDrive's own vehicles add.
-_NOT_NEEDED = ("angular_velocity", "steering", "throttle_brake", "action")
+_OTHERS = ("angular_velocity", "steering", "throttle_brake", "action")
 #: A longer last step is motion.
 _MOVED_M = 0.05
 #: A scenario file names its dictionaries within this many bytes.
@@ -303,7 +303,7 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Track
         ),
         track_id=np.array([names.get(name) for name in table], np.int64),
     )
-    unknown = {str(name) for state in states for name in state} - {*_COLUMNS, *_NOT_NEEDED}
+    unknown = {str(name) for state in states for name in state} - {*_COLUMNS, *_OTHERS}
     return tracks, Counter(unknown_fields=len(unknown))
 
 

@@ -189,7 +189,7 @@ def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bo
     for group in _groups(ids, keep):
         kind = RoadKind(int(kinds[group[0]]))
         limit = float(limits[group].max()) * parsing.MPS_PER_MPH if kind in LANE_KINDS else 0.0
-        line = _unclosed(points[group]) if kind in POLYGON_KINDS else points[group]
+        line = _open_ring(points[group]) if kind in POLYGON_KINDS else points[group]
         mapped.append(MapFeature(int(ids[group[0]]), kind, line, limit_mps=limit if limit > 0 else None))
     return tuple(mapped), bool(valid.all())
 
@@ -210,7 +210,7 @@ def _limits(features: ExampleFeatures, count: int) -> Array:
     return np.where(np.isfinite(limits) & (limits > 0), limits, 0.0)
 
 
-def _unclosed(points: Array) -> Array:
+def _open_ring(points: Array) -> Array:
     """A ring without its repeated last point: map features are closed implicitly."""
     closed = len(points) > 1 and np.allclose(points[0], points[-1], rtol=0, atol=1e-3)
     return points[:-1] if closed else points

@@ -75,10 +75,10 @@ def write_record(file: BinaryIO, payload: bytes) -> None:
     length = struct.pack("<Q", len(payload))
     for part in (length, payload):
         file.write(part)
-        file.write(struct.pack("<I", masked(crc32c(part))))
+        file.write(struct.pack("<I", mask_crc(crc32c(part))))
 
 
-def masked(crc: int) -> int:
+def mask_crc(crc: int) -> int:
     """TFRecord's mask of a CRC-32C: rotate right by 15 bits, add a constant, modulo 2**32."""
     return (((crc >> 15) | (crc << 17)) + _MASK) & 0xFFFFFFFF
 
@@ -128,7 +128,7 @@ def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> byte
     if len(header) < _HEADER_BYTES:
         raise _Lost(f"truncated: {len(header)} bytes where a record's header of {_HEADER_BYTES} should be")
     length, length_crc = struct.unpack("<QI", header)
-    if masked(crc32c(header[:8])) != length_crc:
+    if mask_crc(crc32c(header[:8])) != length_crc:
         raise _bad_length(header, start)
     left = size - file.tell()
     if length > _LONGEST_BYTES or length + _FOOTER_BYTES > left:
@@ -137,7 +137,7 @@ def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> byte
     footer = file.read(_FOOTER_BYTES)
     if len(footer) < _FOOTER_BYTES:
         raise _Lost("the file became shorter while it was read")
-    return payload if masked(crc32c(payload)) == struct.unpack("<I", footer)[0] else None
+    return payload if mask_crc(crc32c(payload)) == struct.unpack("<I", footer)[0] else None
 
 
 def count_records(path: str | Path) -> int:
@@ -163,7 +163,7 @@ def looks_framed(path: str | Path) -> bool:
     except (OSError, ValueError):
         return False
     whole = len(header) == _HEADER_BYTES
-    return whole and masked(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
+    return whole and mask_crc(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
 
 
 def _crc32c_slowly(data: bytes) -> int:
