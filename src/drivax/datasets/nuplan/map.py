@@ -163,7 +163,7 @@ def _city(path: Path, mtime_ns: int, size: int) -> City:
             blocks.setdefault(lane.roadblock, []).append(lane_id)
     boundaries = layers.get("boundaries")
     fids = () if boundaries is None else boundaries.fid.tolist()
-    rows = {fid: row for row, fid in enumerate(fids)}
+    rows: dict[int | None, int] = {fid: row for row, fid in enumerate(fids)}
     return City(path, epsg, layers, lanes, blocks, rows, len(names - LAYERS.keys() - _OTHERS))
 
 

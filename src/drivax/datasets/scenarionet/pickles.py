@@ -148,7 +148,7 @@ class _Machine:
         try:
             self.stack.append(make(*arguments))
         except (TypeError, AttributeError) as error:
-            raise ValueError(f"odd arguments for {named.name}") from error
+            raise ValueError(f"odd arguments for {function.name}") from error
 
     def _build(self, argument: Any) -> None:
         (state,) = self._take(1)
