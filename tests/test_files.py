@@ -151,15 +151,24 @@ def test_a_partial_folder_has_one_writer_at_a_time(tmp_path: Path):
     assert names(tmp_path) == set()
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_is_reported_with_path_need_and_cure(tmp_path: Path, code: int):
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+        OSError(errno.EDQUOT, os.strerror(errno.EDQUOT)),
+        ValueError(
+            "RESOURCE_EXHAUSTED: Failed to write 305 bytes to file 9: No space left on device [os_error_code='28']"
+        ),
+    ],
+)
+def test_a_full_disk_is_reported_with_path_need_and_cure(tmp_path: Path, error: Exception):
     with (
         pytest.raises(
             DataError, match=r"set: no space left on device \(.+ free, of about 3\.0 MB needed\); make"
         ),
         explain_full_disk(tmp_path / "set", needed=3_000_000),
     ):
-        raise OSError(code, os.strerror(code))
+        raise error
 
 
 def test_of_nested_blocks_the_outermost_names_the_output(tmp_path: Path):

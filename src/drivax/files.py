@@ -100,8 +100,8 @@ def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, FullDiskError) as error:
-        if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EDQUOT):
+    except Exception as error:
+        if not _is_full_disk(error):
             raise
         needed = needed or getattr(error, "needed", 0)
         need = f"of about {format_bytes(needed)} needed" if needed else "more needed"
@@ -109,6 +109,13 @@ def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
         full = FullDiskError(problem, file=path, cure="make room, or choose another disk")
         full.needed = needed
         raise full from error
+
+
+def _is_full_disk(error: Exception) -> bool:
+    """Whether the disk is full: a system error, or one of a library (TensorStore) that quotes it."""
+    codes = (errno.ENOSPC, errno.EDQUOT)
+    quoted = any(os.strerror(code) in str(error) for code in codes)
+    return isinstance(error, FullDiskError) or getattr(error, "errno", None) in codes or quoted
 
 
 @contextlib.contextmanager
