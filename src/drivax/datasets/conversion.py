@@ -158,7 +158,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Converted:
-    """What a conversion did.
+    """Result of a conversion.
 
     Attributes:
         path: The scenario set.

@@ -1,4 +1,4 @@
-"""What a file or folder is, what is missing, and how large a scenario set it would become, without converting it."""
+"""Diagnosis of a file or folder: its format, missing files, and the size of its scenario set, without conversion."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a path is.
+    """Diagnosis of a path.
 
     Attributes:
         path: The file or folder.
@@ -171,7 +171,7 @@ def gaps(paths: Sequence[Path]) -> list[str]:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a conversion will need and what the disk has left; ``sampled`` if only some of the files were counted."""
+    """Size of a conversion and free space of the disk; ``sampled`` if only some of the files were counted."""
 
     scenarios: int
     size_bytes: int

@@ -79,7 +79,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Survey:
-    """What a file or folder (``root``) holds.
+    """Content of a file or folder (``root``).
 
     Attributes:
         inputs: The files to read, sorted by path.
@@ -141,7 +141,7 @@ def find_files(src: str | Path, name: str = AUTO) -> tuple[list[Path], int]:
 
 
 def _kind(path: Path, readers: tuple[Reader, ...]) -> Input | str:
-    """What a file of a folder is: an input, a companion of one, or nothing that is known."""
+    """Classify a file of a folder: input, companion of one, or ignored."""
     if path.name.lower().endswith(_NEVER):
         return "ignored"
     by_name = any(_matches(path, reader.patterns) for reader in readers)

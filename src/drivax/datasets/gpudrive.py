@@ -72,7 +72,7 @@ _ROAD_TYPES = {
 _KINDS = {int(kind): kind for kind in RoadKind}
 #: Points of the published files are 0.5 m apart; twice that is a jump where the map was clipped.
 _SPLIT_GAP_M, _DENSE_M = 1.0, 0.75
-#: What other converters to this form leave out: heights of the map, of agents and of boxes.
+#: Fields that other converters to this form omit: heights of the map, of agents and of boxes.
 _ABSENT = ("z", "height")
 #: Written decimals: a tenth of a millimetre.
 _DIGITS = 4

@@ -1,4 +1,4 @@
-"""What readers share: imports of extras, checks, time bases, lights by lane, city names, JSON files, heights."""
+"""Common parts of readers: imports of extras, checks, time bases, lights by lane, city names, JSON files, heights."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def nonzero(*lost: Mapping[str, int], **counts: int) -> dict[str, int]:
 
 
 def one_point_features(features: Sequence[MapFeature]) -> int:
-    """How many lines and polygons have one point only, so neither direction nor extent."""
+    """Number of lines and polygons of one point, which have neither direction nor extent."""
     return sum(len(f.points) < 2 and f.kind != RoadKind.STOP_SIGN for f in features)
 
 

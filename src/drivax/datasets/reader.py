@@ -1,4 +1,4 @@
-"""What every reader of a public format is, and how it reports records that it could not read."""
+"""Protocol of the readers of public formats, and their report of unreadable records."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class BadRecord:
 
 @dataclass(frozen=True)
 class Description:
-    """What ``drivax doctor`` tells about one file of a format.
+    """Description of one file of a format by ``drivax doctor``.
 
     Attributes:
         dataset: Full name of the public data set; ``flavour`` is its form, ``version`` as far as the file tells.
@@ -82,7 +82,7 @@ class Reader(Protocol):
         ...
 
     def describe(self, path: Path) -> Description:
-        """What the file is, without decoding all of it.
+        """Describe the file without decoding all of it.
 
         Raises:
             DataError: The file is damaged.

@@ -15,7 +15,7 @@ from drivax.datasets.womd.tfrecord import read_records
 from drivax.errors import DataError, UsageError
 from drivax.scenario.store import MANIFEST
 
-#: What a file is by its first bytes (of a tar archive those from ``_TAR_BYTE`` on), and what to do.
+#: Kinds of files by their first bytes (of a tar archive those from ``_TAR_BYTE`` on), and cures.
 _TAR, _TAR_BYTE = b"ustar", 257
 _MAGIC = {
     b"\x1f\x8b": ("the file is gzip-compressed", "decompress it first (gunzip, or tar xzf for a .tgz)"),
@@ -44,7 +44,7 @@ _MAGIC = {
 }
 _HEAD = 1 << 16
 _MOTION = "download the motion data set (scenario/*.tfrecord-*)"
-#: What a JSON file is by words at its beginning, and what to do.
+#: Kinds of JSON files by words at their beginning, and cures.
 _JSON = {
     rb'"(objects|roads)"': (
         "looks like a GPUDrive scene but has no metadata, so the ego is unknown",

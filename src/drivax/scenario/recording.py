@@ -302,7 +302,11 @@ def with_ego(recording: Recording, row: int) -> Recording:
 
 
 def check(recording: Recording, capacity: Capacity) -> None:
-    """Raise DataError if a recording is invalid."""
+    """Check a recording.
+
+    Raises:
+        DataError: It is invalid.
+    """
     problem = _check_names(recording) or _check_time(recording, capacity.steps) or _check_shapes(recording)
     problem = problem or _check_tracks(recording) or _check_extent(recording)
     problem = problem or _check_map(recording) or _check_lights(recording)

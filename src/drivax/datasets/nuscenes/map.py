@@ -85,7 +85,7 @@ class City:
     lost: Mapping[str, int]
 
     def around(self, xy: Float[Array, "point 2"], margin_m: float) -> tuple[MapFeature, ...]:
-        """What reaches into the box around some points; lines are cut there, lanes and polygons stay whole."""
+        """Features in the box around some points; lines are cut there, lanes and polygons stay whole."""
         box = Box.around(xy, margin_m)
         number = len(self.features)
         kept: list[MapFeature] = []

@@ -234,7 +234,7 @@ class Scene:
 
 @dataclass
 class Tables:
-    """What is needed of a version's tables, in arrays of numbers.
+    """Content of a version's tables, in arrays of numbers.
 
     Attributes:
         scenes: Rows of ``scene.json``.

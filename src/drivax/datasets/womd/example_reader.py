@@ -41,7 +41,7 @@ class WomdExample(womd.TfRecordReader):
         return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by the spacing of map points, truncated map, paths."""
+        """Describe the first record: version by the spacing of map points, truncated map, paths."""
         recording = self.first(path)
         no_graph = "no lane graph and no speed limits: lanes are chained by geometry"
         notes = [*womd.notes_of(recording), no_graph]
@@ -222,7 +222,7 @@ def _is_coarse(mapped: Sequence[MapFeature]) -> bool:
 
 
 def _paths(features: ExampleFeatures) -> int:
-    """How many paths of the ego the file holds."""
+    """Number of paths of the ego in the file."""
     if not (features.has("path_samples/valid") and features.has("path_samples/on_route")):
         return 0
     valid = features.numbers("path_samples/valid") == 1

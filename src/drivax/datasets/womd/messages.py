@@ -85,7 +85,7 @@ _MESSAGES: dict[str, tuple[_Field, ...]] = {
     "BytesList": _fields("value 1 bytes*"),
     "FloatList": _fields("value 1 float*"),
     "Int64List": _fields("value 1 int64*"),
-    # What tells the Waymo perception and end-to-end driving data sets from motion data.
+    # Messages of the Waymo perception and end-to-end driving data sets, to tell them from motion data.
     "Context": _fields("name 1 bytes"),
     "Frame": _fields(
         "context 1 Context, timestamp_micros 2 int64, pose 3 bytes, images 4 bytes*, lasers 5 bytes*"
@@ -239,7 +239,7 @@ class ExampleFeatures:
         self._values: Mapping[str, Any] = {entry.key: entry.value for entry in message.features.feature}
 
     def _list(self, name: str) -> tuple[str | None, Sequence[Any]]:
-        """Which list holds a feature, and its values."""
+        """Kind of list of a feature, and its values."""
         value = self._values.get(name)
         kind = None if value is None else value.WhichOneof("kind")
         return kind, () if kind is None else getattr(value, kind).value
@@ -284,7 +284,7 @@ class ExampleFeatures:
         return text or hashlib.sha256(payload).hexdigest()[:16]
 
     def unknown(self) -> int:
-        """How many features have names that neither the data set nor ScenarioMax use: a renamed one may be needed."""
+        """Number of features with names that neither the data set nor ScenarioMax uses."""
         return sum(_KNOWN.fullmatch(str(name)) is None for name in self._values)
 
     def origin(self) -> Float64[np.ndarray, "3"]:

@@ -1,4 +1,4 @@
-"""What the formats of motion data in TFRecord files share: detection, the base of their readers, object types."""
+"""Common parts of the formats of motion data in TFRecord files: detection, base of the readers, object types."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def flavour(payload: bytes) -> str | None:
 
 
 def scenariomax_signs(features: ExampleFeatures) -> int:
-    """How many of ScenarioMax's three signs an example shows; WOMD's examples show none.
+    """Count which of ScenarioMax's three signs an example shows; WOMD's examples show none.
 
     The prediction difficulty is missing; tracks are numbered 0, 1, 2, ... with the ego first; all times are -1.
     """
@@ -132,7 +132,7 @@ def agent_kind(code: int) -> AgentKind:
 
 
 def notes_of(recording: Recording) -> tuple[str, ...]:
-    """What a user should know about recordings like this one: length, future, lights."""
+    """Notes for users about recordings like this one: length, future, lights."""
     steps, now = len(recording.timestamps_s), recording.current_step
     notes = [f"{steps} steps, current step {now}"]
     if parsing.windows_of(steps) > 1:

@@ -37,7 +37,7 @@ class WomdScenario(womd.TfRecordReader):
         return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by kinds of features, lane graph, lights."""
+        """Describe the first record: version by kinds of features, lane graph, lights."""
         recording = self.first(path)
         lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
         linked = any(lane.successors or lane.predecessors for lane in lanes)
