@@ -5,6 +5,9 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -148,24 +151,63 @@ def test_a_partial_folder_has_one_writer_at_a_time(tmp_path: Path):
     assert names(tmp_path) == set()
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_is_reported_with_path_need_and_cure(tmp_path: Path, code: int):
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+        OSError(errno.EDQUOT, os.strerror(errno.EDQUOT)),
+        ValueError(
+            "RESOURCE_EXHAUSTED: Failed to write 305 bytes to file 9: No space left on device [os_error_code='28']"
+        ),
+    ],
+)
+def test_a_full_disk_is_reported_with_path_need_and_cure(tmp_path: Path, error: Exception):
     with (
         pytest.raises(
             DataError, match=r"set: no space left on device \(.+ free, of about 3\.0 MB needed\); make"
         ),
         explain_full_disk(tmp_path / "set", needed=3_000_000),
     ):
-        raise OSError(code, os.strerror(code))
+        raise error
 
 
 def test_of_nested_blocks_the_outermost_names_the_output(tmp_path: Path):
     with (
-        pytest.raises(DataError, match=r"^\S+/set: no space left on device \([^,]+ free\)"),
+        pytest.raises(DataError, match=r"^\S+/set: no space left on device \([^,]+ free, more needed\)"),
         explain_full_disk(tmp_path / "set"),
         atomic_write(tmp_path / "set" / "manifest.json"),
     ):
         raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_an_output_reports_the_need_of_a_file_in_it(tmp_path: Path):
+    with (
+        pytest.raises(
+            DataError, match=r"^\S+/run: no space left on device \(.+ free, of about 12 kB needed\)"
+        ),
+        explain_full_disk(tmp_path / "run"),
+        replace_folder(tmp_path / "run" / "checkpoint"),
+        atomic_write(tmp_path / "run" / "checkpoint" / "weights", 12_000),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_write_larger_than_its_limit_reports_the_size_of_the_file(tmp_path: Path):
+    """A text of 100 kB where files may have 10 kB: the system's own error, with EFBIG in place of ENOSPC."""
+    code = """
+import errno, resource, signal, sys
+from pathlib import Path
+from drivax import files
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+errno.ENOSPC = errno.EFBIG
+files.write_text(Path(sys.argv[1]), "x" * 100_000)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "log"], capture_output=True, text=True, check=False
+    )
+    assert re.search(r"log: no space left on device \(.+ free, of about 100 kB needed\); make", done.stderr)
+    assert names(tmp_path) == set()
 
 
 def test_a_partial_folder_that_cannot_start_leaves_nothing_behind(tmp_path: Path, monkeypatch):

@@ -172,19 +172,19 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
     for group in dict.fromkeys(row["group"] for row in rows):
         for planner in PLANNERS:
-            found = [row for row in rows if (row["group"], row["planner"]) == (group, planner)]
+            group_rows = [row for row in rows if (row["group"], row["planner"]) == (group, planner)]
             cells = (
                 group,
                 planner,
-                len(found),
-                _middle(found, "distance_m", 1),
-                sum(row["collision_step"] is not None for row in found),
-                f"{sum(row['offroad_steps'] for row in found)} of {sum(row['steps'] for row in found)}",
-                sum(row["contradicted_steps"] for row in found) if planner == "expert" else "",
-                sum(row["left_map_steps"] for row in found),
-                sum(row["red_light_step"] is not None for row in found),
-                _middle(found, "mean_divergence_m", 2),
-                _middle(found, "final_divergence_m", 2),
+                len(group_rows),
+                _middle(group_rows, "distance_m", 1),
+                sum(row["collision_step"] is not None for row in group_rows),
+                f"{sum(row['offroad_steps'] for row in group_rows)} of {sum(row['steps'] for row in group_rows)}",
+                sum(row["contradicted_steps"] for row in group_rows) if planner == "expert" else "",
+                sum(row["left_map_steps"] for row in group_rows),
+                sum(row["red_light_step"] is not None for row in group_rows),
+                _middle(group_rows, "mean_divergence_m", 2),
+                _middle(group_rows, "final_divergence_m", 2),
             )
             lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
@@ -197,8 +197,8 @@ def _middle(rows: list[dict[str, Any]], name: str, digits: int) -> str:
 
 def offenders(rows: list[dict[str, Any]]) -> str:
     """Table of exact replays with a violation."""
-    found = [row for row in rows if row["planner"] == "expert" and not is_clean(row)]
-    if not found:
+    violations = [row for row in rows if row["planner"] == "expert" and not is_clean(row)]
+    if not violations:
         return "Every exact replay is clean."
     lines = [
         "Exact replays that are not clean:",
@@ -206,7 +206,7 @@ def offenders(rows: list[dict[str, Any]]) -> str:
         "| scenarios | scenario | what | distance m |",
         "|---" * 4 + "|",
     ]
-    for row in found:
+    for row in violations:
         what = []
         if row["collision_step"] is not None:
             what.append(f"collides at step {row['collision_step']}")
@@ -246,10 +246,10 @@ def main() -> int:
 
     def finish() -> None:
         for planner in PLANNERS:
-            found = rows_of(batch, planner)
-            rows.extend(found)
+            batch_rows = rows_of(batch, planner)
+            rows.extend(batch_rows)
             if planner == "expert" and args.pictures is not None:
-                for row, case in zip(found, batch, strict=True):
+                for row, case in zip(batch_rows, batch, strict=True):
                     if not is_clean(row):
                         draw(row, case.scenario, args.pictures)
         seconds = time.monotonic() - begin

@@ -79,7 +79,7 @@ def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
     )
 
 
-def measured(data: Path) -> dict[str, Any]:
+def measure(data: Path) -> dict[str, Any]:
     """Count, for each group, the scenes in which a metric agrees with the devkit."""
     groups = json.loads(gzip.decompress((data / "nuplan_metrics" / "verdicts.json.gz").read_bytes()))
     counts: dict[str, Any] = {}
@@ -129,7 +129,7 @@ def main() -> None:
     if not args.table:
         if args.data is None:
             parser.error("the following arguments are required: --data")
-        result[args.state] = measured(args.data)
+        result[args.state] = measure(args.data)
         print(json.dumps(result[args.state], indent=1))
         if not args.write:
             return

@@ -28,7 +28,7 @@ from drivax.report.episodes import outcome
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import windows
-from drivax.scenario.schema import Scenario
+from drivax.scenario.schema import STEPS, Scenario
 from drivax.tracking.run_folder import versions
 from experiments.repository import DOCS, RESULTS
 
@@ -43,40 +43,45 @@ MODULES = {"search": "search_planner:SearchPlanner"}
 TRAFFIC = ("log", "idm")
 
 
-def scenarios_of(data: Path) -> Iterator[tuple[str, Scenario]]:
-    """Yield every scenario of every file, with the name of its folder."""
+def read_scenarios(data: Path) -> Iterator[tuple[str, Scenario]]:
+    """Yield every scenario of every file, with the name of the file relative to the folder."""
     for file in find_files(data)[0]:
         for recording in detect(file).read(file):
             if isinstance(recording, BadRecord):
                 raise SystemExit(str(recording.error()))
             for window in windows(recording):
-                yield file.relative_to(data).parts[0], assemble(window)
+                yield file.relative_to(data).as_posix(), assemble(window)
 
 
-def measured(data: Path) -> dict[str, Any]:
+def measure(data: Path) -> dict[str, Any]:
     """Return outcome, score and progress of every planner by scenario."""
     sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
-    sources, scenarios = zip(*scenarios_of(data), strict=True)
+    files, scenarios = zip(*read_scenarios(data), strict=True)
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
-    rows = [{"source": source, "scenario_id": one.id} for source, one in zip(sources, scenarios, strict=True)]
-    found: dict[str, Any] = {kind: {} for kind in TRAFFIC}
+    rows = [
+        {"source": file.split("/")[0], "scenario_id": scenario.id, "steps": int(scenario.steps)}
+        for file, scenario in zip(files, scenarios, strict=True)
+    ]
+    results: dict[str, Any] = {kind: {} for kind in TRAFFIC}
     for planner in PLANNERS:
         driver, task = find_planner(MODULES.get(planner, planner), bank, False)
         for kind in TRAFFIC:
             table = evaluate(driver, bank, names, task=task, traffic=find_traffic(kind))
-            found[kind][planner] = [
+            results[kind][planner] = [
                 {
                     "outcome": outcome(table, row),
                     **{name: _number(table.metrics[name][row]) for name in ("vmax_score", "progress")},
                 }
                 for row in range(len(rows))
             ]
-            print(planner, kind, [one["outcome"] for one in found[kind][planner]], flush=True)
+            print(planner, kind, [episode["outcome"] for episode in results[kind][planner]], flush=True)
     return {
         "command": "python -m experiments.data.real_files --data ../shared/data --write",
         "when": datetime.now(UTC).isoformat(timespec="minutes"),
+        "files": len(set(files)),
+        "recordings": len({scenario.text("segment") for scenario in scenarios}),
         "scenarios": rows,
-        "planners": found,
+        "planners": results,
         "versions": versions(),
     }
 
@@ -86,8 +91,15 @@ def _number(value: float) -> float | None:
 
 
 def tables(result: dict[str, Any]) -> str:
-    """Return a table per kind of traffic: scenarios in rows, planners in columns."""
-    lines: list[str] = []
+    """Return the counts, and a table per kind of traffic: scenarios in rows, planners in columns."""
+    rows = [row for planners in result["planners"].values() for row in planners.values()]
+    scenarios = result["scenarios"]
+    short = sum(scenario["steps"] < STEPS for scenario in scenarios)
+    lines = [
+        f"{result['files']} files of {result['recordings']} drives, {len(scenarios)} scenarios ({short} of them "
+        f"shorter than {STEPS} steps), {sum(map(len, rows))} episodes.",
+        "",
+    ]
     for kind, planners in result["planners"].items():
         lines += [
             f"In `{kind}` traffic:",
@@ -95,20 +107,20 @@ def tables(result: dict[str, Any]) -> str:
             f"| source | scenario | {' | '.join(f'`{p}`' for p in planners)} |",
         ]
         lines.append("|---|---|" + "---|" * len(planners))
-        for row, about in enumerate(result["scenarios"]):
-            cells = [_cell(driven[row]) for driven in planners.values()]
+        for row, about in enumerate(scenarios):
+            cells = [_cell(episodes[row]) for episodes in planners.values()]
             lines.append(f"| {about['source']} | {about['scenario_id']} | {' | '.join(cells)} |")
-        passed = [sum(one["outcome"] == "success" for one in driven) for driven in planners.values()]
-        lines += [f"| | **successes** of {len(result['scenarios'])} | {' | '.join(map(str, passed))} |", ""]
+        counts = [sum(e["outcome"] == "success" for e in episodes) for episodes in planners.values()]
+        lines += [f"| | **successes** of {len(scenarios)} | {' | '.join(map(str, counts))} |", ""]
     return "\n".join(lines[:-1])
 
 
-def _cell(one: dict[str, Any]) -> str:
-    score = "" if one["vmax_score"] is None else f" {one['vmax_score']:.2f}"
-    return f"{one['outcome']}{score}"
+def _cell(episode: dict[str, Any]) -> str:
+    score = "" if episode["vmax_score"] is None else f" {episode['vmax_score']:.2f}"
+    return f"{episode['outcome']}{score}"
 
 
-def into_page(result: dict[str, Any]) -> None:
+def write_page(result: dict[str, Any]) -> None:
     """Write the tables to the page."""
     before, rest = PAGE.read_text().split(BEGIN)
     PAGE.write_text(f"{before}{BEGIN}\n\n{tables(result)}\n\n{END}{rest.split(END)[1]}")
@@ -124,14 +136,14 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="put what is stored into the page")
     args = parser.parse_args()
     if args.table:
-        into_page(json.loads(RESULT.read_text()))
+        write_page(json.loads(RESULT.read_text()))
         return
     if args.data is None:
         parser.error("the following arguments are required: --data")
-    result = measured(args.data)
+    result = measure(args.data)
     if args.write:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
-        into_page(result)
+        write_page(result)
 
 
 if __name__ == "__main__":

@@ -111,8 +111,8 @@ class Row:
 def movers(recording: Recording, style: RouteStyle) -> Iterator[tuple[Scenario, bool]]:
     """Yield every vehicle that is valid now and drives 5 m or more as ego; flag the source's ego."""
     tracks = recording.tracks
-    there = (tracks.kind == AgentKind.VEHICLE) & tracks.valid[:, recording.current_step]
-    for row in np.flatnonzero(there):
+    is_vehicle = (tracks.kind == AgentKind.VEHICLE) & tracks.valid[:, recording.current_step]
+    for row in np.flatnonzero(is_vehicle):
         scenario = assemble(with_ego(recording, int(row)), routes=style)
         if scenario.tags["moves"] == "yes":
             yield scenario, int(row) == recording.ego
@@ -130,7 +130,7 @@ def recordings(data: Path | None, world: int) -> Iterator[tuple[str, Recording]]
                 yield f"{file.parent.name}/{file.name}", window
 
 
-def measured(source: str, scenario: Scenario, ego: bool) -> Row:
+def measure(source: str, scenario: Scenario, ego: bool) -> Row:
     """Return the row of one scenario."""
     return Row(
         source=source,
@@ -199,7 +199,7 @@ def main() -> None:
     rows = []
     for source, recording in recordings(options.data, options.world):
         for scenario, ego in movers(recording, options.routes):
-            rows.append(row := measured(source, scenario, ego))
+            rows.append(row := measure(source, scenario, ego))
             if options.pictures and row.routed and not row.covered:
                 draw(scenario, row, options.pictures)
     print(table(rows))

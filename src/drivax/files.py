@@ -26,7 +26,9 @@ from drivax.errors import DataError, UsageError
 
 
 class FullDiskError(DataError):
-    """The disk is full."""
+    """The disk is full; ``needed`` is the size of the output in bytes, 0 if unknown."""
+
+    needed = 0
 
 
 def sync_and_close(file: IO[bytes]) -> None:
@@ -93,38 +95,52 @@ def check_space(path: Path, needed: int, cure: str = "make room, or choose anoth
 def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
     """Raise a FullDiskError that names ``path`` when the block fills the disk, and the bytes ``needed`` if known.
 
-    The operating system's error for a write names no file; of nested blocks the outermost names the output.
+    The operating system's error for a write names no file. Of nested blocks the outermost names the output, and the
+    outermost that knows them the bytes.
     """
     try:
         yield
-    except (OSError, FullDiskError) as error:
-        if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EDQUOT):
+    except Exception as error:
+        if not _is_full_disk(error):
             raise
-        need = f", of about {format_bytes(needed)} needed" if needed else ""
-        problem = f"no space left on device ({format_bytes(free_bytes(path.parent))} free{need})"
-        raise FullDiskError(problem, file=path, cure="make room, or choose another disk") from error
+        needed = needed or getattr(error, "needed", 0)
+        need = f"of about {format_bytes(needed)} needed" if needed else "more needed"
+        problem = f"no space left on device ({format_bytes(free_bytes(path.parent))} free, {need})"
+        full = FullDiskError(problem, file=path, cure="make room, or choose another disk")
+        full.needed = needed
+        raise full from error
+
+
+def _is_full_disk(error: Exception) -> bool:
+    """Whether the disk is full: a system error, or one of a library (TensorStore) that quotes it."""
+    codes = (errno.ENOSPC, errno.EDQUOT)
+    quoted = any(os.strerror(code) in str(error) for code in codes)
+    return isinstance(error, FullDiskError) or getattr(error, "errno", None) in codes or quoted
 
 
 @contextlib.contextmanager
-def atomic_write(path: Path) -> Iterator[IO[bytes]]:
-    """Yield a binary file that appears as ``path`` when the block ends; an error leaves nothing behind."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+def atomic_write(path: Path, needed: int = 0) -> Iterator[IO[bytes]]:
+    """Yield a binary file that appears as ``path`` when the block ends; an error leaves nothing behind.
+
+    A full disk is reported with the space that is free without the part that did fit, and the bytes ``needed``.
+    """
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    try:
-        with explain_full_disk(path), partial.open("wb") as file:
+    with explain_full_disk(path, needed), contextlib.ExitStack() as cleanup:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cleanup.callback(partial.unlink, missing_ok=True)
+        with partial.open("wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
         sync_folder(path.parent)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
-    with atomic_write(path) as file:
-        file.write(text.encode())
+    content = text.encode()
+    with atomic_write(path, len(content)) as file:
+        file.write(content)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -133,17 +149,18 @@ def write_json(path: Path, value: Any) -> None:
 
 
 @contextlib.contextmanager
-def replace_folder(path: Path) -> Iterator[Path]:
-    """Yield a new folder that replaces ``path`` when the block ends; an error leaves ``path`` unchanged."""
+def replace_folder(path: Path, needed: int = 0) -> Iterator[Path]:
+    """Yield a new folder that replaces ``path`` when the block ends; an error leaves ``path`` unchanged.
+
+    A full disk is reported as by :func:`atomic_write`.
+    """
     partial = _hidden_path(path, f"partial-{os.getpid()}")
     shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        with explain_full_disk(path):
-            yield partial
-            _publish(partial, path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with explain_full_disk(path, needed), contextlib.ExitStack() as cleanup:
+        cleanup.callback(shutil.rmtree, partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        yield partial
+        _publish(partial, path)
 
 
 class PartialFolder:

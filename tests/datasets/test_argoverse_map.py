@@ -109,6 +109,13 @@ def test_check_list_22_ids_of_nine_digits_survive(read):
     assert 205_119_121 in lanes(read(content)) and int(np.float32(205_119_121)) != 205_119_121
 
 
+def test_names_of_unknown_elements_and_fields_are_counted(read):
+    content = av2_motion.local_map() | {"traffic_lights": {}}
+    for segment in content["lane_segments"].values():
+        segment["speed_limit"] = 13.4
+    assert read(content).lost == {"unknown_fields": 2}
+
+
 def test_painted_lines_are_read_once_and_unpainted_ones_left_out(read):
     """Both lanes next to a line name it; the oncoming ones from the other end and with other points between."""
     found = read(av2_motion.local_map())

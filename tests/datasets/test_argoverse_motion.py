@@ -163,6 +163,11 @@ def test_repeated_rows_are_counted(rewritten):
     assert recording.lost == {"repeated_rows": 1} and recording.tracks.valid[4].all()
 
 
+def test_columns_of_unknown_names_are_counted(rewritten):
+    recording = decode(rewritten(lambda table: table | {"length_m": table["heading"]}))
+    assert recording.lost == {"unknown_fields": 1}
+
+
 def test_unknown_types_are_others(rewritten):
     kinds = ["rickshaw" if kind == "bus" else kind for kind in av2_motion.columns()["object_type"]]
     assert decode(rewritten(object_type=kinds)).tracks.kind[2] == AgentKind.OTHER

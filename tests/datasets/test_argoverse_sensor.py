@@ -138,6 +138,14 @@ def test_frames_without_a_pose_are_left_out_and_counted(rewritten):
     assert recording.lost == {"frames_without_pose": 2} and len(recording.timestamps_s) == FRAMES - 2
 
 
+def test_columns_of_unknown_names_are_counted(rewritten):
+    path = rewritten(
+        lambda boxes: boxes | {"vx_m": boxes["qw"]},
+        lambda poses: poses | {"vx_m": poses["qw"], "vy_m": poses["qw"]},
+    )
+    assert decode(path).lost == {"unknown_fields": 2}
+
+
 def test_poses_may_be_unordered_and_repeated(rewritten, recording):
     def shuffled(poses):
         order = np.random.default_rng(1).permutation(len(poses["timestamp_ns"]))

@@ -390,7 +390,7 @@ def test_length_of_scenarios_is_an_option_and_a_property_of_the_set(wire, tmp_pa
 
 
 def test_many_files_are_sampled_and_scaled_by_size(wire, tmp_path, monkeypatch):
-    monkeypatch.setattr("drivax.datasets.doctor._COUNTED", 4)
+    monkeypatch.setattr("drivax.datasets.doctor._COUNT_FILES", 4)
     record = wire.frame(wire.scenario(steps=11))
     (tmp_path / "src").mkdir()
     for number in range(12):

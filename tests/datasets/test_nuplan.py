@@ -227,6 +227,18 @@ def test_boxes_without_a_track_are_counted(tmp_path):
     assert 1 not in recording.tracks.track_id[1:] or len(recording.tracks.track_id) == 12
 
 
+def test_tables_columns_and_layers_of_unknown_names_are_counted(tmp_path):
+    path = sample.write(tmp_path)
+    change(path, "CREATE TABLE lidar_pc_annotation (token BLOB, type TEXT)")
+    change(path, "ALTER TABLE lidar_box ADD COLUMN roll FLOAT")
+    change(
+        next(tmp_path.rglob("*.gpkg")),
+        "INSERT INTO gpkg_geometry_columns VALUES ('trees', 'g', 'POINT', 4326, 0, 0)",
+    )
+    (recording,) = read(path)
+    assert recording.lost == {"unknown_fields": 3}
+
+
 def test_unknown_sizes_and_velocities(tmp_path):
     path = sample.write(tmp_path)
     change(

@@ -144,6 +144,21 @@ def test_kinds_and_names(scene):
     assert Flag.DIFFERENTIATED_VELOCITY in scene.flags
 
 
+def test_tables_and_fields_of_unknown_names_are_counted(tmp_path):
+    path = sample.write(tmp_path)
+    for name, field in (("ego_pose", "speed"), ("sample_annotation", "speed")):
+        file = path.with_name(f"{name}.json")
+        file.write_text(json.dumps([row | {field: 1.0} for row in json.loads(file.read_text())]))
+    path.with_name("weather.json").write_text("[]")
+    path.with_name("attribute.json").write_text("[]")  # known, and not needed
+    (map_file,) = tmp_path.rglob(f"{sample.CITY}.json")
+    content = sample.city() | {"parking_meter": []}
+    content["lane"][0]["speed_limit"] = 13.4
+    map_file.write_text(json.dumps(content))
+    (scene,) = NuScenes().read(path)
+    assert scene.lost == {"dangling_links": 1, "unknown_fields": 4}
+
+
 def test_lane_graph(scene):
     lanes = {f.feature_id: f for f in scene.features if f.kind is RoadKind.LANE_SURFACE}
     right, left, on, north, turn = (lanes[i] for i in range(5))

@@ -106,6 +106,11 @@ def test_18_any_other_global_is_refused_with_its_name(called, name, protocol, tm
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_constructor_with_odd_arguments_is_refused_with_its_name():
+    with pytest.raises(DataError, match=r"odd arguments for builtins\.set"):
+        pickles.load(pickle.dumps(Runs(set, [1], [2]), 2))
+
+
 def test_objects_of_classes_are_refused():
     class_instance = pickle.dumps(pytest.approx(1.0))
     with pytest.raises(DataError, match="names "):

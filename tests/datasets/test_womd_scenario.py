@@ -47,6 +47,27 @@ def test_assembled_flags(recording):
     assert assemble(recording).has & ~Flag.DEFAULT_LIMITS == measured
 
 
+def test_fields_of_unknown_numbers_are_counted(wire, recording):
+    """Different ones, at any depth; those that are known and not needed are not."""
+    boundary = wire.blob(13, wire.whole(1, 0) + wire.whole(2, 8))
+    extent = wire.blob(11, wire.whole(1, 4) + wire.whole(2, 0) + wire.whole(4, 3))
+    lane = wire.lane(wire.line(0.0, stop=40.0)) + extent + boundary
+    state = wire.state(wire.X0, wire.Y0, 30.5, 5.0, 2.0, 1.7, 0.0, 10.0, 0.0)
+
+    def scene(*more, lane=lane, state=state):
+        track = wire.blob(2, wire.track(7, 1, [state] * wire.STEPS) + b"".join(more))
+        return decode(
+            wire.scenario(
+                tracks=track, sdc=wire.whole(6, 0), predict=b"", map=wire.blob(8, wire.feature(1, 3, lane))
+            )
+        ).lost
+
+    assert "unknown_fields" not in recording.lost and "unknown_fields" not in scene()
+    assert scene(wire.double(9, 1.0), wire.double(9, 2.0))["unknown_fields"] == 1
+    assert scene(lane=lane + wire.double(20, 3.5))["unknown_fields"] == 1
+    assert scene(state=state + wire.single(12, 0.1) + wire.single(13, 0.1))["unknown_fields"] == 2
+
+
 def test_rows_are_rows_and_ids_are_ids(recording):
     assert recording.ego == 2
     assert recording.tracks.track_id.tolist() == [900, 17, 2406]

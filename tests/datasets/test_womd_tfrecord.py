@@ -8,7 +8,7 @@ import zlib
 
 import pytest
 
-from drivax.datasets.womd.tfrecord import count_records, looks_framed, masked, read_records
+from drivax.datasets.womd.tfrecord import count_records, looks_framed, mask_crc, read_records
 from drivax.errors import DataError, UsageError
 
 PAYLOADS = (b"first", b"", b"third record", b"x" * 300)
@@ -40,8 +40,8 @@ def test_masked_crc_of_known_values(wire):
     assert wire.crc32c(bytes(32)) == 0x8A9136AA
     assert wire.crc32c(b"123456789") == 0xE3069283
     # Worked by hand: rotating 1 right by 15 gives 2**17.
-    assert masked(1) == 0x20000 + 0xA282EAD8
-    assert masked(0xFFFFFFFF) == 0xA282EAD7
+    assert mask_crc(1) == 0x20000 + 0xA282EAD8
+    assert mask_crc(0xFFFFFFFF) == 0xA282EAD7
 
 
 def test_reads_records_with_numbers(good, read):

@@ -63,6 +63,18 @@ def same(one, other, skip=(), **tolerance) -> bool:
     )
 
 
+def test_closed_edges_is_a_fact_about_the_crop_and_not_about_the_city():
+    """An open edge 400 m away changes nothing that is stored; one next to the log clears the flag."""
+    ring = edge(70, line((-50, -4), (130, -4), (130, 8), (-50, 8), (-50, -4)))
+    road, far, near = lane(1, line((-40, 0), (120, 0))), line((0, 400), (50, 400)), line((0, 20), (50, 20))
+    assert Flag.CLOSED_EDGES in assemble(busy_recording((road, ring))).has
+    assert Flag.CLOSED_EDGES in assemble(busy_recording((road, ring, edge(71, far)))).has
+    assert Flag.CLOSED_EDGES not in assemble(busy_recording((road, ring, edge(71, near)))).has
+    assert Flag.CLOSED_EDGES not in assemble(busy_recording((road, edge(71, far)))).has
+    plain, other = (assemble(busy_recording((road, ring, *more))) for more in ((), (edge(71, far),)))
+    assert same(plain, other)
+
+
 def test_assembled_record_equals_hand_computation():
     scenario = assemble(busy_recording())
     assert (scenario.id, scenario.tags["dataset"], scenario.overflow) == ("hand-made", "test", {})

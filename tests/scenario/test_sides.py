@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.build.grid import CUTOFF_M, DRIVABLE, SPLIT, Grid, cell_sides, pack_sides
+from drivax.scenario.build.grid import CUTOFF_M, DRIVABLE, SPLIT, Grid, cell_sides, pack_sides, ringed_cells
 from drivax.scenario.build.segments import cut, road_lines
 from drivax.scenario.schema import CAPACITIES
 
@@ -21,9 +21,19 @@ def ring(*corners, number=1):
 
 
 def sides_of(*features, closed=True):
-    segments = cut(road_lines(features, np.zeros(3), None))
+    roads = road_lines(features, np.zeros(3), None)
+    segments = cut(roads)
     grid = Grid.around(segments.middle, PATH, CAPACITY)
-    return finer(grid), segments, unpacked(grid, cell_sides(grid, segments, NO_LANES, closed))
+    return (
+        finer(grid),
+        segments,
+        unpacked(grid, sides(grid, segments, roads.closed[segments.polyline] & closed)),
+    )
+
+
+def sides(grid, segments, closed, lanes=NO_LANES) -> np.ndarray:
+    """Packed sides; the crop is 100 m around ``PATH``."""
+    return cell_sides(grid, segments, lanes, closed, ringed_cells(grid, segments, closed, PATH, 100.0))
 
 
 def finer(grid) -> Grid:
@@ -92,7 +102,7 @@ def nearest_side(segments, xy) -> int:
 
 def test_sides_beyond_open_edge_ends_are_unknown():
     # One edge along +x from 0 to 100: left of it is road, right of it is not, beyond its ends nobody knows.
-    grid, _, side = sides_of(edge(1, line((0, 0), (100, 0), step=1.0)), closed=False)
+    grid, _, side = sides_of(edge(1, line((0, 0), (100, 0), step=1.0)))
 
     def at(x, y):
         return side[grid.cell(np.array([[float(x), float(y)]]))[0]]
@@ -107,8 +117,27 @@ def test_a_lane_against_the_edges_leaves_the_side_unknown():
     grid = Grid.around(edges.middle, np.array([[0.0, 0.0]]), CAPACITY)
     lane = np.stack([np.arange(0.0, 100.0), np.full(100, -8.0)], axis=-1)
     cell = finer(grid).cell(np.array([[50.0, -8.0]]))[0]
-    assert unpacked(grid, cell_sides(grid, edges, NO_LANES, False))[cell] == -1
-    assert unpacked(grid, cell_sides(grid, edges, lane, False))[cell] == 0
+    closed = np.zeros(len(edges), dtype=bool)
+    assert unpacked(grid, sides(grid, edges, closed))[cell] == -1
+    assert unpacked(grid, sides(grid, edges, closed, lane))[cell] == 0
+
+
+def test_an_open_edge_outside_the_crop_changes_no_side_inside():
+    grid, _, side = sides_of(OUTER, ISLAND)
+    open_edges = [edge(8 + i, line((-10, y), (10, y), step=1.0)) for i, y in enumerate((180, -180))]
+    same_grid, _, other = sides_of(OUTER, ISLAND, *open_edges)
+    assert (same_grid.origin == grid.origin).all()
+    crop = (np.abs(grid.centres - [5.0, 0.0]) < [100.0, 95.0]).all(axis=1)
+    assert (side[crop] == other[crop]).all() and {1, -1} <= set(other[crop])
+    # Beyond the crop the open edge may part road from field: at 50 m from every edge nothing is known.
+    cell = grid.cell(np.array([[-205.0, -5.0], [205.0, 5.0]]))
+    assert (other[cell] == 0).all()
+
+
+def test_an_open_edge_in_the_crop_leaves_places_far_from_edges_unknown():
+    grid, _, side = sides_of(OUTER, ISLAND, edge(9, line((70, 60), (90, 60), step=1.0)))
+    middle = grid.cell(np.array([[0.0, 0.0]]))[0]  # 50 m from the next edge
+    assert sides_of(OUTER, ISLAND)[2][middle] == -1 and side[middle] == 0
 
 
 def test_sides_far_from_edges_are_unknown_where_rings_contradict():

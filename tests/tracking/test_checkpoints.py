@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
@@ -140,6 +141,17 @@ def test_a_failed_save_leaves_nothing_and_harms_nothing(tmp_path: Path):
         checkpoints.save(2, {"a": "text"})
     assert checkpoints.steps() == [1]
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_full_disk_reports_the_size_of_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(path: Path, arrays: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("drivax.tracking.checkpoints._save_arrays", full)
+    message = r"step-000000003: no space left on device \(.+ free, of about 4\d{2} kB needed\)"
+    with pytest.raises(DataError, match=message):
+        Checkpoints(tmp_path).save(3, {"weights": np.zeros((100, 1000), np.float32)})
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_left_overs_of_a_killed_process_are_no_checkpoints(tmp_path: Path):

@@ -21,7 +21,7 @@ from typing import Any, TypeVar, get_args
 from drivax.datasets.doctor import Estimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, reader_named, survey
 from drivax.datasets.reader import BadRecord, of_length
-from drivax.datasets.spool import converted_ahead
+from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
@@ -35,7 +35,7 @@ _Result = TypeVar("_Result")
 #: Scenarios that are audited together.
 _BATCH = 64
 #: A scenario or bad record, and the place after it: file number, items read of that file.
-_Placed = tuple[Scenario | BadRecord, tuple[int, int]]
+_Item = tuple[Scenario | BadRecord, tuple[int, int]]
 #: Called with (files done, files, scenarios so far).
 Progress = Callable[[int, int, int], None]
 #: Returns the audit of each scenario as a dictionary.
@@ -158,7 +158,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Converted:
-    """What a conversion did.
+    """Result of a conversion.
 
     Attributes:
         path: The scenario set.
@@ -168,7 +168,7 @@ class Converted:
         ignored: Number of files of unknown format in the folder.
         formats: Number of files by format.
         skipped: Records that could not be read or converted, and duplicates.
-        filtered: Number of scenarios that the filters left out.
+        filtered: Number of scenarios that the filters rejected.
         seconds: Wall time.
     """
 
@@ -230,7 +230,7 @@ def convert(
         done = _drain(data, options, sink, writer, progress)
         if not len(writer):
             raise _empty_error(data, sink)
-        writer.source |= sink.left_out()
+        writer.source |= sink.skipped_rows()
     return Converted(
         Path(out), len(writer), written, done, data.ignored, dict(data.formats), tuple(sink.skipped),
         sink.filtered, time.monotonic() - begin,
@@ -265,7 +265,7 @@ def _identity(data: Survey, options: Conversion, audited: bool) -> dict[str, Any
 
 
 class _Sink:
-    """Takes results in order: leaves out duplicates, audits in batches, filters, writes, and collects bad records.
+    """Takes results in order: drops duplicates, audits in batches, filters, writes, and collects bad records.
 
     Batches end where a shard ends, as they would after an interruption.
     """
@@ -278,7 +278,7 @@ class _Sink:
         self._options = options
         self._audit = audit
         self._selection = Selection.parse(options.filters)
-        self._waiting: list[_Placed] = []
+        self._waiting: list[_Item] = []
         self._scenarios_waiting = 0
         self.skipped: list[BadRecord] = []
         self.filtered = 0
@@ -289,7 +289,7 @@ class _Sink:
             for row in note["skipped"]:
                 file = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
                 self.skipped.append(BadRecord(file, row["record"], row["problem"], row["cure"]))
-        self._noted = len(self.skipped)
+        self._notes = len(self.skipped)
         if options.strict and self.skipped:
             raise self.skipped[0].error()
 
@@ -317,7 +317,7 @@ class _Sink:
         while self._waiting and not self.full:
             self._write_batch()
 
-    def left_out(self) -> dict[str, Any]:
+    def skipped_rows(self) -> dict[str, Any]:
         """Records that are not in the set, for its manifest."""
         rows = [_row(self._data, bad) for bad in self.skipped]
         rows = [{name: value for name, value in row.items() if name != "cure"} for row in rows]
@@ -333,7 +333,7 @@ class _Sink:
 
     def _write_batch(self) -> None:
         batch, self._waiting, self._scenarios_waiting = self._waiting, [], 0
-        items = self._without_duplicates(batch)
+        items = self._drop_duplicates(batch)
         scenarios = [item for item in items if isinstance(item, Scenario)]
         findings = [{} for _ in scenarios] if self._audit is None else self._audit(scenarios)
         pairs = zip(scenarios, findings, strict=True)
@@ -349,7 +349,7 @@ class _Sink:
                 self._scenarios_waiting = sum(isinstance(item, Scenario) for item, _ in self._waiting)
                 return
 
-    def _without_duplicates(self, batch: list[_Placed]) -> list[Scenario | BadRecord]:
+    def _drop_duplicates(self, batch: list[_Item]) -> list[Scenario | BadRecord]:
         """The items of a batch, with bad records in place of duplicates."""
         items: list[Scenario | BadRecord] = []
         seen: set[tuple[str, str]] = set()
@@ -371,8 +371,8 @@ class _Sink:
         if self._writer.room > 1:
             self._writer.add(scenario)
             return False
-        rows = [_row(self._data, bad) for bad in self.skipped[self._noted :]]
-        self._noted = len(self.skipped)
+        rows = [_row(self._data, bad) for bad in self.skipped[self._notes :]]
+        self._notes = len(self.skipped)
         self._writer.add(scenario, {"place": place, "filtered": self.filtered, "skipped": rows})
         return True
 
@@ -411,7 +411,7 @@ def _results(
     if options.workers == 1 or len(tasks) <= 1:
         yield from (convert_file(*task) for task in tasks)
         return
-    yield from converted_ahead(tasks, convert_file, options.sizes, options.workers, folder)
+    yield from convert_ahead(tasks, convert_file, options.sizes, options.workers, folder)
 
 
 def _empty_error(data: Survey, sink: _Sink) -> DataError:

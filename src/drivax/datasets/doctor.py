@@ -1,4 +1,4 @@
-"""What a file or folder is, what is missing, and how large a scenario set it would become, without converting it."""
+"""Diagnosis of a file or folder: its format, missing files, and the size of its scenario set, without conversion."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
 #: Files of a format that are inspected; they stand for the others.
 _SAMPLE = 24
 #: Files of a format whose scenarios are counted; where there are more, the sample is scaled by file size.
-_COUNTED = 48
+_COUNT_FILES = 48
 #: Damaged or unknown files that are named.
-_NAMED = 10
+_MOST_NAMES = 10
 #: Notes given on files of one kind.
 _NOTES = 6
 _FLAVOURS = 3
@@ -34,7 +34,7 @@ _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 class Part:
     """Files of one format, data set and version: ``looked`` of them were described, ``whole`` if those are all.
 
-    ``recordings`` of the description is the sum over these files, None if some file does not tell; ``notes`` and
+    ``recordings`` of the description is the sum over these files, or None if it is unknown for some file; ``notes`` and
     ``missing`` are those of all of them.
     """
 
@@ -46,7 +46,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a path is.
+    """Diagnosis of a path.
 
     Attributes:
         path: The file or folder.
@@ -111,7 +111,7 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
-    unknown = [entry.path for entry in data.inputs if entry.format is None][:_NAMED]
+    unknown = [entry.path for entry in data.inputs if entry.format is None][:_MOST_NAMES]
     problems = [BadRecord.of(unsupported.explain(file), file) for file in unknown]
     for name in sorted(data.formats):
         files = [entry.path for entry in data.inputs if entry.format == name]
@@ -123,11 +123,11 @@ def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
                 problems.append(BadRecord.of(error, file))
                 continue
             groups[name, description.dataset, description.version, step == 1].append(description)
-    parts = (Part(name, _together(many), len(many), whole) for (name, *_, whole), many in groups.items())
+    parts = (Part(name, _merge(many), len(many), whole) for (name, *_, whole), many in groups.items())
     return tuple(parts), problems
 
 
-def _together(many: Sequence[Description]) -> Description:
+def _merge(many: Sequence[Description]) -> Description:
     """One description for files of one data set and version."""
     flavours = sorted({description.flavour for description in many})
     more = f" and {len(flavours) - _FLAVOURS} more" if len(flavours) > _FLAVOURS else ""
@@ -164,14 +164,14 @@ def gaps(paths: Sequence[Path]) -> list[str]:
             continue
         runs = np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1)
         names = (f"{run[0]:05d}" if len(run) == 1 else f"{run[0]:05d} to {run[-1]:05d}" for run in runs)
-        named = f", missing {', '.join(names)}" if len(runs) <= 8 else ""
-        sentences.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{named}")
+        names_text = f", missing {', '.join(names)}" if len(runs) <= 8 else ""
+        sentences.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{names_text}")
     return sentences
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a conversion will need and what the disk has left; ``sampled`` if only some of the files were counted."""
+    """Size of a conversion and free space of the disk; ``sampled`` if only some of the files were counted."""
 
     scenarios: int
     size_bytes: int
@@ -201,7 +201,7 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
     total, sampled = 0.0, False
     for name in data.formats:
         paths = [entry.path for entry in data.inputs if entry.format == name]
-        step = -(-len(paths) // _COUNTED)
+        step = -(-len(paths) // _COUNT_FILES)
         sample = paths[::step]
         sampled |= step > 1
         scale = _size(paths) / max(_size(sample), 1) if step > 1 else 1.0

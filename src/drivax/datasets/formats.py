@@ -79,7 +79,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Survey:
-    """What a file or folder (``root``) holds.
+    """Content of a file or folder (``root``).
 
     Attributes:
         inputs: The files to read, sorted by path.
@@ -141,19 +141,19 @@ def find_files(src: str | Path, name: str = AUTO) -> tuple[list[Path], int]:
 
 
 def _kind(path: Path, readers: tuple[Reader, ...]) -> Input | str:
-    """What a file of a folder is: an input, a companion of one, or nothing that is known."""
+    """Classify a file of a folder: input, companion of one, or ignored."""
     if path.name.lower().endswith(_NEVER):
         return "ignored"
-    named = any(_matches(path, reader.patterns) for reader in readers)
+    by_name = any(_matches(path, reader.patterns) for reader in readers)
     if len(readers) == 1:
         # The reader says record by record what is wrong with a file that only has the name.
-        if named or readers[0].recognise(path):
+        if by_name or readers[0].recognise(path):
             return Input(path, readers[0].name)
     elif (reader := recognise(path)) is not None:
         return Input(path, reader.name)
     if any(_matches(path, reader.companions) for reader in readers):
         return "companion"
-    return Input(path, None) if named else "ignored"
+    return Input(path, None) if by_name else "ignored"
 
 
 def _matches(path: Path, patterns: tuple[str, ...]) -> bool:

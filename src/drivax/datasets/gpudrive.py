@@ -72,7 +72,7 @@ _ROAD_TYPES = {
 _KINDS = {int(kind): kind for kind in RoadKind}
 #: Points of the published files are 0.5 m apart; twice that is a jump where the map was clipped.
 _SPLIT_GAP_M, _DENSE_M = 1.0, 0.75
-#: What other converters to this form leave out: heights of the map, of agents and of boxes.
+#: Fields that other converters to this form omit: heights of the map, of agents and of boxes.
 _ABSENT = ("z", "height")
 #: Written decimals: a tenth of a millimetre.
 _DIGITS = 4
@@ -219,14 +219,14 @@ def _row_numbers(values: Sequence[Any], count: int, what: str) -> tuple[int, ...
 def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
     """Numbers of a list of dictionaries, ``[row, key]``; zeros where the first lacks a key that may be absent."""
     try:
-        here = [key for key in keys if key not in _ABSENT or key in rows[0]] if rows else keys
-        values = np.array([[row[key] for key in here] for row in rows], np.float64)
-        if values.size and values.shape != (len(rows), len(here)):
+        present_keys = [key for key in keys if key not in _ABSENT or key in rows[0]] if rows else keys
+        values = np.array([[row[key] for key in present_keys] for row in rows], np.float64)
+        if values.size and values.shape != (len(rows), len(present_keys)):
             raise ValueError("values are lists")
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise DataError(f"{what} is not a list of numbers {', '.join(keys)}", cure=_SKIP) from error
     table = np.zeros((len(rows), len(keys)))
-    table[:, [keys.index(key) for key in here]] = values.reshape(-1, len(here))
+    table[:, [keys.index(key) for key in present_keys]] = values.reshape(-1, len(present_keys))
     return table
 
 
@@ -241,10 +241,10 @@ def _columns(row: Any, names: Sequence[str], what: str) -> list[list[Any]]:
 
 def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
     """Ids of objects or roads; their indices where none has an id."""
-    given = [row.get("id") for row in rows]
-    if all(number is None for number in given):
-        return list(range(len(given)))
-    ids = [_whole(number, f"the id of {what}") for number in given]
+    numbers = [row.get("id") for row in rows]
+    if all(number is None for number in numbers):
+        return list(range(len(numbers)))
+    ids = [_whole(number, f"the id of {what}") for number in numbers]
     if len(set(ids)) < len(ids) or not all(0 <= number < _ID_END for number in ids):
         raise DataError(f"the ids of {what} are not unique, or not from 0 to {_ID_END - 1}", cure=_SKIP)
     return ids
@@ -321,11 +321,11 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
     if not isinstance(states, Mapping):
         raise DataError("tl_states is not a dictionary of lanes", cure=_SKIP)
     lights = parsing.Lights(steps)
-    for lane, seen in states.items():
+    for lane, observations in states.items():
         if not (lane.isascii() and lane.isdigit() and len(lane) < 11):
             raise DataError(f"tl_states names lane {lane[:40]!r}, which is not an id", cure=_SKIP)
         what = f"tl_states of lane {lane[:40]}"
-        times, seen_states, *place = _columns(seen, ("time_index", "state", "x", "y", "z"), what)
+        times, seen_states, *place = _columns(observations, ("time_index", "state", "x", "y", "z"), what)
         when = parsing.rows_within([_whole(step, what) for step in times], steps, what)
         rows = [dict(zip("xyz", point, strict=True)) for point in zip(*place, strict=True)]
         points = _table(rows, "xyz", what)
@@ -333,7 +333,7 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
             raise DataError(f"{what} is not at a finite place", cure=_SKIP)
         for step, state, point in zip(when, seen_states, points.tolist(), strict=True):
             lights.observe(step, int(lane), _light_state(state), point)
-    return lights.collected(features)
+    return lights.collect(features)
 
 
 def _light_state(state: Any) -> int:

@@ -1,9 +1,10 @@
-"""What readers share: imports of extras, checks, time bases, lights by lane, city names, JSON files, heights."""
+"""Common parts of readers: imports of extras, checks, time bases, lights by lane, city names, JSON files, heights."""
 
 from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -76,20 +77,20 @@ class Lights:
         if states[step] <= _UNKNOWN:
             states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
-    def collected(self, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
-        """The lights in order of first observation, and the number of those without a position, which are left out.
+    def collect(self, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
+        """Return the lights in order of first observation, and the number of those dropped for want of a position.
 
         States are -1 where a light is not observed. A stop point of zeros is none: the light then stands where its lane
         begins.
         """
         starts = {f.feature_id: f.points[0] for f in features if f.kind in LANE_KINDS}
-        placed = [(lane, p if any(p) else starts.get(lane), s) for lane, (p, s) in self._lights.items()]
+        entries = [(lane, p if any(p) else starts.get(lane), s) for lane, (p, s) in self._lights.items()]
         lights = tuple(
             Light(lane, np.array(point, np.float64), np.array(states, np.int8))
-            for lane, point, states in placed
+            for lane, point, states in entries
             if point is not None
         )
-        return lights, len(placed) - len(lights)
+        return lights, len(entries) - len(lights)
 
 
 def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
@@ -116,7 +117,7 @@ def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " t
     return timestamps[nearest] + (steps - nearest) * 0.1
 
 
-def shifted(recording: Recording, offset: Float[np.ndarray, "3"]) -> Recording:
+def shift(recording: Recording, offset: Float[np.ndarray, "3"]) -> Recording:
     """The recording in a map frame in which its present origin lies at ``offset`` (x, y, z), metres."""
     if not offset.any():
         return recording
@@ -165,13 +166,13 @@ def windows_of(steps: int) -> int:
 UNEVEN = "frames are missing or off their time: steps are interpolated by time, and cut at gaps"
 
 
-def nonzero(**counts: int) -> dict[str, int]:
-    """Counts that are not zero, for ``Recording.lost``."""
-    return {name: int(count) for name, count in counts.items() if count}
+def nonzero(*lost: Mapping[str, int], **counts: int) -> dict[str, int]:
+    """Return the sums of counts by name that are not zero, for ``Recording.lost``."""
+    return {name: int(count) for name, count in sum(map(Counter, lost), Counter(counts)).items() if count}
 
 
 def one_point_features(features: Sequence[MapFeature]) -> int:
-    """How many lines and polygons have one point only, so neither direction nor extent."""
+    """Number of lines and polygons of one point, which have neither direction nor extent."""
     return sum(len(f.points) < 2 and f.kind != RoadKind.STOP_SIGN for f in features)
 
 
@@ -215,7 +216,7 @@ def _half_heights(tracks: Tracks) -> Float[Array, "track time"]:
 
 
 def _samples(features: Sequence[MapFeature]) -> Float[Array, "sample 3"]:
-    """Points of all map lines, about ``SPACING_M`` apart along them; closing edges of polygons are left out."""
+    """Points of all map lines, about ``SPACING_M`` apart along them, without the closing edges of polygons."""
     lines = Polylines.of([np.asarray(f.points, np.float64) for f in features if len(f.points)])
     if len(lines.points) == 0:
         return np.zeros((0, 3))

@@ -1,4 +1,4 @@
-"""What every reader of a public format is, and how it reports records that it could not read."""
+"""Protocol of the readers of public formats, and their report of unreadable records."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class BadRecord:
 
 @dataclass(frozen=True)
 class Description:
-    """What ``drivax doctor`` tells about one file of a format.
+    """Description of one file of a format by ``drivax doctor``.
 
     Attributes:
         dataset: Full name of the public data set; ``flavour`` is its form, ``version`` as far as the file tells.
-        recordings: Number of recordings; None if only reading the whole file would tell.
+        recordings: Number of recordings; None for a file that would have to be read whole.
         notes: What the file holds or lacks that its user should know, one short sentence each.
         missing: Files that it needs next to it and that are not there.
     """
@@ -82,7 +82,11 @@ class Reader(Protocol):
         ...
 
     def describe(self, path: Path) -> Description:
-        """What the file is, without decoding all of it; raises a DataError if it is damaged."""
+        """Describe the file without decoding all of it.
+
+        Raises:
+            DataError: The file is damaged.
+        """
         ...
 
     def count(self, path: Path) -> int:

@@ -32,7 +32,7 @@ def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
     """The boundary of all drivable areas together: one closed EDGE_BOUNDARY per ring, drivable side on the left.
 
     Self-intersecting polygons are repaired, overlapping and touching ones joined, gaps of up to 10 cm between them
-    closed (morphological closing); rings of fewer than three different points are left out. Exteriors become
+    closed (morphological closing); rings of fewer than three different points are dropped. Exteriors become
     anticlockwise, holes clockwise, the first point is repeated at the end. Heights are interpolated along the nearest
     edge of the input, 0 if it has two columns. Feature ids count up from ``first_id``.
     """

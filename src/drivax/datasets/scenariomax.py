@@ -52,12 +52,12 @@ def decode(payload: bytes) -> Recording:
 
     Rows that are never valid are padding. Speed limits become m/s by lane, -1 mph is unknown; missing times are
     10 Hz; missing velocities (-1 throughout) are differentiated from positions. Lights that are UNKNOWN throughout are
-    left out: the writer fills with UNKNOWN what it does not know, for some sources also yellow.
+    dropped: the writer fills with UNKNOWN what it does not know, for some sources also yellow.
     """
     table = tf_example.features_of(payload)
-    rows = np.arange(table.numbers("state/id").size)
-    used = np.flatnonzero((table.over_time("valid", rows) == 1).any(axis=1))
-    recording = tf_example.recording(table, payload, used, womd.SCENARIOMAX_FORMAT, womd.SCENARIOMAX_FORMAT)
+    all_rows = np.arange(table.numbers("state/id").size)
+    rows = np.flatnonzero((table.over_time("valid", all_rows) == 1).any(axis=1))
+    recording = tf_example.recording(table, payload, rows, womd.SCENARIOMAX_FORMAT, womd.SCENARIOMAX_FORMAT)
     tracks, flags = recording.tracks, recording.flags
     if tracks.valid.any() and (tracks.velocity[tracks.valid] == -1.0).all():
         velocity = differentiate(tracks.xy, tracks.valid, recording.timestamps_s)

@@ -23,7 +23,7 @@ from drivax.tracking.workers import await_interrupt, worker_pool
 _SPOOLED = np.zeros(())
 
 
-def converted_ahead(
+def convert_ahead(
     tasks: Sequence[tuple[Any, ...]],
     convert: Callable[..., Iterator[Scenario | BadRecord]],
     capacity: Capacity,
@@ -47,9 +47,9 @@ def converted_ahead(
     try:
         while True:
             # Two tasks ahead keep all workers busy and bound the space on the disk.
-            while len(waiting) < workers + 2 and (numbered := next(todo, None)) is not None:
-                path = spool / f"{numbered[0]}.records"
-                waiting.append((path, pool.submit(_spool, numbered[1], convert, path)))
+            while len(waiting) < workers + 2 and (item := next(todo, None)) is not None:
+                path = spool / f"{item[0]}.records"
+                waiting.append((path, pool.submit(_spool, item[1], convert, path)))
             if not waiting:
                 return
             path, future = waiting.popleft()

@@ -15,7 +15,7 @@ from drivax.datasets.womd.tfrecord import read_records
 from drivax.errors import DataError, UsageError
 from drivax.scenario.store import MANIFEST
 
-#: What a file is by its first bytes (of a tar archive those from ``_TAR_BYTE`` on), and what to do.
+#: Kinds of files by their first bytes (of a tar archive those from ``_TAR_BYTE`` on), and cures.
 _TAR, _TAR_BYTE = b"ustar", 257
 _MAGIC = {
     b"\x1f\x8b": ("the file is gzip-compressed", "decompress it first (gunzip, or tar xzf for a .tgz)"),
@@ -44,7 +44,7 @@ _MAGIC = {
 }
 _HEAD = 1 << 16
 _MOTION = "download the motion data set (scenario/*.tfrecord-*)"
-#: What a JSON file is by words at its beginning, and what to do.
+#: Kinds of JSON files by words at their beginning, and cures.
 _JSON = {
     rb'"(objects|roads)"': (
         "looks like a GPUDrive scene but has no metadata, so the ego is unknown",
@@ -100,8 +100,8 @@ def _is_frame(payload: bytes) -> bool:
     frame = parse("Frame", payload)
     if frame is None or not frame.HasField("timestamp_micros"):
         return False
-    named = frame.context.HasField("name") and frame.context.name.isascii()
-    return named and bool(frame.HasField("pose") or frame.images or frame.lasers)
+    has_name = frame.context.HasField("name") and frame.context.name.isascii()
+    return has_name and bool(frame.HasField("pose") or frame.images or frame.lasers)
 
 
 def _is_end_to_end(payload: bytes) -> bool:

@@ -96,9 +96,9 @@ class Recording:
         route_lanes: Feature ids of the lanes of the intended route in order, if known.
         route_corridor: Feature ids of all lanes that the intended route may use, if only these are known (nuPlan's
             roadblocks).
-        seen: Mask of the valid steps that the sensors of the ego would see; None if all recorded steps were seen.
+        seen: Mask of the valid steps that the sensors of the ego would see; None for all of them.
         tags: Words of the source: ``place`` (city), ``source_format``, ``family`` of the built-in world, ...
-        lost: Numbers of items that the reader left out, by name.
+        lost: Numbers of items that the reader dropped, by name.
         flags: Facts that only the reader knows (default sizes, truncated map, ...).
         split_gap_m: Polylines are split where neighbouring points are further apart (clipped maps).
     """
@@ -127,8 +127,8 @@ class Recording:
 def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> Iterator[Recording]:
     """Cut a recording into windows of ``length`` steps that share its segment; step 10 of each is the current one.
 
-    Window ``k`` starts at step ``k * stride``; a rest that fills no window is left out (110 steps make one window, 199
-    make three). Windows without a valid ego at the current step are left out, and counted in ``lost`` of the others as
+    Window ``k`` starts at step ``k * stride``; a rest that fills no window is dropped (110 steps make one window, 199
+    make three). Windows without a valid ego at the current step are dropped, and counted in ``lost`` of the others as
     ``windows_without_ego``. A recording of at most ``length`` steps is its own window.
 
     No window spans a gap of two or more frames: each side is cut on its own, and ``lost`` counts the ``time_gaps``.
@@ -140,40 +140,40 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
     """
     if stride < 1:
         raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
-    pieces = [_even(piece) for piece in _between_gaps(recording)]
+    pieces = [_resample(piece) for piece in _split_at_gaps(recording)]
     if len(pieces) == 1 and len(pieces[0][1]) <= length:
-        piece, filled = pieces[0]
-        now = min(CURRENT_STEP, len(filled) - 1)
+        piece, frameless = pieces[0]
+        now = min(CURRENT_STEP, len(frameless) - 1)
         piece = piece if piece.current_step == now else replace(piece, current_step=now)
-        yield _counting(piece, interpolated_steps=int(filled.sum()))
+        yield _add_counts(piece, interpolated_steps=int(frameless.sum()))
         return
     cut = [
-        _window(piece, filled, start, length, recording)
-        for piece, filled in pieces
-        for start in range(0, len(filled) - length + 1, stride)
+        _window(piece, frameless, start, length, recording)
+        for piece, frameless in pieces
+        for start in range(0, len(frameless) - length + 1, stride)
     ] or [_window(*max(pieces, key=_usable_steps), 0, length, recording)]
     usable = [window for window in cut if window.tracks.valid[window.ego, window.current_step]]
     if not usable:
         problem = f"the ego is not valid at the current step of any of {len(cut)} windows"
         raise DataError(problem, record=recording.scenario_id, cure="skip the recording")
-    left_out = {"windows_without_ego": len(cut) - len(usable), "time_gaps": len(pieces) - 1}
-    yield from (_counting(window, **left_out) for window in usable)
+    lost = {"windows_without_ego": len(cut) - len(usable), "time_gaps": len(pieces) - 1}
+    yield from (_add_counts(window, **lost) for window in usable)
 
 
 def _usable_steps(piece: tuple[Recording, Array]) -> tuple[bool, int]:
     """Whether the ego of a piece is valid at its current step, and its length."""
-    recording, filled = piece
-    now = min(CURRENT_STEP, len(filled) - 1)
-    return bool(recording.tracks.valid[recording.ego, now]), len(filled)
+    recording, frameless = piece
+    now = min(CURRENT_STEP, len(frameless) - 1)
+    return bool(recording.tracks.valid[recording.ego, now]), len(frameless)
 
 
-def _counting(recording: Recording, **lost: int) -> Recording:
+def _add_counts(recording: Recording, **lost: int) -> Recording:
     """The recording with more counts in ``lost``; itself if they are all 0."""
     lost = {name: count for name, count in lost.items() if count}
     return replace(recording, lost={**recording.lost, **lost}) if lost else recording
 
 
-def _between_gaps(recording: Recording) -> Iterator[Recording]:
+def _split_at_gaps(recording: Recording) -> Iterator[Recording]:
     """The pieces of a recording between gaps; timestamps that do not increase are left to ``check``."""
     times = recording.timestamps_s
     ends = np.flatnonzero(np.diff(times) > GAP_STEPS * step_seconds(times)[0]) + 1
@@ -181,10 +181,10 @@ def _between_gaps(recording: Recording) -> Iterator[Recording]:
         yield recording
         return
     for first, last in pairwise([0, *ends.tolist(), len(times)]):
-        yield _part(recording, slice(first, last))
+        yield _cut(recording, slice(first, last))
 
 
-def _even(recording: Recording) -> tuple[Recording, Bool[np.ndarray, " time"]]:
+def _resample(recording: Recording) -> tuple[Recording, Bool[np.ndarray, " time"]]:
     """Interpolate a recording at even times if a step is too short or too long; mask the steps without a frame."""
     times = recording.timestamps_s
     if is_even(times) or not (np.diff(times) > 0).all():
@@ -195,16 +195,18 @@ def _even(recording: Recording) -> tuple[Recording, Bool[np.ndarray, " time"]]:
     at = np.interp(even, times, np.arange(len(times)))
     frame = np.rint(at).astype(np.int64)
     exact = np.abs(times[frame] - even) <= STEP_TOLERANCE_S
-    return _at(recording, np.where(exact, frame, at), even), ~exact
+    return _interpolate_at(recording, np.where(exact, frame, at), even), ~exact
 
 
-def _at(recording: Recording, at: Float64[np.ndarray, " step"], even: Float64[Array, " step"]) -> Recording:
+def _interpolate_at(
+    recording: Recording, at: Float64[np.ndarray, " step"], even: Float64[Array, " step"]
+) -> Recording:
     """The recording at fractional steps, which come at even times; lights keep their state until the next frame."""
     before, after = np.floor(at).astype(np.int64), np.ceil(at).astype(np.int64)
     tracks, seen = recording.tracks, recording.seen
-    timed = {"valid": tracks.valid[:, before] & tracks.valid[:, after]}
-    for name in _WIDTHS.keys() - timed.keys():
-        timed[name] = interpolate(getattr(tracks, name), tracks.valid, at, angle=name == "heading")
+    series = {"valid": tracks.valid[:, before] & tracks.valid[:, after]}
+    for name in _WIDTHS.keys() - series.keys():
+        series[name] = interpolate(getattr(tracks, name), tracks.valid, at, angle=name == "heading")
 
     def step_of(old: int) -> int:
         return min(int(np.searchsorted(at, old)), len(at) - 1)
@@ -213,7 +215,7 @@ def _at(recording: Recording, at: Float64[np.ndarray, " step"], even: Float64[Ar
         recording,
         timestamps_s=even,
         current_step=step_of(recording.current_step),
-        tracks=replace(tracks, **timed),
+        tracks=replace(tracks, **series),
         seen=None if seen is None else seen[:, before] & seen[:, after],
         lights=tuple(replace(light, states=light.states[before]) for light in recording.lights),
         events=tuple(
@@ -254,23 +256,23 @@ def differentiate(
 
 
 def _window(
-    piece: Recording, filled: Bool[Array, " time"], start: int, length: int, whole: Recording
+    piece: Recording, frameless: Bool[Array, " time"], start: int, length: int, whole: Recording
 ) -> Recording:
     """The steps from ``start`` of a piece on, named by the steps since the beginning of the whole recording."""
-    part = slice(start, min(start + length, len(filled)))
+    part = slice(start, min(start + length, len(frameless)))
     begin = (piece.timestamps_s[0] - whole.timestamps_s[0]) / step_seconds(whole.timestamps_s)[0]
     window = replace(
-        _part(piece, part),
+        _cut(piece, part),
         scenario_id=f"{whole.scenario_id}@{round(begin) + start}",
         current_step=min(CURRENT_STEP, part.stop - part.start - 1),
     )
-    return _counting(window, interpolated_steps=int(filled[part].sum()))
+    return _add_counts(window, interpolated_steps=int(frameless[part].sum()))
 
 
-def _part(recording: Recording, part: slice) -> Recording:
+def _cut(recording: Recording, part: slice) -> Recording:
     """These steps of a recording, without another current step."""
     last = part.stop - part.start - 1
-    timed = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
+    series = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
     events = (
         replace(event, start=max(event.start - part.start, 0), end=min(event.end - part.start, last))
         for event in recording.events
@@ -278,7 +280,7 @@ def _part(recording: Recording, part: slice) -> Recording:
     return replace(
         recording,
         timestamps_s=recording.timestamps_s[part],
-        tracks=replace(recording.tracks, **timed),
+        tracks=replace(recording.tracks, **series),
         seen=None if recording.seen is None else recording.seen[:, part],
         lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
         events=tuple(event for event in events if event.end >= event.start),
@@ -300,7 +302,11 @@ def with_ego(recording: Recording, row: int) -> Recording:
 
 
 def check(recording: Recording, capacity: Capacity) -> None:
-    """Raise DataError if a recording is invalid."""
+    """Check a recording.
+
+    Raises:
+        DataError: It is invalid.
+    """
     problem = _check_names(recording) or _check_time(recording, capacity.steps) or _check_shapes(recording)
     problem = problem or _check_tracks(recording) or _check_extent(recording)
     problem = problem or _check_map(recording) or _check_lights(recording)
@@ -360,9 +366,9 @@ def _check_shapes(recording: Recording) -> Finding:
     shapes = {f"tracks.{name}": (count, steps, *width) for name, width in _WIDTHS.items()}
     shapes |= {"tracks.kind": (count,)} | ({} if recording.seen is None else {"seen": (count, steps)})
     for name, shape in shapes.items():
-        given = np.shape(attrgetter(name)(recording))
-        if given != shape:
-            return f"{name} has shape {given}, not {shape}", "give every track every step"
+        actual = np.shape(attrgetter(name)(recording))
+        if actual != shape:
+            return f"{name} has shape {actual}, not {shape}", "give every track every step"
     rows = (recording.ego, *recording.to_predict, *recording.of_interest)
     if any(not 0 <= row < count for row in rows):
         return f"a track row out of {count} is named in {rows}", "name rows of the track table"
@@ -389,7 +395,7 @@ def _check_tracks(recording: Recording) -> Finding:
     return None
 
 
-def _here(recording: Recording) -> Float[Array, "3"]:
+def _ego_position(recording: Recording) -> Float[Array, "3"]:
     """Position of the ego at the current step."""
     now = recording.ego, recording.current_step
     return np.append(recording.tracks.xy[now], recording.tracks.z[now])
@@ -397,12 +403,12 @@ def _here(recording: Recording) -> Float[Array, "3"]:
 
 def _check_extent(recording: Recording) -> Finding:
     """Positions and speeds of any size would not fit into memory or float32; other tracks lose such steps."""
-    here = _here(recording)
+    ego = _ego_position(recording)
     lost = np.flatnonzero(recording.tracks.valid[recording.ego] & ~plausible(recording, recording.ego))
     if len(lost):
         return f"the ego jumps or is faster than {SPEED_MPS:.0f} m/s at step {lost[0]}", _UNITS
     stops = [np.asarray(light.stop_point) for light in recording.lights if np.shape(light.stop_point) == (3,)]
-    if stops and np.nanmax(np.abs(np.array(stops) - here), initial=0.0) > EXTENT_M:
+    if stops and np.nanmax(np.abs(np.array(stops) - ego), initial=0.0) > EXTENT_M:
         return f"a light is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
     return None
 
@@ -414,23 +420,23 @@ def plausible(recording: Recording, track: int) -> Bool[np.ndarray, " time"]:
     longest is kept, and before and after it those that connect.
     """
     tracks = recording.tracks
-    xy, here = tracks.xy[track], _here(recording)
-    away = np.abs(np.column_stack((xy, tracks.z[track])) - here).max(axis=1)
+    xy, ego = tracks.xy[track], _ego_position(recording)
+    away = np.abs(np.column_stack((xy, tracks.z[track])) - ego).max(axis=1)
     slow = np.abs(tracks.velocity[track]).max(axis=1) <= SPEED_MPS
     at = np.flatnonzero(tracks.valid[track] & (away <= EXTENT_M) & slow)
-    pieces = np.split(at, np.flatnonzero(~_connected(xy, at[:-1], at[1:])) + 1)
+    pieces = np.split(at, np.flatnonzero(~_connects(xy, at[:-1], at[1:])) + 1)
     longest = int(np.argmax([len(piece) for piece in pieces]))
-    kept = pieces[longest]
+    chain = pieces[longest]
     for piece in pieces[longest + 1 :]:
-        kept = np.append(kept, piece) if _connected(xy, kept[-1], piece[0]) else kept
+        chain = np.append(chain, piece) if _connects(xy, chain[-1], piece[0]) else chain
     for piece in reversed(pieces[:longest]):
-        kept = np.append(piece, kept) if _connected(xy, piece[-1], kept[0]) else kept
+        chain = np.append(piece, chain) if _connects(xy, piece[-1], chain[0]) else chain
     result = np.zeros(len(xy), dtype=bool)
-    result[kept] = True
+    result[chain] = True
     return result
 
 
-def _connected(xy: Float[Array, "time 2"], earlier: Any, later: Any) -> Any:
+def _connects(xy: Float[Array, "time 2"], earlier: Any, later: Any) -> Any:
     """Whether a track could drive from its earlier to its later positions."""
     return np.hypot(*(xy[later] - xy[earlier]).T) <= SPEED_MPS * DT_S * (later - earlier)
 
@@ -447,7 +453,7 @@ def _check_map(recording: Recording) -> Finding:
     if not recording.features:
         return None
     points = np.concatenate([feature.points for feature in recording.features])
-    far = np.flatnonzero(~(np.abs(points - _here(recording)).max(axis=1) <= EXTENT_M))
+    far = np.flatnonzero(~(np.abs(points - _ego_position(recording)).max(axis=1) <= EXTENT_M))
     if not len(far):
         return None
     ends = np.cumsum([len(feature.points) for feature in recording.features])

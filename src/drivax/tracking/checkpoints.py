@@ -85,11 +85,12 @@ class Checkpoints:
         arrays, leaves = _describe(state)
         score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
         final = self._path(step)
-        about = {"step": step, "score": score, "leaves": leaves}
-        with replace_folder(final) as partial:
+        about = json.dumps({"step": step, "score": score, "leaves": leaves}, indent=1)
+        needed = len(about) + sum(array.nbytes for array in arrays.values())
+        with replace_folder(final, needed) as partial:
             if arrays:
                 _save_arrays(partial / _ARRAYS, arrays)
-            write_text(partial / ABOUT, json.dumps(about, indent=1))
+            write_text(partial / ABOUT, about)
         self._drop()
         return final
 
@@ -158,7 +159,7 @@ def _present_name(leaf: str) -> str:
 def pack(file: Path, tree: Any) -> None:
     """Write a pytree of arrays to one ``.npz``, by name, atomically; NumPy alone can read it."""
     named: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree)}
-    with atomic_write(file) as out:
+    with atomic_write(file, sum(array.nbytes for array in named.values())) as out:
         np.savez(out, **named)
 
 

@@ -484,3 +484,10 @@ def write(folder: Path) -> Path:
 def write_full(folder: Path, **changes: Any) -> Path:
     """The whole log: 25 s, 500 sweeps, three scenes; ``changes`` replace fields of :class:`Drive`."""
     return write_all(folder, replace(Drive(), **changes))
+
+
+#: The small log without single sweeps, and one of 4 s with a gap.
+FORMS = (
+    lambda folder: write_all(folder, replace(SMALL, missing=frozenset({40, 81, 122}))),
+    lambda folder: write_all(folder, replace(SMALL, sweeps=120, missing=frozenset(range(90, 96)))),
+)

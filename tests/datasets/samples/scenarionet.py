@@ -195,5 +195,33 @@ def write(folder: Path) -> Path:
     return _dump(folder, scenario())
 
 
-#: Writers of further forms, which are damaged in turn (fuzz.run).
-FORMS = (lambda folder: _dump(folder, first_form(scenario())), lambda folder: _dump(folder, window()))
+def at_steps(tree: dict[str, Any], steps: np.ndarray) -> dict[str, Any]:
+    """The scene with these frames only, each at its own time: short logs, dropped frames."""
+    for track in tree["tracks"].values():
+        track["state"] = {name: values[steps] for name, values in track["state"].items()}
+    for body in tree["dynamic_map_states"].values():
+        states = body["state"]["object_state"]
+        body["state"]["object_state"] = [states[step] for step in steps.tolist()]
+    tree["metadata"]["ts"] = tree["metadata"]["ts"][steps]
+    return tree | {"length": len(steps)}
+
+
+def backwards(tree: dict[str, Any]) -> dict[str, Any]:
+    """The scene with the heading of every track off by pi."""
+    for track in tree["tracks"].values():
+        track["state"]["heading"] = track["state"]["heading"] + np.float32(np.pi)
+    return tree
+
+
+#: Steps of a log of 3.4 s with two dropped frames and a gap.
+SHORT = np.delete(np.arange(34), [15, 22, 28, 29, 30])
+#: Scenes in further forms, which are damaged in turn (fuzz.run).
+FORMS = tuple(
+    lambda folder, form=form: _dump(folder, form())
+    for form in (
+        lambda: first_form(scenario()),
+        window,
+        lambda: at_steps(scenario(), SHORT),
+        lambda: backwards(scenario()),
+    )
+)

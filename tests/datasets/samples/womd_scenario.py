@@ -183,8 +183,21 @@ def scenario(scenario_id: str = "0123456789abcdef", steps: int = STEPS, **change
     return b"".join({**parts, **changes}.values())
 
 
+def _write(folder: Path, payload: bytes) -> Path:
+    path = folder / "sample.tfrecord"
+    path.write_bytes(frame(payload))
+    return path
+
+
 def write(folder: Path) -> Path:
     """One TFRecord with one record."""
-    path = folder / "sample.tfrecord"
-    path.write_bytes(frame(scenario()))
-    return path
+    return _write(folder, scenario())
+
+
+def _write_short(folder: Path) -> Path:
+    """A log of 4 s, in which a frame is dropped after step 20."""
+    times = b"".join(double(1, 0.1 * (t + (t > 20))) for t in range(40))
+    return _write(folder, scenario(steps=40, times=times))
+
+
+FORMS = (_write_short,)

@@ -41,10 +41,15 @@ _MARKS = {
     "DOUBLE_SOLID_YELLOW": RoadKind.LINE_SOLID_DOUBLE_YELLOW,
     **dict.fromkeys(("DASH_SOLID_YELLOW", "SOLID_DASH_YELLOW"), RoadKind.LINE_PASSING_DOUBLE_YELLOW),
 }
+#: Names of elements of a map that are read.
+_FIELDS = frozenset((
+    "id", "is_intersection", "lane_type", "centerline", "predecessors", "successors", "area_boundary", "edge1", "edge2",
+    *(f"{side}_{name}" for side in ("left", "right") for name in ("lane_boundary", "lane_mark_type", "neighbor_id")),
+))  # fmt: skip
 
 
 class ArgoverseMap(NamedTuple):
-    """A map's features, and numbers of what was left out."""
+    """A map's features, and counts of what is lost."""
 
     features: tuple[MapFeature, ...]
     lost: dict[str, int]
@@ -76,16 +81,17 @@ def _decode(content: Any) -> ArgoverseMap:
     )
     free = 1 + max((lane.feature_id for lane in lanes), default=0)
     edges = road_edges(rings, free)
-    drawn = [*lines, *((RoadKind.CROSSWALK, walk) for walk in walks)]
+    shapes = [*lines, *((RoadKind.CROSSWALK, walk) for walk in walks)]
     rest = [
-        MapFeature(number, kind, points) for number, (kind, points) in enumerate(drawn, free + len(edges))
+        MapFeature(number, kind, points) for number, (kind, points) in enumerate(shapes, free + len(edges))
     ]
-    lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes))
+    unknown = (content.keys() - {*groups}).union(*segments, *areas, *crossings) - _FIELDS
+    lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes), unknown_fields=len(unknown))
     return ArgoverseMap((*lanes, *edges, *rest), lost)
 
 
 def _lane(segment: Any) -> MapFeature | None:
-    """A lane, or None if a boundary has no length."""
+    """Build a lane; None for a segment with a boundary of no length."""
     left, right = _points(segment, "left_lane_boundary"), _points(segment, "right_lane_boundary")
     lengths = [arc_lengths(line).max(initial=0.0) for line in (left, right)]
     if min(lengths) < 1e-3:

@@ -32,6 +32,8 @@ _COLUMNS: dict[str, Kind] = {
     **dict.fromkeys(("object_category", "timestep", "num_timestamps"), "whole"),
     **dict.fromkeys((*_STATE, "start_timestamp", "end_timestamp"), "number"),
 }
+#: Columns that are not needed: the split at step 50, and the number of the city.
+_OTHERS = {"observed", "map_id"}
 #: Kind and size (length, width, height in metres) of each ``object_type``: the files hold no sizes. Medians of the
 #: boxes of sensor logs; cyclists with the length of their vehicle and the height of a person.
 _TYPES: dict[str, tuple[AgentKind, tuple[float, float, float]]] = {
@@ -123,7 +125,11 @@ def decode(path: Path) -> Recording:
         to_predict=tuple(row for row, word in enumerate(names.words) if word == focal),
         of_interest=tuple(row for row, code in enumerate(category) if code == _SCORED),
         tags={"source_format": "av2-motion"} | place_tags(table.texts["city"].text(0)),
-        lost=local_map.lost | parsing.nonzero(repeated_rows=table.rows - int(tracks.valid.sum())),
+        lost=parsing.nonzero(
+            local_map.lost,
+            repeated_rows=table.rows - int(tracks.valid.sum()),
+            unknown_fields=len(table.others - _OTHERS),
+        ),
         flags=Flag.DEFAULT_SIZES,
     )
 
@@ -151,8 +157,8 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
     parsing.check_within(tables.FASTEST_MPS, states[..., 3:])
     heading = np.where(valid, wrap(states[..., 2]), 0.0)
     xy = states[..., :2].copy()
-    there = ego, valid[ego]
-    xy[there] = parsing.box_centre(xy[there], heading[there], tables.CENTRE_AHEAD_M)
+    at_ego = ego, valid[ego]
+    xy[at_ego] = parsing.box_centre(xy[at_ego], heading[at_ego], tables.CENTRE_AHEAD_M)
     kinds, sizes = _classes(table.texts["object_type"], names, ego)
     return Tracks(
         xy=xy,

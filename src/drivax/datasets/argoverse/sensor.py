@@ -31,6 +31,8 @@ _POSE_COLUMNS: dict[str, Kind] = {"timestamp_ns": "whole", **dict.fromkeys(_POSE
 _BOX_COLUMNS: dict[str, Kind] = {
     **_POSE_COLUMNS, **dict.fromkeys(_SIZE, "number"), "track_uuid": "text", "category": "text"
 }  # fmt: skip
+#: Columns that are not needed.
+_OTHERS = {"num_interior_pts"}
 _VEHICLES = (
     EGO, "REGULAR_VEHICLE", "LARGE_VEHICLE", "BUS", "SCHOOL_BUS", "ARTICULATED_BUS", "BOX_TRUCK", "TRUCK",
     "TRUCK_CAB", "VEHICULAR_TRAILER", "RAILED_VEHICLE",
@@ -70,13 +72,13 @@ class ArgoverseSensor:
         table = read_table(path, {"timestamp_ns": "whole", "track_uuid": "text"})
         frames, tracks = len(np.unique(table.numbers["timestamp_ns"])), len(table.texts["track_uuid"].words)
         map_path = _map_path(path)
-        needed = {POSES: path.with_name(POSES).is_file(), f"map/{MAP_PATTERN}": map_path is not None}
+        files = {POSES: path.with_name(POSES).is_file(), f"map/{MAP_PATTERN}": map_path is not None}
         return Description(
             dataset="Argoverse 2 Sensor",
             flavour=f"one log of {frames} frames in {_places(map_path).get('place', 'an unknown city')}",
             recordings=1,
             notes=(f"{tracks} tracks", "there are no speed limits, lights or stop signs"),
-            missing=tuple(name for name, there in needed.items() if not there),
+            missing=tuple(name for name, exists in files.items() if not exists),
         )
 
     def count(self, path: Path) -> int:
@@ -135,7 +137,11 @@ def decode(path: Path) -> Recording:
         tracks=tracks,
         features=local_map.features,
         tags={"source_format": "av2-sensor"} | _places(map_path),
-        lost=local_map.lost | parsing.nonzero(frames_without_pose=lost_frames),
+        lost=parsing.nonzero(
+            local_map.lost,
+            frames_without_pose=lost_frames,
+            unknown_fields=len((boxes.others - _OTHERS) | poses.others),
+        ),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )
 
@@ -143,10 +149,10 @@ def decode(path: Path) -> Recording:
 def _clock(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
     """Time stamps of the frames with a pose, nanoseconds, and how many frames have none."""
     frames = np.unique(boxes.numbers["timestamp_ns"])
-    posed = np.isin(frames, poses.numbers["timestamp_ns"])
-    if not posed.any():
+    has_pose = np.isin(frames, poses.numbers["timestamp_ns"])
+    if not has_pose.any():
         raise DataError(f"no frame has a pose in {POSES}")
-    return frames[posed], int((~posed).sum())
+    return frames[has_pose], int((~has_pose).sum())
 
 
 def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:

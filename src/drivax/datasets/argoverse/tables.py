@@ -44,11 +44,12 @@ class Words:
 
 @dataclass(frozen=True)
 class Table:
-    """Some columns of a table, one array per name: float64 or int64, or :class:`Words`."""
+    """Some columns of a table, one array per name: float64 or int64, or :class:`Words`; ``others`` are not read."""
 
     rows: int
     numbers: Mapping[str, Array]
     texts: Mapping[str, Words]
+    others: frozenset[str]
 
     def stacked(self, names: Sequence[str]) -> Array:
         """Columns of numbers side by side, float64, shape ``(rows, len(names))``."""
@@ -67,36 +68,43 @@ def has_magic(path: Path, magic: bytes) -> bool:
 def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
     """Read columns of a parquet or feather file, by name and kind: any number, integers, or text.
 
-    Columns that not every version of the format has are left out where they are missing.
+    ``optional`` columns, which not every version of the format has, may be missing.
     """
     pa = import_extra("pyarrow")
     try:
-        table = _load(path, list(columns), optional)
+        table, others = _load(path, list(columns), optional)
         if table.num_rows == 0:
             raise DataError("contains no rows", file=path, cure=_AGAIN)
-        kinds = [(name, columns[name]) for name in table.column_names]
-        texts = {name: _words(table.column(name)) for name, kind in kinds if kind == "text"}
-        others = [(name, kind) for name, kind in kinds if kind != "text"]
-        numbers = {name: _numbers(table.column(name), kind == "whole", name) for name, kind in others}
+        kinds = {name: columns[name] for name in table.column_names}
+        texts = {name: _words(table.column(name)) for name, kind in kinds.items() if kind == "text"}
+        numbers = {
+            name: _numbers(table.column(name), kind == "whole", name)
+            for name, kind in kinds.items()
+            if kind != "text"
+        }
     except FileNotFoundError as error:
         raise DataError("is missing", file=path, cure=_AGAIN) from error
     except DataError as error:
         raise DataError(error.problem, file=path, cure=error.cure) from error
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         raise DataError(f"is not a valid table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
-    return Table(table.num_rows, numbers, texts)
+    return Table(table.num_rows, numbers, texts, others)
 
 
-def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> Any:
-    """The columns as an Arrow table, validated: string offsets of damaged files may point anywhere."""
+def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> tuple[Any, frozenset[str]]:
+    """Return the columns as a validated Arrow table, and the names of the others.
+
+    String offsets of damaged files may point anywhere.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     with pa.OSFile(str(path)) as source:
         if has_magic(path, PARQUET_MAGIC):
             file = pq.ParquetFile(source)
-            columns = [name for name in columns if name in file.schema_arrow.names or name not in optional]
-            _check(file.schema_arrow.names, columns, file.metadata.num_rows)
+            names = file.schema_arrow.names
+            columns = [name for name in columns if name in names or name not in optional]
+            _check(names, columns, file.metadata.num_rows)
             table = file.read(columns=list(columns), use_threads=False)
         else:
             names = pa.ipc.open_file(source).schema.names
@@ -106,7 +114,7 @@ def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> Any:
             table = pa.ipc.open_file(source, options=options).read_all()
     _check(table.schema.names, columns, table.num_rows)
     table.validate(full=True)
-    return table
+    return table, frozenset(names) - {*columns}
 
 
 def _check(names: Sequence[str], columns: Sequence[str], rows: int) -> None:
@@ -131,5 +139,5 @@ def _numbers(column: Any, whole: bool, name: str) -> Array:
 def _words(column: Any) -> Words:
     import pyarrow as pa
 
-    encoded = column.cast(pa.string()).combine_chunks().fill_null("").dictionary_encode()
-    return Words(tuple(encoded.dictionary.to_pylist()), encoded.indices.to_numpy().astype(np.int64))
+    codes = column.cast(pa.string()).combine_chunks().fill_null("").dictionary_encode()
+    return Words(tuple(codes.dictionary.to_pylist()), codes.indices.to_numpy().astype(np.int64))

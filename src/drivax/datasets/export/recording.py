@@ -91,7 +91,7 @@ def _tracks(scenario: Scenario, moving: _Array, parked: _Array) -> Tracks:
 
 
 def _seen(scenario: Scenario, moving: _Array, parked: _Array) -> Bool[_Array, "track time"] | None:
-    """What ego's sensors saw; None where that is everything."""
+    """Mask of what ego's sensors saw; None for all that is valid."""
     seen, valid = (_over_time(scenario, moving, parked, name) for name in ("seen", "valid"))
     return None if np.array_equal(seen, valid) else seen.copy()
 
@@ -118,13 +118,13 @@ def _polylines(scenario: Scenario) -> list[tuple[Float[_Array, "point 3"], int]]
 
 
 def _features(scenario: Scenario, fresh: Iterator[int]) -> list[MapFeature]:
-    features, named = [], set()
+    features, numbers = [], set()
     for local, segment in _polylines(scenario):
         kind = RoadKind(int(scenario.segment_kind[segment]))
         row, lane = int(scenario.segment_feature[segment]), int(scenario.segment_lane[segment])
         number = int(scenario.lane_id[lane] if lane >= 0 else scenario.feature_id[row] if row >= 0 else -1)
-        first = number >= 0 and number not in named
-        named.add(number)
+        first = number >= 0 and number not in numbers
+        numbers.add(number)
         points = local + scenario.origin
         if kind in POLYGON_KINDS and np.array_equal(points[0], points[-1]):
             points = points[:-1]
@@ -140,13 +140,13 @@ def _links(scenario: Scenario, lane: int) -> dict[str, Any]:
         return tuple(int(scenario.lane_id[row]) for row in rows if row >= 0)
 
     # Links made from geometry are not the source's; they are made again.
-    given = Flag.CHAINED_GRAPH not in scenario.has
+    has_graph = Flag.CHAINED_GRAPH not in scenario.has
     limit, width = float(scenario.lane_limit[lane]), float(scenario.lane_width[lane])
     return {
         "limit_mps": limit if limit > 0 else None,
         "width_m": width if width > 0 else None,
-        "successors": ids(scenario.lane_successor[lane]) if given else (),
-        "predecessors": ids(scenario.lane_predecessor[lane]) if given else (),
+        "successors": ids(scenario.lane_successor[lane]) if has_graph else (),
+        "predecessors": ids(scenario.lane_predecessor[lane]) if has_graph else (),
         "left_neighbours": ids(scenario.lane_left[lane : lane + 1]),
         "right_neighbours": ids(scenario.lane_right[lane : lane + 1]),
         "interpolating": bool(scenario.lane_interpolating[lane]),
@@ -155,10 +155,10 @@ def _links(scenario: Scenario, lane: int) -> dict[str, Any]:
 
 def _stop_signs(scenario: Scenario, fresh: Iterator[int]) -> list[MapFeature]:
     """Stop signs, at the height of the nearest segment."""
-    used = np.flatnonzero((scenario.stop_xy != 0).any(axis=1) | (scenario.stop_lane >= 0).any(axis=1))
+    rows = np.flatnonzero((scenario.stop_xy != 0).any(axis=1) | (scenario.stop_lane >= 0).any(axis=1))
     near = scenario.segment_a[: int(scenario.segment_blocks[3])].astype(np.float64)
     signs = []
-    for row in used:
+    for row in rows:
         xy = scenario.stop_xy[row].astype(np.float64)
         z = near[np.hypot(*(near[:, :2] - xy).T).argmin(), 2] if len(near) else 0.0
         lanes = tuple(int(scenario.lane_id[lane]) for lane in scenario.stop_lane[row] if lane >= 0)

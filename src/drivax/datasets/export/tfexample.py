@@ -193,9 +193,9 @@ def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Ar
 def _numbers(recording: Recording) -> dict[int, int]:
     """Written ids of map features by their ids."""
     ids = [feature.feature_id for feature in recording.features]
-    used = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
-    fit = all(0 <= number < _INT_ID_END for number in used)
-    return {number: number if fit else row for row, number in enumerate(used)}
+    numbers = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
+    fit = all(0 <= number < _INT_ID_END for number in numbers)
+    return {number: number if fit else row for row, number in enumerate(numbers)}
 
 
 def _lights(
@@ -271,14 +271,14 @@ def _directions(line: _Array) -> _Array:
 def _paths(scenario: Scenario, numbers: Mapping[int, int], shift: _Array, form: Paths) -> dict[str, _Array]:
     """Routes from ego's first logged position; the route to the goal first and on the route.
 
-    The log route (stored row 1) is privileged and left out, unless no lane leads to the goal: then it is row 0.
+    The log route (stored row 1) is privileged and not exported, unless no lane leads to the goal: then it is row 0.
     """
     shape = (form.count, form.points)
     xyz, lane = np.full((*shape, 3), -1.0), np.full(shape, -1, np.int64)
     arc, valid, on_route = np.zeros(shape), np.zeros(shape, np.int64), np.zeros((form.count, 1), np.int64)
     log = scenario.agent_xy[scenario.agent_valid[:, 0], 0].astype(np.float64)
-    used = [row for row in np.flatnonzero(scenario.route_points > 1) if row != 1][: form.count]
-    for number, row in enumerate(used):
+    rows = [row for row in np.flatnonzero(scenario.route_points > 1) if row != 1][: form.count]
+    for number, row in enumerate(rows):
         count = int(scenario.route_points[row])
         line = np.column_stack((scenario.route_xy[row], scenario.route_z[row]))[:count].astype(np.float64)
         begin = min(int(np.hypot(*(line[:, :2] - log[0]).T).argmin()), count - 2)

@@ -40,10 +40,14 @@ LAYERS: Mapping[str, tuple[str, ...]] = {
     "gen_lane_connectors_scaled_width_polygons": ("lane_connector_fid", "left_boundary_fid", "right_boundary_fid"),
     **dict.fromkeys(_DRIVABLE, ()),
 }  # fmt: skip
-_NEEDED = ("baseline_paths", "lanes_polygons", "lane_connectors")
+#: Layers that are not read.
+_OTHERS = frozenset((
+    "lane_groups_polygons", "lane_group_connectors", "walkways", "traffic_lights", "dubins_nodes",
+))  # fmt: skip
+_BASE_LAYERS = ("baseline_paths", "lanes_polygons", "lane_connectors")
 NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), start=1)}
 #: Folder in the archive of the maps, which the documentation renames to ``maps``.
-_UNPACKED, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
+_ARCHIVE, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
 _FASTEST_MPS = 60.0
 CURE = "download the nuPlan maps again"
 #: Decoded around ego's drive: 100 m that are kept, and space for routes that lead further.
@@ -58,7 +62,7 @@ _LINES: Mapping[int | None, RoadKind] = {
     0: RoadKind.LINE_BROKEN_SINGLE_WHITE,
     2: RoadKind.LINE_SOLID_SINGLE_WHITE,
 }
-_UNPAINTED = (1, 3)
+_NO_PAINT = (1, 3)
 _STOP_SIGN = 1
 
 
@@ -91,7 +95,7 @@ def _listing(log: Path) -> Path:
     if os.environ.get("NUPLAN_MAPS_ROOT"):
         roots.append(Path(os.environ["NUPLAN_MAPS_ROOT"]))
     for root in roots:
-        for pattern in (_LISTING, f"{_UNPACKED}/{_LISTING}"):
+        for pattern in (_LISTING, f"{_ARCHIVE}/{_LISTING}"):
             if listings := sorted(root.glob(pattern)):
                 return listings[-1]
     raise DataError(
@@ -126,6 +130,7 @@ class City:
         lanes: Lanes and connectors by packed id.
         roadblocks: Packed ids of the lanes of each roadblock, by (``lane`` or ``connector``, fid).
         boundary_rows: Row in the layer of boundaries by fid.
+        unknown_layers: Number of layers with unknown names.
     """
 
     path: Path
@@ -134,6 +139,7 @@ class City:
     lanes: Mapping[int, Lane]
     roadblocks: Mapping[tuple[str, int], list[int]]
     boundary_rows: Mapping[int | None, int]
+    unknown_layers: int
 
 
 def city_map(path: Path) -> City:
@@ -146,9 +152,10 @@ def city_map(path: Path) -> City:
 def _city(path: Path, mtime_ns: int, size: int) -> City:
     with open_database(path) as database:
         layers = {name: layer for name in LAYERS if (layer := read_layer(database, name, LAYERS[name]))}
-        if missing := [name for name in _NEEDED if name not in layers]:
+        if missing := [name for name in _BASE_LAYERS if name not in layers]:
             raise DataError(f"has no layer {missing[0]}", file=path, cure=CURE)
         epsg = _read_epsg(database)
+        names = {name for (name,) in database.rows("SELECT table_name FROM gpkg_geometry_columns")}
     lanes = _lanes(layers)
     blocks: dict[tuple[str, int], list[int]] = {}
     for lane_id, lane in lanes.items():
@@ -156,7 +163,8 @@ def _city(path: Path, mtime_ns: int, size: int) -> City:
             blocks.setdefault(lane.roadblock, []).append(lane_id)
     boundaries = layers.get("boundaries")
     fids = () if boundaries is None else boundaries.fid.tolist()
-    return City(path, epsg, layers, lanes, blocks, {fid: row for row, fid in enumerate(fids)})
+    rows: dict[int | None, int] = {fid: row for row, fid in enumerate(fids)}
+    return City(path, epsg, layers, lanes, blocks, rows, len(names - LAYERS.keys() - _OTHERS))
 
 
 def _read_epsg(database: Database) -> int:
@@ -179,7 +187,7 @@ def whole(value: Any) -> int | None:
 
 
 def _limit(value: Any) -> float | None:
-    """A limit in m/s, also from a text; None where it is missing or not plausible."""
+    """A limit in m/s, also from a text; None for a missing or implausible one."""
     if isinstance(value, str) and re.fullmatch(r"\d{1,3}(\.\d{1,20})?", value):
         value = float(value)
     good = isinstance(value, int | float) and math.isfinite(value) and 0.0 < value <= _FASTEST_MPS
@@ -331,7 +339,7 @@ class _Around:
         return [owners[row] for row in rows], self.shapes("baseline_paths", rows)
 
     def shapes(self, name: str, rows: Sequence[int]) -> Array:
-        """Projected geometries of rows; None where one is damaged, empty or too far away."""
+        """Projected geometries of rows; None for one that is damaged, empty or too far away."""
         shapely = import_extra("shapely")
         if not len(rows):
             return np.zeros(0, dtype=object)
@@ -353,7 +361,7 @@ class _Around:
     def outlines(
         self, name: str, rows: Sequence[int], outline: Callable[[Any], Array | None]
     ) -> Iterator[tuple[int, int, Array]]:
-        """Row, packed id and points of geometries; those that have no outline are left out."""
+        """Row, packed id and points of the geometries that have an outline."""
         for row, shape in zip(rows, self.shapes(name, rows), strict=True):
             points, fid = outline(shape), whole(int(self.city.layers[name].fid[row]))
             if points is not None and fid is not None:
@@ -375,7 +383,7 @@ def _transformer(source: int, target: int) -> Any:
 
 
 def _line(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
-    """Points of a line, z = 0, without repeated ones; None where there are fewer than two or the line is in parts."""
+    """Points of a line, z = 0, without repeated ones; None for fewer than two points or a line in parts."""
     shapely = import_extra("shapely")
     if shape is not None and shape.geom_type == "MultiLineString":
         shape = shapely.line_merge(shape)
@@ -434,10 +442,10 @@ def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float
     known = around.city.boundary_rows
     pairs = [[known.get(fid, -1) for fid in lane.boundaries] for lane in lanes]
     rows = np.array(pairs, np.int64).reshape(-1, 2)
-    used = np.unique(rows[rows >= 0])
+    side_rows = np.unique(rows[rows >= 0])
     nothing = np.array(None, dtype=object)
-    lines = np.append(around.shapes("boundaries", used.tolist()), nothing)
-    sides = lines[np.where(rows >= 0, np.searchsorted(used, rows), -1)]
+    lines = np.append(around.shapes("boundaries", side_rows.tolist()), nothing)
+    sides = lines[np.where(rows >= 0, np.searchsorted(side_rows, rows), -1)]
     along = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, nothing)
     places = shapely.line_interpolate_point(along[:, None], _WIDTH_PLACES, normalized=True)
     gaps = shapely.distance(places[:, None], sides[:, :, None])
@@ -448,7 +456,7 @@ def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float
 
 def _line_features(around: _Around) -> Iterator[MapFeature]:
     """Painted boundaries of lanes."""
-    types = {row: kind for row, kind in around.types("boundaries").items() if kind not in _UNPAINTED}
+    types = {row: kind for row, kind in around.types("boundaries").items() if kind not in _NO_PAINT}
     for row, number, points in around.outlines("boundaries", list(types), _line):
         yield MapFeature(number, _LINES.get(types[row], RoadKind.LINE_UNKNOWN), points)
 

@@ -40,6 +40,13 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "scenario_tag": ("lidar_pc_token", "type"),
     "traffic_light_status": ("lidar_pc_token", "lane_connector_id", "status"),
 }  # fmt: skip
+#: Tables, and columns of those that are read, that are not needed; their names hardly repeat with another meaning.
+_OTHERS = frozenset((
+    "lidar", "camera", "image", "token", "vehicle_name", "date", "timestamp", "location", "log_token", "lidar_token",
+    "next_token", "prev_token", "filename", "z", "vz", "acceleration_x", "acceleration_y", "acceleration_z",
+    "angular_rate_x", "angular_rate_y", "epsg", "confidence", "width", "length", "height", "description", "name",
+    "goal_ego_pose_token", "agent_track_token",
+))  # fmt: skip
 #: Length, width and height of the ego (Chrysler Pacifica), metres.
 EGO_SIZE_M = (5.176, 2.297, 1.777)
 #: From the rear axle, where ego poses are, to the middle of the box: (front 4.049 m - rear 1.127 m) / 2.
@@ -159,12 +166,13 @@ _Agents = Mapping[Any, tuple[int, AgentKind]]
 
 @dataclass(frozen=True)
 class Log:
-    """An open log: its name (the file's where it has none), the name of its map, its time line."""
+    """An open log: its name (else the file's), the name of its map, its time line, its number of unknown fields."""
 
     database: Database
     name: str
     map_name: str
     line: TimeLine
+    unknown_fields: int
 
 
 def _open_log(database: Database, path: Path) -> Log:
@@ -175,7 +183,17 @@ def _open_log(database: Database, path: Path) -> Log:
         raise DataError("its table log names no map", file=path, cure="download the file again")
     name, map_name = rows[0]
     name = name if isinstance(name, str) and name else path.stem
-    return Log(database, name, map_name.removesuffix(".gpkg"), time_line(database))
+    return Log(database, name, map_name.removesuffix(".gpkg"), time_line(database), _unknown_fields(database))
+
+
+def _unknown_fields(database: Database) -> int:
+    """Number of tables, and of columns of the tables that are read, with unknown names."""
+    columns = {
+        (table, column)
+        for table, known in TABLES.items()
+        for column in database.columns(table) - _OTHERS.union(known)
+    }
+    return len(database.tables() - TABLES.keys() - _OTHERS) + len(columns)
 
 
 def time_line(database: Database) -> TimeLine:
@@ -193,7 +211,7 @@ def pieces(line: TimeLine, steps: int = STEPS) -> list[Piece]:
     """Cut a time line at gaps and scenes, and long scenes, into pieces of 10 Hz for scenarios of ``steps`` steps.
 
     Of sweeps at 20 Hz every second one is taken, counted from the last gap. A remainder that is too short for a
-    window is left out: it is the future of the windows before.
+    window is dropped: it is the future of the windows before.
     """
     recordings: list[Piece] = []
     counts: dict[Any, int] = {}
@@ -262,7 +280,7 @@ def agents(database: Database) -> _Agents:
 def tracks(log: Log, piece: Piece, known: _Agents) -> tuple[Tracks, int]:
     """Return the tracks of a piece, ego in row 0, and the number of boxes without a track."""
     steps = len(piece.sweeps)
-    boxes, owners, left_out = _boxes(log, piece, known)
+    boxes, owners, lost = _boxes(log, piece, known)
     tokens = sorted({owner for _, owner in owners}, key=lambda token: known[token][0])
     if (len(tokens) + 1) * steps > _MOST_CELLS:
         raise DataError(f"{len(tokens)} tracks in {steps} steps", cure=_CURE)
@@ -284,7 +302,7 @@ def tracks(log: Log, piece: Piece, known: _Agents) -> tuple[Tracks, int]:
         kind=np.array([kind for _, kind in entries], np.int8),
         track_id=np.array([number for number, _ in entries], np.int64),
     )
-    return states, left_out
+    return states, lost
 
 
 def _ego(log: Log, piece: Piece) -> Float64[np.ndarray, "step 9"]:
@@ -389,7 +407,13 @@ def _recording(log: Log, piece: Piece, known: _Agents, city: City) -> Recording:
         lights=lights,
         route_corridor=tuple(lane for lane in route if lane in lanes),
         tags=tags | ({"scenario_types": "|".join(types)} if types else {}),
-        lost=parsing.nonzero(boxes_without_track=boxes, **lost, lights=unlit, roadblocks=unknown),
+        lost=parsing.nonzero(
+            lost,
+            boxes_without_track=boxes,
+            lights=unlit,
+            roadblocks=unknown,
+            unknown_fields=log.unknown_fields + city.unknown_layers,
+        ),
     )
 
 
@@ -409,4 +433,4 @@ def _lights(
             lights.observe(step, lane, _LIGHT_STATES.get(status, LightState.UNKNOWN), starts[lane])
         elif lane not in city.lanes:
             unknown.add(connector)
-    return lights.collected(features)[0], len(unknown)
+    return lights.collect(features)[0], len(unknown)

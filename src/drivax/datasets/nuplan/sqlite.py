@@ -65,6 +65,11 @@ class Database:
             rows += self.rows(f"{query} ({', '.join('?' * len(batch))})", batch)
         return rows
 
+    def tables(self) -> frozenset[str]:
+        """Return the names of all tables but those of SQLite itself."""
+        names = self.rows("SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite%'")
+        return frozenset(str(name) for (name,) in names)
+
     def columns(self, table: str) -> frozenset[str]:
         """Return the names of a table's columns; none where there is no such table (a view is none)."""
         real = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"
@@ -114,7 +119,7 @@ class Layer:
         epsg: Coordinate reference system of the geometries.
         fid: Feature ids (row ids).
         bounds: West, south, east, north in that system; NaN where a geometry is unreadable.
-        columns: Values of the requested columns, None where the layer lacks a column.
+        columns: Values of the requested columns; None for columns that the layer lacks.
     """
 
     name: str
@@ -132,7 +137,7 @@ class Layer:
 
 
 def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> Layer | None:
-    """Read a layer without its geometries; None where the GeoPackage has no such layer."""
+    """Read a layer without its geometries; None for one that the GeoPackage lacks."""
     present = database.columns(name)
     database.require("gpkg_geometry_columns", "table_name", "column_name", "srs_id")
     described = database.rows(
@@ -173,7 +178,7 @@ def _envelope(head: Any) -> tuple[float, float, float, float]:
 
 
 def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]) -> Array:
-    """Return the geometries of rows as an array of shapely objects; None where one is unreadable."""
+    """Return the geometries of rows as an array of shapely objects; None for unreadable ones."""
     shapely = import_extra("shapely")
     fids = layer.fid[rows].tolist()
     query = f"SELECT rowid, {layer.geometry} FROM {layer.name} WHERE rowid IN"
@@ -183,18 +188,18 @@ def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]
         try:
             return np.asarray(shapely.from_wkb(blobs, on_invalid="ignore"))
         except NotImplementedError:  # one of them is a curve
-            return np.array([_decoded(blob) for blob in blobs], dtype=object)
+            return np.array([_decode(blob) for blob in blobs], dtype=object)
 
 
-def _decoded(blob: bytes | None) -> Any:
-    """One geometry; None where it is unreadable or a curve."""
+def _decode(blob: bytes | None) -> Any:
+    """Decode a geometry; None for a curve or an unreadable one."""
     with contextlib.suppress(NotImplementedError):
         return import_extra("shapely").from_wkb(blob, on_invalid="ignore")
     return None
 
 
 def _wkb(blob: Any) -> bytes | None:
-    """The WKB in a geometry BLOB; None where it is none, empty, or of an extension."""
+    """The WKB in a geometry BLOB; None for anything else, empty ones and extensions."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None
     code = blob[3] >> 1 & 7

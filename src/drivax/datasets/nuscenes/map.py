@@ -48,6 +48,22 @@ class Box:
 
 
 _AGAIN = "unpack the map expansion again"
+#: Layers that are read, row by row, and others of the map expansion.
+_LAYERS = (
+    "line", "polygon", "drivable_area", "lane", "lane_connector", "lane_divider", "road_divider", "ped_crossing",
+    "stop_line",
+)  # fmt: skip
+_OTHERS = (
+    "version", "node", "arcline_path_3", "connectivity", "road_segment", "road_block", "walkway", "carpark_area",
+    "traffic_light", "canvas_edge",
+)  # fmt: skip
+#: Names of fields of the rows of these layers that are read, or need not be.
+_FIELDS = (
+    "token", "node_tokens", "exterior_node_tokens", "holes", "polygon_token", "polygon_tokens", "line_token",
+    "lane_divider_segments", "stop_line_type", "lane_type", "from_edge_line_token", "to_edge_line_token",
+    "left_lane_divider_segments", "right_lane_divider_segments", "road_segment_token", "ped_crossing_tokens",
+    "traffic_light_tokens", "road_block_token",
+)  # fmt: skip
 #: Points of centre lines.
 SPACING_M = 0.5
 #: No lane is longer.
@@ -69,7 +85,7 @@ class City:
     lost: Mapping[str, int]
 
     def around(self, xy: Float[Array, "point 2"], margin_m: float) -> tuple[MapFeature, ...]:
-        """What reaches into the box around some points; lines are cut there, lanes and polygons stay whole."""
+        """Features in the box around some points; lines are cut there, lanes and polygons stay whole."""
         box = Box.around(xy, margin_m)
         number = len(self.features)
         kept: list[MapFeature] = []
@@ -109,22 +125,25 @@ class _Layers:
         self._lines = {line["token"]: line["node_tokens"] for line in content["line"]}
         self._polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
         self._lost: dict[str, int] = {}
+        fields = {name for layer in _LAYERS for row in self._layer(layer) for name in row}
+        unknown = content.keys() - {*_LAYERS, *_OTHERS} | fields.difference(_FIELDS)
+        self._count("unknown_fields", len(unknown))
 
     def city(self) -> City:
         """All features, lanes first, numbered in this order."""
         lanes = self._lanes()
         lines = [*self._dividers(), *self._crossings()]
-        numbered = [replace(line, feature_id=len(lanes) + i) for i, line in enumerate(lines)]
-        stops = self._stops(lanes, len(lanes) + len(numbered))
+        features = [replace(line, feature_id=len(lanes) + i) for i, line in enumerate(lines)]
+        stops = self._stops(lanes, len(lanes) + len(features))
         areas = [area for row in self._layer("drivable_area") for area in self._areas(row["polygon_tokens"])]
-        edges = road_edges(areas, len(lanes) + len(numbered) + len(stops))
-        return City((*lanes, *numbered, *stops, *edges), self._lost)
+        edges = road_edges(areas, len(lanes) + len(features) + len(stops))
+        return City((*lanes, *features, *stops, *edges), self._lost)
 
     def _layer(self, name: str) -> Sequence[Mapping[str, Any]]:
         return self._content.get(name, ())
 
     def _points(self, tokens: Sequence[str]) -> Float[Array, "point 3"]:
-        """Nodes by token; missing ones are left out and counted."""
+        """Nodes by token; missing ones are counted."""
         nodes = [self._nodes[token] for token in tokens if token in self._nodes]
         self._count("nodes", len(tokens) - len(nodes))
         return np.column_stack((np.array(nodes, np.float64).reshape(-1, 2), np.zeros(len(nodes))))
@@ -149,11 +168,11 @@ class _Layers:
         paths, links = self._content["arcline_path_3"], self._content["connectivity"]
         rows = [(row, name) for name in ("lane", "lane_connector") for row in self._layer(name)]
         lines = {row["token"]: arc_line(paths[row["token"]]) for row, _ in rows if row["token"] in paths}
-        drawn = [(row, name) for row, name in rows if len(lines.get(row["token"], ())) > 1]
-        self._count("lanes_without_path", len(rows) - len(drawn))
-        index = {row["token"]: i for i, (row, _) in enumerate(drawn)}
+        with_path = [(row, name) for row, name in rows if len(lines.get(row["token"], ())) > 1]
+        self._count("lanes_without_path", len(rows) - len(with_path))
+        index = {row["token"]: i for i, (row, _) in enumerate(with_path)}
         lanes: list[MapFeature] = []
-        for i, (row, name) in enumerate(drawn):
+        for i, (row, name) in enumerate(with_path):
             connects, line = name == "lane_connector", lines[row["token"]]
             link = links.get(row["token"], {})
             after, before = ([*link.get(way, ())] for way in ("outgoing", "incoming"))
@@ -172,7 +191,7 @@ class _Layers:
         return with_neighbours(lanes)
 
     def _width(self, row: Mapping[str, Any], line: Float[Array, "point 2"]) -> float | None:
-        """Area of the lane's polygon over the length of its centre line; None if that is no lane's width."""
+        """Area of the lane's polygon over the length of its centre line; None for an implausible width."""
         length = float(np.hypot(*np.diff(line, axis=0).T).sum())
         for exterior, _ in self._areas([row["polygon_token"]]):
             x, y = exterior[:, 0], exterior[:, 1]
@@ -254,7 +273,7 @@ def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
 
 
 def marking(name: str) -> RoadKind | None:
-    """The kind of a painted divider by its nuScenes name; None if nothing is painted (NIL)."""
+    """The kind of a painted divider by its nuScenes name; None for no paint (NIL)."""
     if name == "NIL":
         return None
     style = "BROKEN" if "DASHED" in name else "SOLID"

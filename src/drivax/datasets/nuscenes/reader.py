@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from drivax.datasets.nuscenes.map import city
-from drivax.datasets.parsing import box_centre, check_finite, flatten, place_tags, windows_of
+from drivax.datasets.parsing import box_centre, check_finite, flatten, nonzero, place_tags, windows_of
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -28,6 +28,15 @@ _TABLES = (
     "category", "ego_pose", "instance", "log", "sample", "sample_annotation", "sample_data", "scene",
 )  # fmt: skip
 _OTHERS = ("attribute", "calibrated_sensor", "map", "sensor", "visibility", "lidarseg", "panoptic")
+#: Names of fields of these tables that are read, or need not be.
+_FIELDS = frozenset((
+    "token", "name", "description", "index", "translation", "rotation", "timestamp", "category_token",
+    "nbr_annotations", "first_annotation_token", "last_annotation_token", "logfile", "vehicle", "date_captured",
+    "location", "scene_token", "prev", "next", "sample_token", "instance_token", "visibility_token",
+    "attribute_tokens", "size", "num_lidar_pts", "num_radar_pts", "ego_pose_token", "calibrated_sensor_token",
+    "fileformat", "is_key_frame", "height", "width", "filename", "log_token", "nbr_samples", "first_sample_token",
+    "last_sample_token",
+))  # fmt: skip
 #: Keyframes are 0.5 s apart; the gap of a missing one is not interpolated.
 LONGEST_GAP_S = 0.75
 #: Scenes last 20 s; a longer one is damage.
@@ -138,7 +147,7 @@ def recording(scene: Scene, map_file: Path) -> Recording:
         tracks=tracks,
         features=features,
         tags={"source_format": "nuscenes"} | place_tags(scene.location),
-        lost=whole.lost,
+        lost=nonzero(whole.lost, unknown_fields=scene.unknown_fields),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )
 
@@ -210,6 +219,7 @@ class Scene:
         poses: Ego poses: time [s], x, y, heading; of the centre of the rear axle.
         observations: Annotations of every instance: time [s], x, y, heading [rad], length, width, height [m].
         kinds: Class of every instance.
+        unknown_fields: Number of tables and fields of unknown names.
     """
 
     name: str
@@ -219,11 +229,12 @@ class Scene:
     poses: Float64[Array, "pose 4"]
     observations: list[Float64[Array, "_ 7"]]
     kinds: list[AgentKind]
+    unknown_fields: int
 
 
 @dataclass
 class Tables:
-    """What is needed of a version's tables, in arrays of numbers.
+    """Content of a version's tables, in arrays of numbers.
 
     Attributes:
         scenes: Rows of ``scene.json``.
@@ -232,6 +243,7 @@ class Tables:
         poses: Scene row, time [s], x, y, heading of every lidar frame's pose.
         annotations: Sample row, instance row, x, y, heading, length, width, height.
         kinds: Class of every instance.
+        unknown_fields: Number of tables and fields of unknown names.
     """
 
     scenes: list[dict[str, str]]
@@ -241,6 +253,7 @@ class Tables:
     poses: Float64[Array, "pose 5"]
     annotations: Float64[Array, "annotation 8"]
     kinds: list[AgentKind]
+    unknown_fields: int
 
     @classmethod
     def read(cls, folder: Path) -> Tables:
@@ -271,9 +284,9 @@ class Tables:
         instance_index = {token: i for i, (token, _) in enumerate(instances)}
         poses = _poses(folder, sample_index, sample_scene)
         annotations = _annotations(folder, sample_index, instance_index)
-        return cls(
-            scenes, logs, sample_scene, sample_time, poses, annotations, [kind for _, kind in instances]
-        )
+        kinds = [kind for _, kind in instances]
+        unknown = _unknown_fields(folder)
+        return cls(scenes, logs, sample_scene, sample_time, poses, annotations, kinds, unknown)
 
     def scene(self, row: int) -> Scene:
         """One scene."""
@@ -296,7 +309,15 @@ class Tables:
             poses=_in_time(poses),
             observations=[_in_time(table[annotations[:, 1] == instance]) for instance in instances],
             kinds=[self.kinds[instance] for instance in instances],
+            unknown_fields=self.unknown_fields,
         )
+
+
+def _unknown_fields(folder: Path) -> int:
+    """Number of tables, and of fields in the first rows of those that are read, with unknown names."""
+    fields = {name for table in _TABLES for name in next(rows(folder / f"{table}.json"), {})}
+    tables = {path.stem for path in folder.glob("*.json")}
+    return len(fields - _FIELDS) + len(tables.difference(_TABLES, _OTHERS))
 
 
 def _in_time(table: Float64[Array, "row column"]) -> Float64[Array, "kept column"]:

@@ -43,7 +43,7 @@ _FASTEST_MPS = 45.0
 _MADE_UP_LIMITS = ("nuscenes", "lyft", "nuplan", "av2")
 #: Data sets with the drivable side on the left of road edges.
 _ORIENTED = ("womd",)
-#: Type names of MetaDrive (metadrive/type.py); others, such as sidewalks, are left out and counted.
+#: Type names of MetaDrive (metadrive/type.py); others, such as sidewalks, are dropped and counted.
 _KINDS = {
     "LANE_UNKNOWN": RoadKind.LANE_UNDEFINED,
     "LANE_SURFACE_STREET": RoadKind.LANE_SURFACE,
@@ -84,12 +84,12 @@ def outlines_on_left(lines: Sequence[Array]) -> list[Array]:
     if _PROBES * len(rings) * sum(map(len, rings)) > _MOST_COMPARISONS:
         raise DataError(f"an outline of {len(rings)} rings", cure=SKIP)
     depth = iter([_depth(points, [other for other in rings if other is not points]) for points in rings])
-    turned = []
+    oriented = []
     for points, closed in zip(lines, ring, strict=True):
         anticlockwise = closed and _area(points) > 0
         exterior = closed and next(depth) % 2 == 0
-        turned.append(points if closed and anticlockwise == exterior else points[::-1].copy())
-    return turned
+        oriented.append(points if closed and anticlockwise == exterior else points[::-1].copy())
+    return oriented
 
 
 def _area(ring: Array) -> float:
@@ -173,14 +173,14 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
     Raises:
         DataError: The map is too large.
     """
-    named = {name: body for key, body in table.items() if (name := as_text(key)) and isinstance(body, dict)}
-    numbers = sum(extent(value) for body in named.values() for value in body.values())
+    bodies = {name: body for key, body in table.items() if (name := as_text(key)) and isinstance(body, dict)}
+    numbers = sum(extent(value) for body in bodies.values() for value in body.values())
     if numbers > MOST_NUMBERS:
         raise DataError(f"a map of {numbers} numbers", cure=SKIP)
-    reading = _Reading(dataset, around, Names(list(named), bits=62), Counter(), set())
-    reading.lost["broken_features"] += len(table) - len(named)
-    reading.lost["unknown_fields"] += len({str(key) for body in named.values() for key in body} - _FIELDS)
-    read = {name: f for name, body in named.items() if (f := _feature(name, body, reading)) is not None}
+    reading = _Reading(dataset, around, Names(list(bodies), bits=62), Counter(), set())
+    reading.lost["broken_features"] += len(table) - len(bodies)
+    reading.lost["unknown_fields"] += len({str(key) for body in bodies.values() for key in body} - _FIELDS)
+    read = {name: f for name, body in bodies.items() if (f := _feature(name, body, reading)) is not None}
     features = list(read.values())
     total = sum(float(np.hypot(*np.diff(f.points[:, :2], axis=0).T).sum()) for f in features)
     if total > _LONGEST_M:
@@ -200,7 +200,7 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
 
 
 def _feature(name: str, body: Mapping[Any, Any], reading: _Reading) -> MapFeature | None:
-    """Return a map feature with z as stored in the file; None if it is skipped."""
+    """Return a map feature with z as in the file; None for one that is skipped."""
     kind = _KINDS.get(body["type"]) if isinstance(body.get("type"), str) else None
     feature_id = reading.names.get(name)
     if kind is None or feature_id is None:
@@ -234,7 +234,7 @@ def _feature(name: str, body: Mapping[Any, Any], reading: _Reading) -> MapFeatur
 
 
 def _points(name: str, kind: RoadKind, body: Mapping[Any, Any]) -> Array | None:
-    """The points as the file has them; None where there are none.
+    """Return the points as the file has them; None without any.
 
     The outlines of crosswalks and speed bumps are called ``polyline`` in the first form of the files.
     """
@@ -254,8 +254,8 @@ def _on_plane(points: Array) -> Array:
 
 def _limit(body: Mapping[Any, Any], reading: _Reading) -> float | None:
     """The speed limit in m/s; 0 in the file means unknown."""
-    given = ((body.get("speed_limit_mph"), parsing.MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
-    for value, unit in given:
+    limits = ((body.get("speed_limit_mph"), parsing.MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
+    for value, unit in limits:
         limit = as_float(value)
         if limit is not None and limit > 0:
             if reading.dataset in _MADE_UP_LIMITS or limit * unit > _FASTEST_MPS:
@@ -266,7 +266,7 @@ def _limit(body: Mapping[Any, Any], reading: _Reading) -> float | None:
 
 
 def _width(body: Mapping[Any, Any]) -> float | None:
-    """Median width of a lane over its points; None where it is missing or not plausible.
+    """Median width of a lane over its points; None for a missing or implausible one.
 
     The file pairs lane and boundary points by index, so distances reach 25 m; a missing side is a copy of the other.
     """

@@ -132,13 +132,13 @@ class _Machine:
         if not isinstance(module, str) or not isinstance(name, str):
             raise ValueError("a name that is not text")
         full = f"{_MODULES.get(module, module)}.{name}"
-        if full not in _NAMED and full not in _CALLED:
+        if full not in _NAMES and full not in _FUNCTIONS:
             raise DataError(f"names {full[:100]}, which is not data", cure=_DISTRUST)
         self.stack.append(_Global(full))
 
     def _call(self, argument: Any) -> None:
-        named, arguments = self._take(2)
-        make = _CALLED.get(named.name) if isinstance(named, _Global) else None
+        function, arguments = self._take(2)
+        make = _FUNCTIONS.get(function.name) if isinstance(function, _Global) else None
         if make is None or not isinstance(arguments, tuple):
             raise ValueError("a call of something else than a constructor")
         # Calls copy their arguments, and the memo can repeat the same argument.
@@ -148,7 +148,7 @@ class _Machine:
         try:
             self.stack.append(make(*arguments))
         except (TypeError, AttributeError) as error:
-            raise ValueError(f"odd arguments for {named.name}") from error
+            raise ValueError(f"odd arguments for {function.name}") from error
 
     def _build(self, argument: Any) -> None:
         (state,) = self._take(1)
@@ -213,7 +213,7 @@ def _new_dictionary(*arguments: Any) -> dict[Any, Any]:
     return {_hashable(key): value for items in pairs for key, value in _members(items)}
 
 
-def _encoded(text: Any, encoding: Any = "latin1") -> bytes:
+def _encode(text: Any, encoding: Any = "latin1") -> bytes:
     """Bytes, as protocols up to 2 hold them."""
     if not isinstance(text, str):
         raise ValueError("bytes of something else")
@@ -275,12 +275,12 @@ def _scalar(dtype: Any, content: Any = b"") -> Any:
 
 
 #: Names that may occur uncalled.
-_NAMED = frozenset((
+_NAMES = frozenset((
     "numpy.ndarray", "builtins.int", "builtins.long", "builtins.float", "builtins.str", "builtins.unicode",
     "builtins.bool", "builtins.list", "builtins.dict", "builtins.tuple",
 ))  # fmt: skip
 #: Constructors that may be called, and their substitutes.
-_CALLED: dict[str, Callable[..., Any]] = {
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "numpy._core.multiarray._reconstruct": _empty_array,
     "numpy._core.multiarray.scalar": _scalar,
     "numpy._core.numeric._frombuffer": _array,
@@ -291,14 +291,14 @@ _CALLED: dict[str, Callable[..., Any]] = {
     "builtins.frozenset": lambda items=(): frozenset(map(_hashable, _members(items))),
     "builtins.bytearray": lambda content=b"", encoding="latin1": _content(content),
     "builtins.bytes": lambda content=b"": _content(content),
-    "_codecs.encode": _encoded,
+    "_codecs.encode": _encode,
 }
 
 
 def _content(content: Any) -> bytes:
     """Bytes of a bytes-like value; an integer, which would allocate that many, is refused."""
     if isinstance(content, str):
-        return _encoded(content)
+        return _encode(content)
     if not isinstance(content, bytes | bytearray):
         raise ValueError("bytes of something else")
     return bytes(content)
@@ -391,6 +391,6 @@ class Names:
         self._numbers = dict(zip(names, numbers, strict=True))
 
     def get(self, value: Any) -> int | None:
-        """Return the number of a name; None where the file has no such name."""
+        """Return the number of a name; None for one that the file lacks."""
         name = as_text(value)
         return None if name is None else self._numbers.get(name)

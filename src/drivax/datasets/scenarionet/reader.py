@@ -79,7 +79,7 @@ _COLUMNS = {
     "valid": ((1,), np.inf),
 }
 #: States of tracks and lights that are not needed: what MetaDrive's own vehicles add.
-_NOT_NEEDED = ("angular_velocity", "steering", "throttle_brake", "action")
+_OTHERS = ("angular_velocity", "steering", "throttle_brake", "action")
 #: A longer last step is motion.
 _MOVED_M = 0.05
 #: A scenario file names its dictionaries within this many bytes.
@@ -123,7 +123,7 @@ class ScenarioNet:
 
     def count(self, path: Path) -> int:
         """Return the number of windows, by the length that the file names at its beginning."""
-        steps = _named_length(_head(path))
+        steps = _length_of(_head(path))
         return 0 if steps is None else parsing.windows_of(steps)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
@@ -153,7 +153,7 @@ def _load(path: Path) -> Any:
         raise DataError(f"cannot be read ({error.strerror})", file=path, cure="check the path") from error
 
 
-def _named_length(head: bytes) -> int | None:
+def _length_of(head: bytes) -> int | None:
     """The value of the key ``length`` in the beginning of a pickle."""
     last = None
     with contextlib.suppress(ValueError):  # the beginning is cut anywhere
@@ -200,14 +200,14 @@ def decode(tree: Any) -> Recording:
         tracks=tracks,
         features=features,
         lights=lights,
-        to_predict=_named_rows(metadata.get("tracks_to_predict"), rows),
-        of_interest=_named_rows(metadata.get("objects_of_interest"), rows),
+        to_predict=_track_rows(metadata.get("tracks_to_predict"), rows),
+        of_interest=_track_rows(metadata.get("objects_of_interest"), rows),
         tags=tags | ({} if kind is None else {"scenario_types": kind[:64]}),
         lost=parsing.nonzero(**lost),
         flags=flags,
         split_gap_m=_WOMD_GAP_M if dataset == "womd" else None,
     )
-    return parsing.shifted(recording, _offset(metadata, table, dataset))
+    return parsing.shift(recording, _offset(metadata, table, dataset))
 
 
 def _offset(metadata: Mapping[Any, Any], table: Mapping[str, Any], dataset: str) -> Array:
@@ -243,20 +243,20 @@ def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
 
 def _dataset(tree: Any, metadata: Mapping[Any, Any]) -> str:
     """The origin of the data in drivax' words."""
-    given = as_text(metadata.get("dataset")) or as_text(metadata.get("coordinate")) or ""
+    name = as_text(metadata.get("dataset")) or as_text(metadata.get("coordinate")) or ""
     version = as_text(tree.get("version")) or ""
     # Early files name the data set in their version only.
-    word = next((word for word in ("nuscenes", "nuplan") if version.startswith(word)), given.lower())
+    word = next((word for word in ("nuscenes", "nuplan") if version.startswith(word)), name.lower())
     word = _DATASETS.get(word, word)
     return word if word.isascii() and 0 < len(word) <= 16 and "\0" not in word else _NAME
 
 
 def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
-    named = as_text(metadata.get("sdc_id"))
-    row = rows.get("ego" if named is None else named)
+    ego = as_text(metadata.get("sdc_id"))
+    row = rows.get("ego" if ego is None else ego)
     if row is not None:
         return row
-    raise DataError(f"the ego {(named or 'is not named')[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
+    raise DataError(f"the ego {(ego or 'is not named')[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
 
 
 def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Tracks, Counter[str]]:
@@ -303,18 +303,18 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Track
         ),
         track_id=np.array([names.get(name) for name in table], np.int64),
     )
-    unknown = {str(name) for state in states for name in state} - {*_COLUMNS, *_NOT_NEEDED}
+    unknown = {str(name) for state in states for name in state} - {*_COLUMNS, *_OTHERS}
     return tracks, Counter(unknown_fields=len(unknown))
 
 
 def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array | None:
-    """One state of one track as ``[time, column]``; None where it is missing."""
-    given = state.get(name)
-    if given is None:
+    """One state of one track as ``[time, column]``; None for a missing one."""
+    series = state.get(name)
+    if series is None:
         return None
-    if count_rows(given) != steps:
-        raise DataError(f"{what} has {count_rows(given)} values of {name}, {steps} steps", cure=SKIP)
-    values = floats(given, f"{what}: {name}")
+    if count_rows(series) != steps:
+        raise DataError(f"{what} has {count_rows(series)} values of {name}, {steps} steps", cure=SKIP)
+    values = floats(series, f"{what}: {name}")
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or values.shape[1] not in _COLUMNS[name][0]:
         raise DataError(f"{what} has a {name} of shape {values.shape}", cure=SKIP)
@@ -358,10 +358,10 @@ def _with_heights(tracks: Tracks, roads: RoadMap) -> tuple[Tracks, tuple[MapFeat
 
 def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
     """Seconds of all steps; 10 Hz where the file has no timestamps."""
-    given = metadata.get("ts")
-    if given is None:
+    stamps = metadata.get("ts")
+    if stamps is None:
         return np.arange(steps) * DT_S
-    times = floats(given, "timestamps")
+    times = floats(stamps, "timestamps")
     if times.shape != (steps,):
         raise DataError(f"timestamps of shape {times.shape}, {steps} steps", cure=SKIP)
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
@@ -371,16 +371,16 @@ def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
 
 def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
     """The current step; files of long recordings name none, or the first."""
-    named = as_int(metadata.get("current_time_index"))
-    if named is None:
+    step = as_int(metadata.get("current_time_index"))
+    if step is None:
         return min(CURRENT_STEP, steps - 1)
-    if named >= steps:
-        raise DataError(f"current_time_index is {named} of {steps} steps", cure=SKIP)
-    return named
+    if step >= steps:
+        raise DataError(f"current_time_index is {step} of {steps} steps", cure=SKIP)
+    return step
 
 
-def _named_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
-    """Rows of the tracks in a list of names or a dictionary by name; unknown names are left out."""
+def _track_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
+    """Rows of the tracks in a list of names or a dictionary by name, without unknown names."""
     names = list(value) if isinstance(value, dict) else as_list(value)
     numbers = (rows.get(name) for item in names if (name := as_text(item)) is not None)
     return tuple(row for row in numbers if row is not None)
@@ -418,13 +418,13 @@ def _lights(
                 continue
             lost["unknown_light_states"] += known is None
             lights.observe(step, lane, LightState.UNKNOWN if known is None else known, place.tolist())
-    return lights.collected(roads.features)[0]
+    return lights.collect(roads.features)[0]
 
 
 def _stop_points(light: Mapping[Any, Any], steps: int, what: str) -> Array:
     """Stop points (x, y and maybe z): one, or one per step in the light's ``state`` in the first form of the files."""
-    named = light.get("stop_point", light["state"].get("stop_point"))
-    points = np.zeros((0, 3)) if named is None else np.atleast_2d(floats(named, f"{what}: stop_point"))
+    stops = light.get("stop_point", light["state"].get("stop_point"))
+    points = np.zeros((0, 3)) if stops is None else np.atleast_2d(floats(stops, f"{what}: stop_point"))
     usable = len(points) in (1, steps) and points.shape[1] in (2, 3) and (np.abs(points) < _FARTHEST_M).all()
     return points if usable else np.zeros((0, 3))
 

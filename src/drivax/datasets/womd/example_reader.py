@@ -41,7 +41,7 @@ class WomdExample(womd.TfRecordReader):
         return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by the spacing of map points, truncated map, paths."""
+        """Describe the first record: version by the spacing of map points, truncated map, paths."""
         recording = self.first(path)
         no_graph = "no lane graph and no speed limits: lanes are chained by geometry"
         notes = [*womd.notes_of(recording), no_graph]
@@ -64,20 +64,20 @@ class WomdExample(womd.TfRecordReader):
 def decode(payload: bytes) -> Recording:
     """The recording in a serialised tf.Example; rows without an id are padding."""
     table = features_of(payload)
-    used = np.flatnonzero(table.numbers("state/id") != -1)
-    return recording(table, payload, used, womd.DATASET, womd.EXAMPLE_FORMAT)
+    rows = np.flatnonzero(table.numbers("state/id") != -1)
+    return recording(table, payload, rows, womd.DATASET, womd.EXAMPLE_FORMAT)
 
 
 def recording(
-    table: ExampleFeatures, payload: bytes, used: Array, dataset: str, source_format: str
+    table: ExampleFeatures, payload: bytes, rows: Array, dataset: str, source_format: str
 ) -> Recording:
-    """The recording in the rows used.
+    """Return the recording in some rows.
 
     Invalid entries (-1 in the file) become zeros, headings are wrapped. Lights are keyed by lane because the 16 slots
     hold different lanes over time. ``path_samples`` count as lost: the route among them was marked with the log's
     future.
     """
-    tracks = _tracks(table, used)
+    tracks = _tracks(table, rows)
     features, truncated = _map_features(table)
     lights, unplaced = _lights(table, features)
     scenario_id = table.scenario_id(payload)
@@ -85,14 +85,14 @@ def recording(
         scenario_id=scenario_id,
         dataset=dataset,
         segment=parsing.segment_of(scenario_id),
-        timestamps_s=_timestamps(table, used, tracks.valid),
+        timestamps_s=_timestamps(table, rows, tracks.valid),
         current_step=table.spans["past"],
-        ego=_ego_row(table, used),
+        ego=_ego_row(table, rows),
         tracks=tracks,
         features=features,
         lights=lights,
-        to_predict=table.marked("state/tracks_to_predict", used),
-        of_interest=table.marked("state/objects_of_interest", used),
+        to_predict=table.marked("state/tracks_to_predict", rows),
+        of_interest=table.marked("state/objects_of_interest", rows),
         tags={"source_format": source_format},
         lost=parsing.nonzero(
             paths=_paths(table),
@@ -103,12 +103,12 @@ def recording(
         flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
         split_gap_m=2.0 if _is_coarse(features) else 1.0,  # twice the nominal spacing of points
     )
-    return parsing.shifted(read, table.origin())
+    return parsing.shift(read, table.origin())
 
 
-def _track_ids(features: ExampleFeatures, used: Array) -> Array:
-    """Ids of the rows used: stored as floats, but WOMD's are far below 2**24."""
-    ids = features.numbers("state/id")[used]
+def _track_ids(features: ExampleFeatures, rows: Array) -> Array:
+    """Ids of the rows: stored as floats, but WOMD's are far below 2**24."""
+    ids = features.numbers("state/id")[rows]
     if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
         raise DataError("state/id contains numbers that are not exact integers", cure=SKIP)
     if (ids < 0).any() or len(np.unique(ids)) < len(ids):
@@ -116,17 +116,17 @@ def _track_ids(features: ExampleFeatures, used: Array) -> Array:
     return ids.astype(np.int64)
 
 
-def _tracks(features: ExampleFeatures, used: Array) -> Tracks:
-    """The tracks in the rows used."""
-    track_id = _track_ids(features, used)
-    valid = features.over_time("valid", used) == 1
+def _tracks(features: ExampleFeatures, rows: Array) -> Tracks:
+    """Return the tracks in the rows."""
+    track_id = _track_ids(features, rows)
+    valid = features.over_time("valid", rows) == 1
 
     def measured(*names: str) -> Array:
-        values = [np.where(valid, features.over_time(name, used).astype(np.float64), 0.0) for name in names]
+        values = [np.where(valid, features.over_time(name, rows).astype(np.float64), 0.0) for name in names]
         parsing.check_finite(*values)
         return values[0] if len(values) == 1 else np.stack(values, axis=-1)
 
-    kinds = np.nan_to_num(features.numbers("state/type", (features.numbers("state/id").size,))[used])
+    kinds = np.nan_to_num(features.numbers("state/type", (features.numbers("state/id").size,))[rows])
     return Tracks(
         xy=measured("x", "y"),
         z=measured("z"),
@@ -139,15 +139,15 @@ def _tracks(features: ExampleFeatures, used: Array) -> Tracks:
     )
 
 
-def _timestamps(features: ExampleFeatures, used: Array, valid: Array) -> Array:
+def _timestamps(features: ExampleFeatures, rows: Array, valid: Array) -> Array:
     """Seconds of every step; where no valid state has a time, 10 Hz from the nearest step that has one."""
-    micros = np.where(valid, features.over_time("timestamp_micros", used), -1).max(axis=0, initial=-1)
+    micros = np.where(valid, features.over_time("timestamp_micros", rows), -1).max(axis=0, initial=-1)
     return parsing.seconds(np.where(micros >= 0, micros * 1e-6, np.nan))
 
 
-def _ego_row(features: ExampleFeatures, used: Array) -> int:
-    """The ego's row among the rows used."""
-    ego = features.marked("state/is_sdc", used)
+def _ego_row(features: ExampleFeatures, rows: Array) -> int:
+    """Return the place of the ego among the rows."""
+    ego = features.marked("state/is_sdc", rows)
     if len(ego) != 1:
         raise DataError(f"state/is_sdc marks {len(ego)} rows, not 1", cure=SKIP)
     return ego[0]
@@ -170,7 +170,7 @@ def _lights(features: ExampleFeatures, mapped: Sequence[MapFeature]) -> tuple[tu
                     start + step, int(lanes[step, slot]), int(states[step, slot]), points[step, slot].tolist()
                 )
         start += steps
-    return collector.collected(mapped)
+    return collector.collect(mapped)
 
 
 def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bool]:
@@ -189,7 +189,7 @@ def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bo
     for group in _groups(ids, keep):
         kind = RoadKind(int(kinds[group[0]]))
         limit = float(limits[group].max()) * parsing.MPS_PER_MPH if kind in LANE_KINDS else 0.0
-        line = _unclosed(points[group]) if kind in POLYGON_KINDS else points[group]
+        line = _open_ring(points[group]) if kind in POLYGON_KINDS else points[group]
         mapped.append(MapFeature(int(ids[group[0]]), kind, line, limit_mps=limit if limit > 0 else None))
     return tuple(mapped), bool(valid.all())
 
@@ -210,7 +210,7 @@ def _limits(features: ExampleFeatures, count: int) -> Array:
     return np.where(np.isfinite(limits) & (limits > 0), limits, 0.0)
 
 
-def _unclosed(points: Array) -> Array:
+def _open_ring(points: Array) -> Array:
     """A ring without its repeated last point: map features are closed implicitly."""
     closed = len(points) > 1 and np.allclose(points[0], points[-1], rtol=0, atol=1e-3)
     return points[:-1] if closed else points
@@ -222,7 +222,7 @@ def _is_coarse(mapped: Sequence[MapFeature]) -> bool:
 
 
 def _paths(features: ExampleFeatures) -> int:
-    """How many paths of the ego the file holds."""
+    """Number of paths of the ego in the file."""
     if not (features.has("path_samples/valid") and features.has("path_samples/on_route")):
         return 0
     valid = features.numbers("path_samples/valid") == 1

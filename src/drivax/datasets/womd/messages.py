@@ -1,16 +1,17 @@
 """Protocol-buffer messages of the Waymo Open Motion Dataset and of tf.Example, built when first used.
 
-Only what drivax reads is declared (field numbers of ``waymo_open_dataset/protos/{scenario,map}.proto`` and
-``tensorflow/core/example``); undeclared fields, camera tokens and compressed lidar among them, are skipped. Enums
-are declared as int32, which is the same on the wire, so that values of later versions are kept. The messages live
-in a descriptor pool of their own and so never clash with an installed ``waymo-open-dataset`` package.
+Declared are the fields of ``waymo_open_dataset/protos/{scenario,map}.proto`` and ``tensorflow/core/example``; those
+that drivax does not need, camera tokens and compressed lidar among them, as bytes. Others are dropped and counted
+(:func:`unknown_fields`). Enums are declared as int32, which is the same on the wire, so that values of later versions
+are kept. The messages live in a descriptor pool of their own and so never clash with an installed
+``waymo-open-dataset`` package.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
@@ -48,7 +49,8 @@ _MESSAGES: dict[str, tuple[_Field, ...]] = {
     "Scenario": _fields(
         "timestamps_seconds 1 double*, tracks 2 Track*, objects_of_interest 4 int32*, scenario_id 5 string,"
         "sdc_track_index 6 int32, dynamic_map_states 7 DynamicMapState*, map_features 8 MapFeature*,"
-        "current_time_index 10 int32, tracks_to_predict 11 RequiredPrediction*"
+        "current_time_index 10 int32, tracks_to_predict 11 RequiredPrediction*, compressed_frame_laser_data 12 bytes*,"
+        "frame_camera_tokens 13 bytes*"
     ),
     "RequiredPrediction": _fields("track_index 1 int32, difficulty 2 int32"),
     "Track": _fields("id 1 int32, object_type 2 int32, states 3 bytes*"),
@@ -65,9 +67,13 @@ _MESSAGES: dict[str, tuple[_Field, ...]] = {
     ),
     "Lane": _fields(
         "speed_limit_mph 1 double, type 2 int32, interpolating 3 bool, polyline 8 bytes*, entry_lanes 9 int64*,"
-        "exit_lanes 10 int64*, left_neighbors 11 LaneNeighbor*, right_neighbors 12 LaneNeighbor*"
+        "exit_lanes 10 int64*, left_neighbors 11 LaneNeighbor*, right_neighbors 12 LaneNeighbor*,"
+        "left_boundaries 13 bytes*, right_boundaries 14 bytes*"
     ),
-    "LaneNeighbor": _fields("feature_id 1 int64"),
+    "LaneNeighbor": _fields(
+        "feature_id 1 int64, self_start_index 2 int32, self_end_index 3 int32, neighbor_start_index 4 int32,"
+        "neighbor_end_index 5 int32, boundaries 6 bytes*"
+    ),
     "Polyline": _fields("type 1 int32, polyline 2 bytes*"),
     "StopSign": _fields("lane 1 int64*, position 2 bytes"),
     "Polygon": _fields("polygon 1 bytes*"),
@@ -79,7 +85,7 @@ _MESSAGES: dict[str, tuple[_Field, ...]] = {
     "BytesList": _fields("value 1 bytes*"),
     "FloatList": _fields("value 1 float*"),
     "Int64List": _fields("value 1 int64*"),
-    # What tells the Waymo perception and end-to-end driving data sets from motion data.
+    # Messages of the Waymo perception and end-to-end driving data sets, to tell them from motion data.
     "Context": _fields("name 1 bytes"),
     "Frame": _fields(
         "context 1 Context, timestamp_micros 2 int64, pose 3 bytes, images 4 bytes*, lasers 5 bytes*"
@@ -91,7 +97,7 @@ _PACKAGE = "drivax"
 
 
 def parse(name: str, payload: bytes) -> Any | None:
-    """The message of this name in a payload, or None if the payload is no such message."""
+    """Parse a payload as the message of this name; None for anything else."""
     message = message_class(name)
     from google.protobuf.message import DecodeError
 
@@ -99,6 +105,22 @@ def parse(name: str, payload: bytes) -> Any | None:
         return message.FromString(payload)
     except DecodeError:
         return None
+
+
+def unknown_fields(message: Any, payload: bytes) -> set[tuple[str, int]]:
+    """Drop the undeclared fields of a message and its parts; return their message and number, read from ``payload``."""
+    size = message.ByteSize()
+    message.DiscardUnknownFields()
+    return set() if message.ByteSize() == size else set(_undeclared(message.FromString(payload)))
+
+
+def _undeclared(message: Any) -> Iterator[tuple[str, int]]:
+    fields = import_extra("google.protobuf.unknown_fields").UnknownFieldSet(message)
+    yield from ((message.DESCRIPTOR.name, field.field_number) for field in fields)
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for part in (value,) if hasattr(value, "ListFields") else value:
+                yield from _undeclared(part)
 
 
 @cache
@@ -217,7 +239,7 @@ class ExampleFeatures:
         self._values: Mapping[str, Any] = {entry.key: entry.value for entry in message.features.feature}
 
     def _list(self, name: str) -> tuple[str | None, Sequence[Any]]:
-        """Which list holds a feature, and its values."""
+        """Kind of list of a feature, and its values."""
         value = self._values.get(name)
         kind = None if value is None else value.WhichOneof("kind")
         return kind, () if kind is None else getattr(value, kind).value
@@ -248,11 +270,11 @@ class ExampleFeatures:
             raise DataError(f"feature {name} contains floats, not integers", cure=SKIP)
         return values
 
-    def marked(self, name: str, used: _Array) -> tuple[int, ...]:
-        """Rows among those used whose value is 1; none if the file lacks the feature."""
+    def marked(self, name: str, rows: _Array) -> tuple[int, ...]:
+        """Places in ``rows`` with the value 1; none if the file lacks the feature."""
         if not self.has(name):
             return ()
-        values = self.numbers(name, (self.numbers("state/id").size,))[used]
+        values = self.numbers(name, (self.numbers("state/id").size,))[rows]
         return tuple(np.flatnonzero(values == 1).tolist())
 
     def scenario_id(self, payload: bytes) -> str:
@@ -262,7 +284,7 @@ class ExampleFeatures:
         return text or hashlib.sha256(payload).hexdigest()[:16]
 
     def unknown(self) -> int:
-        """How many features have names that neither the data set nor ScenarioMax use: a renamed one may be needed."""
+        """Number of features with names that neither the data set nor ScenarioMax uses."""
         return sum(_KNOWN.fullmatch(str(name)) is None for name in self._values)
 
     def origin(self) -> Float64[np.ndarray, "3"]:
@@ -290,10 +312,10 @@ class ExampleFeatures:
             raise DataError(f"state/current has {steps['current']} steps, not 1", cure=SKIP)
         return steps
 
-    def over_time(self, name: str, used: _Array) -> _Array:
-        """``state/{past,current,future}/<name>`` joined, of the rows used: ``[track, time]``."""
+    def over_time(self, name: str, rows: _Array) -> _Array:
+        """``state/{past,current,future}/<name>`` joined, of the rows: ``[track, time]``."""
         count = self.numbers("state/id").size
         spans = [(span, steps) for span, steps in self.spans.items() if steps]
         return np.concatenate(
-            [self.numbers(f"state/{span}/{name}", (count, steps))[used] for span, steps in spans], axis=1
+            [self.numbers(f"state/{span}/{name}", (count, steps))[rows] for span, steps in spans], axis=1
         )

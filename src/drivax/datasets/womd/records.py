@@ -1,4 +1,4 @@
-"""What the formats of motion data in TFRecord files share: detection, the base of their readers, object types."""
+"""Common parts of the formats of motion data in TFRecord files: detection, base of the readers, object types."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _SIGNS = 2
 
 
 def flavour(payload: bytes) -> str | None:
-    """The format of a record's payload by its content, None if it is no known motion data."""
+    """Detect the format of a payload by its content; None for anything but motion data."""
     example = parse("Example", payload)
     if example is not None and any(entry.key == "state/current/x" for entry in example.features.feature):
         return SCENARIOMAX_FORMAT if scenariomax_signs(ExampleFeatures(example)) >= _SIGNS else EXAMPLE_FORMAT
@@ -43,7 +43,7 @@ def flavour(payload: bytes) -> str | None:
 
 
 def scenariomax_signs(features: ExampleFeatures) -> int:
-    """How many of ScenarioMax's three signs an example shows; WOMD's examples show none.
+    """Count which of ScenarioMax's three signs an example shows; WOMD's examples show none.
 
     The prediction difficulty is missing; tracks are numbered 0, 1, 2, ... with the ego first; all times are -1.
     """
@@ -132,7 +132,7 @@ def agent_kind(code: int) -> AgentKind:
 
 
 def notes_of(recording: Recording) -> tuple[str, ...]:
-    """What a user should know about recordings like this one: length, future, lights."""
+    """Notes for users about recordings like this one: length, future, lights."""
     steps, now = len(recording.timestamps_s), recording.current_step
     notes = [f"{steps} steps, current step {now}"]
     if parsing.windows_of(steps) > 1:

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd.messages import POINTS, SKIP, STATES, parse, read_table
+from drivax.datasets.womd.messages import POINTS, SKIP, STATES, parse, read_table, unknown_fields
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -37,7 +37,7 @@ class WomdScenario(womd.TfRecordReader):
         return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by kinds of features, lane graph, lights."""
+        """Describe the first record: version by kinds of features, lane graph, lights."""
         recording = self.first(path)
         lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
         linked = any(lane.successors or lane.predecessors for lane in lanes)
@@ -54,7 +54,7 @@ def decode(payload: bytes) -> Recording:
     """The recording in a serialised ``Scenario``.
 
     Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad), invalid
-    states are zeros (files keep a z there), speed limits are m/s, None for 0. Dangling links are kept.
+    states are zeros (files keep a z there), speed limits are m/s (0 in the file is unknown). Dangling links are kept.
     """
     message = parse("Scenario", payload)
     if message is None or not message.scenario_id:
@@ -80,9 +80,19 @@ def decode(payload: bytes) -> Recording:
         # These are track ids, tracks_to_predict are rows.
         of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
         tags={"source_format": womd.SCENARIO_FORMAT},
-        lost=lost | parsing.nonzero(lights_without_place=unplaced),
+        lost=parsing.nonzero(
+            lost, lights_without_place=unplaced, unknown_fields=_unknown_fields(message, payload)
+        ),
         split_gap_m=_SPLIT_GAP_M,
     )
+
+
+def _unknown_fields(message: Any, payload: bytes) -> int:
+    """Number of fields of unknown numbers; states, which are kept as bytes, are examined once per length."""
+    states = {len(state): state for track in message.tracks for state in track.states}
+    parsed = ((parse(STATES.name, state), state) for state in states.values())
+    in_states = (unknown_fields(state, blob) for state, blob in parsed if state is not None)
+    return len(unknown_fields(message, payload).union(*in_states))
 
 
 def _check(message: Any, steps: int) -> None:
@@ -128,7 +138,7 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
         for lane in state.lane_states:
             point = lane.stop_point
             lights.observe(step, lane.lane, lane.state, (point.x, point.y, point.z))
-    return lights.collected(features)
+    return lights.collect(features)
 
 
 def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:

@@ -59,9 +59,9 @@ def varints(values: _Array) -> bytes:
     bits = values.reshape(-1, 1).astype(np.int64).view(np.uint64)
     groups = bits >> (np.uint64(7) * _GROUPS)
     more = groups >= 128
-    used = np.concatenate((np.ones_like(more[:, :1]), more[:, :-1]), axis=1)
-    encoded = (groups & np.uint64(127)) | (more.astype(np.uint64) << np.uint64(7))
-    return encoded.astype(np.uint8)[used].tobytes()
+    is_written = np.concatenate((np.ones_like(more[:, :1]), more[:, :-1]), axis=1)
+    content = (groups & np.uint64(127)) | (more.astype(np.uint64) << np.uint64(7))
+    return content.astype(np.uint8)[is_written].tobytes()
 
 
 def shard_name(name: str, number: int, shards: int) -> str:
@@ -75,10 +75,10 @@ def write_record(file: BinaryIO, payload: bytes) -> None:
     length = struct.pack("<Q", len(payload))
     for part in (length, payload):
         file.write(part)
-        file.write(struct.pack("<I", masked(crc32c(part))))
+        file.write(struct.pack("<I", mask_crc(crc32c(part))))
 
 
-def masked(crc: int) -> int:
+def mask_crc(crc: int) -> int:
     """TFRecord's mask of a CRC-32C: rotate right by 15 bits, add a constant, modulo 2**32."""
     return (((crc >> 15) | (crc << 17)) + _MASK) & 0xFFFFFFFF
 
@@ -122,13 +122,13 @@ class _Lost(DataError):
 
 
 def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> bytes | None:
-    """The payload of the next record, None if its checksum differs."""
+    """Read the payload of the next record; None for a wrong checksum."""
     start = file.tell()
     header = file.read(_HEADER_BYTES)
     if len(header) < _HEADER_BYTES:
         raise _Lost(f"truncated: {len(header)} bytes where a record's header of {_HEADER_BYTES} should be")
     length, length_crc = struct.unpack("<QI", header)
-    if masked(crc32c(header[:8])) != length_crc:
+    if mask_crc(crc32c(header[:8])) != length_crc:
         raise _bad_length(header, start)
     left = size - file.tell()
     if length > _LONGEST_BYTES or length + _FOOTER_BYTES > left:
@@ -137,7 +137,7 @@ def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> byte
     footer = file.read(_FOOTER_BYTES)
     if len(footer) < _FOOTER_BYTES:
         raise _Lost("the file became shorter while it was read")
-    return payload if masked(crc32c(payload)) == struct.unpack("<I", footer)[0] else None
+    return payload if mask_crc(crc32c(payload)) == struct.unpack("<I", footer)[0] else None
 
 
 def count_records(path: str | Path) -> int:
@@ -163,7 +163,7 @@ def looks_framed(path: str | Path) -> bool:
     except (OSError, ValueError):
         return False
     whole = len(header) == _HEADER_BYTES
-    return whole and masked(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
+    return whole and mask_crc(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
 
 
 def _crc32c_slowly(data: bytes) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from drivax.errors import DataError
-from drivax.scenario.build.grid import EDGE_BLOCK, LANE_BLOCK, GridSegments, arrange, cell_sides
+from drivax.scenario.build.grid import EDGE_BLOCK, LANE_BLOCK, GridSegments, arrange, cell_sides, ringed_cells
 from drivax.scenario.build.lanes import (
     LaneGraph,
     LaneSegments,
@@ -103,6 +103,7 @@ class Parts:
     routes: RouteSet
     grid: GridSegments
     sides: Int[Array, " cell"]
+    ringed: bool
     roads: RoadLines
     polylines: Int[Array, " polyline"]
     rows: RoadRows
@@ -167,6 +168,8 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     preferred = (*recording.to_predict, *recording.of_interest)
     placement = place(tracks, preferred, capacity.agents, capacity.parked)
     edges, lanes = (segments.take(segments.block == block) for block in (EDGE_BLOCK, LANE_BLOCK))
+    closed = roads.closed[edges.polyline]
+    ringed = ringed_cells(grid.grid, edges, closed, path, MARGIN_M)
     on_graph = LaneSegments.of(segments, graph)
     parts = Parts(
         tracks=tracks,
@@ -175,7 +178,8 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
         graph=graph,
         routes=_renumber(routes, keep, whole.count),
         grid=grid,
-        sides=cell_sides(grid.grid, edges, lanes.middle, roads.rings_closed),
+        sides=cell_sides(grid.grid, edges, lanes.middle, closed, ringed),
+        ringed=bool(ringed.any()),
         roads=roads,
         polylines=polylines,
         rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),
@@ -289,7 +293,7 @@ def _flags(recording: Recording, parts: Parts) -> Flag:
         (Flag.LIGHTS, len(parts.lights.z) > 0),
         (Flag.NO_FUTURE, len(recording.timestamps_s) < LEAST_STEPS),
         (Flag.DEFAULT_SIZES, parts.tracks.has_default_size[np.append(slots.moving, slots.parked)].any()),
-        (Flag.CLOSED_EDGES, parts.roads.rings_closed),
+        (Flag.CLOSED_EDGES, parts.ringed),
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
         (Flag.ROUTE, parts.routes.on_lanes),
         (Flag.DEFAULT_LIMITS, ((parts.graph.limit <= 0) & among(parts.graph.kind, _LIMITED_KINDS)).any()),

@@ -49,6 +49,12 @@ class Grid:
         origin = (centre - size / 2).astype(np.float32).astype(np.float64)
         return cls(origin, capacity.cell_m, capacity.grid)
 
+    @property
+    def centres(self) -> Float[Array, "cell 2"]:
+        """Centre of every cell, row-major."""
+        along = (np.arange(self.side) + 0.5) * self.cell_m
+        return self.origin + np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+
     def column_row(self, xy: Float[Array, "point 2"]) -> Int[Array, "point 2"]:
         """Column and row of the cell of each point; may lie outside the square."""
         return np.floor((xy - self.origin) / self.cell_m).astype(np.int64)
@@ -147,14 +153,29 @@ def arrange(
     )
 
 
+def ringed_cells(
+    grid: Grid, edges: Segments, closed: Bool[Array, " edge"], path: Float[Array, "step 2"], margin_m: float
+) -> Bool[Array, " cell"]:
+    """Mask of the cells that are known to be road or not however far the next edge is, because edges are closed rings.
+
+    All cells if each edge of the source is part of a closed ring (``closed``). If this holds for those in the box of
+    ``path`` widened by the margin, the cells in this box. Else none.
+    """
+    near = inside_box(edges.middle, path, margin_m)
+    if not len(near) or closed.all():
+        return np.full(grid.side**2, len(near) > 0)
+    return inside_box(grid.centres, path, margin_m) & (near.any() and closed[near].all())
+
+
 def cell_sides(
-    grid: Grid, edges: Segments, lanes: Float[Array, "point 2"], rings_closed: bool
-) -> Int32[Array, " cell"]:
+    grid: Grid, edges: Segments, lanes: Float[Array, "point 2"], closed: Bool[Array, " edge"],
+    ringed: Bool[Array, " cell"],
+) -> Int32[Array, " cell"]:  # fmt: skip
     """Sides of the 3 x 3 side cells of every grid cell, packed by :func:`pack_sides`.
 
     The nearest of ``edges`` (all of the source, also those outside the crop) decides: its left is drivable; beyond the
     end of an open edge the side is unknown. Side cells with a lane centre (``lanes``) are never off the road. Cells out
-    of reach of all edges get a side only if every road edge is a closed ring.
+    of reach of all edges get a side only if they are ``ringed`` (:func:`ringed_cells`).
     """
     fine = Grid(grid.origin, grid.cell_m / SPLIT, grid.side * SPLIT)
     if not len(edges):
@@ -166,8 +187,8 @@ def cell_sides(
     lane_cells = fine.cell(lanes[fine.contains(lanes)])
     on_road = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
     side[on_road] = 0
-    if rings_closed:
-        square = _sides_within_rings(grid, edges).reshape(grid.side, grid.side)
+    if ringed.any():
+        square = _sides_within_rings(grid, edges, closed, ringed).reshape(grid.side, grid.side)
         within = square.repeat(SPLIT, axis=0).repeat(SPLIT, axis=1).ravel()
         side = np.where(within != 0, within, side)
     return pack_sides(side.reshape(fine.side, fine.side))
@@ -240,8 +261,10 @@ def _open_ends(a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> tu
     return ~np.isin(first, last), ~np.isin(last, first)
 
 
-def _sides_within_rings(grid: Grid, edges: Segments) -> Int8[Array, " cell"]:
-    """Sides of cells far from every edge, if all edges are closed rings: 1 drivable, -1 not, 0 unknown.
+def _sides_within_rings(
+    grid: Grid, edges: Segments, closed: Bool[Array, " edge"], ringed: Bool[Array, " cell"]
+) -> Int8[Array, " cell"]:
+    """Sides of ringed cells far from every edge: 1 drivable, -1 not, 0 unknown.
 
     No edge crosses a cell whose 3 x 3 block holds none, so the whole cell lies on one side. Rings have the drivable
     side on their left (outer rings counter-clockwise, islands clockwise), so the winding number of its centre is one
@@ -249,15 +272,16 @@ def _sides_within_rings(grid: Grid, edges: Segments) -> Int8[Array, " cell"]:
     2001).
     """
     side = np.zeros(grid.side**2, dtype=np.int8)
-    winding = _winding_at_centres(grid, edges)
-    if winding.min() < 0 < winding.max():
+    rings = edges.take(closed)
+    winding = _winding_at_centres(grid, rings).ravel()
+    low, high = winding[ringed].min(), winding[ringed].max()
+    if low < 0 < high:
         return side  # Rings contradict each other.
-    drivable = winding > 0 if winding.max() > 0 else winding == 0
-    corner = np.concatenate((edges.a[:, :2], edges.b[:, :2]))
-    centre = grid.origin + (np.arange(grid.side)[:, None] + 0.5) * grid.cell_m
-    within = (centre >= corner.min(axis=0)) & (centre <= corner.max(axis=0))
-    known = (within[None, :, 0] & within[:, None, 1]) & ~_near_edge(grid, edges)
-    side.reshape(grid.side, grid.side)[known] = np.where(drivable[known], 1, -1)
+    drivable = winding > 0 if high > 0 else winding == 0
+    corner = np.concatenate((rings.a[:, :2], rings.b[:, :2]))
+    within = (grid.centres >= corner.min(axis=0)) & (grid.centres <= corner.max(axis=0))
+    known = ringed & within.all(axis=1) & ~_near_edge(grid, edges).ravel()
+    side[known] = np.where(drivable[known], 1, -1)
     return side
 
 

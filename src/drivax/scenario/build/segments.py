@@ -45,12 +45,6 @@ class RoadLines:
     closed: Bool[Array, " polyline"]
     arc: Float[Array, " point"]
 
-    @property
-    def rings_closed(self) -> bool:
-        """Whether there are road edges, and all of them are closed rings."""
-        rings = self.closed[among(self.kind, EDGE_KINDS)]
-        return len(rings) > 0 and bool(rings.all())
-
 
 @dataclass(frozen=True)
 class Segments:
