@@ -1,4 +1,4 @@
-"""Closed-loop rollouts on the device: a planner drives a batch of scenarios from a start step to the end of the log."""
+"""Closed-loop rollouts: a planner drives a batch of scenarios from a start step to the end of the log."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import SimState
 from drivax.tasks.task import Task
 
-#: Number folded into the key of an episode to draw its start.
+#: Folded into an episode's key to draw its start.
 _START_STREAM = 1
-#: Units of packed positions (m) and headings (rad), and the reach of int16 from a scenario's origin.
+#: Units of packed positions (m) and headings (rad), and the largest coordinate that int16 holds.
 _POSITION_UNIT_M, _HEADING_UNIT_RAD, _MAX_POSITION_M = 0.02, 1e-4, 650.0
-#: Stands for "absent" in a packed pose.
+#: Packed pose of an absent agent.
 _ABSENT = -32768
 
 
 @record
 class Episodes:
-    """The outcome of a batch of episodes.
+    """Results of a batch of episodes.
 
     Attributes:
         metrics: Every metric by name.
         events: Step of the first collision, off-road step and red light, -1 for none.
-        motion: x, y, heading, speed of the driven agent from the start step to the end; repeated beyond a short log.
-        actions: Executed actions, after bounds and actuators; repeated beyond a short log.
+        motion: x, y, heading, speed of the driven agent from the start step on, repeated after the end of a short log.
+        actions: Executed actions, after bounds and actuators, repeated after the end of a short log.
         others: Packed poses of the other agents at each step (:func:`pack_poses`); None in log traffic.
         offroad_steps: Number of steps off the road.
         crashed: First step with a non-finite action, -1 for none; metrics cover the steps before it.
@@ -58,7 +58,7 @@ class Episodes:
 
 
 def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Array:
-    """Return a random key for each scenario; it depends on the seed and the scenario's identity, not on its row."""
+    """Return a random key for each scenario, derived from the seed and the scenario's identity."""
     return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), bank.identity[index])
 
 
@@ -69,7 +69,11 @@ def evaluation_task(task: Task) -> Task:
 
 
 def check_actions(planner: Planner, task: Task) -> None:
-    """Raise UsageError for a planner with another action space than the task."""
+    """Check that planner and task have the same action space.
+
+    Raises:
+        UsageError: They differ.
+    """
     if getattr(planner, "actions", task.actions) != task.actions:
         problem = f"planner {planner.name} has another action space than the task"
         raise UsageError(problem, cure="use the task's")
@@ -80,9 +84,10 @@ def drive(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, index: Int[Array, " B"], keys: Array,
     start_step: int = CURRENT_STEP, slot: Any = 0,
 ) -> Episodes:  # fmt: skip
-    """Run one planner on rows ``index`` of a bank; one compilation per planner kind, batch size and start step.
+    """Run a planner on scenarios ``index`` of a bank; ``slot`` is the driven agent.
 
-    The task's episodes must not end early (:func:`evaluation_task`); ``slot`` is the driven agent.
+    The task's episodes must not end early (:func:`evaluation_task`). Each planner type, batch size and start step needs
+    one compilation.
     """
     episode = partial(_episode, simulator, planner, bank, start_step, slot)
     return jax.vmap(episode)(index, keys)
@@ -92,50 +97,55 @@ def _episode(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, start_step: int, slot: Any, index: Array, key: Array
 ) -> Episodes:  # fmt: skip
     state = simulator.reset(bank, index, start_step, slot, jax.random.fold_in(key, _START_STREAM))
-    begin_key, key = jax.random.split(key)
-    carry = planner.init(bank, state, begin_key)
+    init_key, key = jax.random.split(key)
+    carry = planner.init(bank, state, init_key)
 
     def others(state: SimState) -> Int16[Array, "A 3"] | None:
         traffic = simulator.traffic
         return None if traffic.name == LogTraffic.name else pack_poses(traffic.agents(bank, state.context, 0))
 
     def step(loop_state: Any, key: Array) -> Any:
-        state, measured, carry, is_finite = loop_state
-        # A log that is shorter than others of its bank ends earlier: its last state stays.
-        ended = state.context.step >= bank.last_step[index]
-        after, carry, finite = advance(simulator, planner, bank, state, carry, key)
-        state = jax.tree.map(partial(jnp.where, ended), state, after)
-        is_finite &= finite | ended
-        measured = state if planner.replays else jax.tree.map(partial(jnp.where, is_finite), state, measured)
-        context, offroad = measured.context, is_finite & ~ended & state.facts.offroad
-        outputs = context.history[-1], context.action, offroad, is_finite, others(state)
-        return (state, measured, carry, is_finite), outputs
+        state, metric_state, carry, all_finite = loop_state
+        # A short log ends before the others of its bank; its last state is kept.
+        is_over = state.context.step >= bank.last_step[index]
+        next_state, carry, is_finite = advance(simulator, planner, bank, state, carry, key)
+        state = jax.tree.map(partial(jnp.where, is_over), state, next_state)
+        all_finite &= is_finite | is_over
+        metric_state = (
+            state if planner.replays else jax.tree.map(partial(jnp.where, all_finite), state, metric_state)
+        )
+        context, offroad = metric_state.context, all_finite & ~is_over & state.facts.offroad
+        outputs = context.history[-1], context.action, offroad, all_finite, others(state)
+        return (state, metric_state, carry, all_finite), outputs
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)
-    first = (state, state, carry, jnp.ones((), bool))
-    (last, final, _, _), (motion, actions, offroad, is_finite, later_others) = jax.lax.scan(step, first, keys)
-    others_first = others(state)
-    metrics, uncut_metrics = episode_metrics(bank, final), episode_metrics(bank, last)
+    initial = (state, state, carry, jnp.ones((), bool))
+    (last, final, _, _), (motion, actions, offroad, all_finite, later_others) = jax.lax.scan(
+        step, initial, keys
+    )
+    first_others = others(state)
+    metrics, full_metrics = episode_metrics(bank, final), episode_metrics(bank, last)
     # Whether a metric is defined must not depend on when the planner crashed.
     names = [name for name in FAILED if name in metrics]
-    failed = {name: replace(metrics[name], defined=uncut_metrics[name].defined) for name in names}
+    failed_metrics = {name: replace(metrics[name], defined=full_metrics[name].defined) for name in names}
     return Episodes(
-        metrics=metrics | failed,
+        metrics=metrics | failed_metrics,
         events=event_steps(final.episode),
         motion=jnp.concatenate([state.context.history[-1][None], motion]),
         actions=actions,
-        others=None if others_first is None else jnp.concatenate([others_first[None], later_others]),
+        others=None if first_others is None else jnp.concatenate([first_others[None], later_others]),
         offroad_steps=offroad.sum().astype(jnp.int32),
-        crashed=jnp.where(is_finite.all(), -1, start_step + jnp.argmin(is_finite)),
+        crashed=jnp.where(all_finite.all(), -1, start_step + jnp.argmin(all_finite)),
     )
 
 
 def advance(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any, key: Array
 ) -> tuple[SimState, Any, Bool[Array, ""]]:
-    """Return state and carry one step later, and whether the action was finite; replaying planners follow the log.
+    """Return the next state, the next carry, and whether the action was finite.
 
-    An action that is not finite is replaced by ``Task.coast``, so that the state stays finite.
+    A non-finite action is replaced by ``Task.coast``, so that the state stays finite. Planners that replay follow the
+    log.
     """
     situation = simulator.situation(bank, state)
     observation = simulator.observe(bank, state.context)
@@ -144,14 +154,14 @@ def advance(
     length_m = bank.length_m(context.index, context.slot)
     if planner.replays:
         action = simulator.task.actuated(motion, action, context.action, length_m)
-        logged = logged_motion(bank, context, 1)
-        return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
+        logged_pose = logged_motion(bank, context, 1)
+        return simulator.replay(bank, state, logged_pose, action)[0], carry, jnp.ones((), bool)
     is_finite, coast = jnp.isfinite(action).all(), simulator.task.coast(motion, length_m)
     return simulator.step(bank, state, jnp.where(is_finite, action, coast))[0], carry, is_finite
 
 
 def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
-    """Pack positions and headings of bank rows; agents further than 650 m from the origin count as absent."""
+    """Pack positions and headings of bank agents; agents further than 650 m from the origin are stored as absent."""
     xy = agents[..., AgentColumn.XY]
     heading = jnp.arctan2(agents[..., AgentColumn.SIN], agents[..., AgentColumn.COS])
     poses = jnp.concatenate([xy / _POSITION_UNIT_M, heading[..., None] / _HEADING_UNIT_RAD], axis=-1)
@@ -159,7 +169,7 @@ def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]
     return jnp.where(present[..., None], jnp.round(poses), _ABSENT).astype(jnp.int16)
 
 
-def unpack_poses(rows: Int16[np.ndarray, "*batch A 3"]) -> Float32[np.ndarray, "*batch A 3"]:
-    """Return positions (m) and headings (rad), NaN where absent."""
-    poses = rows * np.array([_POSITION_UNIT_M, _POSITION_UNIT_M, _HEADING_UNIT_RAD], np.float32)
-    return np.where(rows == _ABSENT, np.nan, poses).astype(np.float32)
+def unpack_poses(packed: Int16[np.ndarray, "*batch A 3"]) -> Float32[np.ndarray, "*batch A 3"]:
+    """Return positions (m) and headings (rad), NaN for absent agents."""
+    poses = packed * np.array([_POSITION_UNIT_M, _POSITION_UNIT_M, _HEADING_UNIT_RAD], np.float32)
+    return np.where(packed == _ABSENT, np.nan, poses).astype(np.float32)
