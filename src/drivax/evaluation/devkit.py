@@ -430,24 +430,17 @@ def _time_to_collision(
     for sample in range(len(ego.xy)):
         if sample in fault_samples:
             times[sample] = 0.0
-        elif abs(ego.speed[sample]) > _TTC_STOPPED_MPS:
-            angle = _angle_deg(ego.rear_axle[sample], ego.heading[sample], tracks.xy[sample])
-            relevant = (angle < _AHEAD_DEG) | (includes_sides[sample] & (angle <= _BEHIND_DEG))
-            agents = np.flatnonzero(relevant & tracks.present[sample] & (first_contact > sample))
-            ego_boxes = _sweep(ego.corners[sample], ego.heading[sample], abs(ego.speed[sample]), ahead_s)
-            agent_boxes = _sweep(
-                tracks.corners[sample, agents],
-                tracks.heading[sample, agents],
-                tracks.speed[sample, agents],
-                ahead_s,
-            )
-            overlaps = (
-                shapely.intersects(ego_boxes, agent_boxes).any(axis=0)
-                if len(agents)
-                else np.zeros(len(ahead_s), bool)
-            )
-            if overlaps.any():
-                times[sample] = ahead_s[overlaps.argmax()]
+            continue
+        angle = _angle_deg(ego.rear_axle[sample], ego.heading[sample], tracks.xy[sample])
+        relevant = (angle < _AHEAD_DEG) | (includes_sides[sample] & (angle <= _BEHIND_DEG))
+        agents = np.flatnonzero(relevant & tracks.present[sample] & (first_contact > sample))
+        if not len(agents) or abs(ego.speed[sample]) <= _TTC_STOPPED_MPS:
+            continue
+        ego_boxes = _sweep(ego.corners[sample], ego.heading[sample], abs(ego.speed[sample]), ahead_s)
+        motion = (values[sample, agents] for values in (tracks.corners, tracks.heading, tracks.speed))
+        overlaps = shapely.intersects(ego_boxes, _sweep(*motion, ahead_s)).any(axis=0)
+        if overlaps.any():
+            times[sample] = ahead_s[overlaps.argmax()]
     return times
 
 

@@ -145,18 +145,28 @@ def observation_statistics(
     if permute:
         candidates = np.flatnonzero(in_log)
         positions = np.linspace(0, len(candidates) - 1, min(PERMUTED, len(candidates))).round().astype(int)
-        rows = candidates[np.unique(positions)]
-        states, permuted = (samples.state, samples.carry, samples.key, samples.observation), len(rows)
-        *planner_inputs, inputs = jax.tree.map(
-            lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], states
-        )
-        act = partial(_actions, simulator, planner, bank, *planner_inputs)
-        columns, groups = importances(act, jax.device_get(inputs), seed)
+        indices = candidates[np.unique(positions)]
+        columns, groups = _planner_importances(simulator, planner, bank, samples, indices, seed)
+        permuted = len(indices)
     observations = _mask_after_log(observations, in_log)
     features = column_statistics(task.observation.features, observations, hit, collides, columns)
     return ObservationStatistics(
         planner.name, len(collides), int(collides.sum()), int(in_log.sum()), permuted, features, groups
     )
+
+
+def _planner_importances(
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, samples: SampledStates, indices: Values, seed: int
+) -> tuple[dict[tuple[str, int], float], dict[str, float]]:  # fmt: skip
+    """Return the :func:`importances` for a planner in the sampled states with the given flat indices."""
+
+    def select(leaf: Array) -> Array:
+        return leaf.reshape(samples.hit.size, *leaf.shape[2:])[indices]
+
+    states = (samples.state, samples.carry, samples.key, samples.observation)
+    *planner_inputs, observation = jax.tree.map(select, states)
+    act = partial(_actions, simulator, planner, bank, *planner_inputs)
+    return importances(act, jax.device_get(observation), seed)
 
 
 def _mask_after_log(observation: Mapping[str, Values], in_log: Values) -> dict[str, Values]:

@@ -144,7 +144,7 @@ def strata_of(entries: Sequence[Mapping[str, Any]], tags: Sequence[str]) -> list
     Raises:
         UsageError: A tag does not occur in any scenario.
     """
-    known = {name: None for entry in entries for name in entry["tags"]}
+    known = dict.fromkeys(name for entry in entries for name in entry["tags"])
     for tag in tags:
         if tag not in known:
             raise UsageError(f"no scenario has a tag {tag!r}", cure=did_you_mean(tag, list(known)))

@@ -356,24 +356,16 @@ class _Evaluation:
         }
         columns = {key: tuple(row[key] for row in names) for key in ("dataset", "scenario_id", "segment")}
         columns |= {"planner": (planner,) * n, "seed": (str(self.seed),) * n, "traffic": (traffic,) * n}
-        own_metrics = {
-            name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
-            for name, metric in self.metrics.items()
-            if name not in METRICS
-        }
-        crashes: list[Crash] = []
-        for row in np.flatnonzero(crash_step >= 0).tolist():
-            step = int(crash_step[row])
-            error = errors.get((int(identity[row]), step), "action is not finite")
-            crashes.append(Crash(names[row]["dataset"], names[row]["scenario_id"], step, error))
+        info: dict[str, Any] = {"planner": planner, "traffic": traffic}
+        if own_metrics := self._own_metrics():
+            info["own_metrics"] = own_metrics
         return EpisodeTable(
             folder=None,
             name=planner,
-            info={"planner": planner, "traffic": traffic}
-            | ({"own_metrics": own_metrics} if own_metrics else {}),
+            info=info,
             keys={name: columns[name] for name in KEYS},
             metrics=fail_crashed(metrics, crash_step >= 0),
-            crashes=tuple(crashes),
+            crashes=_crashes(crash_step, names, identity, errors),
             in_memory=Trajectories(
                 ego=np.asarray(episodes.motion),
                 action=actions,
@@ -382,6 +374,27 @@ class _Evaluation:
                 others=None if episodes.others is None else np.asarray(episodes.others),
             ),
         )
+
+    def _own_metrics(self) -> dict[str, dict[str, str]]:
+        user_metrics = {name: metric for name, metric in self.metrics.items() if name not in METRICS}
+        return {
+            name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
+            for name, metric in user_metrics.items()
+        }
+
+
+def _crashes(
+    crash_step: Int[np.ndarray, " episode"],
+    names: Names,
+    identity: Any,
+    errors: Mapping[tuple[int, int], str],
+) -> tuple[Crash, ...]:
+    crashes = []
+    for row in np.flatnonzero(crash_step >= 0).tolist():
+        step = int(crash_step[row])
+        error = errors.get((int(identity[row]), step), "action is not finite")
+        crashes.append(Crash(names[row]["dataset"], names[row]["scenario_id"], step, error))
+    return tuple(crashes)
 
 
 def until_crash(

@@ -69,9 +69,9 @@ def _ratio(difference: Any, deviation: Any) -> float | None:
 def power(effect: float, n: float, confidence: float = 0.95, share: float | None = None) -> float:
     """Return the probability that a two-sided t-test detects an effect.
 
-    It is ``P(|T| > t)`` with noncentral t: for pairs with ``n - 1`` degrees of freedom and noncentrality ``d
-    sqrt(n)``, for two arms with ``n - 2`` and ``d sqrt(n w (1 - w))`` (Cohen 1988, section 2.3; Johnson, Kotz and
-    Balakrishnan, Continuous Univariate Distributions 2, 1995, chapter 31).
+    It is ``P(|T| > t)`` with noncentral t. Pairs have ``n - 1`` degrees of freedom and noncentrality ``d sqrt(n)``, two
+    arms ``n - 2`` and ``d sqrt(n w (1 - w))`` (Cohen 1988, section 2.3; Johnson, Kotz and Balakrishnan, Continuous
+    Univariate Distributions 2, 1995, chapter 31).
 
     Args:
         effect: ``d_z`` of pairs, or Cohen's d of two arms.

@@ -65,7 +65,7 @@ def effective_size(weights: Any) -> float:
 def wilson(successes: float | int, n: float | int, confidence: float = 0.95) -> Interval:
     """Return the score interval of a proportion (Wilson, J. Am. Stat. Assoc. 22, 1927).
 
-    ``centre = (p + z^2 / 2n) / (1 + z^2 / n)``, ``half = z / (1 + z^2 / n) * sqrt(p (1 - p) / n + z^2 / 4n^2)``;
+    ``centre = (p + z^2 / 2n) / (1 + z^2 / n)``, ``margin = z / (1 + z^2 / n) * sqrt(p (1 - p) / n + z^2 / 4n^2)``;
     always within [0, 1]. The number of trials ``n`` may be fractional (an effective sample size).
     """
     z = normal_quantile(confidence)
@@ -74,11 +74,11 @@ def wilson(successes: float | int, n: float | int, confidence: float = 0.95) -> 
     if n == 0:
         return UNDEFINED
     p = successes / n
-    shrink = 1.0 + z * z / n
-    centre = (p + z * z / (2 * n)) / shrink
-    half = z / shrink * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
-    low = 0.0 if successes == 0 else max(0.0, centre - half)
-    high = 1.0 if successes == n else min(1.0, centre + half)
+    denominator = 1.0 + z * z / n
+    centre = (p + z * z / (2 * n)) / denominator
+    margin = z / denominator * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
+    low = 0.0 if successes == 0 else max(0.0, centre - margin)
+    high = 1.0 if successes == n else min(1.0, centre + margin)
     return Interval(float(p), float(low), float(high), round(n))
 
 
@@ -106,10 +106,10 @@ def bootstrap_mean(
     """Return the percentile bootstrap interval of a mean, resampling whole clusters, within strata if given.
 
     Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3; clusters: Davison and Hinkley,
-    Bootstrap Methods, 1997, section 3.8. As many clusters as there are in total are drawn with replacement; the mean
-    of a resample is its sum over its number of episodes. Strata: ``C_h - 1`` of the ``C_h`` clusters of each stratum
-    are drawn and weighted by ``C_h / (C_h - 1)``, which keeps the variance correct in small strata (Rao, Wu and Yue,
-    Surv. Methodol. 18, 1992). Strata of a single cluster are pooled.
+    Bootstrap Methods, 1997, section 3.8. A resample draws as many clusters as there are, with replacement; its mean is
+    its sum over its number of episodes. Within strata, it draws ``C_h - 1`` of the ``C_h`` clusters of each stratum
+    and weights them by ``C_h / (C_h - 1)``, which keeps the variance correct in small strata (Rao, Wu and Yue, Surv.
+    Methodol. 18, 1992). Strata of a single cluster are pooled.
     """
     check_draws(confidence, resamples)
     x, labels = drop_undefined(values, clusters)

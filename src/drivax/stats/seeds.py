@@ -137,6 +137,8 @@ class CrossedEffect:
     def _smallest_number(
         self, extrapolate: Callable[[int], CrossedEffect], present: int, power: float, confidence: float
     ) -> int | None:
+        """Return the smallest number above ``present`` that detects this difference; None if there is none."""
+
         def detects(number: int) -> bool:
             return abs(self.difference) >= extrapolate(number).detectable(power, confidence)
 

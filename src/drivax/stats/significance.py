@@ -106,10 +106,10 @@ def paired_bootstrap_test(
 ) -> SignificanceResult:
     """Apply a bootstrap test to a mean paired difference, resampling whole clusters; it assumes no symmetry.
 
-    ``t = m / se`` is compared with ``t* = (m* - m) / se*`` of resamples, ``p = (1 + #{|t*| >= |t|}) / (1 +
-    resamples)`` (Efron and Tibshirani 1993, section 16.4; symmetric bootstrap-t: Hall, The Bootstrap and Edgeworth
-    Expansion, 1992, section 3.6). The standard error is that of a ratio of totals, ``se^2 = C / (C - 1) sum((S_c - m
-    n_c)^2) / n^2``.
+    ``t = m / se`` is compared with ``t* = (m* - m) / se*`` of resamples,
+    ``p = (1 + #{|t*| >= |t|}) / (1 + resamples)`` (Efron and Tibshirani 1993, section 16.4; symmetric bootstrap-t:
+    Hall, The Bootstrap and Edgeworth Expansion, 1992, section 3.6). The standard error is that of a ratio of totals,
+    ``se^2 = C / (C - 1) sum((S_c - m n_c)^2) / n^2``.
     """
     check_draws(0.95, resamples)
     x, labels = drop_undefined(paired_differences(a, b), clusters)
