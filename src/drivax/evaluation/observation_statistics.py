@@ -271,14 +271,7 @@ def _moments(values: Values, valid: Values) -> tuple[int, int, float, float, flo
     x, broken = values[valid & finite].astype(np.float64), int((~finite).sum())
     if not x.size:
         return 0, broken, math.nan, math.nan, math.nan, math.nan
-    return (
-        x.size,
-        broken,
-        float(x.mean()),
-        float(x.std()),
-        float(x.min()),
-        float(x.max()),
-    )
+    return x.size, broken, float(x.mean()), float(x.std()), float(x.min()), float(x.max())
 
 
 def collision_correlation(values: Values, valid: Values, collides: Values) -> float:
