@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from drivax import settings
 from drivax.curation.ensemble import Ensemble, EnsembleConfig, train_ensemble
@@ -180,29 +180,38 @@ def ensemble_table(
             scenarios and others.
     """
     predictions = ensemble.predictions(data, progress)
-    valid, is_training_set = valid_steps(data), data.hash == ensemble.set_hash
+    is_training_set = data.hash == ensemble.set_hash
     is_unseen = ensemble.fold < 0 if is_training_set else np.ones(len(data), bool)
     groups = [group for group in (~is_unseen, is_unseen) if group.any()]
     scales: list[Any] = [scale] * len(groups)
-    if predictions.information is None:
-        per_dimension = predictions.disagreement(ensemble.deviation)
-        total = per_dimension.sum(axis=-1)
-        if scale is None:
-            scales = [float(np.percentile(total[group][valid[group]], _SCALE_PERCENTILE)) for group in groups]
-        half_point = np.zeros((len(data), 1))
-        for group, value in zip(groups, scales, strict=True):
-            half_point[group] = np.maximum(value, np.finfo(np.float64).tiny)
-        actions = enumerate(np.moveaxis(per_dimension, -1, 0))
-        components = {f"action_{index}": values / (values + half_point) for index, values in actions}
-        components["disagreement"] = total / (total + half_point)
-    else:
+    if predictions.information is not None:
         components = {"information": predictions.information / math.log(ensemble.config.folds)}
+    else:
+        disagreement = predictions.disagreement(ensemble.deviation)
+        if scale is None:
+            total, valid = disagreement.sum(axis=-1), valid_steps(data)
+            scales = [float(np.percentile(total[group][valid[group]], _SCALE_PERCENTILE)) for group in groups]
+        components = _disagreement_components(disagreement, groups, scales)
     error = predictions.error(ensemble.deviation, ensemble.fold if is_training_set else None)
     details = {"trained_on": ensemble.set_hash, "scale": scales[0] if len(scales) == 1 else scales}
     table = make_table("ensemble", ensemble.config, data, components, details)
     is_known = predictions.known & groups[-1][:, None]
     correlation = {"error_rank_correlation": rank_correlation(table.steps[is_known], error[is_known])}
     return replace(table, config={**table.config, **correlation})
+
+
+def _disagreement_components(
+    disagreement: Float[np.ndarray[Any, Any], "N T D"], groups: Sequence[Bool[np.ndarray[Any, Any], " N"]],
+    scales: Sequence[float],
+) -> dict[str, Any]:  # fmt: skip
+    """Return ``d / (d + scale)`` of each dimension of the action and of their sum; each group has its scale."""
+    scale = np.zeros((len(disagreement), 1))
+    for group, value in zip(groups, scales, strict=True):
+        scale[group] = np.maximum(value, np.finfo(np.float64).tiny)
+    dimensions = enumerate(np.moveaxis(disagreement, -1, 0))
+    components = {f"action_{index}": values / (values + scale) for index, values in dimensions}
+    total = disagreement.sum(axis=-1)
+    return {**components, "disagreement": total / (total + scale)}
 
 
 def _ensemble_combination(config: EnsembleConfig) -> Combination:

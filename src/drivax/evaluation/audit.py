@@ -169,6 +169,7 @@ def _replay_findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, An
     reverse_m, forward_m = _reverse_and_forward_m(scenario)
     mostly_reverses = reverse_m > np.maximum(MOSTLY_REVERSE_M, MOSTLY_REVERSE_SHARE * (reverse_m + forward_m))
     reverses = (reverse_m > REVERSE_M) | mostly_reverses
+    violates = collides.any() or offroad.any() or bool(log_runs_red) or reverses[0]
     return {
         "log_collides": bool(collides.any()),
         "first_collision_step": _first_step(collides),
@@ -186,9 +187,7 @@ def _replay_findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, An
         "route_reaches_goal": reaches_goal if len(deviation) else None,
         "ignored_overlaps": int(series["ignored"].max()),
         **{name: _clipped_share(series[name], evaluated) for name in _ACTION_SPACES},
-        "clean": not collides.any() and not offroad.any() and not log_runs_red and not reverses[0]
-        if has_map
-        else None,
+        "clean": not violates if has_map else None,
     }
 
 

@@ -241,7 +241,7 @@ def _speeds(xy: Float[np.ndarray[Any, Any], "t A 2"]) -> Float[np.ndarray[Any, A
 def _fill_gaps(
     values: Float[np.ndarray[Any, Any], "t A"], valid: Bool[np.ndarray[Any, Any], "t A"]
 ) -> Float[np.ndarray[Any, Any], "t A"]:
-    """Fill gaps with the last valid value, or before it with the first one."""
+    """Fill gaps with the previous valid value, and leading gaps with the first valid value."""
     steps = np.arange(len(values))[:, None]
     last = np.maximum.accumulate(np.where(valid, steps, -1), axis=0)
     return np.take_along_axis(values, np.where(last >= 0, last, valid.argmax(axis=0)), axis=0)
