@@ -132,8 +132,8 @@ STEP_VALUES: dict[str, StepValue] = {value.name: value for value in _ALL}
 def step_metrics(situation: Situation, values: Sequence[StepValue] | None = None) -> dict[str, Value]:
     """Return step values of a situation, for tables and plots; by default all that are not delayed.
 
-    The situation must contain the facts that they read (with ``metrics: full`` it contains all). Comfort needs the
-    eleven following steps; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
+    The situation must contain the facts that the values read (with ``metrics: full`` it contains all facts). Comfort
+    needs the eleven following steps; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
     """
     moment = Moment(situation, situation.context.step, jnp.zeros((), bool))
     result = {}

@@ -168,7 +168,7 @@ def paired_bootstrap(
 def interquartile_bootstrap(
     values: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES, *, seed: int
 ) -> Interval:
-    """Return the percentile bootstrap interval of the interquartile mean over training seeds of their mean episode.
+    """Return the percentile bootstrap interval of the interquartile mean of the means of training seeds.
 
     ``values`` are ``[seed, episode]``; ``n`` counts the defined values. Seeds and clusters are crossed: every seed is
     evaluated on every scenario. Both are resampled independently with replacement (Owen, Ann. Appl. Stat. 1, 2007,
@@ -176,11 +176,11 @@ def interquartile_bootstrap(
     :func:`~drivax.stats.seeds.seeds_interval` for means.
     """
     check_draws(confidence, resamples)
-    rows = [as_values(row) for row in values]
-    labels = dense_labels(clusters, rows[0].size, "cluster")
-    if any(row.size != labels.size for row in rows):
+    by_seed = [as_values(seed_values) for seed_values in values]
+    labels = dense_labels(clusters, by_seed[0].size, "cluster")
+    if any(seed_values.size != labels.size for seed_values in by_seed):
         raise UsageError("seeds have different episodes", cure="give one value per seed and episode")
-    sums, counts = _seed_totals(np.stack(rows), labels)
+    sums, counts = _seed_totals(np.stack(by_seed), labels)
     n, (seeds, cluster_count) = int(counts.sum()), sums.shape
     if not n:
         return UNDEFINED
@@ -188,9 +188,9 @@ def interquartile_bootstrap(
     if cluster_count < 2:
         return Interval(mean, None, None, n)
     rng, means = np.random.default_rng(seed), np.empty(resamples)
-    for number in range(resamples):
+    for resample in range(resamples):
         cluster_draws, seed_draws = _draw_counts(cluster_count, rng), _draw_counts(seeds, rng)
-        means[number] = _interquartile(seed_draws, sums @ cluster_draws, counts @ cluster_draws)
+        means[resample] = _interquartile(seed_draws, sums @ cluster_draws, counts @ cluster_draws)
     return Interval(mean, *_percentiles(means, confidence), n)
 
 
