@@ -198,34 +198,52 @@ def _compare_metric(
     plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side], split: Split | None
 ) -> MetricComparison:
     """Compare the planners in one metric; the winner is added later."""
-    clusters, seeds = sides[0].pairs.clusters, max(len(side.tables) for side in sides)
     x, y = (side.values(metric) for side in sides)
-    undefined_counts = [
+    undefined_a, undefined_b = (
         int((np.isnan(values) & side.arm).sum()) for values, side in zip((x, y), sides, strict=True)
-    ]
-    resampling = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
+    )
     included = ~np.isnan(x) & ~np.isnan(y) if split is None else np.ones(x.size, bool)
     x, y = np.where(included, x, np.nan), np.where(included, y, np.nan)
+    a, b = (side.interval(plan, metric, included) for side in sides)
+    difference, evidence = _test_difference(plan, metric, sides, split, x, y)
+    column = sides[0].tables[0].metric(metric)
+    return MetricComparison(
+        metric=metric,
+        unit="" if column is None else column.unit,
+        better="-" if column is None else column.better,
+        a=a,
+        b=b,
+        difference=difference,
+        effects={"d": effects.cohens_d(x, y)} if split else asdict(effects.cohens_d_paired(x, y)),
+        evidence=evidence,
+        p_adjusted=None,
+        winner=None,
+        seeds=max(len(side.tables) for side in sides),
+        undefined_a=undefined_a,
+        undefined_b=undefined_b,
+    )
+
+
+def _test_difference(
+    plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side], split: Split | None, x: Values, y: Values
+) -> tuple[Interval, SignificanceResult]:
+    """Return the difference of the means, and its significance test."""
+    clusters = sides[0].pairs.clusters
+    resampling = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
     if split is not None:
         values = np.where(split.first, x, y)
-        difference = split_bootstrap(values, split.first, clusters, strata=split.strata, **resampling)
-        evidence = significance.split_permutation(
-            values, split.first, clusters, split.strata, plan.resamples, seed=plan.seed
+        return (
+            split_bootstrap(values, split.first, clusters, strata=split.strata, **resampling),
+            significance.split_permutation(
+                values, split.first, clusters, split.strata, plan.resamples, seed=plan.seed
+            ),
         )
-    elif seeds == 1:
+    if max(len(side.tables) for side in sides) == 1:
         difference = paired_bootstrap(x, y, clusters, **resampling)
-        evidence = _paired_test(plan, metric, x, y, clusters)
-    else:
-        difference, effect = _seed_difference(plan, metric, sides)
-        p, units = (None, 0) if effect is None else (effect.p, effect.clusters)
-        evidence = SignificanceResult("t", p, units, exact=False)
-    effect_sizes = {"d": effects.cohens_d(x, y)} if split else asdict(effects.cohens_d_paired(x, y))
-    a, b = (side.interval(plan, metric, included) for side in sides)
-    column = sides[0].tables[0].metric(metric)
-    unit, better = ("", "-") if column is None else (column.unit, column.better)
-    return MetricComparison(
-        metric, unit, better, a, b, difference, effect_sizes, evidence, None, None, seeds, *undefined_counts
-    )
+        return difference, _paired_test(plan, metric, x, y, clusters)
+    difference, effect = _seed_difference(plan, metric, sides)
+    p, units = (None, 0) if effect is None else (effect.p, effect.clusters)
+    return difference, SignificanceResult("t", p, units, exact=False)
 
 
 def _seed_difference(
