@@ -228,8 +228,8 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
             arrays = {name: archive[name] for name in archive.files if name not in ("header", "scenario_id")}
             _check_shapes(ids, arrays, file, data)
             valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
-            component_arrays = [name for name in arrays if name.startswith(_COMPONENT)]
-            components = {name.removeprefix(_COMPONENT): arrays[name] for name in component_arrays}
+            component_names = [name for name in arrays if name.startswith(_COMPONENT)]
+            components = {name.removeprefix(_COMPONENT): arrays[name] for name in component_names}
             method, config, set_hash = (header[name] for name in ("method", "config", "set_hash"))
             table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components)
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:

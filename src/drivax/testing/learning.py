@@ -50,7 +50,7 @@ def check_encoder(config: EncoderConfig | str) -> None:
 
     It builds for any groups, including groups without rows. It embeds an observation or a batch as ``[..., width]``
     float32, compiled or not. Its parameters depend only on the key, and are its only state. Values and gradients are
-    finite, also if all rows are masked. Masked rows have no effect.
+    finite, also if all rows are masked. Valid rows have an effect, masked rows have none.
     """
     settings = instance(config)
     what = f"encoder {type(settings).__name__}"
