@@ -204,7 +204,7 @@ def _disagreement_components(
     disagreement: Float[np.ndarray[Any, Any], "N T D"], groups: Sequence[Bool[np.ndarray[Any, Any], " N"]],
     scales: Sequence[float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return ``d / (d + scale)`` of the dimensions of the action and of their sum; ``scales`` are those of the groups."""
+    """Return ``d / (d + scale)`` of the action's dimensions and of their sum, with a scale for each group."""
     scale = np.zeros((len(disagreement), 1))
     for group, value in zip(groups, scales, strict=True):
         scale[group] = np.maximum(value, np.finfo(np.float64).tiny)
