@@ -151,7 +151,10 @@ def split_bootstrap(
     n = sum(arm_values.size for arm_values, _, _ in arms)
     if min(labels.max() for _, labels, _ in arms) == 0:
         return Interval(difference, None, None, n)
-    means = [_resample_means(*arm, resamples, rng) for arm in arms]
+    means = [
+        _resample_means(arm_values, labels, arm_strata, resamples, rng)
+        for arm_values, labels, arm_strata in arms
+    ]
     return Interval(difference, *_percentiles(means[0] - means[1], confidence), n)
 
 
