@@ -39,7 +39,7 @@ from drivax.studies.bench import (
 )
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.task import Task
-from drivax.testing.worlds import padded
+from drivax.testing.worlds import pad_agents
 from drivax.tracking.run_folder import versions
 from experiments.repository import DOCS, RESULTS
 
@@ -173,7 +173,7 @@ def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
         parked=bank.parked[:, :count],
         parked_when=bank.parked_when[:, :, :count],
     )
-    return padded(few, count - few.agents.shape[2])
+    return pad_agents(few, count - few.agents.shape[2])
 
 
 def growth(small: ScenarioBank, large: ScenarioBank, config: BenchConfig) -> float:

@@ -50,7 +50,7 @@ def test_scores_weight_the_training_data(place, capsys):
     assert len(json.loads((place / "weighted" / "run.json").read_text())["weights"]) == 64
     capsys.readouterr()
     assert trained(place, "set-4", "other", *scores) != 0
-    assert "scores are of other data" in capsys.readouterr().err and not (place / "other").exists()
+    assert "scores belong to another set" in capsys.readouterr().err and not (place / "other").exists()
     assert trained(place, "set-3", "missing", "--scores", str(place / "none.npz")) != 0
     assert "score table not found" in capsys.readouterr().err
 
@@ -87,7 +87,7 @@ def test_incompatible_flags_are_refused(place, capsys):
     curate = ["curate", "kinematic", "--data", str(place / "set-3"), "--out", str(other)]
     assert main([*curate, "--weights", "braking", "1", "--overwrite"]) == 0
     assert main([*call, "--arm", "heuristic", "--scores", str(other)]) == 1
-    assert "scores of 'kinematic' with combination" in capsys.readouterr().err
+    assert "scores of 'kinematic' have combination" in capsys.readouterr().err
     assert not (place / "none").exists()
 
 

@@ -1,4 +1,4 @@
-"""Aggregators and weighted sums, by other means."""
+"""Aggregators and weighted sums against other implementations."""
 
 import numpy as np
 import pytest
@@ -25,8 +25,8 @@ def by_hand(name, values):
 
 @pytest.mark.parametrize("name", ["max", "mean", "std", "p0", "p50", "p99", "p100", "top1", "top10", "top99"])
 def test_aggregators(name):
-    wanted = [by_hand(name, steps[valid]) for steps, valid in zip(STEPS, VALID, strict=True)]
-    np.testing.assert_allclose(aggregate(STEPS, VALID, name), wanted, atol=1e-12)
+    expected = [by_hand(name, steps[valid]) for steps, valid in zip(STEPS, VALID, strict=True)]
+    np.testing.assert_allclose(aggregate(STEPS, VALID, name), expected, atol=1e-12)
     # What is beside the valid steps does not matter.
     np.testing.assert_array_equal(
         aggregate(np.where(VALID, STEPS, 9.0), VALID, name), aggregate(STEPS, VALID, name)
@@ -34,19 +34,19 @@ def test_aggregators(name):
 
 
 def test_step_scores_are_weighted_means():
-    """Whatever the weights add up to, so that none is cut off."""
+    """The sum of the weights does not matter, and no score is clipped."""
     parts = {"a": STEPS, "b": STEPS[::-1], "unused": STEPS}
     steps, scenarios = Combination({"a": 0.9, "b": 0.3}, "mean").combine(parts, VALID)
-    wanted = np.where(VALID, 0.75 * STEPS + 0.25 * STEPS[::-1], 0.0)
-    np.testing.assert_allclose(steps, wanted)
-    np.testing.assert_allclose(scenarios, aggregate(wanted, VALID, "mean"))
+    expected = np.where(VALID, 0.75 * STEPS + 0.25 * STEPS[::-1], 0.0)
+    np.testing.assert_allclose(steps, expected)
+    np.testing.assert_allclose(scenarios, aggregate(expected, VALID, "mean"))
 
 
 def test_components_have_their_own_aggregators():
     parts = {"a": STEPS, "b": STEPS[::-1]}
     both = Combination({"a": 0.6, "b": 0.3}, {"a": "p90", "b": "std"})
-    wanted = (2 * aggregate(STEPS, VALID, "p90") + aggregate(STEPS[::-1], VALID, "std")) / 3
-    np.testing.assert_allclose(both.combine(parts, VALID)[1], wanted)
+    expected = (2 * aggregate(STEPS, VALID, "p90") + aggregate(STEPS[::-1], VALID, "std")) / 3
+    np.testing.assert_allclose(both.combine(parts, VALID)[1], expected)
 
 
 @pytest.mark.parametrize(

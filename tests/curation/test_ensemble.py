@@ -1,4 +1,4 @@
-"""Ensemble: folds, disagreement and information by hand, and an ensemble that knows where it has seen little."""
+"""Ensemble: folds, disagreement and information by hand, and disagreement on rare data."""
 
 import math
 from dataclasses import replace
@@ -73,7 +73,7 @@ def test_folds_never_share_a_recording():
         assign_folds(["a", "b", "c", "d", "d"], 5, seed=0)
 
 
-def test_disagreement_is_the_variance_over_that_of_the_expert():
+def test_disagreement_is_relative_to_the_variance_of_the_expert():
     action = np.zeros((1, 2, 3, 2), np.float32)
     action[0, 1] = [[0.1, 0.0], [0.2, 0.0], [0.3, 0.3]]
     predictions = Predictions(action, np.zeros((1, 2, 2)), np.ones((1, 2), bool), None)
@@ -82,7 +82,7 @@ def test_disagreement_is_the_variance_over_that_of_the_expert():
     np.testing.assert_allclose(values[0, 1], [0.01 / 0.25, 0.03 / 0.01], rtol=1e-5)
 
 
-def test_error_is_of_the_member_that_has_not_seen_the_scenario():
+def test_error_is_that_of_the_member_that_excluded_the_scenario():
     action = np.zeros((2, 1, 2, 1), np.float32)
     action[0, 0], action[1, 0] = [[0.4], [0.9]], [[0.1], [0.2]]
     predictions = Predictions(action, np.zeros((2, 1, 1)), np.ones((2, 1), bool), None)
@@ -108,8 +108,8 @@ def test_information_of_grids_is_the_jensen_shannon_divergence():
     assert values.mean() == pytest.approx(expected, abs=0.02)
 
 
-def test_information_depends_on_modes_that_the_mean_hides():
-    """Two ensemble that agree to turn either way know the same; two that turn one way each do not."""
+def test_information_depends_on_modes_with_equal_means():
+    """Two members with the same two modes have no mutual information; two members with one mode each have."""
 
     def sides(first):
         parts = SquashedGaussian(jnp.array([[0.0, -1.0], [0.0, 1.0], [0.0, 0.0]]), jnp.full((3, 2), 0.05))
@@ -123,7 +123,7 @@ def test_information_depends_on_modes_that_the_mean_hides():
 @pytest.mark.slow
 @pytest.mark.parametrize("weighted", ["plain", "rarity"])
 def test_member_learns_from_all_folds_but_its_own(ensemble, data, weighted):
-    """What the expert did there is replaced: the member whose fold it is learns the same, all others something else."""
+    """Changed expert actions of a fold do not affect its own member, but all others."""
     config = replace(TINY, weighted=weighted)
     environment, bank = Driving(Simulator(config.task)), ScenarioBank.from_scenarios(data)
     experience, _ = experience_of(config, environment, bank)
@@ -225,7 +225,7 @@ def test_predictions_cover_every_step(ensemble, data):
 
 @pytest.mark.slow
 def test_members_disagree_on_rare_data(ensemble, tmp_path):
-    """Drives as those that they were cloned from, in between and unseen, and others: turned, fast, hemmed in."""
+    """Scenarios similar to the training data, and others: rotated, fast, and enclosed by agents."""
     usual = [[car(speed=8.1 + 0.2 * row), car(x=60.0, speed=8.0)] for row in range(4)]
     strange = [
         [car(speed=25.0), car(x=12.0), car(x=-8.0, speed=25.0), car(y=3.7, speed=25.0)],

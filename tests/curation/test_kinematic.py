@@ -1,4 +1,4 @@
-"""Criticality of hand-made scenes, worked out on paper; the constant speeds make every step's formula short."""
+"""Criticality of hand-made scenes against hand-computed values; constant speeds keep formulas short."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ NOISE = np.random.default_rng(0).standard_normal(91)
 
 
 def with_speeds(speeds):
-    """A car straight ahead at given speeds."""
+    """A car that drives straight on at given speeds."""
     along = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * 0.1)])
     track = car()
     return track | {
@@ -33,7 +33,7 @@ def with_speeds(speeds):
 
 
 def turning(heading):
-    """A car at 5 m/s with given headings; where it gets to does not matter."""
+    """A car at 5 m/s with given headings; its position does not matter."""
     track = car(speed=5.0)
     return track | {"heading": heading, "velocity": 5.0 * np.stack([np.cos(heading), np.sin(heading)], -1)}
 
@@ -72,20 +72,20 @@ SCENES = {
 
 @pytest.fixture(scope="module")
 def components():
-    """By scene and name."""
+    """Components by scene and name."""
     bank = bank_of(*(straight_road(cars) for cars in SCENES.values()))
-    found = {name: np.asarray(part) for name, part in score_bank(CONFIG, bank).items()}
-    return {scene: {name: part[row] for name, part in found.items()} for row, scene in enumerate(SCENES)}
+    result = {name: np.asarray(part) for name, part in score_bank(CONFIG, bank).items()}
+    return {scene: {name: part[row] for name, part in result.items()} for row, scene in enumerate(SCENES)}
 
 
-def conflict(found):
-    return (found["urgency"] + found["braking"]) / 2
+def conflict(result):
+    return (result["urgency"] + result["braking"]) / 2
 
 
 @pytest.fixture(scope="module")
 def steps(components):
-    """Conflict: the mean of urgency and braking."""
-    return {scene: conflict(found) for scene, found in components.items()}
+    """Return the mean of urgency and braking."""
+    return {scene: conflict(result) for scene, result in components.items()}
 
 
 def expected(ttc_s, braking_mps2, config=CONFIG):
@@ -111,11 +111,11 @@ def test_components_equal_hand_computed_values(steps):
 
 
 def test_every_step_of_an_approach(steps):
-    """From 74 m away to nearly there: no seam where one query of the route ends and the next begins."""
+    """From a distance of 74 m to nearly 0, without a discontinuity between the two route windows."""
     at = np.arange(3, 45)
     gap = 60.0 - 4.8 - 15.0 * (at - NOW) * 0.1
-    wanted = [expected(g / 15.0, 15.0**2 / (2 * g)) for g in gap]
-    np.testing.assert_allclose(steps["far"][at], wanted, atol=1e-3)
+    reference = [expected(g / 15.0, 15.0**2 / (2 * g)) for g in gap]
+    np.testing.assert_allclose(steps["far"][at], reference, atol=1e-3)
 
 
 def test_agents_off_the_path_do_not_count(steps):
@@ -125,11 +125,11 @@ def test_agents_off_the_path_do_not_count(steps):
 
 
 def test_oncoming_agent_counts_as_standing(components):
-    """No braking takes away what others bring to the closing speed, and who stands has nothing to brake."""
+    """Braking does not reduce the other agent's part of the closing speed, and a standing car cannot brake."""
     for scene in ("waiting", "letting pass"):
         assert components[scene]["braking"].max() == components[scene]["urgency"].max() == 0.0
-    wanted = 5.0**2 / (2 * (40.0 - 4.8)) / CONFIG.full_braking_mps2
-    assert components["head on"]["braking"][NOW] == pytest.approx(wanted, abs=1e-3)
+    reference = 5.0**2 / (2 * (40.0 - 4.8)) / CONFIG.full_braking_mps2
+    assert components["head on"]["braking"][NOW] == pytest.approx(reference, abs=1e-3)
 
 
 def test_nearer_and_faster_is_more_critical(steps):
@@ -160,7 +160,7 @@ def test_speed_noise_of_one_cm_per_s_is_negligible(components):
 
 
 def test_jerk_and_yaw_acceleration(components):
-    """Constant ones, which the fitted polynomials give exactly: half of twice nuPlan's limit, and 0.6 rad/s2."""
+    """Constant values, which the fitted polynomials reproduce: half of twice nuPlan's limit, and 0.6 rad/s2."""
     np.testing.assert_allclose(components["jerk"]["volatility"], 0.5, atol=2e-3)
     np.testing.assert_allclose(components["bend"]["volatility"], 0.6 / (2 * 1.93), atol=2e-3)
 
@@ -171,25 +171,25 @@ BRAKING = 30.0 - 2.0 * (TIME + 1.0)
 @pytest.mark.parametrize("there", [range(5, 91), range(51), {*range(91)} - {*range(40, 50)}, range(2, 16)])
 @pytest.mark.parametrize(("speeds", "jerk"), [(BRAKING, 0.0), (20.0 + 4.13 / 2 * (TIME - 4.5) ** 2, 0.5)])
 def test_volatility_ignores_steps_without_ego(there, speeds, jerk):
-    """Constant deceleration, or jerk, up to the last step that is known; 0 where there are no 1.5 s on end."""
+    """Constant deceleration or jerk up to the last valid step; 0 without 1.5 s of valid steps."""
     valid = np.isin(np.arange(91), list(there))
     track = with_speeds(speeds)
     bank = bank_of(straight_road([track | {"valid": valid}]))
-    found = np.asarray(score_bank(CONFIG, bank)["volatility"][0])
+    result = np.asarray(score_bank(CONFIG, bank)["volatility"][0])
     acts = valid & np.roll(valid, -1)
     acts[-1] = acts[-2]
-    wanted = jerk if valid.sum() > 15 else 0.0
-    np.testing.assert_allclose(found, np.where(acts, wanted, 0.0), atol=3e-3)
+    reference = jerk if valid.sum() > 15 else 0.0
+    np.testing.assert_allclose(result, np.where(acts, reference, 0.0), atol=3e-3)
 
 
 def test_volatility_is_of_the_next_action():
-    """Speed jumps between steps 50 and 51, which is the action of step 50: the window is centred there."""
+    """The speed jumps between steps 50 and 51, the action of step 50, where the window is centred."""
     speeds = np.where(np.arange(91) <= 50, 10.0, 10.2)
     bank = bank_of(straight_road([with_speeds(speeds)]))
-    found = np.asarray(score_bank(CONFIG, bank)["volatility"][0])
+    result = np.asarray(score_bank(CONFIG, bank)["volatility"][0])
     # The slope of a line through 15 values of which one is 2 m/s2, k steps from the middle: 2 k / 280 per step.
-    wanted = [2.0 * abs(k) / 280 / 0.1 / (2 * 4.13) if abs(k) <= 7 else 0.0 for k in range(-10, 11)]
-    np.testing.assert_allclose(found[40:61], wanted, atol=1e-3)
+    reference = [2.0 * abs(k) / 280 / 0.1 / (2 * 4.13) if abs(k) <= 7 else 0.0 for k in range(-10, 11)]
+    np.testing.assert_allclose(result[40:61], reference, atol=1e-3)
 
 
 def test_distances_are_to_segments(components):
@@ -213,7 +213,7 @@ def test_agents_that_appear_overlapping_are_ignored(steps):
 
 
 def test_default_weights_rank_stopped_above_oncoming_car(components):
-    """The published heuristic ranks them the other way round."""
+    """The published heuristic ranks them in the opposite order."""
     valid = np.ones((2, 91), bool)
     both = {
         name: np.stack([components[scene][name] for scene in ("stopped", "oncoming")])
@@ -226,7 +226,7 @@ def test_default_weights_rank_stopped_above_oncoming_car(components):
 
 @pytest.mark.slow
 def test_batches_do_not_change_scores(tmp_path, components, monkeypatch):
-    """Batched, against the bank of all."""
+    """Scores of batches equal those of a single bank."""
     monkeypatch.setattr(scoring, "BATCH", 4)
     names = list(SCENES)[:6]
     with ScenarioWriter(tmp_path / "set", Capacity()) as writer:

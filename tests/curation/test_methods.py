@@ -1,4 +1,4 @@
-"""Every method by name, on a small set of the built-in world and on one that it did not make."""
+"""All methods by name, on a small set of the built-in world and on another set."""
 
 from dataclasses import replace
 from typing import get_args, get_type_hints
@@ -23,7 +23,7 @@ from scenes import SMALL, car, straight_road
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Four drives, said to be of the built-in world; the second has an event, the third ends early."""
+    """Four scenarios with the name of the built-in world; the second has an event, the third ends early."""
     path = tmp_path_factory.mktemp("methods") / "set"
     drives = [
         ([car(speed=10.0)], ()),
@@ -99,7 +99,9 @@ def test_oracle_scores_are_labels(data, tables):
 def test_oracle_refuses_sets_without_labels(tmp_path):
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
         writer.add(assemble(straight_road([car()]), SMALL))
-    with pytest.raises(DataError, match="only the built-in world has event labels, this set is of test; use"):
+    with pytest.raises(
+        DataError, match="only the built-in world has event labels, this set is from test; use"
+    ):
         curate("oracle", Request(ScenarioSet.open(tmp_path / "set")))
 
 
@@ -131,7 +133,7 @@ def test_settings_of_a_method(data, tables, tmp_path, capsys):
     table = curate("kinematic", Request(data, config=KinematicConfig(urgent_s=2.0)))
     assert table.config["urgent_s"] == 2.0
     assert table.components["urgency"].max() >= tables["kinematic"].components["urgency"].max()
-    with pytest.raises(UsageError, match="uniform has no settings of type KinematicConfig; leave them out"):
+    with pytest.raises(UsageError, match="uniform has no settings of type KinematicConfig; remove them"):
         curate("uniform", Request(data, config=KinematicConfig()))
     out = tmp_path / "scores.npz"
     assert main(["curate", "kinematic", "--data", str(data.path), "--out", str(out), "--urgent_s", "2"]) == 0
@@ -141,7 +143,7 @@ def test_settings_of_a_method(data, tables, tmp_path, capsys):
 
 
 def test_weights_and_aggregators_can_be_changed(data, tmp_path):
-    """The aggregators of components that are left out weigh nothing."""
+    """Aggregators of components without weight have no effect."""
     out = tmp_path / "scores.npz"
     call = [
         "curate",
@@ -155,12 +157,12 @@ def test_weights_and_aggregators_can_be_changed(data, tmp_path):
         "1",
     ]
     assert main(call) == 0
-    found = read_scores(out, data)
+    result = read_scores(out, data)
     assert (
-        found.combination.weights == {"volatility": 1.0} and found.combination.scenario["density"] == "mean"
+        result.combination.weights == {"volatility": 1.0} and result.combination.scenario["density"] == "mean"
     )
     assert main([*call, "--overwrite", "--scenario", "volatility", "max"]) == 0
-    top = np.where(found.valid, found.components["volatility"], 0.0).max(axis=1)
+    top = np.where(result.valid, result.components["volatility"], 0.0).max(axis=1)
     np.testing.assert_allclose(read_scores(out, data).scenarios, top, rtol=1e-6)
 
 
@@ -169,8 +171,8 @@ def test_tables_with_other_settings_are_refused(data, tables, tmp_path):
         write_scores(tables[name], tmp_path / f"{name}.npz")
         check_current(read_scores(tmp_path / f"{name}.npz", data))
     table = tables["kinematic"]
-    with pytest.raises(DataError, match=r"with urgent_s 0\.95, which is 2\.0 here; score again"):
+    with pytest.raises(DataError, match=r"have urgent_s 0\.95, not 2\.0; score again"):
         check_current(table, KinematicConfig(urgent_s=2.0))
     for other in (replace(table.combination, scenario="max"), Combination({"urgency": 1.0}, "top10")):
-        with pytest.raises(DataError, match="scores of 'kinematic' with combination"):
+        with pytest.raises(DataError, match="scores of 'kinematic' have combination"):
             check_current(table.recombine(other))

@@ -1,4 +1,4 @@
-"""Densities against the formula for every pair, closed forms, and the published histogram by another program."""
+"""Densities against the formula for all pairs, closed forms, and another implementation of the published histogram."""
 
 from dataclasses import replace
 
@@ -17,12 +17,12 @@ def test_density_of_one_action_is_the_kernel():
     density = KernelRarity(bandwidth=0.1, cells=512).density
     middle = np.zeros((1, 2)) + 1 / 512  # the centre of a cell
     at = middle + np.array([[0.0, 0.0], [0.1, 0.0], [0.0, -0.2], [0.15, 0.15]])
-    wanted = np.exp(-0.5 * ((at - middle) ** 2).sum(axis=1) / 0.01) / (2 * np.pi * 0.01)
-    np.testing.assert_allclose(density(middle, at), wanted, rtol=2e-3)
+    expected = np.exp(-0.5 * ((at - middle) ** 2).sum(axis=1) / 0.01) / (2 * np.pi * 0.01)
+    np.testing.assert_allclose(density(middle, at), expected, rtol=2e-3)
 
 
 def test_density_integrates_to_one_at_the_bounds_too():
-    """Kernels that reach over a bound are mirrored."""
+    """Kernels are mirrored at the bounds."""
     actions = np.clip(RNG.normal(0.9, 0.3, (500, 2)), -1, 1)
     centres = -1 + (np.arange(256) + 0.5) / 128
     grid = np.stack(np.meshgrid(centres, centres), -1).reshape(-1, 2)
@@ -32,15 +32,15 @@ def test_density_integrates_to_one_at_the_bounds_too():
 def test_density_equals_the_sum_over_pairs():
     actions, at = RNG.uniform(-0.5, 0.5, (400, 2)), RNG.uniform(-0.5, 0.5, (60, 2))
     apart = ((at[:, None] - actions) ** 2).sum(axis=2)
-    wanted = np.exp(-0.5 * apart / 0.05**2).mean(axis=1) / (2 * np.pi * 0.05**2)
+    expected = np.exp(-0.5 * apart / 0.05**2).mean(axis=1) / (2 * np.pi * 0.05**2)
     np.testing.assert_allclose(
-        KernelRarity(bandwidth=0.05, cells=1024).density(actions, at), wanted, rtol=0.02
+        KernelRarity(bandwidth=0.05, cells=1024).density(actions, at), expected, rtol=0.02
     )
 
 
 @pytest.mark.parametrize("temper", [1.0, 0.5, 0.0])
 def test_inverse_frequency_tempered_and_clipped(temper):
-    """Two places far apart, one with nine tenths of the actions: the other's are nine times rarer."""
+    """Two distant actions, of which one has nine tenths of the steps: the other is nine times rarer."""
     actions = np.repeat([[0.25, 0.25], [-0.5, 0.5]], (900, 100), axis=0)
     scores = KernelRarity(temper=temper, most=5.0).scores(actions, actions)
     np.testing.assert_allclose(scores[:900], 1 / 5)
@@ -50,7 +50,7 @@ def test_inverse_frequency_tempered_and_clipped(temper):
 
 
 def test_published_histogram():
-    """Counted and weighed cell by cell."""
+    """The histogram is counted and weighted cell by cell."""
     config = PublishedRarity()
     acceleration, curvature = config.edges
     assert len(acceleration) == len(curvature) == 90
@@ -65,9 +65,9 @@ def test_published_histogram():
         counts[i, j] += 1
         cells.append((i, j))
     weight = 1 / (counts + 1)
-    wanted = [weight[cell] / weight.mean() / 3 + 0.01 for cell in cells]
+    expected = [weight[cell] / weight.mean() / 3 + 0.01 for cell in cells]
     scores = config.scores(actions, actions)
-    np.testing.assert_allclose(scores, wanted)
+    np.testing.assert_allclose(scores, expected)
     assert scores.max() < 1.764 / 3 + 0.01  # the cap of 3 never binds
 
 
@@ -83,12 +83,12 @@ def test_expert_actions_and_their_mask():
         straight_road([faster]),
         straight_road([car(speed=5.0, steps=range(30))]),
     )
-    found = {name: np.asarray(part) for name, part in score_bank(ExpertActions(), bank).items()}
-    np.testing.assert_allclose(found["action"][0, :89], 0.0, atol=1e-3)
-    np.testing.assert_allclose(found["action"][1, :89], [[1 / 3, 0.0]] * 89, atol=2e-3)
-    assert found["known"].sum(axis=1).tolist() == [89, 89, 28]
-    steps = rarity_steps(KernelRarity(), found["action"], found["known"])
-    assert (steps[found["known"]] > 0).all() and (steps[~found["known"]] == 0).all()
+    result = {name: np.asarray(part) for name, part in score_bank(ExpertActions(), bank).items()}
+    np.testing.assert_allclose(result["action"][0, :89], 0.0, atol=1e-3)
+    np.testing.assert_allclose(result["action"][1, :89], [[1 / 3, 0.0]] * 89, atol=2e-3)
+    assert result["known"].sum(axis=1).tolist() == [89, 89, 28]
+    steps = rarity_steps(KernelRarity(), result["action"], result["known"])
+    assert (steps[result["known"]] > 0).all() and (steps[~result["known"]] == 0).all()
     assert steps[1, 20] > steps[0, 20]  # 90 steps against 118 without acceleration
 
 

@@ -1,4 +1,4 @@
-"""The table of scores: what comes back, and what is refused."""
+"""Score tables: round trips and refusals."""
 
 import json
 from dataclasses import replace
@@ -49,20 +49,20 @@ def table(data):
 def test_tables_round_trip(data, table, tmp_path):
     out = tmp_path / "deep" / "scores"
     write_scores(table, out)
-    found = read_scores(out, data)
+    result = read_scores(out, data)
     config = {
         "urgent_s": 0.95,
         "combination": {"weights": {"urgency": 0.5, "braking": 0.5}, "scenario": "max"},
     }
-    assert (found.method, dict(found.config), found.set_hash, found.scenario_ids) == (
+    assert (result.method, dict(result.config), result.set_hash, result.scenario_ids) == (
         "kinematic", config, data.hash, ("drive-0", "drive-1"),
     )  # fmt: skip
-    np.testing.assert_array_equal(found.valid, table.valid)
-    np.testing.assert_allclose(found.steps, table.steps, rtol=1e-6)
-    np.testing.assert_allclose(found.scenarios, table.steps.max(axis=1), rtol=1e-6)
-    assert sorted(found.components) == ["braking", "urgency"]
+    np.testing.assert_array_equal(result.valid, table.valid)
+    np.testing.assert_allclose(result.steps, table.steps, rtol=1e-6)
+    np.testing.assert_allclose(result.scenarios, table.steps.max(axis=1), rtol=1e-6)
+    assert sorted(result.components) == ["braking", "urgency"]
     for name, part in table.components.items():
-        np.testing.assert_array_equal(found.components[name], part)
+        np.testing.assert_array_equal(result.components[name], part)
     with np.load(out) as stored:
         assert json.loads(str(stored["header"]))["method"] == "kinematic"
         np.testing.assert_allclose(stored["scenario_score"], table.steps.max(axis=1), rtol=1e-6)
@@ -71,16 +71,16 @@ def test_tables_round_trip(data, table, tmp_path):
 
 def test_components_can_be_combined_again(data, table, tmp_path):
     write_scores(table, tmp_path / "scores.npz")
-    found = read_scores(tmp_path / "scores.npz", data)
-    again = found.recombine(Combination({"braking": 0.25, "urgency": 0.75}, "mean"))
-    parts = 0.25 * found.components["braking"] + 0.75 * found.components["urgency"]
-    wanted = np.where(found.valid, parts, 0.0)
-    np.testing.assert_allclose(again.steps, wanted, rtol=1e-6)
-    np.testing.assert_allclose(again.scenarios, [wanted[0].mean(), wanted[1, :80].mean()], rtol=1e-6)
+    result = read_scores(tmp_path / "scores.npz", data)
+    again = result.recombine(Combination({"braking": 0.25, "urgency": 0.75}, "mean"))
+    parts = 0.25 * result.components["braking"] + 0.75 * result.components["urgency"]
+    expected = np.where(result.valid, parts, 0.0)
+    np.testing.assert_allclose(again.steps, expected, rtol=1e-6)
+    np.testing.assert_allclose(again.scenarios, [expected[0].mean(), expected[1, :80].mean()], rtol=1e-6)
     assert again.config["combination"]["weights"] == {"braking": 0.25, "urgency": 0.75}
     assert again.config["combination"]["scenario"] == "mean"
     with pytest.raises(UsageError, match="unknown component 'brakes'; did you mean 'braking'"):
-        found.recombine(Combination({"brakes": 1.0}))
+        result.recombine(Combination({"brakes": 1.0}))
 
 
 def test_older_versions_are_refused(data, table, tmp_path, monkeypatch):
@@ -93,7 +93,7 @@ def test_older_versions_are_refused(data, table, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def lively(tmp_path_factory):
-    """A drive that speeds up, brakes, swerves and is not seen for a second; a car ahead, and an oncoming car."""
+    """Ego accelerates, brakes, swerves and is unobserved for a second, with a car ahead and an oncoming car."""
     t = (np.arange(91) - 10) * 0.1
     speed, swerve = 9.0 + 3.0 * np.sin(0.9 * t), 0.8 * np.sin(0.7 * t)
     along = np.cumsum(speed) * 0.1
@@ -122,10 +122,10 @@ FROZEN = {
 
 @pytest.mark.parametrize("method", ["kinematic", "published", "action_rarity", "action_rarity_published"])
 def test_scores_equal_stored_values_of_this_version(lively, method):
-    """Tables of before would be taken for today's: where these change, raise SCORES_VERSION, too."""
-    found = curate(method, Request(lively))
+    """If these values change, increase SCORES_VERSION, so that older tables are refused."""
+    result = curate(method, Request(lively))
     assert scores.SCORES_VERSION == 3
-    np.testing.assert_allclose([*found.scenarios, *found.steps[0, ::12]], FROZEN[method], atol=5e-4)
+    np.testing.assert_allclose([*result.scenarios, *result.steps[0, ::12]], FROZEN[method], atol=5e-4)
 
 
 def test_missing_table_is_refused(data, tmp_path):
@@ -138,7 +138,7 @@ def test_table_of_other_data_is_refused(data, table, tmp_path):
     write_scores(replace(table, set_hash="0" * 64), tmp_path / "old.npz")
     with pytest.raises(DataError) as error:
         read_scores(tmp_path / "old.npz", data)
-    assert "scores are of other data (hash 000000000000" in str(error.value)
+    assert "scores belong to another set (hash 000000000000" in str(error.value)
     assert str(error.value).endswith("; run `drivax curate` again")
 
 
@@ -209,13 +209,13 @@ def test_failed_write_keeps_the_old_table(table, tmp_path, monkeypatch):
     assert file.read_bytes() == before and [path.name for path in tmp_path.iterdir()] == ["scores.npz"]
 
 
-def test_the_command(data, tmp_path, capsys):
+def test_command_writes_scores(data, tmp_path, capsys):
     out, top = tmp_path / "scores.npz", tmp_path / "top"
     command = ["curate", "kinematic", "--data", str(data.path)]
     assert main([*command, "--out", str(out), "--export", str(top), "1"]) == 0
     said = capsys.readouterr().out
-    found = read_scores(out, data)
-    assert found.scenarios[1] > found.scenarios[0] and found.steps[1].max() > 0.5
+    result = read_scores(out, data)
+    assert result.scenarios[1] > result.scenarios[0] and result.steps[1].max() > 0.5
     assert "2 scenarios, kinematic" in said and "effective sample" in said and "the 1 most critical" in said
     assert max(map(len, said.replace(str(tmp_path), "").splitlines())) < 100
     assert [entry["scenario_id"] for entry in ScenarioSet.open(top).entries] == ["drive-1"]
@@ -223,16 +223,18 @@ def test_the_command(data, tmp_path, capsys):
     anew = [*command, "--out", str(tmp_path / "anew.npz"), "--again", str(out)]
     assert main([*anew, "--weights", "urgency", "0.5", "density", "0.25", "--scenario", "max"]) == 0
     other = read_scores(tmp_path / "anew.npz", data)
-    by_hand = (2 * found.components["urgency"] + found.components["density"]) / 3
-    np.testing.assert_allclose(other.steps, np.where(found.valid, by_hand, 0.0), rtol=1e-6)
+    by_hand = (2 * result.components["urgency"] + result.components["density"]) / 3
+    np.testing.assert_allclose(other.steps, np.where(result.valid, by_hand, 0.0), rtol=1e-6)
     np.testing.assert_array_equal(other.scenarios, other.steps.max(axis=1))
     assert other.combination == Combination({"urgency": 0.5, "density": 0.25}, "max")
     # And one aggregator for each component.
     weights, apart = ["--weights", "urgency", "0.5", "braking", "0.25"], ["urgency", "max", "braking", "mean"]
     assert main([*anew, "--overwrite", *weights, "--scenario", *apart]) == 0
     other = read_scores(tmp_path / "anew.npz", data)
-    urgency, braking = (np.where(found.valid, found.components[name], 0.0) for name in ("urgency", "braking"))
-    by_hand = (2 * urgency.max(axis=1) + braking.sum(axis=1) / found.valid.sum(axis=1)) / 3
+    urgency, braking = (
+        np.where(result.valid, result.components[name], 0.0) for name in ("urgency", "braking")
+    )
+    by_hand = (2 * urgency.max(axis=1) + braking.sum(axis=1) / result.valid.sum(axis=1)) / 3
     np.testing.assert_allclose(other.scenarios, by_hand, rtol=1e-5)
     assert other.combination.scenario == {"urgency": "max", "braking": "mean"}
     capsys.readouterr()
@@ -241,7 +243,7 @@ def test_the_command(data, tmp_path, capsys):
         (["--scenario", "p101"], "unknown aggregator 'p101'"),
         (
             [*weights, "--scenario", "urgency", "max"],
-            "missing aggregator for 'braking'; name one for each comp",
+            "missing aggregator for 'braking'; name an aggregator for each comp",
         ),
         ([*weights, "--scenario", *apart, "densty", "max"], "'densty'; did you mean 'density'"),
         ([*weights, "--scenario", "urgency", "max", "braking", "most"], "unknown aggregator 'most'"),
@@ -260,8 +262,8 @@ def test_the_command(data, tmp_path, capsys):
         (["ensemble", *mixture, "--weights", "action_0", "1"], "unknown component 'action_0'"),
     ):
         assert main(["curate", *wrong[:1], *begin, *wrong[1:]]) == 2
-        told = capsys.readouterr().err
-        assert words in told and "scor" not in told.split(words)[0]
+        messages = capsys.readouterr().err
+        assert words in messages and "scor" not in messages.split(words)[0]
     assert main(["curate", "published", *anew[2:], "--overwrite"]) == 2
     assert "is a table of kinematic; use curate kinematic" in capsys.readouterr().err
     for ignored in (["--seed", "1"], ["--like", str(out)]):
@@ -280,7 +282,7 @@ def test_the_command(data, tmp_path, capsys):
         assert (
             main([*command, "--out", str(tmp_path / "x"), "--export", str(tmp_path / "y"), out_of_range]) == 2
         )
-        assert "most critical of 2 scenarios; ask for 1 to 2" in capsys.readouterr().err
+        assert "of 2 scenarios; ask for 1 to 2" in capsys.readouterr().err
     for taken, words in ((data.path, "is the set that is read"), (top, "already exists")):
         assert main([*command, "--out", str(tmp_path / "x"), "--export", str(taken), "1"]) == 2
         assert words in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The most critical scenarios of a set: their order, at most one of each recording, and the set that they become."""
+"""The most critical scenarios of a set: order, one scenario per recording, and the exported set."""
 
 import csv
 from dataclasses import replace
@@ -24,7 +24,7 @@ SOURCES = (("a", "one"), ("a", "one"), ("a", "two"), ("b", "one"), ("a", "four")
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Six drives of five recordings; the second one ends early."""
+    """Six scenarios of five recordings; the second one ends early."""
     path = tmp_path_factory.mktemp("subset") / "set"
     with ScenarioWriter(path, SMALL) as writer:
         for row, (dataset, segment) in enumerate(SOURCES):
@@ -35,7 +35,7 @@ def data(tmp_path_factory):
 
 
 def hand_made(data, scenarios, means=None):
-    """A table with these scores of scenarios and these means of their valid steps."""
+    """A table with given scores of scenarios and means of their valid steps."""
     valid = np.stack([np.asarray(one.record["agent_valid"][:, 0], bool) for one in data])
     means = np.zeros(len(data)) if means is None else np.asarray(means)
     steps = np.where(valid, means[:, None], 0.0)
@@ -53,7 +53,7 @@ def test_ties_are_ordered_by_mean_step_score_then_index(data):
 
 
 def test_order_survives_a_round_trip(data, tmp_path):
-    """A file rounds to float32: what is equal there is equal before."""
+    """Files round to float32, so scores that are equal in float32 are ties."""
     near = 0.5 + 1e-12 * np.arange(6)
     table = hand_made(data, near, [0.3, 0.1, 0.2, 0.6, 0.5, 0.4])
     write_scores(table, tmp_path / "scores.npz")
@@ -63,7 +63,7 @@ def test_order_survives_a_round_trip(data, tmp_path):
 
 
 def test_the_most_critical_of_each_recording(data):
-    """Scenarios of one recording leave room for others; a name of another data set is another one."""
+    """Only one scenario per recording is selected; recordings of other data sets may have the same name."""
     table = hand_made(data, [0.8, 0.9, 0.1, 0.3, 0.7, 0.6])
     recordings = recordings_of(data.entries)
     assert len(set(recordings)) == 5 and recordings[0] == recordings[1]
@@ -84,19 +84,19 @@ def test_subset_holds_one_scenario_of_each_recording_by_default(data, tmp_path):
 
 
 def test_count_beyond_the_recordings_is_refused(data, tmp_path, capsys):
-    told = (
-        "the 6 most critical of 5 recordings, one scenario of each; "
+    message = (
+        "cannot select 6 scenarios from 5 recordings, one of each; "
         "ask for 1 to 5, or pass --all-windows to choose among all 6 scenarios"
     )
-    with pytest.raises(UsageError, match=told):
+    with pytest.raises(UsageError, match=message):
         check_top(data, tmp_path / "top", 6)
     check_top(data, tmp_path / "top", 5)
     check_top(data, tmp_path / "top", 6, all_windows=True)
-    with pytest.raises(UsageError, match="the 7 most critical of 6 scenarios; ask for 1 to 6"):
+    with pytest.raises(UsageError, match="cannot select 7 of 6 scenarios; ask for 1 to 6"):
         check_top(data, tmp_path / "top", 7, all_windows=True)
     command = ["curate", "uniform", "--data", str(data.path), "--out", str(tmp_path / "scores.npz")]
     assert main([*command, "--export", str(tmp_path / "top"), "6"]) == 2
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert main([*command, "--all-windows"]) == 2
     assert "--all-windows without a subset to choose; pass --export TOP N" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
@@ -123,7 +123,7 @@ def test_subset_folder_holds_its_scores(data, tmp_path):
     assert own.config["urgent_s"] == table.config["urgent_s"]
     # Scores of the whole set are not those of the subset, and where those are is said.
     write_scores(table, tmp_path / "whole.npz")
-    with pytest.raises(DataError, match=r"scores are of other data .*; use .*top/scores\.npz"):
+    with pytest.raises(DataError, match=r"scores belong to another set .*; use .*top/scores\.npz"):
         read_scores(tmp_path / "whole.npz", top)
 
 
@@ -153,8 +153,8 @@ def test_command_prints_the_most_critical(data, tmp_path, capsys):
     assert lines[place + 1 : place + 3] == ["/top/scores.npz: their scores", "  rank  score  scenario"]
     table = read_scores(out, data)
     rows = top_rows(table, 3, recordings_of(data.entries))
-    told = [line.split() for line in lines[place + 3 :]]
-    assert told == [
+    message = [line.split() for line in lines[place + 3 :]]
+    assert message == [
         [str(rank), f"{table.scenarios[row]:.3f}", f"drive-{row}"] for rank, row in enumerate(rows, start=1)
     ]
 

@@ -1,4 +1,4 @@
-"""Weights and what they do, against closed forms."""
+"""Weights and statistics of draws against closed forms."""
 
 import numpy as np
 import pytest
@@ -31,14 +31,14 @@ DRAWN = TABLE.drawable
 
 @pytest.mark.parametrize("temperature", [1.0, 0.5, 2.0])
 def test_quantiles_to_a_power(temperature):
-    """Of u uniform in (0, 1), u^k has mean 1/(k+1) and mean square 1/(2k+1): an effective share of (2k+1)/(k+1)^2."""
+    """For uniform u in (0, 1), u^k has mean 1/(k+1) and mean square 1/(2k+1): an effective share of (2k+1)/(k+1)^2."""
     k = 1 / temperature
     weights = sampling_weights(TABLE, plain(normalise="quantile", temperature=temperature), "step")
-    found = draw_statistics(weights, DRAWN)
-    assert found.effective == pytest.approx((2 * k + 1) / (k + 1) ** 2, rel=1e-3)
-    assert found.tilt == pytest.approx((k + 1) * 0.99**k, rel=1e-2)
-    assert found.largest == pytest.approx(k + 1, rel=1e-2)
-    assert found.concentration == pytest.approx(1 - 0.95 ** (k + 1), rel=1e-2)
+    result = draw_statistics(weights, DRAWN)
+    assert result.effective == pytest.approx((2 * k + 1) / (k + 1) ** 2, rel=1e-3)
+    assert result.tilt == pytest.approx((k + 1) * 0.99**k, rel=1e-2)
+    assert result.largest == pytest.approx(k + 1, rel=1e-2)
+    assert result.concentration == pytest.approx(1 - 0.95 ** (k + 1), rel=1e-2)
 
 
 def test_mixture_with_uniform():
@@ -65,7 +65,7 @@ def test_clipping_and_floor():
 
 @pytest.mark.parametrize("most", [1.1, 2.0, 10.0])
 def test_clip_bounds_all_weights(most):
-    """However heavy the tail; the others keep their proportions, and no more is clipped than has to be."""
+    """For any tail; other weights keep their proportions, and as few weights as possible are clipped."""
     rng = np.random.default_rng(0)
     for power in (0.5, 1.0, 4.0):
         score = rng.uniform(0.001, 1.0, (20, 11)) ** power
@@ -90,7 +90,7 @@ def test_clip_with_too_few_positive_scores():
     ids=["heuristic", "rarity"],
 )
 def test_published_weights_have_the_published_tilt(mean, deviation, share):
-    """Scores of a mean and deviation, drawn with 0.01 on top (the study's own statistics of its scores)."""
+    """Scores with the mean and deviation of the published study, plus 0.01."""
     table = make_table(np.resize((mean - deviation, mean + deviation), (40, 51)))
     weights = sampling_weights(table, PUBLISHED, "step")
     assert effective_size(weights[table.drawable]) / table.drawable.sum() == pytest.approx(share, abs=1e-3)
@@ -102,8 +102,8 @@ def test_equal_scores_are_uniform_at_either_scale():
         weights = sampling_weights(table, WeightConfig(), scale)
         np.testing.assert_allclose(weights[:, :-1], 1.0)
         assert (weights[:, -1] == 0).all()
-        found = draw_statistics(weights, table.drawable)
-        assert (found.effective, found.effective_scenarios) == (pytest.approx(1.0), pytest.approx(1.0))
+        result = draw_statistics(weights, table.drawable)
+        assert (result.effective, result.effective_scenarios) == (pytest.approx(1.0), pytest.approx(1.0))
 
 
 def test_steps_of_a_scenario_share_its_weight():
@@ -134,11 +134,11 @@ def test_low_temperature_is_stable():
 def test_one_step_with_all_the_weight():
     one = np.zeros((4, 26))
     one[2, 3] = 1.0
-    found = draw_statistics(
+    result = draw_statistics(
         sampling_weights(make_table(one), plain(), "step"), np.pad(np.ones((4, 25), bool), ((0, 0), (0, 1)))
     )
-    assert (found.effective, found.effective_scenarios) == (pytest.approx(0.01), pytest.approx(0.25))
-    assert (found.largest, found.concentration) == (pytest.approx(100.0), pytest.approx(1.0))
+    assert (result.effective, result.effective_scenarios) == (pytest.approx(0.01), pytest.approx(0.25))
+    assert (result.largest, result.concentration) == (pytest.approx(100.0), pytest.approx(1.0))
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_one_step_with_all_the_weight():
 )
 @pytest.mark.parametrize("scale", ["step", "scenario"])
 def test_permuted_scores_keep_the_distribution_of_weights(config, scale):
-    """Over all steps, and over scenarios too: critical steps lie together, and so do those of the control."""
+    """The distribution is the same over steps and over scenarios, because scenarios are permuted as a whole."""
     table = make_table(np.clip(RNG.random((500, 1)) ** 3 + 0.1 * RNG.random((500, 41)), 0, 1))
     control = permute_scores(table, seed=7)
     drawn = table.drawable
@@ -185,7 +185,7 @@ def test_permuted_scores_of_scenarios_of_unequal_length():
 
 
 def test_weights_are_zero_on_unusable_steps():
-    """Ranks, mean and effective size are over these alone."""
+    """Ranks, mean and effective size are those of usable steps."""
     usable = DRAWN & (RNG.random(DRAWN.shape) < 0.5)
     weights = sampling_weights(TABLE, plain(normalise="quantile"), "step", usable)
     assert (weights[~usable] == 0).all() and weights[usable].mean() == pytest.approx(1.0)
@@ -197,7 +197,7 @@ def test_weights_are_zero_on_unusable_steps():
 
 @pytest.mark.parametrize("config", [WeightConfig(), plain(most=1.5), PUBLISHED])
 def test_scenario_ranks_count_drawable_steps(config):
-    """The same as weighing every step by its scenario's score, one by one."""
+    """The weights equal those of steps that have the scores of their scenarios."""
     table = make_table(RNG.random((60, 41)), scenarios=RNG.random(60) ** 4)
     usable = table.drawable & (np.arange(41) < RNG.integers(0, 41, 60)[:, None])
     usable[np.argsort(table.scenarios)[-20:]] &= np.arange(41) == 0  # the most critical have one step each

@@ -1,4 +1,4 @@
-"""The audit against hand-made scenarios, and against the evaluation of the exact expert."""
+"""The audit against hand-made scenarios and against the evaluation of the exact expert."""
 
 from dataclasses import replace
 
@@ -33,13 +33,13 @@ def world():
 
 
 @pytest.fixture(scope="module")
-def found(world):
+def findings(world):
     return audit(world.scenarios)
 
 
-def test_filters_know_every_finding(found):
+def test_filters_know_every_finding(findings):
     kinds = {"truth": bool, "number": int | float, "word": str}
-    for finding in found:
+    for finding in findings:
         assert set(finding) == set(FINDINGS)
         for name, value in finding.items():
             quantity = FINDINGS[name]
@@ -54,10 +54,10 @@ def offroad_steps(planner, bank):
 
 
 @pytest.mark.slow
-def test_audit_agrees_with_the_evaluation_of_the_expert(world, found):
+def test_audit_agrees_with_the_evaluation_of_the_expert(world, findings):
     results = evaluate(Expert(), world.bank, world.names)
     offroad = offroad_steps(Expert(), world.bank)
-    for row, finding in enumerate(found):
+    for row, finding in enumerate(findings):
         metric = {name: values[row] for name, values in results.metrics.items()}
         assert finding["log_collides"] == (metric["collision"] > 0)
         assert finding["log_left_map"] == (metric["left_map"] > 0)
@@ -70,10 +70,10 @@ def test_audit_agrees_with_the_evaluation_of_the_expert(world, found):
 
 
 @pytest.mark.slow
-def test_batch_size_and_other_scenarios_change_no_finding(world, found):
+def test_batch_size_and_other_scenarios_change_no_finding(world, findings):
     scenarios = list(world.scenarios)
-    assert audit(scenarios * 12) == found * 12 and len(found) * 12 > BATCH
-    assert audit(scenarios[::-1]) == found[::-1]
+    assert audit(scenarios * 12) == findings * 12 and len(findings) * 12 > BATCH
+    assert audit(scenarios[::-1]) == findings[::-1]
     assert audit([]) == []
 
 
@@ -110,7 +110,7 @@ def test_leaving_and_entering_the_road_have_their_first_steps():
 
 
 def turned(track):
-    """The same motion with headings off by pi, as in sources that know them up to pi."""
+    """The same motion with headings off by pi, as in sources that know headings only up to pi."""
     return track | {"heading": (track["heading"] + 2 * np.pi) % (2 * np.pi) - np.pi}
 
 
@@ -179,10 +179,10 @@ def test_steps_without_a_logged_ego_are_not_evaluated():
 
 def test_red_lights_count_only_where_lights_are_known():
     red, green, none = (straight_road([car(0, 0, 0, 10)], light=state) for state in (RED, GREEN, None))
-    found = audited(red, green, replace(none, flags=none.flags & ~Flag.LIGHTS))
-    assert [finding["log_runs_red"] for finding in found] == [True, False, None]
-    assert [finding["lights_seen"] for finding in found] == [1, 1, 0]
-    assert [finding["clean"] for finding in found] == [False, True, True]
+    findings = audited(red, green, replace(none, flags=none.flags & ~Flag.LIGHTS))
+    assert [finding["log_runs_red"] for finding in findings] == [True, False, None]
+    assert [finding["lights_seen"] for finding in findings] == [1, 1, 0]
+    assert [finding["clean"] for finding in findings] == [False, True, True]
 
 
 def test_unobserved_lights_are_not_seen():
@@ -243,7 +243,7 @@ def test_agents_on_another_level_do_not_collide():
 
 @pytest.mark.slow
 def test_logged_ego_of_every_real_file_is_clean(real_data):
-    """No collision, at most 1 % of the steps off the road, no false finding through z on the overpass."""
+    """No collision, at most 1 % of the steps off the road, and no false finding on the overpass (by heights)."""
     scenarios = []
     for file in find_files(real_data)[0]:
         for recording in detect(file).read(file):

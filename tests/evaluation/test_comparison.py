@@ -1,4 +1,4 @@
-"""Comparisons of hand-made evaluations: what is paired, what is refused, and what the rule says."""
+"""Comparisons of hand-made evaluations: pairing, refusals and decisions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PLAN = ComparisonPlan(minimum_scenarios=10, resamples=400, secondary=("collision
 
 
 def table(name, shift=0.0, seed=1, rows=range(N), per_recording=1, about=None, **metrics):
-    """An evaluation with a score, collisions and comfort; rows are numbers of scenarios."""
+    """An evaluation with score, collisions and comfort; ``rows`` are numbers of scenarios."""
     rng, rows = np.random.default_rng(seed), np.array(rows)
     scene = np.random.default_rng(0).normal(0.6, 0.2, 10 * N)[rows]
     values = {
@@ -48,15 +48,15 @@ def table(name, shift=0.0, seed=1, rows=range(N), per_recording=1, about=None, *
 
 def test_paired_comparison_equals_hand_computed_values():
     a, b = table("one", 0.1, seed=2), table("two")
-    found = compare(PLAN, [a], [b])
-    one = found.primary
+    result = compare(PLAN, [a], [b])
+    one = result.primary
     x, y = a.metrics["vmax_score"], b.metrics["vmax_score"]
     assert one.difference == paired_bootstrap(x, y, a.clusters, resamples=400, seed=0)
     assert one.evidence == paired_permutation(x, y, a.clusters, 400, seed=0)
     assert one.effects["d_z"] == pytest.approx((x - y).mean() / (x - y).std(ddof=1))
-    assert (found.scenarios, found.recordings, found.strata) == ((N, N), (N, N), 1)
-    assert one.winner == "A" and found.decision.recommendation == "A" and found.decision.because == "test"
-    rates = found.secondary
+    assert (result.scenarios, result.recordings, result.strata) == ((N, N), (N, N), 1)
+    assert one.winner == "A" and result.decision.recommendation == "A" and result.decision.because == "test"
+    rates = result.secondary
     assert rates[0].evidence == mcnemar_test(a.metrics["collision"], b.metrics["collision"])
     assert rates[0].a == rate(a.metrics["collision"])
     assert [r.p_adjusted for r in rates] == holm_adjust([r.evidence.p for r in rates])
@@ -78,21 +78,21 @@ def test_lower_is_better_for_metrics_to_minimise():
 
 def test_recordings_are_resampled_as_a_whole():
     a, b = table("one", per_recording=3, seed=2), table("two", per_recording=3)
-    found = compare(PLAN, [a], [b])
-    assert found.recordings == (20, 20) and found.secondary[0].evidence.name == "permutation"
-    assert found.primary.evidence.units == 20
+    result = compare(PLAN, [a], [b])
+    assert result.recordings == (20, 20) and result.secondary[0].evidence.name == "permutation"
+    assert result.primary.evidence.units == 20
 
 
 def test_order_does_not_matter_and_only_common_scenarios_count():
     a = table("one", rows=range(N))
     part = table("two", rows=list(reversed(range(20, N + 10))))
-    found = compare(PLAN, [a], [part])
+    result = compare(PLAN, [a], [part])
     y = dict(zip(part.keys["scenario_id"], part.metrics["vmax_score"], strict=True))
     expected = np.mean([a.metrics["vmax_score"][row] - y[f"s{row}"] for row in range(20, N)])
-    assert found.scenarios == (40, 40) and found.primary.difference.mean == pytest.approx(expected)
+    assert result.scenarios == (40, 40) and result.primary.difference.mean == pytest.approx(expected)
 
 
-def test_undefined_values_are_left_out_in_pairs():
+def test_pairs_with_undefined_values_are_excluded():
     a, b = table("one", seed=2), table("two")
     a.metrics["vmax_score"][:5], b.metrics["vmax_score"][3:10] = np.nan, np.nan
     one = compare(PLAN, [a], [b]).primary
@@ -101,26 +101,26 @@ def test_undefined_values_are_left_out_in_pairs():
 
 
 def test_too_few_scenarios_decide_nothing():
-    found = compare(
+    result = compare(
         dataclasses.replace(PLAN, minimum_scenarios=61), [table("one", 0.3)], [table("two", seed=2)]
     )
-    assert found.primary.winner == "A", "the test is told all the same"
-    assert (found.decision.recommendation, found.decision.because) == ("not enough scenarios", "minimum")
-    assert found.decision.needed >= 61
+    assert result.primary.winner == "A", "the test is told all the same"
+    assert (result.decision.recommendation, result.decision.because) == ("not enough scenarios", "minimum")
+    assert result.decision.needed >= 61
 
 
 def test_power_separates_no_difference_from_too_few_scenarios():
     a, b = table("one", seed=2), table("two")
     deviation = (a.metrics["vmax_score"] - b.metrics["vmax_score"]).std(ddof=1)
     for smallest, recommendation in ((0.05, "no difference"), (0.01, "not enough scenarios")):
-        found = compare(dataclasses.replace(PLAN, smallest_difference=smallest), [a], [b])
-        assert found.primary.winner is None and found.decision.because == "power"
-        assert found.decision.recommendation == recommendation
-        seen = found.sensitivity
+        result = compare(dataclasses.replace(PLAN, smallest_difference=smallest), [a], [b])
+        assert result.primary.winner is None and result.decision.because == "power"
+        assert result.decision.recommendation == recommendation
+        seen = result.sensitivity
         assert seen.power == pytest.approx(power(smallest / deviation, N)) and seen.design_effect == 1.0
         assert seen.needed == scenarios_needed(smallest / deviation)
         assert power(seen.detectable / deviation, N) == pytest.approx(0.8)
-    assert found.decision.needed == found.sensitivity.needed > N
+    assert result.decision.needed == result.sensitivity.needed > N
     # Without a number of its own: a tenth of the deviation, for which textbooks ask for 787 pairs.
     assert compare(PLAN, [a], [b]).sensitivity.needed == scenarios_needed(0.1) == 787
 
@@ -133,14 +133,14 @@ def test_clustered_scenarios_need_more_of_them():
 
 
 def test_equal_planners_give_no_difference():
-    found = compare(PLAN, [table("one")], [table("two")])
-    assert (found.decision.recommendation, found.decision.because) == ("no difference", "equal")
-    assert found.primary.evidence.p == 1.0 and found.sensitivity is None
+    result = compare(PLAN, [table("one")], [table("two")])
+    assert (result.decision.recommendation, result.decision.because) == ("no difference", "equal")
+    assert result.primary.evidence.p == 1.0 and result.sensitivity is None
 
 
 def test_worse_secondary_metrics_are_caveats():
-    found = compare(PLAN, [table("one", 0.3, collision=np.ones(N))], [table("two", seed=2)])
-    assert found.decision.recommendation == "A" and found.decision.caveats == ("collision",)
+    result = compare(PLAN, [table("one", 0.3, collision=np.ones(N))], [table("two", seed=2)])
+    assert result.decision.recommendation == "A" and result.decision.caveats == ("collision",)
 
 
 def entries():
@@ -153,34 +153,34 @@ def test_splits_give_each_planner_its_own_scenarios(split):
     rows = range(10 * N)
     plan = dataclasses.replace(PLAN, split=split, strata=("difficulty",), ratio=0.4)
     a, b = table("one", 0.2, seed=2, rows=rows), table("two", rows=rows)
-    found = compare(plan, [a], [b], entries())
-    assert found.scenarios == (240, 360) and found.strata == (2 if split == "stratified" else 1)
-    one = found.primary
+    result = compare(plan, [a], [b], entries())
+    assert result.scenarios == (240, 360) and result.strata == (2 if split == "stratified" else 1)
+    one = result.primary
     assert (one.a.n, one.b.n, one.difference.n) == (240, 360, 600) and list(one.effects) == ["d"]
     assert one.difference.mean == pytest.approx(one.a.mean - one.b.mean)
     assert one.difference.mean == pytest.approx(0.2, abs=0.05)
-    assert found.decision.recommendation == "A"
+    assert result.decision.recommendation == "A"
     # Nearly the width of an ordinary interval of two means.
     spread = np.sqrt(0.2**2 + 0.05**2) * np.sqrt(1 / 240 + 1 / 360)
     assert one.difference.high - one.difference.low == pytest.approx(2 * 1.96 * spread, rel=0.15)
     expected = scipy.stats.norm.ppf([0.975, 0.8]).sum() ** 2 / 0.1**2 / (0.4 * 0.6)
-    assert found.sensitivity.needed == pytest.approx(expected, rel=0.01)
+    assert result.sensitivity.needed == pytest.approx(expected, rel=0.01)
 
 
 def seeds_of(*shifts, folder="runs/bc", first=3, **more):
-    """Evaluations of the seeds of a policy, each better by another shift."""
+    """Evaluations of the seeds of a policy with different shifts of the score."""
     tables = [table(f"seed-{n}", shift, seed=first + n, **more) for n, shift in enumerate(shifts)]
     return [dataclasses.replace(one, folder=Path(folder) / one.name) for one in tables]
 
 
 def test_interval_covers_seeds_and_scenarios():
     seeds, others = seeds_of(0.0, 0.03, 0.06), [table("two")]
-    found = compare(PLAN, seeds, others)
-    assert found.names[0] == "bc" and found.folders[0] == Path("runs/bc")
+    result = compare(PLAN, seeds, others)
+    assert result.names[0] == "bc" and result.folders[0] == Path("runs/bc")
     rows = np.stack([one.metrics["vmax_score"] for one in seeds])
     other = others[0].metrics["vmax_score"]
     apart = rows.mean(axis=0) - other
-    one = found.primary
+    one = result.primary
     assert one.difference.mean == pytest.approx(apart.mean()) and one.difference.n == N
     # By hand: every scenario is its own recording, and the other planner is certain.
     rest = rows - rows.mean(axis=1, keepdims=True) - rows.mean(axis=0) + rows.mean()
@@ -194,39 +194,39 @@ def test_interval_covers_seeds_and_scenarios():
     )
     assert one.evidence.p == pytest.approx(2 * scipy.stats.t.sf(abs(apart.mean()) / np.sqrt(square), freedom))
     assert (one.winner is None) == (one.difference.low <= 0 <= one.difference.high)
-    spread = found.seeds[0]
+    spread = result.seeds[0]
     assert spread.means == pytest.approx(rows.mean(axis=1))
     assert spread.interquartile.low < spread.interquartile.mean < spread.interquartile.high
-    assert found.seeds[1] is None and found.secondary[0].a.n == N, "shares of several seeds are no 0 or 1"
+    assert result.seeds[1] is None and result.secondary[0].a.n == N, "shares of several seeds are no 0 or 1"
 
 
-def test_seeds_that_differ_decide_nothing_with_any_number_of_scenarios():
-    """Either seed alone would be sure; and no number of scenarios would do."""
+def test_no_number_of_scenarios_decides_between_varying_seeds():
+    """Each seed alone would be significant, but no number of scenarios suffices."""
     others, plan = [table("two")], dataclasses.replace(PLAN, smallest_difference=0.05)
     seeds = seeds_of(-0.2, 0.3)
     alone = [compare(plan, [seed], others).decision.recommendation for seed in seeds]
     assert alone == ["B", "A"]
-    found = compare(plan, seeds, others)
-    assert (found.decision.recommendation, found.decision.because) == ("not enough scenarios", "seeds")
-    assert found.sensitivity.needed is None and found.sensitivity.power < 0.2
-    assert found.primary.a.low < found.primary.a.mean < found.primary.a.high
+    result = compare(plan, seeds, others)
+    assert (result.decision.recommendation, result.decision.because) == ("not enough scenarios", "seeds")
+    assert result.sensitivity.needed is None and result.sensitivity.power < 0.2
+    assert result.primary.a.low < result.primary.a.mean < result.primary.a.high
 
 
 def test_seeds_that_agree_give_a_winner_or_no_difference():
     others = seeds_of(0.0, 0.0, 0.0, folder="runs/other", first=9)
     assert compare(PLAN, seeds_of(0.3, 0.3, 0.3), others).decision.recommendation == "A"
     plan = dataclasses.replace(PLAN, smallest_difference=0.5)
-    found = compare(plan, seeds_of(0.0, 0.0, 0.001), others)
-    assert (found.decision.recommendation, found.decision.because) == ("no difference", "power")
-    assert found.sensitivity.needed == N
+    result = compare(plan, seeds_of(0.0, 0.0, 0.001), others)
+    assert (result.decision.recommendation, result.decision.because) == ("no difference", "power")
+    assert result.sensitivity.needed == N
 
 
 def test_seeds_that_differ_equally_everywhere_need_more_seeds():
     rows = [np.ones(N), np.zeros(N)]
     seeds = [table(f"seed-{n}", vmax_score=row) for n, row in enumerate(rows)]
-    found = compare(PLAN, seeds, [table("two", vmax_score=np.zeros(N))])
-    assert (found.decision.recommendation, found.decision.because) == ("not enough scenarios", "seeds")
-    assert (found.primary.a.low, found.primary.a.high) == (0.0, 1.0), "a score is no less, and no more"
+    result = compare(PLAN, seeds, [table("two", vmax_score=np.zeros(N))])
+    assert (result.decision.recommendation, result.decision.because) == ("not enough scenarios", "seeds")
+    assert (result.primary.a.low, result.primary.a.high) == (0.0, 1.0), "a score is no less, and no more"
     same = compare(
         PLAN, [table(f"seed-{n}", vmax_score=rows[0]) for n in range(2)], [table("two", vmax_score=rows[0])]
     )
@@ -234,9 +234,9 @@ def test_seeds_that_differ_equally_everywhere_need_more_seeds():
 
 
 def test_seeds_on_one_recording_decide_nothing():
-    found = compare(PLAN, seeds_of(0.0, 0.1, per_recording=N), [table("two", per_recording=N)])
-    assert found.primary.evidence.p is None and found.primary.winner is None and found.sensitivity is None
-    assert found.primary.difference.low is None and found.primary.difference.mean is not None
+    result = compare(PLAN, seeds_of(0.0, 0.1, per_recording=N), [table("two", per_recording=N)])
+    assert result.primary.evidence.p is None and result.primary.winner is None and result.sensitivity is None
+    assert result.primary.difference.low is None and result.primary.difference.mean is not None
 
 
 def test_split_with_several_seeds_is_refused():
@@ -246,8 +246,8 @@ def test_split_with_several_seeds_is_refused():
 
 
 def test_comparison_is_plain_json():
-    found = compare(PLAN, [table("one", 0.1)], [table("two", seed=2)])
-    stored = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    result = compare(PLAN, [table("one", 0.1)], [table("two", seed=2)])
+    stored = json.loads(json.dumps(result.as_dict(), allow_nan=False))
     assert stored["decision"]["recommendation"] == "A" and stored["primary"]["difference"]["n"] == N
     assert stored["plan"]["primary"] == "vmax_score" and stored["secondary"][0]["metric"] == "collision"
     assert settings.load(ComparisonPlan, stored["plan"]) == PLAN
@@ -329,11 +329,11 @@ def written(folder, lines, about='{"kind": "evaluation", "planner": "p"}'):
 
 def test_runs_round_trip_and_damaged_files_are_named(tmp_path):
     run = written(tmp_path / "run", ["p,d,s1,,0,log,1", "p,d,s1,,1,log,0", "p,d,s2,r,0,log,"])
-    found = EpisodeTable.read(run)
-    assert found.by_scenario("success")["d", "s1"] == 0.5 and np.isnan(
-        found.by_scenario("success")["d", "s2"]
+    result = EpisodeTable.read(run)
+    assert result.by_scenario("success")["d", "s1"] == 0.5 and np.isnan(
+        result.by_scenario("success")["d", "s2"]
     )
-    assert found.clusters == ["d/s1", "d/s1", "d/r"]
+    assert result.clusters == ["d/s1", "d/s1", "d/r"]
     bad = written(tmp_path / "nan", ["p,d,s1,,0,log,nan"])
     with pytest.raises(Exception, match="record 1: success is NaN"):
         EpisodeTable.read(bad)

@@ -1,4 +1,4 @@
-"""The same seed gives the same bits; batch size, neighbours and automatic resets change no episode.
+"""The same seed gives the same bits; batch size, neighbours and automatic resets do not change episodes.
 
 Bits are equal where one compiled program runs. Programs of other batch sizes round differently (vectorised and scalar
 tails), so between them truths and counts are equal and numbers agree to rounding. The quick run compares single steps
@@ -70,7 +70,7 @@ def test_metrics_do_not_depend_on_batch_size_or_neighbours(world):
 
 @pytest.mark.slow
 def test_automatic_resets_change_no_episode(world):
-    """Three environments drive six scenarios one after the other; each episode is what it is by itself."""
+    """Three environments run six scenarios; each episode equals a separate run."""
     simulator = Simulator(Task(metrics=METRICS))
 
     def action(context):
@@ -104,16 +104,16 @@ def test_automatic_resets_change_no_episode(world):
         for row in [row for row in live if done[row]]:
             expected[row] = jax.tree.map(lambda leaf, row=row: np.asarray(leaf[row]), (states, metrics))
             live.remove(row)
-    found, over, rows = {}, jnp.zeros(3, bool), np.arange(3)
+    result, over, rows = {}, jnp.zeros(3, bool), np.arange(3)
     states = begin(world, jnp.arange(COUNT))
     states = jax.tree.map(lambda leaf: leaf[:3], states)
-    while len(found) < COUNT:
+    while len(result) < COUNT:
         rows = np.where(over, rows + 3, rows) % COUNT
         states, over, metrics = or_begin(world, states, over, jnp.asarray(rows))
         for place in np.flatnonzero(over):
             row = int(states.context.index[place])
             assert row == rows[place]
-            found[row] = jax.tree.map(lambda leaf, at=place: np.asarray(leaf[at]), (states, metrics))
+            result[row] = jax.tree.map(lambda leaf, at=place: np.asarray(leaf[at]), (states, metrics))
     assert len({int(state.context.step) for state, _ in expected.values()}) > 1, "some end early"
     for row in range(COUNT):
-        same_but_rounding(expected[row], found[row])
+        same_but_rounding(expected[row], result[row])

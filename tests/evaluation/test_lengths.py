@@ -1,4 +1,4 @@
-"""Logs of other lengths: short ones in banks of longer ones, and scenarios of 15 s.
+"""Logs of different lengths: short logs in banks of longer ones, and scenarios of 15 s.
 
 The oracle of a short log: the same log in a bank that has no room for more steps, where no code can see a difference
 between the end of the log and the end of the arrays. All values agree, because all that looks ahead (goal, routes,
@@ -43,7 +43,7 @@ LOOK_AHEAD = {
 
 
 def cut(recording, steps):
-    """The first steps of a recording."""
+    """Return the first steps of a recording."""
     timed = {f.name: getattr(recording.tracks, f.name) for f in fields(recording.tracks)}
     timed = {name: value[:, :steps] if value.ndim > 1 else value for name, value in timed.items()}
     lights = tuple(replace(light, states=light.states[:steps]) for light in recording.lights)
@@ -52,7 +52,7 @@ def cut(recording, steps):
 
 
 def scenes():
-    """A drive through a red light that ends in a collision, and one behind a car that brakes and one that appears."""
+    """A scenario with a red light and a collision, and one behind a braking and an appearing car."""
     braking = driven(np.clip(9.0 - 0.15 * np.arange(STEPS), 0.0, None))
     late = car(x=-14.0, y=3.7, speed=9.0, steps=range(20, STEPS))
     weave = driven(np.clip(8.0 + 0.1 * np.arange(STEPS), 8.0, 14.0), 0.03 * np.sin(np.arange(STEPS) / 6))
@@ -69,7 +69,7 @@ def named(recording, name, capacity=SMALL):
 
 @pytest.fixture(scope="module")
 def logs():
-    """Scenarios of the same short logs: with padding after long ones, and with room for no more steps."""
+    """Scenarios of the same short logs, with padding next to long logs and without room for further steps."""
     exact = replace(SMALL, steps=SHORT)
     padded = [named(cut(scene, SHORT), f"short-{i}") for i, scene in enumerate(scenes())]
     alone = [named(cut(scene, SHORT), f"short-{i}", exact) for i, scene in enumerate(scenes())]
@@ -103,7 +103,7 @@ def test_short_log_next_to_long_ones_is_judged_to_its_last_step(logs, planner, t
     assert (whole.metrics["distance"] > other.metrics["distance"] + 5.0).any()
 
 
-def test_first_steps_of_a_long_log_give_what_the_short_log_gives(logs):
+def test_first_steps_of_a_long_log_equal_the_short_log(logs):
     _, alone, long = logs
     bank = ScenarioBank.from_scenarios(long, trim=False)
     early = replace(bank, last_step=jnp.full(2, SHORT - 1))
@@ -142,10 +142,10 @@ def test_starts_after_the_end_of_the_log_are_refused(logs):
 
 def test_audit_of_a_short_log_ends_with_it(logs):
     padded, alone, long = logs
-    found = audit([*padded, long[0]])
-    assert found[:2] == audit(alone)
-    assert found[2] == audit(long)[0]
-    assert found[0]["distance_m"] == pytest.approx(10.0 * 0.1 * (SHORT - 11), abs=0.01)
+    result = audit([*padded, long[0]])
+    assert result[:2] == audit(alone)
+    assert result[2] == audit(long)[0]
+    assert result[0]["distance_m"] == pytest.approx(10.0 * 0.1 * (SHORT - 11), abs=0.01)
 
 
 def test_criticality_of_a_short_log_is_that_of_the_log_alone(logs):

@@ -40,7 +40,7 @@ def generated(seed, count):
 
 @cache
 def real_windows(folder):
-    """The ego's windows of every real file, and what the audit finds in them."""
+    """Windows of the egos of all real files, and their audit findings."""
     scenarios = []
     for file in find_files(folder)[0]:
         for recording in detect(file).read(file):
@@ -59,7 +59,7 @@ def test_thousand_generated_logs_replay_exactly_and_can_be_driven(part):
 @pytest.mark.slow
 def test_every_real_file_replays_exactly_and_can_be_driven(real_data):
     scenarios, findings = real_windows(real_data)
-    clean = [one for one, found in zip(scenarios, findings, strict=True) if found["clean"]]
+    clean = [one for one, finding in zip(scenarios, findings, strict=True) if finding["clean"]]
     assert len(clean) == len(scenarios) >= 19
     check_exact(clean)
     assert np.nanmax(driven_by(DRIVEN, clean)["fde"]) <= 0.3

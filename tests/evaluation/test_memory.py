@@ -51,7 +51,7 @@ def test_every_control_group_of_the_process_counts(tmp_path):
 
 
 def test_out_of_memory_is_one_line_with_the_cure():
-    """A program that asks for 4 TB; and what numpy says."""
+    """A program that needs 4 TB, and NumPy's error."""
 
     @jax.jit
     def greedy(x):

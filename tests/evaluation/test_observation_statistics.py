@@ -1,4 +1,4 @@
-"""Statistics of observations against numpy and scipy, and episodes whose course is known."""
+"""Statistics of observations against NumPy and SciPy, and in episodes with known results."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ STARE_M = 30.0
 
 
 def faulty(bank, context, frames):
-    """A feature of one number that is not one at steps 20 and 50 of the first scenario."""
+    """A feature that is not finite at steps 20 and 50 of the first scenario."""
     broken = (context.index == 0) & ((context.step == 20) | (context.step == 50))
     return jnp.where(broken, jnp.nan, context.step / 100.0)[None]
 
 
 @record
 class Shy(Memoryless):
-    """Hardly does a thing, by the place ahead of the first agent; looks at nothing else."""
+    """A planner with small actions that depend only on the position of the first agent."""
 
     actions: Any = static(default=Physical())
     name: str = static(default="shy")
@@ -58,19 +58,19 @@ TASK = Task(
 
 @pytest.fixture(scope="module")
 def bank():
-    """One scenario in which ego at 9 m/s meets a standing car, two in which no agent is on its lane."""
+    """One scenario in which ego at 9 m/s reaches a standing car, and two without agents in its lane."""
     standing = car(STARE_M, 0, 0, 0)
     scenes = [[car(0, 0, 0, 9), standing], *([car(0, 0, 0, 9), car(-20 - k, 3.7, 0, 5)] for k in range(2))]
     return bank_of(*(replace(straight_road(cars), scenario_id=f"s{k}") for k, cars in enumerate(scenes)))
 
 
 @pytest.fixture(scope="module")
-def shy(bank):
+def summary(bank):
     return observation_statistics(Shy(), bank, TASK, permute=True)
 
 
-def column(found, group, name):
-    (one,) = [one for one in found.features if (one.group, one.name) == (group, name)]
+def column(result, group, name):
+    (one,) = [one for one in result.features if (one.group, one.name) == (group, name)]
     return one
 
 
@@ -84,48 +84,56 @@ def test_states_are_sampled_before_and_after_the_collision(bank):
 
 
 @pytest.mark.slow
-def test_statistics_of_a_column_are_of_its_valid_rows(shy):
-    assert (shy.planner, shy.episodes, shy.collisions, shy.states, shy.permuted) == (
+def test_statistics_of_a_column_are_of_its_valid_rows(summary):
+    assert (
+        summary.planner,
+        summary.episodes,
+        summary.collisions,
+        summary.states,
+        summary.permuted,
+    ) == (
         "shy",
         3,
-        shy.collisions,
+        summary.collisions,
         24,
         24,
     )
-    length = column(shy, "agents", "length")
+    length = column(summary, "agents", "length")
     # One other agent, at both steps of every look.
     assert length.count == 48 and length.broken == 0
     np.testing.assert_allclose(
         [length.mean, length.std, length.low, length.high], [0.96, 0, 0.96, 0.96], atol=1e-6
     )
-    assert column(shy, "lights", "on_route").count == 0 and np.isnan(column(shy, "lights", "on_route").mean)
+    assert column(summary, "lights", "on_route").count == 0 and np.isnan(
+        column(summary, "lights", "on_route").mean
+    )
 
 
 @pytest.mark.slow
-def test_entries_that_are_not_finite_are_counted(shy):
-    one = column(shy, "faulty", "0")
-    assert (one.broken, shy.broken, one.count) == (2, 2, 22)
+def test_entries_that_are_not_finite_are_counted(summary):
+    one = column(summary, "faulty", "0")
+    assert (one.broken, summary.broken, one.count) == (2, 2, 22)
     steps = np.array([*range(10, 81, 10)] * 3)[[k for k in range(24) if k not in (1, 4)]] / 100
     np.testing.assert_allclose(
         [one.mean, one.std, one.low, one.high], [steps.mean(), steps.std(), 0.1, 0.8], rtol=1e-5
     )
-    rows = shy.as_dict()["features"]
+    rows = summary.as_dict()["features"]
     assert [row["broken"] for row in rows if row["group"] == "faulty"] == [2]
     (light,) = [row for row in rows if (row["group"], row["name"]) == ("lights", "on_route")]
     assert light["mean"] is None and light["count"] == 0
 
 
 @pytest.mark.slow
-def test_only_features_that_the_planner_uses_are_important(shy):
-    found = {(one.group, one.name): one.importance for one in shy.features}
-    assert found.pop(("agents", "position x")) > 0.5 and shy.groups["agents"] > 0.5
-    assert set(found.values()) == {0.0}
-    assert {value for name, value in shy.groups.items() if name != "agents"} == {0.0}
+def test_only_features_that_the_planner_uses_are_important(summary):
+    result = {(one.group, one.name): one.importance for one in summary.features}
+    assert result.pop(("agents", "position x")) > 0.5 and summary.groups["agents"] > 0.5
+    assert set(result.values()) == {0.0}
+    assert {value for name, value in summary.groups.items() if name != "agents"} == {0.0}
 
 
 @pytest.mark.slow
 def test_other_agents_move_by_the_traffic_model():
-    """A car comes up behind ego at 12 m/s: the log drives through it, by IDM it brakes."""
+    """A car approaches from behind at 12 m/s: the log drives through ego, IDM brakes."""
     bank = bank_of(straight_road([car(0, 0, 0, 2), car(-40, 0, 0, 12)]))
     log, idm = (
         column(
@@ -142,7 +150,7 @@ def test_planner_of_another_action_space_is_refused(bank):
 
 
 def test_statistics_of_hand_made_observations():
-    """Two episodes of three looks at one row that is there or not; the second one hits an agent at its last look."""
+    """Two episodes of three samples with one row that may be masked; the second collides at its last sample."""
     rows = np.arange(12.0).reshape(2, 3, 1, 2)
     mask = np.array([[[True], [True], [False]], [[True], [True], [True]]])
     rows[0, 1, 0, 1], rows[0, 2, 0, 1], rows[1, 0, 0, 1] = np.nan, np.inf, -np.inf
@@ -176,9 +184,9 @@ def test_correlation_equals_scipy_pointbiserialr():
     valid[3] = False  # no agent is there in the whole episode
     values[7, 2, 1] = np.nan
     means = [values[k][valid[k] & np.isfinite(values[k])].mean() for k in range(40) if k != 3]
-    wanted = stats.pointbiserialr(np.delete(collides, 3), means).statistic
-    assert abs(wanted) > 0.3
-    assert collision_correlation(values, valid, collides) == pytest.approx(wanted, abs=1e-9)
+    expected = stats.pointbiserialr(np.delete(collides, 3), means).statistic
+    assert abs(expected) > 0.3
+    assert collision_correlation(values, valid, collides) == pytest.approx(expected, abs=1e-9)
     assert np.isnan(collision_correlation(values, valid, np.zeros(40, bool)))
     assert np.isnan(collision_correlation(np.full((40, 2), 0.3), np.ones((40, 2), bool), collides))
 

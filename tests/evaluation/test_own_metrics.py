@@ -20,7 +20,7 @@ from scenes import SMALL, bank_of, car, straight_road
 
 @pytest.mark.slow
 def test_own_metric_is_a_column_with_unit_and_direction(tmp_path):
-    """Row 0: a car stands 30 m ahead of a standing ego. Row 1: no other agent, so it is undefined."""
+    """Scenario 0: a car stands 30 m ahead of a standing ego. Scenario 1: no other agent, so the metric is undefined."""
     worlds = straight_road([car(), car(x=30.0)]), replace(straight_road([car()]), scenario_id="alone")
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
         for world in worlds:
@@ -43,7 +43,7 @@ def test_own_metric_is_a_column_with_unit_and_direction(tmp_path):
 
 def test_own_metrics_change_no_other_column():
     bank, names = bank_of(straight_road([car()])), [{"dataset": "", "scenario_id": "a", "segment": "a"}]
-    with pytest.raises(UsageError, match="another column 'crashed'; give your metric another name"):
+    with pytest.raises(UsageError, match="the column 'crashed' already exists; rename your metric"):
         evaluate(make_planner("random"), bank, names, task=Task(metrics=("own_terms:crashed",)))
 
 

@@ -1,4 +1,4 @@
-"""Stored episodes by the devkit's rules: what is read off a scenario and a run, and the table of both definitions."""
+"""The devkit profile: inputs from scenarios and runs, and the table of both definitions."""
 
 import csv
 from dataclasses import replace
@@ -30,7 +30,7 @@ from scenes import SMALL, car, straight_road
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """One drive with a free road, one with a standing car in ego's lane."""
+    """One scenario with a free road, and one with a standing car in ego's lane."""
     path = tmp_path_factory.mktemp("profiles") / "set"
     with ScenarioWriter(path, SMALL) as writer:
         for name, cars in (("free", []), ("blocked", [car(x=60.0, speed=0.0)])):
@@ -89,7 +89,7 @@ def test_hitting_a_standing_car_is_at_fault_by_both_definitions(data, run):
 
 
 def test_simulated_traffic_is_read_from_its_stored_poses(data, tmp_path):
-    """In a set whose banks are smaller than its records; the standing car stays where it is."""
+    """In a set whose banks are smaller than its records, the standing car does not move."""
     table = run_evaluation(
         EvaluationConfig("constant_velocity", traffic="idm"),
         make_planner("constant_velocity"),
@@ -112,7 +112,7 @@ def test_speeds_of_stored_poses_bridge_absences():
     np.testing.assert_allclose(speed[4:, 1], 2.0)
 
 
-def test_crashed_episodes_score_nothing(data, run):
+def test_crashed_episodes_score_zero(data, run):
     table, _ = run
     crash = Crash(table.keys["dataset"][0], "free", 20, "error")
     free, _ = devkit_rows(replace(table, crashes=(crash,)), data)

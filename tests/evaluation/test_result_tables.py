@@ -1,4 +1,4 @@
-"""Tables of evaluations against counts by hand and the formulas they name."""
+"""Tables of evaluations against hand-computed counts and the formulas that they name."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ N = 12
 
 
 def run(name, metrics, *, data="h1", path="sets/test", trained=None, traffic="log", planner=None):
-    """An evaluation of twelve scenarios, each a recording of its own."""
+    """An evaluation of twelve scenarios from twelve recordings."""
     about = {"planner": planner or name, "traffic": traffic, "data": [{"path": path, "hash": data}]}
     if trained:
         about["trained_on"] = [{"path": where, "hash": key} for where, key in trained]
@@ -81,21 +81,21 @@ def test_results_and_differences():
     assert low == pytest.approx(0.1) == high, "every pair differs by as much"
 
 
-def test_kinds_of_collision_are_shares_of_all_episodes():
+def test_collision_types_are_shares_of_all_episodes():
     kinds = [1, 1, 3, 6, 0, 0, 0, 0, 0, 0, np.nan, np.nan]
     table = collisions_table([run("a", {"collision_type": kinds}), run("old", {"success": [1] * N})])
     assert heads(table) == ("a",), "a run that does not know kinds has no column"
-    assert "share of the episodes in which they are known" in table.caption
+    assert "share of the episodes with a known type" in table.caption
     whole = collisions_table([run("a", {"collision_type": [*kinds[:10], 0, 2]})])
     assert "share of all episodes" in whole.caption and {
         numbers(whole, row)[0].interval.n for row in whole.rows
     } == {N}
     assert set(COLLISION_KINDS) == set(CollisionType) - {CollisionType.NONE}
-    found = dict(zip((label for label, *_ in labels(table)), means(table), strict=True))
-    assert found["rear end"] == [0.2] and found["side"] == [0.1] and found["standing object"] == [0.1]
-    assert found["head-on"] == [0.0]
-    found = numbers(table, table.rows[0])[0].interval.as_dict()
-    assert found == pytest.approx(wilson(2, 10).as_dict()), "undefined episodes do not count"
+    result = dict(zip((label for label, *_ in labels(table)), means(table), strict=True))
+    assert result["rear end"] == [0.2] and result["side"] == [0.1] and result["standing object"] == [0.1]
+    assert result["head-on"] == [0.0]
+    result = numbers(table, table.rows[0])[0].interval.as_dict()
+    assert result == pytest.approx(wilson(2, 10).as_dict()), "undefined episodes do not count"
 
 
 def test_strata_in_the_order_of_their_words():
@@ -150,7 +150,7 @@ def test_transfer_is_training_by_evaluation():
 
 
 def test_policies_of_one_name_are_distinguished(tmp_path):
-    """Every algorithm has a seed-0; what they are called on the command line differs."""
+    """Every algorithm has a ``seed-0``; only their names on the command line differ."""
     runs = []
     for place, (planner, data) in enumerate(
         [("runs/bc/seed-0", "A"), ("runs/ppo/seed-0", "A"), ("runs/bc/seed-0", "B")]

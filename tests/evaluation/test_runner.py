@@ -1,4 +1,4 @@
-"""Evaluation: episodes depend on their scenario alone, crashes fail episodes, and the audit finds violations."""
+"""Episodes depend only on their scenario, crashes fail episodes, and the audit finds violations."""
 
 import csv
 import json
@@ -44,7 +44,7 @@ def data(scenarios):
 
 @pytest.fixture(scope="module")
 def driven(data):
-    """Drives some of the scenarios, all of them in one program."""
+    """Evaluate some of the scenarios, all in one program."""
 
     def drive(some, planner=None, batch=4, seed=0):
         return evaluate(
@@ -100,12 +100,12 @@ def test_built_in_planners_do_not_depend_on_batches_order_or_other_scenarios(sce
     expected = by_scenario(drivax.evaluate(planner, tmp_path / "set", traffic="idm"))
     ids = [scenario.id for scenario in scenarios[:3:-1]]
     for data, options in ((tmp_path / "set", {"batch": 2}), (load(tmp_path / "set", scenarios=ids), {})):
-        found = by_scenario(drivax.evaluate(planner, data, traffic="idm", **options))
-        assert found == {name: expected[name] for name in found} and len(found) in (COUNT, len(ids))
+        result = by_scenario(drivax.evaluate(planner, data, traffic="idm", **options))
+        assert result == {name: expected[name] for name in result} and len(result) in (COUNT, len(ids))
 
 
 def test_stored_actions_reproduce_the_motion(whole):
-    """The first number is a share of 6 m/s2, for a tenth of a second."""
+    """The first number of an action is a share of 6 m/s2, applied for a tenth of a second."""
     assert whole.trajectories.action.shape == (COUNT, 80, 2) and np.abs(whole.trajectories.action).max() <= 1
     before, after = whole.trajectories.ego[:, :-1, 3], whole.trajectories.ego[:, 1:, 3]
     drives = after > 0.01
@@ -160,8 +160,8 @@ def test_crash_fails_its_episode_and_changes_no_other(scenarios, whole, crashed)
 
 def test_crash_has_scenario_step_and_error(scenarios, crashed, whole, tmp_path):
     crashed.write(tmp_path)
-    found = json.loads((tmp_path / "crashes.json").read_text())
-    assert found == [
+    result = json.loads((tmp_path / "crashes.json").read_text())
+    assert result == [
         {"dataset": "drivax", "scenario_id": scenarios[3].id, "step": 40, "error": "action is not finite"}
     ]
     with (tmp_path / "episodes.csv").open() as file:
@@ -186,7 +186,7 @@ def test_crash_has_scenario_step_and_error(scenarios, crashed, whole, tmp_path):
 
 
 def test_summary_has_the_intervals_of_the_tables(whole, tmp_path):
-    """Segments of two data sets may share a name, and where none is known scenarios are their own clusters."""
+    """Segments of two data sets may have the same name; scenarios without a segment are their own clusters."""
     names = {
         "dataset": tuple(f"set-{row % 2}" for row in range(COUNT)),
         "segment": tuple("a" if row < 4 else "" for row in range(COUNT)),
@@ -200,13 +200,13 @@ def test_summary_has_the_intervals_of_the_tables(whole, tmp_path):
         json.loads((tmp_path / "summary.json").read_text())["metrics"],
     )
     for name in ("success", "offroad", "progress_ratio"):
-        told = summarise(stored, name).as_dict()
-        assert summary[name] == pytest.approx(told, rel=1e-4), name
+        message = summarise(stored, name).as_dict()
+        assert summary[name] == pytest.approx(message, rel=1e-4), name
 
 
 def test_fail_crashed_equals_hand_computed_values():
     nan = np.nan
-    found = fail_crashed(
+    result = fail_crashed(
         {
             "success": np.array([1.0, 1.0, nan]), "vmax_score": np.array([0.5, nan, 0.7]),
             "vmax_score_partial": np.array([nan, 0.9, nan]), "collision": np.array([0.0, 0.0, 1.0]),
@@ -214,13 +214,13 @@ def test_fail_crashed_equals_hand_computed_values():
         },
         np.array([False, True, True]),
     )  # fmt: skip
-    assert list(found) == ["success", "vmax_score", "vmax_score_partial", "collision", "crashed", "own"]
+    assert list(result) == ["success", "vmax_score", "vmax_score_partial", "collision", "crashed", "own"]
     expected = {
         "success": [1.0, 0.0, nan], "vmax_score": [0.5, nan, 0.0], "vmax_score_partial": [nan, 0.0, nan],
         "collision": [0.0, 0.0, 1.0], "crashed": [0.0, 1.0, 1.0], "own": [3.0, 4.0, 5.0],
     }  # fmt: skip
     for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+        np.testing.assert_array_equal(result[name], values, err_msg=name)
 
 
 def test_planner_of_another_action_space_is_refused(data):
@@ -239,13 +239,13 @@ def test_audit_finds_violations_of_the_log():
     leaves = straight_road([car(0, 0, np.deg2rad(-3), 10)])
     jumps = straight_road([car(0, 0, 0, 10)], light=4)
     together = straight_road([car(0, 0, 0, 5), car(1, 0.5, 0, 5)])
-    found = audit([assemble(r) for r in (clean, crash, leaves, jumps, together)])
-    assert [row["log_collides"] for row in found] == [False, True, False, False, False]
-    assert [row["log_runs_red"] for row in found] == [False, False, False, True, False]
-    assert [row["clean"] for row in found] == [True, False, False, False, True]
-    assert found[2]["log_offroad_fraction"] > 0.1 and found[2]["first_offroad_step"] > 10
-    assert found[0]["first_offroad_step"] is None and found[0]["distance_m"] == pytest.approx(64, abs=0.1)
-    assert [row["ignored_overlaps"] for row in found] == [0, 0, 0, 0, 1]
+    result = audit([assemble(r) for r in (clean, crash, leaves, jumps, together)])
+    assert [row["log_collides"] for row in result] == [False, True, False, False, False]
+    assert [row["log_runs_red"] for row in result] == [False, False, False, True, False]
+    assert [row["clean"] for row in result] == [True, False, False, False, True]
+    assert result[2]["log_offroad_fraction"] > 0.1 and result[2]["first_offroad_step"] > 10
+    assert result[0]["first_offroad_step"] is None and result[0]["distance_m"] == pytest.approx(64, abs=0.1)
+    assert [row["ignored_overlaps"] for row in result] == [0, 0, 0, 0, 1]
 
 
 def test_start_step_without_an_action_is_refused():
@@ -263,8 +263,8 @@ def test_scenarios_without_ego_or_future_are_refused_with_a_filter():
     late = straight_road([car(steps=range(5, 91)), car(30)])
     gap = straight_road([car(steps=[*range(40), *range(50, 91)])])
     logs = [named(straight_road([car()]), "good"), named(late, "late"), named(gap, "gap")]
-    for step, told in ((45, "1 of 3 .*'scenario_id!=gap'"), (2, "1 of 3 .*'scenario_id!=late'")):
-        with pytest.raises(UsageError, match=rf"not in the log at step {step} in {told}"):
+    for step, message in ((45, "1 of 3 .*'scenario_id!=gap'"), (2, "1 of 3 .*'scenario_id!=late'")):
+        with pytest.raises(UsageError, match=rf"not in the log at step {step} in {message}"):
             evaluate(fragile(), logs, start=NoisyStart(), start_step=step)
     long = straight_road([car()])
     tracks = {

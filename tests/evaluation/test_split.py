@@ -14,39 +14,39 @@ HARD = ["hard" if (n // 2) % 3 == 0 or n % 8 == 3 else "easy" for n in range(120
 
 
 def test_split_assigns_whole_recordings_in_the_ratio():
-    found = assign(CLUSTERS, None, 0.25, seed=1)
+    result = assign(CLUSTERS, None, 0.25, seed=1)
     arms = {cluster: set() for cluster in CLUSTERS}
-    for cluster, mine in zip(CLUSTERS, found.first, strict=True):
+    for cluster, mine in zip(CLUSTERS, result.first, strict=True):
         arms[cluster].add(bool(mine))
-    assert all(len(arm) == 1 for arm in arms.values()) and found.first.sum() == 30
-    assert found.strata_count == 1
-    np.testing.assert_array_equal(found.first, assign(CLUSTERS, None, 0.25, seed=1).first)
-    assert (found.first != assign(CLUSTERS, None, 0.25, seed=2).first).any()
+    assert all(len(arm) == 1 for arm in arms.values()) and result.first.sum() == 30
+    assert result.strata_count == 1
+    np.testing.assert_array_equal(result.first, assign(CLUSTERS, None, 0.25, seed=1).first)
+    assert (result.first != assign(CLUSTERS, None, 0.25, seed=2).first).any()
 
 
 def test_strata_are_split_in_halves():
-    found = assign(CLUSTERS, HARD, 0.5, seed=0)
-    assert found.strata_count == 2
+    result = assign(CLUSTERS, HARD, 0.5, seed=0)
+    assert result.strata_count == 2
     for stratum in range(2):
-        mine = found.first[found.strata == stratum]
+        mine = result.first[result.strata == stratum]
         assert abs(int(mine.sum()) - int((~mine).sum())) <= 2, "two scenarios of a recording"
     # Recordings of both kinds belong to the first kind by name among equals: easy.
-    sizes = Counter(found.strata.tolist())
+    sizes = Counter(result.strata.tolist())
     assert sizes == {0: 80, 1: 40}
 
 
-def test_rounding_in_a_stratum_is_made_up_for_in_the_next():
-    """Ten strata of eleven recordings each: halves of the whole, though no stratum can be halved."""
+def test_rounding_errors_carry_over_to_the_next_stratum():
+    """Ten strata of eleven recordings are split into halves, although no stratum can be halved."""
     clusters = [str(number) for number in range(110)]
-    found = assign(clusters, [f"{number % 10}" for number in range(110)], 0.5, seed=0)
-    assert found.first.sum() == 55 and found.strata_count == 10
+    result = assign(clusters, [f"{number % 10}" for number in range(110)], 0.5, seed=0)
+    assert result.first.sum() == 55 and result.strata_count == 10
 
 
 def test_small_strata_are_merged():
     clusters = [str(number) for number in range(40)]
     strata = ["common"] * 28 + ["rare"] * 7 + ["rarer"] * 5
-    found = assign(clusters, strata, 0.5, seed=0)
-    assert found.strata_count == 2 and Counter(found.strata.tolist()) == {0: 28, 1: 12}
+    result = assign(clusters, strata, 0.5, seed=0)
+    assert result.strata_count == 2 and Counter(result.strata.tolist()) == {0: 28, 1: 12}
 
 
 def test_empty_arm_is_refused():

@@ -29,10 +29,10 @@ def test_poses_round_trip_within_a_centimetre_and_absent_agents_stay_absent():
     rows[0, 0, :2], rows[0, 0, 7], there[0, 0] = (700.0, 0.0), 1.0, False
     kept = np.asarray(pack_poses(jnp.asarray(rows, jnp.float32)))
     assert kept.dtype == np.int16 and kept.shape == (5, 7, 3)
-    found = unpack_poses(kept)
-    np.testing.assert_array_equal(np.isfinite(found).all(-1), there)
-    np.testing.assert_allclose(found[there][:, :2], xy[there], atol=0.0101)
-    turned = found[there][:, 2] - heading[there]
+    result = unpack_poses(kept)
+    np.testing.assert_array_equal(np.isfinite(result).all(-1), there)
+    np.testing.assert_allclose(result[there][:, :2], xy[there], atol=0.0101)
+    turned = result[there][:, 2] - heading[there]
     np.testing.assert_allclose((turned + np.pi) % (2 * np.pi) - np.pi, 0.0, atol=6e-5)
 
 
@@ -43,7 +43,7 @@ def box(xy, heading, size):
 
 
 def nearest_m(scenario, drive, step):
-    """From ego to the nearest other that is drawn at a step."""
+    """Return the distance from ego to the nearest drawn agent at a step."""
     x, y, heading, _ = drive.ego[step]
     ego = box((x, y), heading, scenario.agent_size[0])
     moving = [
@@ -82,9 +82,9 @@ def test_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
 def test_log_traffic_stores_no_trajectories(tmp_path):
     generate(tmp_path / "set", 2, 3, Generation(workers=0))
     assert drivax.evaluate("constant_velocity", tmp_path / "set").trajectories.others is None
-    found = drivax.evaluate("constant_velocity", tmp_path / "set", traffic="idm").trajectories.others
+    result = drivax.evaluate("constant_velocity", tmp_path / "set", traffic="idm").trajectories.others
     scenarios = ScenarioSet.open(tmp_path / "set")
-    for rows, scenario in zip(found, scenarios, strict=True):
+    for rows, scenario in zip(result, scenarios, strict=True):
         # No agent has moved yet when the episode begins.
         pose, there = unpack_poses(rows[0]), scenario.agent_valid[10, : rows.shape[1]]
         np.testing.assert_allclose(pose[there][:, :2], scenario.agent_xy[10, : len(there)][there], atol=0.02)

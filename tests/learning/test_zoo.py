@@ -144,7 +144,7 @@ def test_misspelt_policy_lists_the_names(bank, capsys, tmp_path):
         "out",
     ]
     assert main(command) == 2
-    told = "there is no policy 'zoo:bold' in the zoo; use zoo:aggressive"
+    told = "no policy 'zoo:bold' in the zoo; use zoo:aggressive"
     assert capsys.readouterr().err == f"drivax: {told}\n"
     with pytest.raises(UsageError, match=told):
         find_planner("zoo:bold", bank)

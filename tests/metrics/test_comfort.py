@@ -33,7 +33,7 @@ def test_tail_matrix_equals_scipys_filter(window, order, derivative):
 
 
 def histories(speed, heading):
-    """The 23-row history at every step of a long signal."""
+    """Return the 23-row history at every step of a long signal."""
     motion = np.stack([0 * speed, 0 * speed, heading, speed], -1).astype(np.float32)
     return np.stack([motion[t - 22 : t + 1] for t in range(22, len(speed))])
 

@@ -1,4 +1,4 @@
-"""Every metric on hand-made scenes whose values can be worked out on paper, and what must change nothing."""
+"""Metrics of hand-made scenes against hand-computed values, and changes that must not affect metrics."""
 
 from collections import Counter
 from dataclasses import replace
@@ -14,30 +14,30 @@ from scenes import car, moved, tracks
 SCENES = scenes()
 
 
-def differences(scene, found):
-    """What is not as expected: name, expected, found."""
+def differences(scene, result):
+    """Differences from expected values: name, expected, computed."""
     wrong = []
     for name, value in scene.expected.items():
-        got = found[name]
+        actual = result[name]
         same = (
             value is None
-            if got is None
-            else value is not None and got == pytest.approx(value, rel=2e-3, abs=6e-3)
+            if actual is None
+            else value is not None and actual == pytest.approx(value, rel=2e-3, abs=6e-3)
         )
         if not same:
-            wrong.append((name, value, got))
+            wrong.append((name, value, actual))
     return wrong
 
 
 @pytest.fixture(scope="module")
-def judged():
-    found = judge([s.recording for s in SCENES.values()], [s.drive for s in SCENES.values()])
-    return dict(zip(SCENES, found, strict=True))
+def metrics_by_scene():
+    result = judge([s.recording for s in SCENES.values()], [s.drive for s in SCENES.values()])
+    return dict(zip(SCENES, result, strict=True))
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_values_by_hand(judged, name):
-    assert differences(SCENES[name], judged[name]) == []
+def test_values_by_hand(metrics_by_scene, name):
+    assert differences(SCENES[name], metrics_by_scene[name]) == []
 
 
 def test_every_metric_has_at_least_five_expected_values():
@@ -51,7 +51,7 @@ def test_every_metric_has_at_least_five_expected_values():
 
 
 def turned(drive, angle):
-    """The same way of driving in a world that is turned by ``angle`` about ego's place at step 10."""
+    """The same motion in a world that is rotated by ``angle`` about ego's position at step 10."""
     if drive is None:
         return None
 
@@ -64,7 +64,7 @@ def turned(drive, angle):
 
 
 def with_others(recording, change):
-    """A recording whose others are those that ``change`` makes of them."""
+    """A recording with other agents changed by ``change``."""
     old = recording.tracks
     names = ("xy", "heading", "velocity", "valid", "kind")
     cars = [
@@ -79,42 +79,42 @@ def shifted_and_turned(scene):
 
 
 def reversed_and_joined(scene):
-    """The others in another order, among agents that are too far away to matter."""
+    """The other agents in another order, among agents that are too far away to matter."""
     far = [car(100.0 + 9 * i, 3.7, 0.0, 20.0, steps=range(20, 80)) for i in range(5)]
     return with_others(scene.recording, lambda others: [*far[:2], *others[::-1], *far[2:]]), scene.drive
 
 
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("change", [shifted_and_turned, reversed_and_joined])
-def test_irrelevant_changes_keep_every_metric(judged, change, every):
+def test_irrelevant_changes_keep_every_metric(metrics_by_scene, change, every):
     some = dict(list(SCENES.items())[::every])
     pairs = [change(scene) for scene in some.values()]
     again = judge([recording for recording, _ in pairs], [drive for _, drive in pairs])
-    for (name, scene), found in zip(some.items(), again, strict=True):
+    for (name, scene), result in zip(some.items(), again, strict=True):
         # The mapped area is a box along the scenario's own axes: turning the world changes its corners.
-        assert {d[0] for d in differences(scene, found)} <= {"left_map"}, name
+        assert {d[0] for d in differences(scene, result)} <= {"left_map"}, name
         for metric in set(METRICS) - {"left_map"}:
-            one, other = judged[name][metric], found[metric]
+            one, other = metrics_by_scene[name][metric], result[metric]
             assert (one is None) == (other is None), (name, metric)
             if one is not None:
                 assert one == pytest.approx(other, rel=3e-3, abs=2e-2), (name, metric)
 
 
-def test_step_values_accumulate_to_episode_metrics(judged):
-    """Step values are the numbers that episodes are made of."""
-    for name, found in judged.items():
-        series = found["series"]
+def test_step_values_accumulate_to_episode_metrics(metrics_by_scene):
+    """Accumulating step values gives the episode metrics."""
+    for name, result in metrics_by_scene.items():
+        series = result["series"]
         assert all(len(values) == 80 for values in series.values()), name
         for metric, step in (("collision", "collision"), ("offroad", "offroad"), ("red_light", "red_light")):
-            if found[metric] is not None:
-                assert found[metric] == series[step].max(), (name, metric)
-        assert found["distance"] == pytest.approx(series["distance"].sum(), abs=1e-2)
-        if found["min_ttc"] is not None:
-            assert found["min_ttc"] == pytest.approx(np.nanmin(series["ttc"]))
-            assert found["average_ttc"] == pytest.approx(np.nanmean(series["ttc"]), abs=1e-4)
+            if result[metric] is not None:
+                assert result[metric] == series[step].max(), (name, metric)
+        assert result["distance"] == pytest.approx(series["distance"].sum(), abs=1e-2)
+        if result["min_ttc"] is not None:
+            assert result["min_ttc"] == pytest.approx(np.nanmin(series["ttc"]))
+            assert result["average_ttc"] == pytest.approx(np.nanmean(series["ttc"]), abs=1e-4)
         else:
             assert np.isnan(series["ttc"]).all()
-        if found["speeding_max"] is not None:
-            assert found["speeding_max"] == pytest.approx(np.nanmax(series["speeding"]), abs=1e-5)
+        if result["speeding_max"] is not None:
+            assert result["speeding_max"] == pytest.approx(np.nanmax(series["speeding"]), abs=1e-5)
         first = np.flatnonzero(series["collision"])
-        assert found["collision_step"] == (11 + first[0] if first.size else -1), name
+        assert result["collision_step"] == (11 + first[0] if first.size else -1), name

@@ -21,7 +21,7 @@ QUARTER = np.pi / 2
 
 
 def random_car(rng):
-    """Someone near ego's way, at constant velocity, in a quarter of all cases standing, sometimes only for a while."""
+    """A car near ego's path at constant velocity; a quarter stand, and some are present only for a while."""
     kind, length, width = KINDS[rng.choice(4, p=[0.6, 0.1, 0.2, 0.1])]
     heading = rng.choice([0.0, np.pi, QUARTER, -QUARTER]) + rng.normal(0, 0.15)
     x, y, speed = rng.uniform([-20, -3, 0.0], [70, 8, 12.0])
@@ -33,7 +33,7 @@ def random_car(rng):
 
 
 def random_scene(rng):
-    """A road with a light, up to six others, and a way of driving; the log drives straight on."""
+    """A road with a light, up to six other agents, and ego's motion; the log drives straight on."""
     cars = [
         car(speed=rng.choice([0.0, 4.0, 10.0, 13.0])),
         *(random_car(rng) for _ in range(rng.integers(0, 7))),
@@ -59,7 +59,7 @@ def random_lane(rng):
 
 
 def random_drive(rng):
-    """Continues the log smoothly: a wave of speed, a wave of heading, and a drift to one side."""
+    """Continue the log smoothly, with oscillating speed and heading and a drift to one side."""
     wave, pace = rng.uniform(0.3, 3), rng.uniform(0.3, 2)
     gain = rng.uniform(-4, 4) / wave
     steer, drift = rng.choice([0.0, 0.05, 0.3]) * rng.normal(), rng.choice([0.0, 0.0, 0.05]) * rng.normal()
@@ -78,31 +78,31 @@ def random_drive(rng):
     return drive
 
 
-def same(value, got):
-    if value is None or got is None:
-        return value is got
-    return got == pytest.approx(float(value), rel=2e-3, abs=5e-3)
+def same(value, actual):
+    if value is None or actual is None:
+        return value is actual
+    return actual == pytest.approx(float(value), rel=2e-3, abs=5e-3)
 
 
 def compare(seed):
-    """Judges ``BATCH`` random scenes twice; how many were compared, the others being too close to call."""
+    """Evaluate ``BATCH`` random scenes twice, and return how many are compared; the others are near a threshold."""
     rng = np.random.default_rng(seed)
     cases = [random_scene(rng) for _ in range(BATCH)]
-    found = judge([road for road, _, _ in cases], [drive for _, drive, _ in cases])
+    result = judge([road for road, _, _ in cases], [drive for _, drive, _ in cases])
     compared = 0
-    for number, ((road, drive, two_way), got) in enumerate(zip(cases, found, strict=True)):
+    for number, ((road, drive, two_way), actual) in enumerate(zip(cases, result, strict=True)):
         ego = road.tracks
         log = np.column_stack([ego.xy[0], ego.heading[0], np.hypot(*ego.velocity[0].T)])
         # What the package was given: the same motion in float32.
         oracle = Judge(road, drive(log).astype(np.float32).astype(np.float64), two_way)
-        expected, ttc = oracle.episode(got["series"]["ttc"])
+        expected, ttc = oracle.episode(actual["series"]["ttc"])
         if oracle.ambiguous:
             continue
         compared += 1
         for name, value in expected.items():
-            assert same(value, got[name]), (seed, number, name, value, got[name])
+            assert same(value, actual[name]), (seed, number, name, value, actual[name])
         for t, (value, grazing) in ttc.items():
-            fine = got["series"]["ttc"][t - 11] == pytest.approx(value, abs=4e-3)
+            fine = actual["series"]["ttc"][t - 11] == pytest.approx(value, abs=4e-3)
             assert fine or (value == 5.0 and grazing() == 5.0), (seed, number, t, value)
     return compared
 

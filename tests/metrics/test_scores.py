@@ -21,7 +21,7 @@ def values(undefined=(), **changes):
     }
 
 
-def test_perfect_is_one_and_discomfort_costs_its_weight():
+def test_perfect_score_is_one_and_discomfort_costs_its_weight():
     for score in (nuplan_score, vmax_score):
         full, partial = score(values())
         assert float(full.value) == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Selected metrics are the same as in the full set, and what is not selected is neither measured nor carried."""
+"""Selected metrics equal those of the full set, and other metrics are neither computed nor carried."""
 
 import re
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ COSTLY = ("time_to_collision", "classify_contacts", "check_lights", "check_comfo
 
 @dataclass(frozen=True)
 class Traced:
-    """What a task's step is made of: shapes of its state, number of operations, costly functions that are called."""
+    """A traced step of a task: shapes of its state, number of operations, and calls of costly functions."""
 
     state: object
     operations: int
@@ -42,8 +42,8 @@ class Traced:
 
 @pytest.fixture(scope="module")
 def traced():
-    """The default task with each set, and one metric alone, by name."""
-    found = {}
+    """The default task with each set and with a single metric, by name."""
+    result = {}
     with pytest.MonkeyPatch.context() as patch:
         called = set()
 
@@ -58,15 +58,15 @@ def traced():
 
         for name in COSTLY:
             listen({"check_comfort": steps, "check_lights": situation}.get(name, contact), name)
-        for wanted in ("none", "training", "full", ("at_fault_collision",)):
+        for reference in ("none", "training", "full", ("at_fault_collision",)):
             called.clear()
-            simulator = Simulator(Task(metrics=wanted))
+            simulator = Simulator(Task(metrics=reference))
             state = jax.eval_shape(lambda bank, simulator=simulator: simulator.reset(bank, 0), BANK)
             step = jax.make_jaxpr(lambda bank, s, of=simulator: of.step(bank, s, jnp.zeros(2))[0])(
                 BANK, state
             )
-            found[wanted] = Traced(state, str(step).count(" = "), frozenset(called))
-    return found
+            result[reference] = Traced(state, str(step).count(" = "), frozenset(called))
+    return result
 
 
 def size(tree):
@@ -82,11 +82,11 @@ def test_sets_contain_catalogue_metrics():
 
 
 def test_list_of_sets_and_metrics_adds_their_inputs():
-    wanted = select_metrics(("training", "comfortable", "min_ttc", "min_ttc"))
-    assert wanted.names == (*SETS["training"], "comfortable", "min_ttc")
-    assert "comfort" in dict(wanted.metrics) and "comfort" not in wanted.names
-    order = [name for name, _ in wanted.metrics]
-    for name, metric in wanted.metrics:
+    reference = select_metrics(("training", "comfortable", "min_ttc", "min_ttc"))
+    assert reference.names == (*SETS["training"], "comfortable", "min_ttc")
+    assert "comfort" in dict(reference.metrics) and "comfort" not in reference.names
+    order = [name for name, _ in reference.metrics]
+    for name, metric in reference.metrics:
         assert all(order.index(needed) < order.index(name) for needed in metric.inputs)
     assert select_metrics(("min_ttc",)).reads == {"ttc_s", "ttc_defined"}
     assert select_metrics("none").reads == frozenset() and select_metrics("full").reads == FACTS
@@ -95,9 +95,9 @@ def test_list_of_sets_and_metrics_adds_their_inputs():
 
 
 def test_misspelt_names_fail_with_one_line():
-    for wanted in ("trainin", ("training", "min_tcc")):
+    for reference in ("trainin", ("training", "min_tcc")):
         with pytest.raises(UsageError, match="did you mean"):
-            Task(metrics=wanted)
+            Task(metrics=reference)
     with pytest.raises(UsageError, match=r"task.*: unknown metric 'ful'.*'full'"):
         settings.load(TrainConfig, {"task": {"metrics": "ful"}})
 
@@ -136,7 +136,7 @@ def test_unread_facts_are_none(traced):
 
 
 def random_situations(count=60):
-    """Made-up measurements of steps 11 to 10 + ``count`` of scenario 0, stacked."""
+    """Random measurements of steps 11 to 10 + ``count`` of scenario 0, stacked."""
     simulator, rng = Simulator(Task()), np.random.default_rng(5)
     shape = jax.eval_shape(lambda bank: simulator.situation(bank, simulator.reset(bank, 0)), BANK)
 
@@ -147,27 +147,27 @@ def random_situations(count=60):
             return jnp.asarray(rng.uniform(0.0, 2.0, (count, *leaf.shape)), leaf.dtype)
         return jnp.zeros((count, *leaf.shape), leaf.dtype)
 
-    found = jax.tree.map(filled, shape)
-    kinds = jnp.asarray(rng.choice([0, 0, 0, 2, 3], count), found.facts.collision_type.dtype)
-    facts = replace(found.facts, collision_type=kinds, limit_mps=found.facts.limit_mps - 0.5)
-    return replace(found, facts=facts, context=replace(found.context, step=jnp.arange(11, 11 + count)))
+    result = jax.tree.map(filled, shape)
+    kinds = jnp.asarray(rng.choice([0, 0, 0, 2, 3], count), result.facts.collision_type.dtype)
+    facts = replace(result.facts, collision_type=kinds, limit_mps=result.facts.limit_mps - 0.5)
+    return replace(result, facts=facts, context=replace(result.context, step=jnp.arange(11, 11 + count)))
 
 
-def episode(wanted, found, empty):
+def episode(reference, result, empty):
     """Metrics and first events of measured steps."""
-    last = 10 + found.context.step.shape[0]
+    last = 10 + result.context.step.shape[0]
 
     @jax.jit
-    def run(found):
+    def run(result):
         def one(episode, now):
             return episode_add(episode, now, jnp.asarray(10), now.context.step == last), None
 
-        summed = jax.lax.scan(one, episode_start(wanted), found)[0]
-        context = jax.tree.map(lambda leaf: leaf[-1], found.context)
+        summed = jax.lax.scan(one, episode_start(reference), result)[0]
+        context = jax.tree.map(lambda leaf: leaf[-1], result.context)
         state = replace(empty, context=context, episode=summed, start=jnp.asarray(10))
         return episode_metrics(BANK, state), event_steps(summed)
 
-    return jax.tree.map(np.asarray, run(found))
+    return jax.tree.map(np.asarray, run(result))
 
 
 LEAN = ("vmax_score", "min_ttc", "max_jerk", "fde", "wrong_way_worst", "collision_type")
@@ -179,9 +179,9 @@ def zeros(shapes):
 
 @pytest.mark.slow
 def test_operators_and_selection_do_not_change_values(traced):
-    found, empty = random_situations(), zeros(traced["none"].state)
-    full, events = episode("full", found, empty)
-    facts = jax.tree.map(np.asarray, found.facts)
+    result, empty = random_situations(), zeros(traced["none"].state)
+    full, events = episode("full", result, empty)
+    facts = jax.tree.map(np.asarray, result.facts)
     ttc = facts.ttc_s[facts.ttc_defined]
     over = np.maximum(facts.speed_mps - facts.limit_mps, 0)[facts.limit_mps > 0]
     wrong = np.where(facts.wrong_way, facts.moved_m, 0)
@@ -198,9 +198,9 @@ def test_operators_and_selection_do_not_change_values(traced):
         assert full[name].value == pytest.approx(float(value), rel=1e-5), name
     for name in ("collision", "offroad", "red_light"):
         assert events[name] == 11 + np.argmax(getattr(facts, name)), name
-    for wanted in ("training", LEAN):
-        lean, lean_events = episode(wanted, found, empty)
-        assert set(lean) == set(select_metrics(wanted).names)
+    for reference in ("training", LEAN):
+        lean, lean_events = episode(reference, result, empty)
+        assert set(lean) == set(select_metrics(reference).names)
         for name, value in lean.items():
             np.testing.assert_allclose(value.value, full[name].value, rtol=1e-6, err_msg=name)
             assert value.defined == full[name].defined, name
@@ -222,8 +222,8 @@ def test_a_selection_changes_no_value_in_simulation():
 
     full = drive_straight_on(Task())
     assert full["collision"].value == 1.0
-    for wanted in ("training", LEAN):
-        for name, value in drive_straight_on(Task(metrics=wanted)).items():
+    for reference in ("training", LEAN):
+        for name, value in drive_straight_on(Task(metrics=reference)).items():
             np.testing.assert_allclose(value.value, full[name].value, rtol=1e-5, atol=1e-5, err_msg=name)
             assert value.defined == full[name].defined, name
 
@@ -235,8 +235,8 @@ def test_evaluation_uses_the_full_set_whatever_the_task_learned_with():
 
 def test_no_metric_is_defined_before_the_first_step(traced):
     state = replace(zeros(traced["full"].state), episode=episode_start("full"))
-    found = jax.jit(episode_metrics)(BANK, state)
-    assert {name for name, value in found.items() if bool(value.defined)} == {"steps", "last_step"}
+    result = jax.jit(episode_metrics)(BANK, state)
+    assert {name for name, value in result.items() if bool(value.defined)} == {"steps", "last_step"}
 
 
 def test_the_guide_lists_every_metric_with_its_unit(repository):

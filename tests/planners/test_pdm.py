@@ -27,7 +27,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import Trajectory
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
-from drivax.testing.worlds import other_future, scattered
+from drivax.testing.worlds import change_future, scatter_garbage
 from quick import quick
 from scenes import RED, SMALL, bank_of, car, moved, straight_road
 
@@ -237,7 +237,7 @@ def test_pdm_does_not_read_the_future():
     bank = bank_of(
         straight_road([car(0, 0, 0, 10), car(30, 0, 0, 5), PERSON(25, -5, np.pi / 2, 1.0)], light=RED)
     )
-    seen, other = considering(bank), considering(other_future(bank, 10))
+    seen, other = considering(bank), considering(change_future(bank, 10))
     assert np.array_equal(seen[0], other[0]) and np.array_equal(seen[2].score, other[2].score)
 
 
@@ -247,7 +247,7 @@ def test_pdm_is_invariant_to_rotation_shift_and_padding_values():
     turned, _, other = decide(moved(recording, 0.7, 1000.0, -500.0))
     assert turned == pytest.approx(action, abs=5e-3)
     np.testing.assert_allclose(other.score, scored.score, atol=0.01)
-    filled = considering(scattered(bank_of(recording)))
+    filled = considering(scatter_garbage(bank_of(recording)))
     np.testing.assert_allclose(filled[0], action, atol=1e-6)
 
 

@@ -19,7 +19,7 @@ from drivax.studies.bench import BenchConfig, _parts, _repeat_part
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
-from drivax.testing.worlds import padded
+from drivax.testing.worlds import pad_agents
 from scenes import GLIMPSE
 
 BATCH = 4096
@@ -59,7 +59,7 @@ def test_a_step_costs_the_same_on_a_map_of_twice_the_segments(bank, plain):
 
 
 def test_a_step_costs_at_most_in_proportion_to_agents(bank, plain):
-    few, many = plain, operations(padded(bank, bank.agents.shape[2]))
+    few, many = plain, operations(pad_agents(bank, bank.agents.shape[2]))
     assert few < many < 1.5 * few
 
 
@@ -71,7 +71,7 @@ def test_operation_count_detects_pairwise_agent_work(bank):
             return {"apart": jnp.sum((xy[:, None] - xy) ** 2)}
 
     few = operations(bank, Pairs(Task(metrics="none")))
-    many = operations(padded(bank, bank.agents.shape[2]), Pairs(Task(metrics="none")))
+    many = operations(pad_agents(bank, bank.agents.shape[2]), Pairs(Task(metrics="none")))
     assert many - few > 3 * 64 * 64 * 2  # differences and squares of pairs, four times as many
 
 

@@ -23,17 +23,17 @@ CLUSTERS = np.repeat(np.arange(40), [1, 2, 3, 4] * 10)
 
 
 def scenes(rng):
-    """How hard scenarios are, similar within recordings, and skewed."""
+    """Difficulty of scenarios, correlated within recordings and skewed."""
     return rng.gamma(1.0, 1.0, 40)[CLUSTERS] + rng.gamma(1.0, 1.0, CLUSTERS.size)
 
 
 def noise(rng):
-    """What a planner makes of them, similar within recordings."""
+    """Results of a planner relative to the difficulty, correlated within recordings."""
     return rng.normal(size=40)[CLUSTERS] + rng.normal(size=CLUSTERS.size)
 
 
 def rejected(p_of):
-    """Share of simulations with a p-value below 0.05."""
+    """Return the share of simulations with a p-value below 0.05."""
     rng = np.random.default_rng(0)
     return np.mean([p_of(rng, trial) < 0.05 for trial in range(TRIALS)])
 
@@ -49,7 +49,7 @@ def test_tests_of_paired_means(test):
 
 
 @pytest.mark.slow
-def test_without_clusters_too_much_is_rejected():
+def test_ignoring_clusters_rejects_too_often():
     def p(rng, trial):
         return paired_permutation(noise(rng), noise(rng), resamples=RESAMPLES, seed=trial).p
 
@@ -84,7 +84,7 @@ def test_tests_of_arms(stratified):
 
 @pytest.mark.slow
 def test_holm_keeps_the_whole_family_at_its_level():
-    """Three metrics of one drive go together; that any of them is called a difference has at most 5 %."""
+    """Three metrics of one episode are correlated; any of them is significant in at most 5 % of cases."""
 
     def p(rng, trial):
         common = noise(rng)

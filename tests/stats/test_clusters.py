@@ -26,7 +26,7 @@ def test_design_effect_by_hand():
     assert design_effect(np.array([1.0, 2, 3]), np.zeros(3, np.int64)) == 3.0
 
 
-def test_design_effect_of_equal_clusters_is_one_plus_m_minus_one_times_their_correlation():
+def test_design_effect_of_equal_clusters_follows_kish():
     """Kish: ``1 + (m - 1) rho`` for clusters of ``m`` (here m = 5, rho = 0.6)."""
     rng = np.random.default_rng(0)
     x = np.sqrt(0.6) * rng.normal(size=(20_000, 1)) + np.sqrt(0.4) * rng.normal(size=(20_000, 5))

@@ -21,8 +21,8 @@ from drivax.stats.effects import (
 
 def test_effect_sizes_by_hand():
     # Differences 1, 1, 4: mean 2, deviation sqrt(3). Variances of (2, 3, 7) and (1, 2, 3): 7 and 1.
-    found = cohens_d_paired([2.0, 3.0, 7.0, None], [1.0, 2.0, 3.0, 5.0])
-    assert found.d_z == pytest.approx(2 / math.sqrt(3)) and found.d_av == pytest.approx(2 / math.sqrt(4))
+    result = cohens_d_paired([2.0, 3.0, 7.0, None], [1.0, 2.0, 3.0, 5.0])
+    assert result.d_z == pytest.approx(2 / math.sqrt(3)) and result.d_av == pytest.approx(2 / math.sqrt(4))
     # Means 4 and 2, pooled variance (2 * 7 + 2 * 1) / 4 = 4.
     assert cohens_d([2.0, 3.0, 7.0], [1.0, 2.0, 3.0, None]) == pytest.approx(2 / 2)
     assert cohens_d([1.0, 1.0], [1.0, 1.0]) is None and cohens_d([1.0], [2.0, 3.0]) is None

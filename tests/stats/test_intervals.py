@@ -25,17 +25,17 @@ from drivax.stats.intervals import (
 @pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
 def test_wilson_is_scipys(successes, n, confidence):
     expected = scipy.stats.binomtest(successes, n).proportion_ci(confidence, method="wilson")
-    found = wilson(successes, n, confidence)
-    assert found.mean == successes / n and found.n == n
-    assert found.low == pytest.approx(expected.low, abs=1e-12)
-    assert found.high == pytest.approx(expected.high, abs=1e-12)
+    result = wilson(successes, n, confidence)
+    assert result.mean == successes / n and result.n == n
+    assert result.low == pytest.approx(expected.low, abs=1e-12)
+    assert result.high == pytest.approx(expected.high, abs=1e-12)
 
 
 def test_wilson_by_hand():
     # z = 1: p = 1/2, n = 3: centre 1/2, half = (1 / (1 + 1/3)) sqrt(1/12 + 1/36) = 3/4 * 1/3 = 1/4.
     one_sigma = math.erf(1 / math.sqrt(2))
-    found = wilson(1.5, 3, one_sigma)
-    assert (found.low, found.high) == pytest.approx((0.25, 0.75), abs=1e-12)
+    result = wilson(1.5, 3, one_sigma)
+    assert (result.low, result.high) == pytest.approx((0.25, 0.75), abs=1e-12)
 
 
 def test_effective_sizes():
@@ -63,29 +63,29 @@ def test_rate_of_independent_episodes_is_wilson():
 
 def test_rate_of_clusters_by_hand():
     # Two clusters of two, totals 2 and 0, p = 1/2: variance 2/1 * (1 + 1) / 16 = 1/4; binomial 1/16; deff 4.
-    found = rate([1, 1, 0, 0], ["a", "a", "b", "b"])
+    result = rate([1, 1, 0, 0], ["a", "a", "b", "b"])
     expected = wilson(0.5, 1)
-    assert (found.mean, found.n) == (0.5, 4)
-    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+    assert (result.mean, result.n) == (0.5, 4)
+    assert (result.low, result.high) == pytest.approx((expected.low, expected.high))
     # Totals 1 and 1: no spread between clusters, so no better than independent.
     balanced = rate([1, 0, 1, 0], ["a", "a", "b", "b"])
     assert (balanced.low, balanced.high) == pytest.approx((wilson(2, 4).low, wilson(2, 4).high))
 
 
-def test_rate_where_all_agree_counts_clusters():
-    found = rate([0] * 12, ["a"] * 6 + ["b"] * 6)
-    assert (found.mean, found.low, found.n) == (0.0, 0.0, 12)
-    assert found.high == pytest.approx(wilson(0, 2).high)
+def test_rate_of_equal_values_counts_clusters():
+    result = rate([0] * 12, ["a"] * 6 + ["b"] * 6)
+    assert (result.mean, result.low, result.n) == (0.0, 0.0, 12)
+    assert result.high == pytest.approx(wilson(0, 2).high)
 
 
 def test_bootstrap_is_the_exact_distribution_of_a_small_sample():
     # All 27 equally likely resamples of three values; the percentile bounds of 40,000 draws must be theirs.
     values = np.array([0.0, 1.0, 5.0])
     means = sorted(float(np.mean(draw)) for draw in itertools.product(values, repeat=3))
-    found = bootstrap_mean(values, confidence=0.8, resamples=40_000, seed=3)
-    assert found.mean == 2.0 and found.n == 3
-    assert found.low == pytest.approx(np.quantile(means, 0.1, method="inverted_cdf"))
-    assert found.high == pytest.approx(np.quantile(means, 0.9, method="inverted_cdf"))
+    result = bootstrap_mean(values, confidence=0.8, resamples=40_000, seed=3)
+    assert result.mean == 2.0 and result.n == 3
+    assert result.low == pytest.approx(np.quantile(means, 0.1, method="inverted_cdf"))
+    assert result.high == pytest.approx(np.quantile(means, 0.9, method="inverted_cdf"))
 
 
 def test_cluster_bootstrap_is_the_exact_distribution_of_whole_clusters():
@@ -95,10 +95,10 @@ def test_cluster_bootstrap_is_the_exact_distribution_of_whole_clusters():
         sum(totals[c][0] for c in draw) / sum(totals[c][1] for c in draw)
         for draw in itertools.product("abc", repeat=3)
     )
-    found = bootstrap_mean(values, labels, confidence=0.9, resamples=40_000, seed=1)
-    assert found.mean == pytest.approx(2.8)
-    assert found.low == pytest.approx(np.quantile(means, 0.05, method="inverted_cdf"))
-    assert found.high == pytest.approx(np.quantile(means, 0.95, method="inverted_cdf"))
+    result = bootstrap_mean(values, labels, confidence=0.9, resamples=40_000, seed=1)
+    assert result.mean == pytest.approx(2.8)
+    assert result.low == pytest.approx(np.quantile(means, 0.05, method="inverted_cdf"))
+    assert result.high == pytest.approx(np.quantile(means, 0.95, method="inverted_cdf"))
 
 
 def test_bootstrap_agrees_with_scipy():
@@ -106,10 +106,10 @@ def test_bootstrap_agrees_with_scipy():
     expected = scipy.stats.bootstrap(
         (values,), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1)
     ).confidence_interval
-    found = bootstrap_mean(values, resamples=20_000, seed=0)
+    result = bootstrap_mean(values, resamples=20_000, seed=0)
     width = expected.high - expected.low
-    assert found.low == pytest.approx(expected.low, abs=0.03 * width)
-    assert found.high == pytest.approx(expected.high, abs=0.03 * width)
+    assert result.low == pytest.approx(expected.low, abs=0.03 * width)
+    assert result.high == pytest.approx(expected.high, abs=0.03 * width)
 
 
 def test_pairs_agree_with_scipy_and_need_both():
@@ -124,13 +124,13 @@ def test_pairs_agree_with_scipy_and_need_both():
         n_resamples=20_000,
         rng=np.random.default_rng(2),
     ).confidence_interval
-    found = paired_bootstrap([*a, 3.0, None], [*b, None, 9.0], resamples=20_000, seed=0)
-    assert found.n == 60 and found.mean == pytest.approx(float(np.mean(a - b)))
+    result = paired_bootstrap([*a, 3.0, None], [*b, None, 9.0], resamples=20_000, seed=0)
+    assert result.n == 60 and result.mean == pytest.approx(float(np.mean(a - b)))
     width = expected.high - expected.low
-    assert found.low == pytest.approx(expected.low, abs=0.03 * width)
-    assert found.high == pytest.approx(expected.high, abs=0.03 * width)
+    assert result.low == pytest.approx(expected.low, abs=0.03 * width)
+    assert result.high == pytest.approx(expected.high, abs=0.03 * width)
     apart = bootstrap_mean(a, seed=0)
-    assert found.high - found.low < (apart.high - apart.low) / 2, (
+    assert result.high - result.low < (apart.high - apart.low) / 2, (
         "pairing removes the spread between scenarios"
     )
 
@@ -140,7 +140,7 @@ def test_a_single_cluster_has_no_interval():
     assert bootstrap_mean([7.0], seed=0) == Interval(7.0, None, None, 1)
 
 
-def test_undefined_episodes_take_their_cluster_along():
+def test_clusters_without_defined_episodes_are_excluded():
     assert bootstrap_mean([1.0, None, 3.0], ["a", "b", "c"], seed=4) == bootstrap_mean([1.0, 3.0], seed=4)
 
 
@@ -154,7 +154,7 @@ def test_seeds_repeat_and_chunks_do_not_matter(monkeypatch):
 
 
 def test_coverage_of_clustered_data():
-    """95 % intervals of clustered data cover the truth; ignoring the clusters covers it far too seldom."""
+    """95 % intervals of clustered data cover the true value; intervals that ignore clusters do so too rarely."""
     rng = np.random.default_rng(11)
     clusters, size, trials, truth = 40, 5, 300, 0.7
     labels = np.repeat(np.arange(clusters), size)
@@ -162,12 +162,12 @@ def test_coverage_of_clustered_data():
     for trial in range(trials):
         p = rng.beta(truth * 1.5, (1 - truth) * 1.5, clusters)
         values = (rng.random((clusters, size)) < p[:, None]).astype(float).ravel()
-        for name, found in (
+        for name, result in (
             ("rate", rate(values, labels)),
             ("mean", bootstrap_mean(values, labels, resamples=600, seed=trial)),
             ("naive", rate(values)),
         ):
-            hits[name] += found.low <= truth <= found.high
+            hits[name] += result.low <= truth <= result.high
     share = {name: count / trials for name, count in hits.items()}
     # Binomial standard error of a coverage of 0.95 in 300 trials: 0.0126.
     assert 0.91 <= share["rate"] <= 0.985 and 0.90 <= share["mean"] <= 0.985
@@ -208,16 +208,16 @@ def test_interquartile_bootstrap_of_equal_seeds_is_that_of_their_episodes():
 
 
 def test_stratified_bootstrap_is_the_exact_distribution():
-    """Two strata of three and two clusters: two draws weighed by 3/2, and one draw weighed by 2."""
+    """Two strata of three and two clusters: two draws of weight 3/2, and one draw of weight 2."""
     values, strata = [0.0, 1.0, 5.0, 10.0, 14.0], ["x", "x", "x", "y", "y"]
     means = [
         (1.5 * (a + b) + 2 * c) / 5
         for a in (0.0, 1.0, 5.0) for b in (0.0, 1.0, 5.0) for c in (10.0, 14.0)
     ]  # fmt: skip
-    found = bootstrap_mean(values, strata=strata, confidence=0.8, resamples=40_000, seed=2)
-    assert found.mean == pytest.approx(6.0) and found.n == 5
-    assert found.low == pytest.approx(np.quantile(means, 0.1, method="inverted_cdf"))
-    assert found.high == pytest.approx(np.quantile(means, 0.9, method="inverted_cdf"))
+    result = bootstrap_mean(values, strata=strata, confidence=0.8, resamples=40_000, seed=2)
+    assert result.mean == pytest.approx(6.0) and result.n == 5
+    assert result.low == pytest.approx(np.quantile(means, 0.1, method="inverted_cdf"))
+    assert result.high == pytest.approx(np.quantile(means, 0.9, method="inverted_cdf"))
 
 
 def test_stratified_bootstrap_has_the_variance_of_stratified_sampling():
@@ -228,18 +228,18 @@ def test_stratified_bootstrap_has_the_variance_of_stratified_sampling():
     spread = np.array([values[strata == h].var(ddof=1) for h in range(10)])
     expected = math.sqrt((0.1**2 * spread / 3).sum())
     one_sigma = math.erf(1 / math.sqrt(2))
-    found = bootstrap_mean(values, strata=strata, confidence=one_sigma, resamples=20_000, seed=0)
-    assert (found.high - found.low) / 2 == pytest.approx(expected, rel=0.03)
+    result = bootstrap_mean(values, strata=strata, confidence=one_sigma, resamples=20_000, seed=0)
+    assert (result.high - result.low) / 2 == pytest.approx(expected, rel=0.03)
     without = bootstrap_mean(values, confidence=one_sigma, seed=0)
-    assert without.high - without.low > 10 * (found.high - found.low), (
+    assert without.high - without.low > 10 * (result.high - result.low), (
         "between strata nothing is left to chance"
     )
 
 
-def test_strata_take_clusters_along_and_undefined_values_out():
+def test_strata_assign_clusters_and_exclude_undefined_values():
     values, clusters, strata = [1.0, 2.0, 3.0, None, 5.0], list("aabbc"), list("xxyyy")
-    found = bootstrap_mean(values, clusters, strata=strata, seed=0)
-    assert found.n == 4 and found.mean == pytest.approx(2.75)
+    result = bootstrap_mean(values, clusters, strata=strata, seed=0)
+    assert result.n == 4 and result.mean == pytest.approx(2.75)
     with pytest.raises(UsageError, match="lies in two strata"):
         bootstrap_mean([1.0, 2.0], ["a", "a"], strata=["x", "y"], seed=0)
 
@@ -250,16 +250,16 @@ def test_split_bootstrap_draws_each_arm_by_itself():
         (a + b) / 2 - sum(c) / 3
         for a in (0, 1) for b in (0, 1) for c in itertools.product((3, 5, 6), repeat=3)
     ]  # fmt: skip
-    found = split_bootstrap(values, first, confidence=0.9, resamples=40_000, seed=0)
-    assert found.mean == pytest.approx(0.5 - 14 / 3) and found.n == 5
-    assert found.low == pytest.approx(np.quantile(means, 0.05, method="inverted_cdf"))
-    assert found.high == pytest.approx(np.quantile(means, 0.95, method="inverted_cdf"))
+    result = split_bootstrap(values, first, confidence=0.9, resamples=40_000, seed=0)
+    assert result.mean == pytest.approx(0.5 - 14 / 3) and result.n == 5
+    assert result.low == pytest.approx(np.quantile(means, 0.05, method="inverted_cdf"))
+    assert result.high == pytest.approx(np.quantile(means, 0.95, method="inverted_cdf"))
     assert split_bootstrap(values, np.zeros(5, bool), seed=0) == Interval(None, None, None, 0)
     assert split_bootstrap(values, first, ["a", "b", "a", "c", "d"], seed=0).low is None, (
         "one cluster in an arm"
     )
     strata = np.array([0, 1, 0, 1, 1])
-    assert split_bootstrap(values, first, strata=strata, seed=0).mean == found.mean
+    assert split_bootstrap(values, first, strata=strata, seed=0).mean == result.mean
 
 
 @pytest.mark.parametrize("n", [4, 8, 12, 40])
@@ -277,11 +277,11 @@ def test_interquartile_mean_by_hand():
 
 def test_interquartile_bootstrap_is_the_exact_distribution():
     values = np.array([[0.0, 2.0], [1.0, 5.0], [8.0, 9.0]])
-    found = interquartile_bootstrap(values, confidence=0.8, resamples=20_000, seed=0)
-    assert found.mean == pytest.approx(interquartile_mean(values.mean(axis=1))) and found.n == 6
+    result = interquartile_bootstrap(values, confidence=0.8, resamples=20_000, seed=0)
+    assert result.mean == pytest.approx(interquartile_mean(values.mean(axis=1))) and result.n == 6
     means = [
         interquartile_mean([values[a, list(drawn)].mean() for a in agents])
         for agents in itertools.product(range(3), repeat=3) for drawn in itertools.product(range(2), repeat=2)
     ]  # fmt: skip
-    assert found.low == pytest.approx(np.quantile(means, 0.1), abs=0.06)
-    assert found.high == pytest.approx(np.quantile(means, 0.9), abs=0.06)
+    assert result.low == pytest.approx(np.quantile(means, 0.1), abs=0.06)
+    assert result.high == pytest.approx(np.quantile(means, 0.9), abs=0.06)

@@ -1,4 +1,4 @@
-"""Rankings, pair by pair."""
+"""Ranking measures against their definitions by pairs."""
 
 import numpy as np
 import pytest
@@ -37,8 +37,8 @@ def test_interval_equals_that_of_placement_values():
     a, b = SCORES[LABELS][:, None], SCORES[~LABELS]
     right = (a > b) + (a == b) / 2
     spread = np.sqrt(right.mean(1).var(ddof=1) / len(a) + right.mean(0).var(ddof=1) / len(b))
-    wanted = right.mean() + 1.959964 * spread * np.array([-1, 1])
-    np.testing.assert_allclose(auc_interval(SCORES, LABELS), wanted, rtol=1e-6)
+    expected = right.mean() + 1.959964 * spread * np.array([-1, 1])
+    np.testing.assert_allclose(auc_interval(SCORES, LABELS), expected, rtol=1e-6)
 
 
 def test_interval_covers_the_true_value():
@@ -66,8 +66,8 @@ def test_weights_are_repetitions():
     times = RNG.integers(1, 4, 150)
     scores, labels = (np.repeat(part, times) for part in (SCORES, LABELS))
     for measure in (roc_auc, precision_at_base_rate):
-        wanted = measure(scores, labels)
-        assert measure(SCORES, LABELS, times.astype(float)) == pytest.approx(wanted, rel=1e-12)
+        expected = measure(scores, labels)
+        assert measure(SCORES, LABELS, times.astype(float)) == pytest.approx(expected, rel=1e-12)
 
 
 def test_invalid_arguments_are_refused():
@@ -86,7 +86,7 @@ def test_rank_correlation_equals_scipy():
 
 
 def test_cluster_bootstrap_covers_the_true_value():
-    """Forty scenarios of twenty steps that share most of their score: by steps alone intervals are far too short."""
+    """Forty scenarios of twenty steps with similar scores; intervals that ignore clusters are too short."""
     rng, truth, covered, apart = np.random.default_rng(3), 0.7592, [], []
     labels = np.repeat(np.arange(40) < 20, 20)
     cluster = np.repeat(np.arange(40), 20)
@@ -107,17 +107,17 @@ def test_bootstrap_intervals_hold_the_measures_and_agree_with_delong():
 
 
 def test_interval_of_rank_correlation():
-    """Of normal variables Fisher's: tanh(atanh(r) +- 1.96 / sqrt(n - 3)), nearly; repeating each value adds nothing."""
+    """Approximately Fisher's interval for normal variables; repeated values add no information."""
     rng = np.random.default_rng(3)
     one, noise = rng.normal(size=(2, 400))
     other = 0.5 * one + noise
     rho = rank_correlation(one, other)
-    wanted = np.tanh(np.arctanh(rho) + np.array([-1.96, 1.96]) / np.sqrt(397))
+    expected = np.tanh(np.arctanh(rho) + np.array([-1.96, 1.96]) / np.sqrt(397))
     for times in (1, 3):
-        found = correlation_interval(
+        result = correlation_interval(
             np.repeat(one, times), np.repeat(other, times), np.repeat(np.arange(400), times)
         )
-        np.testing.assert_allclose(found, wanted, atol=0.025)
+        np.testing.assert_allclose(result, expected, atol=0.025)
     assert correlation_interval(one, other, np.zeros(400)) == (-1.0, 1.0)
     assert correlation_interval(one, (np.arange(400) == 7).astype(float), np.arange(400)) == (-1.0, 1.0)
-    assert np.diff(correlation_interval(one, other, np.arange(400), confidence=0.5)) < np.diff(wanted) / 2
+    assert np.diff(correlation_interval(one, other, np.arange(400), confidence=0.5)) < np.diff(expected) / 2

@@ -1,4 +1,4 @@
-"""Differences over seeds and scenarios: hand-computed, against SciPy where one part vanishes, calibrated."""
+"""Differences over seeds and scenarios: hand-computed, against SciPy if one variance is 0, and calibration."""
 
 import math
 from dataclasses import replace
@@ -31,25 +31,25 @@ def drawn(rng, seeds, scenarios, *, agent=0.0, scenario=0.0, interaction=0.0, sh
 
 def test_crossed_difference_by_hand():
     a, b = np.array([[1.0, 0.0], [1.0, 1.0]]), np.array([[0.0, 0.0], [0.0, 1.0]])
-    found = crossed_difference(a, b)
-    assert found.difference == 0.5
+    result = crossed_difference(a, b)
+    assert result.difference == 0.5
     # Means of seeds are 0.5, 1 and 0, 0.5; differences by scenario 1 and 0.
-    assert found.seeds == pytest.approx((0.125 / 2, 0.125 / 2))
-    assert found.scenarios == pytest.approx(2 * (0.25 + 0.25) / 4)
+    assert result.seeds == pytest.approx((0.125 / 2, 0.125 / 2))
+    assert result.scenarios == pytest.approx(2 * (0.25 + 0.25) / 4)
     # Residuals of either kind are +-1/4 in a checkerboard: 2 (4 (1/8)^2) / 2 = 1/16.
-    assert found.interaction == pytest.approx((0.0625, 0.0625))
-    assert found.error == pytest.approx(math.sqrt(0.125 + 0.25 - 0.125))
+    assert result.interaction == pytest.approx((0.0625, 0.0625))
+    assert result.error == pytest.approx(math.sqrt(0.125 + 0.25 - 0.125))
     parts = (0.0625, 0.0625, 0.25)
-    assert found.degrees_of_freedom == pytest.approx(0.25**2 / sum(part**2 for part in parts))
+    assert result.degrees_of_freedom == pytest.approx(0.25**2 / sum(part**2 for part in parts))
 
 
 def test_variance_of_seeds_alone_gives_welchs_test():
     rng = np.random.default_rng(0)
     means = rng.normal(size=(2, 5)) * np.array([[1.0], [3.0]])
     a, b = (np.repeat(row[:, None], 30, axis=1) for row in means)
-    found, wanted = crossed_difference(a, b), stats.ttest_ind(*means, equal_var=False)
-    assert found.p == pytest.approx(wanted.pvalue)
-    assert found.interval() == pytest.approx(tuple(wanted.confidence_interval()))
+    result, expected = crossed_difference(a, b), stats.ttest_ind(*means, equal_var=False)
+    assert result.p == pytest.approx(expected.pvalue)
+    assert result.interval() == pytest.approx(tuple(expected.confidence_interval()))
 
 
 def test_variance_of_scenarios_alone_gives_a_paired_t_test():
@@ -62,11 +62,11 @@ def test_variance_of_scenarios_alone_gives_a_paired_t_test():
 def test_mean_of_one_policy():
     rng = np.random.default_rng(8)
     alone = rng.random((1, 40))
-    wanted = stats.ttest_1samp(alone[0], 0.0).confidence_interval()
-    assert crossed_mean(alone).interval() == pytest.approx(tuple(wanted))
+    expected = stats.ttest_1samp(alone[0], 0.0).confidence_interval()
+    assert crossed_mean(alone).interval() == pytest.approx(tuple(expected))
     constant = np.repeat(rng.random((5, 1)), 40, axis=1)
-    wanted = stats.ttest_1samp(constant[:, 0], 0.0).confidence_interval()
-    assert crossed_mean(constant).interval() == pytest.approx(tuple(wanted))
+    expected = stats.ttest_1samp(constant[:, 0], 0.0).confidence_interval()
+    assert crossed_mean(constant).interval() == pytest.approx(tuple(expected))
 
 
 def test_clusters_count_once():
@@ -82,10 +82,10 @@ def test_clusters_count_once():
     "effects", [{"agent": 1.0}, {"agent": 0.3, "interaction": 1.0}, {"scenario": 3.0, "interaction": 1.0}]
 )
 def test_false_positives_keep_their_level(effects):
-    """Of comparisons without a difference at most 5 % are called one; by scenarios alone far more would be."""
+    """At most 5 % of comparisons without a difference are significant; ignoring seeds would give far more."""
     rng = np.random.default_rng(3)
-    found = [crossed_difference(*drawn(rng, 5, 50, **effects)).p < 0.05 for _ in range(400)]
-    assert np.mean(found) < 0.08  # 5 % and three standard errors
+    result = [crossed_difference(*drawn(rng, 5, 50, **effects)).p < 0.05 for _ in range(400)]
+    assert np.mean(result) < 0.08  # 5 % and three standard errors
 
 
 @pytest.mark.parametrize(
@@ -99,16 +99,16 @@ def test_false_positives_keep_their_level(effects):
     ],
 )
 def test_standard_error_is_the_deviation_of_the_difference(effects):
-    """The scatter of the difference itself, over many studies; neither seeds nor scenarios count twice."""
+    """It equals the deviation over many studies; neither seeds nor scenarios count twice."""
     rng = np.random.default_rng(9)
     apart = effects.pop("apart", 0.0)
-    found = []
+    result = []
     for _ in range(600):
         a, b = drawn(rng, 5, 60, **effects)
-        found.append(crossed_difference(a + apart * rng.normal(size=60), b))
-    scatter = np.var([one.difference for one in found])
+        result.append(crossed_difference(a + apart * rng.normal(size=60), b))
+    scatter = np.var([one.difference for one in result])
     # Of 600 a variance is known to 6 %; that the error is never below either part costs some percent more.
-    assert 0.85 < np.mean([one.error**2 for one in found]) / scatter < 1.25
+    assert 0.85 < np.mean([one.error**2 for one in result]) / scatter < 1.25
 
 
 def test_weights_count_scenarios_several_times():
@@ -126,12 +126,12 @@ def test_detectable_difference_is_detected_with_its_power():
     rng = np.random.default_rng(4)
     effects = {"agent": 0.3, "interaction": 1.0}
     typical = np.mean([crossed_difference(*drawn(rng, 5, 200, **effects)).detectable() for _ in range(100)])
-    found = [crossed_difference(*drawn(rng, 5, 200, shift=typical, **effects)).p < 0.05 for _ in range(300)]
-    assert 0.72 < np.mean(found) < 0.93
+    result = [crossed_difference(*drawn(rng, 5, 200, shift=typical, **effects)).p < 0.05 for _ in range(300)]
+    assert 0.72 < np.mean(result) < 0.93
 
 
 def test_needed_seeds_and_clusters_reach_the_power():
-    """Seeds, or scenarios: drawn again in that number they find a difference of this size in about 80 %."""
+    """Studies with that number of seeds or scenarios detect the difference in about 80 % of cases."""
     rng = np.random.default_rng(5)
     effects = {"agent": 0.02, "interaction": 1.0}
 
@@ -146,11 +146,11 @@ def test_needed_seeds_and_clusters_reach_the_power():
     clusters = typical(lambda one: one.clusters_needed())
     assert seeds > 4 and clusters > 100
     for number, scenarios in ((seeds, 100), (4, clusters)):
-        found = [
+        result = [
             crossed_difference(*drawn(rng, number, scenarios, shift=0.15, **effects)).p < 0.05
             for _ in range(200)
         ]
-        assert 0.68 < np.mean(found) < 0.92
+        assert 0.68 < np.mean(result) < 0.92
 
 
 def test_needed_numbers_at_their_ends():
@@ -158,24 +158,24 @@ def test_needed_numbers_at_their_ends():
     no_noise = crossed_difference(*drawn(rng, 4, 400, agent=5.0, shift=0.01))
     assert no_noise.clusters_needed() is None  # no number of scenarios makes up for seeds
     # Found at the present size by 5 %, not by the level that many claims ask for: more are needed, not fewer.
-    found = CrossedEffect(0.02, (2e-5, 2e-5), 1e-5, (5, 5), 400)
-    assert found.p < 0.05
-    assert found.seeds_needed() > 5
-    assert found.seeds_needed(confidence=1 - 0.05 / 30) > found.seeds_needed()
-    more = found._with_seeds(found.seeds_needed())
-    assert more.detectable() <= 0.02 < found._with_seeds(found.seeds_needed() - 1).detectable()
+    result = CrossedEffect(0.02, (2e-5, 2e-5), 1e-5, (5, 5), 400)
+    assert result.p < 0.05
+    assert result.seeds_needed() > 5
+    assert result.seeds_needed(confidence=1 - 0.05 / 30) > result.seeds_needed()
+    more = result._with_seeds(result.seeds_needed())
+    assert more.detectable() <= 0.02 < result._with_seeds(result.seeds_needed() - 1).detectable()
 
 
 def test_log_ratio_of_a_constant_ratio_is_exact():
     rng = np.random.default_rng(6)
     b = rng.uniform(1.0, 2.0, size=(3, 30))
-    found = log_ratio(0.5 * b, b)
-    assert found.difference == pytest.approx(math.log(0.5)) and found.error > 0.0
+    result = log_ratio(0.5 * b, b)
+    assert result.difference == pytest.approx(math.log(0.5)) and result.error > 0.0
     assert log_ratio(0.0 * b, b) is None
 
 
-def test_log_ratio_covers():
-    """Rates of 0.1 and 0.2: the interval holds ln 0.5 in nearly all of the cases."""
+def test_log_ratio_interval_covers_the_true_value():
+    """Rates of 0.1 and 0.2: nearly all intervals contain ln 0.5."""
     rng = np.random.default_rng(7)
     held = 0
     for _ in range(200):
@@ -186,18 +186,18 @@ def test_log_ratio_covers():
 
 
 def test_differences_of_the_same_seeds_are_paired():
-    """Agents vary far more than what is done to each of them."""
+    """Seeds vary far more than the difference between the policies of a seed."""
     rng = np.random.default_rng(11)
     before, _ = drawn(rng, 5, 50, agent=2.0)
     after = before + 0.1 + 0.02 * rng.normal(size=(5, 1))
     assert crossed_difference(after, before).p > 0.5
     paired = crossed_mean(after - before)
     assert paired.p < 0.01
-    wanted = stats.ttest_rel(after[:, 0], before[:, 0]).confidence_interval()
-    assert paired.interval() == pytest.approx(tuple(wanted))
+    expected = stats.ttest_rel(after[:, 0], before[:, 0]).confidence_interval()
+    assert paired.interval() == pytest.approx(tuple(expected))
 
 
-def test_undefined_scenarios_are_left_out_and_too_little_is_refused():
+def test_undefined_scenarios_are_excluded_and_too_few_are_refused():
     a, b = np.array([[1.0, 0.0, np.nan], [1.0, 1.0, 1.0]]), np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
     assert crossed_difference(a, b) == crossed_difference(a[:, :2], b[:, :2])
     with pytest.raises(UsageError, match="too few seeds or recordings"):
@@ -212,9 +212,11 @@ def test_seeds_interval():
     rng = np.random.default_rng(0)
     values, clusters = (rng.random((3, 60)) < 0.3).astype(np.float64), np.arange(60) // 2
     values[0, 5] = np.nan
-    found, wanted = seeds_interval(values, clusters), crossed_mean(values, clusters)
-    assert (found.mean, found.low, found.high) == pytest.approx((wanted.difference, *wanted.interval()))
-    assert found.n == 59
+    result, expected = seeds_interval(values, clusters), crossed_mean(values, clusters)
+    assert (result.mean, result.low, result.high) == pytest.approx(
+        (expected.difference, *expected.interval())
+    )
+    assert result.n == 59
     # A rate lies within 0 and 1, and is never certain.
     few = np.zeros((2, 20))
     few[0, 0] = 1.0
@@ -233,13 +235,13 @@ def test_seeds_interval():
 
 def test_power_of_the_detectable_difference():
     rng = np.random.default_rng(1)
-    found = crossed_difference(rng.normal(size=(3, 80)) + rng.normal(size=(3, 1)), rng.normal(size=(3, 80)))
-    assert found.power(found.detectable(0.8)) == pytest.approx(0.8)
-    assert found.power(0.0) < 0.05 and CrossedEffect(0.1, (0.0, 0.0), 0.0, (2, 2), 9).power(0.1) == 1.0
+    result = crossed_difference(rng.normal(size=(3, 80)) + rng.normal(size=(3, 1)), rng.normal(size=(3, 80)))
+    assert result.power(result.detectable(0.8)) == pytest.approx(0.8)
+    assert result.power(0.0) < 0.05 and CrossedEffect(0.1, (0.0, 0.0), 0.0, (2, 2), 9).power(0.1) == 1.0
 
 
-def test_more_clusters_may_help_although_many_more_would_not():
-    """With ever more clusters only the seeds' two degrees of freedom are left."""
+def test_more_clusters_may_suffice_although_many_more_do_not():
+    """With more and more clusters, only the two degrees of freedom of the seeds remain."""
     one = CrossedEffect(5.0, (1.0, 0.0), 5.0, (3, 2), 100)
     needed = one.clusters_needed()
     assert needed is not None and 100 < needed < 1000
@@ -250,9 +252,9 @@ def test_more_clusters_may_help_although_many_more_would_not():
 
 
 def test_equal_values_have_no_difference():
-    """Three times a number, by three, may be another float."""
+    """Three times a number, divided by three, may be another float."""
     rng = np.random.default_rng(0)
     for _ in range(50):
         row = rng.integers(0, 11, 300) / 10
-        found = crossed_difference(np.stack([row] * 3), repeat_single_seed(row[None]))
-        assert found.difference == 0.0 and found.p == 1.0
+        result = crossed_difference(np.stack([row] * 3), repeat_single_seed(row[None]))
+        assert result.difference == 0.0 and result.p == 1.0

@@ -1,4 +1,4 @@
-"""Tests against enumeration, SciPy and hand-made tables."""
+"""Significance tests against enumeration, SciPy and hand-made tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drivax.stats.significance import (
 
 
 def pairs_of(more, fewer, same=3):
-    """0/1 values with n discordant pairs of either kind."""
+    """Return 0/1 values with given numbers of discordant pairs of either kind."""
     a = [1] * more + [0] * fewer + [1] * same + [0] * same
     b = [0] * more + [1] * fewer + [1] * same + [0] * same
     return np.array(a, float), np.array(b, float)
@@ -33,8 +33,8 @@ def test_mcnemar_is_scipys_sign_test(more, fewer):
     exact = scipy.stats.binomtest(more, n, 0.5).pvalue if n else 1.0
     assert mcnemar_test(a, b, mid=False).p == pytest.approx(exact)
     expected = min(1.0, 2 * scipy.stats.binom.cdf(k, n, 0.5) - scipy.stats.binom.pmf(k, n, 0.5)) if n else 1.0
-    found = mcnemar_test(a, b)
-    assert found.p == pytest.approx(expected) and found.units == n and found.exact
+    result = mcnemar_test(a, b)
+    assert result.p == pytest.approx(expected) and result.units == n and result.exact
 
 
 def test_mcnemar_by_hand():
@@ -53,8 +53,8 @@ def test_permutation_of_pairs_is_scipys():
     expected = scipy.stats.permutation_test(
         (a, b), lambda x, y, axis: np.mean(x - y, axis=axis), permutation_type="samples", vectorized=True
     )  # fmt: skip
-    found = paired_permutation(a, b, seed=0)
-    assert found.exact and found.p == pytest.approx(expected.pvalue)
+    result = paired_permutation(a, b, seed=0)
+    assert result.exact and result.p == pytest.approx(expected.pvalue)
     # Drawn instead of counted: the same up to chance.
     drawn = paired_permutation(a, b, resamples=400, seed=0)
     assert not drawn.exact and drawn.p == pytest.approx(expected.pvalue, abs=0.08)
@@ -64,18 +64,18 @@ def test_permutation_of_clusters_flips_whole_clusters():
     d, clusters = np.array([1.0, 2.0, -1.0, 4.0, 0.5, 0.5]), list("aabcdd")
     sums = np.array([3.0, -1.0, 4.0, 1.0])
     patterns = [abs(np.dot(signs, sums)) >= 7.0 for signs in itertools.product((1, -1), repeat=4)]
-    found = paired_permutation(d, np.zeros(6), clusters, seed=0)
-    assert found.p == pytest.approx(np.mean(patterns)) and found.units == 4
-    assert found.p > paired_permutation(d, np.zeros(6), seed=0).p, "as if pairs were independent: too sure"
+    result = paired_permutation(d, np.zeros(6), clusters, seed=0)
+    assert result.p == pytest.approx(np.mean(patterns)) and result.units == 4
+    assert result.p > paired_permutation(d, np.zeros(6), seed=0).p, "as if pairs were independent: too sure"
 
 
 def test_permutation_of_rates_is_mcnemars_exact_test():
     a, b = pairs_of(8, 2, same=40)
-    found = paired_permutation(a, b, seed=0)
-    assert found.p == pytest.approx(mcnemar_test(a, b, mid=False).p) and found.units == 10
+    result = paired_permutation(a, b, seed=0)
+    assert result.p == pytest.approx(mcnemar_test(a, b, mid=False).p) and result.units == 10
 
 
-def test_permutation_where_nothing_differs_or_everything_does():
+def test_permutation_with_no_or_only_differences():
     same = paired_permutation([1.0, 2.0], [1.0, 2.0], seed=0)
     assert (same.p, same.units) == (1.0, 0)
     assert paired_permutation(np.ones(5), np.zeros(5), seed=0).p == pytest.approx(2 / 2**5)
@@ -87,8 +87,8 @@ def test_bootstrap_test_is_a_t_test_of_many_symmetric_values():
     rng = np.random.default_rng(3)
     d = rng.normal(0.15, 1, 200)
     expected = scipy.stats.ttest_1samp(d, 0).pvalue
-    found = paired_bootstrap_test(d, np.zeros(200), resamples=20_000, seed=0)
-    assert found.p == pytest.approx(expected, abs=0.01)
+    result = paired_bootstrap_test(d, np.zeros(200), resamples=20_000, seed=0)
+    assert result.p == pytest.approx(expected, abs=0.01)
 
 
 def test_bootstrap_test_is_the_exact_distribution_of_a_small_sample():
@@ -106,8 +106,8 @@ def test_bootstrap_test_is_the_exact_distribution_of_a_small_sample():
     for rows in itertools.product(range(4), repeat=4):
         m, e = summary(np.array(rows))
         beyond.append(abs(m - mean) >= mean / error * e - 1e-9)
-    found = paired_bootstrap_test(d, np.zeros(6), clusters, resamples=40_000, seed=1)
-    assert found.p == pytest.approx(np.mean(beyond), abs=0.005)
+    result = paired_bootstrap_test(d, np.zeros(6), clusters, resamples=40_000, seed=1)
+    assert result.p == pytest.approx(np.mean(beyond), abs=0.005)
 
 
 def test_bootstrap_test_of_constant_differences():
@@ -125,8 +125,8 @@ def test_permutation_of_arms_is_every_assignment():
         arm = np.isin(clusters, chosen)
         means[chosen] = values[arm].mean() - values[~arm].mean()
     expected = np.mean([abs(m) >= abs(means[0, 1]) - 1e-12 for m in means.values()])
-    found = split_permutation(values, first, clusters, resamples=20_000, seed=0)
-    assert found.p == pytest.approx(expected, abs=0.01)
+    result = split_permutation(values, first, clusters, resamples=20_000, seed=0)
+    assert result.p == pytest.approx(expected, abs=0.01)
 
 
 def test_permutation_of_arms_keeps_to_strata():
@@ -134,8 +134,8 @@ def test_permutation_of_arms_keeps_to_strata():
     values, strata = np.array([10.0, 9.0, 2.0, 1.0]), ["x", "x", "y", "y"]
     first = np.array([True, False, True, False])
     expected = np.mean([abs(a + b) >= 2 for a in (1, -1) for b in (1, -1)])
-    found = split_permutation(values, first, strata=strata, resamples=20_000, seed=0)
-    assert found.p == pytest.approx(expected, abs=0.01)
+    result = split_permutation(values, first, strata=strata, resamples=20_000, seed=0)
+    assert result.p == pytest.approx(expected, abs=0.01)
     assert split_permutation(values, np.ones(4, bool), seed=0).p is None
 
 

@@ -1,4 +1,4 @@
-"""The check of algorithms: a custom one and PPO pass, and each rule has an algorithm that breaks it."""
+"""Check of algorithms: a custom algorithm and PPO pass, and each rule has an algorithm that violates it."""
 
 import re
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Checks for users: built-in components pass, and each rule has a component that breaks it."""
+"""Checks of user-defined components: built-in components pass, and each rule has a component that violates it."""
 
 import itertools
 import re
@@ -29,16 +29,16 @@ def refused(check, term, words):
 
 @pytest.mark.slow
 def test_worlds_cover_the_facts_of_terms():
-    found = moments().situation
-    facts = found.facts
+    result = moments().situation
+    facts = result.facts
     for name in ("collision", "offroad", "off_route", "ttc_defined", "straddling", "wrong_way"):
         assert 0 < float(getattr(facts, name).mean()) < 1, name
-    kinds = found.surroundings.frame.kind[found.surroundings.frame.valid]
+    kinds = result.surroundings.frame.kind[result.surroundings.frame.valid]
     assert {1, 2} <= set(kinds.tolist())
 
 
 def some(names, *quick):
-    """All names as parameters; all but a few are slow, because each compiles its own programs."""
+    """Return names as parameters; most are marked slow, because each compiles its own programs."""
     slow = [pytest.param(name, marks=pytest.mark.slow) for name in names if name not in quick]
     return [*quick, *slow]
 

@@ -1,4 +1,4 @@
-"""Check of planners: built-in planners pass, and each rule has a planner that breaks it."""
+"""Check of planners: built-in planners pass, and each rule has a planner that violates it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ count = itertools.count()
 
 @record
 class Wrong(Memoryless):
-    """Breaks one rule."""
+    """A planner that violates one rule."""
 
     fault: str = static(default="")
     name: str = static(default="wrong")
@@ -53,7 +53,7 @@ def refused(planner, words):
     assert "\n" not in str(error.value) and "; " in str(error.value)
 
 
-def test_forms_are_checked_before_anything_runs():
+def test_shapes_are_checked_before_anything_runs():
     refused(ConstantVelocity, "is not a planner")
     refused(Wrong(fault="size"), r"gives float32\[3\] as an action; return float32\[2\]")
     refused(Wrong(fault="form"), "changes the shape of its carry")

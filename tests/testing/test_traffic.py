@@ -1,4 +1,4 @@
-"""The check of traffic: built-in and custom models pass, and each rule has a model that breaks it."""
+"""Check of traffic: built-in and custom models pass, and each rule has a model that violates it."""
 
 import itertools
 import re

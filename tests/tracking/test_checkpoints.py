@@ -1,4 +1,4 @@
-"""Checkpoints come back bit for bit, stay in the number asked for, and say what does not fit."""
+"""Checkpoints are restored bit for bit, superseded ones are deleted, and errors name what does not match."""
 
 from __future__ import annotations
 
@@ -79,11 +79,11 @@ def test_parts_are_restored_by_their_paths(tmp_path: Path):
     checkpoints = Checkpoints(tmp_path)
     state = {"critic": jnp.arange(3.0), "critics": jnp.zeros(2), "policy": {"w": jnp.ones(2)}}
     checkpoints.save(5, state)
-    found = checkpoints.restore_parts(
+    result = checkpoints.restore_parts(
         {"['policy']": {"w": jnp.zeros(2)}, "['critic']": jax.ShapeDtypeStruct((3,), jnp.float32)}
     )
-    np.testing.assert_array_equal(found["['critic']"], [0, 1, 2])
-    np.testing.assert_array_equal(found["['policy']"]["w"], [1, 1])
+    np.testing.assert_array_equal(result["['critic']"], [0, 1, 2])
+    np.testing.assert_array_equal(result["['policy']"]["w"], [1, 1])
     named = [".critic['w']", ".critics", ".critic"]
     assert [is_part(leaf, [".critic"]) for leaf in named] == [True, False, True]
     with pytest.raises(DataError, match=r"no \['policy'\]\['v'\]; begin elsewhere"):
@@ -91,7 +91,7 @@ def test_parts_are_restored_by_their_paths(tmp_path: Path):
 
 
 def test_shapes_suffice_as_template(tmp_path: Path):
-    """As a fresh process does: nothing is computed to make the template."""
+    """Like a new process, which computes nothing for the template."""
     checkpoints = Checkpoints(tmp_path)
 
     def initial(seed: int) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def test_shapes_suffice_as_template(tmp_path: Path):
     assert jax.random.uniform(again["key"]) == jax.random.uniform(state["key"])
 
 
-def test_newest_and_best_stay(tmp_path: Path):
+def test_newest_and_best_checkpoints_are_kept(tmp_path: Path):
     checkpoints = Checkpoints(tmp_path, keep=2)
     for step, score in ((10, 0.1), (20, 0.9), (30, None), (40, float("nan")), (50, 0.3)):
         checkpoints.save(step, {"step": step}, score)
@@ -119,7 +119,7 @@ def test_newest_and_best_stay(tmp_path: Path):
     assert checkpoints.steps() == [50, 60]
 
 
-def test_without_scores_only_the_newest_stay(tmp_path: Path):
+def test_without_scores_only_the_newest_are_kept(tmp_path: Path):
     checkpoints = Checkpoints(tmp_path, keep=1)
     for step in (1, 2, 3):
         checkpoints.save(step, {"step": step})
@@ -154,7 +154,7 @@ def test_a_full_disk_reports_the_size_of_the_checkpoint(tmp_path: Path, monkeypa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_left_overs_of_a_killed_process_are_no_checkpoints(tmp_path: Path):
+def test_files_of_a_killed_process_are_no_checkpoints(tmp_path: Path):
     (tmp_path / ".step-5.partial-123").mkdir()
     (tmp_path / "step-x").mkdir()
     checkpoints = Checkpoints(tmp_path)
@@ -223,7 +223,7 @@ def test_later_checkpoints_are_dropped(tmp_path: Path):
     assert checkpoints.steps() == [10, 20] and len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_packed_tree_comes_back_and_is_plain_numpy(tmp_path: Path):
+def test_packed_tree_round_trips_and_is_plain_numpy(tmp_path: Path):
     tree = {"w": jnp.arange(6.0).reshape(2, 3), "deep": {"b": jnp.int32(3)}, "none": None}
     file = tmp_path / "tree.npz"
     pack(file, tree)

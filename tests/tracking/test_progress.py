@@ -1,4 +1,4 @@
-"""Progress: plain lines in a log, a bar on a terminal, honest rates."""
+"""Progress: lines in a log, a bar on a terminal, and rates."""
 
 from __future__ import annotations
 

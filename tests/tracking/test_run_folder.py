@@ -1,4 +1,4 @@
-"""Run folders hold what is needed to believe and repeat a run."""
+"""Run folders contain the information that reproduces a run."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_folders_without_a_run_are_refused(tmp_path: Path):
 
 
 def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Against a repository made here: a clean commit, a run next to it, a new file, a change."""
+    """A temporary repository with a clean commit, a run next to it, a new file, and a change."""
 
     def git(*arguments: str) -> str:
         options = ["-c", "user.name=t", "-c", "user.email=t@t", "-c", "init.defaultBranch=main"]

@@ -1,4 +1,4 @@
-"""Logged numbers survive, and a resumed run continues where it stopped."""
+"""Logged numbers survive a crash, and a resumed run continues its log."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ def test_tensorboard_events(tmp_path: Path):
     with MetricLog(tmp_path) as log:
         log.write(7, {"train/loss": 0.25})
     (file,) = (tmp_path / "tensorboard").iterdir()
-    data, found = file.read_bytes(), []
+    data, result = file.read_bytes(), []
     while data:  # a TFRecord: length, its CRC, the payload, its CRC
         size = int.from_bytes(data[:8], "little")
         event = Event.FromString(data[12 : 12 + size])
-        found += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
+        result += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
         data = data[16 + size :]
-    assert found == [(7, "train/loss", 0.25)]
+    assert result == [(7, "train/loss", 0.25)]

@@ -1,4 +1,4 @@
-"""Worker processes: they work, and none outlives its parent."""
+"""Worker processes run tasks and exit with their parent."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_workers_end_with_a_killed_parent(tmp_path, end):
 
 
 def on_which_cores(number):
-    """What workers do here."""
+    """Task of the workers."""
     return number, len(os.sched_getaffinity(0))
 
 

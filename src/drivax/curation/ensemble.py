@@ -1,7 +1,7 @@
-"""Ensemble of behaviour-cloning policies, trained on different folds of the recordings, that disagrees on rare data.
+"""Ensemble of behaviour cloning policies, whose disagreement is high on rare data.
 
-Each member leaves out one fold of the recordings. All members are trained in one program, from different initial
-parameters, on the same batches; each masks the steps of its own fold. Deep ensembles: Lakshminarayanan et al. 2017,
+Each member excludes one fold of the recordings. All members are trained in one program, from different initial
+parameters, on the same batches; a member masks the steps of its own fold. Deep ensembles: Lakshminarayanan et al. 2017,
 arXiv 1612.01474.
 """
 
@@ -43,13 +43,13 @@ from drivax.tasks.features import Features
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.task import Task
 
-#: Logs that are observed at once.
+#: Logs per batch of observations.
 _LOG_BATCH = 8
-#: Scenarios whose predictions are reduced at once: float64 copies of a large set take several times its memory.
+#: Scenarios per block of predictions, which limits the memory of float64 copies.
 _BLOCK_SIZE = 4096
-#: Actions drawn from every member to estimate the mutual information.
+#: Actions sampled from every member to estimate the mutual information.
 _SAMPLES = 16
-#: Without past steps and the last action, which a policy could copy instead of using its surroundings.
+#: Without past steps and the last action, which a policy could copy.
 _OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
 
 _NETWORK = NetworkConfig(encoder=EntityConfig(), activation="relu")
@@ -62,14 +62,14 @@ class EnsembleConfig:
     """Configuration of an ensemble.
 
     Attributes:
-        folds: Number of members; each leaves out a random 1 / ``folds`` of the recordings.
-        cloning: Training of each member; each uses the steps of the other folds in every ``batch``. With ``loss: mse``
-            the disagreement is the variance of the predicted actions; with ``likelihood`` the mutual information of
-            their distributions, so that ``network.distribution: mixture`` can disagree about modes.
-        learn_from: Approximate number of scenarios to train on, as randomly chosen whole recordings; null: all, which
-            must fit on the device. All are scored.
+        folds: Number of members; each excludes a random 1 / ``folds`` of the recordings.
+        cloning: Training of each member, on the steps of the other folds in every ``batch``. With ``loss: mse`` the
+            disagreement is the variance of the predicted actions; with ``likelihood`` it is the mutual information of
+            the action distributions, so that ``network.distribution: mixture`` can disagree about modes.
+        learn_from: Approximate number of scenarios to train on, in randomly chosen whole recordings; null: all, which
+            must fit on the device. All scenarios are scored.
         total_steps: Logged steps drawn for all members, rounded up to whole iterations of ``cloning``.
-        weighted: ``plain``: uniform draws; ``rarity``: by clipped inverse density of the expert's action
+        weighted: ``plain``: uniform draws; ``rarity``: draws by the clipped inverse density of the expert's action
             (:class:`~drivax.curation.rarity.KernelRarity` with exponent 1).
         task: Observation and action space.
         seed: Seed of folds, networks and draws.
@@ -87,20 +87,20 @@ class EnsembleConfig:
         if self.folds < 2:
             raise UsageError(f"{self.folds} folds", cure="use 2 or more: disagreement needs two members")
         if self.learn_from is not None and self.learn_from < 1:
-            raise UsageError(f"learn_from is {self.learn_from}", cure="use 1 or more, or leave it out")
+            raise UsageError(f"learn_from is {self.learn_from}", cure="use 1 or more, or null")
 
     @property
     def iterations(self) -> int:
-        """Iterations of the training."""
+        """Number of training iterations."""
         return -(-self.total_steps // self.cloning.steps_per_iteration)
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Modes of the members (``action``) and the expert's actions at every step of a set, in units of the action space.
+    """Predictions of the members at every step of a set, and the expert's actions, in units of the action space.
 
-    ``known``: the expert's action is known and within the bounds. ``information``: mutual information of action and
-    member in nats, for members trained by likelihood.
+    ``action`` are the modes of the members. ``known`` marks steps at which the expert's action is known and within the
+    bounds. ``information`` is the mutual information of action and member in nats, for members trained by likelihood.
     """
 
     action: Float[Numbers, "N T K D"]
@@ -109,24 +109,24 @@ class Predictions:
     information: Float[Numbers, "N T"] | None
 
     def disagreement(self, deviation: Float[Numbers, " D"]) -> Float[Numbers, "N T D"]:
-        """Return the unbiased variance among the members over the variance of the expert's actions."""
+        """Return the unbiased variance among members, relative to the variance of the expert's actions."""
         variance = [self.action[block].astype(np.float64).var(axis=2, ddof=1) for block in self._blocks()]
         return np.concatenate(variance) / deviation**2
 
     def error(
         self, deviation: Float[Numbers, " D"], fold: Int[Numbers, " N"] | None
     ) -> Float[Numbers, "N T"]:
-        """Return the squared error over the expert's variance, summed over the action's dimensions.
+        """Return the squared error relative to the variance of the expert's actions, summed over the dimensions.
 
-        It is that of the member ``fold``, which has not seen the scenario; of the members' mean where none has (-1).
+        The prediction is that of member ``fold``, which excluded the scenario, or the mean of all members (fold -1).
         """
         members = np.full(len(self.action), -1) if fold is None else fold
         errors = []
         for block in self._blocks():
             action, member = self.action[block].astype(np.float64), members[block, None, None]
             member_action = np.take_along_axis(action, member[..., None], axis=2)[:, :, 0]
-            predicted = np.where(member < 0, action.mean(axis=2), member_action)
-            errors.append((((predicted - self.expert[block]) / deviation) ** 2).sum(axis=-1))
+            prediction = np.where(member < 0, action.mean(axis=2), member_action)
+            errors.append((((prediction - self.expert[block]) / deviation) ** 2).sum(axis=-1))
         return np.concatenate(errors)
 
     def _blocks(self) -> list[slice]:
@@ -135,10 +135,10 @@ class Predictions:
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """A trained ensemble: the learner of one member, and the parameters of all along a leading axis.
+    """A trained ensemble: the learner of one member, and the parameters of all members along a leading axis.
 
-    ``set_hash`` is the hash of the training set, ``fold`` the fold of every scenario (-1 if no member has seen it), and
-    ``deviation`` the standard deviation of the expert's actions, in units of the action space.
+    ``set_hash`` is the hash of the training set, ``fold`` the fold of every scenario (-1 for those not trained on),
+    and ``deviation`` the standard deviation of the expert's actions, in units of the action space.
     """
 
     config: EnsembleConfig
@@ -149,7 +149,7 @@ class Ensemble:
     deviation: Float[Numbers, " D"]
 
     def predictions(self, data: ScenarioSet, progress: Progress | None = None) -> Predictions:
-        """Return the predictions on a set, which need not be the training set."""
+        """Return the predictions on a set, which may differ from the training set."""
         values = map_batches(data, lambda bank: self._predict_bank(self.parameters, bank), progress)
         return Predictions(**{"information": None, **values})
 
@@ -161,7 +161,8 @@ class Ensemble:
         def predict(index: Array) -> dict[str, Array]:
             observation = environment.observe_recorded(bank, (jnp.full_like(steps, index), steps))
             act = partial(self.learner.distribution, observation=observation)
-            values = {"action": jnp.moveaxis(jax.vmap(lambda member: act(member).mode())(parameters), 0, 1)}
+            modes = jax.vmap(lambda member: act(member).mode())(parameters)
+            values = {"action": jnp.moveaxis(modes, 0, 1)}
             if self.config.cloning.loss == "likelihood":
                 values["information"] = mutual_information(jax.vmap(act)(parameters), jax.random.key(0))
             return values
@@ -172,17 +173,17 @@ class Ensemble:
 
 
 def mutual_information(members: Distribution, key: Array) -> Float[Array, "*batch"]:
-    """Return the mutual information of action and member, nats: 0 for equal distributions, at most ``ln K``.
+    """Return the mutual information of action and member in nats: 0 for equal distributions, at most ``ln K``.
 
-    The mean of ``ln p_k(a) - ln (1/K sum_j p_j(a))`` over members k and actions drawn from them (Jensen-Shannon
-    divergence; Lin 1991), estimated from 16 samples of each. The members lie along the leading axis.
+    It is the mean of ``ln p_k(a) - ln (1/K sum_j p_j(a))`` over members k and their actions a (Jensen-Shannon
+    divergence; Lin 1991), estimated from 16 samples of each member. The members lie along the leading axis.
     """
     count = jax.tree.leaves(members)[0].shape[0]
     density = jax.vmap(lambda member, action: member.log_prob(action), (0, None))
 
     def estimate(key: Array) -> Array:
         actions = jax.vmap(lambda member, key: member.sample(key))(members, jax.random.split(key, count))
-        log_prob = jax.vmap(density, (None, 0))(members, actions)  # [sampled from, density of, ...]
+        log_prob = jax.vmap(density, (None, 0))(members, actions)  # [sampled member, density member, ...]
         own_log_prob = jnp.moveaxis(jnp.diagonal(log_prob), -1, 0)
         return jnp.mean(own_log_prob - jax.nn.logsumexp(log_prob, axis=1) + math.log(count), axis=0)
 
@@ -191,7 +192,7 @@ def mutual_information(members: Distribution, key: Array) -> Float[Array, "*batc
 
 
 def assign_folds(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers, " N"]:
-    """Return a random fold of every scenario; all scenarios of a recording have the same one.
+    """Return a random fold of every scenario; all scenarios of a recording have the same fold.
 
     Raises:
         UsageError: There are fewer recordings than folds.
@@ -204,13 +205,13 @@ def assign_folds(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers,
 
 
 def sample_recordings(clusters: Sequence[str], count: int | None, seed: int) -> Int[Numbers, " n"]:
-    """Return the scenarios of random whole recordings, at least ``count`` together, in order; None: all."""
+    """Return the sorted scenarios of random whole recordings, at least ``count`` in total; None: all scenarios."""
     names, recording = np.unique(clusters, return_inverse=True)
     if count is None:
         return np.arange(len(recording))
     rank = np.random.default_rng(seed).permutation(len(names))
     sizes = np.bincount(rank[recording])
-    # Take recordings until there are enough scenarios.
+    # Add recordings until there are enough scenarios.
     return np.flatnonzero((np.cumsum(sizes) - sizes < count)[rank[recording]])
 
 
@@ -219,40 +220,41 @@ def train_ensemble(config: EnsembleConfig, data: ScenarioSet, log: Progress | No
 
     Raises:
         UsageError: There are fewer recordings than folds, or the scenarios do not fit on the device.
-        DataError: No step can be learned from.
+        DataError: No step is usable for training.
     """
     environment = Driving(Simulator(config.task))
     clusters = np.array(recordings_of(data.entries))
-    training_rows = sample_recordings(clusters.tolist(), config.learn_from, config.seed)
+    training_scenarios = sample_recordings(clusters.tolist(), config.learn_from, config.seed)
     fold = np.full(len(data), -1)
-    fold[training_rows] = assign_folds(clusters[training_rows].tolist(), config.folds, config.seed)
-    _check_memory(config, data, len(training_rows), free_memory(jax.devices()[0]))
-    bank = ScenarioBank.from_scenarios(data[index] for index in training_rows)
+    fold[training_scenarios] = assign_folds(clusters[training_scenarios].tolist(), config.folds, config.seed)
+    _check_memory(config, data, len(training_scenarios), free_memory(jax.devices()[0]))
+    bank = ScenarioBank.from_scenarios(data[index] for index in training_scenarios)
     experience, deviation = experience_of(config, environment, bank)
     learner = config.cloning.build(environment, bank, config.iterations)
-    parameters = fit(config, learner, experience, fold[training_rows], log)
+    parameters = fit(config, learner, experience, fold[training_scenarios], log)
     return Ensemble(config, learner, parameters, data.hash, fold, deviation)
 
 
 def _check_memory(config: EnsembleConfig, data: ScenarioSet, count: int, free: int | None) -> None:
-    """Raise UsageError if the scenarios do not fit on the device."""
+    """Check that the scenarios fit on the device; building a bank takes twice its memory."""
     if free is None:
         return
     size = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)).nbytes
-    # Building a bank takes twice its memory.
     if 2 * size * count > free:
-        fitting = free // (4 * size)
+        max_scenarios = free // (4 * size)
         problem = (
             f"{count:,} scenarios take about {2e-9 * size * count:,.0f} GB, and {free / 1e9:,.0f} GB are free"
         )
-        cure = f"pass --learn_from {fitting} to train on fewer scenarios; all are scored"
-        raise UsageError(problem, file=data.path, cure=cure if fitting >= config.folds else "free memory")
+        cure = f"pass --learn_from {max_scenarios} to train on fewer scenarios; all are scored"
+        raise UsageError(
+            problem, file=data.path, cure=cure if max_scenarios >= config.folds else "free memory"
+        )
 
 
 def experience_of(
     config: EnsembleConfig, environment: Driving, bank: ScenarioBank
 ) -> tuple[Experience, Float[Numbers, " D"]]:
-    """Return the experience that members learn from, and the standard deviation of the expert's actions."""
+    """Return the experience for training the members, and the standard deviation of the expert's actions."""
     experience = ExperienceConfig(mask_clipped=config.cloning.mask_clipped).of(environment, bank)
     usable = np.asarray(experience.usable)
     action = np.asarray(experience.expert.action, np.float64)
@@ -269,20 +271,22 @@ def fit(
     """Return the trained parameters of all members, along a leading axis.
 
     With ``batched``, all members are updated in one batched computation instead of one after another, with the same
-    results. None: except on CPUs, where products of batched small matrices take three times as long.
+    results. By default this is used on all devices except CPUs, where batched products of small matrices take three
+    times as long.
     """
     environment, cloning = require_log(learner.environment), config.cloning
     if batched is None:
         batched = jax.default_backend() != "cpu"
     steps_per_member = math.ceil(cloning.batch * (1.0 - 1.0 / config.folds))
 
-    def update(experience: Experience, fold: Array, trained: Any, key: Array) -> tuple[tuple[Any, Any], None]:
+    def update(experience: Experience, fold: Array, states: Any, key: Array) -> tuple[tuple[Any, Any], None]:
         indices = sample_steps(experience.critic, key, (cloning.batch,))
         observation, action, _ = expert_actions(environment, experience, indices)
 
         def update_member(member: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:
-            is_other_fold = fold[indices[0]] != member[0]
-            # Sort steps of its own fold last. Steps are independent draws, so the other steps are cut at random.
+            own_fold, member_state = member
+            is_other_fold = fold[indices[0]] != own_fold
+            # Sort steps of the own fold last. Steps are independent draws, so the cut removes random other steps.
             order = jnp.argsort(~is_other_fold, stable=True)[:steps_per_member]
             batch = jax.tree.map(lambda leaf: leaf[order], observation)
 
@@ -291,23 +295,23 @@ def fit(
                     learner.distribution(parameters, batch), action[order], is_other_fold[order]
                 )
 
-            return imitation_update(member[1], learner.optimiser, loss)[0]
+            return imitation_update(member_state, learner.optimiser, loss)[0]
 
         size = config.folds if batched else None
-        return jax.lax.map(update_member, (jnp.arange(config.folds), trained), batch_size=size), None
+        return jax.lax.map(update_member, (jnp.arange(config.folds), states), batch_size=size), None
 
     @partial(jax.jit, donate_argnums=2)
-    def iterate(experience: Experience, fold: Array, trained: Any, key: Array) -> Any:
+    def iterate(experience: Experience, fold: Array, states: Any, key: Array) -> Any:
         keys = jax.random.split(key, cloning.updates)
-        return jax.lax.scan(partial(update, experience, fold), trained, keys)[0]
+        return jax.lax.scan(partial(update, experience, fold), states, keys)[0]
 
     network_key, key = jax.random.split(jax.random.key(config.seed))
     keys = jax.random.split(network_key, config.folds)
     state = jax.jit(jax.vmap(learner.init, (None, 0)))(experience.data, keys)
-    trained = (state.parameters, state.optimiser)
+    states = (state.parameters, state.optimiser)
     for iteration in range(config.iterations):
-        trained = iterate(experience, jnp.asarray(fold), trained, jax.random.fold_in(key, iteration))
-        jax.block_until_ready(trained)
+        states = iterate(experience, jnp.asarray(fold), states, jax.random.fold_in(key, iteration))
+        jax.block_until_ready(states)
         if log is not None:
             log(iteration + 1, config.iterations)
-    return trained[0]
+    return states[0]

@@ -1,20 +1,20 @@
-"""Kinematic criticality: surrogate safety measures and driving behaviour of the logged driver.
+"""Kinematic criticality: surrogate safety measures and driving behaviour in the log.
 
 Components of every step, all in [0, 1]:
 
 - urgency: inverse time to collision (Hayward, 1972), scaled from 0 at the horizon of 5 s to 1 at ``urgent_s``;
 - braking: required deceleration to the nearest agent on ego's path at constant speed, ``(v - v_leader)^2 / (2 gap)``
   (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), over the car's maximum deceleration (brake threat number
-  of Braennstroem, Sjoeberg and Coelingh, 2008). Oncoming agents count as standing: ego's braking cannot reduce their
-  share of the closing speed;
-- volatility: the larger of jerk and yaw acceleration, each over a limit, from a Savitzky-Golay filter (1964) centred at
-  the action of the step;
-- off_road: closeness of a corner of the car to the road's edge, or beyond it;
+  of Braennstroem, Sjoeberg and Coelingh, 2008). Oncoming agents count as standing, because ego's braking cannot reduce
+  their share of the closing speed;
+- volatility: the larger of jerk and yaw acceleration, relative to their limits, from a Savitzky-Golay filter (1964)
+  centred at the action of the step;
+- off_road: closeness of the car's corners to the road edge, 1 beyond it;
 - lane_deviation: distance to the nearest lane centre;
 - density: number of agents.
 
-Time to collision detects crossing traffic but assumes fixed headings, so it reports oncoming traffic in bends.
-Required braking follows the path through bends but only considers agents on it.
+Time to collision detects crossing traffic, but assumes fixed headings and therefore reports oncoming traffic in bends.
+Required braking follows the path through bends, but only considers agents on it.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import STOPPED_MPS, TTC_HORIZON_S, time_to_collision
 from drivax.simulator.types import Frame
 
-#: Centres of the two windows of the map query that cover about 75 m of the path ahead, m.
+#: Centres of two route windows that cover about 75 m of the path ahead, m.
 _WINDOWS_M = (6.0, 45.0)
-#: nuPlan's window of 1.5 s, at its orders: jerk from accelerations, yaw acceleration from headings.
+#: nuPlan's filter window of 1.5 s, and its orders for jerk (from accelerations) and yaw acceleration (from headings).
 _WINDOW, _JERK_ORDER, _YAW_ORDER = 15, 2, 3
 
 
 @dataclass(frozen=True)
 class KinematicConfig:
-    """Scales of the components: the value at which each is 1.
+    """Scales of the components: the values at which they reach 1.
 
     Attributes:
         urgent_s: Time to collision; the bound of the metric ``ttc_ok``.
         full_braking_mps2: Required deceleration; the limit of the physical action space.
         full_jerk_mps3, full_yaw_rps2: Jerk, and yaw acceleration (rad/s2); twice nuPlan's limits.
-        edge_m: Distance of a corner inside the road's edge at which off_road is 0.
+        edge_m: Distance of a corner inside the road edge at which off_road is 0.
         lane_m: Distance to the lane centre.
         crowd: Number of agents, ego included.
     """
@@ -85,7 +85,7 @@ class KinematicConfig:
 
 
 def check_positive(values: dict[str, float]) -> None:
-    """Raise UsageError for scales that are not positive and finite."""
+    """Check that scales are positive and finite."""
     for name, value in values.items():
         if not 0.0 < value < float("inf"):
             raise UsageError(f"{name} is {value}", cure="use a positive number")
@@ -94,7 +94,7 @@ def check_positive(values: dict[str, float]) -> None:
 def urgency(
     ttc_s: Float[Array, ""], speed_mps: Float[Array, ""], config: KinematicConfig
 ) -> Float[Array, ""]:
-    """Return the scaled inverse time to collision: 0 beyond 5 s or standing, 1 at ``urgent_s`` or less."""
+    """Return the scaled inverse time to collision: 0 above 5 s or at standstill, 1 up to ``urgent_s``."""
     low, high = 1.0 / TTC_HORIZON_S, 1.0 / config.urgent_s
     share = (1.0 / jnp.maximum(ttc_s, 1e-3) - low) / (high - low)
     return jnp.where(speed_mps >= STOPPED_MPS, jnp.clip(share, 0.0, 1.0), 0.0)
@@ -108,28 +108,32 @@ def required_braking(
 
     An agent is on the path if its box overlaps a strip of ego's width along the logged route, on ego's level, up to
     about 75 m ahead. Oncoming agents count as standing, so that ego need not brake while it stands or gives way. The
-    result is 0 if no agent is on the path, or ego does not approach the nearest one.
+    result is 0 if no agent is on the path, or if ego does not approach it.
 
-    Only agents that ``counts`` marks are considered; ``along_m`` is ego's arc length along the logged route.
+    ``counts`` masks the agents to consider; ``along_m`` is ego's arc length along the logged route.
     """
     ego_box, xy = frame.box[0], frame.box[:, :2]
 
-    def window(offset_m: float) -> Any:
-        near = along_m + offset_m
-        return jax.vmap(lambda point: queries.project_on_route(bank, index, point, near, route=LOG_ROUTE))(xy)
+    def project_at(offset_m: float) -> Any:
+        centre_m = along_m + offset_m
+        return jax.vmap(
+            lambda point: queries.project_on_route(bank, index, point, centre_m, route=LOG_ROUTE)
+        )(xy)
 
-    # Beyond a window the projection is its end point, so take the nearer of the two.
-    first, second = map(window, _WINDOWS_M)
-    nearer = first.distance_m <= second.distance_m
+    # Outside its window a projection is an end point, so use the nearer projection.
+    near, far = map(project_at, _WINDOWS_M)
+    use_near = near.distance_m <= far.distance_m
     projections = jax.tree.map(
-        lambda a, b: jnp.where(nearer.reshape(-1, *(1,) * (a.ndim - 1)), a, b), first, second
+        lambda a, b: jnp.where(use_near.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
+        near,
+        far,
     )
     cos = jnp.sum(frame.box[:, 2:4] * projections.heading, axis=-1)
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
-    length, width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
+    half_length, half_width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
     counts = counts & (jnp.abs(frame.z - frame.z[0]) <= queries.LEVEL_M)
-    on_path = projections.distance_m < jnp.abs(sin) * length + jnp.abs(cos) * width + ego_box[5] / 2
-    gap = projections.along_m - along_m - (jnp.abs(cos) * length + sin * width) - ego_box[4] / 2
+    on_path = projections.distance_m < jnp.abs(sin) * half_length + jnp.abs(cos) * half_width + ego_box[5] / 2
+    gap = projections.along_m - along_m - (jnp.abs(cos) * half_length + sin * half_width) - ego_box[4] / 2
     gap = jnp.where(counts & on_path & (projections.along_m > along_m), gap, jnp.inf)
     nearest = jnp.argmin(gap)
     leader_speed_mps = jnp.maximum(jnp.sum(frame.velocity[nearest] * projections.heading[nearest]), 0.0)
@@ -138,7 +142,7 @@ def required_braking(
 
 
 def crowding(log: LoggedScenario, crowd: int) -> Float[Array, " T"]:
-    """Return the number of valid agents, ego included, over ``crowd``, at most 1."""
+    """Return the number of valid agents, ego included, relative to ``crowd``, at most 1."""
     return jnp.minimum(log.frame.valid.sum(axis=1) / crowd, 1.0)
 
 
@@ -158,17 +162,17 @@ def _required_braking_of_log(bank: ScenarioBank, log: LoggedScenario) -> Float[A
 
 
 def _volatility(config: KinematicConfig, log: LoggedScenario, last: Int[Array, ""]) -> Float[Array, " T"]:
-    """Return the volatility of the action between each step and the next; the ``last`` step repeats the one before.
+    """Return the volatility of the action from each step to the next; the ``last`` step repeats the previous value.
 
-    Derivatives are nuPlan's (``metrics.comfort``), of a polynomial fitted to 1.5 s: noise of 1 cm/s in the speed gives
-    some hundredths of a m/s3.
+    Derivatives are nuPlan's (``metrics.comfort``), of a polynomial fitted to 1.5 s. Noise of 1 cm/s in the speed
+    changes the jerk by some hundredths of a m/s3.
     """
     speed, heading = log.motion[:, 3], log.motion[:, 2]
     valid = log.valid[1:] & log.valid[:-1]
     acceleration = (speed[1:] - speed[:-1]) / DT_S
     heading_change = jnp.concatenate([jnp.zeros(1), jnp.cumsum(wrap(heading[1:] - heading[:-1]))])
     jerk = _derivative(acceleration, valid, _JERK_ORDER, 1)
-    # At the middle of the action, like the jerk.
+    # Like jerk, in the middle between two steps.
     yaw = _derivative((heading_change[1:] + heading_change[:-1]) / 2, valid, _YAW_ORDER, 2)
     share = jnp.maximum(jnp.abs(jerk) / config.full_jerk_mps3, jnp.abs(yaw) / config.full_yaw_rps2)
     share = jnp.minimum(share, 1.0)
@@ -178,13 +182,13 @@ def _volatility(config: KinematicConfig, log: LoggedScenario, last: Int[Array, "
 def _derivative(
     signal: Float[Array, " K"], valid: Bool[Array, " K"], order: int, derivative: int
 ) -> Float[Array, " K"]:
-    """Differentiate a polynomial fitted to the known window around each sample; 0 where there is none."""
+    """Differentiate a polynomial fitted to the valid window around each sample; 0 without a valid window."""
     sample = jnp.arange(len(signal))
     first = jax.lax.cummax(jnp.where(valid, -1, sample)) + 1
     last = jax.lax.cummin(jnp.where(valid, len(signal), sample), reverse=True) - 1
     start = jnp.clip(sample - _WINDOW // 2, first, last - (_WINDOW - 1))
     window = signal[jnp.clip(start[:, None] + jnp.arange(_WINDOW), 0, len(signal) - 1)]
-    # One filter for each position in a window.
+    # One filter per position in the window.
     filters = jnp.asarray(savgol_matrix(_WINDOW, _WINDOW, order, derivative), jnp.float32)
     value = jnp.sum(filters[sample - start] * window, axis=-1) / DT_S**derivative
     return jnp.where(valid & (last - first >= _WINDOW - 1), value, 0.0)
@@ -192,9 +196,9 @@ def _derivative(
 
 def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(box: Array, ground: Array) -> Array:
-        # A logged car without an edge nearby counts as on the road: it is on a driveway, or beyond the map.
-        road = jnp.ones(4, bool)
-        beyond = queries.offroad_distance(bank, log.index, box[:2], corners(box), road, ground)
+        # A logged car without a road edge nearby is on a driveway or outside the map, and counts as on the road.
+        on_road = jnp.ones(4, bool)
+        beyond = queries.offroad_distance(bank, log.index, box[:2], corners(box), on_road, ground)
         return jnp.max(jnp.clip(1.0 + beyond / config.edge_m, 0.0, 1.0))
 
     return jax.vmap(at_step)(log.frame.box[:, 0], log.ground_m)
@@ -203,7 +207,7 @@ def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: LoggedScena
 def _deviation(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(xy: Array, ground: Array) -> Array:
         distance = queries.lane_distance(bank, log.index, xy, ground)
-        # Infinite where no lane is near: in a car park, on a driveway, beyond the map.
+        # Infinite without a lane nearby: in a car park, on a driveway, outside the map.
         return jnp.where(jnp.isfinite(distance), jnp.minimum(distance / config.lane_m, 1.0), 0.0)
 
     return jax.vmap(at_step)(log.motion[:, :2], log.ground_m)
@@ -211,10 +215,10 @@ def _deviation(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario)
 
 @dataclass(frozen=True)
 class PublishedConfig:
-    """The published kinematic heuristic, for comparison, with the values at which its five components are 1.
+    """The published kinematic heuristic, for comparison; fields are the values at which its components reach 1.
 
-    Backward differences at 10 Hz, the product of distance and closing speed, and distances to the points of the map, of
-    which only lanes for cars count. Noise of 1 cm/s scores like violent driving, and distant traffic like a conflict
+    It uses backward differences at 10 Hz, the product of distance and closing speed, and distances to map points (of
+    lanes, only those for cars). Noise of 1 cm/s scores like violent driving, and distant traffic like a conflict
     (``tests/curation/test_published.py``), which :class:`KinematicConfig` avoids.
 
     Attributes:
@@ -223,7 +227,7 @@ class PublishedConfig:
         edge_m: Distance of ego's centre to the nearest point of a road edge at which off_road is 0.
         lane_m: Distance to the nearest point of a lane centre.
         crowd: Number of agents, ego included.
-        spacing_m: Distance of the map's points, sampled from our segments; 0.5 m as in Waymo's maps.
+        spacing_m: Spacing of the map points, sampled from our segments; 0.5 m as in Waymo's maps.
     """
 
     jerk_mps3: float = 2.5
@@ -253,15 +257,15 @@ class PublishedConfig:
 
 
 def _published_volatility(config: PublishedConfig, log: LoggedScenario) -> Float[Array, " T"]:
-    """Return jerk and yaw acceleration from two backward differences, 0 at the start."""
+    """Return the larger of jerk and yaw acceleration, from backward differences that are 0 at the start."""
     heading = log.motion[:, 2]
-    acceleration = _backward(norm(log.velocity)) / DT_S
-    yaw_rate = wrap(_backward(heading)) / DT_S
-    jerk, yaw = _backward(acceleration) / DT_S, _backward(yaw_rate) / DT_S
+    acceleration = _backward_difference(norm(log.velocity)) / DT_S
+    yaw_rate = wrap(_backward_difference(heading)) / DT_S
+    jerk, yaw = _backward_difference(acceleration) / DT_S, _backward_difference(yaw_rate) / DT_S
     return jnp.minimum(jnp.maximum(jnp.abs(jerk) / config.jerk_mps3, jnp.abs(yaw) / config.yaw_rps2), 1.0)
 
 
-def _backward(values: Float[Array, " T"]) -> Float[Array, " T"]:
+def _backward_difference(values: Float[Array, " T"]) -> Float[Array, " T"]:
     return jnp.concatenate([jnp.zeros(1), values[1:] - values[:-1]])
 
 

@@ -1,4 +1,4 @@
-"""Logged scenarios, and the evaluation of score functions over whole scenario sets."""
+"""Logged scenarios, and score functions over whole scenario sets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 #: Index into ``bank.routes`` of the logged route.
 LOG_ROUTE = 1
-#: Scenarios that are scored in one batch.
+#: Scenarios per batch.
 BATCH = 64
 #: Called with (scenarios done, scenarios).
 Progress = Callable[[int, int], None]
@@ -33,14 +33,14 @@ Numbers = np.ndarray[Any, Any]
 
 @record
 class LoggedScenario:
-    """The log of one scenario; where ego is not observed, its last motion is repeated.
+    """Log of one scenario; while ego is not observed, its last motion is repeated.
 
     Attributes:
         context, frame: Context of ego, and all agents, at every step.
-        motion, velocity: x, y (m), heading (rad), speed (m/s) of ego; its velocity as logged (m/s).
+        motion, velocity: x, y (m), heading (rad) and speed (m/s) of ego, and its logged velocity (m/s).
         valid: Whether ego is observed.
-        ignored: Agents that overlap ego from their first step, until they separate; metrics ignore them, too.
-        along_m, ground_m: Arc length of ego along the logged route, and height of the ground under it.
+        ignored: Agents that overlap ego from their first step until they separate, which metrics ignore, too.
+        along_m, ground_m: Arc length of ego along the logged route, and height of the ground under ego.
     """
 
     context: AgentContext
@@ -54,7 +54,7 @@ class LoggedScenario:
 
     @property
     def index(self) -> Int[Array, ""]:
-        """Scenario of the bank."""
+        """Index of the scenario in the bank."""
         return self.context.index[0]
 
 
@@ -65,13 +65,13 @@ def read_log(bank: ScenarioBank, index: Int[Array, ""]) -> LoggedScenario:
     last_valid = jnp.maximum(jax.lax.cummax(jnp.where(valid, steps, -1)), jnp.argmax(valid))
     contexts = jax.vmap(lambda step: _context(bank, index, step))(last_valid)
     motion = jax.vmap(lambda context: logged_motion(bank, context, 0))(contexts)
-    contexts = jax.vmap(lambda step, now: _context(bank, index, step, now))(steps, motion)
+    contexts = jax.vmap(partial(_context, bank, index))(steps, motion)
 
     def frame_at(context: AgentContext) -> Frame:
         return frame_of(bank, index, context.step, bank.agents[index, context.step], alone(context), 0)
 
     frame = jax.vmap(frame_at)(contexts)
-    overlapping = jax.vmap(lambda now: overlaps(now, jnp.int32(0)))(frame)
+    overlapping = jax.vmap(lambda agents: overlaps(agents, jnp.int32(0)))(frame)
     return LoggedScenario(
         context=contexts,
         motion=motion,
@@ -102,7 +102,7 @@ def _ignored_agents(overlapping: Bool[Array, "T S"], valid: Bool[Array, "T S"]) 
 
 def _along_route(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, "T 2"]) -> Float[Array, " T"]:
     def step(along: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
-        # Search no further than the car can have moved, as the simulator does.
+        # Search only as far as the car can have moved, as the simulator does.
         point, distance = inputs
         projection = project_on_route(bank, index, point, along, 1.5 * distance + 2.0, route=LOG_ROUTE)
         along = jnp.maximum(along, projection.along_m)
@@ -132,7 +132,7 @@ def score_steps(data: ScenarioSet, score: Any, progress: Progress | None = None)
 def map_batches(
     data: ScenarioSet, function: Callable[[ScenarioBank], dict[str, Any]], progress: Progress | None = None
 ) -> dict[str, Numbers]:
-    """Apply a function to banks of one shape that hold ``BATCH`` scenarios each: by name ``[N, ...]``."""
+    """Apply a function to banks of ``BATCH`` scenarios of one shape, and return its results by name, ``[N, ...]``."""
     sizes, batches = Sizes.used(data), list[dict[str, Any]]()
     for first in range(0, len(data), BATCH):
         scenarios = data[first : first + BATCH]
@@ -149,5 +149,5 @@ def map_batches(
 
 
 def valid_steps(data: ScenarioSet) -> Bool[Numbers, "N T"]:
-    """Return the steps at which ego is observed."""
+    """Return the mask of steps at which ego is observed."""
     return np.stack([np.asarray(scenario.record["agent_valid"][:, 0], bool) for scenario in data])

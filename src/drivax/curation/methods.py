@@ -1,10 +1,10 @@
-"""Registered curation methods, which score scenario sets."""
+"""Registered curation methods, which score the scenarios of a set."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from drivax import settings
 from drivax.curation.ensemble import Ensemble, EnsembleConfig, train_ensemble
@@ -29,7 +29,7 @@ from drivax.stats.ranking import rank_correlation
 from drivax.synthetic.events import EventKind
 
 #: Weights of the kinematic heuristic, chosen on the validation set of the built-in world's benchmark
-#: (docs/results/curation.md). A scenario scores as its most critical second.
+#: (docs/results/curation.md). A scenario is scored by its most critical second.
 KINEMATIC = Combination(
     {"urgency": 0.35, "braking": 0.20, "volatility": 0.30, "lane_deviation": 0.10, "off_road": 0.05}, "top10"
 )
@@ -38,7 +38,7 @@ PUBLISHED = Combination(
     {"volatility": 0.40, "interaction": 0.05, "off_road": 0.05, "lane_deviation": 0.47, "density": 0.03},
     {"volatility": "p99", "interaction": "p99", "off_road": "p99", "lane_deviation": "std", "density": "mean"},
 )  # fmt: skip
-#: The 95th percentile, because the very rarest steps may be noise.
+#: The 95th percentile, because the rarest steps may be noise.
 RARITY = Combination({"rarity": 1.0}, "p95")
 _ALL = Combination({"all": 1.0})
 #: Percentile of a set's disagreement that scores 0.5.
@@ -50,9 +50,10 @@ class Request:
     """Arguments of a method.
 
     Attributes:
-        data: The set.
-        like, seed: Table to match, and seed of the permutation (``random_matched`` only; an ensemble has its own seed).
-        config: Settings of the method, of the type of its ``Method.config``; None: the defaults.
+        data: The scenario set.
+        like, seed: Table to match, and seed of the permutation (only ``random_matched``; an ensemble has its own
+            seed).
+        config: Settings of the method, of the type of ``Method.config``; None: the defaults.
         progress: Called with (scenarios done, scenarios).
         training: Called with (iterations done, iterations) while an ensemble is trained.
     """
@@ -67,9 +68,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Method:
-    """A registered method, with its default settings (``config``; None: it has none).
+    """A registered method; ``config`` are its default settings, None for a method without settings.
 
-    Given the settings, ``combination`` combines components into scores, and ``unweighted`` names those without weight.
+    From settings, ``combination`` returns the combination of components, and ``unweighted`` the names of further
+    components.
     """
 
     name: str
@@ -83,8 +85,8 @@ def curate(name: str, request: Request) -> ScoreTable:
     """Score a set.
 
     Raises:
-        UsageError: The method is unknown, lacks an argument, or has other settings.
-        DataError: It cannot score this set.
+        UsageError: The method is unknown, lacks an argument, or takes other settings.
+        DataError: The method cannot score this set.
     """
     if name not in METHODS:
         raise UsageError(f"unknown method {name!r}", cure=did_you_mean(name, sorted(METHODS)))
@@ -94,7 +96,7 @@ def curate(name: str, request: Request) -> ScoreTable:
     default = METHODS[name].config
     config = default if request.config is None else request.config
     if type(config) is not type(default):
-        cure = "leave them out" if default is None else f"use {type(default).__name__}"
+        cure = "remove them" if default is None else f"use {type(default).__name__}"
         raise UsageError(f"{name} has no settings of type {type(config).__name__}", cure=cure)
     table = METHODS[name].score(replace(request, config=config))
     if request.progress is not None:
@@ -108,27 +110,36 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
     ``config`` are the settings of the method (None: the defaults), ``file`` is the source of the table.
 
     Raises:
-        DataError: It has other settings or another combination.
+        DataError: Settings or combination differ.
     """
     method, stored = METHODS[table.method], dict(table.config)
     config = method.config if config is None else config
     current: dict[str, Any] = {} if method.config is None else plain(config)
+    if method.config is not None:
+        stored |= _with_present_names(stored, config, current)
     if table.components:
         current["combination"] = asdict(method.combination(config))
-    if method.config is not None:  # fields of older tables by their present names
-        renamed = {name: stored[name] for name in current if name in stored and name != "combination"}
-        renamed = plain(settings.load(type(config), json.loads(json.dumps(renamed))))
-        stored |= {name: renamed[name] for name in renamed if name in stored}
-    # Through JSON: a table that was read has lists instead of tuples.
+    # Convert tuples to lists, as in tables from files.
     stored, current = (json.loads(json.dumps(values)) for values in (stored, current))
     for name, value in current.items():
         if stored.get(name) != value:
-            problem = f"scores of {table.method!r} with {name} {stored.get(name)}, which is {value} here"
+            problem = f"scores of {table.method!r} have {name} {stored.get(name)}, not {value}"
             raise DataError(problem, file=file, cure="score again with `drivax curate`")
 
 
+def _with_present_names(stored: Mapping[str, Any], config: Any, names: Collection[str]) -> dict[str, Any]:
+    """Return stored settings ``names`` with the present names of their fields."""
+    values = {name: stored[name] for name in names if name in stored}
+    present = plain(settings.load(type(config), json.loads(json.dumps(values))))
+    return {name: value for name, value in present.items() if name in stored}
+
+
 def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> None:
-    """Raise UsageError for weights or aggregators (fields of :class:`Combination`) that a method cannot apply."""
+    """Check that a method can apply weights or aggregators (fields of :class:`Combination`).
+
+    Raises:
+        UsageError: A component is unknown, or a weight or aggregator is invalid.
+    """
     default = METHODS[name].combination(config)
     replace(default, **changes).check_components({*default.weights, *METHODS[name].unweighted(config)})
 
@@ -155,47 +166,56 @@ def ensemble_table(
 ) -> ScoreTable:
     """Return scores by the disagreement d of an ensemble, which may have been trained on another set.
 
-    The component ``disagreement`` is ``d / (d + scale)``, which keeps the order of d; ``action_0``, ``action_1`` are
-    the same of each dimension of the action. An ensemble trained by likelihood has ``information`` instead, the mutual
-    information over its maximum. ``error_rank_correlation`` in the table's configuration is the rank correlation of
-    scores and squared errors over steps: on its training set, of the member that has not seen the scenario; where the
-    ensemble learned from a part of the set, of the members' mean over the rest.
+    The component ``disagreement`` is ``d / (d + scale)``, which is monotonic in d; ``action_0`` and ``action_1`` are
+    the same for each dimension of the action. An ensemble trained by likelihood has ``information`` instead, the
+    mutual information relative to its maximum. ``error_rank_correlation`` in the table's configuration is the rank
+    correlation of scores and squared errors over steps: on the training set, of the member that excluded the scenario;
+    if the ensemble was trained on a part of the set, of the members' mean on the rest.
 
     Args:
         ensemble: The ensemble.
         data: The set.
         progress: Called with (scenarios done, scenarios).
-        scale: Disagreement that scores 0.5; None: the 99th percentile of the set, separately for the scenarios that
-            the ensemble was trained on and for the rest.
+        scale: Disagreement that scores 0.5; None: the 99th percentile of the set, computed separately for training
+            scenarios and others.
     """
     predictions = ensemble.predictions(data, progress)
-    valid, is_training_set = valid_steps(data), data.hash == ensemble.set_hash
-    unseen = ensemble.fold < 0 if is_training_set else np.ones(len(data), bool)
-    groups = [group for group in (~unseen, unseen) if group.any()]
+    is_training_set = data.hash == ensemble.set_hash
+    is_unseen = ensemble.fold < 0 if is_training_set else np.ones(len(data), bool)
+    groups = [group for group in (~is_unseen, is_unseen) if group.any()]
     scales: list[Any] = [scale] * len(groups)
-    if predictions.information is None:
-        dimensions = predictions.disagreement(ensemble.deviation)
-        total = dimensions.sum(axis=-1)
-        if scale is None:
-            scales = [float(np.percentile(total[group][valid[group]], _SCALE_PERCENTILE)) for group in groups]
-        half = np.zeros((len(data), 1))
-        for group, value in zip(groups, scales, strict=True):
-            half[group] = np.maximum(value, np.finfo(np.float64).tiny)
-        actions = enumerate(np.moveaxis(dimensions, -1, 0))
-        components = {f"action_{index}": values / (values + half) for index, values in actions}
-        components["disagreement"] = total / (total + half)
-    else:
+    if predictions.information is not None:
         components = {"information": predictions.information / math.log(ensemble.config.folds)}
+    else:
+        disagreement = predictions.disagreement(ensemble.deviation)
+        if scale is None:
+            total, valid = disagreement.sum(axis=-1), valid_steps(data)
+            scales = [float(np.percentile(total[group][valid[group]], _SCALE_PERCENTILE)) for group in groups]
+        components = _disagreement_components(disagreement, groups, scales)
     error = predictions.error(ensemble.deviation, ensemble.fold if is_training_set else None)
     details = {"trained_on": ensemble.set_hash, "scale": scales[0] if len(scales) == 1 else scales}
     table = make_table("ensemble", ensemble.config, data, components, details)
-    known = predictions.known & groups[-1][:, None]
-    correlation = {"error_rank_correlation": rank_correlation(table.steps[known], error[known])}
+    is_known = predictions.known & groups[-1][:, None]
+    correlation = {"error_rank_correlation": rank_correlation(table.steps[is_known], error[is_known])}
     return replace(table, config={**table.config, **correlation})
 
 
+def _disagreement_components(
+    disagreement: Float[np.ndarray[Any, Any], "N T D"], groups: Sequence[Bool[np.ndarray[Any, Any], " N"]],
+    scales: Sequence[float],
+) -> dict[str, Any]:  # fmt: skip
+    """Return ``d / (d + scale)`` of the action's dimensions and of their sum, with a scale for each group."""
+    scale = np.zeros((len(disagreement), 1))
+    for group, value in zip(groups, scales, strict=True):
+        scale[group] = np.maximum(value, np.finfo(np.float64).tiny)
+    dimensions = enumerate(np.moveaxis(disagreement, -1, 0))
+    components = {f"action_{index}": values / (values + scale) for index, values in dimensions}
+    total = disagreement.sum(axis=-1)
+    return {**components, "disagreement": total / (total + scale)}
+
+
 def _ensemble_combination(config: EnsembleConfig) -> Combination:
-    """Score a scenario by its most uncertain second."""
+    """Score a scenario by the second with the largest disagreement."""
     by_likelihood = config.cloning.loss == "likelihood"
     return Combination({"information" if by_likelihood else "disagreement": 1.0}, "top10")
 
@@ -234,11 +254,11 @@ def event_steps(data: ScenarioSet) -> Bool[np.ndarray, "N T"]:
     """Return the steps within a labelled event of the built-in world.
 
     Raises:
-        DataError: The set is not of the built-in world.
+        DataError: The set is not from the built-in world.
     """
-    dataset = {str(entry["dataset"]) for entry in data.entries}
-    if dataset != {"drivax"}:
-        problem = f"only the built-in world has event labels, this set is of {', '.join(sorted(dataset))}"
+    datasets = {str(entry["dataset"]) for entry in data.entries}
+    if datasets != {"drivax"}:
+        problem = f"only the built-in world has event labels, this set is from {', '.join(sorted(datasets))}"
         cure = "use another method, or a set that `drivax generate` made"
         raise DataError(problem, file=data.path, cure=cure)
     step = np.arange(data.capacity.steps)
@@ -250,7 +270,7 @@ def event_steps(data: ScenarioSet) -> Bool[np.ndarray, "N T"]:
 
 
 def event_kinds(data: ScenarioSet) -> Int[np.ndarray, " N"]:
-    """Return the :class:`~drivax.synthetic.events.EventKind` of every scenario's first event, 0 where it has none."""
+    """Return the :class:`~drivax.synthetic.events.EventKind` of every scenario's first event, or 0 without events."""
     return np.array([max(int(scenario.record["event_kind"][0]), 0) for scenario in data])
 
 

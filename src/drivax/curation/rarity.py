@@ -23,8 +23,8 @@ from drivax.tasks.actions import Physical
 
 Actions = Float[np.ndarray[Any, Any], "n 2"]
 Values = Float[np.ndarray[Any, Any], " n"]
-Others = Float[np.ndarray[Any, Any], "m 2"]
-OtherValues = Float[np.ndarray[Any, Any], " m"]
+QueryActions = Float[np.ndarray[Any, Any], "m 2"]
+QueryValues = Float[np.ndarray[Any, Any], " m"]
 
 #: The default action space of imitation and offline learning.
 _SPACE = Physical()
@@ -32,12 +32,12 @@ _SPACE = Physical()
 
 @dataclass(frozen=True)
 class ExpertActions:
-    """Score function that returns the action that follows the log from every step, in the default action space."""
+    """Score function that returns the logged action of every step, in the default action space."""
 
     def __call__(self, bank: ScenarioBank, log: LoggedScenario) -> dict[str, Array]:
-        """Return ``action [T, 2]``, clipped, and ``known [T]``: ego is observed at the step and at the next two.
+        """Return the clipped ``action [T, 2]``, and ``known [T]``: ego is observed at the step and the next two.
 
-        The curvature needs the second of them.
+        The curvature depends on the second next step.
         """
         action = jax.vmap(lambda context: expert_action(bank, context, _SPACE))(log.context)
         later = jnp.concatenate([log.valid, jnp.zeros(2, bool)])
@@ -49,16 +49,16 @@ class ExpertActions:
 class KernelRarity:
     """Inverse density by Gaussian kernels, tempered and clipped.
 
-    The density (Rosenblatt, 1956; Parzen, 1962) is computed on a grid: counts per cell, convolved with the kernel and
-    mirrored at the bounds, so that it integrates to 1 over the action space; linear between the cells' centres.
-    The score at density p is ``min((p_median / p) ** temper, most) / most``, where ``p_median`` is the density at the
-    median step: usual actions score 1 / most, very rare ones 1.
+    The density (Rosenblatt, 1956; Parzen, 1962) is computed on a grid. Counts per cell are convolved with the kernel
+    and mirrored at the bounds, so that the density integrates to 1 over the action space; it is interpolated linearly
+    between cell centres. The score at density p is ``min((p_median / p) ** temper, most) / most``, where ``p_median``
+    is the median density over steps: common actions score 1 / most, very rare ones 1.
 
     Attributes:
         bandwidth: Standard deviation of the kernel, in units of the action space.
-        cells: Cells of the grid along either dimension.
-        temper: Exponent: 1 is inverse frequency, 0 gives all actions the same score.
-        most: Tempered ratio of densities, median over own, at which scores are clipped.
+        cells: Cells of the grid along each dimension.
+        temper: Exponent: 1 is inverse density, 0 gives all actions the same score.
+        most: Tempered density ratio at which scores are clipped.
     """
 
     bandwidth: float = 0.05
@@ -75,8 +75,8 @@ class KernelRarity:
         if not 1.0 <= self.most < float("inf"):
             raise UsageError(f"most is {self.most}", cure="use 1 or more")
 
-    def density(self, actions: Actions, at: Others) -> OtherValues:
-        """Return the density of ``actions`` at the points ``at``, per unit of area; both in [-1, 1]."""
+    def density(self, actions: Actions, at: QueryActions) -> QueryValues:
+        """Return the density of ``actions`` at the points ``at``, per unit of area; both are in [-1, 1]."""
         edges = np.linspace(-1.0, 1.0, self.cells + 1)
         counts = np.histogram2d(actions[:, 0], actions[:, 1], [edges, edges])[0]
         cell = 2.0 / self.cells
@@ -84,10 +84,10 @@ class KernelRarity:
         position = (np.asarray(at, np.float64).T + 1.0) / cell - 0.5
         return map_coordinates(smooth, position, order=1, mode="nearest") / (len(actions) * cell * cell)
 
-    def scores(self, actions: Actions, at: Others) -> OtherValues:
-        """Return the scores of the actions ``at``, in [0, 1], by the density of ``actions``."""
+    def scores(self, actions: Actions, at: QueryActions) -> QueryValues:
+        """Return the scores of the actions ``at``, in [0, 1], from the density of ``actions``."""
         median_density = np.median(self.density(actions, actions))
-        with np.errstate(divide="ignore", over="ignore"):  # infinite where the density is 0, and clipped
+        with np.errstate(divide="ignore", over="ignore"):  # a density of 0 gives infinity, which is clipped
             rarity = (median_density / self.density(actions, at)) ** self.temper
         return np.minimum(rarity, self.most) / self.most
 
@@ -96,10 +96,10 @@ class KernelRarity:
 class PublishedRarity:
     """Inverse frequency in the published histogram of acceleration (m/s2) and curvature (1/m).
 
-    A cell with h actions has the weight ``1 / (h + 1)``, over the mean of all cells, including empty ones and those
-    without width. The score is ``min(weight, most) / most + 0.01``, at most 1; the constant dominates it. The action
-    space is within the bins. The published code counts an action on the edge of two bins in the upper one and looks
-    it up in the lower one, which affects standing still; here both use the upper one.
+    A cell with h actions has the weight ``1 / (h + 1)``, divided by the mean over all cells (including empty cells and
+    those of zero width). The score is ``min(weight, most) / most + 0.01``, at most 1; the constant dominates it. The
+    bins cover the action space. The published code counts an action on the edge of two bins in the upper bin but looks
+    it up in the lower one, which affects standing still. Here both use the upper bin.
 
     Attributes:
         most: Weight at which scores are clipped; no cell reaches it.
@@ -109,24 +109,24 @@ class PublishedRarity:
 
     @property
     def edges(self) -> tuple[Values, Values]:
-        """Edges of the 89 bins of acceleration and of curvature; edges where two ranges meet occur twice."""
+        """Edges of the 89 bins of acceleration and of curvature; shared ends of two ranges occur twice."""
         acceleration = [np.linspace(-10, -2, 20), np.linspace(-2, 1.5, 50), np.linspace(1.5, 8, 20)]
         curvature = [np.linspace(-1, -0.2, 25), np.linspace(-0.2, 0.2, 40), np.linspace(0.2, 1, 25)]
         return np.concatenate(acceleration), np.concatenate(curvature)
 
-    def scores(self, actions: Actions, at: Others) -> OtherValues:
-        """Return the scores of the actions ``at``, in [0, 1], by the counts of ``actions`` in their cells."""
+    def scores(self, actions: Actions, at: QueryActions) -> QueryValues:
+        """Return the scores of the actions ``at``, in [0, 1], from the counts of ``actions`` in their cells."""
         cells = 89 * 89
         weight = 1.0 / (np.bincount(self._cell(actions), minlength=cells) + 1.0)
         rarity = np.minimum((weight / weight.mean())[self._cell(at)], self.most) / self.most
         return np.minimum(rarity + 0.01, 1.0)
 
-    def _cell(self, actions: Others) -> Int[np.ndarray[Any, Any], " m"]:
+    def _cell(self, actions: QueryActions) -> Int[np.ndarray[Any, Any], " m"]:
         scale = np.where(actions[:, 0] < 0, _SPACE.braking_mps2, _SPACE.acceleration_mps2)
         values = (actions[:, 0] * scale, actions[:, 1] * _SPACE.steering)
-        binned = zip(self.edges, values, strict=True)
-        first, second = (np.searchsorted(edges, value, side="right") - 1 for edges, value in binned)
-        return first * 89 + second
+        pairs = zip(self.edges, values, strict=True)
+        acceleration, curvature = (np.searchsorted(edges, value, side="right") - 1 for edges, value in pairs)
+        return acceleration * 89 + curvature
 
 
 def rarity_steps(

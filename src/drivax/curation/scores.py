@@ -1,4 +1,4 @@
-"""Score tables: criticality of steps and scenarios from components, in a file that names their data and method."""
+"""Score tables: criticality of steps and scenarios, in a file that also identifies data and method."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Combination:
     Attributes:
         weights: Non-negative weight of each component; only their ratios matter.
         scenario: Aggregator of steps: ``max``, ``mean``, ``std``, ``p0`` to ``p100`` (percentile) or ``topN`` (mean of
-            the N largest). A string aggregates the combined score; a mapping names an aggregator for each component,
-            and the results are weighted.
+            the N largest). A string aggregates the combined score. A mapping gives each component its aggregator, and
+            the results are weighted.
     """
 
     weights: Mapping[str, float]
@@ -54,10 +54,10 @@ class Combination:
             missing = sorted(set(self.weights) - set(self.scenario))
             if missing:
                 problem = f"missing aggregator for {missing[0]!r}"
-                raise UsageError(problem, cure="name one for each component")
+                raise UsageError(problem, cure="name an aggregator for each component")
 
     def check_components(self, available: Collection[str]) -> None:
-        """Raise UsageError for weights or aggregators of components that are not available."""
+        """Check that all components with a weight or an aggregator are available."""
         for name in (*self.weights, *(() if isinstance(self.scenario, str) else self.scenario)):
             if name not in available:
                 cure = did_you_mean(name, sorted(available))
@@ -66,25 +66,29 @@ class Combination:
     def combine(self, components: Mapping[str, Steps], valid: Valid) -> tuple[Steps, Scenarios]:
         """Return the scores of steps and of scenarios, in [0, 1].
 
-        Invalid steps score 0 and do not count for their scenario.
+        Invalid steps score 0 and are ignored in scenario scores.
 
         Raises:
-            UsageError: A component that has a weight is missing.
+            UsageError: A component with a weight is missing.
         """
         self.check_components(components)
         shares = {name: weight / sum(self.weights.values()) for name, weight in self.weights.items()}
         steps = sum(share * components[name] for name, share in shares.items())
-        # A mean of ones may exceed 1 by rounding.
+        # Rounding may make a mean of ones exceed 1.
         steps = np.where(valid, np.minimum(steps, 1.0), 0.0)
         if isinstance(self.scenario, str):
             return steps, aggregate(steps, valid, self.scenario)
-        aggregated = {name: aggregate(components[name], valid, self.scenario[name]) for name in shares}
-        scenarios = sum((share * aggregated[name] for name, share in shares.items()), np.zeros(len(steps)))
+        scenario_components = {
+            name: aggregate(components[name], valid, self.scenario[name]) for name in shares
+        }
+        scenarios = sum(
+            (share * scenario_components[name] for name, share in shares.items()), np.zeros(len(steps))
+        )
         return steps, np.minimum(scenarios, 1.0)
 
 
 def check_aggregator(name: str) -> None:
-    """Raise UsageError for an unknown aggregator."""
+    """Check the name of an aggregator."""
     match = _NUMBERED.fullmatch(name)
     if match is None:
         known = name in ("max", "mean", "std")
@@ -96,35 +100,35 @@ def check_aggregator(name: str) -> None:
 
 
 def aggregate(steps: Steps, valid: Valid, name: str) -> Scenarios:
-    """Aggregate the valid steps of every scenario; 0 where there are none.
+    """Aggregate the valid steps of every scenario; 0 if there are none.
 
-    Percentiles interpolate linearly (NumPy's default); ``std`` is the population's.
+    Percentiles interpolate linearly (NumPy's default); ``std`` is the population standard deviation.
     """
     check_aggregator(name)
     count = valid.sum(axis=1)
     divisor = np.maximum(count, 1)
-    masked = np.where(valid, steps, 0.0)
-    mean = masked.sum(axis=1) / divisor
+    valid_scores = np.where(valid, steps, 0.0)
+    mean = valid_scores.sum(axis=1) / divisor
     if name == "mean":
         return mean
     if name == "std":
         return np.sqrt(np.where(valid, (steps - mean[:, None]) ** 2, 0.0).sum(axis=1) / divisor)
-    ordered = np.sort(np.where(valid, steps, np.inf), axis=1)
-    ordered = np.where(np.isinf(ordered), 0.0, ordered)
+    sorted_scores = np.sort(np.where(valid, steps, np.inf), axis=1)
+    sorted_scores = np.where(np.isinf(sorted_scores), 0.0, sorted_scores)
     match = _NUMBERED.fullmatch(name)
     if match is not None and match[1] == "top":
         rank = np.arange(steps.shape[1])
         largest = (rank < count[:, None]) & (rank >= count[:, None] - int(match[2]))
-        return np.where(largest, ordered, 0.0).sum(axis=1) / np.maximum(largest.sum(axis=1), 1)
+        return np.where(largest, sorted_scores, 0.0).sum(axis=1) / np.maximum(largest.sum(axis=1), 1)
     position = (divisor - 1) * (1.0 if match is None else int(match[2]) / 100.0)
     low = np.floor(position).astype(int)
     high, scenario = np.minimum(low + 1, divisor - 1), np.arange(len(steps))
     fraction = position - low
-    return ordered[scenario, low] * (1.0 - fraction) + ordered[scenario, high] * fraction
+    return sorted_scores[scenario, low] * (1.0 - fraction) + sorted_scores[scenario, high] * fraction
 
 
 SCORES_VERSION = 3
-#: File name of the scores of an exported subset, in its folder.
+#: File name of a subset's scores in its folder.
 OWN_SCORES = "scores.npz"
 _RERUN = "run `drivax curate` again"
 _COMPONENT = "component_"
@@ -132,14 +136,14 @@ _COMPONENT = "component_"
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """Scores of every scenario and step of a set, in the set's order.
+    """Scores of every scenario and step of a set, in the order of the set.
 
     Attributes:
-        method, config: Its name and configuration; ``combination`` holds the arguments of :meth:`recombine`.
-        set_hash, scenario_ids: ``ScenarioSet.hash`` of the data, and the id of each scenario.
+        method, config: Name and configuration of the method; ``combination`` holds the arguments of :meth:`recombine`.
+        set_hash, scenario_ids: ``ScenarioSet.hash`` of the data, and the ids of its scenarios.
         valid: Whether ego is observed; other steps score 0.
         steps, scenarios: Scores, in [0, 1].
-        components: Components of the steps' scores by name, in [0, 1].
+        components: Components of the step scores by name, in [0, 1].
     """
 
     method: str
@@ -153,21 +157,21 @@ class ScoreTable:
 
     @property
     def drawable(self) -> Bool[np.ndarray[Any, Any], "N T"]:
-        """Steps that can be drawn: ego is observed at the next step too, so its action is known."""
+        """Steps that can be drawn, at which ego's action is known: it is observed at this and the next step."""
         return self.valid & np.pad(self.valid[:, 1:], ((0, 0), (0, 1)))
 
     @cached_property
     def order(self) -> Int[np.ndarray[Any, Any], " N"]:
         """Indices by descending scenario score; ties by descending mean step score, then by index.
 
-        Scores are compared in float32, as files store them, so that a table that was read has the same order.
+        Scores are compared in float32, the precision of files, so that stored tables have the same order.
         """
         steps, scenarios = (scores.astype(np.float32) for scores in (self.steps, self.scenarios))
         return np.lexsort((-aggregate(steps.astype(np.float64), self.valid, "mean"), -scenarios))
 
     @property
     def combination(self) -> Combination:
-        """The combination of components into scores."""
+        """Combination of the components."""
         return Combination(**self.config["combination"])
 
     def recombine(self, combination: Combination) -> ScoreTable:
@@ -180,11 +184,11 @@ class ScoreTable:
 def write_scores(table: ScoreTable, out: Path, overwrite: bool = False) -> None:
     """Write a table as ``.npz``.
 
-    It holds ``header`` (JSON), ``scenario_id``, ``valid``, ``step_score``, ``scenario_score``, and ``component_NAME``
-    of each component.
+    The arrays are ``header`` (JSON), ``scenario_id``, ``valid``, ``step_score``, ``scenario_score``, and
+    ``component_NAME`` for each component.
 
     Raises:
-        UsageError: ``out`` exists and ``overwrite`` is not given, or is a folder.
+        UsageError: ``out`` is a folder, or exists and ``overwrite`` is not set.
         DataError: A score is not in [0, 1].
     """
     check_output(out, overwrite)
@@ -210,22 +214,22 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
     """Read the scores of a set.
 
     Raises:
-        DataError: The table is missing, damaged, of another version, or of other data than ``data``.
+        DataError: The table is missing or damaged, has another version, or belongs to another set.
     """
     if not file.is_file():
         cure = "write it with `drivax curate METHOD --data SET --out FILE`"
         raise DataError("score table not found", file=file, cure=cure)
     try:
-        # np.load does not close a damaged file that it opened itself.
-        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as stored:
-            header = json.loads(str(stored["header"][()]))
-            ids = tuple(str(name) for name in stored["scenario_id"])
+        # np.load would not close a damaged file.
+        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as archive:
+            header = json.loads(str(archive["header"][()]))
+            ids = tuple(str(name) for name in archive["scenario_id"])
             _check_source(header["version"], header["set_hash"], file, data)
-            arrays = {name: stored[name] for name in stored.files if name not in ("header", "scenario_id")}
+            arrays = {name: archive[name] for name in archive.files if name not in ("header", "scenario_id")}
             _check_shapes(ids, arrays, file, data)
             valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
-            named = [name for name in arrays if name.startswith(_COMPONENT)]
-            components = {name.removeprefix(_COMPONENT): arrays[name] for name in named}
+            component_names = [name for name in arrays if name.startswith(_COMPONENT)]
+            components = {name.removeprefix(_COMPONENT): arrays[name] for name in component_names}
             method, config, set_hash = (header[name] for name in ("method", "config", "set_hash"))
             table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components)
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
@@ -240,16 +244,18 @@ def _check_source(version: object, set_hash: object, file: Path, data: ScenarioS
         raise DataError(f"version {version}, this drivax reads {SCORES_VERSION}", file=file, cure=_RERUN)
     if set_hash != data.hash:
         subset_scores = data.path / OWN_SCORES
-        problem = f"scores are of other data (hash {str(set_hash)[:12]}, {data.path} has {data.hash[:12]})"
+        problem = (
+            f"scores belong to another set (hash {str(set_hash)[:12]}, {data.path} has {data.hash[:12]})"
+        )
         cure = f"use {subset_scores}" if subset_scores.is_file() and subset_scores != file else _RERUN
         raise DataError(problem, file=file, cure=cure)
 
 
 def _check_shapes(ids: tuple[str, ...], arrays: Mapping[str, Any], file: Path, data: ScenarioSet) -> None:
-    expected = tuple(entry["scenario_id"] for entry in data.entries)
-    shape = (len(expected), data.capacity.steps)
+    expected_ids = tuple(entry["scenario_id"] for entry in data.entries)
+    shape = (len(expected_ids), data.capacity.steps)
     shapes = {name: shape[:1] if name == "scenario_score" else shape for name in arrays}
-    if ids != expected or any(values.shape != shapes[name] for name, values in arrays.items()):
+    if ids != expected_ids or any(values.shape != shapes[name] for name, values in arrays.items()):
         raise DataError("does not score every scenario and step of its set", file=file, cure=_RERUN)
 
 

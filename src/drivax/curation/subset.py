@@ -1,4 +1,4 @@
-"""Write the most critical scenarios of a set as a scenario set that includes their scores."""
+"""Write the most critical scenarios of a set as a scenario set with scores."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ def check_top(
     """Check, before any work, that a subset can be written.
 
     Raises:
-        UsageError: There are fewer recordings (with ``all_windows``: scenarios), ``out`` exists, or is the set itself.
+        UsageError: The set has fewer recordings (with ``all_windows``: scenarios), or ``out`` exists or is the set.
     """
     total, recordings = len(data), len(set(recordings_of(data.entries)))
     if not all_windows and recordings < total and not 1 <= count <= recordings:
         cure = f"ask for 1 to {recordings}, or pass --all-windows to choose among all {total} scenarios"
-        problem = f"the {count} most critical of {recordings} recordings, one scenario of each"
+        problem = f"cannot select {count} scenarios from {recordings} recordings, one of each"
         raise UsageError(problem, cure=cure)
     if not 1 <= count <= total:
-        raise UsageError(f"the {count} most critical of {total} scenarios", cure=f"ask for 1 to {total}")
+        raise UsageError(f"cannot select {count} of {total} scenarios", cure=f"ask for 1 to {total}")
     refuse_part(data, out)
-    ScenarioWriter(out, data.capacity, overwrite=overwrite)  # writes only when entered
+    ScenarioWriter(out, data.capacity, overwrite=overwrite)  # checks ``out``, writes nothing
 
 
 def top_rows(table: ScoreTable, count: int, recordings: Sequence[str] | None = None) -> list[int]:
     """Return the indices of the ``count`` most critical scenarios, in the order of ``ScoreTable.order``.
 
-    With the recording of every scenario, only the most critical scenario of each recording is taken.
+    Given the recording of every scenario, only the most critical scenario of each recording is considered.
     """
     indices = table.order
     if recordings is not None:
@@ -47,17 +47,18 @@ def top_rows(table: ScoreTable, count: int, recordings: Sequence[str] | None = N
 
 
 def subset_of_table(table: ScoreTable, indices: Sequence[int], subset: ScenarioSet) -> ScoreTable:
-    """Return the scores of a subset that ``write_part`` wrote; their configuration names the whole set as ``part_of``.
+    """Return the scores of a subset that ``write_part`` wrote.
 
-    ``indices`` are the scenarios of the whole set in the order of the subset.
+    ``indices`` are the scenarios in the whole set, in the order of the subset. ``part_of`` in the configuration of the
+    result identifies the whole set.
     """
-    rows = list(indices)
-    source = subset.manifest["source"]["part_of"]
-    source = {name: value for name, value in source.items() if name not in ("method", "config")}
-    ids = tuple(table.scenario_ids[index] for index in rows)
-    scores = {name: getattr(table, name)[rows] for name in ("valid", "steps", "scenarios")}
-    components = {name: component[rows] for name, component in table.components.items()}
-    config = {**table.config, "part_of": source}
+    order = list(indices)
+    part_of = subset.manifest["source"]["part_of"]
+    part_of = {name: value for name, value in part_of.items() if name not in ("method", "config")}
+    ids = tuple(table.scenario_ids[index] for index in order)
+    scores = {name: getattr(table, name)[order] for name in ("valid", "steps", "scenarios")}
+    components = {name: component[order] for name, component in table.components.items()}
+    config = {**table.config, "part_of": part_of}
     return replace(
         table, config=config, set_hash=subset.hash, scenario_ids=ids, components=components, **scores
     )
@@ -67,21 +68,21 @@ def write_top(
     table: ScoreTable, data: ScenarioSet, count: int, out: Path, overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None, all_windows: bool = False,
 ) -> Exported:  # fmt: skip
-    """Write the ``count`` most critical scenarios as a scenario set, the most critical first, with their scores.
+    """Write the ``count`` most critical scenarios as a scenario set, in descending order, with their scores.
 
-    Without ``all_windows``, only the most critical scenario of each recording is chosen. ``progress`` is called with
-    (scenarios done, scenarios).
+    Without ``all_windows``, only the most critical scenario of each recording is considered. ``progress`` is called
+    with (scenarios done, scenarios).
 
     Raises:
-        UsageError: There are fewer, or ``out`` exists.
+        UsageError: The set has fewer scenarios or recordings, or ``out`` exists.
     """
     check_top(data, out, count, overwrite, all_windows)
     indices = top_rows(table, count, None if all_windows else recordings_of(data.entries))
-    chosen_by = {
+    selection = {
         "most_critical": count, "all_windows": all_windows, "method": table.method, "config": dict(table.config)
     }  # fmt: skip
 
     def write_own_scores(folder: Path) -> None:
         write_scores(subset_of_table(table, indices, ScenarioSet.open(folder)), folder / OWN_SCORES)
 
-    return write_part(data, indices, out, overwrite, progress, chosen_by, write_own_scores)
+    return write_part(data, indices, out, overwrite, progress, selection, write_own_scores)

@@ -1,4 +1,4 @@
-"""Turn scores into sampling weights, describe the draws that weights lead to, and permute scores as a control."""
+"""Convert scores to sampling weights, compute statistics of weighted draws, and permute scores as a control."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ class WeightConfig:
 
     For the score s of a step, or of its scenario:
 
-    1. ``quantile``: u is the mid-rank of s among all n steps, over n, in (0, 1), so that equal scores have equal
-       weights and the distribution of the scores does not matter; ``none``: u = s. Then u + ``floor``.
-    2. w = u ** (1 / ``temperature``): 1 keeps the ratios, a higher temperature flattens, a lower one sharpens them.
-    3. w, clipped to at most ``most`` times the mean of the clipped weights (where fewer than n / ``most`` are above 0,
-       these become equal), and divided by that mean.
-    4. ``(1 - uniform) w + uniform``: a mixture with uniform sampling, of mean 1.
+    1. ``quantile``: u is the mid-rank of s among all n steps, divided by n. Equal scores have equal weights, and only
+       the order of the scores matters. ``none``: u = s. Then u + ``floor``.
+    2. w = u ** (1 / ``temperature``): 1 keeps the ratios, higher temperatures flatten the weights, lower ones sharpen
+       them.
+    3. w is clipped to ``most`` times the mean of the clipped weights, and divided by that mean. If fewer than
+       n / ``most`` weights are above 0, these become equal.
+    4. ``(1 - uniform) w + uniform``: a mixture with uniform sampling, with mean 1.
 
     Attributes:
         normalise: See 1.
@@ -44,40 +45,40 @@ class WeightConfig:
     uniform: float = 0.2
 
     def __post_init__(self) -> None:
-        for name, holds, cure in (
+        for name, is_valid, cure in (
             ("floor", 0.0 <= self.floor < float("inf"), "use 0 or more"),
             ("temperature", 0.0 < self.temperature < float("inf"), "use a positive number"),
             ("most", self.most > 1.0, "use more than 1, inf for no limit"),
             ("uniform", 0.0 <= self.uniform <= 1.0, "use 0 to 1"),
         ):
-            if not holds:
+            if not is_valid:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure=cure)
 
 
-#: Weights of the published study: proportional to the score plus 0.01.
+#: Weights of the published study, proportional to the score plus 0.01.
 PUBLISHED = WeightConfig(normalise="none", floor=0.01, temperature=1.0, most=float("inf"), uniform=0.0)
 
 
 def sampling_weights(
     table: ScoreTable, config: WeightConfig, scale: Scale, usable: Bool[Array, "N T"] | None = None
 ) -> Float[Array, "N T"]:
-    """Return the weight of every step: mean 1 over the steps that can be drawn, 0 elsewhere.
+    """Return the weight of every step: mean 1 over drawable steps, 0 elsewhere.
 
-    At the scale ``scenario``, every step has the weight of its scenario. The steps that can be drawn are ``usable``
+    At the scale ``scenario``, all steps of a scenario have the same weight. Drawable steps are ``usable``
     (:func:`drivax.learning.loop.usable_steps`), by default ``ScoreTable.drawable``.
 
     Raises:
-        UsageError: No step can be drawn, or all weights are 0.
+        UsageError: No step is drawable, or all weights are 0.
     """
     drawable = table.drawable if usable is None else usable
     if not drawable.any():
         raise UsageError("no step can be drawn", cure="check the set")
     weights = np.zeros(drawable.shape)
     if scale == "step":
-        weights[drawable] = _weights(table.steps[drawable], np.ones(int(drawable.sum())), config)
+        weights[drawable] = _score_weights(table.steps[drawable], np.ones(int(drawable.sum())), config)
     else:
         has_steps = drawable.any(axis=1)
-        weight = _weights(
+        weight = _score_weights(
             table.scenarios[has_steps], drawable[has_steps].sum(axis=1).astype(np.float64), config
         )
         weights[has_steps] = np.where(drawable[has_steps], weight[:, None], 0.0)
@@ -86,16 +87,16 @@ def sampling_weights(
     return weights / weights[drawable].mean()
 
 
-def _weights(
+def _score_weights(
     scores: Float[Array, " n"], mass: Float[Array, " n"], config: WeightConfig
 ) -> Float[Array, " n"]:
-    """Return the weights of scores that ``mass`` steps have each."""
+    """Return the weights of scores; ``mass`` is the number of steps of each score."""
     score = np.asarray(scores, np.float64)
     if config.normalise == "quantile":
         _, rank = np.unique(score, return_inverse=True)
         ties = np.bincount(rank, mass)
         score = ((np.cumsum(ties) - ties / 2.0) / mass.sum())[rank]
-    # In logarithms: a low temperature must neither overflow nor make all weights 0.
+    # Logarithms avoid overflow and underflow at low temperatures.
     with np.errstate(divide="ignore"):
         power = np.log(score + config.floor) / config.temperature
     if not np.isfinite(power.max()):
@@ -107,27 +108,27 @@ def _weights(
 def _clip(weight: Float[Array, " n"], mass: Float[Array, " n"], most: float) -> Float[Array, " n"]:
     """Clip the largest weights to ``most`` times the mean of the result."""
     order = np.argsort(-weight, kind="stable")
-    ordered, ordered_mass = weight[order], mass[order]
-    if ordered[0] <= most * np.average(weight, weights=mass):
+    sorted_weight, sorted_mass = weight[order], mass[order]
+    if sorted_weight[0] <= most * np.average(weight, weights=mass):
         return weight
-    # If the first k, of mass m, are clipped to c, then c = most (m c + tail) / n, with the weighted sum of all others.
-    clipped_mass = np.cumsum(ordered_mass) - ordered_mass
-    tail_sum = np.cumsum((ordered * ordered_mass)[::-1])[::-1]
+    # Clipping the first k weights (mass m) to c gives c = most (m c + tail) / n; tail is the sum of the others.
+    clipped_mass = np.cumsum(sorted_mass) - sorted_mass
+    tail_sum = np.cumsum((sorted_weight * sorted_mass)[::-1])[::-1]
     remaining = mass.sum() - most * clipped_mass
     limit = most * tail_sum / np.where(remaining > 0.0, remaining, np.inf)
-    feasible = np.flatnonzero((remaining > 0.0) & (limit >= ordered) & (limit > 0.0))
-    return np.minimum(weight, limit[feasible[0]] if len(feasible) else ordered[ordered > 0].min())
+    feasible = np.flatnonzero((remaining > 0.0) & (limit >= sorted_weight) & (limit > 0.0))
+    return np.minimum(weight, limit[feasible[0]] if len(feasible) else sorted_weight[sorted_weight > 0].min())
 
 
 @dataclass(frozen=True)
 class DrawStatistics:
-    """Statistics of the draws under some weights.
+    """Statistics of weighted draws.
 
     Attributes:
         effective: Effective sample size over the number of drawable steps, ``(sum w)^2 / (n sum w^2)`` (Kish, 1965):
-            1 for uniform weights, 1 / n if one step has all weight.
-        effective_scenarios: The same for the scenarios' sums of weights.
-        tilt, largest: 99th percentile of the weights, and the largest, over their mean.
+            1 for uniform weights, 1 / n if one step has all the weight.
+        effective_scenarios: The same for the sums of weights of scenarios.
+        tilt, largest: 99th percentile and maximum of the weights, over their mean.
         concentration: Share of the draws from the 5 % of steps with the largest weights; 0.05 for uniform weights.
     """
 
@@ -139,26 +140,26 @@ class DrawStatistics:
 
 
 def draw_statistics(weights: Float[Array, "N T"], drawable: Bool[Array, "N T"]) -> DrawStatistics:
-    """Return statistics of weights over the steps that can be drawn."""
+    """Return statistics of weights over drawable steps."""
     values = weights[drawable]
     has_steps = drawable.any(axis=1)
-    ordered = np.sort(values)[::-1]
+    sorted_values = np.sort(values)[::-1]
     return DrawStatistics(
         effective=effective_size(values) / values.size,
         effective_scenarios=effective_size(weights.sum(axis=1)[has_steps]) / int(has_steps.sum()),
         tilt=float(np.quantile(values, 0.99) / values.mean()),
-        largest=float(ordered[0] / values.mean()),
-        concentration=float(ordered[: max(round(len(values) * 0.05), 1)].sum() / values.sum()),
+        largest=float(sorted_values[0] / values.mean()),
+        concentration=float(sorted_values[: max(round(len(values) * 0.05), 1)].sum() / values.sum()),
     )
 
 
 def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | None = None) -> ScoreTable:
-    """Return the matched random control of a table: every scenario gets the scores of another one, cyclically shifted.
+    """Return the matched random control of a table: each scenario gets the shifted scores of a random scenario.
 
-    The distribution of the scores is kept over all steps, within a scenario, and among scenarios; exactly where all
-    scenarios have the same number of usable steps (longer sequences are cut, shorter ones repeated). Permuting single
-    steps would spread large scores evenly over all scenarios, and the control would see more scenarios. ``usable``
-    steps are those of :func:`sampling_weights`.
+    Shifts are cyclic. This keeps the distribution of scores over steps, within scenarios, and among scenarios;
+    exactly, if all scenarios have the same number of usable steps (longer sequences are cut, shorter ones repeated).
+    Permuting single steps would spread large scores over all scenarios, so that the control would sample more
+    scenarios. ``usable`` is as in :func:`sampling_weights`.
     """
     rng = np.random.default_rng(seed)
     drawable = table.drawable if usable is None else usable

@@ -1,6 +1,7 @@
-"""Audit scenarios: replay each log through the metrics. Any violation of the expert is a defect of map or converter.
+"""Audit scenarios: replay the logged ego and evaluate the episode.
 
-Steps without a logged ego are not evaluated; :data:`~drivax.scenario.select.selection.FINDINGS` explains each finding.
+A violation by the logged ego points to a defect of the map or the converter. Steps without a logged ego are not
+evaluated. :data:`~drivax.scenario.select.selection.FINDINGS` explains the findings.
 """
 
 from __future__ import annotations
@@ -21,46 +22,48 @@ from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import AgentContext, Facts, Frame, SimState, Situation, Surroundings
 from drivax.tasks.actions import PHYSICAL, PUBLISHED
 
-Finding = dict[str, float | int | bool | str | None]
+Findings = dict[str, float | int | bool | str | None]
 
 #: Logs per batch.
 BATCH = 64
-#: Agents that drive further backwards, or this far and hardly forwards, do not manoeuvre: their headings are wrong by
-#: pi. Slower motion is jitter.
-REVERSE_M, MOSTLY_REVERSE_M, MOSTLY, CREEP_MPS = 20.0, 5.0, 0.9, 0.5
+#: The heading of an agent is wrong by pi if it reverses more than 20 m, or more than 5 m and 90 % of its distance.
+REVERSE_M, MOSTLY_REVERSE_M, MOSTLY_REVERSE_SHARE = 20.0, 5.0, 0.9
+#: Slower motion is jitter.
+CREEP_MPS = 0.5
 _DRIVERS = (AgentKind.VEHICLE, AgentKind.CYCLIST)
-#: A route leads to the goal when the log ends within this distance of it (semantics, ``reached_goal``).
+#: Largest distance of the log's end from the goal of a route that leads there, m (as for ``reached_goal``).
 GOAL_M = 3.0
-_READ = (
+_FACTS = (
     "collision", "offroad", "left_map", "red_light", "ignored", "moved_m", "route_deviation_m", "goal_distance_m",
     "logged", "log_divergence_m",
 )  # fmt: skip
-#: Action spaces whose bounds the audit compares with the log.
-_SPACES = {"clipped_physical": PHYSICAL, "clipped_published": PUBLISHED}
+#: Action spaces, by the finding that counts logged actions outside their bounds.
+_ACTION_SPACES = {"clipped_physical": PHYSICAL, "clipped_published": PUBLISHED}
 
 
 def scenario_names(scenarios: Sequence[Scenario]) -> list[dict[str, str]]:
-    """Return ``dataset``, ``scenario_id`` and ``segment`` of scenarios, the keys of tables."""
+    """Return the table keys of scenarios: ``dataset``, ``scenario_id`` and ``segment``."""
     return [{name: s.text(name) for name in ("dataset", "scenario_id", "segment")} for s in scenarios]
 
 
-def audit(scenarios: Sequence[Scenario]) -> list[Finding]:
-    """Replay the logs of scenarios of one capacity exactly, from the current step to their end.
+def audit(scenarios: Sequence[Scenario]) -> list[Findings]:
+    """Replay the logs of scenarios of one capacity, from the current step to their end.
 
     Returns:
-        Findings by name, one mapping per scenario. None means not applicable (a route deviation without a route);
-        logs that are too short to evaluate get only findings that need no replay.
+        Findings of each scenario by name. A finding that does not apply is None (a route deviation without a route).
+        Logs that are too short to evaluate have only the findings that need no replay.
     """
-    futures = [scenario.steps >= LEAST_STEPS for scenario in scenarios]
-    usable = [scenario for scenario, future in zip(scenarios, futures, strict=True) if future]
-    batches = (usable[first : first + BATCH] for first in range(0, len(usable), BATCH))
-    replayed = iter([row for batch in batches for row in _replay_batch(batch)])
-    pairs = zip(scenarios, futures, strict=True)
-    return [(next(replayed) if future else {}) | _static_findings(scenario) for scenario, future in pairs]
+    long_enough = [scenario for scenario in scenarios if scenario.steps >= LEAST_STEPS]
+    batches = (long_enough[first : first + BATCH] for first in range(0, len(long_enough), BATCH))
+    replay_findings = iter([findings for batch in batches for findings in _replay_batch(batch)])
+    return [
+        (next(replay_findings) if scenario.steps >= LEAST_STEPS else {}) | _static_findings(scenario)
+        for scenario in scenarios
+    ]
 
 
-def _static_findings(scenario: Scenario) -> Finding:
-    """Return findings that need no replay."""
+def _static_findings(scenario: Scenario) -> Findings:
+    """Return the findings that need no replay."""
     flags = scenario.has
     return {
         "lights_seen": int((scenario.light_state >= 0).any(axis=0).sum()),
@@ -70,10 +73,10 @@ def _static_findings(scenario: Scenario) -> Finding:
     }
 
 
-class _Watch:
-    """A task without observation, reward, metrics and termination, which keeps the program small."""
+class _EmptyTask:
+    """A task without observations, reward, metrics or termination, which keeps the compiled program small."""
 
-    reads = frozenset(_READ)
+    reads = frozenset(_FACTS)
 
     def motion(self, motion: Array, action: Array, length: Any) -> Array:
         return PHYSICAL.move(motion, action, length)
@@ -105,111 +108,115 @@ class _Watch:
         pass
 
 
-@partial(jax.jit, static_argnames="driven")
-def replay(bank: ScenarioBank, index: Int[Array, " B"], driven: bool = False) -> dict[str, Array]:
-    """Return facts of scenarios (rows of the bank) from the current step on, ``[B, T - 10]`` each.
+@partial(jax.jit, static_argnames="use_dynamics")
+def replay(bank: ScenarioBank, index: Int[Array, " B"], use_dynamics: bool = False) -> dict[str, Array]:
+    """Return facts of scenarios ``index`` from the current step on, ``[B, T - 10]`` each.
 
-    By the names of ``simulator.types.Facts``; ``clipped_<space>``: the action that follows the log to this step is
-    outside of an action space. With ``driven``, ego follows the log through the dynamics instead of being put there.
+    Keys are names of ``simulator.types.Facts``, and ``clipped_<space>``: whether the logged action into the step
+    exceeds the bounds of an action space. Ego is placed at its logged poses; with ``use_dynamics`` it follows the log
+    through the dynamics.
     """
-    simulator = Simulator(_Watch())
+    simulator = Simulator(_EmptyTask())
 
     def step(state: SimState, _: None) -> tuple[SimState, dict[str, Array]]:
         action = jnp.clip(expert_action(bank, state.context, PHYSICAL), -1.0, 1.0)
-        if driven:
-            after, _transition = simulator.step(bank, state, action)
+        if use_dynamics:
+            next_state, _transition = simulator.step(bank, state, action)
         else:
-            logged = logged_motion(bank, state.context, 1)
-            after, _transition = simulator.replay(bank, state, logged, action)
-        clipped = {
-            name: space.clipped(expert_action(bank, state.context, space)) for name, space in _SPACES.items()
+            logged_pose = logged_motion(bank, state.context, 1)
+            next_state, _transition = simulator.replay(bank, state, logged_pose, action)
+        exceeds_bounds = {
+            name: space.clipped(expert_action(bank, state.context, space))
+            for name, space in _ACTION_SPACES.items()
         }
-        return after, _read(after.facts) | clipped
+        return next_state, _select_facts(next_state.facts) | exceeds_bounds
 
-    def episode(row: Array) -> dict[str, Array]:
-        start = simulator.reset(bank, row)
-        first = _read(start.facts) | dict.fromkeys(_SPACES, jnp.zeros((), bool))
+    def replay_scenario(scenario: Array) -> dict[str, Array]:
+        start = simulator.reset(bank, scenario)
+        first = _select_facts(start.facts) | dict.fromkeys(_ACTION_SPACES, jnp.zeros((), bool))
         _, later = jax.lax.scan(step, start, None, length=bank.steps - 1 - CURRENT_STEP)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, later)
 
-    return jax.vmap(episode)(index)
+    return jax.vmap(replay_scenario)(index)
 
 
-def _read(facts: Facts) -> dict[str, Array]:
-    return {name: getattr(facts, name) for name in _READ}
+def _select_facts(facts: Facts) -> dict[str, Array]:
+    return {name: getattr(facts, name) for name in _FACTS}
 
 
-def _replay_batch(scenarios: Sequence[Scenario]) -> list[Finding]:
-    """Return findings of one batch, padded and not trimmed, so that one compiled program serves every batch."""
-    filled = [*scenarios, *[scenarios[-1]] * (BATCH - len(scenarios))]
-    bank = ScenarioBank.from_scenarios(filled, trim=False)
+def _replay_batch(scenarios: Sequence[Scenario]) -> list[Findings]:
+    """Return findings of one batch, padded to ``BATCH`` without trimming, so that all batches share one program."""
+    batch = [*scenarios, *[scenarios[-1]] * (BATCH - len(scenarios))]
+    bank = ScenarioBank.from_scenarios(batch, trim=False)
     series = jax.tree.map(np.asarray, replay(bank, jnp.arange(BATCH)))
     return [
-        _findings(scenario, {name: values[row] for name, values in series.items()})
-        for row, scenario in enumerate(scenarios)
+        _replay_findings(scenario, {name: values[index] for name, values in series.items()})
+        for index, scenario in enumerate(scenarios)
     ]
 
 
-def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) -> Finding:
-    """Return findings of one replay; entry 0 of the series, the current step, counts only for ``first_*_step``."""
-    flags, logged = scenario.has, series["logged"]
-    evaluated = logged.copy()
+def _replay_findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) -> Findings:
+    """Return the findings of one replay; entry 0, the current step, counts only for ``first_*_step``."""
+    flags, in_log = scenario.has, series["logged"]
+    evaluated = in_log.copy()
     evaluated[0] = False
-    mapped = int(scenario.segment_blocks[2]) > 0
-    hit, off, red = (series[name] & evaluated for name in ("collision", "offroad", "red_light"))
+    has_map = int(scenario.segment_blocks[2]) > 0
+    collides, offroad, runs_red = (series[name] & evaluated for name in ("collision", "offroad", "red_light"))
+    on_road = in_log & ~series["offroad"] & ~series["left_map"]
     deviation = series["route_deviation_m"][evaluated] if Flag.ROUTE in flags else np.zeros(0)
-    ran_red = bool(red.any()) if Flag.LIGHTS in flags else None
-    reached = bool((series["goal_distance_m"][evaluated][-1:] <= GOAL_M).all())
-    backwards, forwards = _driven_m(scenario)
-    mostly = backwards > np.maximum(MOSTLY_REVERSE_M, MOSTLY * (backwards + forwards))
-    reverses = (backwards > REVERSE_M) | mostly
+    log_runs_red = bool(runs_red.any()) if Flag.LIGHTS in flags else None
+    reaches_goal = bool((series["goal_distance_m"][evaluated][-1:] <= GOAL_M).all())
+    reverse_m, forward_m = _reverse_and_forward_m(scenario)
+    mostly_reverses = reverse_m > np.maximum(MOSTLY_REVERSE_M, MOSTLY_REVERSE_SHARE * (reverse_m + forward_m))
+    reverses = (reverse_m > REVERSE_M) | mostly_reverses
+    violates = collides.any() or offroad.any() or bool(log_runs_red) or reverses[0]
     return {
-        "log_collides": bool(hit.any()),
-        "first_collision_step": _first(hit),
-        "log_offroad_fraction": _rounded(off[evaluated].mean(), 4) if mapped and evaluated.any() else None,
-        "first_offroad_step": _first(off) if mapped else None,
-        "first_onroad_step": _first(logged & ~series["offroad"] & ~series["left_map"]) if mapped else None,
-        "log_left_map": bool((series["left_map"] & evaluated).any()) if mapped else None,
-        "log_runs_red": ran_red,
-        "distance_m": _rounded(series["moved_m"][evaluated].sum()),
-        "reverse_m": _rounded(backwards[0]),
+        "log_collides": bool(collides.any()),
+        "first_collision_step": _first_step(collides),
+        "log_offroad_fraction": _round(offroad[evaluated].mean(), 4) if has_map and evaluated.any() else None,
+        "first_offroad_step": _first_step(offroad) if has_map else None,
+        "first_onroad_step": _first_step(on_road) if has_map else None,
+        "log_left_map": bool((series["left_map"] & evaluated).any()) if has_map else None,
+        "log_runs_red": log_runs_red,
+        "distance_m": _round(series["moved_m"][evaluated].sum()),
+        "reverse_m": _round(reverse_m[0]),
         "log_reverses": bool(reverses[0]),
         "agents_reversing": int(reverses[1:].sum()),
-        "route_deviation_mean_m": _rounded(deviation.mean()) if len(deviation) else None,
-        "route_deviation_max_m": _rounded(deviation.max()) if len(deviation) else None,
-        "route_reaches_goal": reached if len(deviation) else None,
+        "route_deviation_mean_m": _round(deviation.mean()) if len(deviation) else None,
+        "route_deviation_max_m": _round(deviation.max()) if len(deviation) else None,
+        "route_reaches_goal": reaches_goal if len(deviation) else None,
         "ignored_overlaps": int(series["ignored"].max()),
-        **{name: _share(series[name], evaluated) for name in _SPACES},
-        "clean": not hit.any() and not off.any() and not ran_red and not reverses[0] if mapped else None,
+        **{name: _clipped_share(series[name], evaluated) for name in _ACTION_SPACES},
+        "clean": not violates if has_map else None,
     }
 
 
-def _driven_m(scenario: Scenario) -> Float[np.ndarray, "2 agent"]:
-    """Return how far vehicles and cyclists drive against and along their heading after the current step, metres."""
-    now = slice(CURRENT_STEP, int(scenario.steps))
-    valid, heading = scenario.agent_valid[now], scenario.agent_heading[now][:-1]
-    step = np.diff(scenario.agent_xy[now].astype(np.float64), axis=0)
+def _reverse_and_forward_m(scenario: Scenario) -> Float[np.ndarray, "2 agent"]:
+    """Return how far vehicles and cyclists drive backwards and forwards after the current step, metres."""
+    future = slice(CURRENT_STEP, int(scenario.steps))
+    valid, heading = scenario.agent_valid[future], scenario.agent_heading[future][:-1]
+    step = np.diff(scenario.agent_xy[future].astype(np.float64), axis=0)
     along = step[..., 0] * np.cos(heading) + step[..., 1] * np.sin(heading)
-    counted = valid[1:] & valid[:-1] & np.isin(scenario.agent_kind, _DRIVERS)
+    drives = valid[1:] & valid[:-1] & np.isin(scenario.agent_kind, _DRIVERS)
     return np.stack(
         [
-            np.where(counted & (sign * along > CREEP_MPS * DT_S), sign * along, 0.0).sum(axis=0)
+            np.where(drives & (sign * along > CREEP_MPS * DT_S), sign * along, 0.0).sum(axis=0)
             for sign in (-1, 1)
         ]
     )
 
 
-def _share(clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:
-    """Return the share of steps from an evaluated (or the current) step whose action a space clips."""
-    steps = evaluated.copy()
-    steps[2:] &= evaluated[1:-1]
-    return _rounded(clipped[steps].mean(), 4) if steps.any() else None
+def _clipped_share(clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:
+    """Return the share of clipped actions among those from an evaluated or the current step."""
+    counts = evaluated.copy()
+    counts[2:] &= evaluated[1:-1]
+    return _round(clipped[counts].mean(), 4) if counts.any() else None
 
 
-def _first(holds: np.ndarray[Any, Any]) -> int | None:
+def _first_step(condition: np.ndarray[Any, Any]) -> int | None:
     """Return the first step of the log at which a condition holds."""
-    return CURRENT_STEP + int(holds.argmax()) if holds.any() else None
+    return CURRENT_STEP + int(condition.argmax()) if condition.any() else None
 
 
-def _rounded(value: Any, digits: int = 3) -> float | None:
+def _round(value: Any, digits: int = 3) -> float | None:
     return round(float(value), digits) if np.isfinite(value) else None

@@ -1,6 +1,7 @@
-"""Compare two planners: intervals, tests, power, and a decision by the rule of a plan.
+"""Compare two planners: intervals, tests, power, and the decision of a plan.
 
-The primary metric decides; p-values of secondary metrics are adjusted for their number. Differences are ``A - B``.
+The primary metric decides. The p-values of secondary metrics are adjusted for multiple testing. Differences are
+``A - B``.
 """
 
 from __future__ import annotations
@@ -26,16 +27,18 @@ from drivax.stats.intervals import Interval, interquartile_bootstrap, paired_boo
 from drivax.stats.seeds import CrossedEffect, difference_interval, seeds_interval
 from drivax.stats.significance import SignificanceResult
 
-#: Smallest difference that matters by default, as a share of the standard deviation.
+#: Default of the smallest difference that matters, as a share of the standard deviation.
 _SMALL_EFFECT = 0.1
 Values = Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
 class SeedSpread:
-    """Means of a policy's seeds in the primary metric (None: undefined throughout), and their interquartile mean.
+    """Spread of the primary metric over the seeds of a policy.
 
-    The interval of the interquartile mean resamples seeds and recordings.
+    Attributes:
+        means: Mean of each seed; None if no value is defined.
+        interquartile: Interquartile mean; its interval resamples seeds and recordings.
     """
 
     means: tuple[float | None, ...]
@@ -44,15 +47,15 @@ class SeedSpread:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The result of a comparison.
+    """Result of a comparison.
 
     Attributes:
         names, folders: Names and run folders of A and B.
         traffic: Traffic model of both.
-        scenarios, recordings: Numbers of A and of B; the same ones where they are paired.
-        strata: Number of strata of the split; 1 without.
-        sensitivity: Of the primary metric; None where it does not vary.
-        seeds: Spread over seeds of A and B; None for a single one.
+        scenarios, recordings: Numbers of scenarios and recordings of A and of B, which are the same if paired.
+        strata: Number of strata of the split; 1 without strata.
+        sensitivity: Sensitivity of the primary metric; None if the metric does not vary.
+        seeds: Spread over seeds of A and B; None for a single seed.
     """
 
     plan: ComparisonPlan
@@ -69,7 +72,7 @@ class Comparison:
     decision: Decision
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; null where undefined."""
+        """Return plain values for JSON; undefined values are null."""
         folders = [None if folder is None else str(folder) for folder in self.folders]
         values = asdict(self) | {"plan": settings.plain(self.plan), "folders": folders}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
@@ -77,7 +80,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Side:
-    """One planner: the evaluations of its seeds, and its arm of the common scenarios."""
+    """One planner: the evaluation of each seed, and the mask of its common scenarios."""
 
     tables: Sequence[EpisodeTable]
     pairs: Pairs
@@ -87,7 +90,7 @@ class _Side:
         return np.stack([self.pairs.values(table, metric) for table in self.tables])
 
     def values(self, metric: str) -> Values:
-        """Return the mean over the seeds; NaN where undefined for a seed, and outside of the arm."""
+        """Return the mean over the seeds; NaN outside the arm, and if it is undefined for a seed."""
         return np.where(self.arm, self.by_seed(metric).mean(axis=0), np.nan)
 
     @property
@@ -105,32 +108,33 @@ class _Side:
         return len({cluster for cluster, in_arm in zip(self.pairs.clusters, self.arm, strict=True) if in_arm})
 
     def interval(self, plan: ComparisonPlan, metric: str, included: Bool[np.ndarray, " n"]) -> Interval:
-        """Return mean and interval over the included scenarios."""
+        """Return the mean and its interval over the included scenarios."""
         clusters = self.pairs.clusters
         if len(self.tables) == 1:
-            x = np.where(included, self.values(metric), np.nan)
-            return interval_of(metric, x, clusters, plan.confidence, plan.seed)
-        x = np.where(included, self.by_seed(metric), np.nan)
-        return seeds_interval(x, clusters, confidence=plan.confidence, share=metric in SHARES)
+            values = np.where(included, self.values(metric), np.nan)
+            return interval_of(metric, values, clusters, plan.confidence, plan.seed)
+        by_seed = np.where(included, self.by_seed(metric), np.nan)
+        return seeds_interval(by_seed, clusters, confidence=plan.confidence, share=metric in SHARES)
 
     def spread(self, plan: ComparisonPlan) -> SeedSpread | None:
         if len(self.tables) == 1:
             return None
-        x = np.where(self.arm, self.by_seed(plan.primary), np.nan)
-        middle = interquartile_bootstrap(
-            x, self.pairs.clusters, plan.confidence, plan.resamples, seed=plan.seed
+        values = np.where(self.arm, self.by_seed(plan.primary), np.nan)
+        defined = [seed_values[~np.isnan(seed_values)] for seed_values in values]
+        means = tuple(float(seed_values.mean()) if seed_values.size else None for seed_values in defined)
+        interquartile = interquartile_bootstrap(
+            values, self.pairs.clusters, plan.confidence, plan.resamples, seed=plan.seed
         )
-        means = [row[~np.isnan(row)] for row in x]
-        return SeedSpread(tuple(float(row.mean()) if row.size else None for row in means), middle)
+        return SeedSpread(means, interquartile)
 
 
 def compare(
     plan: ComparisonPlan, a: Sequence[EpisodeTable], b: Sequence[EpisodeTable],
     entries: Sequence[Mapping[str, Any]] = (),
 ) -> Comparison:  # fmt: skip
-    """Compare two planners by a plan, each with an evaluation per seed.
+    """Compare two planners by a plan, given an evaluation per seed of each.
 
-    Manifest ``entries`` of the scenarios are for a stratified split.
+    ``entries`` are the manifest entries of the scenarios, which a stratified split needs.
 
     Raises:
         UsageError: The evaluations cannot be compared, or lack a metric of the plan.
@@ -147,14 +151,13 @@ def compare(
     all_scenarios = np.ones(len(pairs.keys), bool)
     arms = (all_scenarios, all_scenarios) if split is None else (split.first, ~split.first)
     sides = _Side(a, pairs, arms[0]), _Side(b, pairs, arms[1])
-    first, *others = (
-        _compare_metric(plan, metric, sides, split) for metric in (plan.primary, *plan.secondary)
-    )
-    if min(first.a.n, first.b.n) == 0:
+    primary = _compare_metric(plan, plan.primary, sides, split)
+    if min(primary.a.n, primary.b.n) == 0:
         raise pairing.undefined_metric(plan.primary, (*a, *b))
-    adjusted = significance.holm_adjust([metric.evidence.p for metric in others])
-    secondary = tuple(metric.with_winner(plan, p) for metric, p in zip(others, adjusted, strict=True))
-    primary = first.with_winner(plan, first.evidence.p)
+    primary = primary.with_winner(plan, primary.evidence.p)
+    others = [_compare_metric(plan, metric, sides, split) for metric in plan.secondary]
+    adjusted_p = significance.holm_adjust([other.evidence.p for other in others])
+    secondary = tuple(other.with_winner(plan, p) for other, p in zip(others, adjusted_p, strict=True))
     sensitivity = _sensitivity(plan, sides, split)
     return Comparison(
         plan=plan,
@@ -182,51 +185,71 @@ def _names(a: _Side, b: _Side) -> tuple[str, str]:
 def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, Any]]) -> Split:
     strata = None
     if plan.split == "stratified":
-        known = {(entry["dataset"], entry["scenario_id"]): entry for entry in entries}
-        missing = next((key for key in pairs.keys if key not in known), None)
+        entry_by_key = {(entry["dataset"], entry["scenario_id"]): entry for entry in entries}
+        missing = next((key for key in pairs.keys if key not in entry_by_key), None)
         if missing is not None:
             cure = "pass the set that was evaluated with --data"
             raise UsageError(f"stratum of scenario {missing[1]} is unknown", cure=cure)
-        strata = pairing.strata_of([known[key] for key in pairs.keys], plan.strata)
+        strata = pairing.strata_of([entry_by_key[key] for key in pairs.keys], plan.strata)
     return pairing.assign(pairs.clusters, strata, plan.ratio, plan.seed)
 
 
 def _compare_metric(
     plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side], split: Split | None
 ) -> MetricComparison:
-    """Compare one metric, without its winner."""
-    clusters, seeds = sides[0].pairs.clusters, max(len(side.tables) for side in sides)
+    """Compare the planners in one metric; the winner is added later."""
     x, y = (side.values(metric) for side in sides)
-    undefined = [int((np.isnan(v) & side.arm).sum()) for v, side in zip((x, y), sides, strict=True)]
-    draws = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
+    undefined_a, undefined_b = (
+        int((np.isnan(values) & side.arm).sum()) for values, side in zip((x, y), sides, strict=True)
+    )
     included = ~np.isnan(x) & ~np.isnan(y) if split is None else np.ones(x.size, bool)
     x, y = np.where(included, x, np.nan), np.where(included, y, np.nan)
+    a, b = (side.interval(plan, metric, included) for side in sides)
+    difference, evidence = _test_difference(plan, metric, sides, split, x, y)
+    column = sides[0].tables[0].metric(metric)
+    return MetricComparison(
+        metric=metric,
+        unit="" if column is None else column.unit,
+        better="-" if column is None else column.better,
+        a=a,
+        b=b,
+        difference=difference,
+        effects={"d": effects.cohens_d(x, y)} if split else asdict(effects.cohens_d_paired(x, y)),
+        evidence=evidence,
+        p_adjusted=None,
+        winner=None,
+        seeds=max(len(side.tables) for side in sides),
+        undefined_a=undefined_a,
+        undefined_b=undefined_b,
+    )
+
+
+def _test_difference(
+    plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side], split: Split | None, x: Values, y: Values
+) -> tuple[Interval, SignificanceResult]:
+    """Return the difference of the means, and its significance test."""
+    clusters = sides[0].pairs.clusters
+    resampling = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
     if split is not None:
         values = np.where(split.first, x, y)
-        difference = split_bootstrap(values, split.first, clusters, strata=split.strata, **draws)
-        evidence = significance.split_permutation(
-            values, split.first, clusters, split.strata, plan.resamples, seed=plan.seed
+        return (
+            split_bootstrap(values, split.first, clusters, strata=split.strata, **resampling),
+            significance.split_permutation(
+                values, split.first, clusters, split.strata, plan.resamples, seed=plan.seed
+            ),
         )
-    elif seeds == 1:
-        difference = paired_bootstrap(x, y, clusters, **draws)
-        evidence = _paired_test(plan, metric, x, y, clusters)
-    else:
-        difference, crossed = _seed_difference(plan, metric, sides)
-        p, units = (None, 0) if crossed is None else (crossed.p, crossed.clusters)
-        evidence = SignificanceResult("t", p, units, exact=False)
-    size = {"d": effects.cohens_d(x, y)} if split else asdict(effects.cohens_d_paired(x, y))
-    a, b = (side.interval(plan, metric, included) for side in sides)
-    column = sides[0].tables[0].metric(metric)
-    unit, better = ("", "-") if column is None else (column.unit, column.better)
-    return MetricComparison(
-        metric, unit, better, a, b, difference, size, evidence, None, None, seeds, *undefined
-    )
+    if max(len(side.tables) for side in sides) == 1:
+        difference = paired_bootstrap(x, y, clusters, **resampling)
+        return difference, _paired_test(plan, metric, x, y, clusters)
+    difference, effect = _seed_difference(plan, metric, sides)
+    p, units = (None, 0) if effect is None else (effect.p, effect.clusters)
+    return difference, SignificanceResult("t", p, units, exact=False)
 
 
 def _seed_difference(
     plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side]
 ) -> tuple[Interval, CrossedEffect | None]:
-    """Return a difference whose interval covers other seeds and other recordings."""
+    """Return the difference with an interval over seeds and recordings, and its crossed effect."""
     x, y = (side.by_seed(metric) for side in sides)
     return difference_interval(x, y, sides[0].pairs.clusters, plan.confidence)
 
@@ -234,7 +257,7 @@ def _seed_difference(
 def _paired_test(
     plan: ComparisonPlan, metric: str, x: Values, y: Values, clusters: Sequence[str]
 ) -> SignificanceResult:
-    """Apply McNemar's test to rates in independent pairs; else the plan's test of means, by recordings."""
+    """Apply McNemar's test to rates in independent pairs, otherwise the plan's test of means by recording."""
     _, labels = drop_undefined(x, clusters)
     independent = labels.size == 0 or int(labels.max()) + 1 == labels.size
     values = np.concatenate((x, y))
@@ -246,7 +269,7 @@ def _paired_test(
 
 
 def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split | None) -> Sensitivity | None:
-    """Return the sensitivity of the comparison in the primary metric."""
+    """Return the sensitivity of the comparison in the primary metric; None if the metric does not vary."""
     x, y = (side.values(plan.primary) for side in sides)
     if split is None:
         deviations, labels = drop_undefined(x - y, sides[0].pairs.clusters)
@@ -254,25 +277,25 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
     else:
         residuals = np.where(split.first, x - np.nanmean(x), y - np.nanmean(y))
         deviations, labels = drop_undefined(residuals, sides[0].pairs.clusters)
-        a, b = x[~np.isnan(x)], y[~np.isnan(y)]
-        share = a.size / deviations.size
-        deviation = effects.pooled_deviation(a, b) if deviations.size > 2 else 0.0
+        defined_a, defined_b = x[~np.isnan(x)], y[~np.isnan(y)]
+        share = defined_a.size / deviations.size
+        deviation = effects.pooled_deviation(defined_a, defined_b) if deviations.size > 2 else 0.0
     if deviations.size < 2:
         return None
     inflation = design_effect(deviations, labels)
     smallest = plan.smallest_difference or _SMALL_EFFECT * deviation
     if max(len(side.tables) for side in sides) > 1:
-        crossed = _seed_difference(plan, plan.primary, sides)[1]
-        return _seed_sensitivity(plan, crossed, deviations.size, deviation, inflation, smallest)
+        crossed_effect = _seed_difference(plan, plan.primary, sides)[1]
+        return _seed_sensitivity(plan, crossed_effect, deviations.size, deviation, inflation, smallest)
     if deviation <= effects.ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
         return None
-    effect, n = smallest / deviation, deviations.size / inflation
-    detectable_d = effects.detectable_effect(n, plan.power, plan.confidence, share)
+    effect, effective_n = smallest / deviation, deviations.size / inflation
+    detectable_d = effects.detectable_effect(effective_n, plan.power, plan.confidence, share)
     return Sensitivity(
         deviation=deviation,
         design_effect=inflation,
         smallest=smallest,
-        power=effects.power(effect, n, plan.confidence, share),
+        power=effects.power(effect, effective_n, plan.confidence, share),
         detectable=None if detectable_d is None else detectable_d * deviation,
         needed=math.ceil(inflation * effects.scenarios_needed(effect, plan.power, plan.confidence, share)),
     )
@@ -282,7 +305,7 @@ def _seed_sensitivity(
     plan: ComparisonPlan, effect: CrossedEffect | None, n: int, deviation: float, inflation: float,
     smallest: float,
 ) -> Sensitivity | None:  # fmt: skip
-    """Return the sensitivity of a comparison over seeds, whose variance more scenarios do not reduce."""
+    """Return the sensitivity of a comparison over seeds; more scenarios do not reduce the variance of seeds."""
     if effect is None or effect.error == 0.0:
         return None
     power, needed = effect.power(smallest, plan.confidence), n

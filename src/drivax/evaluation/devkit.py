@@ -1,8 +1,8 @@
 """nuPlan's closed-loop score as its devkit computes it, from stored motions, in float64.
 
-Every function follows one metric of nuplan-devkit 1.2 (``planning/metrics/evaluation_metrics``), quirks included: the
-first sample counts, agents that overlap ego from the start count as collisions, and comfort has no logged past.
-``nuplan_score`` is our own definition of the same score (semantics, Metrics).
+The functions reproduce metrics of nuplan-devkit 1.2 (``planning/metrics/evaluation_metrics``), including their
+quirks: the first sample counts, agents that overlap ego from the start count as collisions, and comfort has no logged
+past. ``nuplan_score`` is our own definition of the same score (semantics, Metrics).
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from drivax.metrics.comfort import (
 )
 from drivax.scenario.schema import DT_S, AgentKind
 
-#: Rear axle to centre of nuPlan's car (Chrysler Pacifica), m.
+#: Distance from rear axle to centre of nuPlan's car (Chrysler Pacifica), m.
 REAR_AXLE_M = 1.461
-#: From the corners of ``geometry.boxes`` to the devkit's order: front left, rear left, rear right, front right.
+#: Corners of ``geometry.boxes`` in the devkit's order: front left, rear left, rear right, front right.
 _DEVKIT_ORDER = (0, 3, 2, 1)
 _STOPPED_MPS, _TTC_STOPPED_MPS = 0.05, 0.005
 _AHEAD_DEG, _BEHIND_DEG = 30.0, 150.0
 _TTC_STEP_S, _TTC_HORIZON_S, _MIN_TTC_S = 0.1, 3.0, 0.95
 _OUTSIDE_M, _OVERSPEED_MPS, _MIN_PROGRESS_M = 0.3, 2.23, 2.0
 _WRONG_WAY_M, _FAR_WRONG_WAY_M, _DIRECTION_S = 2.0, 6.0, 1.0
-#: Largest distance to a connector that ego has just left, and is still assigned to, m.
+#: Largest distance at which ego is still assigned to the connector that it has left, m.
 _MAX_EXIT_M = 5.0
 _EGO_STOPPED, _TRACK_STOPPED, _FRONT, _REAR, _LATERAL = range(5)
 
@@ -125,8 +125,8 @@ class RoadObject:
         block: Its roadblock.
         limit_mps: Speed limit; None if unknown.
         connector: Whether it is a connector.
-        successors: Indices of the objects that follow.
-        predecessors: Indices of the objects before.
+        successors: Indices of the successors.
+        predecessors: Indices of the predecessors.
     """
 
     polygon: Any
@@ -147,7 +147,7 @@ class Road:
 
     Attributes:
         objects: Lanes and connectors.
-        outside_m: Distance of ego's corners outside the drivable area (0 or less inside).
+        outside_m: Distance of ego's corners outside the drivable area (at most 0 inside).
         intersection: Whether points are in an intersection.
     """
 
@@ -157,24 +157,24 @@ class Road:
 
     def containing(self, points: Points) -> Bool[np.ndarray, "n o"]:
         """Return which objects contain each point."""
-        inside = [shapely.contains_xy(each.polygon, points[:, 0], points[:, 1]) for each in self.objects]
+        inside = [shapely.contains_xy(lane.polygon, points[:, 0], points[:, 1]) for lane in self.objects]
         return np.stack(inside, axis=1) if inside else np.zeros((len(points), 0), bool)
 
     @cached_property
     def blocks(self) -> Mapping[int, Any]:
         """Area of each roadblock."""
-        members: dict[int, list[Any]] = {}
-        for each in self.objects:
-            members.setdefault(each.block, []).append(each.polygon)
-        return {block: shapely.unary_union(polygons) for block, polygons in members.items()}
+        polygons: dict[int, list[Any]] = {}
+        for lane in self.objects:
+            polygons.setdefault(lane.block, []).append(lane.polygon)
+        return {block: shapely.unary_union(areas) for block, areas in polygons.items()}
 
 
 @dataclass(frozen=True)
 class Collision:
-    """The first contact with an agent.
+    """First contact with an agent.
 
     Attributes:
-        sample: Its sample.
+        sample: Sample of the contact.
         agent: Index of the agent.
         type: 0 ego stopped, 1 agent stopped, 2 front, 3 rear, 4 lateral.
         at_fault: Whether ego is at fault.
@@ -188,7 +188,7 @@ class Collision:
 
 @dataclass(frozen=True)
 class Comfort:
-    """Filtered series of an episode and their verdicts: ``lon``, ``lat``, ``lonjerk``, ``jerk``, ``yaw``, ``yawacc``.
+    """Filtered series of an episode: ``lon``, ``lat``, ``lonjerk``, ``jerk``, ``yaw``, ``yawacc``.
 
     Attributes:
         series: Values of each sample.
@@ -205,20 +205,20 @@ class DevkitVerdict:
 
     Attributes:
         score: The closed-loop score.
-        fault_score: 1 without at-fault collisions, 0.5 after one with a static object, else 0.
-        drivable: No corner 0.3 m or more outside the drivable area.
+        fault_score: 1 without at-fault collisions, 0.5 after one collision with a static object, else 0.
+        drivable: 1 if no corner is 0.3 m or more outside the drivable area.
         direction: 1, 0.5 or 0: less than 2 m, less than 6 m, or more against traffic within a second.
-        making_progress: Progress ratio of at least 0.2.
-        ttc_ok: Time to collision always at least 0.95 s.
+        making_progress: 1 if the progress ratio is at least 0.2.
+        ttc_ok: 1 if the time to collision is always at least 0.95 s.
         progress: Progress ratio along the expert's route.
         speed: Speed-limit compliance.
-        comfortable: All six series within their limits.
+        comfortable: 1 if all six comfort series are within their limits.
         collisions: First contacts.
         ttc_s: Time to collision of each sample, inf if there is none within 3 s.
-        in_lane: Samples in which all corners are in one lane, or in connected ones.
+        in_lane: Whether all corners are in one lane or in connected lanes, per sample.
         backward_m: Largest distance against traffic within a second, at most 0.
         progress_m: Progress of the expert and of ego.
-        comfort: Comfort in detail.
+        comfort: Comfort series.
     """
 
     score: float
@@ -243,30 +243,30 @@ def devkit_verdict(ego: EgoMotion, tracks: Tracks, road: Road, expert_xy: Points
 
     Args:
         ego: Motion of ego.
-        tracks: Motion of the others in the same samples.
+        tracks: Motion of the other agents in the same samples.
         road: The map.
         expert_xy: Centres of the logged ego.
     """
     in_lane = _in_one_lane(ego, road)
     collisions = _collisions(ego, tracks, in_lane)
     ttc_s = _time_to_collision(ego, tracks, road, in_lane, collisions)
-    driven = _route(road, ego.xy)
-    backward_m = _wrong_way_distance(road, driven, ego)
+    ego_route = _route(road, ego.xy)
+    backward_m = _wrong_way_distance(road, ego_route, ego)
     progress_m = _progress(road, expert_xy, ego.xy)
     comfort = comfort_series(ego)
     terms = {
         "fault_score": _fault_score(collisions, tracks),
-        "drivable": float(_stays_on_road(ego, road, driven)),
-        "direction": 1.0 if -backward_m < _WRONG_WAY_M else 0.5 if -backward_m < _FAR_WRONG_WAY_M else 0.0,
+        "drivable": float(_stays_on_road(ego, road, ego_route)),
+        "direction": _direction_score(-backward_m),
         "ttc_ok": float(ttc_s.min() >= _MIN_TTC_S),
         "progress": 1.0 if progress_m is None else _progress_ratio(*progress_m),
-        "speed": _speed_compliance(road, driven, ego.speed),
+        "speed": _speed_compliance(road, ego_route, ego.speed),
         "comfortable": float(all(comfort.within.values())),
     }
     terms["making_progress"] = float(terms["progress"] >= 0.2)
     term_names = {"progress_ratio": "progress", "speed_compliance": "speed"}
-    weighted = sum(weight * terms[term_names.get(name, name)] for name, weight in NUPLAN_WEIGHTS.items())
-    mean = weighted / sum(NUPLAN_WEIGHTS.values())
+    weighted_sum = sum(weight * terms[term_names.get(name, name)] for name, weight in NUPLAN_WEIGHTS.items())
+    mean = weighted_sum / sum(NUPLAN_WEIGHTS.values())
     gates = ("fault_score", "drivable", "direction", "making_progress")
     return DevkitVerdict(
         score=mean * float(np.prod([terms[name] for name in gates])),
@@ -278,22 +278,23 @@ def devkit_verdict(ego: EgoMotion, tracks: Tracks, road: Road, expert_xy: Points
 def comfort_series(ego: EgoMotion) -> Comfort:
     """Return the six comfort series (``ego_is_comfortable``).
 
-    The acceleration of the centre adds both terms of the yawing frame along the car's axis, so that the lateral one is
-    always 0, and jerk magnitude is of the rear axle; yaw rate and yaw acceleration have windows of 5 samples.
+    As in the devkit, the acceleration of the centre adds both terms of the yawing frame to the longitudinal component,
+    so that the lateral one is always 0. Jerk magnitude is that of the rear axle. The filter windows of yaw rate and yaw
+    acceleration have 5 samples.
     """
     samples = len(ego.heading)
-    along = ego.acceleration + ego.rear_axle_m * (ego.yaw_rate**2 + ego.yaw_acceleration)
 
     def apply_filter(values: Float64[np.ndarray, " t"], window: tuple[int, int, int]) -> Any:
         width, order, derivative = window
         matrix = savgol_matrix(samples, min(width, samples), order, derivative)
         return np.round(matrix @ values / ego.dt_s**derivative, 8)
 
-    heading, smooth = np.unwrap(ego.heading), apply_filter(along, SMOOTH)
+    longitudinal = ego.acceleration + ego.rear_axle_m * (ego.yaw_rate**2 + ego.yaw_acceleration)
+    heading, acceleration = np.unwrap(ego.heading), apply_filter(longitudinal, SMOOTH)
     series = {
-        "lon": smooth,
+        "lon": acceleration,
         "lat": np.zeros(samples),
-        "lonjerk": apply_filter(smooth, JERK),
+        "lonjerk": apply_filter(acceleration, JERK),
         "jerk": apply_filter(apply_filter(np.abs(ego.acceleration), SMOOTH), JERK),
         "yaw": apply_filter(heading, YAW_RATE),
         "yawacc": apply_filter(heading, YAW_ACCELERATION),
@@ -305,6 +306,12 @@ def comfort_series(ego: EgoMotion) -> Comfort:
         for (name, values), (low, high) in zip(series.items(), bounds, strict=True)
     }
     return Comfort(series, within)
+
+
+def _direction_score(backward_m: float) -> float:
+    if backward_m < _WRONG_WAY_M:
+        return 1.0
+    return 0.5 if backward_m < _FAR_WRONG_WAY_M else 0.0
 
 
 def _directions(heading: Any) -> Float64[np.ndarray, "*n 2"]:
@@ -320,7 +327,7 @@ def _boxes(
 def _angle_deg(
     origin: Float64[np.ndarray, " 2"], heading: float, xy: Float64[np.ndarray, "a 2"]
 ) -> Float64[np.ndarray, " a"]:
-    """Return the angle between a heading and the direction from a point to others."""
+    """Return the angle between a heading and the direction from ``origin`` to each point."""
     offset = xy - origin
     distance = np.maximum(np.hypot(*offset.T), 1e-12)
     return np.degrees(np.arccos(np.clip(offset @ _directions(heading) / distance, -1.0, 1.0)))
@@ -330,27 +337,28 @@ def _in_one_lane(ego: EgoMotion, road: Road) -> Bool[np.ndarray, " t"]:
     """Return whether all corners are in one lane, or in lanes that follow each other (``ego_lane_change``)."""
     inside = road.containing(ego.corners[:, _DEVKIT_ORDER].reshape(-1, 2)).reshape(len(ego.xy), 4, -1)
     result, candidates = np.zeros(len(ego.xy), bool), set[int]()
-    for sample, by_corner in enumerate(inside):
-        lanes: list[set[int]] = []
-        for corner in by_corner:
-            known = _candidates(road, corner, candidates)
-            lanes.append(known or _current_objects(road, corner))
+    for sample, inside_by_corner in enumerate(inside):
+        lanes_by_corner: list[set[int]] = []
+        for corner_inside in inside_by_corner:
+            continuing = _candidates(road, corner_inside, candidates)
+            lanes_by_corner.append(continuing or _current_objects(road, corner_inside))
             # As in the devkit: only in the second sample a corner's lanes become candidates of the next corners.
-            candidates |= lanes[-1] if sample == 1 and not known else set()
-        result[sample] = all(lanes) and _common_or_connected(road, lanes)
-        candidates = set().union(*lanes)
+            if sample == 1 and not continuing:
+                candidates |= lanes_by_corner[-1]
+        result[sample] = all(lanes_by_corner) and _common_or_connected(road, lanes_by_corner)
+        candidates = set().union(*lanes_by_corner)
     return result
 
 
 def _current_objects(road: Road, inside: Bool[np.ndarray, " o"]) -> set[int]:
-    """Return the lane of a point, else the connectors (``get_current_route_objects``)."""
+    """Return the lane that contains a point, or else the connectors (``get_current_route_objects``)."""
     containing = np.flatnonzero(inside).tolist()
     lanes = [index for index in containing if not road.objects[index].connector]
     return set(lanes[:1] or containing)
 
 
 def _candidates(road: Road, inside: Bool[np.ndarray, " o"], candidates: set[int]) -> set[int]:
-    """Return the candidates that contain a point, or those that follow a single one."""
+    """Return the candidates that contain a point; if a single candidate does not, its successors that do."""
     matching = {index for index in candidates if inside[index]}
     if not matching and len(candidates) == 1:
         (candidate,) = candidates
@@ -358,24 +366,24 @@ def _candidates(road: Road, inside: Bool[np.ndarray, " o"], candidates: set[int]
     return matching
 
 
-def _common_or_connected(road: Road, by_corner: Sequence[set[int]]) -> bool:
-    if set.intersection(*by_corner):
+def _common_or_connected(road: Road, lanes_by_corner: Sequence[set[int]]) -> bool:
+    """Return whether the corners share a lane, or the lanes of the rear corners continue into those of the front."""
+    if set.intersection(*lanes_by_corner):
         return True
-    front_left, rear_left, rear_right, front_right = (
-        side
-        | {
-            n
-            for index in side
-            for n in (road.objects[index].successors if rear else road.objects[index].predecessors)
-        }
-        for side, rear in zip(by_corner, (False, True, True, False), strict=True)
+    front_left, rear_left, rear_right, front_right = lanes_by_corner
+    before_left, before_right = (
+        lanes.union(*(road.objects[index].predecessors for index in lanes))
+        for lanes in (front_left, front_right)
     )
-    rears = by_corner[1] & rear_right or by_corner[2] & rear_left
-    return bool(rears and front_left & rear_right & front_right & rear_left)
+    after_left, after_right = (
+        lanes.union(*(road.objects[index].successors for index in lanes)) for lanes in (rear_left, rear_right)
+    )
+    rears = rear_left & after_right or rear_right & after_left
+    return bool(rears and before_left & after_right & before_right & after_left)
 
 
 def _collisions(ego: EgoMotion, tracks: Tracks, in_lane: Bool[np.ndarray, " t"]) -> tuple[Collision, ...]:
-    """Return the first contact with every agent and its type (``no_ego_at_fault_collisions``)."""
+    """Return the first contact with each agent, and its type (``no_ego_at_fault_collisions``)."""
     ego_boxes: Any = shapely.polygons(ego.corners)
     boxes: Any = shapely.polygons(tracks.corners)
     touches = shapely.intersects(ego_boxes[:, None], boxes) & tracks.present
@@ -394,17 +402,17 @@ def _collisions(ego: EgoMotion, tracks: Tracks, in_lane: Bool[np.ndarray, " t"])
             kind = _FRONT
         else:
             kind = _LATERAL
-        fault = kind in (_TRACK_STOPPED, _FRONT) or (kind == _LATERAL and not in_lane[sample])
-        collisions.append(Collision(sample, agent, kind, fault))
-    return tuple(sorted(collisions, key=lambda each: each.sample))
+        at_fault = kind in (_TRACK_STOPPED, _FRONT) or (kind == _LATERAL and not in_lane[sample])
+        collisions.append(Collision(sample, agent, kind, at_fault))
+    return tuple(sorted(collisions, key=lambda collision: collision.sample))
 
 
 def _fault_score(collisions: Sequence[Collision], tracks: Tracks) -> float:
-    """Return 1 - n/2 for n at-fault collisions with static objects, 0 after one with a road user."""
-    static = [
-        tracks.kind[each.agent] in (AgentKind.STATIC, AgentKind.OTHER) for each in collisions if each.at_fault
-    ]
-    return max(0.0, 1.0 - sum(static) / 2) if all(static) else 0.0
+    """Return 1 - n/2 for n at-fault collisions with static objects, 0 after an at-fault collision with a road user."""
+    at_fault = [tracks.kind[collision.agent] for collision in collisions if collision.at_fault]
+    if not all(kind in (AgentKind.STATIC, AgentKind.OTHER) for kind in at_fault):
+        return 0.0
+    return max(0.0, 1.0 - len(at_fault) / 2)
 
 
 def _time_to_collision(
@@ -413,80 +421,81 @@ def _time_to_collision(
 ) -> Float64[np.ndarray, " t"]:  # fmt: skip
     """Return the time to collision of every sample at constant velocities (``time_to_collision_within_bound``)."""
     times = np.full(len(ego.xy), np.inf)
-    faults = {each.sample for each in collisions if each.at_fault}
+    fault_samples = {collision.sample for collision in collisions if collision.at_fault}
     first_contact = np.full(len(tracks.kind), len(ego.xy))
-    for each in collisions:
-        first_contact[each.agent] = each.sample
-    any_direction = ~in_lane | road.intersection(ego.rear_axle)
+    for collision in collisions:
+        first_contact[collision.agent] = collision.sample
+    includes_sides = ~in_lane | road.intersection(ego.rear_axle)
     ahead_s = np.arange(_TTC_STEP_S, _TTC_HORIZON_S, _TTC_STEP_S)
     for sample in range(len(ego.xy)):
-        if sample in faults:
+        if sample in fault_samples:
             times[sample] = 0.0
-        elif abs(ego.speed[sample]) > _TTC_STOPPED_MPS:
-            angle = _angle_deg(ego.rear_axle[sample], ego.heading[sample], tracks.xy[sample])
-            relevant = (angle < _AHEAD_DEG) | (any_direction[sample] & (angle <= _BEHIND_DEG))
-            agents = np.flatnonzero(relevant & tracks.present[sample] & (first_contact > sample))
-            ego_boxes = _sweep(ego.corners[sample], ego.heading[sample], abs(ego.speed[sample]), ahead_s)
-            others = _sweep(
-                tracks.corners[sample, agents],
-                tracks.heading[sample, agents],
-                tracks.speed[sample, agents],
-                ahead_s,
-            )
-            overlaps = (
-                shapely.intersects(ego_boxes, others).any(axis=0)
-                if len(agents)
-                else np.zeros(len(ahead_s), bool)
-            )
-            if overlaps.any():
-                times[sample] = ahead_s[overlaps.argmax()]
+            continue
+        angle = _angle_deg(ego.rear_axle[sample], ego.heading[sample], tracks.xy[sample])
+        relevant = (angle < _AHEAD_DEG) | (includes_sides[sample] & (angle <= _BEHIND_DEG))
+        agents = np.flatnonzero(relevant & tracks.present[sample] & (first_contact > sample))
+        if not len(agents) or abs(ego.speed[sample]) <= _TTC_STOPPED_MPS:
+            continue
+        ego_boxes = _sweep(ego.corners[sample], ego.heading[sample], abs(ego.speed[sample]), ahead_s)
+        motion = (values[sample, agents] for values in (tracks.corners, tracks.heading, tracks.speed))
+        overlaps = shapely.intersects(ego_boxes, _sweep(*motion, ahead_s)).any(axis=0)
+        if overlaps.any():
+            times[sample] = ahead_s[overlaps.argmax()]
     return times
 
 
 def _sweep(
     boxes: Float64[np.ndarray, "*a 4 2"], heading: Any, speed: Any, times: Float64[np.ndarray, " k"]
 ) -> Any:
-    """Return the boxes moved along their headings to every time."""
+    """Return the boxes at every time, moved along their headings at constant speed."""
     direction = _directions(heading) * np.asarray(speed)[..., None]
     return shapely.polygons(boxes[..., None, :, :] + times[:, None, None] * direction[..., None, None, :])
 
 
-def _stays_on_road(ego: EgoMotion, road: Road, driven: Sequence[Sequence[int]]) -> bool:
-    """Return whether all corners are less than 0.3 m outside (``drivable_area_compliance``).
+def _stays_on_road(ego: EgoMotion, road: Road, route: Sequence[Sequence[int]]) -> bool:
+    """Return whether all corners are less than 0.3 m outside the drivable area (``drivable_area_compliance``).
 
-    Corners in a lane, or within 0.3 m of a lane of ego's centre, count as inside.
+    A corner in a lane, or within 0.3 m of a lane of ego's centre, counts as inside.
     """
     for sample, corner in np.argwhere(road.outside_m(ego) >= _OUTSIDE_M):
         if road.containing(ego.corners[sample, corner][None]).any():
             continue
         point = shapely.points(ego.corners[sample, corner])
-        lanes = [road.objects[index].polygon for index in driven[sample]]
+        lanes = [road.objects[index].polygon for index in route[sample]]
         if not any(shapely.distance(lane, point) < _OUTSIDE_M for lane in lanes):
             return False
     return True
 
 
 def _route(road: Road, points: Points) -> list[list[int]]:
-    """Return the lane or the connectors of each point, with its history (``get_route``)."""
-    containing, crossing = road.containing(points), road.intersection(points)
+    """Return the lane or connectors of each point, given the points before it (``get_route``)."""
+    containing, in_intersection = road.containing(points), road.intersection(points)
     route: list[list[int]] = []
     current: list[int] = []
-    for sample, inside_objects in enumerate(containing):
-        current = sorted(_candidates(road, inside_objects, set(current))) if current else []
+    for sample, inside in enumerate(containing):
+        current = sorted(_candidates(road, inside, set(current))) if current else []
         if not current:
-            current = sorted(_current_objects(road, inside_objects))
-            connects = bool(current) and road.objects[current[0]].connector
+            current = sorted(_current_objects(road, inside))
+            on_connector = bool(current) and road.objects[current[0]].connector
             last = route[-1] if sample > 1 else []
-            if last and road.objects[last[0]].connector and (connects or (not current and crossing[sample])):
+            if (
+                last
+                and road.objects[last[0]].connector
+                and (on_connector or (not current and in_intersection[sample]))
+            ):
                 point = shapely.points(points[sample])
-                near = [n for n in last if shapely.distance(road.objects[n].polygon, point) < _MAX_EXIT_M]
-                current = near or current
+                nearby = [
+                    index
+                    for index in last
+                    if shapely.distance(road.objects[index].polygon, point) < _MAX_EXIT_M
+                ]
+                current = nearby or current
         route.append(current)
     return _drop_extra_connectors(road, route)
 
 
 def _drop_extra_connectors(road: Road, route: list[list[int]]) -> list[list[int]]:
-    """Keep, of overlapping connectors, those that the route continues on."""
+    """Keep only those of overlapping connectors on which the route continues."""
     result = list(route)
     for sample in range(len(result) - 2, -1, -1):
         objects, next_objects = result[sample], result[sample + 1]
@@ -500,11 +509,11 @@ def _drop_extra_connectors(road: Road, route: list[list[int]]) -> list[list[int]
     return result
 
 
-def _wrong_way_distance(road: Road, driven: Sequence[Sequence[int]], ego: EgoMotion) -> float:
-    """Return the largest distance against traffic within a second (``driving_direction_compliance``), at most 0."""
+def _wrong_way_distance(road: Road, route: Sequence[Sequence[int]], ego: EgoMotion) -> float:
+    """Return minus the largest distance against traffic in a second (``driving_direction_compliance``)."""
     progress = np.zeros(len(ego.xy))
-    last_object, last_position = (driven[0][0] if driven[0] else None), None
-    for sample, objects in enumerate(driven):
+    last_object, last_position = (route[0][0] if route[0] else None), None
+    for sample, objects in enumerate(route):
         if not objects:
             continue
         if objects[0] == last_object:
@@ -524,7 +533,7 @@ def _locate(line: Any, point: Float64[np.ndarray, " 2"]) -> float:
 
 
 def _progress(road: Road, expert_xy: Points, ego_xy: Points) -> tuple[float, float] | None:
-    """Return the progress of expert and ego along the expert's roadblocks; None without a route."""
+    """Return the progress of expert and ego along the expert's roadblocks; None if the expert has no route."""
     blocks: list[tuple[int, Any]] = []
     for objects in _route(road, expert_xy):
         if objects and (not blocks or road.objects[objects[0]].block != blocks[-1][0]):
@@ -534,27 +543,31 @@ def _progress(road: Road, expert_xy: Points, ego_xy: Points) -> tuple[float, flo
     return _block_progress(road, blocks, expert_xy), _block_progress(road, blocks, ego_xy)
 
 
-def _block_progress(road: Road, pairs: Sequence[tuple[int, Any]], points: Points) -> float:
-    """Return the progress along the base lines of a chain of roadblocks (``ego_progress_along_expert_route``)."""
-    index, total = 0, 0.0
-    last_m = _locate(pairs[0][1], points[0])
+def _block_progress(road: Road, blocks: Sequence[tuple[int, Any]], points: Points) -> float:
+    """Return the progress along a chain of roadblocks and their centre lines (``ego_progress_along_expert_route``)."""
+    current, total = 0, 0.0
+    last_m = _locate(blocks[0][1], points[0])
     for x, y in points[1:]:
-        after = index
-        skipped = 0.0
-        while after < len(pairs) and not shapely.contains_xy(road.blocks[pairs[after][0]], x, y):
-            after += 1
-            if index + 1 < after < len(pairs):
-                line, previous, following = (pairs[number][1] for number in (after - 1, after - 2, after))
-                skipped += _locate(line, _end(following, 0)) - _locate(line, _end(previous, -1))
-        if after == len(pairs):
+        candidate, skipped_m = current, 0.0
+        while candidate < len(blocks) and not shapely.contains_xy(road.blocks[blocks[candidate][0]], x, y):
+            candidate += 1
+            if current + 1 < candidate < len(blocks):
+                previous, skipped_line, next_line = (
+                    line for _, line in blocks[candidate - 2 : candidate + 1]
+                )
+                skipped_m += _locate(skipped_line, _end(next_line, 0)) - _locate(
+                    skipped_line, _end(previous, -1)
+                )
+        if candidate == len(blocks):
             continue
-        here_m = _locate(pairs[after][1], np.array([x, y]))
-        if after == index:
-            total += here_m - last_m
+        line, last_line = blocks[candidate][1], blocks[current][1]
+        position_m = _locate(line, np.array([x, y]))
+        if candidate == current:
+            total += position_m - last_m
         else:
-            rest_m = shapely.length(pairs[index][1]) - last_m
-            total += rest_m + skipped + here_m - _locate(pairs[after][1], _end(pairs[index][1], -1))
-        index, last_m = after, here_m
+            rest_m = shapely.length(last_line) - last_m
+            total += rest_m + skipped_m + position_m - _locate(line, _end(last_line, -1))
+        current, last_m = candidate, position_m
     return float(total)
 
 
@@ -568,17 +581,19 @@ def _progress_ratio(expert_m: float, ego_m: float) -> float:
     return min(1.0, max(ego_m, _MIN_PROGRESS_M) / max(expert_m, _MIN_PROGRESS_M))
 
 
-def _speed_compliance(road: Road, driven: Sequence[Sequence[int]], speed: Float64[np.ndarray, " t"]) -> float:
-    """Return 1 less the mean speeding over 2.23 m/s (``speed_limit_compliance``).
+def _speed_compliance(road: Road, route: Sequence[Sequence[int]], speed: Float64[np.ndarray, " t"]) -> float:
+    """Return 1 minus the mean speeding over 2.23 m/s, at least 0 (``speed_limit_compliance``).
 
-    A connector has the highest limit of the lanes that it joins; samples without a lane, or where a limit is unknown,
-    count as 0.
+    The limit of a connector is the highest limit of the lanes that it joins. Speeding is 0 in samples without a lane or
+    with an unknown limit.
     """
     speeding = np.zeros(len(speed))
-    for sample, objects in enumerate(driven):
+    for sample, objects in enumerate(route):
         lanes = [road.objects[index] for index in objects]
         if lanes and lanes[0].connector:
-            lanes = [road.objects[n] for each in lanes for n in (*each.successors, *each.predecessors)]
+            lanes = [
+                road.objects[index] for lane in lanes for index in (*lane.successors, *lane.predecessors)
+            ]
         limits = [lane.limit_mps for lane in lanes]
         if limits and all(limits):
             speeding[sample] = max(0.0, speed[sample] - max(limit for limit in limits if limit))

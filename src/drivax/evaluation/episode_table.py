@@ -1,4 +1,4 @@
-"""Episodes of an evaluation with metrics, trajectories and crashes, in memory or in a run folder."""
+"""Episodes of an evaluation: metrics, trajectories and crashes, in memory or in a run folder."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate
 from drivax.tracking.run_folder import RunFolder, existing
 
-#: Columns of ``episodes.csv`` before the metrics.
+#: Key columns of ``episodes.csv``, before the metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
 #: Columns that an evaluation adds to the metrics.
 _CRASHED = "the planner raised an error, or its action was not finite: a failed episode"
@@ -33,15 +33,14 @@ ADDED = {
     "crashed": Column("-", "low", _CRASHED, kind="rate"), "action_jerk": Column("-", "low", _ACTION_JERK)
 }  # fmt: skip
 _COLUMNS: dict[str, Column] = {**METRICS, **ADDED}
-#: Columns of zeros and ones: their interval is Wilson's.
+#: Columns of zeros and ones, which have Wilson intervals.
 RATES = names_of(_COLUMNS, "rate")
-#: Columns that lie between 0 and 1.
+#: Columns with values between 0 and 1.
 SHARES = names_of(_COLUMNS, "rate", "score")
 #: Columns without a mean.
 NOT_SUMMARISED = tuple(name for name, column in _COLUMNS.items() if not column.summarised)
-#: Columns that are 0 in an episode in which the planner crashed.
+#: Columns that are 0 if the planner crashed.
 FAILED = tuple(name for name, column in _COLUMNS.items() if column.fails_on_crash)
-#: Cure for a damaged run folder.
 _RERUN = "run drivax evaluate again"
 
 Array = np.ndarray[Any, Any]
@@ -53,7 +52,7 @@ Tags = Mapping[ScenarioKey, Mapping[str, str]]
 
 @dataclass(frozen=True)
 class Crash:
-    """An episode whose planner crashed: the first such step of the log, and the error in one line."""
+    """Crash of a planner in one episode: the first step of the log at which it occurred, and the error."""
 
     dataset: str
     scenario_id: str
@@ -63,15 +62,15 @@ class Crash:
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Trajectories of ego and traffic, one row per episode, in each scenario's local frame.
+    """Trajectories of ego and traffic in each scenario's local frame, one episode per row.
 
     Attributes:
-        ego: x, y [m], heading [rad], speed [m/s] at every step from ``start`` on; repeated beyond a short log.
-        action: Executed action at every step from ``start`` on, NaN after a crash and beyond a short log; no columns
-            where unknown.
-        start: Step of the log at which the planner took over.
+        ego: x, y [m], heading [rad], speed [m/s] from step ``start`` on; repeated after the end of a short log.
+        action: Executed actions from step ``start`` on, NaN after a crash and after the end of a short log; without
+            columns if unknown.
+        start: Step of the log at which the planner takes over.
         events: Step of the first event by name (:data:`EVENTS`), -1 for none.
-        others: Packed poses of the other agents (``evaluation.rollout.pack_poses``); None where they replayed the log.
+        others: Packed poses of the other agents (``evaluation.rollout.pack_poses``); None in log traffic.
     """
 
     ego: Float32[Array, "episode step 4"]
@@ -89,9 +88,9 @@ class EpisodeTable:
         folder, info: Run folder (None for episodes in memory), and content of ``run.json``.
         name: Planner name in tables.
         keys: Columns :data:`KEYS` as text.
-        metrics: Values by metric name, NaN where undefined.
-        crashes: Episodes whose planner crashed.
-        in_memory: Trajectories of an evaluation that has just run.
+        metrics: Values by metric name, NaN if undefined.
+        crashes: Crashes of the planner.
+        in_memory: Trajectories of an evaluation that was not read from a folder.
     """
 
     folder: Path | None
@@ -124,7 +123,7 @@ class EpisodeTable:
 
     @classmethod
     def read_seeds(cls, path: str | Path) -> tuple[EpisodeTable, ...]:
-        """Read the evaluation in a folder, or those in its sub-folders: one per training seed, ordered by name."""
+        """Read the evaluation in a folder, or those in its sub-folders (one per training seed), ordered by name."""
         path = Path(path)
         folders = sorted(file.parent for file in path.glob("*/episodes.csv"))
         if (path / "run.json").is_file() or not folders:
@@ -143,37 +142,39 @@ class EpisodeTable:
 
     @property
     def own_metrics(self) -> Mapping[str, Column]:
-        """Unit, direction and text of user-defined metrics."""
-        info = (self.info.get("own_metrics") or {}).items()
-        texts = {name: [str(metric[key]) for key in ("unit", "better", "text")] for name, metric in info}
-        return {
-            name: Column(unit, cast(Direction, better), text) for name, (unit, better, text) in texts.items()
-        }
+        """Unit, direction and definition of user-defined metrics."""
+        columns = {}
+        for name, metric in (self.info.get("own_metrics") or {}).items():
+            unit, better, definition = (str(metric[key]) for key in ("unit", "better", "text"))
+            columns[name] = Column(unit, cast(Direction, better), definition)
+        return columns
 
     @property
     def data(self) -> Mapping[str, Any]:
-        """Path, hash and name of the scenario set, as far as they are known."""
+        """Path, hash and name of the scenario set, if known."""
         data = self.info.get("data") or {}
-        return data[0] if isinstance(data, list) and data else data if isinstance(data, dict) else {}
+        if isinstance(data, list):
+            return data[0] if data else {}
+        return data if isinstance(data, dict) else {}
 
     @cached_property
     def settings(self) -> Mapping[str, Any]:
-        """Content of ``config.yaml``; empty without one."""
+        """Content of ``config.yaml``; empty if there is none."""
         return {} if self.folder is None else RunFolder(self.folder, dict(self.info)).settings
 
     @property
     def scenarios(self) -> list[ScenarioKey]:
-        """The scenario of every episode."""
+        """Scenario of every episode."""
         return list(zip(self.keys["dataset"], self.keys["scenario_id"], strict=True))
 
     @property
     def clusters(self) -> list[str]:
-        """Cluster of every episode: its segment, or its scenario where no segment is known."""
+        """Cluster of every episode: its segment, or its scenario if the segment is unknown."""
         return recordings(*(self.keys[name] for name in ("dataset", "segment", "scenario_id")))
 
     @property
     def crash_by_scenario(self) -> dict[ScenarioKey, Crash]:
-        """The crash of each scenario whose planner crashed."""
+        """Crash by scenario."""
         return {(crash.dataset, crash.scenario_id): crash for crash in self.crashes}
 
     @cached_property
@@ -191,33 +192,32 @@ class EpisodeTable:
         return _read_trajectories(path, self.keys["scenario_id"], self.traffic == "log")
 
     def metric(self, name: str) -> Column | None:
-        """Unit and direction of a metric; None where unknown."""
+        """Return the description of a metric, or None if it is unknown."""
         return METRICS.get(name) or ADDED.get(name) or self.own_metrics.get(name)
 
     def by_scenario(self, metric: str) -> dict[ScenarioKey, float]:
-        """Mean of a metric per scenario over its defined episodes; NaN where there is none."""
+        """Return the mean of a metric over the defined episodes of each scenario; NaN if there are none."""
         column = self.metrics.get(metric, np.full(len(self), np.nan))
-        defined: dict[ScenarioKey, list[float]] = {key: [] for key in self.scenarios}
+        defined_values: dict[ScenarioKey, list[float]] = {key: [] for key in self.scenarios}
         for key, value in zip(self.scenarios, column.tolist(), strict=True):
             if not math.isnan(value):
-                defined[key].append(value)
-        return {key: float(np.mean(values)) if values else math.nan for key, values in defined.items()}
+                defined_values[key].append(value)
+        return {key: float(np.mean(values)) if values else math.nan for key, values in defined_values.items()}
 
     def summary(self) -> dict[str, Any]:
         """Return mean and 95 % interval of every metric (:func:`interval_of`), the content of ``summary.json``.
 
-        A metric without any defined value has mean null and n 0.
+        A metric without defined values has mean null and n 0.
         """
         clusters = np.array(self.clusters)
-        summarised = {name: values for name, values in self.metrics.items() if name not in NOT_SUMMARISED}
-        table = {name: interval_of(name, values, clusters).as_dict() for name, values in summarised.items()}
+        columns = {name: values for name, values in self.metrics.items() if name not in NOT_SUMMARISED}
+        table = {name: interval_of(name, values, clusters).as_dict() for name, values in columns.items()}
         return {"planner": self.planner, "traffic": self.traffic, "metrics": table}
 
     def rows(self) -> list[dict[str, str]]:
         """Return the rows of ``episodes.csv``: undefined metrics are empty cells, booleans 0 or 1."""
-        columns = {name: self.keys[name] for name in KEYS} | {
-            name: [_cell(value) for value in values] for name, values in self.metrics.items()
-        }
+        columns = {name: self.keys[name] for name in KEYS}
+        columns |= {name: tuple(map(_cell, values)) for name, values in self.metrics.items()}
         return [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
 
     def write(self, folder: Path) -> None:
@@ -245,10 +245,10 @@ class EpisodeTable:
         )
 
     def open_set(self, data: Path | None = None) -> ScenarioSet:
-        """Open the scenario set that was evaluated; ``data`` is its path if it has moved.
+        """Open the scenario set of this evaluation; ``data`` is its path if it has moved.
 
         Raises:
-            DataError: The set is missing, or has another hash.
+            DataError: The set is missing, or its hash differs.
         """
         run_path = self.data.get("path")
         if data is None and run_path is None:
@@ -258,29 +258,30 @@ class EpisodeTable:
         if data is None and not path.exists():
             cure = "pass its new path with --data SET"
             raise DataError("scenario set of this run not found", file=path, cure=cure)
-        scenarios, expected = ScenarioSet.open(path), str(self.data.get("hash") or "")
-        if expected and scenarios.hash != expected:
-            hashes = f"hash {scenarios.hash[:12]}, not {expected[:12]}"
+        scenarios, expected_hash = ScenarioSet.open(path), str(self.data.get("hash") or "")
+        if expected_hash and scenarios.hash != expected_hash:
+            hashes = f"hash {scenarios.hash[:12]}, not {expected_hash[:12]}"
             problem = f"not the set that {self.name!r} was evaluated on ({hashes})"
             raise DataError(problem, file=path, cure="pass the set that was evaluated with --data SET")
         return scenarios
 
 
-def fail_crashed(metrics: Mapping[str, Array], crashed: Any) -> dict[str, Array]:
-    """Set the metrics :data:`FAILED` of crashed episodes to 0 where defined, and add the column ``crashed``.
+def fail_crashed(metrics: Mapping[str, Array], has_crashed: Any) -> dict[str, Array]:
+    """Set the metrics :data:`FAILED` of crashed episodes to 0 if defined, and add the column ``crashed``.
 
-    A crash thus never improves a score. Other metrics cover the steps before the crash; user-defined ones come last.
+    A crash thus never improves a score. Other metrics cover the steps before the crash. User-defined metrics come
+    last.
     """
     values = {
-        name: np.where(crashed & ~np.isnan(column), 0.0, column) if name in FAILED else column
+        name: np.where(has_crashed & ~np.isnan(column), 0.0, column) if name in FAILED else column
         for name, column in metrics.items()
     }
     built_in = {name: column for name, column in values.items() if name in METRICS}
-    return built_in | {"crashed": np.asarray(crashed, np.float64)} | values
+    return built_in | {"crashed": np.asarray(has_crashed, np.float64)} | values
 
 
 def interval_of(name: str, values: Any, clusters: Any, confidence: float = 0.95, seed: int = 0) -> Interval:
-    """Return mean and interval over the episodes that define the metric: Wilson's for rates, else a bootstrap."""
+    """Return the mean of a metric over its defined episodes, with a Wilson interval for rates, else a bootstrap."""
     if name in RATES:
         return rate(values, clusters, confidence)
     return bootstrap_mean(values, clusters, confidence, seed=seed)
@@ -293,7 +294,7 @@ def _cell(value: Any) -> str:
 
 
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
-    """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN where undefined."""
+    """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
     with existing(path, _RERUN).open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     header = rows[0] if rows else []
@@ -312,7 +313,7 @@ def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Arr
 
 
 def _read_metric(path: Path, name: str, cells: Sequence[str]) -> Array:
-    """Parse the cells of a metric as float64; empty cells are NaN (undefined), all others must be finite."""
+    """Parse the cells of a metric as float64; empty cells are undefined (NaN), all others must be finite."""
     values = np.full(len(cells), np.nan)
     for row, cell in enumerate(cells):
         if not cell.strip():
@@ -329,47 +330,57 @@ def _read_metric(path: Path, name: str, cells: Sequence[str]) -> Array:
 
 
 def _read_crashes(path: Path) -> tuple[Crash, ...]:
-    """Read ``crashes.json``, which only exists after crashes."""
+    """Read ``crashes.json``, which exists only after crashes."""
     if not path.is_file():
         return ()
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
-        return tuple(Crash(r["dataset"], r["scenario_id"], int(r["step"]), str(r["error"])) for r in rows)
+        return tuple(
+            Crash(row["dataset"], row["scenario_id"], int(row["step"]), str(row["error"])) for row in rows
+        )
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
 
 
 def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: bool) -> Trajectories:
-    """Read ``trajectories.npz`` in the order of ``scenario_ids``; repeated ids are matched in order."""
+    """Read ``trajectories.npz`` in the order of ``scenario_ids``; repeated ids are matched by their order."""
     try:
-        with existing(path, _RERUN).open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            ids = [_text(value) for value in stored["scenario_id"]]
-            ego = stored["ego"].astype(np.float32)
-            action = (stored["action"] if "action" in stored else ego[:, 1:, :0]).astype(np.float32)
-            start = stored["start"].astype(np.int64)
-            events = {name: stored[f"{name}_step"].astype(np.int64) for name in EVENTS}
-            others = None if log_traffic else stored["others"]
+        with existing(path, _RERUN).open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            ids = [_text(value) for value in archive["scenario_id"]]
+            ego = archive["ego"].astype(np.float32)
+            action = (archive["action"] if "action" in archive else ego[:, 1:, :0]).astype(np.float32)
+            start = archive["start"].astype(np.int64)
+            events = {name: archive[f"{name}_step"].astype(np.int64) for name in EVENTS}
+            others = None if log_traffic else archive["others"]
     except KeyError as error:
         raise DataError(f"lacks an array: {error.args[0]}", file=path, cure=_RERUN) from error
     except (ValueError, IndexError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
-    n = len(ids)
-    if ego.ndim != 3 or ego.shape[::2] != (n, 4) or action.shape[:-1] != (n, ego.shape[1] - 1) or any(
-        array.shape != (n,) for array in (start, *events.values())
-    ) or (others is not None and (
-        others.ndim != 4 or others.shape[:2] != ego.shape[:2] or others.shape[3] != 3 or others.dtype != np.int16
-    )):  # fmt: skip
+    trajectories = Trajectories(ego, action, start, events, others)
+    if not _has_consistent_shapes(trajectories, len(ids)):
         raise DataError("its arrays disagree in shape", file=path, cure=_RERUN)
     row_of = {key: row for row, key in enumerate(_with_occurrence(ids))}
     try:
         rows = [row_of[key] for key in _with_occurrence(scenario_ids)]
     except KeyError as error:
         raise DataError("lacks an episode", file=path, record=error.args[0][0], cure=_RERUN) from None
-    order = slice(None) if rows == list(range(n)) else rows
-    events = {name: steps[order] for name, steps in events.items()}
+    if rows == list(range(len(ids))):
+        return trajectories
+    events = {name: steps[rows] for name, steps in events.items()}
     return Trajectories(
-        ego[order], action[order], start[order], events, None if others is None else others[order]
+        ego[rows], action[rows], start[rows], events, None if others is None else others[rows]
     )
+
+
+def _has_consistent_shapes(trajectories: Trajectories, episodes: int) -> bool:
+    ego, action, others = trajectories.ego, trajectories.action, trajectories.others
+    if ego.ndim != 3 or ego.shape[::2] != (episodes, 4) or action.shape[:-1] != (episodes, ego.shape[1] - 1):
+        return False
+    if any(steps.shape != (episodes,) for steps in (trajectories.start, *trajectories.events.values())):
+        return False
+    return others is None or (
+        others.ndim == 4 and others.shape[:2] == ego.shape[:2] and others.shape[3] == 3 and others.dtype == np.int16
+    )  # fmt: skip
 
 
 def _with_occurrence(ids: Sequence[str]) -> list[tuple[str, int]]:

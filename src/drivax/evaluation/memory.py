@@ -14,48 +14,49 @@ from drivax.errors import DrivaxError
 
 #: Maximum number of scenarios loaded at a time; their bank takes about 6 GB.
 MOST = 10_000
-#: Bytes that a program may need per scenario; PDM-Closed needs half (docs/log/2026-11-22-evaluation.md).
+#: Bytes reserved per scenario of a program call; PDM-Closed needs half (docs/log/2026-11-22-evaluation.md).
 _PROGRAM_BYTES = 8_000_000
-#: Files of a control group (of a container or a job): its limit, and its use.
+#: Limit and usage files of a control group (a container or a job), version 2 and version 1.
 _GROUP_FILES = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
-_GROUPS, _OUR_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-_MACHINE = Path("/proc/meminfo")
+_GROUPS, _PROCESS_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+_MEMORY_INFO = Path("/proc/meminfo")
 
 
 def memory_of(device: Any, share: int = 1) -> int | None:
-    """Return the bytes available on a device; on a CPU the memory of machine or container, over ``share``."""
+    """Return the memory of a device in bytes; of a CPU, the memory of the machine or container over ``share``."""
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return int(stats["bytes_limit"])
     if device.platform != "cpu":
         return None
-    whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return min([whole, *(limit for limit, _ in _group_limits())]) // share
+    total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min([total, *(limit for limit, _ in _group_limits())]) // share
 
 
 def free_memory(device: Any) -> int | None:
-    """Return the free bytes of a device, None where unknown; the page cache of Linux counts as free."""
+    """Return the free bytes of a device, or None if unknown; the page cache of Linux counts as free."""
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))
     if device.platform != "cpu":
         return None
     free = []
-    if _MACHINE.is_file():
-        free.append(1024 * _table(_MACHINE)["MemAvailable:"])
-    free += [limit - used for limit, used in _group_limits()]
+    if _MEMORY_INFO.is_file():
+        free.append(1024 * _read_numbers(_MEMORY_INFO)["MemAvailable:"])
+    free += [limit - usage for limit, usage in _group_limits()]
     return max(min(free), 0) if free else memory_of(device)
 
 
 def scenarios_at_a_time(scenario_bytes: int, lanes: int, free: int | None) -> int:
-    """Return the number of scenarios that fit in half of the free memory, at least those of one program call (lanes).
+    """Return the number of scenarios that fit in half of the free memory, at least ``lanes``.
 
-    A scenario exists twice while a bank is made. Free bytes are None where unknown.
+    ``lanes`` is the number of scenarios of a program call. A scenario exists twice while its bank is built. ``free``
+    is in bytes, or None if unknown.
     """
     if free is None:
         return MOST
-    room = free // 2 - lanes * _PROGRAM_BYTES
-    return int(min(max(room // (2 * scenario_bytes), lanes), MOST))
+    available = free // 2 - lanes * _PROGRAM_BYTES
+    return int(min(max(available // (2 * scenario_bytes), lanes), MOST))
 
 
 @contextmanager
@@ -70,32 +71,35 @@ def report_out_of_memory(count: int) -> Iterator[None]:
         raise DrivaxError(f"out of memory with {count:,} scenarios loaded", cure=cure) from error
 
 
-def _group_limits(groups: Path = _GROUPS, ours: Path = _OUR_GROUPS) -> list[tuple[int, int]]:
-    """Return limit and use (bytes, without the page cache) of every control group of this process that has a limit.
+def _group_limits(groups: Path = _GROUPS, process: Path = _PROCESS_GROUPS) -> list[tuple[int, int]]:
+    """Return limit and usage (bytes, without the page cache) of every limited control group of this process.
 
-    The file ``ours`` names them as ``hierarchy:controllers:path`` (cgroups(7)), ``groups`` is their folder.
+    The file ``process`` lists them as ``hierarchy:controllers:path`` (cgroups(7)) below the folder ``groups``.
     """
     limits = []
-    rows = ours.read_text(encoding="utf-8").splitlines() if ours.is_file() else []
-    for _, controllers, path in (row.split(":", 2) for row in rows):
+    lines = process.read_text(encoding="utf-8").splitlines() if process.is_file() else []
+    for _, controllers, path in (line.split(":", 2) for line in lines):
         if controllers and "memory" not in controllers.split(","):
             continue
         root = groups / "memory" if controllers else groups
-        # In a container our own group may be mounted as the root.
+        # In a container, the container's own group may be mounted as the root.
         folder = root / path.strip("/")
         for group in {folder, *folder.parents} - {*groups.parents} - ({groups} if controllers else set()):
-            for limit_file, used_file in _GROUP_FILES:
-                limit, used = (_number(group / file) for file in (limit_file, used_file))
-                if limit is not None and used is not None:
-                    statistics = group / "memory.stat"
-                    kept = _table(statistics) if statistics.is_file() else {}
-                    files = kept.get("active_file", 0) + kept.get("inactive_file", 0)
-                    limits.append((limit, max(used - files, 0)))
+            for limit_file, usage_file in _GROUP_FILES:
+                limit, usage = (_read_number(group / file) for file in (limit_file, usage_file))
+                if limit is not None and usage is not None:
+                    limits.append((limit, max(usage - _page_cache(group), 0)))
     return limits
 
 
-def _number(file: Path) -> int | None:
-    """Return the number in a file; None where it cannot be read or holds none ("max")."""
+def _page_cache(group: Path) -> int:
+    statistics = group / "memory.stat"
+    numbers = _read_numbers(statistics) if statistics.is_file() else {}
+    return numbers.get("active_file", 0) + numbers.get("inactive_file", 0)
+
+
+def _read_number(file: Path) -> int | None:
+    """Return the number in a file, or None if the file is unreadable or not a number ("max")."""
     try:
         text = file.read_text(encoding="ascii").strip()
     except OSError:
@@ -103,7 +107,7 @@ def _number(file: Path) -> int | None:
     return int(text) if text.isdecimal() else None
 
 
-def _table(file: Path) -> dict[str, int]:
-    """Return names and numbers of a file with both in every line."""
-    rows = (line.split() for line in file.read_text(encoding="ascii").splitlines())
-    return {row[0]: int(row[1]) for row in rows if len(row) > 1 and row[1].isdecimal()}
+def _read_numbers(file: Path) -> dict[str, int]:
+    """Return the numbers of a file by name; a line is a name and its number."""
+    lines = (line.split() for line in file.read_text(encoding="ascii").splitlines())
+    return {words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdecimal()}

@@ -1,7 +1,8 @@
 """Statistics of observation features, their correlation with collisions, and their importance to a policy.
 
-States of closed-loop episodes are sampled ``every`` steps. Of each column of each group: mean, standard deviation and
-extremes over all valid rows, entries that are not finite, correlation with collisions, and importance to the planner.
+States of closed-loop episodes are sampled ``every`` steps. The statistics of a column are its mean, standard deviation
+and extremes over all valid rows, its non-finite entries, its correlation with collisions, and its importance to the
+planner.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.features import Features, feature_names
 from drivax.tasks.task import Task
 
-#: Steps between two sampled states, scenarios per program call, and states on which features are permuted.
+#: Steps between sampled states, scenarios per program call, and states whose features are permuted.
 EVERY, BATCH, PERMUTED = 10, 64, 512
 Values = np.ndarray[Any, Any]
 
@@ -38,8 +39,8 @@ Values = np.ndarray[Any, Any]
 class SampledStates:
     """Sampled states of episodes, ``[episode, sample]``, with the planner's carry, random key and observation.
 
-    ``hit``: ego has collided by then; ``collides``: it collides before the end of the log, ``[episode]``. Beyond the
-    end of a short log its last state is repeated.
+    ``hit`` marks states after ego's first collision, ``collides`` episodes with a collision, ``[episode]``. The last
+    state of a short log is repeated after its end.
     """
 
     state: SimState
@@ -52,11 +53,11 @@ class SampledStates:
 
 @dataclass(frozen=True)
 class FeatureStatistics:
-    """Statistics of one column of one group; NaN where undefined.
+    """Statistics of one column of one group; NaN if undefined.
 
     Attributes:
-        count: Finite entries of valid rows, which ``mean``, ``std``, ``low`` and ``high`` are of.
-        broken: Entries that are NaN or infinite, of masked rows too.
+        count: Finite entries of valid rows, from which ``mean``, ``std``, ``low`` and ``high`` are computed.
+        broken: NaN or infinite entries, including those of masked rows.
         collision: Correlation with collisions (:func:`collision_correlation`).
         importance: Change of the planner's action when the column is permuted (:func:`importances`).
     """
@@ -75,14 +76,14 @@ class FeatureStatistics:
 
 @dataclass(frozen=True)
 class ObservationStatistics:
-    """Statistics of all columns, group by group.
+    """Statistics of all columns, ordered by group.
 
     Attributes:
         planner: Name of the planner.
-        episodes, collisions: Numbers of episodes, and of those with a collision.
-        states, permuted: Numbers of sampled states, and of those on which features were permuted.
+        episodes, collisions: Numbers of episodes, and of episodes with a collision.
+        states, permuted: Numbers of sampled states, and of states whose features were permuted.
         features: Statistics of each column.
-        groups: Importance of each group as a whole, where features were permuted.
+        groups: Importance of each group as a whole, if features were permuted.
     """
 
     planner: str
@@ -95,11 +96,11 @@ class ObservationStatistics:
 
     @property
     def broken(self) -> int:
-        """Entries that are NaN or infinite."""
+        """Number of NaN or infinite entries."""
         return sum(feature.broken for feature in self.features)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; null where undefined."""
+        """Return plain values for JSON; undefined values are null."""
         names = ("planner", "episodes", "collisions", "states", "permuted")
         features = [_plain(asdict(feature)) for feature in self.features]
         summary = {name: getattr(self, name) for name in names}
@@ -107,17 +108,18 @@ class ObservationStatistics:
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    undefined = {
-        name for name, value in values.items() if isinstance(value, float) and not np.isfinite(value)
+    """Replace floats that are not finite by None."""
+    return {
+        name: None if isinstance(value, float) and not np.isfinite(value) else value
+        for name, value in values.items()
     }
-    return {name: None if name in undefined else value for name, value in values.items()}
 
 
 def observation_statistics(
     planner: Planner, bank: ScenarioBank, task: Task, *, permute: bool, traffic: Traffic | None = None,
     every: int = EVERY, seed: int = 0,
 ) -> ObservationStatistics:  # fmt: skip
-    """Drive every scenario of a bank from its current step to the end, and summarise the observations.
+    """Run a planner on every scenario of a bank from its current step on, and summarise the observations.
 
     Args:
         planner: The planner; ``expert`` for the log itself.
@@ -129,7 +131,7 @@ def observation_statistics(
         seed: Seed of the planner, as in an evaluation, and of the permutations.
 
     Raises:
-        UsageError: The planner acts in another action space than the task.
+        UsageError: Planner and task have different action spaces.
     """
     check_actions(planner, task)
     traffic = traffic or LogTraffic()
@@ -138,31 +140,43 @@ def observation_statistics(
     observations = {name: np.asarray(leaf) for name, leaf in samples.observation.items()}
     hit, collides = np.asarray(samples.hit), np.asarray(samples.collides)
     context = samples.state.context
-    driven = np.asarray(context.step < bank.last_step[context.index])
+    in_log = np.asarray(context.step < bank.last_step[context.index])
     columns, groups, permuted = {}, {}, 0
     if permute:
-        steps = np.flatnonzero(driven)
-        rows = np.linspace(0, len(steps) - 1, min(PERMUTED, len(steps))).round().astype(int)
-        rows = steps[np.unique(rows)]
-        states, permuted = (samples.state, samples.carry, samples.key, samples.observation), len(rows)
-        *rest, inputs = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], states)
-        act = partial(_actions, simulator, planner, bank, *rest)
-        columns, groups = importances(act, jax.device_get(inputs), seed)
-    observations = _mask_beyond_log(observations, driven)
+        candidates = np.flatnonzero(in_log)
+        positions = np.linspace(0, len(candidates) - 1, min(PERMUTED, len(candidates))).round().astype(int)
+        indices = candidates[np.unique(positions)]
+        columns, groups = _planner_importances(simulator, planner, bank, samples, indices, seed)
+        permuted = len(indices)
+    observations = _mask_after_log(observations, in_log)
     features = column_statistics(task.observation.features, observations, hit, collides, columns)
     return ObservationStatistics(
-        planner.name, len(collides), int(collides.sum()), int(driven.sum()), permuted, features, groups
+        planner.name, len(collides), int(collides.sum()), int(in_log.sum()), permuted, features, groups
     )
 
 
-def _mask_beyond_log(observation: Mapping[str, Values], driven: Values) -> dict[str, Values]:
+def _planner_importances(
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, samples: SampledStates, indices: Values, seed: int
+) -> tuple[dict[tuple[str, int], float], dict[str, float]]:  # fmt: skip
+    """Return the :func:`importances` for a planner in the sampled states with the given flat indices."""
+
+    def select(leaf: Array) -> Array:
+        return leaf.reshape(samples.hit.size, *leaf.shape[2:])[indices]
+
+    states = (samples.state, samples.carry, samples.key, samples.observation)
+    *planner_inputs, observation = jax.tree.map(select, states)
+    act = partial(_actions, simulator, planner, bank, *planner_inputs)
+    return importances(act, jax.device_get(observation), seed)
+
+
+def _mask_after_log(observation: Mapping[str, Values], in_log: Values) -> dict[str, Values]:
     """Return observations ``[episode, sample, ...]`` with every group masked after the end of the log."""
     result = dict(observation)
     masks = {f"{group}_mask" for group in observation}
     for group in (name for name in observation if name not in masks):
         shape = observation[group].shape[:-1]
         valid = result.get(f"{group}_mask", np.ones(shape, bool))
-        result[f"{group}_mask"] = valid & driven.reshape(*driven.shape, *(1,) * (len(shape) - driven.ndim))
+        result[f"{group}_mask"] = valid & in_log.reshape(*in_log.shape, *(1,) * (len(shape) - in_log.ndim))
     return result
 
 
@@ -170,9 +184,10 @@ def column_statistics(
     features: Features, observation: Mapping[str, Values], hit: Values, collides: Values,
     importance: Mapping[tuple[str, int], float],
 ) -> tuple[FeatureStatistics, ...]:  # fmt: skip
-    """Return statistics of every column of :class:`SampledStates` observations ``[episode, sample, ...]``, by group.
+    """Return the statistics of every column of observations ``[episode, sample, ...]``, ordered by group.
 
-    ``importance`` maps group and column number to the permutation importance.
+    ``hit`` and ``collides`` are those of :class:`SampledStates`; ``importance`` maps group and column number to the
+    permutation importance.
     """
     names = feature_names(features, {name: values.shape[2:] for name, values in observation.items()})
     statistics = []
@@ -180,8 +195,8 @@ def column_statistics(
         for column, name in enumerate(columns):
             values = observation[group][..., column]
             valid = observation.get(f"{group}_mask", np.ones(values.shape, bool))
-            before = valid & ~hit.reshape(*hit.shape, *(1,) * (valid.ndim - hit.ndim))
-            correlation = collision_correlation(values, before, collides)
+            before_collision = valid & ~hit.reshape(*hit.shape, *(1,) * (valid.ndim - hit.ndim))
+            correlation = collision_correlation(values, before_collision, collides)
             change = importance.get((group, column), math.nan)
             statistics.append(FeatureStatistics(group, name, *_moments(values, valid), correlation, change))
     return tuple(statistics)
@@ -190,14 +205,14 @@ def column_statistics(
 def sample_states(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0
 ) -> SampledStates:
-    """Return sampled states of one episode per scenario; the episodes are those of an evaluation with this seed."""
+    """Return sampled states of one episode per scenario; an evaluation with this seed has the same episodes."""
     batches, size = [], min(BATCH, len(bank))
     for first in range(0, len(bank), BATCH):
-        rows = np.arange(first, min(first + BATCH, len(bank)))
+        scenarios = np.arange(first, min(first + BATCH, len(bank)))
         # Pad the last batch with its last scenario, so that all batches share one compilation.
-        index = jnp.asarray(np.pad(rows, (0, size - len(rows)), mode="edge"), jnp.int32)
+        index = jnp.asarray(np.pad(scenarios, (0, size - len(scenarios)), mode="edge"), jnp.int32)
         samples = _sample_batch(simulator, planner, bank, index, episode_keys(bank, index, seed), every)
-        count = len(rows)
+        count = len(scenarios)
         batches.append(jax.tree.map(lambda leaf, count=count: leaf[:count], samples))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
 
@@ -213,16 +228,16 @@ def _episode(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, index: Array, key: Array
 ) -> SampledStates:
     state = simulator.reset(bank, index)
-    begin_key, key = jax.random.split(key)
-    carry = planner.init(bank, state, begin_key)
+    init_key, key = jax.random.split(key)
+    carry = planner.init(bank, state, init_key)
     steps = bank.steps - 1 - CURRENT_STEP
     keys = jax.random.split(key, steps)
 
     def step(loop_state: Any, key: Array) -> tuple[Any, None]:
         state, carry, hit = loop_state
-        ended = state.context.step >= bank.last_step[index]
-        after, carry, _ = advance(simulator, planner, bank, state, carry, key)
-        state = jax.tree.map(partial(jnp.where, ended), state, after)
+        is_over = state.context.step >= bank.last_step[index]
+        next_state, carry, _ = advance(simulator, planner, bank, state, carry, key)
+        state = jax.tree.map(partial(jnp.where, is_over), state, next_state)
         return (state, carry, hit | state.facts.collision), None
 
     def sample(loop_state: Any, keys: Array) -> tuple[Any, Any]:
@@ -231,8 +246,8 @@ def _episode(
         return jax.lax.scan(step, loop_state, keys)[0], samples
 
     sampled_steps = steps - steps % every
-    first = (state, carry, state.facts.collision)
-    loop_state, samples = jax.lax.scan(sample, first, keys[:sampled_steps].reshape(-1, every))
+    initial = (state, carry, state.facts.collision)
+    loop_state, samples = jax.lax.scan(sample, initial, keys[:sampled_steps].reshape(-1, every))
     (_, _, hit), _ = jax.lax.scan(step, loop_state, keys[sampled_steps:])
     return SampledStates(*samples, collides=hit)
 
@@ -242,7 +257,7 @@ def _actions(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any, key: Array,
     observation: dict[str, Array],
 ) -> Float[Array, "M D"]:  # fmt: skip
-    """Return the planner's actions in these states for these observations."""
+    """Return the planner's actions for given observations in given states."""
 
     def act(state: SimState, carry: Any, key: Array, observation: dict[str, Array]) -> Array:
         return planner.act(carry, bank, state, simulator.situation(bank, state), observation, key)[0]
@@ -251,25 +266,25 @@ def _actions(
 
 
 def _moments(values: Values, valid: Values) -> tuple[int, int, float, float, float, float]:
-    """Return count, broken, mean, std, low and high of :class:`FeatureStatistics`."""
+    """Return ``count``, ``broken``, ``mean``, ``std``, ``low`` and ``high`` of :class:`FeatureStatistics`."""
     finite = np.isfinite(values)
     x, broken = values[valid & finite].astype(np.float64), int((~finite).sum())
     if not x.size:
         return 0, broken, math.nan, math.nan, math.nan, math.nan
-    return (x.size, broken, float(x.mean()), float(x.std()), float(x.min()), float(x.max()))
+    return x.size, broken, float(x.mean()), float(x.std()), float(x.min()), float(x.max())
 
 
 def collision_correlation(values: Values, valid: Values, collides: Values) -> float:
     """Return the point-biserial correlation of a column with collisions, over episodes (Tate 1954).
 
-    Pearson's r of the column's mean over its valid entries ``[episode, sample, ...]`` and whether the episode has a
-    collision (1) or none (0). Episodes without valid entries are left out; NaN where all episodes are of one kind or
-    have the same mean.
+    It is Pearson's r between the column's mean over its valid entries ``[episode, sample, ...]`` and the collision
+    indicator of the episode. Episodes without valid entries are excluded. The result is NaN if all episodes have the
+    same outcome or the same mean.
     """
-    counts = (valid & np.isfinite(values)).reshape(len(values), -1)
-    total = np.where(counts, values.reshape(len(values), -1), 0.0).sum(axis=1, dtype=np.float64)
-    has_values = counts.any(axis=1)
-    mean = total[has_values] / counts.sum(axis=1)[has_values]
+    included = (valid & np.isfinite(values)).reshape(len(values), -1)
+    total = np.where(included, values.reshape(len(values), -1), 0.0).sum(axis=1, dtype=np.float64)
+    has_values = included.any(axis=1)
+    mean = total[has_values] / included.sum(axis=1)[has_values]
     outcome = collides[has_values].astype(np.float64)
     # Treat a column as constant if it only varies by rounding.
     if len(mean) < 3 or outcome.std() == 0 or mean.std() <= 1e-6 * max(np.abs(mean).max(), 1e-6):
@@ -282,11 +297,11 @@ def importances(
 ) -> tuple[dict[tuple[str, int], float], dict[str, float]]:
     """Return the change of actions when a feature is permuted, by (group, column) and by group.
 
-    Permutation importance (Breiman 2001), of the action instead of a loss. A column's entries are permuted among the
-    valid rows of all states; a whole group is exchanged between states, mask included. The change is the root mean
-    square difference to the action for the true observation, over states and action dimensions, each divided by its
-    standard deviation over the states: 0 means that the feature does not matter, 1.41 that the action might be another
-    state's. NaN where the action is the same in all states.
+    This is permutation importance (Breiman 2001) of the action instead of a loss. A column is permuted among the valid
+    rows of all states; a whole group is permuted between states, including its mask. The change is the root mean
+    square difference from the action for the true observation, over states and action dimensions, in standard
+    deviations of each dimension over the states. A feature without influence has 0; 1.41 is the difference between the
+    actions of independent states. The result is NaN if the action is the same in all states.
 
     Args:
         act: From a batch of observations to actions ``[state, D]``.
@@ -298,10 +313,12 @@ def importances(
     std = actions.std(axis=0)
     varies = std > 1e-6
 
-    def change(changed: dict[str, Values]) -> float:
+    def change(permuted_groups: dict[str, Values]) -> float:
         if not varies.any():
             return math.nan
-        shift = (np.asarray(act(dict(observation) | changed), np.float64) - actions)[:, varies] / std[varies]
+        shift = (np.asarray(act(dict(observation) | permuted_groups), np.float64) - actions)[:, varies] / std[
+            varies
+        ]
         return float(np.sqrt(np.mean(shift**2)))
 
     columns, groups = {}, {}

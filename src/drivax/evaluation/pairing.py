@@ -1,4 +1,4 @@
-"""Pair the episodes of evaluations by scenario, or split the scenarios into two arms, one for each planner."""
+"""Pair the episodes of two planners by scenario, or split the scenarios between them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from drivax.stats.clusters import cluster_strata, dense_labels
 
 #: Settings of an evaluation that must agree between paired episodes.
 _START_SETTINGS = ("noisy_start", "start_step")
-#: Strata of fewer recordings are merged.
+#: Smaller strata are merged.
 _MIN_CLUSTERS = 10
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """The scenarios that evaluations have in common, in the order of the first, and the cluster of each."""
+    """The common scenarios of several evaluations, in the order of the first, and their clusters."""
 
     keys: tuple[ScenarioKey, ...]
     clusters: tuple[str, ...]
@@ -32,20 +32,20 @@ class Pairs:
     def of(cls, first: EpisodeTable, *others: EpisodeTable) -> Pairs:
         """Return the common scenarios of evaluations."""
         cluster = dict(zip(first.scenarios, first.clusters, strict=True))
-        evaluated = [set(other.scenarios) for other in others]
-        keys = tuple(key for key in cluster if all(key in scenarios for scenarios in evaluated))
+        other_scenarios = [set(other.scenarios) for other in others]
+        keys = tuple(key for key in cluster if all(key in scenarios for scenarios in other_scenarios))
         return cls(keys, tuple(cluster[key] for key in keys))
 
     def values(self, table: EpisodeTable, metric: str) -> Float64[np.ndarray[Any, Any], " scenario"]:
-        """Return a metric of one evaluation per scenario; repeated episodes are averaged."""
+        """Return the values of a metric in one evaluation; repeated episodes of a scenario are averaged."""
         means = table.by_scenario(metric)
         return np.array([means[key] for key in self.keys], np.float64)
 
 
 def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
-    """Return problem and cure if the episodes of two runs cannot be paired; None if they can.
+    """Return problem and cure if the episodes of two runs cannot be paired, else None.
 
-    Pairs need the same scenario set, traffic and starts.
+    Paired episodes need the same scenario set, traffic and start.
     """
     hashes = [str(run.data.get("hash") or "") for run in (a, b)]
     if all(hashes) and hashes[0] != hashes[1]:
@@ -62,7 +62,7 @@ def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
 
 
 def comparable(a: EpisodeTable, b: EpisodeTable) -> bool:
-    """Whether the episodes of two runs can be paired."""
+    """Return whether the episodes of two runs can be paired."""
     return mismatch(a, b) is None
 
 
@@ -70,13 +70,13 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
     """Check that the evaluations of A and B, one per training seed, can be paired.
 
     Raises:
-        UsageError: A run is named twice, a side holds several planners, or sets, traffic or starts differ.
+        UsageError: A run occurs twice, a side contains several planners, or set, traffic or start differ.
     """
     tables = (*a, *b)
     if len({id(t) if t.folder is None else t.folder.resolve() for t in tables}) < len(tables):
         raise UsageError("A and B are the same run", file=a[0].folder, cure="name two runs")
     for side in (a, b):
-        # Seeds are numbered at the end of the name, before the checkpoint; two checkpoints are two planners.
+        # A name ends with the seed's number and the checkpoint. Another checkpoint is another planner.
         planners = {re.sub(r"^(.*?)[0-9]*(@[0-9]+)?$", r"\1\2", table.name): table.name for table in side}
         if len(planners) > 1:
             problem = f"contains evaluations of several planners ({', '.join(sorted(planners.values()))})"
@@ -93,7 +93,7 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
     """Check that a comparison can use a metric.
 
     Raises:
-        UsageError: An evaluation lacks it, its mean has no meaning, or it is primary without a better direction.
+        UsageError: An evaluation lacks the metric, the metric has no mean, or ``primary`` has no better direction.
     """
     for table in tables:
         if metric not in table.metrics:
@@ -111,7 +111,7 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
 
 
 def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
-    """Return the error for a primary metric without a single pair of values."""
+    """Return the error for a primary metric that is undefined in every pair."""
     partial = [table.metrics.get(f"{metric}_partial", np.full(1, np.nan)) for table in tables]
     if any(not np.isnan(values).all() for values in partial):
         problem = f"every {metric} is partial: one of its inputs is undefined in these scenarios"
@@ -125,8 +125,8 @@ class Split:
     """Assignment of scenarios to two arms; all scenarios of a recording are in the same arm.
 
     Attributes:
-        first: Mask of the first arm.
-        strata: Stratum of each scenario; all 0 in a random split.
+        first: Mask of the scenarios of the first arm.
+        strata: Stratum of each scenario; 0 for all in a random split.
     """
 
     first: Bool[np.ndarray, " n"]
@@ -139,12 +139,12 @@ class Split:
 
 
 def strata_of(entries: Sequence[Mapping[str, Any]], tags: Sequence[str]) -> list[str]:
-    """Return the stratum of each scenario (manifest entry): the values of its tags.
+    """Return the stratum of each scenario (manifest entry): the values of its tags, joined by spaces.
 
     Raises:
-        UsageError: No scenario has one of the tags.
+        UsageError: A tag does not occur in any scenario.
     """
-    known = {name: None for entry in entries for name in entry["tags"]}
+    known = dict.fromkeys(name for entry in entries for name in entry["tags"])
     for tag in tags:
         if tag not in known:
             raise UsageError(f"no scenario has a tag {tag!r}", cure=did_you_mean(tag, list(known)))
@@ -152,10 +152,10 @@ def strata_of(entries: Sequence[Mapping[str, Any]], tags: Sequence[str]) -> list
 
 
 def assign(clusters: Sequence[str], strata: Sequence[str] | None, ratio: float, seed: int) -> Split:
-    """Assign whole clusters to two arms at random, in each stratum (None: in all) a share of ``ratio`` to the first.
+    """Randomly assign whole clusters to two arms; the first arm gets a share of ``ratio``, in each stratum if given.
 
-    A cluster belongs to the most frequent stratum of its scenarios (the first by name among equals). Strata of fewer
-    than ten clusters are merged. The rounding error of a stratum carries over to the next.
+    A cluster belongs to the most frequent stratum of its scenarios (of equally frequent ones, the first by name).
+    Strata of fewer than ten clusters are merged. Rounding errors carry over to the next stratum.
 
     Raises:
         UsageError: An arm is empty.
@@ -164,22 +164,23 @@ def assign(clusters: Sequence[str], strata: Sequence[str] | None, ratio: float, 
     count = int(labels.max()) + 1
     stratum_of = np.zeros(count, np.int64)
     if strata is not None:
-        stratum_of = cluster_strata(_most_frequent(labels, strata), labels, _MIN_CLUSTERS)
-    rng, first, available, assigned = np.random.default_rng(seed), np.zeros(count, bool), 0, 0
+        stratum_of = cluster_strata(_majority_strata(labels, strata), labels, _MIN_CLUSTERS)
+    rng, in_first = np.random.default_rng(seed), np.zeros(count, bool)
+    available = assigned = 0
     for stratum in range(int(stratum_of.max()) + 1):
         members = rng.permutation(np.flatnonzero(stratum_of == stratum))
         available += members.size
         quota = round(ratio * available) - assigned
-        first[members[:quota]] = True
+        in_first[members[:quota]] = True
         assigned += quota
-    if not first.any() or first.all():
+    if not in_first.any() or in_first.all():
         problem = f"{count} recordings at a ratio of {ratio} leave an arm empty"
         raise UsageError(problem, cure="use split: paired, or evaluate more scenarios")
-    return Split(first[labels], stratum_of[labels])
+    return Split(in_first[labels], stratum_of[labels])
 
 
-def _most_frequent(labels: Int64[np.ndarray, " n"], strata: Sequence[str]) -> list[str]:
-    """Return the stratum of each scenario's cluster."""
+def _majority_strata(labels: Int64[np.ndarray, " n"], strata: Sequence[str]) -> list[str]:
+    """Return, for each scenario, the most frequent stratum of its cluster."""
     votes: dict[int, Counter[str]] = {}
     for label, stratum in zip(labels, strata, strict=True):
         votes.setdefault(int(label), Counter())[stratum] += 1

@@ -1,4 +1,4 @@
-"""The plan of a comparison, written before it is run, and the rule by which it decides."""
+"""Plan of a comparison, written before the comparison is run, and its decision rule."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ Arm = Literal["A", "B"]
 
 @dataclass(frozen=True)
 class ComparisonPlan:
-    """Metrics, split, tests and decision rule of a comparison, written as YAML before it is run.
+    """Metrics, split, tests and decision rule of a comparison, read from a YAML file.
 
     Attributes:
         name: Heading of the page.
         a, b: Run folders of ``drivax evaluate``; the command line may name them instead.
         primary: The metric that decides.
-        secondary: Further metrics to report; the primary one is left out of them.
+        secondary: Further metrics to report; the primary metric is removed from them.
         split: ``paired`` compares on every common scenario; ``random`` and ``stratified`` give each planner its own
             scenarios.
-        ratio: Share of the recordings that A gets in a split.
-        strata: Tags by which a stratified split balances the arms.
-        minimum_scenarios: With fewer, nothing is decided.
+        ratio: Share of the recordings for A in a split.
+        strata: Tags that a stratified split balances between the arms.
+        minimum_scenarios: Number of scenarios that a decision requires.
         confidence: Level of intervals; tests reject at 1 - confidence.
-        power: Probability to detect the smallest difference that "no difference" requires.
+        power: Probability of detecting the smallest difference that matters, required for "no difference".
         smallest_difference: The smallest difference that matters, in the unit of the primary metric; null: a tenth of
             the standard deviation.
-        test: Test of means in pairs: ``permutation``, or ``bootstrap`` where differences are far from symmetric.
-        resamples: Number of bootstraps and permutations.
+        test: Test of means in pairs: ``permutation``, or ``bootstrap`` if differences are far from symmetric.
+        resamples: Number of bootstrap samples and permutations.
         seed: Seed of the split and of all resampling.
     """
 
@@ -66,9 +66,9 @@ class ComparisonPlan:
             raise UsageError("the smallest difference that matters is above 0", cure="give its size, or null")
         if len(set(self.secondary)) < len(self.secondary):
             raise UsageError("a metric is named twice", cure="name each metric once")
-        # So that the primary metric can be changed without changing the secondary ones.
-        others = tuple(name for name in self.secondary if name != self.primary)
-        object.__setattr__(self, "secondary", others)
+        # The primary metric may be one of the default secondary ones.
+        secondary = tuple(name for name in self.secondary if name != self.primary)
+        object.__setattr__(self, "secondary", secondary)
         if self.split != "paired" and self.test == "bootstrap":
             cure = "use test: permutation, or split: paired"
             raise UsageError("the bootstrap test is for pairs", cure=cure)
@@ -80,12 +80,12 @@ class Sensitivity:
 
     Attributes:
         deviation: Standard deviation of the paired differences, or within the arms of a split.
-        design_effect: Factor by which clustering in recordings increases the number of scenarios needed.
+        design_effect: Factor by which clustering in recordings increases the required number of scenarios.
         smallest: The smallest difference that matters.
-        power: Probability to detect it with these scenarios.
-        detectable: The difference that is detected with the plan's power.
-        needed: Scenarios needed to detect the smallest difference with the plan's power; None where seeds differ so
-            much that no number suffices.
+        power: Probability of detecting it with these scenarios.
+        detectable: The smallest difference that is detected with the plan's power.
+        needed: Number of scenarios that detect ``smallest`` with the plan's power; None if seeds vary too much for any
+            number.
     """
 
     deviation: float
@@ -98,18 +98,18 @@ class Sensitivity:
 
 @dataclass(frozen=True)
 class MetricComparison:
-    """One metric of both planners.
+    """Comparison of two planners in one metric.
 
     Attributes:
-        unit: ``-`` for shares, empty where unknown.
-        better: ``high`` or ``low``; ``-`` where neither is.
-        a, b, difference: Means over the scenarios that count, and ``A - B``.
+        unit: ``-`` for shares, empty if unknown.
+        better: ``high``, ``low``, or ``-`` for neither.
+        a, b, difference: Means over the included scenarios, and ``A - B``.
         effects: Cohen's d: ``d_z`` and ``d_av`` of pairs, ``d`` of a split.
-        evidence: The test.
-        p_adjusted: By Holm's method over the secondary metrics; the primary metric's own.
-        winner: Which is better by the (adjusted) test; None if neither.
+        evidence: Result of the test.
+        p_adjusted: p-value, for secondary metrics adjusted by Holm's method.
+        winner: The better planner by the (adjusted) test; None if neither.
         seeds: The larger number of seeds of A and B.
-        undefined_a, undefined_b: Scenarios left out because the value of A, or of B, is undefined.
+        undefined_a, undefined_b: Numbers of scenarios excluded because the value of A, or of B, is undefined.
     """
 
     metric: str
@@ -127,7 +127,7 @@ class MetricComparison:
     undefined_b: int
 
     def with_winner(self, plan: ComparisonPlan, p: float | None) -> MetricComparison:
-        """Return the comparison with its adjusted p-value, and the winner where that is small enough."""
+        """Return the comparison with its adjusted p-value ``p``, and with the winner if the test rejects."""
         mean, winner = self.difference.mean, None
         if self.better != "-" and mean and p is not None and p < 1 - plan.confidence:
             winner = "A" if (mean > 0) == (self.better == "high") else "B"
@@ -136,12 +136,12 @@ class MetricComparison:
 
 @dataclass(frozen=True)
 class Decision:
-    """Decision by the rule of a plan.
+    """Decision of a comparison.
 
     Attributes:
-        recommendation: The planner to take, no difference, or not enough scenarios to decide.
+        recommendation: The planner to choose, no difference, or not enough scenarios to decide.
         because: The part of the rule that decided.
-        needed: Number of scenarios needed, if there are too few.
+        needed: Required number of scenarios, if there are too few.
         caveats: Secondary metrics in which the recommended planner is worse.
     """
 
@@ -157,9 +157,10 @@ def decide(
 ) -> Decision:  # fmt: skip
     """Decide by the rule: enough scenarios, then the test, then the power to conclude "no difference".
 
-    With fewer scenarios than the plan's minimum nothing is decided. A test that rejects gives the better planner. One
-    that does not means "no difference" only if the smallest difference that matters would have been detected with the
-    plan's power; otherwise there are not enough scenarios, or seeds, where no number of scenarios suffices.
+    With fewer scenarios than the plan's minimum, there is no decision. A test that rejects recommends the better
+    planner. Otherwise the result is "no difference" if the comparison had the plan's power to detect the smallest
+    difference that matters. If it had not, there are not enough scenarios, or not enough seeds if no number of
+    scenarios suffices.
     """
     n = primary.difference.n
     needed = max(plan.minimum_scenarios, 0 if sensitivity is None else sensitivity.needed or 0)

@@ -1,4 +1,4 @@
-"""Tables of evaluations: results, differences, kinds of collision, strata, and transfer between data sets."""
+"""Tables of evaluations: results, differences, collision types, strata, and transfer between data sets."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from drivax.table import Cell, Column, Table, interval_cell
 
 CONFIDENCE = 0.95
 SEED = 0
-#: Tags by which results are broken down.
+#: Tags for breakdowns of the results.
 STRATA = ("difficulty", "type", "density", "scenario_types")
-#: The value of a tag in scenarios that lack it.
+#: Tag value of scenarios without the tag.
 UNKNOWN = "unknown"
-#: Kinds of collision: name, and typical cause.
+#: Name and typical cause of each collision type.
 COLLISION_KINDS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
     {
         CollisionType.REAR_END: ("rear end", "hit the agent ahead: distance and braking"),
@@ -46,7 +46,7 @@ _ARROWS = {"high": " ↑", "low": " ↓", "-": ""}
 class MetricLabel:
     """Presentation of a metric: label with unit, better direction (``-`` for none), unit, and explanation.
 
-    The unit is ``rate`` for a share of episodes, ``share`` for another number without a unit; the explanation of an
+    The unit is ``rate`` for shares of episodes, and ``share`` for other numbers without a unit. The explanation of an
     unknown metric is empty.
     """
 
@@ -68,31 +68,31 @@ class MetricLabel:
 
 
 def metric_label(name: str, runs: Sequence[EpisodeTable] = ()) -> MetricLabel:
-    """Return the label of a metric; ``runs`` describe user-defined metrics."""
-    own = (run.own_metrics[name] for run in runs if name in run.own_metrics)
-    metric = METRICS.get(name) or ADDED.get(name) or next(own, None)
+    """Return the label of a metric; ``runs`` contain the descriptions of user-defined metrics."""
+    own_columns = (run.own_metrics[name] for run in runs if name in run.own_metrics)
+    metric = METRICS.get(name) or ADDED.get(name) or next(own_columns, None)
     if metric is None:
         return MetricLabel(name.replace("_", " "), "-", "", "")
     text = metric.label or name.replace("_", " ")
-    plain = metric.unit == "-"
-    if not plain:
+    has_no_unit = metric.unit == "-"
+    if not has_no_unit:
         text = f"{text} [{metric.unit.replace('s2', 's²').replace('s3', 's³')}]"
-    unit = "rate" if name in RATES else "share" if plain else metric.unit
+    unit = "rate" if name in RATES else "share" if has_no_unit else metric.unit
     return MetricLabel(text, metric.better, unit, f"{metric.definition[:1].upper()}{metric.definition[1:]}.")
 
 
 def metric_names(runs: Sequence[EpisodeTable]) -> list[str]:
-    """Return the metrics of all runs, each once, in the order of first appearance."""
+    """Return the metrics of all runs without duplicates, in the order of first appearance."""
     return list(dict.fromkeys(name for run in runs for name in run.metrics))
 
 
 def headline_names(names: Sequence[str]) -> list[str]:
-    """Return the headline metrics among ``names``, in the order of the first table."""
+    """Return the headline metrics among ``names``, in headline order."""
     return [name for name in headline(METRICS) if name in names]
 
 
 def sort_metrics(names: Sequence[str]) -> list[str]:
-    """Sort metrics by their definition, with unknown ones last; codes are left out."""
+    """Sort metrics in the order of their definition, with unknown ones last, and drop codes."""
     rank = {name: index for index, name in enumerate((*METRICS, *ADDED))}
     return sorted((name for name in names if name not in CODES), key=lambda name: rank.get(name, len(rank)))
 
@@ -100,7 +100,7 @@ def sort_metrics(names: Sequence[str]) -> list[str]:
 def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interval:
     """Return the mean of a metric over episodes (``rows``), with its interval as in ``summary.json``.
 
-    The interval is undefined if the evaluation lacks the metric.
+    The result is undefined if the evaluation lacks the metric.
     """
     if metric not in run.metrics:
         return UNDEFINED
@@ -108,14 +108,18 @@ def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interv
 
 
 def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
-    """Return ``run - other`` of a metric, scenario by scenario; repeated episodes are averaged first."""
+    """Return ``run - other`` of a metric, paired by scenario; repeated episodes are averaged first."""
     pairs = Pairs.of(run, other)
     values, others = pairs.values(run, metric), pairs.values(other, metric)
     return paired_bootstrap(values, others, pairs.clusters, CONFIDENCE, seed=SEED)
 
 
 def paired_differences(results: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
-    """Return :func:`paired_difference` of two evaluations of one set; others raise :class:`UsageError`."""
+    """Return :func:`paired_difference` of two evaluations of one set.
+
+    Raises:
+        UsageError: The evaluations have different scenarios.
+    """
     if set(results.scenarios) != set(other.scenarios):
         raise UsageError("the scenarios of the evaluations differ", cure="evaluate both on one set")
     return paired_difference(results, other, metric)
@@ -124,8 +128,8 @@ def paired_differences(results: EpisodeTable, other: EpisodeTable, metric: str) 
 def difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> tuple[Interval, str]:
     """Return the paired difference ``run - other`` of a metric with its verdict.
 
-    The verdict is ``better``, ``worse``, ``unclear`` (the interval holds 0), ``same`` (no pair differs) or ``none``
-    (no direction, no interval).
+    The verdict is ``better``, ``worse``, ``unclear`` (the interval contains 0), ``same`` (all differences are 0) or
+    ``none`` (no better direction, or no interval).
     """
     interval = paired_difference(run, other, metric)
     return interval, _verdict(interval, metric_label(metric, [run]).better)
@@ -143,15 +147,17 @@ def _verdict(interval: Interval, better: str) -> str:
 
 
 def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
-    """Return a table with planners in rows and metrics in columns, the best mean of each column marked."""
+    """Return a table with planners in rows and metrics in columns; the best mean of each column is marked."""
     means = [[summarise(run, name) for run in runs] for name in metrics]
-    best = [_best_mean(column, metric_label(name, runs)) for name, column in zip(metrics, means, strict=True)]
+    best_means = [
+        _best_mean(column, metric_label(name, runs)) for name, column in zip(metrics, means, strict=True)
+    ]
     rows = []
     for index, run in enumerate(runs):
         label = Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic")
         cells = [
             _cell(runs, name, column[index], {"run": run.name, "metric": name}, best_mean)
-            for name, column, best_mean in zip(metrics, means, best, strict=True)
+            for name, column, best_mean in zip(metrics, means, best_means, strict=True)
         ]
         rows.append((label, *cells))
     columns = (Column("planner", label=True), *_metric_columns(metrics, runs))
@@ -159,7 +165,7 @@ def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Tabl
 
 
 def _best_mean(intervals: Sequence[Interval], label: MetricLabel) -> float | None:
-    """Return the best mean of a column; None without a better direction, or if all means are equal."""
+    """Return the best mean of a column; None if all means are equal or the metric has no better direction."""
     means = [interval.mean for interval in intervals if interval.mean is not None]
     if label.better == "-" or len(means) < 2 or min(means) == max(means):
         return None
@@ -189,19 +195,21 @@ def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table
     """Return a table with metrics in rows and runs in columns."""
     rows = []
     for name in metrics:
-        links = [(run, {"run": run.name, "metric": name}) for run in runs]
-        cells = (_cell(runs, name, summarise(run, name), link) for run, link in links)
+        cells = (_cell(runs, name, summarise(run, name), {"run": run.name, "metric": name}) for run in runs)
         rows.append((_metric_cell(name, runs), *cells))
     columns = (Column("metric", "metric", label=True), *(Column(run.name, run.name) for run in runs))
     return Table("results", columns, tuple(rows), f"Mean and {CONFIDENCE:.0%} interval", "planner")
 
 
-#: Text of each verdict; its sign carries the same information as the colour.
+#: Text of each verdict; the symbol makes it readable without the colour.
 _MARKS = {"better": "▲ better", "worse": "▼ worse", "unclear": "unclear", "same": "= same", "none": ""}
 
 
 def differences_table(policy: EpisodeTable, others: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
-    """Return a table with metrics in rows and other runs in columns: the policy minus the other, paired by scenario."""
+    """Return a table with metrics in rows and other runs in columns.
+
+    Entries are differences between the policy and the other run, paired by scenario.
+    """
     rows = tuple(
         (_metric_cell(name, [policy]), *(_difference_cell(policy, other, name) for other in others))
         for name in metrics
@@ -212,8 +220,8 @@ def differences_table(policy: EpisodeTable, others: Sequence[EpisodeTable], metr
 
 
 def _difference_cell(policy: EpisodeTable, other: EpisodeTable, metric: str) -> Cell:
-    if unmatched := mismatch(policy, other):
-        return Cell(f"no pairs: {unmatched[0]}", style="undefined")
+    if problem := mismatch(policy, other):
+        return Cell(f"no pairs: {problem[0]}", style="undefined")
     interval, verdict = difference(policy, other, metric)
     if interval.mean is None:
         return interval_cell(interval, "", metric, signed=True, title="no scenario where both are defined")
@@ -222,40 +230,41 @@ def _difference_cell(policy: EpisodeTable, other: EpisodeTable, metric: str) -> 
 
 
 def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
-    """Return a table with kinds of the first collision in rows and runs in columns.
+    """Return a table with types of the first collision in rows and runs in columns.
 
-    Shares are of the episodes with a known kind; a run without kinds has no column.
+    Shares are of the episodes with a known type. Runs without types have no column.
     """
     runs = [run for run in runs if "collision_type" in run.metrics]
-    known = not any(np.isnan(run.metrics["collision_type"]).any() for run in runs)
-    population = "all episodes" if known else "the episodes in which they are known (n)"
+    all_known = not any(np.isnan(run.metrics["collision_type"]).any() for run in runs)
+    population = "all episodes" if all_known else "the episodes with a known type (n)"
     rows = []
     for code, (name, _) in COLLISION_KINDS.items():
         cells = []
         for run in runs:
-            kinds = run.metrics["collision_type"]
-            share = rate(np.where(np.isnan(kinds), np.nan, kinds == code), run.clusters, CONFIDENCE)
+            types = run.metrics["collision_type"]
+            share = rate(np.where(np.isnan(types), np.nan, types == code), run.clusters, CONFIDENCE)
             cells.append(_cell(runs, "collision", share, {"run": run.name, "kind": int(code)}))
         rows.append((Cell(name), *cells))
-    caption = f"First collisions by kind: share of {population} with {CONFIDENCE:.0%} interval"
+    caption = f"First collisions by type: share of {population} with {CONFIDENCE:.0%} interval"
     columns = (Column("first collision", label=True), *(Column(run.name, run.name) for run in runs))
     return Table("collisions", columns, tuple(rows), caption, "planner")
 
 
 def strata_table(runs: Sequence[EpisodeTable], tags: Tags, tag: str, metrics: Sequence[str]) -> Table:
-    """Return a table with a row per value of a tag and run, metrics in columns; without the tag it is ``unknown``.
+    """Return a table with a row for each value of a tag and run, and metrics in columns.
 
-    A scenario with several words (``scenario_types``) counts in the row of each.
+    Scenarios without the tag have the value ``unknown``. A tag with several words (``scenario_types``) counts in the
+    row of each word.
     """
-    values = {
+    words = {
         run.name: [tags.get(key, {}).get(tag, UNKNOWN).split("|") for key in run.scenarios] for run in runs
     }
-    order = {value: place for place, value in enumerate(TAGS.get(tag, ()))}
-    present_values = {value for run_words in values.values() for words in run_words for value in words}
+    rank = {value: index for index, value in enumerate(TAGS.get(tag, ()))}
+    values = {value for episodes in words.values() for episode in episodes for value in episode}
     rows = []
-    for value in sorted(present_values, key=lambda value: (order.get(value, len(order)), value)):
+    for value in sorted(values, key=lambda value: (rank.get(value, len(rank)), value)):
         for run in runs:
-            episodes = np.flatnonzero([value in words for words in values[run.name]])
+            episodes = np.flatnonzero([value in episode for episode in words[run.name]])
             if episodes.size:
                 link = {"run": run.name, "tags": {tag: value}}
                 means = ((name, summarise(run, name, episodes)) for name in metrics)
@@ -267,7 +276,7 @@ def strata_table(runs: Sequence[EpisodeTable], tags: Tags, tag: str, metrics: Se
 
 
 def set_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
-    """Return unique short names of all data sets that runs were evaluated or trained on, by their key."""
+    """Return unique short names of the data sets of runs (evaluation and training), by :func:`set_key`."""
     entries = {
         set_key(entry): entry for run in runs for entry in (run.data, *(run.info.get("trained_on") or ()))
     }
@@ -287,45 +296,45 @@ def _set_name(entry: Mapping[str, Any]) -> str:
 
 
 def _planner_key(run: EpisodeTable) -> str:
-    """Return the planner as named on the command line, else its own name."""
+    """Return the planner as named on the command line, or else its own name."""
     return str(run.settings.get("planner") or run.planner)
 
 
 def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
-    """Return the name of each planner by its key: its own if unique, else the shortest unique end of its path."""
-    own = {_planner_key(run): run.planner for run in runs}
+    """Return the name of each planner by its key: its own name, or the shortest unique end of its path."""
+    own_names = {_planner_key(run): run.planner for run in runs}
     names = {}
-    for key, name in own.items():
-        paths = [Path(other).parts for other in own if other != key and own[other] == name]
+    for key, name in own_names.items():
+        namesakes = [Path(other).parts for other in own_names if other != key and own_names[other] == name]
         parts = Path(key).parts
-        unique = (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in paths))
-        length = next(unique, len(parts))
-        names[key] = "/".join(parts[-length:]) if paths else name
+        lengths = (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in namesakes))
+        length = next(lengths, len(parts))
+        names[key] = "/".join(parts[-length:]) if namesakes else name
     return names
 
 
 def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
     """Return a table of a metric with training data in rows and evaluation data in columns.
 
-    A planner is identified by its command-line name (``bc/seed-0`` and ``ppo/seed-0`` are two). Several runs of one
-    planner on one set, for example with different starts, have a row each.
+    A planner is identified by its command-line name (``bc/seed-0`` and ``ppo/seed-0`` are different planners). Several
+    runs of a planner on the same set, for example with different starts, have separate rows.
     """
     planners, names = _planner_names(runs), set_names(runs)
-    evaluated = [names[set_key(run.data)] for run in runs]
+    evaluation_sets = [names[set_key(run.data)] for run in runs]
     cells: dict[tuple[str, ...], dict[str, Cell]] = {}
-    for run, set_name in zip(runs, evaluated, strict=True):
-        trained = ", ".join(names[set_key(entry)] for entry in run.info.get("trained_on") or ()) or "–"
-        labels = (planners[_planner_key(run)], trained, run.traffic)
+    for run, set_name in zip(runs, evaluation_sets, strict=True):
+        training_sets = ", ".join(names[set_key(entry)] for entry in run.info.get("trained_on") or ()) or "–"
+        labels = (planners[_planner_key(run)], training_sets, run.traffic)
         if set_name in cells.get(labels, {}):
             labels = (run.name, *labels[1:])
         link = {"run": run.name, "metric": metric}
         cells.setdefault(labels, {})[set_name] = _cell(runs, metric, summarise(run, metric), link)
-    sets = tuple(dict.fromkeys(evaluated))
+    sets = tuple(dict.fromkeys(evaluation_sets))
     rows = tuple(
         (*map(Cell, labels), *(row.get(name, Cell(style="undefined")) for name in sets))
         for labels, row in cells.items()
     )
-    heads = [Column(key, label=True) for key in ("planner", "trained on", "traffic")]
-    columns = (*heads, *(Column(name, name) for name in sets))
+    headings = [Column(key, label=True) for key in ("planner", "trained on", "traffic")]
+    columns = (*headings, *(Column(name, name) for name in sets))
     caption = f"By training and evaluation data: mean and {CONFIDENCE:.0%} interval"
     return Table(f"transfer-{metric}", columns, rows, caption, "evaluated on")

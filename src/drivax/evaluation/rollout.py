@@ -1,4 +1,4 @@
-"""Closed-loop rollouts on the device: a planner drives a batch of scenarios from a start step to the end of the log."""
+"""Closed-loop rollouts: a planner drives a batch of scenarios from a start step to the end of the log."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.task import Task
 
-#: Number folded into the key of an episode to draw its start.
+#: Folded into an episode's key to draw its start.
 _START_STREAM = 1
-#: Units of packed positions (m) and headings (rad), and the reach of int16 from a scenario's origin.
+#: Units of packed positions (m) and headings (rad), and the largest coordinate that int16 holds.
 _POSITION_UNIT_M, _HEADING_UNIT_RAD, _MAX_POSITION_M = 0.02, 1e-4, 650.0
-#: Stands for "absent" in a packed pose.
+#: Packed pose of an absent agent.
 _ABSENT = -32768
 
 
 @record
 class Episodes:
-    """The outcome of a batch of episodes.
+    """Results of a batch of episodes.
 
     Attributes:
         metrics: Every metric by name.
         events: Step of the first collision, off-road step and red light, -1 for none.
-        motion: x, y, heading, speed of the driven agent from the start step to the end; repeated beyond a short log.
-        actions: Executed actions, after bounds and actuators; repeated beyond a short log.
+        motion: x, y, heading, speed of the driven agent from the start step on, repeated after the end of a short log.
+        actions: Executed actions, after bounds and actuators, repeated after the end of a short log.
         others: Packed poses of the other agents at each step (:func:`pack_poses`); None in log traffic.
         offroad_steps: Number of steps off the road.
         crashed: First step with a non-finite action, -1 for none; metrics cover the steps before it.
@@ -59,12 +59,12 @@ class Episodes:
 
 @record
 class _Loop:
-    """An episode between two steps; ``measured`` stays at the last state before a non-finite action."""
+    """An episode between two steps; ``metric_state`` stays at the last state before a non-finite action."""
 
     state: SimState
-    measured: SimState
+    metric_state: SimState
     carry: Any
-    is_finite: Bool[Array, ""]
+    all_finite: Bool[Array, ""]
 
 
 @record
@@ -74,12 +74,12 @@ class _StepOutput:
     motion: Float[Array, "4"]
     action: Float[Array, " D"]
     offroad: Bool[Array, ""]
-    is_finite: Bool[Array, ""]
+    all_finite: Bool[Array, ""]
     others: Int16[Array, "A 3"] | None
 
 
 def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Array:
-    """Return a random key for each scenario; it depends on the seed and the scenario's identity, not on its row."""
+    """Return a random key for each scenario, derived from the seed and the scenario's identity."""
     return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), bank.identity[index])
 
 
@@ -90,7 +90,11 @@ def evaluation_task(task: Task) -> Task:
 
 
 def check_actions(planner: Planner, task: Task) -> None:
-    """Raise UsageError for a planner with another action space than the task."""
+    """Check that planner and task have the same action space.
+
+    Raises:
+        UsageError: They differ.
+    """
     if getattr(planner, "actions", task.actions) != task.actions:
         problem = f"planner {planner.name} has another action space than the task"
         raise UsageError(problem, cure="use the task's")
@@ -101,9 +105,10 @@ def drive(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, index: Int[Array, " B"], keys: Array,
     start_step: int = CURRENT_STEP, slot: Any = 0,
 ) -> Episodes:  # fmt: skip
-    """Run one planner on rows ``index`` of a bank; one compilation per planner kind, batch size and start step.
+    """Run a planner on scenarios ``index`` of a bank; ``slot`` is the driven agent.
 
-    The task's episodes must not end early (:func:`evaluation_task`); ``slot`` is the driven agent.
+    The task's episodes must not end early (:func:`evaluation_task`). Each planner type, batch size and start step needs
+    one compilation.
     """
     step = partial(_step, simulator, planner, bank)
     first, step_keys = jax.vmap(partial(_start, simulator, planner, bank, start_step, slot))(index, keys)
@@ -118,8 +123,8 @@ def _start(
 ) -> tuple[_Loop, Array]:  # fmt: skip
     """Reset one episode; return also a key for each of its steps."""
     state = simulator.reset(bank, index, start_step, slot, jax.random.fold_in(key, _START_STREAM))
-    planner_key, key = jax.random.split(key)
-    loop = _Loop(state, state, planner.init(bank, state, planner_key), jnp.ones((), bool))
+    init_key, key = jax.random.split(key)
+    loop = _Loop(state, state, planner.init(bank, state, init_key), jnp.ones((), bool))
     return loop, jax.random.split(key, bank.steps - 1 - start_step)
 
 
@@ -128,16 +133,18 @@ def _step(
 ) -> tuple[_Loop, _StepOutput]:
     """Advance one episode; after the last step of its log, its state stays."""
     state, context = loop.state, loop.state.context
-    over = context.step >= bank.last_step[context.index]
-    after, carry, finite = advance(simulator, planner, bank, state, loop.carry, key)
-    state = jax.tree.map(partial(jnp.where, over), state, after)
-    is_finite = loop.is_finite & (finite | over)
-    measured = loop.measured
-    measured = state if planner.replays else jax.tree.map(partial(jnp.where, is_finite), state, measured)
-    context, offroad = measured.context, is_finite & ~over & state.facts.offroad
+    is_over = context.step >= bank.last_step[context.index]
+    after, carry, is_finite = advance(simulator, planner, bank, state, loop.carry, key)
+    state = jax.tree.map(partial(jnp.where, is_over), state, after)
+    all_finite = loop.all_finite & (is_finite | is_over)
+    metric_state = loop.metric_state
+    metric_state = (
+        state if planner.replays else jax.tree.map(partial(jnp.where, all_finite), state, metric_state)
+    )
+    context, offroad = metric_state.context, all_finite & ~is_over & state.facts.offroad
     others = _others(simulator.traffic, bank, state)
-    output = _StepOutput(context.history[-1], context.action, offroad, is_finite, others)
-    return _Loop(state, measured, carry, is_finite), output
+    output = _StepOutput(context.history[-1], context.action, offroad, all_finite, others)
+    return _Loop(state, metric_state, carry, all_finite), output
 
 
 def _others(traffic: Traffic, bank: ScenarioBank, state: SimState) -> Int16[Array, "A 3"] | None:
@@ -149,28 +156,29 @@ def _outcome(
     traffic: Traffic, bank: ScenarioBank, start_step: int, first: _Loop, last: _Loop, steps: _StepOutput
 ) -> Episodes:
     """Return the outcome of one episode from its first and last state and the outputs of its steps."""
-    metrics, uncut_metrics = episode_metrics(bank, last.measured), episode_metrics(bank, last.state)
+    metrics, full_metrics = episode_metrics(bank, last.metric_state), episode_metrics(bank, last.state)
     # Whether a metric is defined must not depend on when the planner crashed.
     names = [name for name in FAILED if name in metrics]
-    failed = {name: replace(metrics[name], defined=uncut_metrics[name].defined) for name in names}
+    failed_metrics = {name: replace(metrics[name], defined=full_metrics[name].defined) for name in names}
     first_others = _others(traffic, bank, first.state)
     return Episodes(
-        metrics=metrics | failed,
-        events=event_steps(last.measured.episode),
+        metrics=metrics | failed_metrics,
+        events=event_steps(last.metric_state.episode),
         motion=jnp.concatenate([first.state.context.history[-1][None], steps.motion]),
         actions=steps.action,
         others=None if first_others is None else jnp.concatenate([first_others[None], steps.others]),
         offroad_steps=steps.offroad.sum().astype(jnp.int32),
-        crashed=jnp.where(steps.is_finite.all(), -1, start_step + jnp.argmin(steps.is_finite)),
+        crashed=jnp.where(steps.all_finite.all(), -1, start_step + jnp.argmin(steps.all_finite)),
     )
 
 
 def advance(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any, key: Array
 ) -> tuple[SimState, Any, Bool[Array, ""]]:
-    """Return state and carry one step later, and whether the action was finite; replaying planners follow the log.
+    """Return the next state, the next carry, and whether the action was finite.
 
-    An action that is not finite is replaced by ``Task.coast``, so that the state stays finite.
+    A non-finite action is replaced by ``Task.coast``, so that the state stays finite. Planners that replay follow the
+    log.
     """
     situation = simulator.situation(bank, state)
     observation = simulator.observe(bank, state.context)
@@ -179,14 +187,14 @@ def advance(
     length_m = bank.length_m(context.index, context.slot)
     if planner.replays:
         action = simulator.task.actuated(motion, action, context.action, length_m)
-        logged = logged_motion(bank, context, 1)
-        return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
+        logged_pose = logged_motion(bank, context, 1)
+        return simulator.replay(bank, state, logged_pose, action)[0], carry, jnp.ones((), bool)
     is_finite, coast = jnp.isfinite(action).all(), simulator.task.coast(motion, length_m)
     return simulator.step(bank, state, jnp.where(is_finite, action, coast))[0], carry, is_finite
 
 
 def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
-    """Pack positions and headings of bank rows; agents further than 650 m from the origin count as absent."""
+    """Pack positions and headings of bank agents; agents further than 650 m from the origin are stored as absent."""
     xy = agents[..., AgentColumn.XY]
     heading = jnp.arctan2(agents[..., AgentColumn.SIN], agents[..., AgentColumn.COS])
     poses = jnp.concatenate([xy / _POSITION_UNIT_M, heading[..., None] / _HEADING_UNIT_RAD], axis=-1)
@@ -194,7 +202,7 @@ def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]
     return jnp.where(present[..., None], jnp.round(poses), _ABSENT).astype(jnp.int16)
 
 
-def unpack_poses(rows: Int16[np.ndarray, "*batch A 3"]) -> Float32[np.ndarray, "*batch A 3"]:
-    """Return positions (m) and headings (rad), NaN where absent."""
-    poses = rows * np.array([_POSITION_UNIT_M, _POSITION_UNIT_M, _HEADING_UNIT_RAD], np.float32)
-    return np.where(rows == _ABSENT, np.nan, poses).astype(np.float32)
+def unpack_poses(packed: Int16[np.ndarray, "*batch A 3"]) -> Float32[np.ndarray, "*batch A 3"]:
+    """Return positions (m) and headings (rad), NaN for absent agents."""
+    poses = packed * np.array([_POSITION_UNIT_M, _POSITION_UNIT_M, _HEADING_UNIT_RAD], np.float32)
+    return np.where(packed == _ABSENT, np.nan, poses).astype(np.float32)

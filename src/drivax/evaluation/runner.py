@@ -1,8 +1,8 @@
 """Evaluate a planner on every scenario of a set, in memory or into a run folder.
 
-An episode depends on planner, task, traffic, start, seed and scenario alone. Random keys follow from the scenario's
-identity (``bank.identity``), and each program runs a fixed number of scenarios (a short batch is padded) in banks of
-fixed sizes. So neither order nor batch size nor the other scenarios of a batch change a bit of it.
+An episode depends only on planner, task, traffic, start, seed and scenario, bit for bit: not on the order of the
+scenarios or the batch size. Random keys derive from the scenario's identity (``bank.identity``). Every program call
+runs a fixed number of scenarios (short batches are padded) in banks of fixed sizes.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress as ProgressBar
 from drivax.tracking.run_folder import RunFolder, learned_from
 
-#: Scenarios per program call on a CPU, where more leave the caches and fewer cost overhead
+#: Scenarios per program call on a CPU, where larger batches exceed the caches and smaller ones add overhead
 #: (docs/log/2026-11-22-evaluation.md), and on other devices.
 LANES, LANES_ELSEWHERE = 16, 256
-#: Scenarios that an error names, and crashes that are listed one by one.
-_NAMED = _LISTED = 5
+#: Maximum number of scenarios in an error message, and of crashes in a list.
+_MAX_NAMED = _MAX_LISTED = 5
 #: Columns of the headline table, with their short names.
 HEADLINE = {
     "success": "success", "accuracy": "accuracy", "at_fault_collision": "at fault", "collision": "collision",
@@ -61,13 +61,13 @@ Progress = Callable[[int, int], None]
 
 
 def lanes() -> int:
-    """Scenarios per program call on this platform."""
+    """Return the number of scenarios per program call on this platform."""
     return LANES if jax.default_backend() == "cpu" else LANES_ELSEWHERE
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """What is evaluated; stored as ``config.yaml``.
+    """Configuration of an evaluation, stored as ``config.yaml``.
 
     Attributes:
         planner: Planner to evaluate: a name, module:name of your own, the run folder of a training run (RUN or
@@ -108,15 +108,15 @@ def run_evaluation(
 ) -> EpisodeTable:  # fmt: skip
     """Evaluate a planner on the scenarios of a set that ``config`` selects, and write the run folder.
 
-    The folder appears once all episodes are done. The traffic model is by default the built-in one named
-    ``config.traffic``; ``sizes`` are those that the whole set uses, if they are known already.
+    The folder appears when all episodes are finished. ``traffic`` defaults to the built-in model ``config.traffic``,
+    ``sizes`` to those that the whole set uses.
     """
     scenarios = data.take(select_scenarios(data, config.filter, config.scenarios, config.limit))
     RunFolder.check(Path(out), overwrite, "evaluation")
-    # The scenarios to evaluate have been verified; of the others only the sizes are read.
+    # Verification is for the evaluated scenarios; the others only contribute their sizes.
     sizes = sizes or Sizes.used(ScenarioSet.open(data.path, verify=False))
-    needed = len(scenarios) * _episode_bytes(config.traffic, sizes, data.capacity.steps)
-    check_space(Path(out), needed)
+    needed_bytes = len(scenarios) * _episode_bytes(config.traffic, sizes, data.capacity.steps)
+    check_space(Path(out), needed_bytes)
     with ProgressBar(f"evaluating {planner.name}", "scenarios", len(scenarios)) as bar:
         table = evaluate(
             planner,
@@ -133,25 +133,25 @@ def run_evaluation(
     info: dict[str, Any] = {"kind": "evaluation", **table.info}
     if trained := learned_from(config.planner):
         info["trained_on"] = trained
-    with explain_full_disk(Path(out), needed), replace_folder(Path(out)) as partial_folder:
+    with explain_full_disk(Path(out), needed_bytes), replace_folder(Path(out)) as partial_folder:
         RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)
         table.write(partial_folder)
     return table
 
 
 def _episode_bytes(traffic: str, sizes: Sizes, steps: int) -> int:
-    """Return about how many bytes an episode takes in a run folder, as measured on the built-in world."""
+    """Return the approximate size of an episode in a run folder, measured on the built-in world."""
     return 22 * steps if traffic == "log" else steps * (22 + 3 * sizes.agents)
 
 
-def with_metrics(task: Task, more: tuple[str, ...]) -> Task:
+def with_metrics(task: Task, extra: tuple[str, ...]) -> Task:
     """Return the task with further metrics."""
     metrics = task.metrics if isinstance(task.metrics, tuple) else (task.metrics,)
-    return replace(task, metrics=tuple(dict.fromkeys((*metrics, *more)))) if more else task
+    return replace(task, metrics=tuple(dict.fromkeys((*metrics, *extra)))) if extra else task
 
 
 def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Format headline metrics of planners as a table of at most 100 columns; undefined means are empty."""
+    """Format headline metrics of planners as a table of at most 100 columns; undefined means are empty cells."""
     rows = []
     for summary in summaries:
         means = (summary["metrics"][name]["mean"] for name in HEADLINE)
@@ -162,35 +162,41 @@ def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
 
 
 def format_metrics(summary: Mapping[str, Any], names: tuple[str, ...]) -> str:
-    """Format metrics of one planner as a table: mean, 95 % interval and n; names are those of ``metrics.selection``."""
+    """Format metrics of one planner as a table: mean, 95 % interval and n; ``names`` as in ``metrics.selection``."""
     rows = []
     for name in select_metrics(names).names:
-        if (metric := summary["metrics"].get(name)) is not None:
-            numbers = (metric[key] for key in ("mean", "low", "high"))
-            mean, low, high = ("" if number is None else f"{number:.4g}" for number in numbers)
-            rows.append(tuple(map(Cell, (name, mean, f"{low} to {high}" if low else "", f"{metric['n']:,}"))))
+        metric = summary["metrics"].get(name)
+        if metric is None:
+            continue
+        numbers = (metric[key] for key in ("mean", "low", "high"))
+        mean, low, high = ("" if number is None else f"{number:.4g}" for number in numbers)
+        interval = f"{low} to {high}" if low else ""
+        rows.append((Cell(name), Cell(mean), Cell(interval), Cell(f"{metric['n']:,}")))
     columns = (Column("metric", label=True), *map(Column, ("mean", "95 % interval", "n")))
     return Table("metrics", columns, tuple(rows)).text()
 
 
 def format_crashes(table: EpisodeTable) -> str:
-    """Format the first crashes, a line each; empty without any."""
+    """Format the first crashes, one per line; empty if there are none."""
     if not table.crashes:
         return ""
     count = len(table.crashes)
     lines = [f"{table.planner} crashed in {count} of {len(table)} episodes, which count as failed:"]
-    lines += [f"  {crash.scenario_id}, step {crash.step}: {crash.error}" for crash in table.crashes[:_LISTED]]
-    if count > _LISTED:
-        lines.append(f"  and {count - _LISTED} more, in crashes.json")
+    lines += [
+        f"  {crash.scenario_id}, step {crash.step}: {crash.error}" for crash in table.crashes[:_MAX_LISTED]
+    ]
+    if count > _MAX_LISTED:
+        lines.append(f"  and {count - _MAX_LISTED} more, in crashes.json")
     return "\n".join(lines)
 
 
 class Options(TypedDict, total=False):
-    """Keyword options of :func:`evaluate`: start step (default: current step), seed (default: 0), and more.
+    """Keyword options of :func:`evaluate`.
 
-    ``batch`` is the number of stored scenarios loaded at a time, by default what fits in memory; no result depends on
-    it. ``sizes`` of the banks are by default what the scenarios use; subsets with the sizes of the whole set share its
-    compiled program. ``progress`` is called with (done, total) after every batch.
+    ``start_step`` defaults to the current step, and ``seed`` to 0. ``batch`` is the number of stored scenarios loaded
+    at a time, by default as many as fit in memory; results do not depend on it. ``sizes`` of the banks default to what
+    the scenarios use; subsets with the sizes of the whole set share its compiled program. ``progress`` is called with
+    (done, total) after every batch.
     """
 
     start_step: int
@@ -204,21 +210,21 @@ def evaluate(
     planner: Planner, scenarios: ScenarioBank | Sequence[Scenario], names: Names | None = None, *,
     task: Task | None = None, traffic: Traffic | None = None, start: Start | None = None, **options: Unpack[Options],
 ) -> EpisodeTable:  # fmt: skip
-    """Run a planner on every scenario to the end of its log, and measure each episode.
+    """Run a planner on every scenario to the end of its log, and measure the episodes.
 
     Args:
         planner: The planner.
         scenarios: A bank, or stored scenarios of one capacity.
         names: ``dataset``, ``scenario_id`` and ``segment`` of every scenario of a bank.
         task: Action space and observation of the planner. All metrics are measured, and no episode ends early.
-        traffic: Traffic model, log replay by default; what it needs is precomputed here.
-        start: How episodes start, as logged by default. Random starts are the same for every planner.
+        traffic: Traffic model, log replay by default; its precomputed data is added here.
+        start: Start of the episodes, as logged by default. Random starts are the same for every planner.
         options: See :class:`Options`.
 
     Raises:
-        UsageError: Planner, task, start and scenarios do not fit together.
+        UsageError: Planner, task, start and scenarios are incompatible.
         DataError: A log is too short.
-        DrivaxError: Memory does not suffice, or ego's motion is not finite.
+        DrivaxError: Memory is insufficient, or ego's motion is not finite.
     """
     batch, sizes, progress = options.get("batch"), options.get("sizes"), options.get("progress")
     start_step, seed = options.get("start_step", CURRENT_STEP), options.get("seed", 0)
@@ -241,22 +247,22 @@ def evaluate(
             rows = {int(number): row for row, number in enumerate(identity)}
             prepare(lambda number: scenarios[rows[number]])
         sizes = sizes or Sizes.used(scenarios)
-        size = min(batch or _fitting(simulator.traffic, scenarios, sizes), len(scenarios))
+        size = min(batch or _batch_size(simulator.traffic, scenarios, sizes), len(scenarios))
         banks = _banks(scenarios, identity, size, sizes)
     episodes, done = [], 0
     with raised() as errors, report_out_of_memory(size):
         for bank in banks:
-            for finished in evaluation.episodes(bank):
-                episodes.append(finished)
-                done += len(finished.crashed)
+            for batch_episodes in evaluation.episodes(bank):
+                episodes.append(batch_episodes)
+                done += len(batch_episodes.crashed)
                 if progress is not None:
                     progress(done, len(names))
-    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *episodes)
-    return evaluation.table(joined, names, identity, errors)
+    all_episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *episodes)
+    return evaluation.table(all_episodes, names, identity, errors)
 
 
 def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
-    """Check the names of a bank, and that episodes can start there."""
+    """Check that a bank has names, and that its episodes can start, and return the names."""
     if len(names) != len(bank):
         problem = f"{len(names)} scenario names for a bank of {len(bank)}"
         raise UsageError(problem, cure="name every scenario of the bank")
@@ -266,19 +272,19 @@ def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
 
 
 def _steps_of(scenarios: Sequence[Scenario]) -> int:
-    """Number of steps that the stored scenarios have room for."""
+    """Return the step capacity of stored scenarios."""
     return scenarios[0].capacity.steps if len(scenarios) else STEPS
 
 
 def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
-    """Return the names of stored scenarios, and check that episodes can start there."""
+    """Check that the episodes of stored scenarios can start, and return the names."""
     names = scenario_names(scenarios)
     steps, present = zip(*((int(s.steps), s.agent_valid[start_step, 0]) for s in scenarios), strict=True)
     _check_starts(names, np.array(steps), np.array(present), start_step)
     return names
 
 
-def _fitting(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> int:
+def _batch_size(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> int:
     """Return the number of scenarios that fit in memory at a time."""
     single = prepare_bank(traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes))
     return scenarios_at_a_time(single.nbytes, lanes(), free_memory(jax.devices()[0]))
@@ -287,7 +293,7 @@ def _fitting(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> i
 def _banks(
     scenarios: Sequence[Scenario], identity: UInt32[np.ndarray, " n"], size: int, sizes: Sizes
 ) -> Iterator[ScenarioBank]:
-    """Yield banks of ``size`` scenarios with the identities that they have in the whole."""
+    """Yield banks of ``size`` scenarios; ``identity`` is that of all scenarios."""
     for first in range(0, len(scenarios), size):
         rows = slice(first, first + size)
         bank = ScenarioBank.from_scenarios(scenarios[rows], trim=sizes)
@@ -296,7 +302,7 @@ def _banks(
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """What is evaluated, and how; the simulator has the task of :func:`evaluation_task`."""
+    """A checked evaluation; its simulator has the task of :func:`evaluation_task`."""
 
     simulator: Simulator
     planner: Planner
@@ -308,7 +314,7 @@ class _Evaluation:
     def of(
         cls, simulator: Simulator, planner: Planner, start_step: int, seed: int, steps: int
     ) -> _Evaluation:
-        """Check that planner, task and start fit together."""
+        """Check that planner, task and start are compatible."""
         task = simulator.task
         if not isinstance(task, Task):
             raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
@@ -320,12 +326,12 @@ class _Evaluation:
             raise UsageError(problem, cure="use expert_actions")
         task = evaluation_task(task)
         metrics = metric_specs(task.metrics)
-        if taken := sorted({*KEYS, *ADDED} & metrics.keys()):
-            raise UsageError(f"there is another column {taken[0]!r}", cure="give your metric another name")
+        if conflicts := sorted({*KEYS, *ADDED} & metrics.keys()):
+            raise UsageError(f"the column {conflicts[0]!r} already exists", cure="rename your metric")
         return cls(replace(simulator, task=task), planner, start_step, seed, metrics)
 
     def episodes(self, bank: ScenarioBank) -> Iterator[Episodes]:
-        """Run all scenarios of a bank in its order, a batch at a time."""
+        """Run the scenarios of a bank in order, and yield their episodes in batches."""
         bank, width = prepare_bank(self.simulator.traffic, bank), lanes()
         index = jnp.arange(width, dtype=jnp.int32)
         for first in range(0, len(bank), width):
@@ -341,29 +347,25 @@ class _Evaluation:
         """Tabulate episodes; ``errors`` are the planner's exceptions by identity and step."""
         _check_finite(episodes, names)
         n, planner, traffic = len(names), self.planner.name, self.simulator.traffic.name
-        values, crashed = episodes.metrics, np.asarray(episodes.crashed)
-        actions = until_crash(np.asarray(episodes.actions), crashed, self.start_step)
-        driven = self.start_step + np.arange(actions.shape[1]) < values["last_step"].value[:, None]
-        actions = np.where(driven[..., None], actions, np.nan)
+        values, crash_step = episodes.metrics, np.asarray(episodes.crashed)
+        actions = until_crash(np.asarray(episodes.actions), crash_step, self.start_step)
+        in_log = self.start_step + np.arange(actions.shape[1]) < values["last_step"].value[:, None]
+        actions = np.where(in_log[..., None], actions, np.nan)
         metrics = {"action_jerk": action_jerk(actions)} | {
             name: np.where(values[name].defined, values[name].value, np.nan) for name in self.metrics
         }
         columns = {key: tuple(row[key] for row in names) for key in ("dataset", "scenario_id", "segment")}
         columns |= {"planner": (planner,) * n, "seed": (str(self.seed),) * n, "traffic": (traffic,) * n}
-        theirs = {name: metric for name, metric in self.metrics.items() if name not in METRICS}
-        own = {name: {"unit": m.unit, "better": m.better, "text": m.definition} for name, m in theirs.items()}
-        crashes: list[Crash] = []
-        for row in np.flatnonzero(crashed >= 0).tolist():
-            step = int(crashed[row])
-            error = errors.get((int(identity[row]), step), "action is not finite")
-            crashes.append(Crash(names[row]["dataset"], names[row]["scenario_id"], step, error))
+        info: dict[str, Any] = {"planner": planner, "traffic": traffic}
+        if own_metrics := self._own_metrics():
+            info["own_metrics"] = own_metrics
         return EpisodeTable(
             folder=None,
             name=planner,
-            info={"planner": planner, "traffic": traffic} | ({"own_metrics": own} if own else {}),
+            info=info,
             keys={name: columns[name] for name in KEYS},
-            metrics=fail_crashed(metrics, crashed >= 0),
-            crashes=tuple(crashes),
+            metrics=fail_crashed(metrics, crash_step >= 0),
+            crashes=_crashes(crash_step, names, identity, errors),
             in_memory=Trajectories(
                 ego=np.asarray(episodes.motion),
                 action=actions,
@@ -373,36 +375,56 @@ class _Evaluation:
             ),
         )
 
+    def _own_metrics(self) -> dict[str, dict[str, str]]:
+        user_metrics = {name: metric for name, metric in self.metrics.items() if name not in METRICS}
+        return {
+            name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
+            for name, metric in user_metrics.items()
+        }
+
+
+def _crashes(
+    crash_step: Int[np.ndarray, " episode"],
+    names: Names,
+    identity: Any,
+    errors: Mapping[tuple[int, int], str],
+) -> tuple[Crash, ...]:
+    crashes = []
+    for row in np.flatnonzero(crash_step >= 0).tolist():
+        step = int(crash_step[row])
+        error = errors.get((int(identity[row]), step), "action is not finite")
+        crashes.append(Crash(names[row]["dataset"], names[row]["scenario_id"], step, error))
+    return tuple(crashes)
+
 
 def until_crash(
-    actions: Float[np.ndarray, "episode step D"], crashed: Int[np.ndarray, " episode"], start: int
+    actions: Float[np.ndarray, "episode step D"], crash_step: Int[np.ndarray, " episode"], start: int
 ) -> Float[np.ndarray, "episode step D"]:
-    """Return actions with NaN from the step on at which the planner crashed (-1: never).
+    """Return actions with NaN from the step on at which the planner crashed (``crash_step``; -1: never).
 
     ``start`` is the step of the log of the first action.
     """
     step = start + np.arange(actions.shape[1])
-    own = (crashed[:, None] < 0) | (step < crashed[:, None])
-    return np.where(own[..., None], actions, np.nan)
+    before_crash = (crash_step[:, None] < 0) | (step < crash_step[:, None])
+    return np.where(before_crash[..., None], actions, np.nan)
 
 
 def action_jerk(actions: Float[np.ndarray, "episode step D"]) -> Float64[np.ndarray, " episode"]:
     """Return the standard deviation of the change of the action from step to step; NaN with fewer than two actions.
 
-    ``sqrt(mean_d var_t(a[t + 1, d] - a[t, d]))`` with the population's variance, in units of the action space; NaN
-    actions are left out. A steady change (a ramp) has none; uniform random actions in [-1, 1] have about
-    ``sqrt(2 / 3) = 0.82``.
+    This is ``sqrt(mean_d var_t(a[t + 1, d] - a[t, d]))`` with the population variance, in units of the action space.
+    NaN actions are ignored. A ramp has 0; uniform random actions in [-1, 1] have about ``sqrt(2 / 3) = 0.82``.
     """
     change = np.diff(np.asarray(actions, np.float64), axis=1)
     with warnings.catch_warnings():
-        # NumPy warns of fewer than two actions, which have no change.
+        # NumPy warns about episodes with fewer than two actions.
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.sqrt(np.nanvar(change, axis=1).mean(axis=-1))
 
 
 @partial(jax.jit, static_argnames="seed")
 def _batch(bank: ScenarioBank, rows: Int[Array, " W"], seed: int) -> tuple[ScenarioBank, Array]:
-    """Return these rows of a bank as a bank of their own, and their keys."""
+    """Return scenarios of a bank as a bank of their own, and their keys."""
     batch = bank.part(rows)
     return batch, episode_keys(batch, jnp.arange(len(rows)), seed)
 
@@ -410,24 +432,28 @@ def _batch(bank: ScenarioBank, rows: Int[Array, " W"], seed: int) -> tuple[Scena
 def _check_starts(
     names: Names, steps: Int[np.ndarray, " n"], present: Bool[np.ndarray, " n"], start_step: int
 ) -> None:
-    """Refuse logs of too few steps, and those without ego at the start or without an action after it."""
+    """Check that logs are long enough, and contain ego at the start step and an action after it."""
     ids = [row["scenario_id"] for row in names]
     if (short := np.flatnonzero(steps < LEAST_STEPS)).size:
-        problem = f"{too_short(int(steps[short[0]]))}; so have {len(short)} of {len(names)} scenarios"
-        cure = "leave them out with --filter flag!=NO_FUTURE"
+        problem = f"{too_short(int(steps[short[0]]))}; {len(short)} of {len(names)} scenarios are too short"
+        cure = "exclude them with --filter flag!=NO_FUTURE"
         raise DataError(problem, record=ids[short[0]], cure=cure)
     present = present & (start_step < steps - 1)
     if absent := [name for name, valid in zip(ids, present, strict=True) if not valid]:
         problem = f"ego is not in the log at step {start_step} in {len(absent)} of {len(names)} scenarios"
-        leave_out = f", or leave them out: --filter 'scenario_id!={'|'.join(absent)}'"
-        cure = "start at another step" + (leave_out if len(absent) <= _NAMED else "")
+        exclude = f", or exclude them: --filter 'scenario_id!={'|'.join(absent)}'"
+        cure = "start at another step" + (exclude if len(absent) <= _MAX_NAMED else "")
         raise UsageError(problem, record=absent[0], cure=cure)
 
 
 def _check_finite(episodes: Episodes, names: Names) -> None:
-    """Refuse motion that is not finite although all actions were: a defect of action space or traffic."""
-    broken = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
-    if broken.size:
-        problem, record = f"ego's motion is not finite in {broken.size} scenarios", names[int(broken[0])]
+    """Check that ego's motion is finite.
+
+    Raises:
+        DrivaxError: It is not, although all actions were: the action space or the traffic is defective.
+    """
+    invalid = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
+    if invalid.size:
+        problem, record = f"ego's motion is not finite in {invalid.size} scenarios", names[int(invalid[0])]
         cure = "check the action space and the traffic"
         raise DrivaxError(problem, record=record["scenario_id"], cure=cure)

@@ -1,4 +1,4 @@
-"""Episode metrics: a metric is an entry of ``METRICS`` (``catalogue``), a quantity of a step one of ``STEP_VALUES``."""
+"""Episode metrics: ``catalogue`` defines the metrics (``METRICS``), ``steps`` their step values (``STEP_VALUES``)."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Specification of every episode metric: unit, direction, operator, label, definition, requirements; and the scores."""
+"""Specification of the episode metrics (unit, direction, operator, definition, requirements), and the scores."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ class Column:
 
     Attributes:
         unit: Unit, ``-`` for shares and booleans.
-        better: ``low``, ``high``, or ``-`` where neither is.
+        better: ``low``, ``high``, or ``-`` for neither.
         definition: One line for tables and reports.
         label: Heading; by default the name of the metric.
         kind: Scale of the values.
-        headline: Position in the first table of a report; None: not there.
+        headline: Position in the first table of a report; None if it is not in that table.
         summarised: Whether the mean over episodes is reported.
-        fails_on_crash: Whether it is 0 in an episode in which the planner crashed.
+        fails_on_crash: Whether the value is 0 if the planner crashed.
     """
 
     unit: str
@@ -51,14 +51,15 @@ class Column:
 
 @dataclass(frozen=True)
 class Metric(Column):
-    """A metric of an episode: a step value under an operator, a function of other metrics, or both.
+    """A metric of an episode: a step value reduced by an operator, a function of other metrics, or both.
 
     Attributes:
-        needs: Scenario flags without which it is undefined.
-        step_value: The step value that is accumulated.
-        operator: How it is accumulated.
+        needs: Scenario flags without which the metric is undefined.
+        step_value: The accumulated step value.
+        operator: Operator that reduces the step values.
         inputs: Metrics that ``compute`` reads.
-        compute: ``(episode end, accumulated value, inputs) -> Value``; the second is undefined without ``step_value``.
+        compute: ``(episode end, accumulated value, inputs) -> Value``; the accumulated value is undefined without
+            ``step_value``.
     """
 
     needs: Flag = Flag.NONE
@@ -76,7 +77,7 @@ class Metric(Column):
 
 @record
 class EpisodeEnd:
-    """The episode that is over: its scenario, the step at which it started, and the number of steps."""
+    """End of an episode: its scenario, start step, and number of steps."""
 
     bank: ScenarioBank
     index: Int[Array, ""]
@@ -84,9 +85,9 @@ class EpisodeEnd:
     steps: Int[Array, ""]
 
 
-#: Values of the metrics that a metric is computed from, by name.
+#: Values of a metric's inputs by name.
 Inputs = Mapping[str, Value]
-#: Weights of the two scores, and the metrics that multiply them.
+#: Weights of the two scores, and their gates.
 NUPLAN_WEIGHTS = {"ttc_ok": 5.0, "progress_ratio": 5.0, "speed_compliance": 4.0, "comfortable": 2.0}
 VMAX_WEIGHTS = {**NUPLAN_WEIGHTS, "lane_keeping": 3.0}
 NUPLAN_GATES = ("at_fault_collision", "offroad")
@@ -94,7 +95,7 @@ VMAX_GATES = (*NUPLAN_GATES, "red_light")
 _PASSES = ("making_progress", "direction")
 NUPLAN_INPUTS = (*NUPLAN_WEIGHTS, *NUPLAN_GATES, *_PASSES)
 VMAX_INPUTS = (*VMAX_WEIGHTS, *VMAX_GATES, *_PASSES)
-#: Time to collision that counts as safe, and mean speeding at which compliance is 0 (nuPlan).
+#: Smallest safe time to collision, and mean speeding at which compliance is 0 (nuPlan).
 _SAFE_TTC_S, _SPEEDING_MPS = 0.95, 2.23
 
 
@@ -102,8 +103,8 @@ def _boolean(value: Bool[Array, ""], defined: Any = True) -> Value:
     return Value(value.astype(jnp.float32), jnp.asarray(defined))
 
 
-def _graded(name: str, good: float, fair: float, end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    """Return 1 where an input is up to ``good``, 0.5 up to ``fair``, else 0."""
+def _grade(name: str, good: float, fair: float, end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    """Return 1 for inputs up to ``good``, 0.5 up to ``fair``, else 0."""
     grade = jnp.where(inputs[name].value <= good, 1.0, jnp.where(inputs[name].value <= fair, 0.5, 0.0))
     return Value(grade, inputs[name].defined)
 
@@ -112,7 +113,7 @@ def _at_least(name: str, threshold: float, end: EpisodeEnd, value: Value, inputs
     return _boolean(inputs[name].value >= threshold, inputs[name].defined)
 
 
-def _on_a_map(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+def _if_mapped(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     return Value(value.value, value.defined & is_mapped(end.bank, end.index))
 
 
@@ -130,22 +131,22 @@ def _progress(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
 
 
 def _progress_ratio(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    log = end.bank.log_progress[end.index]
-    logged = log[end.bank.last_step[end.index]] - log[end.start]
+    log_progress = end.bank.log_progress[end.index]
+    log_gain = log_progress[end.bank.last_step[end.index]] - log_progress[end.start]
     gain = inputs["progress"]
-    ratio = jnp.where(logged < 0.5, 1.0, jnp.clip(gain.value / jnp.maximum(logged, 0.5), 0.0, 1.0))
+    ratio = jnp.where(log_gain < 0.5, 1.0, jnp.clip(gain.value / jnp.maximum(log_gain, 0.5), 0.0, 1.0))
     return Value(ratio, gain.defined)
 
 
 def _reached_goal(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    near = inputs["goal_distance"].value <= 3.0
-    return _boolean(near | (inputs["progress_ratio"].value >= 0.95), inputs["progress_ratio"].defined)
+    is_near = inputs["goal_distance"].value <= 3.0
+    return _boolean(is_near | (inputs["progress_ratio"].value >= 0.95), inputs["progress_ratio"].defined)
 
 
 def _ttc_ok(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    # A car that never moves has no time to collision and is safe.
-    least = inputs["min_ttc"]
-    safe = jnp.where(least.defined, least.value, TTC_HORIZON_S) >= _SAFE_TTC_S
+    # The time to collision of a car that never moves is undefined; the car is safe.
+    min_ttc = inputs["min_ttc"]
+    safe = jnp.where(min_ttc.defined, min_ttc.value, TTC_HORIZON_S) >= _SAFE_TTC_S
     return _boolean(safe, end.steps > 0)
 
 
@@ -154,16 +155,16 @@ def _speed_compliance(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     return Value(jnp.maximum(0.0, 1.0 - mean.value / _SPEEDING_MPS), mean.defined)
 
 
-def _without(collision: str, end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    """Whether there is no such collision, off-road step or red light; a red light counts where lights are known."""
-    ran_red = inputs["red_light"].defined & (inputs["red_light"].value > 0)
-    clean = ~(inputs[collision].value > 0) & ~(inputs["offroad"].value > 0) & ~ran_red
+def _accuracy(collision: str, end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    """Return whether there is no ``collision`` (name of a metric), off-road step or known red light."""
+    runs_red = inputs["red_light"].defined & (inputs["red_light"].value > 0)
+    clean = ~(inputs[collision].value > 0) & ~(inputs["offroad"].value > 0) & ~runs_red
     return _boolean(clean, inputs[collision].defined & inputs["offroad"].defined)
 
 
 def _success(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    clean, reached = inputs["accuracy"], inputs["reached_goal"]
-    return _boolean((clean.value > 0) & (reached.value > 0), clean.defined & reached.defined)
+    clean, reaches_goal = inputs["accuracy"], inputs["reached_goal"]
+    return _boolean((clean.value > 0) & (reaches_goal.value > 0), clean.defined & reaches_goal.defined)
 
 
 def _success_moving(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
@@ -172,17 +173,18 @@ def _success_moving(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
 
 
 def score(metrics: Inputs, weights: Mapping[str, float], gates: tuple[str, ...]) -> tuple[Value, Value]:
-    """Return a full and a partial score: a weighted mean of metrics, times one minus each gate, progress and direction.
+    """Return a full and a partial score: a weighted mean of metrics, times the gates.
 
-    The full score is defined where every input is; the partial one where some input is undefined: undefined terms leave
-    the mean, undefined gates count as passed.
+    Gates multiply the mean by 1 minus their value; progress and direction multiply it by their value. The full score
+    is defined if all inputs are. The partial score is defined if some input is not: undefined terms are removed from
+    the mean, and undefined gates count as passed.
     """
     terms = jnp.stack([jnp.clip(metrics[name].value, 0.0, 1.0) for name in weights])
-    known = jnp.stack([metrics[name].defined for name in weights])
-    share = jnp.asarray(list(weights.values()))[(...,) + (None,) * (terms.ndim - 1)] * known
-    total = share.sum(axis=0)
-    mean = (share * terms).sum(axis=0) / jnp.maximum(total, 1e-9)
-    complete = known.all(axis=0)
+    term_defined = jnp.stack([metrics[name].defined for name in weights])
+    weight = jnp.asarray(list(weights.values()))[(...,) + (None,) * (terms.ndim - 1)] * term_defined
+    total = weight.sum(axis=0)
+    mean = (weight * terms).sum(axis=0) / jnp.maximum(total, 1e-9)
+    complete = term_defined.all(axis=0)
     factors = [(metrics[name].defined, 1.0 - metrics[name].value) for name in gates]
     for defined, factor in factors + [(metrics[name].defined, metrics[name].value) for name in _PASSES]:
         mean = mean * jnp.where(defined, factor, 1.0)
@@ -196,25 +198,25 @@ def nuplan_score(metrics: Inputs) -> tuple[Value, Value]:
 
 
 def vmax_score(metrics: Inputs) -> tuple[Value, Value]:
-    """Return the V-Max score: nuPlan's terms and lane keeping, gated by red lights too; full and partial."""
+    """Return the V-Max score, full and partial: nuPlan's terms and lane keeping, with red lights as another gate."""
     return score(metrics, VMAX_WEIGHTS, VMAX_GATES)
 
 
 def _score(score: Callable[[Inputs], tuple[Value, Value]], number: int) -> Callable[..., Value]:
-    """Return the full (0) or the partial (1) score as a computation of a metric."""
+    """Return the ``compute`` function of a score's full (0) or partial (1) value."""
     return lambda end, value, inputs: score(inputs)[number]
 
 
-def _accumulated(
-    step_value: str, operator: Operator, unit: str, better: Direction, definition: str, **more: Any
+def _step_metric(
+    step_value: str, operator: Operator, unit: str, better: Direction, definition: str, **options: Any
 ) -> Metric:
-    return Metric(unit, better, definition, step_value=STEP_VALUES[step_value], operator=operator, **more)
+    return Metric(unit, better, definition, step_value=STEP_VALUES[step_value], operator=operator, **options)
 
 
-def _computed(
-    compute: Callable[..., Value], inputs: tuple[str, ...], better: Direction, definition: str, **more: Any
+def _derived_metric(
+    compute: Callable[..., Value], inputs: tuple[str, ...], better: Direction, definition: str, **options: Any
 ) -> Metric:
-    return Metric("-", better, definition, inputs=inputs, compute=compute, **more)
+    return Metric("-", better, definition, inputs=inputs, compute=compute, **options)
 
 
 _LANES, _ROUTE = Flag.LANE_GRAPH, Flag.ROUTE
@@ -224,103 +226,103 @@ _SCORE = {"kind": "score", "fails_on_crash": True}
 
 # fmt: off
 METRICS: dict[str, Metric] = {
-    "accuracy": _computed(
-        partial(_without, "collision"), ("collision", "offroad", "red_light"), "high",
+    "accuracy": _derived_metric(
+        partial(_accuracy, "collision"), ("collision", "offroad", "red_light"), "high",
         "no collision, not off the road, no red light run", headline=3, **_OUTCOME),
-    "accuracy_at_fault": _computed(
-        partial(_without, "at_fault_collision"), ("at_fault_collision", "offroad", "red_light"), "high",
+    "accuracy_at_fault": _derived_metric(
+        partial(_accuracy, "at_fault_collision"), ("at_fault_collision", "offroad", "red_light"), "high",
         "no at-fault collision, not off the road, no red light run", label="accuracy, at-fault only", **_OUTCOME),
-    "success": _computed(
+    "success": _derived_metric(
         _success, ("accuracy", "reached_goal"), "high", "accuracy and the goal reached", headline=1, **_OUTCOME),
-    "success_moving": _computed(
+    "success_moving": _derived_metric(
         _success_moving, ("success",), "high", "success where the log drives more than 5 m",
         label="success, moving", headline=2, **_OUTCOME),
-    "vmax_score": _computed(
+    "vmax_score": _derived_metric(
         _score(vmax_score, 0), VMAX_INPUTS, "high", "safety gates times ttc, progress, speed, lanes and comfort",
         label="V-Max score", headline=11, **_SCORE),
-    "nuplan_score": _computed(
+    "nuplan_score": _derived_metric(
         _score(nuplan_score, 0), NUPLAN_INPUTS, "high", "nuPlan's closed-loop score by our definitions",
         label="nuPlan-style score", headline=12, **_SCORE),
-    "vmax_score_partial": _computed(
+    "vmax_score_partial": _derived_metric(
         _score(vmax_score, 1), VMAX_INPUTS, "high", "vmax_score where an input is undefined",
         label="partial V-Max score", **_SCORE),
-    "nuplan_score_partial": _computed(
+    "nuplan_score_partial": _derived_metric(
         _score(nuplan_score, 1), NUPLAN_INPUTS, "high", "nuplan_score where an input is undefined",
         label="partial nuPlan-style score", **_SCORE),
-    "collision": _accumulated("collision", "any", "-", "low", "boxes overlap", headline=4, **_RATE),
-    "at_fault_collision": _accumulated(
+    "collision": _step_metric("collision", "any", "-", "low", "boxes overlap", headline=4, **_RATE),
+    "at_fault_collision": _step_metric(
         "at_fault_collision", "any", "-", "low", "a collision that is ego's fault by nuPlan's rules",
         label="at-fault collision", headline=5, **_RATE),
-    "collision_type": _accumulated(
+    "collision_type": _step_metric(
         "collision_type", "first", "-", "-", "kind of the first collision", kind="code", summarised=False),
-    "offroad": _accumulated(
+    "offroad": _step_metric(
         "offroad", "any", "-", "low", "a corner more than 0.3 m off the road",
-        label="off-road", headline=6, compute=_on_a_map, **_RATE),
-    "left_map": _accumulated(
-        "left_map", "any", "-", "low", "left the mapped area", label="left the map", compute=_on_a_map, **_RATE),
-    "red_light": _accumulated(
+        label="off-road", headline=6, compute=_if_mapped, **_RATE),
+    "left_map": _step_metric(
+        "left_map", "any", "-", "low", "left the mapped area", label="left the map", compute=_if_mapped, **_RATE),
+    "red_light": _step_metric(
         "red_light", "any", "-", "low", "ran a red light", needs=Flag.LIGHTS, headline=7, **_RATE),
-    "min_ttc": _accumulated("ttc", "min", "s", "high", "smallest time to collision, at most 5", label="minimum TTC"),
-    "average_ttc": _accumulated("ttc", "mean", "s", "high", "mean time to collision", label="mean TTC"),
-    "ttc_ok": _computed(
+    "min_ttc": _step_metric("ttc", "min", "s", "high", "smallest time to collision, at most 5", label="minimum TTC"),
+    "average_ttc": _step_metric("ttc", "mean", "s", "high", "mean time to collision", label="mean TTC"),
+    "ttc_ok": _derived_metric(
         _ttc_ok, ("min_ttc",), "high", "time to collision always at least 0.95 s", label="TTC ok", headline=9, **_RATE),
-    "comfort": _accumulated("comfort", "mean", "-", "high", "share of steps within nuPlan's limits"),
-    "comfortable": _computed(
+    "comfort": _step_metric("comfort", "mean", "-", "high", "share of steps within nuPlan's limits"),
+    "comfortable": _derived_metric(
         partial(_at_least, "comfort", 1.0 - 1e-6), ("comfort",), "high", "every step within nuPlan's limits",
         headline=10, **_RATE),
-    "max_jerk": _accumulated("jerk", "max", "m/s3", "low", "largest jerk magnitude"),
-    "max_lateral_acceleration": _accumulated(
+    "max_jerk": _step_metric("jerk", "max", "m/s3", "low", "largest jerk magnitude"),
+    "max_lateral_acceleration": _step_metric(
         "lateral_acceleration", "max", "m/s2", "low", "largest lateral acceleration"),
-    "speeding_mean": _accumulated("speeding", "mean", "m/s", "low", "mean speed above the limit"),
-    "speeding_max": _accumulated("speeding", "max", "m/s", "low", "largest speed above the limit"),
-    "speed_compliance": _computed(
+    "speeding_mean": _step_metric("speeding", "mean", "m/s", "low", "mean speed above the limit"),
+    "speeding_max": _step_metric("speeding", "max", "m/s", "low", "largest speed above the limit"),
+    "speed_compliance": _derived_metric(
         _speed_compliance, ("speeding_mean",), "high", "1 - mean speeding / 2.23 m/s, at least 0"),
-    "wrong_way": _accumulated("wrong_way", "sum", "m", "low", "distance driven against traffic", needs=_LANES),
-    "wrong_way_worst": _accumulated(
+    "wrong_way": _step_metric("wrong_way", "sum", "m", "low", "distance driven against traffic", needs=_LANES),
+    "wrong_way_worst": _step_metric(
         "wrong_way", "worst_second", "m", "low", "most distance against traffic within 1 s",
         label="wrong way within 1 s", needs=_LANES),
-    "direction": _computed(
-        partial(_graded, "wrong_way_worst", 2.0, 6.0), ("wrong_way_worst",), "high",
+    "direction": _derived_metric(
+        partial(_grade, "wrong_way_worst", 2.0, 6.0), ("wrong_way_worst",), "high",
         "1, 0.5 or 0: at most 2 m, 6 m or more against traffic in 1 s"),
-    "lane_straddle": _accumulated(
+    "lane_straddle": _step_metric(
         "lane_straddle", "sum", "s", "low", "time across the border of ego's lanes", needs=_LANES),
-    # Sums of 0.1 s in float32: a hundredth of a step keeps 3.4 s on the right side.
-    "lane_keeping": _computed(
-        partial(_graded, "lane_straddle", 3.401, 5.701), ("lane_straddle",), "high",
+    # A margin of 1 ms absorbs the rounding of sums of 0.1 s in float32.
+    "lane_keeping": _derived_metric(
+        partial(_grade, "lane_straddle", 3.401, 5.701), ("lane_straddle",), "high",
         "1, 0.5 or 0: straddling at most 3.4 s, 5.7 s or longer"),
-    "progress": _accumulated(
+    "progress": _step_metric(
         "progress", "last", "m", "high", "distance gained along the route",
         label="progress along the route", needs=_ROUTE, compute=_progress),
-    "progress_ratio": _computed(
+    "progress_ratio": _derived_metric(
         _progress_ratio, ("progress",), "high", "progress as a share of the log's", label="progress", headline=8),
-    "making_progress": _computed(
+    "making_progress": _derived_metric(
         partial(_at_least, "progress_ratio", 0.2), ("progress_ratio",), "high", "progress ratio at least 0.2", **_RATE),
-    "route_deviation_mean": _accumulated(
+    "route_deviation_mean": _step_metric(
         "route_deviation", "mean", "m", "low", "mean distance to the route", needs=_ROUTE),
-    "route_deviation_max": _accumulated(
+    "route_deviation_max": _step_metric(
         "route_deviation", "max", "m", "low", "largest distance to the route", needs=_ROUTE),
-    "off_route": _accumulated(
+    "off_route": _step_metric(
         "off_route", "any", "-", "low", "left the lanes of the route", needs=_ROUTE | _LANES, **_RATE),
-    "ade": _accumulated("log_divergence", "mean", "m", "-", "mean distance to the logged position", label="ADE"),
-    "fde": _accumulated(
+    "ade": _step_metric("log_divergence", "mean", "m", "-", "mean distance to the logged position", label="ADE"),
+    "fde": _step_metric(
         "log_divergence", "last", "m", "-", "distance to the logged position at the end", label="FDE"),
-    "goal_distance": _accumulated(
+    "goal_distance": _step_metric(
         "goal_distance", "last", "m", "low", "distance to the goal at the end", needs=_ROUTE),
-    "reached_goal": _computed(
+    "reached_goal": _derived_metric(
         _reached_goal, ("goal_distance", "progress_ratio"), "high",
         "within 3 m of the goal, or progress ratio at least 0.95", label="goal reached", **_RATE),
-    "distance": _accumulated("distance", "sum", "m", "-", "distance driven"),
-    "ignored_overlaps": _accumulated(
+    "distance": _step_metric("distance", "sum", "m", "-", "distance driven"),
+    "ignored_overlaps": _step_metric(
         "ignored", "max", "-", "-", "agents ignored because they overlapped at the start"),
-    "steps": _computed(_steps, (), "-", "steps driven", summarised=False),
-    "last_step": _computed(_last_step, (), "-", "last step of the log", summarised=False),
+    "steps": _derived_metric(_steps, (), "-", "steps driven", summarised=False),
+    "last_step": _derived_metric(_last_step, (), "-", "last step of the log", summarised=False),
 }
 # fmt: on
 #: Metrics without a mean.
 CODES = ("collision_type",)
-#: Metrics whose first step is stored as well.
+#: Metrics whose first step is stored.
 EVENTS = ("collision", "offroad", "red_light")
-#: What a training loop logs: needs neither fault, time to collision, comfort nor limits.
+#: Metrics of training logs, which need no fault, time to collision, comfort or speed limits.
 TRAINING = (
     "success", "success_moving", "accuracy", "collision", "offroad", "left_map", "red_light", "off_route",
     "progress", "progress_ratio", "making_progress", "reached_goal", "goal_distance", "distance", "steps",
@@ -336,5 +338,5 @@ def headline(columns: Mapping[str, Column]) -> tuple[str, ...]:
 
 
 def names_of(columns: Mapping[str, Column], *kinds: Kind) -> tuple[str, ...]:
-    """Return the names of the columns of these kinds."""
+    """Return the names of the columns of the given kinds."""
     return tuple(name for name, column in columns.items() if column.kind in kinds)

@@ -1,6 +1,6 @@
-"""Metrics of an episode, accumulated in the graph: situation -> step values -> accumulators -> episode metrics.
+"""Accumulate the metrics of an episode: situation -> step values -> accumulators -> episode metrics.
 
-Each accumulator has one entry per step value that some selected metric needs under that operator, and no other.
+Accumulators hold only the step values that the selected metrics need under their operators.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class Episode:
     """Accumulators of one episode.
 
     Attributes:
-        total, count: Sum over the steps that define a value, and the number of those steps.
-        low, high, last, first: Extremes, the last value, and the first one above zero (0 while there is none); NaN or
-            infinite before any step defines one.
+        total, count: Sum of the defined values, and their number.
+        low, high, last, first: Minimum, maximum, last value, and first value above zero (0 until there is one); NaN or
+            infinite before the first defined value.
         event_step: Step of the first collision, off-road step and red light.
         second, worst: The last ten values, and the largest sum over ten consecutive steps.
-        selection: The metrics that are accumulated.
+        selection: The accumulated metrics.
     """
 
     total: Float[Array, "*batch total"]
@@ -65,7 +65,7 @@ def episode_start(metrics: MetricNames = "full") -> Episode:
     """Return the accumulators of an episode without steps."""
     selection = select_metrics(metrics)
     size = {name: len(values) for name, values in _entries(selection).items()}
-    # Types as strong as those of later steps: else a program that steps is traced and compiled twice.
+    # Strong types, as in later steps; weak ones would cause a second compilation.
     full = partial(jnp.full, dtype=float)
     return Episode(
         total=jnp.zeros(size["total"]),
@@ -84,27 +84,27 @@ def episode_start(metrics: MetricNames = "full") -> Episode:
 def episode_add(
     episode: Episode, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
 ) -> Episode:
-    """Add the step to ``situation``, in an episode that began at ``start``; ``final`` evaluates its last steps too."""
+    """Add one step to an episode that began at ``start``; ``final`` marks its last step."""
     selection, values = episode.selection, _entries(episode.selection)
     moment = _MomentValues(Moment(situation, start, final))
-    added, number = moment.sums(values["total"])
+    total, count = moment.sums(values["total"])
     low, _ = moment.extremes(values["low"], jnp.min, jnp.inf)
     high, _ = moment.extremes(values["high"], jnp.max, -jnp.inf)
     last, last_counts = moment.extremes(values["last"], jnp.max, -jnp.inf)
     first, first_counts = moment.extremes(values["first"], jnp.max, -jnp.inf)
-    waiting = first_counts & ~(episode.first > 0)
-    happens, _ = moment.extremes(tuple(STEP_VALUES[name] for name in selection.events), jnp.max, 0.0)
-    begins = (happens > 0) & (episode.event_step == _NEVER)
+    first_now = first_counts & ~(episode.first > 0)
+    event_values, _ = moment.extremes(tuple(STEP_VALUES[name] for name in selection.events), jnp.max, 0.0)
+    event_now = (event_values > 0) & (episode.event_step == _NEVER)
     window, _ = moment.sums(values["worst"])
     second = jnp.concatenate([episode.second[:, 1:], window[:, None]], axis=1)
     return Episode(
-        total=episode.total + added,
-        count=episode.count + number,
+        total=episode.total + total,
+        count=episode.count + count,
         low=jnp.minimum(episode.low, low),
         high=jnp.maximum(episode.high, high),
         last=jnp.where(last_counts, last, episode.last),
-        first=jnp.where(waiting, first, episode.first),
-        event_step=jnp.where(begins, situation.context.step.astype(jnp.int16), episode.event_step),
+        first=jnp.where(first_now, first, episode.first),
+        event_step=jnp.where(event_now, situation.context.step.astype(jnp.int16), episode.event_step),
         second=second,
         worst=jnp.maximum(episode.worst, second.sum(axis=1)),
         selection=selection,
@@ -112,46 +112,46 @@ def episode_add(
 
 
 class _MomentValues:
-    """Step values of one moment, each read once."""
+    """Step values of one moment, each computed once."""
 
     def __init__(self, moment: Moment) -> None:
         self.moment = moment
-        self.read: dict[StepValue, tuple[Array, Array]] = {}
+        self.values: dict[StepValue, tuple[Array, Array]] = {}
 
-    def _one(self, value: StepValue) -> tuple[Array, Array]:
-        if value not in self.read:
+    def _read(self, value: StepValue) -> tuple[Array, Array]:
+        if value not in self.values:
             number, defined = value.read(self.moment)
             defined = jnp.broadcast_to(jnp.asarray(defined, bool), number.shape)
-            self.read[value] = number.astype(jnp.float32), defined
-        return self.read[value]
+            self.values[value] = number.astype(jnp.float32), defined
+        return self.values[value]
 
     def sums(self, values: Sequence[StepValue]) -> tuple[Float[Array, " R"], Int[Array, " R"]]:
-        """Return the sums and the numbers of defined values."""
-        pairs = [self._one(value) for value in values]
+        """Return the sums and numbers of the defined values."""
+        pairs = [self._read(value) for value in values]
         total = [jnp.where(defined, number, 0.0).sum() for number, defined in pairs]
         count = [defined.sum(dtype=jnp.int16) for _, defined in pairs]
-        return _stacked(total, jnp.float32), _stacked(count, jnp.int16)
+        return _stack(total, jnp.float32), _stack(count, jnp.int16)
 
     def extremes(
         self, values: Sequence[StepValue], reduce: Callable[[Array], Array], none: float
     ) -> tuple[Float[Array, " R"], Bool[Array, " R"]]:
-        """Return the reduced defined values, ``none`` where there are none, and whether there are any."""
-        pairs = [self._one(value) for value in values]
-        best = [reduce(jnp.where(defined, number, none)) for number, defined in pairs]
-        return _stacked(best, jnp.float32), _stacked([defined.any() for _, defined in pairs], jnp.bool_)
+        """Return the reduced defined values, ``none`` if there are none, and whether there are any."""
+        pairs = [self._read(value) for value in values]
+        reduced = [reduce(jnp.where(defined, number, none)) for number, defined in pairs]
+        return _stack(reduced, jnp.float32), _stack([defined.any() for _, defined in pairs], jnp.bool_)
 
 
-def _stacked(scalars: Sequence[Array], kind: type) -> Array:
+def _stack(scalars: Sequence[Array], kind: type) -> Array:
     return jnp.stack(scalars) if scalars else jnp.zeros(0, kind)
 
 
 def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
-    """Return the selected metrics of the episode that ended in ``state``; undefined ones have the value 0."""
+    """Return the selected metrics of the episode that ended in ``state``; undefined metrics have the value 0."""
     context, episode = state.context, state.episode
     end = EpisodeEnd(bank, context.index, state.start, context.step - state.start)
     result: dict[str, Value] = {}
     for name, metric in episode.selection.metrics:
-        value = _accumulated(episode, metric)
+        value = _accumulated_value(episode, metric)
         if metric.compute is not None:
             value = metric.compute(end, value, result)
         defined = value.defined & _has(bank, state, metric.needs) & jnp.isfinite(value.value)
@@ -160,14 +160,14 @@ def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
 
 
 def _has(bank: ScenarioBank, state: SimState, needs: Flag) -> Bool[Array, ""]:
-    """Whether the scenario has the flags that a metric needs; only ego has a route."""
-    desired = jnp.uint32(int(needs))
-    held = (bank.flags[state.context.index] & desired) == desired
-    return held & ((Flag.ROUTE not in needs) | (state.context.slot == 0))
+    """Return whether the scenario has the flags that a metric needs; only ego has a route."""
+    required = jnp.uint32(int(needs))
+    has_flags = (bank.flags[state.context.index] & required) == required
+    return has_flags & ((Flag.ROUTE not in needs) | (state.context.slot == 0))
 
 
-def _accumulated(episode: Episode, metric: Metric) -> Value:
-    """Return an accumulated step value; undefined where no step defined it."""
+def _accumulated_value(episode: Episode, metric: Metric) -> Value:
+    """Return an accumulated step value; undefined if no step defined it."""
     if metric.step_value is None:
         return Value(jnp.zeros(()), jnp.zeros((), bool))
     accumulator = next(name for name, operators in _ACCUMULATORS.items() if metric.operator in operators)

@@ -1,4 +1,4 @@
-"""Select metrics by name, and derive what has to be measured and carried for them."""
+"""Select metrics by name, and derive the step values and facts that they need."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from drivax.metrics.steps import StepValue
 from drivax.plugins import find_named, is_dotted
 from drivax.simulator.types import FACTS
 
-#: A configuration's choice: the name of a set, or names of sets, metrics and the user's own metrics.
+#: Selection in a configuration: the name of a set, or names of sets, metrics and user-defined metrics.
 MetricNames = str | tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class MetricSelection:
-    """Metrics that are computed, in order. :func:`select_metrics` caches them: compiled programs compare by identity.
+    """Selected metrics. :func:`select_metrics` caches selections, because compiled programs compare them by identity.
 
     Attributes:
         names: The requested metrics.
-        metrics: These and their inputs, inputs first.
-        reads: Facts that their step values read; all facts for the full set, for planners.
+        metrics: The requested metrics and their inputs, inputs first.
+        reads: Facts that their step values read; all facts for the full set, so that planners can read them.
     """
 
     names: tuple[str, ...]
@@ -32,9 +32,9 @@ class MetricSelection:
     reads: frozenset[str]
 
     def step_values(self, *operators: Operator) -> tuple[StepValue, ...]:
-        """Return the step values that one of these operators (by default any) accumulates, each once."""
-        metrics = [m for _, m in self.metrics if not operators or m.operator in operators]
-        return tuple({m.step_value: None for m in metrics if m.step_value is not None})
+        """Return the step values that one of the operators (default: any) accumulates, without duplicates."""
+        metrics = [metric for _, metric in self.metrics if not operators or metric.operator in operators]
+        return tuple(dict.fromkeys(metric.step_value for metric in metrics if metric.step_value is not None))
 
     @property
     def events(self) -> tuple[str, ...]:
@@ -46,10 +46,10 @@ class MetricSelection:
 def select_metrics(names: MetricNames) -> MetricSelection:
     """Return the metrics that a configuration names: a set, or a tuple of sets, metrics and dotted names.
 
-    The last word of a dotted name (``package.module:name``) is the name of the user's metric.
+    The last word of a dotted name (``package.module:name``) is the name of a user-defined metric.
 
     Raises:
-        UsageError: There is no such set or metric, or two metrics have the same name.
+        UsageError: A set or metric is unknown, or two metrics have the same name.
     """
     requested: dict[str, None] = {}
     own: dict[str, Metric] = {}
@@ -89,14 +89,16 @@ def _own_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
         raise UsageError(f"{entry!r} is not a metric", cure="make it a drivax.metrics.catalogue.Metric")
     if name in METRICS or name in others:
         raise UsageError(f"{entry!r}: the metric {name!r} already exists", cure="choose another name")
-    for needed in metric.inputs:
-        if needed not in METRICS and needed not in others:
-            raise UsageError(f"{entry!r}: unknown input {needed!r}", cure=did_you_mean(needed, [*METRICS]))
+    for input_name in metric.inputs:
+        if input_name not in METRICS and input_name not in others:
+            raise UsageError(
+                f"{entry!r}: unknown input {input_name!r}", cure=did_you_mean(input_name, [*METRICS])
+            )
     return metric
 
 
 def _add_with_inputs(name: str, known: Mapping[str, Metric], metrics: dict[str, Metric]) -> None:
     if name not in metrics:
-        for needed in known[name].inputs:
-            _add_with_inputs(needed, known, metrics)
+        for input_name in known[name].inputs:
+            _add_with_inputs(input_name, known, metrics)
         metrics[name] = known[name]

@@ -1,6 +1,6 @@
-"""Step values: numbers of one measured step, which an episode accumulates to metrics.
+"""Step values: quantities of one step, which an episode accumulates to metrics.
 
-A step value names the facts that it reads: facts that no selected metric needs are neither measured nor carried.
+A step value names the facts that it reads, so that only the facts of selected metrics are computed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from drivax.simulator.types import FACTS, Facts, Situation
 
 @record
 class Value:
-    """A metric's value and whether it is defined."""
+    """Value of a metric, and whether it is defined."""
 
     value: Float[Array, "*batch"]
     defined: Bool[Array, "*batch"]
@@ -34,7 +34,7 @@ class Moment:
     Attributes:
         situation: Context, facts and surroundings.
         start: First step of the episode.
-        final: Whether the episode ends here, so that the comfort of its last steps is evaluated too.
+        final: Whether the episode ends at this step; its last steps are then evaluated for comfort.
     """
 
     situation: Situation
@@ -48,26 +48,26 @@ class Moment:
 
     @cached_property
     def comfort(self) -> tuple[ComfortSteps, Bool[Array, " tail"]]:
-        """Comfort of the last twelve steps, and which of them count now: the oldest, at the end all."""
+        """Comfort of the last twelve steps, and a mask: the oldest step, or at the end of the episode all steps."""
         step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
         return check_comfort(self.situation.context.history), counts
 
 
-#: A number, or several on one axis, and whether each is defined.
+#: Reads a number, or several along one axis, and whether they are defined.
 Read = Callable[[Moment], tuple[Array, Any]]
 
 
 @dataclass(frozen=True)
 class StepValue:
-    """A number of a step.
+    """A quantity of a step.
 
     Attributes:
         name: Its name.
         unit: Its unit, ``-`` for booleans and codes.
         read: Function from a moment to the value and whether it is defined (a boolean, or a plain True).
-        reads: Names of the facts that ``read`` needs; by default all.
-        delayed: Whether it is evaluated some steps later, several steps at once.
+        reads: Names of the facts that ``read`` needs; all facts by default.
+        delayed: Whether the value is computed several steps later, for several steps at once.
     """
 
     name: str
@@ -78,27 +78,28 @@ class StepValue:
 
 
 def _fact(name: str, unit: str, fact: str, defined: str = "") -> StepValue:
-    """Return the step value of a fact, defined where the fact ``defined`` holds."""
-    reads = frozenset({fact, defined} if defined else {fact})
-    return StepValue(
-        name, unit, lambda m: (getattr(m.facts, fact), not defined or getattr(m.facts, defined)), reads
-    )
+    """Return the step value of a fact; ``defined`` names the fact that says whether it is defined."""
+
+    def read(moment: Moment) -> tuple[Array, Any]:
+        return getattr(moment.facts, fact), not defined or getattr(moment.facts, defined)
+
+    return StepValue(name, unit, read, frozenset({fact, defined} if defined else {fact}))
 
 
 def _speeding(moment: Moment) -> tuple[Array, Array]:
-    over = jnp.maximum(0.0, moment.facts.speed_mps - moment.facts.limit_mps)
-    known = moment.facts.limit_mps > 0
-    return jnp.where(known, over, 0.0), known
+    excess = jnp.maximum(0.0, moment.facts.speed_mps - moment.facts.limit_mps)
+    has_limit = moment.facts.limit_mps > 0
+    return jnp.where(has_limit, excess, 0.0), has_limit
 
 
 def _wrong_way(moment: Moment) -> tuple[Array, bool]:
     return jnp.where(moment.facts.wrong_way, moment.facts.moved_m, 0.0), True
 
 
-def _comfort(name: str, unit: str, part: str) -> StepValue:
+def _comfort(name: str, unit: str, field: str) -> StepValue:
     def read(moment: Moment) -> tuple[Array, Array]:
         steps, counts = moment.comfort
-        return getattr(steps, part), counts
+        return getattr(steps, field), counts
 
     return StepValue(name, unit, read, frozenset(), delayed=True)
 
@@ -129,14 +130,14 @@ STEP_VALUES: dict[str, StepValue] = {value.name: value for value in _ALL}
 
 
 def step_metrics(situation: Situation, values: Sequence[StepValue] | None = None) -> dict[str, Value]:
-    """Return step values of one situation, for tables and plots; by default all that belong to one step.
+    """Return step values of a situation, for tables and plots; by default all that are not delayed.
 
-    The facts of the situation must hold what the values read (a task with ``metrics: full`` holds all). Comfort needs
-    the eleven steps that follow; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
+    The situation must contain the facts that the values read (with ``metrics: full`` it contains all facts). Comfort
+    needs the eleven following steps; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
     """
     moment = Moment(situation, situation.context.step, jnp.zeros((), bool))
     result = {}
-    for value in values or [v for v in STEP_VALUES.values() if not v.delayed]:
+    for value in values or [value for value in STEP_VALUES.values() if not value.delayed]:
         number, defined = value.read(moment)
         result[value.name] = Value(number.astype(jnp.float32), jnp.asarray(defined, bool))
     return result

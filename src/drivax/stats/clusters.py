@@ -1,6 +1,6 @@
-"""Values of episodes in clusters: windows of one recording (``segment``) are not independent of each other.
+"""Clustered values: windows of one recording (``segment``) are not independent.
 
-Whole clusters are resampled, flipped or assigned, within strata (kinds of scenario) where these are given.
+Whole clusters are resampled, flipped or assigned, optionally within strata (types of scenarios).
 """
 
 from __future__ import annotations
@@ -15,53 +15,58 @@ from drivax.errors import UsageError
 
 Values = Float64[np.ndarray, " n"]
 Labels = Int64[np.ndarray, " n"]
-#: A sum per cluster.
+#: Sums by cluster.
 Totals = Float64[np.ndarray, " cluster"]
-#: The stratum of each cluster.
+#: Stratum of each cluster.
 Strata = Int64[np.ndarray, " cluster"]
 
 
 def recordings(datasets: Iterable[str], segments: Iterable[str], scenarios: Iterable[str]) -> list[str]:
-    """Return the cluster of each scenario: its recording, or itself where no recording (``segment``) is known."""
+    """Return the cluster of each scenario: its recording (``segment``), or the scenario itself if that is unknown."""
     rows = zip(datasets, segments, scenarios, strict=True)
     return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in rows]
 
 
 def recordings_of(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the recording of each scenario of a set, from the entries of its manifest."""
+    """Return the recording of each scenario of a set, given the entries of its manifest."""
     names = ("dataset", "segment", "scenario_id")
     return recordings(*([str(entry[name]) for entry in entries] for name in names))
 
 
 def as_values(values: Any) -> Values:
-    """Convert to float64 with NaN where undefined; refuse infinite values."""
+    """Convert to float64, with NaN for undefined values.
+
+    Raises:
+        UsageError: A value is infinite, or the values are not a flat list.
+    """
     x = np.asarray(values, dtype=np.float64)
     if x.ndim != 1 or np.isinf(x).any():
         problem = "values must be a list of finite numbers, NaN or None"
-        raise UsageError(problem, cure="leave infinite ones undefined")
+        raise UsageError(problem, cure="replace infinite values by None")
     return x
 
 
 def paired_differences(a: Any, b: Any) -> Values:
-    """Return ``a - b`` pair by pair, NaN where either is undefined."""
+    """Return ``a - b`` by pair; NaN if either value is undefined."""
     first, second = as_values(a), as_values(b)
     if first.shape != second.shape:
-        problem = f"pairs need two lists of one length, not {first.size} and {second.size}"
+        problem = f"pairs need lists of equal length, not {first.size} and {second.size}"
         raise UsageError(problem, cure="pair by scenario first")
     return first - second
 
 
 def drop_undefined(values: Any, clusters: Any = None) -> tuple[Values, Labels]:
-    """Return the defined values and their dense cluster labels; without clusters each value is its own."""
+    """Return the defined values and their dense cluster labels; by default each value is a cluster."""
     x = as_values(values)
     labels, keep = dense_labels(clusters, x.size, "cluster"), ~np.isnan(x)
     return x[keep], dense_labels(labels[keep], int(keep.sum()), "cluster")
 
 
 def dense_labels(labels: Any, count: int, kind: str) -> Labels:
-    """Return labels as numbers from 0 on; None gives each of ``count`` values its own.
+    """Return labels as numbers from 0 on; None labels ``count`` values by their index.
 
-    Raises UsageError unless there are ``count`` labels; the message calls them ``kind``.
+    Raises:
+        UsageError: The number of labels is not ``count``; the message calls them ``kind``.
     """
     if labels is None:
         return np.arange(count, dtype=np.int64)
@@ -72,17 +77,17 @@ def dense_labels(labels: Any, count: int, kind: str) -> Labels:
 
 
 def cluster_totals(x: Values, labels: Labels) -> tuple[Totals, Totals]:
-    """Return sum and number of the values of each cluster."""
+    """Return the sum and the number of values of each cluster."""
     return np.bincount(labels, weights=x), np.bincount(labels).astype(np.float64)
 
 
 def design_effect(x: Values, labels: Labels) -> float:
     """Return the variance of a mean relative to that of independent values, between 1 and ``n``.
 
-    ``deff = V / (s^2 / n)`` with ``V = C / (C - 1) * sum((S_c - m n_c)^2) / n^2``, the variance of the ratio of cluster
+    ``deff = V / (s^2 / n)``. ``V = C / (C - 1) * sum((S_c - m n_c)^2) / n^2`` is the variance of the ratio of cluster
     totals (Kish, Survey Sampling, 1965, section 8.2; Cochran, Sampling Techniques, 1977, section 6.3), and ``s^2`` the
-    mean squared deviation, for shares ``p (1 - p)``. Where all values agree, or there is one cluster, ``V`` cannot be
-    estimated, and clusters count as single values: ``n / C``.
+    mean squared deviation, ``p (1 - p)`` for shares. If all values are equal, or there is only one cluster, ``V``
+    cannot be estimated; each cluster then counts as one value: ``n / C``.
     """
     sums, counts = cluster_totals(x, labels)
     n, clusters, mean = x.size, sums.size, float(x.mean())
@@ -99,7 +104,10 @@ def cluster_strata(strata: Any, labels: Labels, minimum: int = 2) -> Strata:
     """Return the stratum of each cluster, given the stratum and the dense cluster label of each value.
 
     Strata with fewer than ``minimum`` clusters are pooled; a pool that is still too small joins the smallest other
-    stratum (Cochran 1977, section 5A.12, "collapsed strata"). Raises UsageError if a cluster lies in two strata.
+    stratum (Cochran 1977, section 5A.12, "collapsed strata").
+
+    Raises:
+        UsageError: A cluster lies in two strata.
     """
     value_strata = dense_labels(strata, labels.size, "stratum")
     _, first = np.unique(labels, return_index=True)

@@ -12,7 +12,7 @@ from scipy import special
 from drivax.errors import UsageError
 from drivax.stats.clusters import as_values, paired_differences
 
-#: Deviations below this, relative to the values, are rounding.
+#: Relative deviations below this are rounding errors.
 ROUNDING = 1e-9
 #: Upper bound of :func:`scenarios_needed`.
 _MAX_SCENARIOS = 10**12
@@ -20,7 +20,7 @@ _MAX_SCENARIOS = 10**12
 
 @dataclass(frozen=True)
 class PairedEffect:
-    """Standardised mean differences of pairs; None where nothing varies or fewer than two pairs are defined.
+    """Standardised mean differences of pairs; None if nothing varies or fewer than two pairs are defined.
 
     Power depends on ``d_z``; ``d_av`` is comparable with an unpaired d.
     """
@@ -30,24 +30,24 @@ class PairedEffect:
 
 
 def cohens_d_paired(a: Any, b: Any) -> PairedEffect:
-    """Cohen's d of pairs, ``d_z = m / s(a - b)`` and ``d_av = m / sqrt((s(a)^2 + s(b)^2) / 2)``.
+    """Return Cohen's d of pairs, ``d_z = m / s(a - b)`` and ``d_av = m / sqrt((s(a)^2 + s(b)^2) / 2)``.
 
     Cohen, Statistical Power Analysis, 1988, section 2.3.5 (``d_z``); Cumming, Understanding the New Statistics, 2012,
-    chapter 11 (``d_av``). Standard deviations have ``n - 1``; pairs with an undefined value are left out.
+    chapter 11 (``d_av``). Standard deviations divide by ``n - 1``. Pairs with an undefined value are ignored.
     """
     difference = paired_differences(a, b)
     keep = ~np.isnan(difference)
     if keep.sum() < 2:
         return PairedEffect(None, None)
-    paired, first, second = difference[keep], as_values(a)[keep], as_values(b)[keep]
-    average_deviation = math.sqrt((first.var(ddof=1) + second.var(ddof=1)) / 2)
-    return PairedEffect(_ratio(paired.mean(), paired.std(ddof=1)), _ratio(paired.mean(), average_deviation))
+    difference, first, second = difference[keep], as_values(a)[keep], as_values(b)[keep]
+    mean, average_deviation = difference.mean(), math.sqrt((first.var(ddof=1) + second.var(ddof=1)) / 2)
+    return PairedEffect(_ratio(mean, difference.std(ddof=1)), _ratio(mean, average_deviation))
 
 
 def cohens_d(a: Any, b: Any) -> float | None:
-    """Cohen's d of two independent samples, ``(m_a - m_b) / s`` with the pooled standard deviation (Cohen 1988, 2.5).
+    """Return Cohen's d of two independent samples, ``(m_a - m_b) / s`` with the pooled deviation (Cohen 1988, 2.5).
 
-    None where nothing varies, or a sample has fewer than two defined values.
+    The result is None if nothing varies, or if a sample has fewer than two defined values.
     """
     first, second = (values[~np.isnan(values)] for values in (as_values(a), as_values(b)))
     if min(first.size, second.size) < 2:
@@ -56,7 +56,7 @@ def cohens_d(a: Any, b: Any) -> float | None:
 
 
 def pooled_deviation(a: Any, b: Any) -> float:
-    """``sqrt(((n_a - 1) s_a^2 + (n_b - 1) s_b^2) / (n_a + n_b - 2))`` of defined values."""
+    """Return the pooled standard deviation, ``sqrt(((n_a - 1) s_a^2 + (n_b - 1) s_b^2) / (n_a + n_b - 2))``."""
     first, second = as_values(a), as_values(b)
     squares = sum(float(np.square(sample - sample.mean()).sum()) for sample in (first, second))
     return math.sqrt(squares / (first.size + second.size - 2))
@@ -67,15 +67,15 @@ def _ratio(difference: Any, deviation: Any) -> float | None:
 
 
 def power(effect: float, n: float, confidence: float = 0.95, share: float | None = None) -> float:
-    """Return the probability that a two-sided t-test detects an effect of this size.
+    """Return the probability that a two-sided t-test detects an effect.
 
-    ``P(|T| > t)`` with ``T`` noncentral t: for pairs ``n - 1`` degrees of dof and noncentrality ``d sqrt(n)``, for
-    two arms ``n - 2`` and ``d sqrt(n w (1 - w))`` (Cohen 1988, section 2.3; Johnson, Kotz and Balakrishnan, Continuous
+    It is ``P(|T| > t)`` with noncentral t. Pairs have ``n - 1`` degrees of freedom and noncentrality ``d sqrt(n)``, two
+    arms ``n - 2`` and ``d sqrt(n w (1 - w))`` (Cohen 1988, section 2.3; Johnson, Kotz and Balakrishnan, Continuous
     Univariate Distributions 2, 1995, chapter 31).
 
     Args:
         effect: ``d_z`` of pairs, or Cohen's d of two arms.
-        n: Pairs, or scenarios of both arms; may be fractional (an effective sample size).
+        n: Number of pairs, or of scenarios of both arms; may be fractional (an effective sample size).
         confidence: 1 - significance level.
         share: ``w``, the share of the first arm; None for pairs.
     """
@@ -98,8 +98,8 @@ def scenarios_needed(
 ) -> int:
     """Return the smallest number of independent scenarios that detects an effect with power ``target``.
 
-    Counts pairs, or scenarios of both arms together; clustered ones need ``deff`` times as many. Arguments as for
-    :func:`power`.
+    It counts pairs, or the scenarios of both arms. Clustered scenarios need ``deff`` times as many. Arguments are
+    those of :func:`power`.
     """
     if effect == 0 or not 0 < target < 1:
         problem = f"no number of scenarios detects an effect of {effect} with power {target}"
@@ -116,7 +116,7 @@ def scenarios_needed(
 def detectable_effect(
     n: float, target: float = 0.8, confidence: float = 0.95, share: float | None = None
 ) -> float | None:
-    """Return the smallest effect that is detected with power ``target``; None where ``n`` is too small for any."""
+    """Return the smallest effect that is detected with power ``target``; None if ``n`` is too small for any effect."""
     low, high = 0.0, 1.0
     while power(high, n, confidence, share) < target:
         if high > 1e6:

@@ -1,8 +1,8 @@
 """Confidence intervals for rates, means and paired differences.
 
-Every function takes one value per episode; ``None`` or NaN means undefined: the episode is left out and does not count
-in ``n``. Labels (one per episode) assign episodes to clusters, which are resampled as a whole; None: every episode is
-its own. ``confidence`` is the coverage, ``seed`` that of the random numbers.
+Functions take one value per episode. Undefined values (``None`` or NaN) are ignored and do not count in ``n``.
+``clusters`` are labels of the episodes; whole clusters are resampled. Without labels, every episode is a cluster.
+``confidence`` is the coverage, ``seed`` the seed of the random numbers.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from drivax.stats.clusters import (
 )
 
 RESAMPLES = 10_000
-#: Random numbers drawn at once: bounds the memory to about 16 MB.
+#: Random numbers per chunk, which limits memory to about 16 MB.
 _CHUNK = 2_000_000
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with its interval and the number of episodes or pairs where it is defined.
+    """An estimate, its interval, and the number of defined episodes or pairs.
 
     ``mean`` is None if there are none; ``low`` and ``high`` are None if the spread cannot be estimated.
     """
@@ -56,18 +56,17 @@ UNDEFINED = Interval(None, None, None, 0)
 
 
 def effective_size(weights: Any) -> float:
-    """Effective sample size of weights, ``(sum w)^2 / sum w^2`` (Kish, Survey Sampling, 1965); 0 without any."""
+    """Return the effective sample size of weights, ``(sum w)^2 / sum w^2`` (Kish, Survey Sampling, 1965), or 0."""
     weights = np.asarray(weights, np.float64)
     squares = float(np.sum(weights**2))
     return float(np.sum(weights)) ** 2 / squares if squares > 0.0 else 0.0
 
 
 def wilson(successes: float | int, n: float | int, confidence: float = 0.95) -> Interval:
-    """Score interval of a proportion (Wilson, J. Am. Stat. Assoc. 22, 1927).
+    """Return the score interval of a proportion (Wilson, J. Am. Stat. Assoc. 22, 1927).
 
-    ``centre = (p + z^2 / 2n) / (1 + z^2 / n)``,
-    ``half = z / (1 + z^2 / n) * sqrt(p (1 - p) / n + z^2 / 4n^2)``; always within [0, 1]. The trials ``n`` may be
-    fractional (an effective sample size).
+    ``centre = (p + z^2 / 2n) / (1 + z^2 / n)``, ``margin = z / (1 + z^2 / n) * sqrt(p (1 - p) / n + z^2 / 4n^2)``;
+    always within [0, 1]. The number of trials ``n`` may be fractional (an effective sample size).
     """
     z = normal_quantile(confidence)
     if not 0 <= successes <= n:
@@ -75,16 +74,16 @@ def wilson(successes: float | int, n: float | int, confidence: float = 0.95) -> 
     if n == 0:
         return UNDEFINED
     p = successes / n
-    shrink = 1.0 + z * z / n
-    centre = (p + z * z / (2 * n)) / shrink
-    half = z / shrink * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
-    low = 0.0 if successes == 0 else max(0.0, centre - half)
-    high = 1.0 if successes == n else min(1.0, centre + half)
+    denominator = 1.0 + z * z / n
+    centre = (p + z * z / (2 * n)) / denominator
+    margin = z / denominator * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
+    low = 0.0 if successes == 0 else max(0.0, centre - margin)
+    high = 1.0 if successes == n else min(1.0, centre + margin)
     return Interval(float(p), float(low), float(high), round(n))
 
 
 def rate(values: Any, clusters: Any = None, confidence: float = 0.95) -> Interval:
-    """Wilson interval of a share of 0/1 values whose episodes may come in clusters.
+    """Return the Wilson interval of a share of 0/1 values, optionally in clusters.
 
     The trials are replaced by the effective sample size ``n / deff`` (Kish 1965; Dean and Pagano, J. Surv.
     Stat. Methodol. 3, 2015) with the design effect of :func:`~drivax.stats.clusters.design_effect`.
@@ -104,13 +103,13 @@ def bootstrap_mean(
     values: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES,
     *, strata: Any = None, seed: int,
 ) -> Interval:  # fmt: skip
-    """Percentile bootstrap interval of a mean, resampling whole clusters, within strata if given.
+    """Return the percentile bootstrap interval of a mean, resampling whole clusters, within strata if given.
 
     Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3; clusters: Davison and Hinkley,
-    Bootstrap Methods, 1997, section 3.8: draw as many clusters as there are, with replacement; the mean of a
-    resample is its sum over its number of episodes. Strata: draw ``C_h - 1`` of the ``C_h`` clusters of each and weight
-    them by ``C_h / (C_h - 1)``, which keeps the variance right in small strata (Rao, Wu and Yue, Surv. Methodol. 18,
-    1992); strata of a single cluster are pooled.
+    Bootstrap Methods, 1997, section 3.8. A resample draws as many clusters as there are, with replacement; its mean is
+    its sum over its number of episodes. Within strata, it draws ``C_h - 1`` of the ``C_h`` clusters of each stratum
+    and weights them by ``C_h / (C_h - 1)``, which keeps the variance correct in small strata (Rao, Wu and Yue, Surv.
+    Methodol. 18, 1992). Strata of a single cluster are pooled.
     """
     check_draws(confidence, resamples)
     x, labels = drop_undefined(values, clusters)
@@ -131,42 +130,40 @@ def split_bootstrap(
     values: Any, first: Bool[np.ndarray, " n"], clusters: Any = None, confidence: float = 0.95,
     resamples: int = RESAMPLES, *, strata: Any = None, seed: int,
 ) -> Interval:  # fmt: skip
-    """Percentile bootstrap interval of the difference of the means of two arms that share no cluster, first - second.
+    """Return the percentile bootstrap interval of ``mean(first arm) - mean(second arm)``; the arms share no cluster.
 
-    Each arm is resampled separately, as :func:`bootstrap_mean` does (Efron and Tibshirani 1993, section 8.3). ``first``
-    marks the episodes of the first arm.
+    The arms are resampled separately, as in :func:`bootstrap_mean` (Efron and Tibshirani 1993, section 8.3). ``first``
+    masks the episodes of the first arm.
     """
     check_draws(confidence, resamples)
     x = as_values(values)
+    cluster_labels = dense_labels(clusters, x.size, "cluster")
+    stratum_labels = None if strata is None else dense_labels(strata, x.size, "stratum")
     rng, arms = np.random.default_rng(seed), []
-    scenario_strata = None if strata is None else dense_labels(strata, x.size, "stratum")
     for arm in (first, ~first):
-        chosen = arm & ~np.isnan(x)
-        arm_values, labels = drop_undefined(x[chosen], dense_labels(clusters, x.size, "cluster")[chosen])
+        included = arm & ~np.isnan(x)
+        arm_values, labels = drop_undefined(x[included], cluster_labels[included])
         if arm_values.size == 0:
             return UNDEFINED
-        arms.append(
-            (
-                arm_values,
-                labels,
-                None if scenario_strata is None else cluster_strata(scenario_strata[chosen], labels),
-            )
-        )
-    mean, n = float(arms[0][0].mean() - arms[1][0].mean()), sum(values.size for values, _, _ in arms)
+        arm_strata = None if stratum_labels is None else cluster_strata(stratum_labels[included], labels)
+        arms.append((arm_values, labels, arm_strata))
+    difference = float(arms[0][0].mean() - arms[1][0].mean())
+    n = sum(arm_values.size for arm_values, _, _ in arms)
     if min(labels.max() for _, labels, _ in arms) == 0:
-        return Interval(mean, None, None, n)
+        return Interval(difference, None, None, n)
     means = [
-        _resample_means(values, labels, arm_strata, resamples, rng) for values, labels, arm_strata in arms
+        _resample_means(arm_values, labels, arm_strata, resamples, rng)
+        for arm_values, labels, arm_strata in arms
     ]
-    return Interval(mean, *_percentiles(means[0] - means[1], confidence), n)
+    return Interval(difference, *_percentiles(means[0] - means[1], confidence), n)
 
 
 def paired_bootstrap(
     a: Any, b: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES, *, seed: int
 ) -> Interval:
-    """Percentile bootstrap interval of ``mean(a - b)`` over the pairs where both are defined.
+    """Return the percentile bootstrap interval of ``mean(a - b)`` over pairs with two defined values.
 
-    Pairing removes the spread between scenarios that both planners share (Efron and Tibshirani 1993, chapter 8).
+    Pairing removes the variation between scenarios that both planners share (Efron and Tibshirani 1993, chapter 8).
     """
     return bootstrap_mean(paired_differences(a, b), clusters, confidence, resamples, seed=seed)
 
@@ -174,19 +171,19 @@ def paired_bootstrap(
 def interquartile_bootstrap(
     values: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES, *, seed: int
 ) -> Interval:
-    """Percentile bootstrap interval of the interquartile mean over training seeds of their mean episode.
+    """Return the percentile bootstrap interval of the interquartile mean of the means of training seeds.
 
-    Seeds and clusters are crossed: every seed is evaluated on every scenario. Each resample draws as many of both as
-    there are, independently and with replacement (Owen, Ann. Appl. Stat. 1, 2007, "The pigeonhole bootstrap"). Like
-    every bootstrap it is too narrow with few seeds; for means see :func:`~drivax.stats.seeds.seeds_interval`.
-    ``values`` are ``[seed, episode]``; ``n`` counts the defined ones.
+    ``values`` are ``[seed, episode]``; ``n`` counts the defined values. Seeds and clusters are crossed: every seed is
+    evaluated on every scenario. Both are resampled independently with replacement (Owen, Ann. Appl. Stat. 1, 2007,
+    "The pigeonhole bootstrap"). Bootstrap intervals are too narrow with few seeds; see
+    :func:`~drivax.stats.seeds.seeds_interval` for means.
     """
     check_draws(confidence, resamples)
-    rows = [as_values(row) for row in values]
-    labels = dense_labels(clusters, rows[0].size, "cluster")
-    if any(row.size != labels.size for row in rows):
+    by_seed = [as_values(seed_values) for seed_values in values]
+    labels = dense_labels(clusters, by_seed[0].size, "cluster")
+    if any(seed_values.size != labels.size for seed_values in by_seed):
         raise UsageError("seeds have different episodes", cure="give one value per seed and episode")
-    sums, counts = _seed_totals(np.stack(rows), labels)
+    sums, counts = _seed_totals(np.stack(by_seed), labels)
     n, (seeds, cluster_count) = int(counts.sum()), sums.shape
     if not n:
         return UNDEFINED
@@ -194,9 +191,9 @@ def interquartile_bootstrap(
     if cluster_count < 2:
         return Interval(mean, None, None, n)
     rng, means = np.random.default_rng(seed), np.empty(resamples)
-    for number in range(resamples):
+    for resample in range(resamples):
         cluster_draws, seed_draws = _draw_counts(cluster_count, rng), _draw_counts(seeds, rng)
-        means[number] = _interquartile(seed_draws, sums @ cluster_draws, counts @ cluster_draws)
+        means[resample] = _interquartile(seed_draws, sums @ cluster_draws, counts @ cluster_draws)
     return Interval(mean, *_percentiles(means, confidence), n)
 
 
@@ -215,11 +212,11 @@ def _draw_counts(count: int, rng: np.random.Generator) -> Labels:
 
 
 def interquartile_mean(values: Any) -> float | None:
-    """Mean of the middle half of the values (of training seeds, say); None without values.
+    """Return the mean of the middle half of the values, for example of training seeds; None without values.
 
-    More robust to a failed seed than the mean, more efficient than the median (Agarwal et al., NeurIPS 2021, "Deep
-    reinforcement learning at the edge of the statistical precipice"). The value of rank ``i`` of ``n`` covers the
-    quantiles from ``i / n`` to ``(i + 1) / n`` and is weighted by their overlap with [1/4, 3/4].
+    It is more robust to a failed seed than the mean, and more efficient than the median (Agarwal et al., NeurIPS 2021,
+    "Deep reinforcement learning at the edge of the statistical precipice"). The value of rank ``i`` of ``n`` covers
+    the quantiles from ``i / n`` to ``(i + 1) / n`` and is weighted by their overlap with [1/4, 3/4].
     """
     x = np.sort(as_values(values))
     x = x[~np.isnan(x)]
@@ -230,28 +227,32 @@ def interquartile_mean(values: Any) -> float | None:
 
 
 def _interquartile(draws: Labels, sums: Totals, counts: Totals) -> float:
-    """Interquartile mean of the means of the drawn seeds."""
+    """Return the interquartile mean of the means of the drawn seeds."""
     means = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
     mean = interquartile_mean(np.repeat(means, draws))
     return math.nan if mean is None else mean
 
 
 def check_draws(confidence: float, resamples: int) -> None:
-    """Raise UsageError for a confidence outside (0, 1) or no resamples."""
+    """Check the arguments of a bootstrap.
+
+    Raises:
+        UsageError: The confidence is outside (0, 1), or there are no resamples.
+    """
     normal_quantile(confidence)
     if resamples < 1:
         raise UsageError(f"number of resamples is {resamples}", cure="use 1000 or more")
 
 
 def normal_quantile(confidence: float) -> float:
-    """Two-sided quantile z of the standard normal distribution."""
+    """Return the two-sided quantile z of the standard normal distribution."""
     if not 0 < confidence < 1:
         raise UsageError(f"confidence is {confidence}", cure="use a number between 0 and 1, for example 0.95")
     return float(special.ndtri((1 + confidence) / 2))
 
 
 def _percentiles(values: Float64[np.ndarray, " resample"], confidence: float) -> tuple[float, float]:
-    """Return the bounds of the central share of the resamples."""
+    """Return the bounds of the central part of the resamples."""
     low, high = np.nanquantile(values, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
 
@@ -275,7 +276,7 @@ def _resample_means(
 def _draw_totals(
     sums: Totals, counts: Totals, draws: int, resamples: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "2 resample"]:
-    """Return sum and number of the values of ``draws`` clusters index with replacement, ``resamples`` times."""
+    """Return sum and number of the values of ``draws`` clusters drawn with replacement, ``resamples`` times."""
     chunks, equal_counts = [], bool((counts == counts[0]).all())
     for size in chunk_sizes(resamples, draws):
         index = rng.integers(0, sums.size, size=(size, draws), dtype=np.int32)
@@ -285,6 +286,6 @@ def _draw_totals(
 
 
 def chunk_sizes(resamples: int, width: int) -> list[int]:
-    """Split resamples that take ``width`` random numbers each into chunks of bounded memory."""
-    rows = max(1, _CHUNK // max(1, width))
-    return [min(rows, resamples - begin) for begin in range(0, resamples, rows)]
+    """Split resamples of ``width`` random numbers into chunks of bounded memory."""
+    chunk = max(1, _CHUNK // max(1, width))
+    return [min(chunk, resamples - first) for first in range(0, resamples, chunk)]

@@ -1,6 +1,6 @@
 """Ranking quality of scores: AUC, precision at the base rate, and rank correlation.
 
-Functions of labels (true for positives) raise UsageError without positives or negatives.
+Labels are true for positives. Functions of labels raise UsageError without positives or without negatives.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ Labels = Bool[np.ndarray[Any, Any], " n"]
 
 
 def roc_auc(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Return the probability that a positive scores above a negative; a tie counts half (Hanley and McNeil, 1982)."""
+    """Return the probability that a positive scores above a negative; ties count half (Hanley and McNeil, 1982)."""
     return _auc(*_weights_by_rank(_ranks(scores, labels), labels, weights))
 
 
 def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> tuple[float, float]:
     """Return the interval of :func:`roc_auc` by DeLong, DeLong and Clarke-Pearson (Biometrics 44, 1988), within [0, 1].
 
-    Raises UsageError for fewer than two positives or negatives.
+    Raises:
+        UsageError: There are fewer than two positives or negatives.
     """
     positive, negative = scores[labels], scores[~labels]
     if min(len(positive), len(negative)) < 2:
@@ -34,15 +35,15 @@ def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> t
     positive_share = (ranks[labels] - rankdata(positive)) / len(negative)
     negative_share = 1.0 - (ranks[~labels] - rankdata(negative)) / len(positive)
     error = np.sqrt(positive_share.var(ddof=1) / len(positive) + negative_share.var(ddof=1) / len(negative))
-    half = float(norm.ppf(0.5 + confidence / 2) * error)
+    margin = float(norm.ppf(0.5 + confidence / 2) * error)
     auc = float(positive_share.mean())
-    return max(auc - half, 0.0), min(auc + half, 1.0)
+    return max(auc - margin, 0.0), min(auc + margin, 1.0)
 
 
 def precision_at_base_rate(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Return the precision among the ``k`` highest scores, with ``k`` the number of positives.
+    """Return the precision among the ``k`` highest scores, where ``k`` is the number of positives.
 
-    Ties at the threshold count in proportion. 1 for a perfect ranking, the base rate for a random one.
+    Ties at the threshold count in proportion. A perfect ranking has 1, a random one the base rate.
     """
     return _precision(*_weights_by_rank(_ranks(scores, labels), labels, weights))
 
@@ -53,8 +54,8 @@ def bootstrap_intervals(
 ) -> tuple[tuple[float, float], tuple[float, float]]:  # fmt: skip
     """Return cluster-bootstrap percentile intervals of :func:`roc_auc` and :func:`precision_at_base_rate`.
 
-    Clusters with a positive and those without are drawn separately, which keeps the base rate (Davison and Hinkley,
-    Bootstrap Methods, 1997, 3.8).
+    Clusters with and without positives are drawn separately, which keeps the base rate (Davison and Hinkley, Bootstrap
+    Methods, 1997, section 3.8).
     """
     rank, rng = _ranks(scores, labels), np.random.default_rng(0)
     names, cluster = np.unique(clusters, return_inverse=True)
@@ -62,9 +63,9 @@ def bootstrap_intervals(
     groups = [np.flatnonzero(has_positive), np.flatnonzero(~has_positive)]
     samples = []
     for _ in range(resamples):
-        drawn = np.concatenate([rng.choice(group, len(group)) for group in groups if len(group)])
-        draws = np.bincount(drawn, minlength=len(names))[cluster]
-        by_rank = _weights_by_rank(rank, labels, weights * draws)
+        draws = np.concatenate([rng.choice(group, len(group)) for group in groups if len(group)])
+        draw_counts = np.bincount(draws, minlength=len(names))[cluster]
+        by_rank = _weights_by_rank(rank, labels, weights * draw_counts)
         samples.append((_auc(*by_rank), _precision(*by_rank)))
     low, high = _percentiles(samples, confidence)
     return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
@@ -100,12 +101,12 @@ def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -
     positive, total = positive[::-1], (positive + negative)[::-1]
     count = positive.sum()
     remaining = count - (np.cumsum(total) - total)
-    taken = np.clip(np.divide(remaining, total, out=np.zeros_like(total), where=total > 0), 0.0, 1.0)
-    return float(np.sum(positive * taken) / count)
+    included_share = np.clip(np.divide(remaining, total, out=np.zeros_like(total), where=total > 0), 0.0, 1.0)
+    return float(np.sum(positive * included_share) / count)
 
 
 def rank_correlation(first: Numbers, second: Numbers) -> float:
-    """Return the correlation of mid-ranks (Spearman, Am. J. Psychol. 15, 1904); NaN if a list is constant."""
+    """Return Spearman's correlation of mid-ranks (Am. J. Psychol. 15, 1904); NaN if a list is constant."""
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(rankdata(first), rankdata(second))[0, 1])
 
@@ -115,15 +116,16 @@ def correlation_interval(
 ) -> tuple[float, float]:
     """Return the cluster-bootstrap percentile interval of :func:`rank_correlation`.
 
-    (-1, 1) for a single cluster, or if a resample has constant scores (Davison and Hinkley, Bootstrap Methods, 1997,
-    3.8).
+    The interval is (-1, 1) for a single cluster, or if a resample has constant scores (Davison and Hinkley, Bootstrap
+    Methods, 1997, section 3.8).
     """
     labels = np.unique(np.asarray(clusters), return_inverse=True)[1]
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     rng, samples = np.random.default_rng(0), []
     for _ in range(resamples):
-        drawn = np.concatenate([members[n] for n in rng.integers(len(members), size=len(members))])
-        samples.append(rank_correlation(first[drawn], second[drawn]))
+        draws = rng.integers(len(members), size=len(members))
+        indices = np.concatenate([members[cluster] for cluster in draws])
+        samples.append(rank_correlation(first[indices], second[indices]))
     if len(members) < 2 or np.isnan(samples).any():
         return -1.0, 1.0
     low, high = _percentiles(samples, confidence)

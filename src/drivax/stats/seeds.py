@@ -1,8 +1,8 @@
 """Differences between policies trained with several seeds: seeds and scenarios are crossed random effects.
 
-The variances of seeds and scenarios are added, so that an interval covers other seeds and other scenarios. Values have
-a row per seed and a column per scenario; scenarios of weight 0 or with an undefined value are left out. ``clusters``
-are labels of scenarios (None: every scenario is its own).
+The variances of seeds and scenarios are added, so that intervals cover other seeds and other scenarios. Values have a
+row per seed and a column per scenario. Scenarios with weight 0 or an undefined value are ignored. ``clusters`` are
+labels of scenarios; by default every scenario is a cluster.
 """
 
 from __future__ import annotations
@@ -22,35 +22,41 @@ from drivax.stats.effects import ROUNDING
 from drivax.stats.intervals import Interval, effective_size, wilson
 
 Values = Float64[np.ndarray, "seed scenario"]
-#: Values of another policy, with more or fewer seeds.
+#: Values of another policy, with its own number of seeds.
 Others = Float64[np.ndarray, "other_seed other_scenario"]
 Weights = Float64[np.ndarray, " scenario"]
 #: Defaults of a planned comparison.
 _CONFIDENCE, _POWER = 0.95, 0.80
-#: Stands for infinite degrees of freedom.
+#: Replaces infinite degrees of freedom.
 _MAX_FREEDOM = 1e9
-#: The largest number of seeds or clusters that is considered, and the number of candidates up to it.
+#: Largest number of seeds or clusters to consider, and number of candidates up to it.
 _MAX_NUMBER, _CANDIDATES = 10**6, 400
 
 
 @dataclass(frozen=True)
 class CrossedEffect:
-    """A mean difference of two policies with several seeds each, all evaluated on the same scenarios.
+    """Mean difference of two policies with several seeds each, all evaluated on the same scenarios.
 
     The squared standard error is ``se^2 = s_a^2 / K_a + s_b^2 / K_b + v - e_a - e_b``, at least the larger of the
-    variances of seeds and of scenarios: the variances of the means of seeds; the variance of the mean over scenarios by
-    clusters, ``v = C / (C - 1) sum((S_c - m W_c)^2) / W^2`` (a ratio of totals; Cochran, Sampling Techniques, 1977,
-    section 6.3); and for each policy the interaction of seeds and scenarios, which both variances contain,
-    ``e = C / (C - 1) sum(R_kc^2) / (K (K - 1) W^2)`` with totals ``R_kc`` of the residuals of a two-way layout (Owen,
-    Ann. Appl. Stat. 1, 2007). Degrees of freedom are those of Satterthwaite (Biometrics Bulletin 2, 1946).
+    variances of seeds and of scenarios. Its terms are
+
+    - the variances of the seed means;
+    - the variance of the mean over scenarios by clusters, ``v = C / (C - 1) sum((S_c - m W_c)^2) / W^2`` (a ratio of
+      totals; Cochran, Sampling Techniques, 1977, section 6.3);
+    - for each policy, the interaction of seeds and scenarios, which both variances contain,
+      ``e = C / (C - 1) sum(R_kc^2) / (K (K - 1) W^2)`` with totals ``R_kc`` of the residuals of a two-way layout
+          (Owen,
+      Ann. Appl. Stat. 1, 2007).
+
+    Degrees of freedom are those of Satterthwaite (Biometrics Bulletin 2, 1946).
 
     Attributes:
         difference: Mean difference.
         seeds: Variance from the choice of seeds, by policy.
         scenarios: Variance from the choice of scenarios.
-        agents: Number of seeds, by policy.
+        seed_counts: Number of seeds, by policy.
         clusters: Number of clusters.
-        both: Variance of the interaction, by policy.
+        interaction: Variance of the interaction, by policy.
     """
 
     difference: float
@@ -68,7 +74,7 @@ class CrossedEffect:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Degrees of freedom; infinite where nothing varies."""
+        """Degrees of freedom; infinite if nothing varies."""
         variances = (*self.seeds, self.scenarios)
         dofs = (*(count - 1 for count in self.seed_counts), self.clusters - 1)
         denominator = sum(v**2 / dof for v, dof in zip(variances, dofs, strict=True) if v > 0.0)
@@ -83,25 +89,25 @@ class CrossedEffect:
 
     def interval(self, confidence: float = _CONFIDENCE) -> tuple[float, float]:
         """Return the confidence interval of the difference."""
-        half = self._quantile((1.0 + confidence) / 2.0) * self.error
-        return self.difference - half, self.difference + half
+        margin = self._quantile((1.0 + confidence) / 2.0) * self.error
+        return self.difference - margin, self.difference + margin
 
     def detectable(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> float:
         """Return the smallest difference that is detected with probability ``power``."""
         return self.error * (self._quantile((1.0 + confidence) / 2.0) + self._quantile(power))
 
     def power(self, difference: float, confidence: float = _CONFIDENCE) -> float:
-        """Return the probability that a difference of this size is detected."""
+        """Return the probability of detecting a difference of this size."""
         if self.error == 0.0:
             return float(difference != 0.0)
         return self._probability(abs(difference) / self.error - self._quantile((1.0 + confidence) / 2.0))
 
     def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Return the number of seeds per policy, above the present one, that detects this difference, if any."""
+        """Return the smallest number of seeds per policy, above the present one, that detects this difference."""
         return self._smallest_number(self._with_seeds, max(self.seed_counts), power, confidence)
 
     def clusters_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Return the number of clusters, above the present one, that detects this difference, if any."""
+        """Return the smallest number of clusters, above the present one, that detects this difference."""
         return self._smallest_number(self._with_clusters, self.clusters, power, confidence)
 
     def _probability(self, t: float) -> float:
@@ -131,12 +137,14 @@ class CrossedEffect:
     def _smallest_number(
         self, extrapolate: Callable[[int], CrossedEffect], present: int, power: float, confidence: float
     ) -> int | None:
+        """Return the smallest number above ``present`` that detects this difference; None if there is none."""
+
         def detects(number: int) -> bool:
             return abs(self.difference) >= extrapolate(number).detectable(power, confidence)
 
-        # Not monotonic: with more of one kind, the degrees of freedom approach the smaller number of the other kind.
-        numbers = np.unique(np.round(np.geomspace(present + 1, max(_MAX_NUMBER, present + 1), _CANDIDATES)))
-        numbers = numbers.astype(int).tolist()
+        # Detection is not monotonic: with more seeds, the degrees of freedom approach those of the clusters.
+        candidates = np.geomspace(present + 1, max(_MAX_NUMBER, present + 1), _CANDIDATES)
+        numbers = np.unique(np.round(candidates)).astype(int).tolist()
         first = next((index for index, number in enumerate(numbers) if detects(number)), None)
         if self.difference == 0.0 or first is None:
             return None
@@ -150,13 +158,16 @@ class CrossedEffect:
 def crossed_mean(values: Values, clusters: Any = None, weights: Weights | None = None) -> CrossedEffect:
     """Return the mean of one policy with the error of :func:`crossed_difference`; a single seed has no variance.
 
-    Given differences between the same seeds, it is a paired comparison. Raises UsageError for fewer than two clusters.
+    Differences between the same seeds of two policies give a paired comparison.
+
+    Raises:
+        UsageError: There are fewer than two clusters.
     """
     return crossed_difference(repeat_single_seed(values), np.zeros((2, values.shape[1])), clusters, weights)
 
 
 def repeat_single_seed(values: Values) -> Others:
-    """Repeat the values of a single seed, which then has no variance, like a planner that is not trained."""
+    """Repeat the values of a single seed, so that it has no variance, as for a planner without training."""
     return values if len(values) > 1 else np.repeat(values, 2, axis=0)
 
 
@@ -164,32 +175,37 @@ def seeds_interval(
     values: Values, clusters: Any = None, weights: Weights | None = None, confidence: float = _CONFIDENCE, *,
     share: bool = False,
 ) -> Interval:  # fmt: skip
-    """Return the mean of one policy with the interval of :func:`crossed_mean`; no bounds with fewer than two clusters.
+    """Return the mean of one policy with the interval of :func:`crossed_mean`.
 
-    A ``share`` lies within 0 and 1; if all values are 0, or all are 1, the interval is Wilson's with one trial per
-    cluster (with weights, their effective sample size, Kish 1965).
+    The interval has no bounds with fewer than two clusters. That of a ``share`` lies within 0 and 1. If all values are
+    0, or all are 1, it is Wilson's interval with one trial per cluster (with weights, their effective sample size,
+    Kish 1965).
     """
     weight, keep = _weights_and_mask(values, values, weights)
-    number = int(keep.sum())
+    n = int(keep.sum())
     labels = dense_labels(clusters, values.shape[1], "cluster")
     if np.unique(labels[keep]).size < 2:
-        return Interval(float(values[:, keep].mean()) if number else None, None, None, number)
+        return Interval(float(values[:, keep].mean()) if n else None, None, None, n)
     effect = crossed_mean(values, labels, weights)
     low, high = effect.interval(confidence)
     distinct = np.unique(values[:, keep])
     if share and distinct.size == 1 and distinct[0] in (0.0, 1.0):
         mass = np.bincount(labels[keep], weight[keep])
         trials = effect.clusters if weights is None else effective_size(mass)
-        return replace(wilson(float(distinct[0]) * trials, trials, confidence), n=number)
+        return replace(wilson(float(distinct[0]) * trials, trials, confidence), n=n)
     if share:
         low, high = max(low, 0.0), min(high, 1.0)
-    return Interval(effect.difference, low, high, number)
+    return Interval(effect.difference, low, high, n)
 
 
 def crossed_difference(
     a: Values, b: Others, clusters: Any = None, weights: Weights | None = None
 ) -> CrossedEffect:
-    """Return the difference of the means of two policies; UsageError for fewer than two seeds of one, or clusters."""
+    """Return the difference of the means of two policies.
+
+    Raises:
+        UsageError: A policy has fewer than two seeds, or there are fewer than two clusters.
+    """
     if a.shape[1] != b.shape[1]:
         raise UsageError("seeds have different scenarios", cure="give one value per seed and scenario")
     labels = dense_labels(clusters, a.shape[1], "cluster")
@@ -198,55 +214,62 @@ def crossed_difference(
     if min(len(a), len(b)) < 2 or not keep.any() or labels.max() < 1:
         cure = "train two seeds or more of each, and evaluate on two recordings or more"
         raise UsageError("too few seeds or recordings to estimate a variance", cure=cure)
-    share, number = weight[keep] / weight[keep].sum(), int(labels.max()) + 1
-    correction, policies = number / (number - 1), (a[:, keep], b[:, keep])
+    share, cluster_count = weight[keep] / weight[keep].sum(), int(labels.max()) + 1
+    correction, policies = cluster_count / (cluster_count - 1), (a[:, keep], b[:, keep])
     difference = policies[0].mean(axis=0) - policies[1].mean(axis=0)
-    # Tiny differences are rounding errors of sums.
+    # Remove the rounding errors of sums.
     rounding = ROUNDING * max(float(np.abs(policy).max()) for policy in policies)
     difference = np.where(np.abs(difference) <= rounding, 0.0, difference)
     mean = float(difference @ share)
-    scenarios = correction * float(np.square(np.bincount(labels, share * (difference - mean), number)).sum())
+    scenarios = correction * float(
+        np.square(np.bincount(labels, share * (difference - mean), cluster_count)).sum()
+    )
     seeds, interaction = [], []
     for policy in policies:
-        seed_means, count = policy @ share, len(policy)
-        seeds.append(float(seed_means.var(ddof=1)) / count)
+        seed_means, seed_count = policy @ share, len(policy)
+        seeds.append(float(seed_means.var(ddof=1)) / seed_count)
         residuals = (policy - seed_means[:, None] - policy.mean(axis=0) + seed_means.mean()) * share
-        totals = np.stack([np.bincount(labels, row, number) for row in residuals])
-        interaction.append(correction * float(np.square(totals).sum()) / (count * (count - 1)))
+        totals = np.stack([np.bincount(labels, row, cluster_count) for row in residuals])
+        interaction.append(correction * float(np.square(totals).sum()) / (seed_count * (seed_count - 1)))
     return CrossedEffect(
-        mean, (seeds[0], seeds[1]), scenarios, (len(a), len(b)), number, (interaction[0], interaction[1])
+        mean,
+        (seeds[0], seeds[1]),
+        scenarios,
+        (len(a), len(b)),
+        cluster_count,
+        (interaction[0], interaction[1]),
     )
 
 
 def difference_interval(
     a: Values, b: Others, clusters: Any = None, confidence: float = _CONFIDENCE
 ) -> tuple[Interval, CrossedEffect | None]:
-    """Return the interval of a difference of policies, each of one seed or several, and its :class:`CrossedEffect`.
+    """Return the interval of the difference of two policies, of one or several seeds, and its :class:`CrossedEffect`.
 
-    With fewer than two clusters there are neither bounds nor a :class:`CrossedEffect`.
+    With fewer than two clusters, the interval has no bounds and the effect is None.
     """
     _, keep = _weights_and_mask(a, b, None)
-    number = int(keep.sum())
+    n = int(keep.sum())
     labels = dense_labels(clusters, a.shape[1], "cluster")
     if np.unique(labels[keep]).size < 2:
-        mean = float(a[:, keep].mean() - b[:, keep].mean()) if number else None
-        return Interval(mean, None, None, number), None
+        mean = float(a[:, keep].mean() - b[:, keep].mean()) if n else None
+        return Interval(mean, None, None, n), None
     effect = crossed_difference(repeat_single_seed(a), repeat_single_seed(b), labels)
-    return Interval(effect.difference, *effect.interval(confidence), number), effect
+    return Interval(effect.difference, *effect.interval(confidence), n), effect
 
 
 def log_ratio(
     a: Values, b: Others, clusters: Any = None, weights: Weights | None = None
 ) -> CrossedEffect | None:
-    """Return ``ln(mean(a) / mean(b))`` of values at least 0 with its error (delta method); None if a mean is 0."""
+    """Return ``ln(mean(a) / mean(b))`` of non-negative values, with its error (delta method); None if a mean is 0."""
     weight, keep = _weights_and_mask(a, b, weights)
     if not keep.any():
         return None
     means = [float(np.average(policy[:, keep].mean(axis=0), weights=weight[keep])) for policy in (a, b)]
     if min(means) <= 0.0:
         return None
-    scaled = crossed_difference(a / means[0], b / means[1], clusters, weights)
-    return replace(scaled, difference=math.log(means[0] / means[1]))
+    relative_effect = crossed_difference(a / means[0], b / means[1], clusters, weights)
+    return replace(relative_effect, difference=math.log(means[0] / means[1]))
 
 
 def _weights_and_mask(

@@ -1,7 +1,7 @@
 """Significance tests of two planners on the same scenarios, or on two arms of a split.
 
-Every test is two-sided and takes one value per scenario; ``None`` or NaN means undefined and leaves the scenario (or
-pair) out. Scenarios of one cluster (recording; None: every scenario is its own) stay together.
+Tests are two-sided and take one value per scenario. Scenarios (or pairs) with undefined values (``None`` or NaN) are
+ignored. Scenarios of a cluster (recording) stay together; by default every scenario is a cluster.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from drivax.stats.clusters import (
 )
 from drivax.stats.intervals import RESAMPLES, check_draws, chunk_sizes
 
-#: Resampled statistics this close to the observed one, relative to its size, are ties.
+#: Relative difference between resampled and observed statistic below which they are tied.
 _TIE = 1e-9
 
 
@@ -48,12 +48,12 @@ class SignificanceResult:
 
 
 def mcnemar_test(a: Any, b: Any, *, mid: bool = True) -> SignificanceResult:
-    """McNemar's test of two rates in independent pairs, exact or mid-p.
+    """Apply McNemar's test to two rates in independent pairs, exact or mid-p.
 
-    Under the null hypothesis, either planner is equally likely to be the only one that fails in each of the ``n``
-    discordant pairs: ``p = 2 P(X <= k)``, at most 1, with ``X ~ Binomial(n, 1/2)`` and ``k`` the smaller of the two
-    counts (McNemar, Psychometrika 12, 1947). The mid-p value, ``p - P(X = k)``, is less conservative and nearly always
-    keeps its level (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013).
+    Under the null hypothesis, either planner is equally likely to fail alone in each of the ``n`` discordant pairs:
+    ``p = 2 P(X <= k)``, at most 1, where ``X ~ Binomial(n, 1/2)`` and ``k`` is the smaller of the two counts (McNemar,
+    Psychometrika 12, 1947). The mid-p value, ``p - P(X = k)``, is less conservative and nearly always keeps its level
+    (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013).
     """
     for values in (as_values(a), as_values(b)):
         if not np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
@@ -62,8 +62,8 @@ def mcnemar_test(a: Any, b: Any, *, mid: bool = True) -> SignificanceResult:
     name = "McNemar mid-p" if mid else "McNemar exact"
     if np.isnan(pairs).all():
         return SignificanceResult(name, None, 0, exact=True)
-    more, fewer = int((pairs > 0).sum()), int((pairs < 0).sum())
-    n, k = more + fewer, min(more, fewer)
+    positive, negative = int((pairs > 0).sum()), int((pairs < 0).sum())
+    n, k = positive + negative, min(positive, negative)
     cdf = float(special.bdtr(k, n, 0.5)) if n else 1.0
     pmf = cdf - float(special.bdtr(k - 1, n, 0.5)) if k else cdf
     p = min(1.0, 2.0 * cdf - pmf) if mid and n else min(1.0, 2.0 * cdf)
@@ -73,13 +73,13 @@ def mcnemar_test(a: Any, b: Any, *, mid: bool = True) -> SignificanceResult:
 def paired_permutation(
     a: Any, b: Any, clusters: Any = None, resamples: int = RESAMPLES, *, seed: int
 ) -> SignificanceResult:
-    """Sign-flipping permutation test of a mean paired difference, by cluster.
+    """Apply a sign-flipping permutation test to a mean paired difference, by cluster.
 
-    If the planners are interchangeable, the difference of each cluster has either sign with equal probability
-    (Fisher, The Design of Experiments, 1935, section 21; Good, Permutation, Parametric and Bootstrap Tests, 2005,
-    section 3.2). All ``2^C`` sign patterns are enumerated if there are at most ``resamples``; otherwise ``resamples``
-    random ones are drawn and ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol.
-    Biol. 9, 2010). For 0/1 values in clusters of one this is McNemar's exact test.
+    If the planners are interchangeable, the difference of each cluster has either sign with equal probability (Fisher,
+    The Design of Experiments, 1935, section 21; Good, Permutation, Parametric and Bootstrap Tests, 2005, section 3.2).
+    Up to ``resamples`` sign patterns are enumerated (``2^C`` of ``C`` clusters). Otherwise ``resamples`` random
+    patterns are drawn, and ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol.
+    Biol. 9, 2010). For 0/1 values in clusters of size one this is McNemar's exact test.
     """
     check_draws(0.95, resamples)
     x, labels = drop_undefined(paired_differences(a, b), clusters)
@@ -87,7 +87,7 @@ def paired_permutation(
         return SignificanceResult("permutation", None, 0, exact=True)
     sums = cluster_totals(x, labels)[0]
     size = np.abs(sums)
-    # Clusters without a difference do not change the statistic.
+    # Remove clusters without a difference, which do not change the statistic.
     sums = sums[size > _TIE * size.max()]
     threshold = abs(float(sums.sum())) - _TIE * float(size.sum())
     if 2.0**sums.size <= resamples:
@@ -104,11 +104,12 @@ def paired_permutation(
 def paired_bootstrap_test(
     a: Any, b: Any, clusters: Any = None, resamples: int = RESAMPLES, *, seed: int
 ) -> SignificanceResult:
-    """Bootstrap test of a mean paired difference, resampling whole clusters; assumes no symmetry.
+    """Apply a bootstrap test to a mean paired difference, resampling whole clusters; it assumes no symmetry.
 
-    ``t = m / se`` is compared with ``t* = (m* - m) / se*`` of resamples, ``p = (1 + #{|t*| >= |t|}) / (1 + resamples)``
-    (Efron and Tibshirani 1993, section 16.4; symmetric bootstrap-t: Hall, The Bootstrap and Edgeworth Expansion, 1992,
-    section 3.6), with the standard error of a ratio of totals, ``se^2 = C / (C - 1) sum((S_c - m n_c)^2) / n^2``.
+    ``t = m / se`` is compared with ``t* = (m* - m) / se*`` of resamples,
+    ``p = (1 + #{|t*| >= |t|}) / (1 + resamples)`` (Efron and Tibshirani 1993, section 16.4; symmetric bootstrap-t:
+    Hall, The Bootstrap and Edgeworth Expansion, 1992, section 3.6). The standard error is that of a ratio of totals,
+    ``se^2 = C / (C - 1) sum((S_c - m n_c)^2) / n^2``.
     """
     check_draws(0.95, resamples)
     x, labels = drop_undefined(paired_differences(a, b), clusters)
@@ -125,7 +126,7 @@ def paired_bootstrap_test(
     for count in chunk_sizes(resamples, sums.size):
         draws = rng.multinomial(sums.size, np.full(sums.size, 1.0 / sums.size), size=count)
         means, errors = _mean_and_error(draws @ moments, sums.size)
-        # A resample without variance supports the null hypothesis, unless it repeats the mean.
+        # A resample without variance supports the null hypothesis, unless its mean is the observed one.
         deviations = np.abs(means - mean)
         extreme += int((deviations >= (abs(mean) / error) * errors - _TIE * abs(mean)).sum())
     return SignificanceResult("bootstrap", (1 + extreme) / (1 + resamples), sums.size, exact=False)
@@ -134,7 +135,7 @@ def paired_bootstrap_test(
 def _mean_and_error(
     moments: Float64[np.ndarray, "resample 5"], clusters: int
 ) -> tuple[Float64[np.ndarray, " resample"], Float64[np.ndarray, " resample"]]:
-    """Mean and its standard error from sums over clusters of S, n, S^2, S n and n^2."""
+    """Return the mean and its standard error from the sums over clusters of S, n, S^2, S n and n^2."""
     s, n, ss, sn, nn = moments.T
     mean = s / n
     variance = clusters / (clusters - 1) * np.maximum(ss - 2 * mean * sn + mean**2 * nn, 0.0) / n**2
@@ -145,11 +146,13 @@ def split_permutation(
     values: Any, first: Bool[np.ndarray, " n"], clusters: Any = None, strata: Any = None,
     resamples: int = RESAMPLES, *, seed: int,
 ) -> SignificanceResult:  # fmt: skip
-    """Permutation test of the means of two arms, reassigning whole clusters; the sizes of the arms stay, by stratum.
+    """Apply a permutation test to the means of two arms, reassigning whole clusters within strata of fixed arm sizes.
 
-    Under the null hypothesis every assignment is as likely as the observed one, and the test is exact (Fisher 1935;
-    Good 2005, section 3.3). ``first`` marks the scenarios of the first arm.
-    Raises UsageError if a cluster is in both arms or in two strata.
+    Under the null hypothesis all assignments are equally likely, and the test is exact (Fisher 1935; Good 2005,
+    section 3.3). ``first`` masks the scenarios of the first arm.
+
+    Raises:
+        UsageError: A cluster is in both arms or in two strata.
     """
     check_draws(0.95, resamples)
     keep = ~np.isnan(as_values(values))
@@ -161,16 +164,16 @@ def split_permutation(
     in_first = cluster_totals(arm.astype(np.float64), labels)[0] > 0
     if (in_first[labels] != arm).any():
         raise UsageError("a cluster is in both arms", cure="assign whole clusters")
-    stratum = np.zeros(sums.size, np.int64)
+    cluster_stratum = np.zeros(sums.size, np.int64)
     if strata is not None:
-        stratum = cluster_strata(dense_labels(strata, keep.size, "stratum")[keep], labels, minimum=1)
+        cluster_stratum = cluster_strata(dense_labels(strata, keep.size, "stratum")[keep], labels, minimum=1)
     tie = _TIE * float(np.abs(x).max())
     threshold = abs(float(_arm_difference(in_first[None], sums, counts)[0])) - tie
     rng, extreme = np.random.default_rng(seed), 0
     for count in chunk_sizes(resamples, sums.size):
         draws = np.empty((count, sums.size), bool)
-        for number in range(int(stratum.max()) + 1):
-            members = stratum == number
+        for stratum in range(int(cluster_stratum.max()) + 1):
+            members = cluster_stratum == stratum
             draws[:, members] = rng.permuted(np.tile(in_first[members], (count, 1)), axis=1)
         extreme += int((np.abs(_arm_difference(draws, sums, counts)) >= threshold).sum())
     return SignificanceResult("permutation", (1 + extreme) / (1 + resamples), sums.size, exact=False)
@@ -187,13 +190,13 @@ def _arm_difference(
 def holm_adjust(ps: Sequence[float | None]) -> list[float | None]:
     """Adjust p-values for multiple tests, under any dependence (Holm, Scand. J. Stat. 6, 1979).
 
-    In ascending order ``p_(i)`` becomes the largest of ``(m - j) p_(j)``, ``j`` from 0 to ``i``, at most 1. None stands
-    for no test and does not count in ``m``.
+    In ascending order, ``p_(i)`` becomes the largest of ``(m - j) p_(j)`` for ``j`` from 0 to ``i``, at most 1. None
+    means that there is no test; it does not count in ``m``.
     """
     order = sorted((p, index) for index, p in enumerate(ps) if p is not None)
-    adjusted: list[float | None] = [None] * len(ps)
+    adjusted_ps: list[float | None] = [None] * len(ps)
     largest = 0.0
     for rank, (p, index) in enumerate(order):
         largest = max(largest, min(1.0, (len(order) - rank) * p))
-        adjusted[index] = largest
-    return adjusted
+        adjusted_ps[index] = largest
+    return adjusted_ps

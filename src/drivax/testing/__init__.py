@@ -1,6 +1,6 @@
-"""Checks for users' own components: call one in a test; the error names the broken rule and the cure.
+"""Checks of user-defined components for tests; errors name the violated rule and the cure.
 
-Each takes an object or its dotted name. The built-in components pass them too.
+A check takes a component or its dotted name. All built-in components pass.
 """
 
 import lazy_loader

@@ -18,9 +18,18 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from drivax.testing import worlds
-from drivax.testing.contract import CLOSE, check_numbers, expect, form, instance, layout, program, same
+from drivax.testing.contract import (
+    TOLERANCE,
+    array_type,
+    check_numbers,
+    expect,
+    instance,
+    layout,
+    program,
+    same,
+)
 
-#: Groups with one and two row axes, with and without masks; the second set has fewer groups, one without rows.
+#: Groups with one and two row axes, with and without masks; one group of the second specification has no rows.
 _SPECS = (
     {
         "agents": (4, 2, 3), "agents_mask": (4, 2), "ego": (2, 6), "ego_static": (4,), "route": (5, 5),
@@ -29,24 +38,24 @@ _SPECS = (
     {"ego": (1, 6), "lights": (2, 7), "lights_mask": (2,), "route": (0, 5), "route_mask": (0,)},
 )  # fmt: skip
 _BATCH = 6
-#: Tolerance with ``dtype: bfloat16``, which has eight significant bits.
-_COARSE = 5e-2
-#: A small observation: compiling takes most of the time of a check.
+#: Tolerance for ``dtype: bfloat16``, which has eight significant bits.
+_BFLOAT16_TOLERANCE = 5e-2
+#: A small observation, because compilation takes most of the time of a check.
 _TASK = Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=3), metrics="training")
 _ITERATIONS = 4
 
 
 def check_encoder(config: EncoderConfig | str) -> None:
-    """Check an encoder by its settings or their dotted name; raise :class:`BrokenContract` if it breaks a rule.
+    """Check an encoder by its settings or their dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    It builds for any groups, including one without rows. It embeds an observation or a batch as ``[..., width]``
-    float32, compiled or not. Its parameters follow from the key and are its only state. Values and gradients are
-    finite, also with all rows masked. Masked rows have no effect, valid rows do.
+    It builds for any groups, including groups without rows. It embeds an observation or a batch as ``[..., width]``
+    float32, compiled or not. Its parameters depend only on the key, and are its only state. Values and gradients are
+    finite, also if all rows are masked. Valid rows have an effect, masked rows have none.
     """
     settings = instance(config)
     what = f"encoder {type(settings).__name__}"
     expect(isinstance(settings, EncoderConfig), f"{what} has no build(spec, rngs)", "see EncoderConfig")
-    close = _COARSE if getattr(settings, "dtype", "") == "bfloat16" else CLOSE
+    tolerance = _BFLOAT16_TOLERANCE if getattr(settings, "dtype", "") == "bfloat16" else TOLERANCE
     for number, spec in enumerate(_SPECS):
         encoder: Any = settings.build(spec, nnx.Rngs(0))
         batch = _observations(spec, number)
@@ -54,12 +63,12 @@ def check_encoder(config: EncoderConfig | str) -> None:
         embedding = run(batch)
         width = getattr(encoder, "width", None)
         valid = embedding.shape == (_BATCH, width) and embedding.dtype == jnp.float32
-        problem = f"{what} embeds {_BATCH} observations as {form(embedding)} with width {width}"
+        problem = f"{what} embeds {_BATCH} observations as {array_type(embedding)} with width {width}"
         expect(valid, problem, "return [*batch, width] float32, and set width")
         check_numbers(what, embedding)
         _check_state(what, settings, spec, encoder)
-        _check_rows(what, (encoder if number == 0 else run, run), batch, embedding, close)
-        _check_masks(what, run, batch, embedding, close)
+        _check_batches(what, (encoder if number == 0 else run, run), batch, embedding, tolerance)
+        _check_masks(what, run, batch, embedding, tolerance)
         _check_gradients(what, encoder, batch)
 
 
@@ -75,40 +84,44 @@ def _observations(spec: Any, seed: int) -> dict[str, Any]:
 
 
 def _check_state(what: str, config: EncoderConfig, spec: Any, encoder: Any) -> None:
-    kept, parameters = (jax.tree.leaves(nnx.state(encoder, *only)) for only in ((), (nnx.Param,)))
+    variables = jax.tree.leaves(nnx.state(encoder))
+    parameters = jax.tree.leaves(nnx.state(encoder, nnx.Param))
     expect(
-        len(kept) == len(parameters) > 0,
-        f"{what} keeps {len(kept) - len(parameters)} variables that are not parameters, of {len(kept)}",
+        len(variables) == len(parameters) > 0,
+        f"{what} keeps {len(variables) - len(parameters)} variables that are not parameters, of {len(variables)}",
         "keep nnx.Param only: no dropout, no running means",
     )
-    again = jax.tree.leaves(nnx.state(config.build(spec, nnx.Rngs(0)), nnx.Param))
-    repeated = same(jax.device_get(parameters), jax.device_get(again), 0.0)
+    rebuilt = jax.tree.leaves(nnx.state(config.build(spec, nnx.Rngs(0)), nnx.Param))
+    repeated = same(jax.device_get(parameters), jax.device_get(rebuilt), 0.0)
     expect(repeated, f"{what} has other initial parameters every time", "draw them from rngs")
 
 
-def _check_rows(what: str, forms: tuple[Any, Any], batch: Any, embedding: Any, close: float) -> None:
-    """Check one observation, alone and in a batch of batches of one, compiled and not."""
-    single, (encoder, run) = jax.tree.map(lambda leaf: leaf[0], batch), forms
+def _check_batches(
+    what: str, encoders: tuple[Any, Any], batch: Any, embedding: Any, tolerance: float
+) -> None:
+    """Check one observation, alone and in a batch with two axes of size one; ``encoders``: eager and compiled."""
+    single, (encoder, run) = jax.tree.map(lambda leaf: leaf[0], batch), encoders
     for result in (encoder(single), run(jax.tree.map(lambda leaf: leaf[None, None], single))[0, 0]):
-        valid = same(embedding[0], jax.device_get(result), close)
+        valid = same(embedding[0], jax.device_get(result), tolerance)
         expect(valid, f"{what} differs in a batch", "use the last axes; any axes may lead")
     spread = np.abs(embedding - embedding[:1]).max()
     expect(spread > 0, f"{what} embeds all observations equally", "let it read the groups")
 
 
-def _check_masks(what: str, run: Any, batch: Any, embedding: Any, close: float) -> None:
-    scattered = {
+def _check_masks(what: str, run: Any, batch: Any, embedding: Any, tolerance: float) -> None:
+    garbage = {
         name: jnp.where(batch[f"{name}_mask"][..., None], rows, worlds.GARBAGE)
         for name, rows in batch.items()
         if f"{name}_mask" in batch
     }
+    unchanged = same(embedding, run(batch | garbage), tolerance)
     cure = "use jnp.where(mask[..., None], rows, 0) first, and mask after each bias"
-    expect(same(embedding, run(batch | scattered), close), f"{what} changes with masked rows", cure)
+    expect(unchanged, f"{what} changes with masked rows", cure)
     check_numbers(f"{what} without rows", run(_without_rows(batch)), "a mean or softmax over no rows")
 
 
 def _without_rows(batch: Any) -> dict[str, Any]:
-    return {n: jnp.zeros_like(value) if n.endswith("_mask") else value for n, value in batch.items()}
+    return {name: jnp.zeros_like(value) if name.endswith("_mask") else value for name, value in batch.items()}
 
 
 def _check_gradients(what: str, encoder: Any, batch: Any) -> None:
@@ -125,11 +138,11 @@ def _check_gradients(what: str, encoder: Any, batch: Any) -> None:
 
 
 def check_algorithm(config: AlgorithmConfig | str) -> None:
-    """Check an algorithm by its settings or their dotted name; raise :class:`BrokenContract` if it breaks a rule.
+    """Check an algorithm by its settings or their dotted name; raise :class:`BrokenContract` if it violates a rule.
 
     Its learner has a state with ``parameters`` and ``iteration`` of constant structure, shapes and types. Iterations
-    are pure, bit-for-bit repeatable after storing the state, change the parameters and log finite numbers. The planner
-    acts within [-1, 1], deterministically by the mode. Use small sizes: the check runs three iterations.
+    are pure, repeat bit for bit from a stored state, change the parameters, and log finite numbers. The planner acts
+    within [-1, 1]; its mode is deterministic. Use small sizes, because the check runs three iterations.
     """
     settings = instance(config)
     what = f"algorithm {type(settings).__name__}"
@@ -151,27 +164,33 @@ def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
     first = init(data, jax.random.key(0))
     valid = isinstance(first, LearnerState)
     expect(valid, f"{what} has a state without parameters or iteration", "add these fields")
-    valid = layout(jax.eval_shape(learner.init, data, jax.random.key(1))) == layout(first)
-    cure = "let shapes depend on the configuration only"
-    expect(valid, f"{what} has a state whose shape depends on the key", cure)
-    valid = layout(jax.eval_shape(learner.iterate, data, first)[0]) == layout(first)
-    cure = "return the same record with the same shapes and types"
-    expect(valid, f"{what} changes the shape of its state in an iteration", cure)
+    _check_state_layout(what, learner, data, first)
     stored = jax.tree.map(jnp.copy, first)  # survives the donation of the state
     second, logs = iterate(data, first)
     before, after = int(stored.iteration), int(second.iteration)
     expect(after == before + 1, f"{what} counts from iteration {before} to {after}", "add one")
-    idle = same(jax.device_get(second.parameters), jax.device_get(stored.parameters), 0.0)
-    expect(not idle, f"{what} learns nothing in an iteration", "return the new parameters")
+    unchanged = same(jax.device_get(second.parameters), jax.device_get(stored.parameters), 0.0)
+    expect(not unchanged, f"{what} learns nothing in an iteration", "return the new parameters")
     _check_logs(what, logs)
-    again, _ = iterate(data, jax.tree.map(jnp.copy, stored))
-    valid = same(_numbers(again), _numbers(second), 0.0)
+    repeated, _ = iterate(data, jax.tree.map(jnp.copy, stored))
+    valid = same(_host_arrays(repeated), _host_arrays(second), 0.0)
     cure = "keep keys and all other inputs of an iteration in the state"
     expect(valid, f"{what} does not repeat an iteration bit for bit", cure)
     third, logs = iterate(data, second)
     _check_logs(what, logs)
-    check_numbers(what, [np.atleast_1d(leaf) for leaf in jax.tree.leaves(_numbers(third.parameters))])
+    parameters = jax.tree.leaves(_host_arrays(third.parameters))
+    check_numbers(what, [np.atleast_1d(leaf) for leaf in parameters])
     return third
+
+
+def _check_state_layout(what: str, learner: Learner, data: Any, state: Any) -> None:
+    """Check that the layout of a state is the same for other keys and after an iteration."""
+    valid = layout(jax.eval_shape(learner.init, data, jax.random.key(1))) == layout(state)
+    cure = "let shapes depend on the configuration only"
+    expect(valid, f"{what} has a state whose shape depends on the key", cure)
+    valid = layout(jax.eval_shape(learner.iterate, data, state)[0]) == layout(state)
+    cure = "return the same record with the same shapes and types"
+    expect(valid, f"{what} changes the shape of its state in an iteration", cure)
 
 
 def _check_logs(what: str, logs: dict[str, Any]) -> None:
@@ -187,8 +206,8 @@ def _check_planner(
     def act(planner: Any, bank: ScenarioBank, key: Any) -> Any:
         state = simulator.reset(bank, 0)
         carry = planner.init(bank, state, key)
-        situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.context)
-        return planner.act(carry, bank, state, situation, seen, key)[0]
+        situation, observation = simulator.situation(bank, state), simulator.observe(bank, state.context)
+        return planner.act(carry, bank, state, situation, observation, key)[0]
 
     keys = jax.random.key(0), jax.random.key(1)
     for samples in (False, True):
@@ -201,11 +220,11 @@ def _check_planner(
         expect(valid, f"{what} uses randomness in its mode", "use the key only to sample")
 
 
-def _numbers(tree: Any) -> Any:
-    """Return all leaves on the host, random keys as numbers."""
+def _host_arrays(tree: Any) -> Any:
+    """Return a tree on the host, with the data of random keys."""
 
-    def number(leaf: Any) -> Any:
-        key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        return np.asarray(jax.random.key_data(leaf) if key else leaf)
+    def host_array(leaf: Any) -> Any:
+        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
 
-    return jax.tree.map(number, tree)
+    return jax.tree.map(host_array, tree)

@@ -23,28 +23,28 @@ from drivax.tasks.task import Task
 from drivax.testing import worlds
 from drivax.testing.contract import (
     Program,
+    array_type,
     check_numbers,
+    check_rotated,
     check_same,
-    check_turned,
     check_variants,
     expect,
-    form,
     instance,
 )
 from drivax.testing.worlds import ANGLE, Moments
 
-#: Bound of features: the Gymnasium adapter clips there.
+#: Largest feature value; the Gymnasium adapter clips at this bound.
 LARGEST = 100.0
-#: Step after which the log is changed, to check that a feature does not see the future.
+#: Step after which the log is changed, to check that features do not depend on the future.
 _NOW = 45
 
 
 def check_reward(term: Term | str) -> None:
-    """Check a reward term or its dotted name; raise :class:`BrokenContract` if it breaks a rule.
+    """Check a reward term or its dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    It is a pure function of facts before, facts now and surroundings, and one finite float32 number. It does not
-    depend on compilation, batching, rotation and shift of the world, the order of agents, padding, or rows of absent
-    agents.
+    It is a pure function of facts before, facts now and surroundings, with one finite float32 result. The result does
+    not depend on compilation, batching, rotation and shift of the world, the order of agents, padding, or rows of
+    absent agents.
     """
     function = instance(term)
 
@@ -55,11 +55,11 @@ def check_reward(term: Term | str) -> None:
 
 
 def check_metric(metric: Metric | str) -> None:
-    """Check a metric or its dotted name; raise :class:`BrokenContract` if it breaks a rule.
+    """Check a metric or its dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    Its step value is a number and whether it is defined, under the rules of :func:`check_reward` where it is defined.
-    It declares all facts that it reads, has unit, direction and text, and computes a finite ``Value`` at the end of an
-    episode where it is defined.
+    Its step value is a number and whether it is defined; a defined number follows the rules of :func:`check_reward`.
+    The metric declares all facts that it reads, and has a unit, direction and definition. At the end of an episode it
+    computes a ``Value``, which is finite if defined.
     """
     what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.definition!r}"
     spec: Any = find_named(metric) if isinstance(metric, str) else metric
@@ -82,25 +82,25 @@ def check_metric(metric: Metric | str) -> None:
 
 
 def check_feature(feature: Feature | str) -> None:
-    """Check an observation feature or its dotted name; raise :class:`BrokenContract` if it breaks a rule.
+    """Check an observation feature or its dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    It is a pure function of bank, context and frames: finite float32 up to 100 with features last, or a pair of those
-    and a mask over rows. It does not depend on compilation, batching, the log's future, rotation and shift of the
-    world, the order of agents, padding, or rows of absent agents.
+    It is a pure function of bank, context and frames that returns finite float32 values up to 100, with features on
+    the last axis, optionally with a mask of rows. Results do not depend on compilation, batching, the log's future,
+    rotation and shift of the world, the order of agents, padding, or rows of absent agents.
     """
     function: Any = find_named(feature) if isinstance(feature, str) else feature
     group = OwnGroup(function)
     what = f"observation feature {group.name!r}"
     simulator = Simulator(Task())
 
-    def seen(bank: ScenarioBank, context: AgentContext) -> Any:
+    def observe(bank: ScenarioBank, context: AgentContext) -> Any:
         def frames(back: int) -> Frame:
             return simulator.frame(bank, context, alone(context), back)
 
         _check_form(what, function(bank, context, frames))
         return group.observe(bank, context, frames)
 
-    program = Program(what, seen, (None, 0))
+    program = Program(what, observe, (None, 0))
     bank, contexts = worlds.worlds(), worlds.moments().situation.context
     results = program.check_pure(bank, contexts)
     check_numbers(what, results)
@@ -110,24 +110,24 @@ def check_feature(feature: Feature | str) -> None:
     )
     check_numbers(what, program(worlds.without_others(bank), contexts))
     check_variants(what, results, worlds.BANK_VARIANTS, lambda change: program(change(bank), contexts))
-    present = np.asarray(contexts.step) == _NOW
-    later = program(worlds.other_future(bank, _NOW), contexts)
-    now, later = (jax.tree.map(lambda leaf: leaf[present], result) for result in (results, later))
+    at_change = np.asarray(contexts.step) == _NOW
+    changed = program(worlds.change_future(bank, _NOW), contexts)
+    expected, changed = (jax.tree.map(lambda leaf: leaf[at_change], result) for result in (results, changed))
     cure = "read the context and its frames; of the bank only map, route 0, goal and the current step"
-    check_same(what, now, later, "the log's future changes", cure)
-    turned = program(worlds.worlds(ANGLE), worlds.moments(ANGLE).situation.context)
-    check_turned(what, results, turned)
+    check_same(what, expected, changed, "the log's future changes", cure)
+    rotated = program(worlds.worlds(ANGLE), worlds.moments(ANGLE).situation.context)
+    check_rotated(what, results, rotated)
 
 
 def _check_form(what: str, rows: Any) -> None:
-    """Check shapes and types, while tracing."""
+    """Check shapes and dtypes while tracing."""
     value, mask = rows if isinstance(rows, tuple) else (rows, None)
     valid = value.dtype == jnp.float32 and value.ndim >= 1
     cure = "return float32 with features on the last axis"
-    expect(valid, f"{what} gives {form(value)} for a context", cure)
+    expect(valid, f"{what} gives {array_type(value)} for a context", cure)
     if mask is not None:
         valid = mask.dtype == bool and mask.shape == value.shape[:-1] and mask.ndim > 0
-        problem = f"{what} gives {form(mask)} as the mask of {list(value.shape)}"
+        problem = f"{what} gives {array_type(mask)} as the mask of {list(value.shape)}"
         expect(valid, problem, "return one boolean per row")
 
 
@@ -139,25 +139,25 @@ def _check_moments(what: str, value: Callable[[Moments], Any], delayed: bool = F
         problem = f"{what} is delayed but returns no row of numbers"
         expect(number.ndim == 2, problem, "return one number and one mask entry per step")
     else:
-        problem = f"{what} gives {form(number[0])} instead of one float32 number"
+        problem = f"{what} gives {array_type(number[0])} instead of one float32 number"
         cure = "reduce it to a scalar, and convert booleans with .astype(jnp.float32)"
         expect(number.ndim == 1 and number.dtype == jnp.float32, problem, cure)
     frame = moments.situation.surroundings.frame
 
-    def changed(change: Callable[[Frame], Frame]) -> Any:
+    def results_of(change: Callable[[Frame], Frame]) -> Any:
         return program(worlds.with_frame(moments, change(frame)))
 
     check_numbers(what, results)
     check_numbers(what, program(worlds.extremes(moments)))
-    check_numbers(what, changed(worlds.frame_without_others))
-    check_variants(what, results, worlds.FRAME_VARIANTS, changed)
-    check_turned(what, results, program(worlds.moments(ANGLE)))
+    check_numbers(what, results_of(worlds.frame_without_others))
+    check_variants(what, results, worlds.FRAME_VARIANTS, results_of)
+    check_rotated(what, results, program(worlds.moments(ANGLE)))
 
 
 def _check_reads(what: str, value: Callable[[Moments], Any], reads: frozenset[str]) -> None:
-    """Check that a value computes without the facts that it does not declare."""
-    unknown = sorted(reads - FACTS - ON_REQUEST)
-    expect(not unknown, f"{what} reads unknown fact {unknown[:1]}", "see simulator.types.Facts")
+    """Check that a value can be computed from its declared facts alone."""
+    unknown_facts = sorted(reads - FACTS - ON_REQUEST)
+    expect(not unknown_facts, f"{what} reads unknown fact {unknown_facts[:1]}", "see simulator.types.Facts")
     try:
         Program(what, value)(worlds.without_facts(worlds.moments(), reads))
     except (AttributeError, TypeError, ValueError) as error:
@@ -165,15 +165,15 @@ def _check_reads(what: str, value: Callable[[Moments], Any], reads: frozenset[st
 
 
 def _check_computed(what: str, metric: Metric) -> None:
-    """Check what is computed at the end, for inputs from 0 to 1, defined and undefined."""
+    """Check ``compute`` for inputs from 0 to 1, defined and undefined."""
     compute = metric.compute
     assert compute is not None
     bank = worlds.worlds()
 
     def value(row: Any, number: Any, defined: Any) -> Any:
-        ending = EpisodeEnd(bank, row, jnp.asarray(10), jnp.asarray(80))
-        given = Value(number, defined)
-        return compute(ending, given, dict.fromkeys(metric.inputs, given))
+        end = EpisodeEnd(bank, row, jnp.asarray(10), jnp.asarray(80))
+        step_value = Value(number, defined)
+        return compute(end, step_value, dict.fromkeys(metric.inputs, step_value))
 
     program = Program(what, value, (0, 0, 0))
     for defined in (True, False):

@@ -1,6 +1,6 @@
-"""Small worlds for checks, and variants of them that must not change results.
+"""Small worlds for checks, and variants that must not change results.
 
-Variants: rotation and shift of the map, order of agents, size and content of padding, the future of the log.
+The variants differ in rotation and shift, order of agents, size and content of padding, or the future of the log.
 """
 
 from __future__ import annotations
@@ -31,114 +31,117 @@ from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Frame, Situation
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task
 
-#: Recordings of the built-in world: a roundabout, a crosswalk with people, a junction with lights.
+#: Recordings of the built-in world: a roundabout, a crosswalk with pedestrians, a junction with lights.
 _RECORDINGS = (0, 6, 8)
 #: Steps of the moments.
 _STEPS = (30, 45, 60, 75)
-#: Offsets of ego from its log: to the left (m), heading (rad), factor of speed.
+#: Changes of ego's log: offset to the left (m), rotation (rad), speed factor.
 _OFFSETS = ((0.0, 0.0, 1.0), (1.7, 0.2, 1.5), (-4.0, -0.3, 0.0), (3.6, 3.0, 1.0), (-9.0, 0.1, 2.5))
 #: Rotation of worlds, rad.
 ANGLE = 1.3
-#: Content of padding that must not matter.
+#: Content of padding, which must not affect results.
 GARBAGE = 777.0
 _CAPACITY = replace(CAPACITIES["default"], name="testing", agents=40, parked=24)
 
 
 @record
 class Moments:
-    """Facts of the step before, the situation now, and the first step of the episode; one moment per row."""
+    """Facts of the previous step, situation, and first step of the episode; one moment per row."""
 
     before: Facts
     situation: Situation
     start: Array
 
 
-def turned(recording: Recording, angle: float, dx: float, dy: float) -> Recording:
-    """Return the world rotated about the origin and shifted."""
+def rotate_recording(recording: Recording, angle: float, dx: float, dy: float) -> Recording:
+    """Return a recording rotated about the origin and shifted."""
     cos, sin = np.cos(angle), np.sin(angle)
-    turn = np.array([[cos, sin], [-sin, cos]])
+    rotation = np.array([[cos, sin], [-sin, cos]])
 
-    def place(points: Any) -> Any:
-        return np.concatenate([points[..., :2] @ turn + np.array([dx, dy]), points[..., 2:]], axis=-1)
+    def transform(points: Any) -> Any:
+        return np.concatenate([points[..., :2] @ rotation + np.array([dx, dy]), points[..., 2:]], axis=-1)
 
-    old = recording.tracks
-    tracks = replace(
-        old,
-        xy=np.where(old.valid[..., None], place(old.xy), 0.0),
-        velocity=old.velocity @ turn,
-        heading=np.where(old.valid, (old.heading + angle + np.pi) % (2 * np.pi) - np.pi, 0.0),
+    tracks = recording.tracks
+    rotated_tracks = replace(
+        tracks,
+        xy=np.where(tracks.valid[..., None], transform(tracks.xy), 0.0),
+        velocity=tracks.velocity @ rotation,
+        heading=np.where(tracks.valid, (tracks.heading + angle + np.pi) % (2 * np.pi) - np.pi, 0.0),
     )
-    features = tuple(replace(f, points=place(f.points)) for f in recording.features)
-    lights = tuple(replace(light, stop_point=place(light.stop_point)) for light in recording.lights)
-    return replace(recording, tracks=tracks, features=features, lights=lights)
+    features = tuple(replace(feature, points=transform(feature.points)) for feature in recording.features)
+    lights = tuple(replace(light, stop_point=transform(light.stop_point)) for light in recording.lights)
+    return replace(recording, tracks=rotated_tracks, features=features, lights=lights)
 
 
 @cache
 def worlds(angle: float = 0.0) -> ScenarioBank:
-    """Return the worlds, with an angle rotated and shifted by several hundred metres."""
+    """Return a bank of the worlds; with an angle they are rotated and shifted by several hundred metres."""
     recordings = [generate_recording(seed=0, index=index) for index in _RECORDINGS]
     if angle:
-        recordings = [turned(recording, angle, 300.0, -700.0) for recording in recordings]
+        recordings = [rotate_recording(recording, angle, 300.0, -700.0) for recording in recordings]
     scenarios = [assemble(recording, _CAPACITY) for recording in recordings]
     return ScenarioBank.from_scenarios(scenarios, trim=False)
 
 
 @cache
 def moments(angle: float = 0.0) -> Moments:
-    """Return moments of the worlds: ego at its logged pose, and offset, rotated, fast and standing."""
+    """Return moments of the worlds, with ego at its logged pose, offset, rotated, fast and standing."""
     return jax.jit(_moments)(worlds(angle))
 
 
 def _moments(bank: ScenarioBank) -> Moments:
-    rows, steps, places = np.meshgrid(np.arange(len(bank)), _STEPS, np.arange(len(_OFFSETS)), indexing="ij")
-    before = jax.vmap(partial(_measured, bank))
-    place = jnp.asarray(_OFFSETS)[places.ravel()]
-    index, step = jnp.asarray(rows.ravel()), jnp.asarray(steps.ravel())
-    # One program measures both sides of the step.
-    both = before(jnp.tile(index, 2), jnp.concatenate([step - 1, step]), jnp.tile(place, (2, 1)))
-    earlier, now = (jax.tree.map(lambda leaf, part=part: jnp.split(leaf, 2)[part], both) for part in (0, 1))
-    return Moments(earlier.facts, now, step - 20)
+    scenarios, steps, changes = np.meshgrid(
+        np.arange(len(bank)), _STEPS, np.arange(len(_OFFSETS)), indexing="ij"
+    )
+    index, step = jnp.asarray(scenarios.ravel()), jnp.asarray(steps.ravel())
+    offset = jnp.asarray(_OFFSETS)[changes.ravel()]
+    # Measure the previous and the current step in one program.
+    measure_all = jax.vmap(partial(_measure_offset, bank))
+    both = measure_all(jnp.tile(index, 2), jnp.concatenate([step - 1, step]), jnp.tile(offset, (2, 1)))
+    before, now = (jax.tree.map(lambda leaf, half=half: jnp.split(leaf, 2)[half], both) for half in (0, 1))
+    return Moments(before.facts, now, step - 20)
 
 
-def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Situation:
-    """Measure with ego's logged history offset, rotated and scaled in speed."""
+def _measure_offset(bank: ScenarioBank, index: Array, step: Array, offset: Array) -> Situation:
+    """Measure a step with ego's logged history offset, rotated and scaled in speed (:data:`_OFFSETS`)."""
     simulator = Simulator(Task())
     context = simulator.context(bank, index, step)
     x, y, heading, speed = jnp.moveaxis(context.history, -1, 0)
-    left_m, turn_rad, pace = place
-    shifted = jnp.stack([x - left_m * jnp.sin(heading), y + left_m * jnp.cos(heading)], axis=-1)
-    moved = jnp.stack([wrap(heading + turn_rad), speed * pace], axis=-1)
-    context = replace(context, history=jnp.concatenate([shifted, moved], axis=-1))
-    now, previous = (simulator.frame(bank, context, alone(context), back) for back in (0, 1))
-    apart = jnp.full(now.valid.shape, int(Contact.APART), jnp.int8)
-    return measure(bank, context, now, previous, apart, remember_lights(bank, context), FACTS | ON_REQUEST)[0]
+    left_m, rotation_rad, speed_factor = offset
+    position = jnp.stack([x - left_m * jnp.sin(heading), y + left_m * jnp.cos(heading)], axis=-1)
+    motion = jnp.stack([wrap(heading + rotation_rad), speed * speed_factor], axis=-1)
+    context = replace(context, history=jnp.concatenate([position, motion], axis=-1))
+    frame, previous_frame = (simulator.frame(bank, context, alone(context), back) for back in (0, 1))
+    contacts = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
+    lights = remember_lights(bank, context)
+    return measure(bank, context, frame, previous_frame, contacts, lights, FACTS | ON_REQUEST)[0]
 
 
-def shuffled_frame(frame: Frame) -> Frame:
-    """Permute the slots of agents; the driven agent stays in slot 0."""
+def permute_frame(frame: Frame) -> Frame:
+    """Permute the slots of agents, except slot 0 of the driven agent."""
     order = order_of(frame.valid.shape[-1])
-    return _of_agents(lambda leaf: leaf[:, order], frame)
+    return _map_agents(lambda leaf: leaf[:, order], frame)
 
 
-def padded_frame(frame: Frame) -> Frame:
+def pad_frame(frame: Frame) -> Frame:
     """Append empty slots with garbage."""
 
     def pad(leaf: Array) -> Array:
         fill = False if leaf.dtype == bool else GARBAGE
-        more = jnp.full((leaf.shape[0], 8, *leaf.shape[2:]), fill).astype(leaf.dtype)
-        return jnp.concatenate([leaf, more], axis=1)
+        padding = jnp.full((leaf.shape[0], 8, *leaf.shape[2:]), fill).astype(leaf.dtype)
+        return jnp.concatenate([leaf, padding], axis=1)
 
-    return _of_agents(pad, frame)
+    return _map_agents(pad, frame)
 
 
-def scattered_frame(frame: Frame) -> Frame:
+def scatter_frame(frame: Frame) -> Frame:
     """Fill empty slots with garbage."""
 
     def fill(leaf: Array) -> Array:
-        there = frame.valid.reshape(*frame.valid.shape, *(1,) * (leaf.ndim - 2))
-        return leaf if leaf.dtype == bool else jnp.where(there, leaf, GARBAGE).astype(leaf.dtype)
+        valid = frame.valid.reshape(*frame.valid.shape, *(1,) * (leaf.ndim - 2))
+        return leaf if leaf.dtype == bool else jnp.where(valid, leaf, GARBAGE).astype(leaf.dtype)
 
-    return _of_agents(fill, frame)
+    return _map_agents(fill, frame)
 
 
 def frame_without_others(frame: Frame) -> Frame:
@@ -146,58 +149,58 @@ def frame_without_others(frame: Frame) -> Frame:
     return replace(frame, valid=frame.valid & (jnp.arange(frame.valid.shape[-1]) == 0))
 
 
-def _of_agents(change: Callable[[Array], Array], frame: Frame) -> Frame:
-    """Apply a change to all fields of agents."""
+def _map_agents(function: Callable[[Array], Array], frame: Frame) -> Frame:
+    """Apply a function to all agent fields of a frame."""
     names = [field.name for field in fields(frame) if field.name != "lights"]
-    return replace(frame, **{name: change(getattr(frame, name)) for name in names})
+    return replace(frame, **{name: function(getattr(frame, name)) for name in names})
 
 
 def with_frame(moments: Moments, frame: Frame) -> Moments:
     """Replace the frames of moments."""
-    around = replace(moments.situation.surroundings, frame=frame)
-    return replace(moments, situation=replace(moments.situation, surroundings=around))
+    surroundings = replace(moments.situation.surroundings, frame=frame)
+    return replace(moments, situation=replace(moments.situation, surroundings=surroundings))
 
 
 def extremes(moments: Moments) -> Moments:
-    """Set all facts to zero: standing, unknown limit, no route."""
+    """Set all facts to zero: standstill, unknown speed limit, no route."""
 
-    def nothing(facts: Facts) -> Facts:
-        still = jax.tree.map(jnp.zeros_like, facts)
-        return replace(still, limit_mps=jnp.full_like(facts.limit_mps, -1.0))
+    def zero(facts: Facts) -> Facts:
+        zeros = jax.tree.map(jnp.zeros_like, facts)
+        return replace(zeros, limit_mps=jnp.full_like(facts.limit_mps, -1.0))
 
-    situation = replace(moments.situation, facts=nothing(moments.situation.facts))
-    return replace(moments, before=nothing(moments.before), situation=situation)
+    situation = replace(moments.situation, facts=zero(moments.situation.facts))
+    return replace(moments, before=zero(moments.before), situation=situation)
 
 
 def without_facts(moments: Moments, reads: frozenset[str]) -> Moments:
-    """Remove all facts but these."""
+    """Remove all facts except those in ``reads``."""
 
-    def only(facts: Facts) -> Facts:
-        # replace() would check the types of the fields.
+    def select(facts: Facts) -> Facts:
+        # replace() would reject None, because it checks the types of fields.
         return jax.tree_util.tree_map_with_path(
             lambda path, fact: fact if path[0].name in reads else None, facts
         )
 
-    situation = replace(moments.situation, facts=only(moments.situation.facts))
-    return replace(moments, before=only(moments.before), situation=situation)
+    situation = replace(moments.situation, facts=select(moments.situation.facts))
+    return replace(moments, before=select(moments.before), situation=situation)
 
 
-def shuffled(bank: ScenarioBank) -> ScenarioBank:
-    """Permute the slots of agents; ego stays in slot 0."""
-    moving = order_of(bank.agents.shape[2])
-    parked = np.random.default_rng(0).permutation(np.arange(len(moving), bank.parked.shape[1]))
-    slots = np.concatenate([moving, parked])
+def permute_agents(bank: ScenarioBank) -> ScenarioBank:
+    """Permute the slots of agents, except slot 0 of ego."""
+    moving_slots = order_of(bank.agents.shape[2])
+    parked_slots = np.random.default_rng(0).permutation(np.arange(len(moving_slots), bank.parked.shape[1]))
+    slots = np.concatenate([moving_slots, parked_slots])
     return replace(
         bank,
-        agents=bank.agents[:, :, moving],
-        extension=bank.extension[:, moving],
+        agents=bank.agents[:, :, moving_slots],
+        extension=bank.extension[:, moving_slots],
         agent_box=bank.agent_box[:, slots],
         parked=bank.parked[:, slots],
         parked_when=bank.parked_when[:, :, slots],
     )
 
 
-def padded(bank: ScenarioBank, slots: int = 8) -> ScenarioBank:
+def pad_agents(bank: ScenarioBank, slots: int = 8) -> ScenarioBank:
     """Append empty slots for agents."""
     n, steps = bank.agents.shape[:2]
     return replace(
@@ -210,12 +213,12 @@ def padded(bank: ScenarioBank, slots: int = 8) -> ScenarioBank:
     )
 
 
-def scattered(bank: ScenarioBank) -> ScenarioBank:
+def scatter_garbage(bank: ScenarioBank) -> ScenarioBank:
     """Fill the rows of absent agents with garbage."""
-    there = bank.agents[..., AgentColumn.VALID] > 0
-    agents = jnp.where(there[..., None], bank.agents, GARBAGE).at[..., AgentColumn.VALID].set(there)
-    ever = (bank.parked_when > 0).any(axis=1)[..., None]
-    return replace(bank, agents=agents, parked=jnp.where(ever, bank.parked, GARBAGE))
+    valid = bank.agents[..., AgentColumn.VALID] > 0
+    agents = jnp.where(valid[..., None], bank.agents, GARBAGE).at[..., AgentColumn.VALID].set(valid)
+    ever_present = (bank.parked_when > 0).any(axis=1)[..., None]
+    return replace(bank, agents=agents, parked=jnp.where(ever_present, bank.parked, GARBAGE))
 
 
 def without_others(bank: ScenarioBank) -> ScenarioBank:
@@ -225,17 +228,17 @@ def without_others(bank: ScenarioBank) -> ScenarioBank:
     return replace(bank, agents=agents, parked_when=jnp.zeros_like(bank.parked_when))
 
 
-def other_future(bank: ScenarioBank, step: int) -> ScenarioBank:
-    """Change the log after ``step``: other motions and lights, no log path. Ego knows route and goal, so they stay."""
-    later = jnp.arange(bank.steps) > step
-    moved = bank.agents.at[..., AgentColumn.XY].add(13.0).at[..., AgentColumn.VELOCITY].multiply(-1.0)
-    moved = moved.at[..., AgentColumn.VALID].set(1.0 - bank.agents[..., AgentColumn.VALID])
+def change_future(bank: ScenarioBank, step: int) -> ScenarioBank:
+    """Change the log after ``step``: motions, lights and the log path. Route and goal stay, because ego knows them."""
+    is_future = jnp.arange(bank.steps) > step
+    agents = bank.agents.at[..., AgentColumn.XY].add(13.0).at[..., AgentColumn.VELOCITY].multiply(-1.0)
+    agents = agents.at[..., AgentColumn.VALID].set(1.0 - bank.agents[..., AgentColumn.VALID])
     return replace(
         bank,
-        agents=jnp.where(later[None, :, None, None], moved, bank.agents),
-        parked_when=bank.parked_when ^ as_words(np.asarray(later)[None, :, None]),
-        light_state=jnp.where(later[None, :, None], (bank.light_state + 1) % 9, bank.light_state),
-        log_progress=jnp.where(later[None], bank.log_progress + 99.0, bank.log_progress),
+        agents=jnp.where(is_future[None, :, None, None], agents, bank.agents),
+        parked_when=bank.parked_when ^ as_words(np.asarray(is_future)[None, :, None]),
+        light_state=jnp.where(is_future[None, :, None], (bank.light_state + 1) % 9, bank.light_state),
+        log_progress=jnp.where(is_future[None], bank.log_progress + 99.0, bank.log_progress),
         log_ahead=jnp.full_like(bank.log_ahead, 99.0),
         routes=bank.routes.at[:, 1].add(50.0),
         extension=bank.extension + 13.0,
@@ -243,10 +246,10 @@ def other_future(bank: ScenarioBank, step: int) -> ScenarioBank:
 
 
 def order_of(slots: int) -> Any:
-    """Return the former slot of each slot of a permuted world."""
+    """Return the original slot of each slot of a permuted world."""
     return np.append(0, np.random.default_rng(0).permutation(np.arange(1, slots)))
 
 
 #: Variants of banks and frames in the order of ``contract.check_variants``.
-BANK_VARIANTS = (scattered, padded, shuffled)
-FRAME_VARIANTS = (scattered_frame, padded_frame, shuffled_frame)
+BANK_VARIANTS = (scatter_garbage, pad_agents, permute_agents)
+FRAME_VARIANTS = (scatter_frame, pad_frame, permute_frame)

@@ -1,7 +1,7 @@
 """Checkpoints of complete training states, restored bit for bit.
 
-Orbax stores the arrays; ``about.json`` has name, dtype, shape and CRC-32 of every leaf, so that errors name the leaf
-that does not fit or is damaged. A checkpoint appears under its name only when it is complete. Exported policies are
+Orbax stores the arrays. ``about.json`` contains name, dtype, shape and CRC-32 of every leaf, so that errors name the
+leaf that is damaged or does not match. Checkpoint folders appear only when they are complete. Exported policies are
 single files without training state (:func:`pack`).
 """
 
@@ -26,7 +26,7 @@ from drivax.errors import DataError
 from drivax.files import atomic_write, replace_folder, write_text
 
 ABOUT = "about.json"
-#: Fields of training states that checkpoints of version 0.1.0 store under another name.
+#: Former names of fields of training states, in checkpoints of version 0.1.0.
 _RENAMED_FIELDS = {"scene": "context", "scenes": "contexts"}
 _ARRAYS = "arrays"
 _CURE = "use the configuration that the checkpoint was trained with"
@@ -36,7 +36,7 @@ State = TypeVar("State")
 
 
 class Checkpoints:
-    """The checkpoints of one run, in sub-folders ``step-000001000``: the newest ``keep``, and the best by score."""
+    """Checkpoints of one run in sub-folders ``step-000001000``: the newest ``keep``, and the best by score."""
 
     def __init__(self, folder: str | Path, keep: int = 2, keep_best: bool = True) -> None:
         if keep < 1:
@@ -49,13 +49,13 @@ class Checkpoints:
         return sorted(int(name) for name in names if name.isdecimal())
 
     def best(self) -> int | None:
-        """Return the step with the highest score, the latest if several tie; None without scores."""
+        """Return the step with the highest score, the latest of equal ones; None without scores."""
         scores = [(self.about(step)["score"], step) for step in self.steps()]
-        scored = [(tuple(np.atleast_1d(score)), step) for score, step in scores if score is not None]
-        return max(scored)[1] if scored else None
+        candidates = [(tuple(np.atleast_1d(score)), step) for score, step in scores if score is not None]
+        return max(candidates)[1] if candidates else None
 
     def best_or_newest(self) -> int | None:
-        """Return the best step, or the newest without scores; None if there is no checkpoint."""
+        """Return the best step, or without scores the newest; None without checkpoints."""
         best = self.best()
         return max(self.steps(), default=None) if best is None else best
 
@@ -80,7 +80,7 @@ class Checkpoints:
     def save(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
         """Store a pytree of numbers and JAX or NumPy arrays, delete superseded checkpoints, and return the folder.
 
-        Higher scores are better; sequences compare lexicographically. A NaN score counts as none.
+        Higher scores are better; sequences are compared lexicographically. A NaN score counts as no score.
         """
         arrays, leaves = _describe(state)
         score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
@@ -91,93 +91,103 @@ class Checkpoints:
             if arrays:
                 _save_arrays(partial / _ARRAYS, arrays)
             write_text(partial / ABOUT, about)
-        self._drop()
+        self._delete_superseded()
         return final
 
     def drop_after(self, step: int) -> None:
-        """Delete all checkpoints of later steps, which belong to an interrupted run."""
-        for later in self.steps():
-            if later > step:
-                self._remove(later)
+        """Delete the checkpoints of later steps, which belong to an interrupted run."""
+        for other in self.steps():
+            if other > step:
+                self._delete(other)
 
     def restore(self, template: State, step: int | None = None, part: str = "") -> State:
-        """Return the stored state, or a part of it (``.parameters``, for example), given such a pytree or its shapes.
+        """Return the stored state, or a part of it (for example ``.parameters``).
 
-        ``step`` None is the newest checkpoint. Raises DataError with the first leaf if the checkpoint is missing,
-        damaged, or does not fit the template.
+        ``template`` is a pytree with the structure and shapes of the state; ``step`` defaults to the newest
+        checkpoint.
+
+        Raises:
+            DataError: The checkpoint is missing or damaged, or a leaf does not match the template.
         """
         return self.restore_parts({part: template}, step)[part]
 
     def restore_parts(
         self, templates: Mapping[str, State], step: int | None = None, cure: str = _CURE
     ) -> dict[str, State]:
-        """Return several parts of a stored state by their paths, as :meth:`restore`; ``cure`` if one does not fit."""
+        """Return several parts of a stored state by their paths, as in :meth:`restore`; errors suggest ``cure``."""
         if step is None:
             step = max(self.steps(), default=None)
         if step is None:
             raise DataError("no checkpoint found", file=self.folder, cure="train without --resume")
-        stored = self.about(step)["leaves"]
-        path = self._path(step)
-        requested = {
-            part + name: leaf
+        stored, path = self.about(step)["leaves"], self._path(step)
+        requested = [
+            (part + name, leaf)
             for part, template in templates.items()
             for name, leaf in _named_leaves(template)
-        }
-        numbers = {leaf["name"]: n for n, leaf in enumerate(stored) if is_part(leaf["name"], templates)}
-        _compare(path, [stored[number] for number in numbers.values()], list(requested.items()), cure)
-        arrays = _load_arrays(path, stored)
-        values = iter([_rebuild(arrays[numbers[name]], leaf) for name, leaf in requested.items()])
+        ]
+        _compare(path, [leaf for leaf in stored if is_part(leaf["name"], templates)], requested, cure)
+        names = [leaf["name"] for leaf in stored]
+        arrays = dict(zip(names, _load_arrays(path, stored), strict=True))
+        values = iter([_rebuild(arrays[name], leaf) for name, leaf in requested])
         return {part: jax.tree.map(lambda _: next(values), template) for part, template in templates.items()}
 
     def _path(self, step: int) -> Path:
         return self.folder / f"step-{step:09d}"
 
-    def _drop(self) -> None:
+    def _delete_superseded(self) -> None:
         steps = self.steps()
-        kept = {*steps[-self.keep :], *([self.best()] if self.keep_best else [])}
+        current = {*steps[-self.keep :], *([self.best()] if self.keep_best else [])}
         for step in steps:
-            if step not in kept:
-                self._remove(step)
+            if step not in current:
+                self._delete(step)
 
-    def _remove(self, step: int) -> None:
-        # Renamed first: a half-deleted folder must not look like a checkpoint.
-        hidden = self.folder / f".step-{step}.old-{os.getpid()}"
-        self._path(step).rename(hidden)
-        shutil.rmtree(hidden, ignore_errors=True)
+    def _delete(self, step: int) -> None:
+        # Rename it first, so that a partially deleted folder does not look like a checkpoint.
+        hidden_folder = self.folder / f".step-{step}.old-{os.getpid()}"
+        self._path(step).rename(hidden_folder)
+        shutil.rmtree(hidden_folder, ignore_errors=True)
 
 
 def is_part(leaf: str, parts: Iterable[str]) -> bool:
-    """Whether the name of a leaf lies within one of these parts of a state (``.critic`` holds no ``.critics``)."""
+    """Return whether a leaf (a name) belongs to one of the parts of a state (``.critics`` not to ``.critic``)."""
     return any(leaf.startswith(part) and (leaf + ".")[len(part)] in ".[" for part in parts)
 
 
 def _present_name(leaf: str) -> str:
-    """Return the name of a leaf with the current names of renamed fields."""
+    """Return the name of a leaf, with the current names of renamed fields."""
     return re.sub(r"\.(\w+)", lambda field: f".{_RENAMED_FIELDS.get(field[1], field[1])}", leaf)
 
 
 def pack(file: Path, tree: Any) -> None:
-    """Write a pytree of arrays to one ``.npz``, by name, atomically; NumPy alone can read it."""
-    named: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree)}
-    with atomic_write(file, sum(array.nbytes for array in named.values())) as out:
-        np.savez(out, **named)
+    """Write a pytree of arrays atomically to an ``.npz`` file, which NumPy alone can read."""
+    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree)}
+    with atomic_write(file, sum(array.nbytes for array in arrays.values())) as out:
+        np.savez(out, **arrays)
 
 
 def unpack(file: Path, template: State) -> State:
-    """Return what :func:`pack` wrote, given a pytree of the same structure, or its shapes; errors as in restoring."""
+    """Return the pytree that :func:`pack` wrote, given a template with its structure and shapes.
+
+    Raises:
+        DataError: The file is damaged or does not match the template.
+    """
     try:
         with zipfile.ZipFile(file) as archive:
-            # Read to the end, which is when a zip compares its checksum.
+            # Only reading a member to its end verifies its checksum.
             members = {name: io.BytesIO(archive.read(name)) for name in archive.namelist()}
         arrays = {
             name.removesuffix(".npy"): np.load(member, allow_pickle=False) for name, member in members.items()
         }
     except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
         raise DataError(f"is damaged ({error})", file=file, cure="use another copy") from error
-    requested = _named_leaves(template)
-    stored = [{"name": n, "type": str(array.dtype), "shape": array.shape} for n, array in arrays.items()]
-    _compare(file, stored, requested, _CURE)
-    return jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[n]) for n, _ in requested])
+    requested_leaves = _named_leaves(template)
+    stored_leaves = [
+        {"name": name, "type": str(array.dtype), "shape": array.shape} for name, array in arrays.items()
+    ]
+    _compare(file, stored_leaves, requested_leaves, _CURE)
+    return jax.tree.unflatten(
+        jax.tree.structure(template), [jnp.asarray(arrays[name]) for name, _ in requested_leaves]
+    )
 
 
 def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
@@ -185,13 +195,15 @@ def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
 
 
 def _describe(state: Any) -> tuple[dict[str, np.ndarray[Any, Any]], list[dict[str, Any]]]:
-    """Return arrays by number, and name, type, shape and checksum of every leaf; Orbax refuses empty arrays."""
+    """Return the non-empty arrays by number (Orbax refuses empty ones), and descriptions of all leaves."""
     arrays, leaves = {}, []
     for number, (name, leaf) in enumerate(_named_leaves(state)):
         array = np.asarray(_to_numpy(leaf), order="C")
-        stored, crc = [str(array.dtype), list(array.shape)], zlib.crc32(array.tobytes())
+        stored_type, crc = [str(array.dtype), list(array.shape)], zlib.crc32(array.tobytes())
         shape = list(np.shape(leaf))
-        leaves.append({"name": name, "type": _type_name(leaf), "shape": shape, "stored": stored, "crc": crc})
+        leaves.append(
+            {"name": name, "type": _type_name(leaf), "shape": shape, "stored": stored_type, "crc": crc}
+        )
         if array.size:
             arrays[f"{number:05d}"] = array
     return arrays, leaves
@@ -213,18 +225,17 @@ def _type_name(leaf: Any) -> str:
 
 
 def _compare(path: Path, stored: list[dict[str, Any]], requested: list[tuple[str, Any]], cure: str) -> None:
-    have = {leaf["name"]: (leaf["type"], tuple(leaf["shape"])) for leaf in stored}
-    need = {name: (_type_name(leaf), tuple(np.shape(leaf))) for name, leaf in requested}
-    for name in [*need, *have]:
-        if name not in have:
+    """Check that stored and requested leaves have the same names, types and shapes."""
+    stored_types = {leaf["name"]: f"{leaf['type']}{list(leaf['shape'])}" for leaf in stored}
+    requested_types = {name: f"{_type_name(leaf)}{list(np.shape(leaf))}" for name, leaf in requested}
+    for name in [*requested_types, *stored_types]:
+        if name not in stored_types:
             raise DataError(f"the checkpoint has no {name}", file=path, cure=cure)
-        if name not in need:
+        if name not in requested_types:
             raise DataError(f"the checkpoint contains {name}, which the template lacks", file=path, cure=cure)
-        if have[name] != need[name]:
-            stored_as, requested_as = (f"{kind}{list(shape)}" for kind, shape in (have[name], need[name]))
-            raise DataError(
-                f"{name} is {stored_as} in the checkpoint, not {requested_as}", file=path, cure=cure
-            )
+        if stored_types[name] != requested_types[name]:
+            problem = f"{name} is {stored_types[name]} in the checkpoint, not {requested_types[name]}"
+            raise DataError(problem, file=path, cure=cure)
 
 
 def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
@@ -239,27 +250,27 @@ def _load_arrays(path: Path, leaves: list[dict[str, Any]]) -> list[np.ndarray[An
 
     empty = [np.zeros(tuple(leaf["stored"][1]), jnp.dtype(leaf["stored"][0])) for leaf in leaves]
     target = {f"{number:05d}": array for number, array in enumerate(empty) if array.size}
-    restored: dict[str, Any] = {}
+    restored_arrays: dict[str, Any] = {}
     if target:
         try:
             with ocp.StandardCheckpointer() as checkpointer:
-                restored = checkpointer.restore((path / _ARRAYS).resolve(), target)
+                restored_arrays = checkpointer.restore((path / _ARRAYS).resolve(), target)
         except Exception as error:
             problem = f"arrays cannot be read ({error})"
             raise DataError(problem, file=path, cure="use another checkpoint") from error
-    arrays = [np.asarray(restored.get(f"{number:05d}", array)) for number, array in enumerate(empty)]
+    arrays = [np.asarray(restored_arrays.get(f"{number:05d}", array)) for number, array in enumerate(empty)]
     for array, leaf in zip(arrays, leaves, strict=True):
         if zlib.crc32(array.tobytes()) != leaf["crc"]:
             raise DataError(f"checksum mismatch in {leaf['name']}", file=path, cure="use another checkpoint")
     return arrays
 
 
-def _rebuild(array: np.ndarray[Any, Any], like: Any) -> Any:
-    if type(like) in _SCALARS:
-        return type(like)(array)
-    if _is_key(like):
-        # "key<fry>": the dtype is all that a ShapeDtypeStruct has.
-        return jax.random.wrap_key_data(jnp.asarray(array), impl=like.dtype._impl.name)
-    if isinstance(like, np.ndarray | np.generic):
-        return array[()] if isinstance(like, np.generic) else array
+def _rebuild(array: np.ndarray[Any, Any], template: Any) -> Any:
+    if type(template) in _SCALARS:
+        return type(template)(array)
+    if _is_key(template):
+        # The dtype ("key<fry>") names the implementation, also for a ShapeDtypeStruct.
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=template.dtype._impl.name)
+    if isinstance(template, np.ndarray | np.generic):
+        return array[()] if isinstance(template, np.generic) else array
     return jnp.asarray(array)

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar with rate and remaining time on a terminal, a line every few seconds in a log."""
+"""Progress reports: a bar with rate and remaining time on a terminal, a line every few seconds in a log."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ INTERVAL_S = 10.0
 
 
 class Progress:
-    """A context manager that reports progress, rate and remaining time; the end prints one line with the total rate.
+    """A context manager that reports progress, rate and remaining time, and prints a summary at the end.
 
     Args:
         what: Name of the work ("converting").
-        unit: What is counted ("scenarios").
+        unit: Counted unit ("scenarios").
         total: Final count; None if unknown.
-        stream: Text file to write to; standard error by default, so that results on standard output stay clean.
-        interval_s: Seconds between two lines if ``stream`` is no terminal.
+        stream: Text file to write to; standard error by default, so that standard output contains only results.
+        interval_s: Seconds between two lines if ``stream`` is not a terminal.
         clock: Returns the time in seconds.
     """
 
@@ -32,12 +32,12 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._interval_s = interval_s
         self._clock = clock
-        self._begin = self._last = clock()
+        self._start = self._last = clock()
         self._bar: Any = None
         self._task: Any = None
 
     def __enter__(self) -> Self:
-        self._begin = self._last = self._clock()
+        self._start = self._last = self._clock()
         if self._stream.isatty():
             self._start_bar()
         return self
@@ -49,11 +49,11 @@ class Progress:
             self._print(self.summary())
 
     def update(self, done: int, note: str = "", total: int | None = None) -> None:
-        """Report the count so far, and a note to show behind it."""
+        """Report the count so far, followed by a note."""
         self.done = done
         self.total = self.total if total is None else total
         if self._bar is not None:
-            rate = f"{_number(self.rate())} {self.unit}/s"
+            rate = f"{_format_number(self.rate())} {self.unit}/s"
             self._bar.update(self._task, completed=done, total=self.total, rate=rate, note=note)
             return
         now = self._clock()
@@ -62,25 +62,28 @@ class Progress:
             self._print(self.line(note))
 
     def advance(self, count: int = 1, note: str = "") -> None:
-        """Report ``count`` more."""
+        """Increase the count."""
         self.update(self.done + count, note)
 
     def rate(self) -> float:
-        """Return the rate per second since the beginning."""
-        return self.done / max(self._clock() - self._begin, 1e-9)
+        """Return the rate per second since the start."""
+        return self.done / max(self._clock() - self._start, 1e-9)
 
     def line(self, note: str = "") -> str:
-        """Return the progress so far as one line."""
-        rate, count, eta = self.rate(), f"{self.done:,} {self.unit}", ""
+        """Return the progress as one line."""
+        rate, count, remaining = self.rate(), f"{self.done:,} {self.unit}", ""
         if self.total:
             count = f"{self.done:,} of {self.total:,} {self.unit} ({100 * self.done / self.total:.0f} %)"
-            eta = f"{duration((self.total - self.done) / rate)} left" if rate > 0 else ""
-        return ", ".join(part for part in (f"{self.what}: {count}", f"{_number(rate)}/s", eta, note) if part)
+            remaining = f"{duration((self.total - self.done) / rate)} left" if rate > 0 else ""
+        fields = (f"{self.what}: {count}", f"{_format_number(rate)}/s", remaining, note)
+        return ", ".join(field for field in fields if field)
 
     def summary(self) -> str:
-        """Return the whole as one line."""
-        seconds = self._clock() - self._begin
-        return f"{self.what}: {self.done:,} {self.unit} in {duration(seconds)}, {_number(self.rate())}/s"
+        """Return count, duration and rate as one line."""
+        seconds = self._clock() - self._start
+        return (
+            f"{self.what}: {self.done:,} {self.unit} in {duration(seconds)}, {_format_number(self.rate())}/s"
+        )
 
     def _print(self, text: str) -> None:
         self._stream.write(text + "\n")
@@ -104,12 +107,12 @@ def duration(seconds: float) -> str:
     """Format seconds as ``4.2 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"
-    rounded = round(seconds)
-    if rounded < 3600:
-        return f"{rounded // 60} min {rounded % 60} s"
+    whole_seconds = round(seconds)
+    if whole_seconds < 3600:
+        return f"{whole_seconds // 60} min {whole_seconds % 60} s"
     minutes = round(seconds / 60)
     return f"{minutes // 60} h {minutes % 60} min"
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

@@ -1,7 +1,7 @@
-"""Run folders: configuration, data, versions and machine of a run, and its outputs.
+"""Run folders: configuration, data, versions, machine and outputs of a run.
 
-A run folder holds ``config.yaml`` (the whole configuration, defaults included), ``run.json`` (all other information
-needed to reproduce the run), and outputs: ``metrics.jsonl``, ``checkpoints/``, ``episodes.csv``, reports.
+A run folder contains ``config.yaml`` (the complete configuration with defaults), ``run.json`` (all other information
+that reproduces the run), and outputs: ``metrics.jsonl``, ``checkpoints/``, ``episodes.csv``, reports.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from drivax.tracking.sinks import read_rows
 
 CONFIG_FILE = "config.yaml"
 RUN_FILE = "run.json"
-#: Prefix of the policies that come with the package.
+#: Prefix of policies that are part of the package.
 ZOO = "zoo:"
 _ZOO_FOLDER = Path(__file__).resolve().parent.parent / "zoo"
-_TRAININGS = ("training", "seeds")
+_TRAINING_KINDS = ("training", "seeds")
 _PACKAGES = ("drivax", "jax", "jaxlib", "flax", "optax", "numpy")
 
 Record = TypeVar("Record")
@@ -55,8 +55,11 @@ class RunFolder:
             path: Folder to create.
             config: Configuration record.
             data: Scenario sets that the run reads.
-            overwrite: See :meth:`check`, which may raise UsageError.
+            overwrite: See :meth:`check`.
             info: Further entries of ``run.json``, plain JSON values.
+
+        Raises:
+            UsageError: The folder exists and cannot be replaced.
         """
         path = Path(path)
         cls.check(path, overwrite, info.get("kind"))
@@ -68,23 +71,35 @@ class RunFolder:
 
     @staticmethod
     def check(path: Path, overwrite: bool, kind: str | None = None) -> None:
-        """Raise UsageError, before any work is done, if a run cannot be written to a folder.
+        """Check, before any work, that a run can be written to a folder.
 
-        Only run folders are replaced, with ``overwrite``; a training (``kind``) only by a training, and nothing else.
+        With ``overwrite``, a run folder is replaced; a training run only by a training run (``kind``), and other runs
+        only by other runs.
+
+        Raises:
+            UsageError: The folder exists and cannot be replaced.
         """
         if not path.exists() or (path.is_dir() and not any(path.iterdir())):
             return
         if not (path / RUN_FILE).is_file():
             raise UsageError("output exists and is not a run folder", file=path, cure="choose another name")
-        present = _kind(path)
-        if kind is not None and present is not None and (present in _TRAININGS) != (kind in _TRAININGS):
-            problem = f"output folder contains a run of kind {present}, not {kind}"
+        present_kind = _kind(path)
+        if (
+            kind is not None
+            and present_kind is not None
+            and (present_kind in _TRAINING_KINDS) != (kind in _TRAINING_KINDS)
+        ):
+            problem = f"output folder contains a run of kind {present_kind}, not {kind}"
             raise UsageError(problem, file=path, cure="choose another name")
         check_output(path, overwrite, folder=True)
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
-        """Open a run folder; raises DataError if it or its ``run.json`` is missing or damaged."""
+        """Open a run folder.
+
+        Raises:
+            DataError: The folder or its ``run.json`` is missing or damaged.
+        """
         path, cure = Path(path), "give a folder written by drivax evaluate or drivax train"
         file = path / RUN_FILE
         if not file.is_file():
@@ -106,22 +121,24 @@ class RunFolder:
     def config(self, cls: type[Record], overrides: Sequence[str] = ()) -> Record:
         """Return the run's configuration as a record, with overrides as on a command line.
 
-        Raises DataError if ``config.yaml`` is missing, UsageError if it does not fit ``cls``.
+        Raises:
+            DataError: ``config.yaml`` is missing.
+            UsageError: It does not match ``cls``.
         """
         return settings.load(cls, existing(self.path / CONFIG_FILE, "run the command again"), overrides)
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Content of ``config.yaml`` as plain values; empty without the file."""
+        """Content of ``config.yaml`` as plain values; empty if there is no such file."""
         file = self.path / CONFIG_FILE
         values = settings.parse_yaml(file.read_text(encoding="utf-8"), file) if file.is_file() else {}
         return values if isinstance(values, dict) else {}
 
     def note(self, **info: Any) -> RunFolder:
-        """Add entries to ``run.json``, and return the folder with them."""
-        merged = self.info | info
-        write_text(self.path / RUN_FILE, _json(merged))
-        return RunFolder(self.path, merged)
+        """Add entries to ``run.json``, and return the updated run folder."""
+        updated_info = self.info | info
+        write_text(self.path / RUN_FILE, _json(updated_info))
+        return RunFolder(self.path, updated_info)
 
     @property
     def checkpoints(self) -> Path:
@@ -134,12 +151,20 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """Return the rows of ``metrics.jsonl`` as :func:`read_rows`; raises DataError if there is none."""
+        """Return the rows of ``metrics.jsonl``.
+
+        Raises:
+            DataError: The file is missing, or a row is damaged.
+        """
         return list(read_rows(existing(self.metrics, "train again")))
 
 
 def existing(path: Path, cure: str) -> Path:
-    """Return the path of a file; raises DataError if there is none."""
+    """Return the path of a file.
+
+    Raises:
+        DataError: The file is missing.
+    """
     if not path.is_file():
         raise DataError("file not found", file=path, cure=cure)
     return path
@@ -150,7 +175,7 @@ def _json(info: Mapping[str, Any]) -> str:
 
 
 def seed_folders(path: str | Path) -> list[Path]:
-    """Return the run folders behind a path: one per seed for a run with ``--seeds``, otherwise the path itself."""
+    """Return the run folders of a path: those of its seeds for a run with ``--seeds``, otherwise the path itself."""
     path = Path(path)
     if _kind(path) != "seeds":
         return [path]
@@ -159,14 +184,18 @@ def seed_folders(path: str | Path) -> list[Path]:
 
 
 def _kind(path: Path) -> str | None:
-    """Return the kind of the run in a folder; None if it cannot be read."""
+    """Return the kind of the run in a folder, or None if it cannot be read."""
     with contextlib.suppress(DataError, OSError):
         return RunFolder.open(path).kind
     return None
 
 
 def run_and_step(name: str) -> tuple[str, int | None]:
-    """Split ``RUN@STEP`` or ``RUN``, which leaves the step None; raises UsageError if the step is not a number."""
+    """Split ``RUN@STEP``; the step of ``RUN`` is None.
+
+    Raises:
+        UsageError: The step is not a number.
+    """
     run, at, step = name.partition("@")
     if at and not step.isdecimal():
         raise UsageError(
@@ -176,21 +205,25 @@ def run_and_step(name: str) -> tuple[str, int | None]:
 
 
 def zoo() -> list[str]:
-    """Return the names of the trained policies that come with the package: ``zoo:NAME``."""
+    """Return the names (``zoo:NAME``) of trained policies that are part of the package."""
     return sorted(ZOO + path.parent.name for path in _ZOO_FOLDER.glob("*/run.json"))
 
 
 def policy_folder(name: str | Path) -> Path:
-    """Return the folder of a policy of the zoo, or the path itself; raises UsageError for an unknown ``zoo:NAME``."""
+    """Return the folder of a ``zoo:NAME`` policy, or the path itself.
+
+    Raises:
+        UsageError: The name is unknown.
+    """
     if not str(name).startswith(ZOO):
         return Path(name)
     if name not in zoo():
-        raise UsageError(f"there is no policy {str(name)!r} in the zoo", cure=f"use {', '.join(zoo())}")
+        raise UsageError(f"no policy {str(name)!r} in the zoo", cure=f"use {', '.join(zoo())}")
     return _ZOO_FOLDER / str(name).removeprefix(ZOO)
 
 
 def is_policy(name: str | Path) -> bool:
-    """Whether a name is that of a trained policy: ``zoo:NAME``, or a folder."""
+    """Return whether a name is that of a trained policy: ``zoo:NAME``, or a folder."""
     return str(name).startswith(ZOO) or Path(name).is_dir()
 
 
@@ -203,7 +236,7 @@ def learned_from(planner: str) -> list[dict[str, Any]]:
 
 
 def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the distinct data sets in a training's ``run.json``, its own first."""
+    """Return the data sets in the ``run.json`` of a training run without duplicates, its own sets first."""
     by_hash: dict[str, dict[str, Any]] = {}
     for entry in (*info.get("data", ()), *info.get("networks_from", {}).get("data", ())):
         by_hash.setdefault(entry["hash"], entry)
@@ -211,7 +244,7 @@ def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
-    """Describe this process, its program, data and machine as plain JSON values."""
+    """Return command, versions, data and machine of this process as plain JSON values."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -223,16 +256,16 @@ def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on."""
-    installed = {"python": platform.python_version()}
+    """Return the versions of Python and of the packages that affect results."""
+    result = {"python": platform.python_version()}
     for name in _PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
-            installed[name] = metadata.version(name)
-    return installed
+            result[name] = metadata.version(name)
+    return result
 
 
 def machine() -> dict[str, Any]:
-    """Describe the machine; asks JAX for its devices, which starts the accelerator."""
+    """Describe the machine; this asks JAX for its devices, which initialises the accelerator."""
     import jax
 
     devices = jax.devices()
@@ -247,18 +280,21 @@ def machine() -> dict[str, Any]:
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:
-    """Return the commit of the checkout around a folder, and whether package or presets are modified, if any."""
+    """Return the commit of the checkout that contains a folder, and whether package or presets are modified.
+
+    The result is None outside a checkout of this package.
+    """
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(folder), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
     try:
-        # An installed package may lie in another repository: only a checkout that tracks this file counts.
+        # An installed package may lie in another repository, which does not track this file.
         this_file = Path(__file__).resolve()
         git("ls-files", "--error-unmatch", str(this_file))
         root = git("rev-parse", "--show-toplevel")
-        changed = git("status", "--porcelain", "--", str(this_file.parents[1]), f"{root}/configs")
-        return {"commit": git("rev-parse", "HEAD"), "changed": bool(changed)}
+        changes = git("status", "--porcelain", "--", str(this_file.parents[1]), f"{root}/configs")
+        return {"commit": git("rev-parse", "HEAD"), "changed": bool(changes)}
     except (OSError, subprocess.SubprocessError):
         return None

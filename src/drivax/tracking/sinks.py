@@ -1,4 +1,4 @@
-"""Sinks of logged metrics: ``metrics.jsonl`` always, TensorBoard if tensorboardX is installed."""
+"""Sinks of logged metrics: ``metrics.jsonl``, and TensorBoard if tensorboardX is installed."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from drivax.files import sync_and_close, write_text
 
 
 class JsonLines:
-    """One JSON object per row: ``{"step": 100, "loss": 0.5, ...}``; NaN and infinities become null.
+    """A file with one JSON object per row: ``{"step": 100, "loss": 0.5, ...}``; NaN and infinities become null.
 
-    Rows are appended after ``resume_step``, and later ones dropped; None starts a new file. Raises DataError if a row
-    of the existing file is damaged, except for a last one that was cut off.
+    Rows after ``resume_step`` are deleted, and new ones appended; None starts a new file.
+
+    Raises:
+        DataError: A row of the existing file is damaged, other than an incomplete last row.
     """
 
     def __init__(self, file: str | Path, resume_step: int | None = None) -> None:
@@ -28,7 +30,7 @@ class JsonLines:
         self._file = self.path.open("wb" if resume_step is None else "ab")
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
-        """Append a row and flush it, so that it survives the process."""
+        """Append a row and flush it, so that a crash does not lose it."""
         row: dict[str, Any] = {"step": int(step)}
         for name, value in values.items():
             row[name] = float(value) if math.isfinite(value) else None
@@ -36,7 +38,7 @@ class JsonLines:
         self._file.flush()
 
     def close(self) -> None:
-        """Flush everything to disk."""
+        """Flush to disk."""
         if not self._file.closed:
             sync_and_close(self._file)
 
@@ -51,19 +53,19 @@ class TensorBoard:
         self._writer = SummaryWriter(str(folder), purge_step=purge, write_to_disk=True)
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
-        """Add one scalar per number."""
+        """Add a scalar for each value."""
         for name, value in values.items():
             self._writer.add_scalar(name, float(value), int(step))
 
     def close(self) -> None:
-        """Flush everything to disk."""
+        """Flush to disk."""
         self._writer.close()
 
 
 class MetricLog:
-    """The log of a run: ``metrics.jsonl`` in its folder, and TensorBoard events (None: if tensorboardX is installed).
+    """Log of a run: ``metrics.jsonl`` in its folder, and TensorBoard events (None: if tensorboardX is installed).
 
-    Rows after ``resume_step`` are dropped; None starts a new log.
+    Rows after ``resume_step`` are deleted; None starts a new log.
     """
 
     def __init__(
@@ -82,7 +84,7 @@ class MetricLog:
             sink.write(step, values)
 
     def close(self) -> None:
-        """Flush everything to disk."""
+        """Flush to disk."""
         for sink in self.sinks:
             sink.close()
 
@@ -94,12 +96,17 @@ class MetricLog:
 
 
 def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a ``metrics.jsonl``, without an incomplete last one; raises DataError for a damaged row."""
+    """Yield the rows of a ``metrics.jsonl`` file, without an incomplete last row.
+
+    Raises:
+        DataError: A row is damaged.
+    """
     for _, row in _rows(Path(file)):
         yield row
 
 
 def _rows(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield every line with its row; an incomplete last line is ignored."""
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
     for number, line in enumerate(lines):
         try:
@@ -108,6 +115,6 @@ def _rows(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         except (ValueError, KeyError, TypeError) as error:
             if number == len(lines) - 1 and not line.endswith("\n"):
                 return
-            problem = "not a metrics row"
-            raise DataError(problem, file=file, record=number + 1, cure="delete the row") from error
+            cure = "delete the row"
+            raise DataError("not a metrics row", file=file, record=number + 1, cure=cure) from error
         yield line if line.endswith("\n") else line + "\n", row

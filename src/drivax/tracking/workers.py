@@ -1,4 +1,4 @@
-"""Worker processes that exit whenever their parent does."""
+"""Worker processes that exit with their parent."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Result = TypeVar("Result")
 def worker_pool(workers: int, cores: Sequence[int] | None = None) -> ProcessPoolExecutor:
     """Return a pool of spawned processes that exit silently on Ctrl-C, and when their parent is killed.
 
-    Each is bound to one of ``cores``; None: to no core.
+    Each process is bound to one of ``cores``, if given.
     """
     processes = multiprocessing.get_context("spawn")
-    free: Any = None
+    core_queue: Any = None
     if cores is not None:
-        free = processes.SimpleQueue()
+        core_queue = processes.SimpleQueue()
         for core in cores:
-            free.put(core)
-    return ProcessPoolExecutor(workers, processes, initializer=_start, initargs=(free,))
+            core_queue.put(core)
+    return ProcessPoolExecutor(workers, processes, initializer=_start, initargs=(core_queue,))
 
 
 def one_core_each(
@@ -34,8 +34,8 @@ def one_core_each(
 ) -> Iterator[tuple[Task, Result]]:
     """Call an importable function with each task in a single-core process; yield results as they finish.
 
-    Parallel tasks neither wait for each other nor change each other's results. At most ``cores`` cores are used; None:
-    all cores of this process.
+    Parallel tasks neither wait for each other nor affect each other's results. At most ``cores`` cores are used, by
+    default all cores of this process.
     """
     available = sorted(os.sched_getaffinity(0))[:cores]
     with worker_pool(len(available), available) as pool:
@@ -49,21 +49,21 @@ def one_core_each(
 
 
 def await_interrupt() -> None:
-    """Wait briefly after a worker died, so that a Ctrl-C that also killed it is raised here (KeyboardInterrupt)."""
+    """Wait briefly after the death of a worker, so that a Ctrl-C that caused it raises KeyboardInterrupt here."""
     time.sleep(0.3)
 
 
-def _start(free: Any) -> None:
-    if free is not None:
-        # Before JAX starts, which makes as many threads as there are cores.
-        os.sched_setaffinity(0, {free.get()})
-    # On Ctrl-C workers die at once and silently; the parent cleans up.
+def _start(core_queue: Any) -> None:
+    if core_queue is not None:
+        # JAX starts one thread per core, so restrict the cores first.
+        os.sched_setaffinity(0, {core_queue.get()})
+    # On Ctrl-C, workers exit at once and silently; the parent cleans up.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
 def _exit_with_parent() -> None:
-    # A killed parent cannot stop its workers, which would wait for work forever.
+    # A killed parent cannot stop its workers, which would then wait forever.
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
