@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-#: The extra that installs a package, by the name under which the package is imported.
+#: Extra that installs a package, by its import name.
 _EXTRAS = {
     "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
     "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
@@ -64,7 +64,7 @@ class UsageError(DrivaxError):
 
 
 def missing_package(error: ImportError) -> UsageError | None:
-    """Return the error for an optional package that is not installed, None if no extra installs it."""
+    """Return the error for an optional package that is not installed, or None if no extra has it."""
     package = (error.name or str(error)).split(".")[0]
     if package not in _EXTRAS:
         return None
@@ -73,10 +73,10 @@ def missing_package(error: ImportError) -> UsageError | None:
 
 
 def import_extra(package: str) -> Any:
-    """Return a package that an extra installs.
+    """Import a package of an extra.
 
     Raises:
-        UsageError: It is not installed.
+        UsageError: The package is not installed.
     """
     try:
         return importlib.import_module(package)
