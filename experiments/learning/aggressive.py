@@ -48,28 +48,28 @@ from experiments.repository import RESULTS, ROOT
 
 RESULT = RESULTS / "aggressive.json"
 ZOO = ROOT / "src" / "drivax" / "zoo"
-OWN = tuple(
+OWN_METRICS = tuple(
     f"boldness:{name}"
     for name in ("speed_ratio", "short_ttc", "lane_changes", "max_acceleration", "max_braking")
 )
-BOLD = tuple(name.partition(":")[2] for name in OWN)
+BOLD_METRICS = tuple(name.partition(":")[2] for name in OWN_METRICS)
 FAILURES = ("collision", "at_fault_collision", "offroad", "red_light")
-#: Vehicles per scenario in whose place the policies are measured, and how many are driven side by side.
+#: Number of vehicles per scenario to replace by the policies, and number of parallel simulations.
 OTHERS, BATCH = 2, 64
 
 Table = dict[str, dict[str, Any]]
 
 
-def in_egos_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> dict[str, Any]:
+def evaluate_as_ego(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> dict[str, Any]:
     """Evaluate log, IDM, behaviour cloning and aggressive policy as ego."""
     drivers: dict[str, tuple[Planner, Task]] = {
         "log": (make_planner("expert"), Task()),
         "idm": (make_planner("idm"), Task()),
         **{name: load_policy(runs / name, bank) for name in ("clone", "aggressive")},
     }
-    metrics_shown = (*BOLD, "min_ttc", *FAILURES, "off_route", "progress_ratio", "success")
+    metrics_shown = (*BOLD_METRICS, "min_ttc", *FAILURES, "off_route", "progress_ratio", "success")
     driven = {
-        name: evaluate(planner, bank, names, task=replace(task, metrics=OWN))
+        name: evaluate(planner, bank, names, task=replace(task, metrics=OWN_METRICS))
         for name, (planner, task) in drivers.items()
     }
     against = {
@@ -90,7 +90,7 @@ def _summary(episodes: EpisodeTable, names: tuple[str, ...]) -> dict[str, Any]:
     return {name: metrics[name] for name in names}
 
 
-def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
+def evaluate_as_others(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
     """Evaluate both policies in place of the vehicles nearest to ego, one at a time, among logged agents."""
     traffic = policy_traffic(runs / "aggressive", count=OTHERS)
     start = jax.jit(jax.vmap(lambda bank, row: traffic.start(bank, row, CURRENT_STEP), (None, 0)))
@@ -99,25 +99,29 @@ def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path)
         planner, task = load_policy(runs / name, bank)
         slots = np.asarray(start(with_driver(bank, planner), jnp.arange(len(bank))).contexts.slot)
         row, place = np.nonzero(slots < bank.agents.shape[2])
-        values = _driven(
-            Simulator(evaluation_task(replace(task, metrics=OWN))), planner, bank, row, slots[row, place]
+        values = _agent_metrics(
+            Simulator(evaluation_task(replace(task, metrics=OWN_METRICS))),
+            planner,
+            bank,
+            row,
+            slots[row, place],
         )
         segments = np.array([names[number]["segment"] for number in row])
         table[name] = {
             metric: interval_of(metric, values[metric], segments).as_dict()
-            for metric in (*BOLD, "min_ttc", *FAILURES, "left_map")
+            for metric in (*BOLD_METRICS, "min_ttc", *FAILURES, "left_map")
         }
     return table
 
 
-def _driven(
+def _agent_metrics(
     simulator: Simulator,
     planner: Planner,
     bank: ScenarioBank,
     row: np.ndarray[Any, Any],
     slot: np.ndarray[Any, Any],
 ) -> dict[str, np.ndarray[Any, Any]]:
-    """Return metrics of a planner-driven agent for each row; NaN where undefined."""
+    """Return the metrics of the agent that the planner drives in each row, NaN where undefined."""
 
     def one(planner: Planner, bank: ScenarioBank, row: jax.Array, slot: jax.Array) -> Any:
         keys = jax.random.key(0)[None]
@@ -133,23 +137,24 @@ def _driven(
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def in_traffic(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
+def evaluate_in_traffic(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
     """Evaluate an IDM car along its route in each kind of traffic."""
     kinds = {name: find_traffic(name) for name in ("log", "idm")}
     kinds |= {name: policy_traffic(runs / name) for name in ("clone", "aggressive")}
     metrics_shown = ("short_ttc", "min_ttc", "max_braking", "collision", "at_fault_collision", "success")
     return {
         name: _summary(
-            evaluate(make_planner("idm"), bank, names, task=Task(metrics=OWN), traffic=traffic), metrics_shown
+            evaluate(make_planner("idm"), bank, names, task=Task(metrics=OWN_METRICS), traffic=traffic),
+            metrics_shown,
         )
         for name, traffic in kinds.items()
     }
 
 
-PARTS = {"ego": in_egos_place, "others": in_others_place, "traffic": in_traffic}
+PARTS = {"ego": evaluate_as_ego, "others": evaluate_as_others, "traffic": evaluate_in_traffic}
 
 
-def judged(args: argparse.Namespace) -> None:
+def judge(args: argparse.Namespace) -> None:
     """Measure, print, and with --write merge the result with the stored parts."""
     stored = ScenarioSet.open(args.data)
     scenarios = list(stored)
@@ -163,26 +168,26 @@ def judged(args: argparse.Namespace) -> None:
     }
     for name in [args.only] if args.only else PARTS:
         found[name] = PARTS[name](bank, names, args.runs)
-        print(json.dumps({name: _means(found[name])}, indent=1), flush=True)
+        print(json.dumps({name: _keep_means(found[name])}, indent=1), flush=True)
         if args.write:
             RESULT.write_text(json.dumps(found, indent=1) + "\n")
 
 
-def _means(found: Mapping[str, Any]) -> dict[str, Any]:
+def _keep_means(found: Mapping[str, Any]) -> dict[str, Any]:
     """Return the same tables with means only."""
     if "mean" in found:
         return found["mean"] if found["mean"] is None else round(found["mean"], 4)
-    return {name: _means(part) for name, part in found.items()}
+    return {name: _keep_means(part) for name, part in found.items()}
 
 
-def packed(args: argparse.Namespace) -> None:
+def pack(args: argparse.Namespace) -> None:
     """Export the policy and its measurements to the package."""
     found = json.loads(RESULT.read_text())
     bank = ScenarioBank.from_scenarios([ScenarioSet.open(args.data)[0]])
     measured = {
         "validation": found["validation"],
-        "ego": _means(found["ego"]["drivers"]["aggressive"]),
-        "others": _means(found["others"]["aggressive"]),
+        "ego": _keep_means(found["ego"]["drivers"]["aggressive"]),
+        "others": _keep_means(found["others"]["aggressive"]),
     }
     folder = export_policy(
         args.runs / "aggressive", ZOO / "aggressive", bank, {"measured": measured}, overwrite=True
@@ -233,7 +238,7 @@ def main() -> None:
     if args.command == "table":
         print(tables())
         return
-    (judged if args.command == "judge" else packed)(args)
+    (judge if args.command == "judge" else pack)(args)
 
 
 if __name__ == "__main__":

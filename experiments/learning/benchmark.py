@@ -35,16 +35,16 @@ from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
 from experiments.learning.tables import interval, table
-from experiments.repository import DOCS, RESULTS, STATE, fetched
+from experiments.repository import DOCS, RESULTS, STATE, fetch
 
-#: Weights of all seeds of the learned planners, and episodes of all planners: fetched from history where they are not.
+#: Weights of all seeds of the learned planners, and episodes of all planners; fetched from history if missing.
 POLICIES, EPISODES = STATE / "policies", STATE / "benchmark"
-#: Episodes by the definitions before decisions 0011 and 0012, of the same planners on the same scenarios.
-FORMER = STATE / "benchmark-former"
+#: Episodes of the same planners and scenarios with the definitions before decisions 0011 and 0012.
+FORMER_EPISODES = STATE / "benchmark-former"
 RESULT = RESULTS / "benchmark.json"
 PAGE = DOCS / "results" / "benchmark.md"
 TRAFFIC = ("log", "idm")
-#: Random actions in the box of the published action space; they have a table of their own.
+#: Random actions in the box of the published action space, shown in a separate table.
 BOX = "random in the published box"
 PLANNERS = ("expert", "pdm", "idm", "constant_velocity", "random", BOX)
 #: Columns of the page, with their short names.
@@ -53,28 +53,28 @@ COLUMNS = {
     "red_light": "red light", "progress": "progress (m)", "ttc_ok": "ttc", "comfortable": "comfort",
     "vmax_score": "vmax score",
 }  # fmt: skip
-#: Whom every learned planner is compared with, and in what.
-AGAINST, COMPARED = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
+#: Planners to compare every learned planner with, and the metrics of the comparison.
+REFERENCES, DIFFERENCE_METRICS = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
 #: Metrics that decisions 0011 and 0012 changed.
-CHANGED = {
+CHANGED_METRICS = {
     "at_fault_collision": "at fault", "offroad": "off-road", "comfortable": "comfort",
     "speed_compliance": "speed compliance", "vmax_score": "vmax score", "nuplan_score": "nuplan score",
 }  # fmt: skip
-#: Tags by which accuracy is broken down, and where those of the scenarios are kept.
+#: Tags for the breakdown of accuracy, and the file with the tags of the scenarios.
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
-#: What the table of random actions shows: until the first failure, as published episodes end there.
-UNTIL = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
+#: Metrics of random actions until the first failure, where published episodes end.
+FAILURE_METRICS = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
 
 Metrics = dict[str, np.ndarray[Any, Any]]
 
 
 @dataclass(frozen=True)
-class Driven:
+class Episodes:
     """Episodes of one planner in one kind of traffic.
 
     Attributes:
         values: ``[seeds, scenarios]`` by metric, NaN where undefined.
-        segments: Of each scenario.
+        segments: Segment of each scenario.
         about: ``planner``, ``traffic``, ``seeds``, ``test`` (hash of the set), ``when``, ``versions``.
     """
 
@@ -83,25 +83,25 @@ class Driven:
     about: Mapping[str, Any]
 
 
-def learned() -> dict[str, list[Path]]:
+def learned_planners() -> dict[str, list[Path]]:
     """Return the folders of all seeds of every learned planner."""
     return {path.name: sorted(path.glob("seed-*")) for path in sorted(POLICIES.glob("*")) if path.is_dir()}
 
 
-def drivers(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
-    """Return the planners of a name: one, or one per seed."""
+def load_planners(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
+    """Load the planner of a name, or one planner per seed."""
     if name == BOX:
         return [(RandomActions(), Task(actions=Published()))]
-    folders = learned().get(name)
+    folders = learned_planners().get(name)
     if not folders:
         return [find_planner(name, bank)]
-    # Of one name, all seeds are driven by one program.
+    # With one name, all seeds share a compiled program.
     loaded = [load_policy(folder, bank) for folder in folders]
     return [(replace(planner, name=name), task) for planner, task in loaded]
 
 
-def until_failure(results: EpisodeTable) -> Metrics:
-    """Steps until the first collision, off-road step or red light (else to the end), and metres driven until then."""
+def metrics_until_failure(results: EpisodeTable) -> Metrics:
+    """Return steps and metres driven until the first collision, off-road step or red light, or to the end."""
     driven = results.trajectories
     events = np.stack([*driven.events.values()])
     last = driven.ego.shape[1] - 1
@@ -111,7 +111,7 @@ def until_failure(results: EpisodeTable) -> Metrics:
     return {"steps_until_failure": steps, "metres_until_failure": np.where(within, moved, 0.0).sum(axis=1)}
 
 
-def drive(args: argparse.Namespace) -> None:
+def evaluate_planners(args: argparse.Namespace) -> None:
     """Evaluate the requested planners in each kind of traffic and store the episodes."""
     stored = ScenarioSet.open(args.data / "test")
     scenarios = list(stored)
@@ -119,11 +119,11 @@ def drive(args: argparse.Namespace) -> None:
     EPISODES.mkdir(parents=True, exist_ok=True)
     tags = {tag: np.array([entry["tags"][tag] for entry in stored.entries]) for tag in TAGS}
     np.savez_compressed(EPISODES / STRATA, allow_pickle=False, test=np.array(stored.hash), **tags)
-    for name in args.planner or (*PLANNERS, *learned()):
+    for name in args.planner or (*PLANNERS, *learned_planners()):
         for kind in args.traffic:
             found = [
                 evaluate(planner, bank, names, task=task, traffic=find_traffic(kind))
-                for planner, task in drivers(name, bank)
+                for planner, task in load_planners(name, bank)
             ]
             about = {
                 "planner": name,
@@ -135,10 +135,10 @@ def drive(args: argparse.Namespace) -> None:
             }
             values = {metric: [results.metrics[metric] for results in found] for metric in found[0].metrics}
             for results in found:
-                for metric, row in until_failure(results).items():
+                for metric, row in metrics_until_failure(results).items():
                     values.setdefault(metric, []).append(row)
             np.savez_compressed(
-                file_of(name, kind),
+                episodes_file(name, kind),
                 allow_pickle=False,
                 about=np.array(json.dumps(about)),
                 segment=np.array([row["segment"] for row in names]),
@@ -147,23 +147,23 @@ def drive(args: argparse.Namespace) -> None:
             print(name, kind, *(round(float(results.metrics["accuracy"].mean()), 3) for results in found))
 
 
-def file_of(name: str, kind: str) -> Path:
-    """File of the stored episodes."""
+def episodes_file(name: str, kind: str) -> Path:
+    """Return the file of the stored episodes."""
     return EPISODES / f"{name.replace(' ', '_')}-{kind}.npz"
 
 
-def episodes(name: str, kind: str, folder: Path | None = None) -> Driven | None:
-    """Return the stored episodes of a planner; None if there are none."""
-    file = (folder or EPISODES) / file_of(name, kind).name
+def read_episodes(name: str, kind: str, folder: Path | None = None) -> Episodes | None:
+    """Return the stored episodes of a planner, or None without any."""
+    file = (folder or EPISODES) / episodes_file(name, kind).name
     if not file.is_file():
         return None
     with np.load(file, allow_pickle=False) as found:
         values = {key: found[key] for key in found.files if key not in ("about", "segment")}
-        return Driven(values, found["segment"], json.loads(str(found["about"])))
+        return Episodes(values, found["segment"], json.loads(str(found["about"])))
 
 
-def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval:
-    """Mean or paired mean difference with its interval over segments and, if there are several, seeds."""
+def mean_interval(driven: Episodes, metric: str, against: Episodes | None = None) -> Interval:
+    """Return the mean, or mean paired difference, with its interval over segments and, if several, seeds."""
     own, segments = driven.values[metric].astype(np.float64), driven.segments
     if against is None:
         if len(own) == 1:
@@ -175,18 +175,18 @@ def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval
     return difference_interval(own, other, segments)[0]
 
 
-def change(driven: Driven, metric: str, before: Driven) -> Interval:
-    """Mean paired difference of the same agents between two kinds of traffic."""
+def mean_change(driven: Episodes, metric: str, before: Episodes) -> Interval:
+    """Return the mean paired difference of the same planner between two kinds of traffic."""
     apart = driven.values[metric].astype(np.float64) - before.values[metric]
     if len(apart) == 1:
         return bootstrap_mean(apart[0], driven.segments, seed=0)
     return seeds_interval(apart, driven.segments)
 
 
-def changes(driven: Driven, former: Driven) -> dict[str, dict[str, float]]:
-    """Means of the changed metrics before and after, and the share of episodes whose value differs."""
+def compare_definitions(driven: Episodes, former: Episodes) -> dict[str, dict[str, float]]:
+    """Return means of the changed metrics before and after, and the share of episodes with a different value."""
     found = {}
-    for metric in CHANGED:
+    for metric in CHANGED_METRICS:
         before, now = (one.values[metric].astype(np.float64) for one in (former, driven))
         moved = ~np.isclose(before, now, rtol=0, atol=1e-5, equal_nan=True)
         found[metric] = {
@@ -195,22 +195,22 @@ def changes(driven: Driven, former: Driven) -> dict[str, dict[str, float]]:
     return found
 
 
-def judged() -> dict[str, Any]:
-    """Return all results of the page from the stored episodes."""
+def compute_results() -> dict[str, Any]:
+    """Compute all results of the page from the stored episodes."""
     driven = {
         (name, kind): found
-        for name in (*PLANNERS, *learned())
+        for name in (*PLANNERS, *learned_planners())
         for kind in TRAFFIC
-        if (found := episodes(name, kind)) is not None
+        if (found := read_episodes(name, kind)) is not None
     }
     tests = {found.about["test"] for found in driven.values()}
     if len(tests) != 1:
         raise SystemExit(f"{len(tests)} test sets: drive all planners on one")
     planners: dict[str, Any] = {}
     for (name, kind), found in driven.items():
-        metrics = (*COLUMNS, *UNTIL) if name in (BOX, "expert") else COLUMNS
+        metrics = (*COLUMNS, *FAILURE_METRICS) if name in (BOX, "expert") else COLUMNS
         planners.setdefault(name, {"seeds": found.about["seeds"]})[kind] = {
-            metric: mean(found, metric).as_dict() for metric in metrics
+            metric: mean_interval(found, metric).as_dict() for metric in metrics
         }
     return {
         "command": "python -m experiments.learning.benchmark judge",
@@ -218,7 +218,7 @@ def judged() -> dict[str, Any]:
         "planners": planners,
         "reactive": {
             name: {
-                metric: change(driven[name, "idm"], metric, driven[name, "log"]).as_dict()
+                metric: mean_change(driven[name, "idm"], metric, driven[name, "log"]).as_dict()
                 for metric in COLUMNS
             }
             for name in planners
@@ -227,27 +227,27 @@ def judged() -> dict[str, Any]:
         "differences": {
             kind: {
                 f"{name} - {other}": {
-                    metric: mean(driven[name, kind], metric, driven[other, kind]).as_dict()
-                    for metric in COMPARED
+                    metric: mean_interval(driven[name, kind], metric, driven[other, kind]).as_dict()
+                    for metric in DIFFERENCE_METRICS
                 }
-                for other in AGAINST
-                for name in ("expert", *(name for name in ("pdm",) if name != other), *learned())
+                for other in REFERENCES
+                for name in ("expert", *(name for name in ("pdm",) if name != other), *learned_planners())
                 if {(name, kind), (other, kind)} <= driven.keys()
             }
             for kind in TRAFFIC
         },
-        "strata": strata(driven),
+        "strata": stratify(driven),
         "changes": {
-            f"{name}, {kind}": changes(found, former)
+            f"{name}, {kind}": compare_definitions(found, former)
             for (name, kind), found in driven.items()
-            if (former := episodes(name, kind, FORMER)) is not None
+            if (former := read_episodes(name, kind, FORMER_EPISODES)) is not None
         },
         "driven": {f"{name}, {kind}": dict(found.about) for (name, kind), found in driven.items()},
     }
 
 
-def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
-    """Accuracy of every planner in log replay traffic, by tag and value."""
+def stratify(driven: Mapping[tuple[str, str], Episodes]) -> list[dict[str, Any]]:
+    """Return the accuracy of every planner in log replay traffic, by tag and value."""
     with np.load(EPISODES / STRATA, allow_pickle=False) as stored:
         tags, of = {tag: stored[tag] for tag in TAGS}, str(stored["test"])
     if any(one.about["test"] != of for one in driven.values()):
@@ -258,7 +258,7 @@ def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
         for value in np.unique(values):
             rows = values == value
             some = {
-                name: mean(
+                name: mean_interval(
                     replace(
                         one, values={"accuracy": one.values["accuracy"][:, rows]}, segments=one.segments[rows]
                     ),
@@ -273,7 +273,7 @@ def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
     return found
 
 
-def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
+def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return the lines of the page's tables by name."""
     planners = result["planners"]
     order = sorted(
@@ -285,7 +285,7 @@ def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
         kind: table(
             heads,
             [
-                (f"`{name}`", str(planners[name]["seeds"]), *cells(planners[name][kind], COLUMNS))
+                (f"`{name}`", str(planners[name]["seeds"]), *format_cells(planners[name][kind], COLUMNS))
                 for name in order
                 if kind in planners[name]
             ],
@@ -293,31 +293,35 @@ def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
         for kind in TRAFFIC
     }
     rows = [
-        (f"`{name}`", *cells(result["reactive"][name], COLUMNS, signed=True))
+        (f"`{name}`", *format_cells(result["reactive"][name], COLUMNS, signed=True))
         for name in order
         if name in result["reactive"]
     ]
     found["reactive"] = table(("planner", *COLUMNS.values()), rows)
     found["differences"] = table(
-        ("difference", "traffic", *(COLUMNS[metric] for metric in COMPARED)),
+        ("difference", "traffic", *(COLUMNS[metric] for metric in DIFFERENCE_METRICS)),
         [
-            (pair, f"`{kind}`", *cells(one, COMPARED, signed=True))
+            (pair, f"`{kind}`", *format_cells(one, DIFFERENCE_METRICS, signed=True))
             for kind, pairs in result["differences"].items()
             for pair, one in pairs.items()
         ],
     )
-    shown = {**UNTIL, "collision": "collision", "offroad": "off-road"}
+    shown = {**FAILURE_METRICS, "collision": "collision", "offroad": "off-road"}
     rows = [
-        (name, f"`{kind}`", *cells(planners[name][kind], shown))
+        (name, f"`{kind}`", *format_cells(planners[name][kind], shown))
         for name in (BOX, "expert")
         for kind in TRAFFIC
         if kind in planners.get(name, {})
     ]
     found["random"] = table(("planner", "traffic", *shown.values()), rows)
     found["changes"] = table(
-        ("planner", "traffic", *CHANGED.values()),
+        ("planner", "traffic", *CHANGED_METRICS.values()),
         [
-            (f"`{name}`", f"`{kind}`", *(changed(result["changes"][f"{name}, {kind}"][m]) for m in CHANGED))
+            (
+                f"`{name}`",
+                f"`{kind}`",
+                *(format_change(result["changes"][f"{name}, {kind}"][m]) for m in CHANGED_METRICS),
+            )
             for name in order
             for kind in TRAFFIC
             if f"{name}, {kind}" in result["changes"]
@@ -339,26 +343,28 @@ def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
     return found
 
 
-def cells(
+def format_cells(
     found: Mapping[str, Any], metrics: Sequence[str] | Mapping[str, str], signed: bool = False
 ) -> list[str]:
     """Format means with intervals; metres with one digit."""
     return [
-        interval(found[metric], signed=signed, digits=1 if "progress" in metric or metric in UNTIL else 3)
+        interval(
+            found[metric], signed=signed, digits=1 if "progress" in metric or metric in FAILURE_METRICS else 3
+        )
         for metric in metrics
     ]
 
 
-def changed(one: Mapping[str, float]) -> str:
-    """Format a mean before and after, and the share of episodes that moved; one number if none did."""
+def format_change(one: Mapping[str, float]) -> str:
+    """Format a mean before and after, with the share of changed episodes, or the mean alone if none changed."""
     if one["moved"] == 0.0:
         return f"{one['after']:.3f}"
     return f"{one['before']:.3f} to {one['after']:.3f} ({one['moved']:.1%})"
 
 
-def filled(text: str, result: Mapping[str, Any]) -> str:
+def fill_page(text: str, result: Mapping[str, Any]) -> str:
     """Return the page with the stored tables."""
-    for what, lines in page(result).items():
+    for what, lines in page_tables(result).items():
         begin, end = f"<!-- benchmark.py: {what} -->", "<!-- benchmark.py: end -->"
         before, rest = text.split(begin)
         shown = "\n".join(lines)
@@ -380,14 +386,14 @@ def main() -> None:
     commands.add_parser("table")
     args = parser.parse_args()
     if args.command != "table":
-        fetched("benchmarks/policies", POLICIES)
-        fetched("benchmarks/results/benchmark", FORMER)
+        fetch("benchmarks/policies", POLICIES)
+        fetch("benchmarks/results/benchmark", FORMER_EPISODES)
     if args.command == "drive":
-        drive(args)
+        evaluate_planners(args)
         return
     if args.command == "judge":
-        RESULT.write_text(json.dumps(judged(), indent=1) + "\n")
-    PAGE.write_text(filled(PAGE.read_text(), json.loads(RESULT.read_text())))
+        RESULT.write_text(json.dumps(compute_results(), indent=1) + "\n")
+    PAGE.write_text(fill_page(PAGE.read_text(), json.loads(RESULT.read_text())))
 
 
 if __name__ == "__main__":

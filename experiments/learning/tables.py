@@ -21,10 +21,10 @@ FOLDER = DOCS / "algorithms"
 COLUMNS = (
     "success", "accuracy", "accuracy_at_fault", "vmax_score", "collision", "offroad", "progress_ratio",
 )  # fmt: skip
-#: What curves show, of every validation.
+#: Metrics of the learning curves.
 CURVES = ("success", "vmax_score")
-#: What the best preset is to reach, and how fast PPO is to train on two cores, in environment steps a second.
-AIMS, SPEED = {"success": 0.80, "accuracy_at_fault": 0.90}, 8_000
+#: Targets of the best preset, and of PPO's training speed on two cores, environment steps per second.
+AIMS, MIN_SPEED = {"success": 0.80, "accuracy_at_fault": 0.90}, 8_000
 _BLOCK = re.compile(r"(<!-- presets\.py: (?!end)(?P<what>[^>]+?) -->\n).*?(<!-- presets\.py: end -->)", re.S)
 
 Result = dict[str, Any]
@@ -37,40 +37,40 @@ def pages() -> Iterator[Path]:
             yield page
 
 
-def filled(page: Path, learning: Result, training: Result) -> str:
+def fill_page(page: Path, learning: Result, training: Result) -> str:
     """Return the text of a page with the stored results between its markers."""
 
     def block(found: re.Match[str]) -> str:
         what, *names = found["what"].split()
-        text = written(what, names, learning, training, page)
+        text = format_block(what, names, learning, training, page)
         return f"{found[1]}\n{text}\n\n{found[3]}"
 
     return _BLOCK.sub(block, page.read_text())
 
 
-def written(what: str, names: list[str], learning: Result, training: Result, page: Path) -> str:
+def format_block(what: str, names: list[str], learning: Result, training: Result, page: Path) -> str:
     """Return a block: ``reached``, ``differences``, ``aims``, ``training``, ``speed`` or ``curves``."""
     parts: dict[str, Callable[[], list[str]]] = {
-        "reached": lambda: reached(learning),
-        "differences": lambda: differences(learning),
-        "aims": lambda: aims(learning, training),
-        "training": lambda: times(learning),
-        "speed": lambda: speeds(training),
-        "curves": lambda: pictures(learning, names, page),
+        "reached": lambda: results_table(learning),
+        "differences": lambda: differences_table(learning),
+        "aims": lambda: aims_table(learning, training),
+        "training": lambda: times_table(learning),
+        "speed": lambda: speeds_table(training),
+        "curves": lambda: curve_images(learning, names, page),
     }
     return "\n".join(parts[what]())
 
 
-def reached(learning: Result) -> list[str]:
-    """Table with one row per planner, highest score first."""
+def results_table(learning: Result) -> list[str]:
+    """Return a table with a row per planner, highest score first."""
     planners = learning["planners"]
     order = sorted(planners, key=lambda name: -planners[name]["vmax_score"]["mean"])
     rows = [[name, *(interval(planners[name][column]) for column in COLUMNS)] for name in order]
     return table(["driver", *(f"`{column}`" for column in COLUMNS)], rows)
 
 
-def differences(learning: Result) -> list[str]:
-    """Table with one row per pair of planners."""
+def differences_table(learning: Result) -> list[str]:
+    """Return a table with a row per pair of planners."""
     rows = [
         [pair, *(interval(found[column], signed=True) for column in CURVES)]
         for pair, found in learning["differences"].items()
@@ -78,14 +78,14 @@ def differences(learning: Result) -> list[str]:
     return table(["difference", *(f"`{column}`" for column in CURVES)], rows)
 
 
-def best(learning: Result) -> str:
-    """The preset with the highest success."""
+def best_preset(learning: Result) -> str:
+    """Return the preset with the highest success."""
     return max(learning["training"], key=lambda name: learning["planners"][name]["success"]["mean"])
 
 
-def aims(learning: Result, training: Result) -> list[str]:
-    """Table of targets and measurements of the best preset."""
-    name = best(learning)
+def aims_table(learning: Result, training: Result) -> list[str]:
+    """Return a table of targets and measurements of the best preset."""
+    name = best_preset(learning)
     rows = []
     for metric, aim in AIMS.items():
         found = learning["planners"][name][metric]
@@ -98,21 +98,21 @@ def aims(learning: Result, training: Result) -> list[str]:
             above = found is not None and found["low"] is not None and found["low"] > 0
             rows.append([f"`{metric}`: `{name}` over `{other}`", "above 0", cell, above])
     speed = training["training"]["ppo"]["steps_per_second"]
-    rows.append(["steps per second of training, `ppo`", f"{SPEED:,}", f"{speed:,}", speed >= SPEED])
+    rows.append(["steps per second of training, `ppo`", f"{MIN_SPEED:,}", f"{speed:,}", speed >= MIN_SPEED])
     cells = [[*row[:3], "yes" if row[3] else "**no**"] for row in rows]
     return table(["what", "aim", "measured", "reached"], cells)
 
 
-def times(learning: Result) -> list[str]:
-    """Table of the training time of each preset."""
+def times_table(learning: Result) -> list[str]:
+    """Return a table of the training time of each preset."""
     rows = [
         [f"`{name}`", str(one["seeds"]), f"{one['seconds']:,}"] for name, one in learning["training"].items()
     ]
     return table(["preset", "seeds", "each trained on one core for at most (s)"], rows)
 
 
-def speeds(training: Result) -> list[str]:
-    """Table of training speeds and the shares of an iteration."""
+def speeds_table(training: Result) -> list[str]:
+    """Return a table of training speeds and the shares of an iteration."""
     rows = []
     for name, one in training["training"].items():
         shares = [f"{share:.0%}" for share in one["share"].values()]
@@ -121,7 +121,7 @@ def speeds(training: Result) -> list[str]:
     return table(["training", "steps/s", *first["share"]], rows)
 
 
-def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
+def curve_images(learning: Result, names: list[str], page: Path) -> list[str]:
     """Return the curves of presets (default: all), with their results on the test split."""
     stored = learning.get("curves", {})
     lines = []
@@ -131,7 +131,7 @@ def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
             continue
         found, count = learning["planners"][name], learning["training"][name]["seeds"]
         cell = ", ".join(f"`{metric}` {interval(found[metric])}" for metric in CURVES)
-        where = Path("../algorithms" if page.parent != FOLDER else "") / picture(name).name
+        where = Path("../algorithms" if page.parent != FOLDER else "") / curve_file(name).name
         lines += [
             f"![Learning curves of {name}]({where.as_posix()})",
             "",
@@ -141,12 +141,12 @@ def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
     return lines[:-1]
 
 
-def picture(name: str) -> Path:
-    """File of a preset's learning curves."""
+def curve_file(name: str) -> Path:
+    """Return the file of a preset's learning curves."""
     return FOLDER / f"curve-{name}.png"
 
 
-def drawn(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> Figure:
+def draw_curves(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> Figure:
     """Draw learning curves of one preset: a panel per quantity, a line per seed.
 
     Args:

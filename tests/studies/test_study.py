@@ -333,8 +333,8 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     blocks = [f"claims {group}" for group in LONGTAIL.groups]
     blocks += ["conditions", "detectable", "draws", "rankings", "rule cost", "validations"]
     blocks += [f"rates {kind}" for kind in ("ordinary", "common", "rare")]
-    page = script.filled("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)
-    assert script.filled(page, results) == page and page.count("|---") >= len(blocks)
+    page = script.fill_page("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)
+    assert script.fill_page(page, results) == page and page.count("|---") >= len(blocks)
     assert "heuristic collides less than its matched random control" in page
     # What was trained with other weights, or evaluated before it was trained, belongs to no study.
     run = out / "runs" / "heuristic" / "seed-0" / "run.json"
