@@ -96,9 +96,9 @@ class Truth:
 
     def groups(self) -> dict[str, Any]:
         """Return masks of scenarios to detect: all events, with and without a forced reaction, and each kind."""
-        forced = self.severity >= FORCED_MPS2
+        is_forced = self.severity >= FORCED_MPS2
         groups = {
-            "all": self.kind > 0, "forced": (self.kind > 0) & forced, "mild": (self.kind > 0) & ~forced
+            "all": self.kind > 0, "forced": (self.kind > 0) & is_forced, "mild": (self.kind > 0) & ~is_forced
         }  # fmt: skip
         return groups | {kind.name.lower(): self.kind == kind for kind in EventKind if kind}
 
@@ -129,14 +129,14 @@ def measure_detection(truth: Truth, events: Any, steps: Any, scenarios: Any) -> 
     }
 
 
-def measure_events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, Any]:
+def measure_events(bench: Path, only: list[str], results: dict[str, Any]) -> dict[str, Any]:
     """Evaluate methods (default: all) on both test sets and merge them with stored results."""
     sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
     hashes = {data.path.name: data.hash for data in sets}
-    if only and stored.get("sets") != hashes:
+    if only and results.get("sets") != hashes:
         raise SystemExit("the stored results are of other sets: score all methods, without --method")
     truth = Truth.of(sets)
-    methods = dict(stored["methods"]) if only else {}
+    methods = dict(results["methods"]) if only else {}
     for name, test_table, table in score_methods(sets, bench / "train", only or list(METHODS)):
         methods[name] = measure_method(truth, table) | {"draws": weight_statistics(test_table)}
         methods[name] |= {
@@ -211,12 +211,12 @@ def error_interval(ensemble: Ensemble, table: ScoreTable, data: ScenarioSet) -> 
 def concatenate_tables(tables: list[ScoreTable]) -> ScoreTable:
     """Concatenate score tables."""
     first = tables[0]
-    stacked = {
+    arrays = {
         name: np.concatenate([getattr(table, name) for table in tables])
         for name in ("valid", "steps", "scenarios")
     }
     ids = sum((table.scenario_ids for table in tables), ())
-    return ScoreTable(first.method, first.config, "both", ids, **stacked)
+    return ScoreTable(first.method, first.config, "both", ids, **arrays)
 
 
 def measure_method(truth: Truth, table: ScoreTable) -> dict[str, Any]:
@@ -270,15 +270,15 @@ def stacking_s(data: list[Any], sizes: Sizes) -> float:
     return time.process_time() - start
 
 
-def events_table(stored: dict[str, Any]) -> str:
+def events_table(results: dict[str, Any]) -> str:
     """Table by method: all events and those that force a reaction, at both scales."""
     lines = [
         "| method | events | scenarios: AUC | precision | steps: AUC | precision |",
         "|---|---|---|---|---|---|",
     ]
-    for method, results in stored["methods"].items():
+    for method, method_results in results["methods"].items():
         for group, words in (("forced", "that force a reaction"), ("mild", "that do not"), ("all", "all")):
-            result = results["events"][group]
+            result = method_results["events"][group]
             measures = (("auc", 3), ("precision", 2), ("step_auc", 3), ("step_precision", 2))
             cells = " | ".join(format_cell(result, *measure) for measure in measures)
             lines.append(f"| `{method}` | {words} ({result['scenarios']}) | {cells} |")
@@ -291,20 +291,20 @@ def format_cell(result: dict[str, Any], measure: str, digits: int) -> str:
     return f"{result[measure]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def ensemble_checks_table(stored: dict[str, Any]) -> str:
+def ensemble_checks_table(results: dict[str, Any]) -> str:
     """Table of the correlation of disagreement and errors."""
     lines = ["| ensemble | rank correlation of scores and errors, by step |", "|---|---|"]
     for name in ENSEMBLES:
-        result = stored["methods"][name]
+        result = results["methods"][name]
         low, high = result["error_rank_interval"]
         lines.append(f"| `{name}` | {result['error_rank_correlation']:.2f} [{low:.2f}, {high:.2f}] |")
     return "\n".join(lines)
 
 
-def checks_table(stored: dict[str, Any]) -> str:
+def checks_table(results: dict[str, Any]) -> str:
     """Table of ``kinematic`` on other sets."""
     lines = ["| set | scenarios | of them with an event that forces a reaction | AUC |", "|---|---|---|---|"]
-    for name, result in stored["checks"].items():
+    for name, result in results["checks"].items():
         lines.append(
             f"| `{name}` | {result['scenarios']} | {result['events']} | {format_cell(result, 'auc', 3)} |"
         )

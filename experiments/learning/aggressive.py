@@ -68,20 +68,20 @@ def evaluate_as_ego(bank: ScenarioBank, names: list[dict[str, str]], runs: Path)
         **{name: load_policy(runs / name, bank) for name in ("clone", "aggressive")},
     }
     metrics_shown = (*BOLD_METRICS, "min_ttc", *FAILURES, "off_route", "progress_ratio", "success")
-    driven = {
+    episodes = {
         name: evaluate(planner, bank, names, task=replace(task, metrics=OWN_METRICS))
         for name, (planner, task) in drivers.items()
     }
-    against = {
+    differences = {
         other: {
-            metric: paired_differences(driven["aggressive"], driven[other], metric).as_dict()
+            metric: paired_differences(episodes["aggressive"], episodes[other], metric).as_dict()
             for metric in metrics_shown
         }
         for other in ("clone", "log")
     }
     return {
-        "drivers": {name: _summary(found, metrics_shown) for name, found in driven.items()},
-        "minus": against,
+        "drivers": {name: _summary(table, metrics_shown) for name, table in episodes.items()},
+        "minus": differences,
     }
 
 
@@ -98,13 +98,13 @@ def evaluate_as_others(bank: ScenarioBank, names: list[dict[str, str]], runs: Pa
     for name in ("clone", "aggressive"):
         planner, task = load_policy(runs / name, bank)
         slots = np.asarray(start(with_driver(bank, planner), jnp.arange(len(bank))).contexts.slot)
-        row, place = np.nonzero(slots < bank.agents.shape[2])
+        row, column = np.nonzero(slots < bank.agents.shape[2])
         values = _agent_metrics(
             Simulator(evaluation_task(replace(task, metrics=OWN_METRICS))),
             planner,
             bank,
             row,
-            slots[row, place],
+            slots[row, column],
         )
         segments = np.array([names[number]["segment"] for number in row])
         table[name] = {
@@ -123,18 +123,20 @@ def _agent_metrics(
 ) -> dict[str, np.ndarray[Any, Any]]:
     """Return the metrics of the agent that the planner drives in each row, NaN where undefined."""
 
-    def one(planner: Planner, bank: ScenarioBank, row: jax.Array, slot: jax.Array) -> Any:
+    def drive_agent(planner: Planner, bank: ScenarioBank, row: jax.Array, slot: jax.Array) -> Any:
         keys = jax.random.key(0)[None]
         return drive(simulator, planner, bank, row[None], keys, CURRENT_STEP, slot).metrics
 
-    many = jax.jit(jax.vmap(one, (None, None, 0, 0)))
-    parts = []
+    drive_batch = jax.jit(jax.vmap(drive_agent, (None, None, 0, 0)))
+    batches = []
     for first in range(0, len(row), BATCH):
-        chosen = np.arange(first, first + BATCH).clip(max=len(row) - 1)
-        found = jax.device_get(many(planner, bank, jnp.asarray(row[chosen]), jnp.asarray(slot[chosen])))
-        kept = min(BATCH, len(row) - first)
-        parts.append({name: np.where(v.defined, v.value, np.nan)[:kept, 0] for name, v in found.items()})
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        indices = np.arange(first, first + BATCH).clip(max=len(row) - 1)
+        metrics = jax.device_get(
+            drive_batch(planner, bank, jnp.asarray(row[indices]), jnp.asarray(slot[indices]))
+        )
+        count = min(BATCH, len(row) - first)
+        batches.append({name: np.where(v.defined, v.value, np.nan)[:count, 0] for name, v in metrics.items()})
+    return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
 
 
 def evaluate_in_traffic(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
@@ -156,41 +158,41 @@ PARTS = {"ego": evaluate_as_ego, "others": evaluate_as_others, "traffic": evalua
 
 def judge(args: argparse.Namespace) -> None:
     """Measure, print, and with --write merge the result with the stored parts."""
-    stored = ScenarioSet.open(args.data)
-    scenarios = list(stored)
+    scenario_set = ScenarioSet.open(args.data)
+    scenarios = list(scenario_set)
     bank, names = ScenarioBank.from_scenarios(scenarios), [dict(row) for row in scenario_names(scenarios)]
-    found: dict[str, Any] = json.loads(RESULT.read_text()) if RESULT.is_file() else {}
-    found |= {
+    results: dict[str, Any] = json.loads(RESULT.read_text()) if RESULT.is_file() else {}
+    results |= {
         "command": "python -m experiments.learning.aggressive judge --data BENCHMARK/validation --runs RUNS --write",
         "when": datetime.now(UTC).isoformat(timespec="minutes"),
-        "validation": {"scenarios": len(scenarios), "hash": stored.hash},
+        "validation": {"scenarios": len(scenarios), "hash": scenario_set.hash},
         "versions": versions(),
     }
     for name in [args.only] if args.only else PARTS:
-        found[name] = PARTS[name](bank, names, args.runs)
-        print(json.dumps({name: _keep_means(found[name])}, indent=1), flush=True)
+        results[name] = PARTS[name](bank, names, args.runs)
+        print(json.dumps({name: _keep_means(results[name])}, indent=1), flush=True)
         if args.write:
-            RESULT.write_text(json.dumps(found, indent=1) + "\n")
+            RESULT.write_text(json.dumps(results, indent=1) + "\n")
 
 
-def _keep_means(found: Mapping[str, Any]) -> dict[str, Any]:
+def _keep_means(results: Mapping[str, Any]) -> dict[str, Any]:
     """Return the same tables with means only."""
-    if "mean" in found:
-        return found["mean"] if found["mean"] is None else round(found["mean"], 4)
-    return {name: _keep_means(part) for name, part in found.items()}
+    if "mean" in results:
+        return results["mean"] if results["mean"] is None else round(results["mean"], 4)
+    return {name: _keep_means(value) for name, value in results.items()}
 
 
 def pack(args: argparse.Namespace) -> None:
     """Export the policy and its measurements to the package."""
-    found = json.loads(RESULT.read_text())
+    results = json.loads(RESULT.read_text())
     bank = ScenarioBank.from_scenarios([ScenarioSet.open(args.data)[0]])
-    measured = {
-        "validation": found["validation"],
-        "ego": _keep_means(found["ego"]["drivers"]["aggressive"]),
-        "others": _keep_means(found["others"]["aggressive"]),
+    measurements = {
+        "validation": results["validation"],
+        "ego": _keep_means(results["ego"]["drivers"]["aggressive"]),
+        "others": _keep_means(results["others"]["aggressive"]),
     }
     folder = export_policy(
-        args.runs / "aggressive", ZOO / "aggressive", bank, {"measured": measured}, overwrite=True
+        args.runs / "aggressive", ZOO / "aggressive", bank, {"measured": measurements}, overwrite=True
     )
     print(f"wrote {folder.path}")
 
@@ -204,9 +206,9 @@ COLUMNS = {
 
 def tables() -> str:
     """Return the stored results as tables of the guide."""
-    found = json.loads(RESULT.read_text())
-    parts = (found["ego"]["drivers"], found["ego"]["minus"], found["others"], found["traffic"])
-    return "\n".join(_table(rows) for rows in parts)
+    results = json.loads(RESULT.read_text())
+    row_groups = (results["ego"]["drivers"], results["ego"]["minus"], results["others"], results["traffic"])
+    return "\n".join(_table(rows) for rows in row_groups)
 
 
 def _table(rows: Mapping[str, Any]) -> str:

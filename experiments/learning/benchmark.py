@@ -96,46 +96,51 @@ def load_planners(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
     if not folders:
         return [find_planner(name, bank)]
     # With one name, all seeds share a compiled program.
-    loaded = [load_policy(folder, bank) for folder in folders]
-    return [(replace(planner, name=name), task) for planner, task in loaded]
+    policies = [load_policy(folder, bank) for folder in folders]
+    return [(replace(planner, name=name), task) for planner, task in policies]
 
 
 def metrics_until_failure(results: EpisodeTable) -> Metrics:
     """Return steps and metres driven until the first collision, off-road step or red light, or to the end."""
-    driven = results.trajectories
-    events = np.stack([*driven.events.values()])
-    last = driven.ego.shape[1] - 1
-    steps = np.where(events < 0, last, events - driven.start).min(axis=0)
-    moved = np.hypot(*np.moveaxis(np.diff(driven.ego[:, :, :2], axis=1), -1, 0))
+    trajectories = results.trajectories
+    events = np.stack([*trajectories.events.values()])
+    last = trajectories.ego.shape[1] - 1
+    steps = np.where(events < 0, last, events - trajectories.start).min(axis=0)
+    distances = np.hypot(*np.moveaxis(np.diff(trajectories.ego[:, :, :2], axis=1), -1, 0))
     within = np.arange(last) < steps[:, None]
-    return {"steps_until_failure": steps, "metres_until_failure": np.where(within, moved, 0.0).sum(axis=1)}
+    return {
+        "steps_until_failure": steps,
+        "metres_until_failure": np.where(within, distances, 0.0).sum(axis=1),
+    }
 
 
 def evaluate_planners(args: argparse.Namespace) -> None:
     """Evaluate the requested planners in each kind of traffic and store the episodes."""
-    stored = ScenarioSet.open(args.data / "test")
-    scenarios = list(stored)
+    test_set = ScenarioSet.open(args.data / "test")
+    scenarios = list(test_set)
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
     EPISODES.mkdir(parents=True, exist_ok=True)
-    tags = {tag: np.array([entry["tags"][tag] for entry in stored.entries]) for tag in TAGS}
-    np.savez_compressed(EPISODES / STRATA, allow_pickle=False, test=np.array(stored.hash), **tags)
+    tags = {tag: np.array([entry["tags"][tag] for entry in test_set.entries]) for tag in TAGS}
+    np.savez_compressed(EPISODES / STRATA, allow_pickle=False, test=np.array(test_set.hash), **tags)
     for name in args.planner or (*PLANNERS, *learned_planners()):
         for kind in args.traffic:
-            found = [
+            tables = [
                 evaluate(planner, bank, names, task=task, traffic=find_traffic(kind))
                 for planner, task in load_planners(name, bank)
             ]
             about = {
                 "planner": name,
                 "traffic": kind,
-                "seeds": len(found),
-                "test": stored.hash,
+                "seeds": len(tables),
+                "test": test_set.hash,
                 "when": datetime.now(UTC).isoformat(timespec="minutes"),
                 "versions": versions(),
             }
-            values = {metric: [results.metrics[metric] for results in found] for metric in found[0].metrics}
-            for results in found:
-                for metric, row in metrics_until_failure(results).items():
+            values = {
+                metric: [episodes.metrics[metric] for episodes in tables] for metric in tables[0].metrics
+            }
+            for episodes in tables:
+                for metric, row in metrics_until_failure(episodes).items():
                     values.setdefault(metric, []).append(row)
             np.savez_compressed(
                 episodes_file(name, kind),
@@ -144,7 +149,7 @@ def evaluate_planners(args: argparse.Namespace) -> None:
                 segment=np.array([row["segment"] for row in names]),
                 **{metric: np.array(rows, np.float32) for metric, rows in values.items()},
             )
-            print(name, kind, *(round(float(results.metrics["accuracy"].mean()), 3) for results in found))
+            print(name, kind, *(round(float(episodes.metrics["accuracy"].mean()), 3) for episodes in tables))
 
 
 def episodes_file(name: str, kind: str) -> Path:
@@ -157,120 +162,130 @@ def read_episodes(name: str, kind: str, folder: Path | None = None) -> Episodes 
     file = (folder or EPISODES) / episodes_file(name, kind).name
     if not file.is_file():
         return None
-    with np.load(file, allow_pickle=False) as found:
-        values = {key: found[key] for key in found.files if key not in ("about", "segment")}
-        return Episodes(values, found["segment"], json.loads(str(found["about"])))
+    with np.load(file, allow_pickle=False) as arrays:
+        values = {key: arrays[key] for key in arrays.files if key not in ("about", "segment")}
+        return Episodes(values, arrays["segment"], json.loads(str(arrays["about"])))
 
 
-def mean_interval(driven: Episodes, metric: str, against: Episodes | None = None) -> Interval:
+def mean_interval(episodes: Episodes, metric: str, against: Episodes | None = None) -> Interval:
     """Return the mean, or mean paired difference, with its interval over segments and, if several, seeds."""
-    own, segments = driven.values[metric].astype(np.float64), driven.segments
+    values, segments = episodes.values[metric].astype(np.float64), episodes.segments
     if against is None:
-        if len(own) == 1:
-            return interval_of(metric, own[0], segments)
-        return seeds_interval(own, segments, share=metric in SHARES)
-    other = against.values[metric].astype(np.float64)
-    if len(own) == len(other) == 1:
-        return paired_bootstrap(own[0], other[0], segments, seed=0)
-    return difference_interval(own, other, segments)[0]
+        if len(values) == 1:
+            return interval_of(metric, values[0], segments)
+        return seeds_interval(values, segments, share=metric in SHARES)
+    other_values = against.values[metric].astype(np.float64)
+    if len(values) == len(other_values) == 1:
+        return paired_bootstrap(values[0], other_values[0], segments, seed=0)
+    return difference_interval(values, other_values, segments)[0]
 
 
-def mean_change(driven: Episodes, metric: str, before: Episodes) -> Interval:
+def mean_change(episodes: Episodes, metric: str, reference: Episodes) -> Interval:
     """Return the mean paired difference of the same planner between two kinds of traffic."""
-    apart = driven.values[metric].astype(np.float64) - before.values[metric]
-    if len(apart) == 1:
-        return bootstrap_mean(apart[0], driven.segments, seed=0)
-    return seeds_interval(apart, driven.segments)
+    differences = episodes.values[metric].astype(np.float64) - reference.values[metric]
+    if len(differences) == 1:
+        return bootstrap_mean(differences[0], episodes.segments, seed=0)
+    return seeds_interval(differences, episodes.segments)
 
 
-def compare_definitions(driven: Episodes, former: Episodes) -> dict[str, dict[str, float]]:
+def compare_definitions(episodes: Episodes, former: Episodes) -> dict[str, dict[str, float]]:
     """Return means of the changed metrics before and after, and the share of episodes with a different value."""
-    found = {}
+    result = {}
     for metric in CHANGED_METRICS:
-        before, now = (one.values[metric].astype(np.float64) for one in (former, driven))
-        moved = ~np.isclose(before, now, rtol=0, atol=1e-5, equal_nan=True)
-        found[metric] = {
-            "before": float(np.nanmean(before)), "after": float(np.nanmean(now)), "moved": float(moved.mean())
-        }  # fmt: skip
-    return found
+        old_values, new_values = (version.values[metric].astype(np.float64) for version in (former, episodes))
+        differs = ~np.isclose(old_values, new_values, rtol=0, atol=1e-5, equal_nan=True)
+        result[metric] = {
+            "before": float(np.nanmean(old_values)),
+            "after": float(np.nanmean(new_values)),
+            "moved": float(differs.mean()),
+        }
+    return result
 
 
 def compute_results() -> dict[str, Any]:
     """Compute all results of the page from the stored episodes."""
-    driven = {
-        (name, kind): found
+    all_episodes = {
+        (name, kind): episodes
         for name in (*PLANNERS, *learned_planners())
         for kind in TRAFFIC
-        if (found := read_episodes(name, kind)) is not None
+        if (episodes := read_episodes(name, kind)) is not None
     }
-    tests = {found.about["test"] for found in driven.values()}
+    tests = {episodes.about["test"] for episodes in all_episodes.values()}
     if len(tests) != 1:
         raise SystemExit(f"{len(tests)} test sets: drive all planners on one")
     planners: dict[str, Any] = {}
-    for (name, kind), found in driven.items():
+    for (name, kind), episodes in all_episodes.items():
         metrics = (*COLUMNS, *FAILURE_METRICS) if name in (BOX, "expert") else COLUMNS
-        planners.setdefault(name, {"seeds": found.about["seeds"]})[kind] = {
-            metric: mean_interval(found, metric).as_dict() for metric in metrics
+        planners.setdefault(name, {"seeds": episodes.about["seeds"]})[kind] = {
+            metric: mean_interval(episodes, metric).as_dict() for metric in metrics
         }
     return {
         "command": "python -m experiments.learning.benchmark judge",
-        "test": {"hash": tests.pop(), "scenarios": len(next(iter(driven.values())).segments)},
+        "test": {"hash": tests.pop(), "scenarios": len(next(iter(all_episodes.values())).segments)},
         "planners": planners,
         "reactive": {
             name: {
-                metric: mean_change(driven[name, "idm"], metric, driven[name, "log"]).as_dict()
+                metric: mean_change(all_episodes[name, "idm"], metric, all_episodes[name, "log"]).as_dict()
                 for metric in COLUMNS
             }
             for name in planners
-            if name != BOX and {(name, kind) for kind in TRAFFIC} <= driven.keys()
+            if name != BOX and {(name, kind) for kind in TRAFFIC} <= all_episodes.keys()
         },
         "differences": {
             kind: {
                 f"{name} - {other}": {
-                    metric: mean_interval(driven[name, kind], metric, driven[other, kind]).as_dict()
+                    metric: mean_interval(
+                        all_episodes[name, kind], metric, all_episodes[other, kind]
+                    ).as_dict()
                     for metric in DIFFERENCE_METRICS
                 }
                 for other in REFERENCES
                 for name in ("expert", *(name for name in ("pdm",) if name != other), *learned_planners())
-                if {(name, kind), (other, kind)} <= driven.keys()
+                if {(name, kind), (other, kind)} <= all_episodes.keys()
             }
             for kind in TRAFFIC
         },
-        "strata": stratify(driven),
+        "strata": stratify(all_episodes),
         "changes": {
-            f"{name}, {kind}": compare_definitions(found, former)
-            for (name, kind), found in driven.items()
-            if (former := read_episodes(name, kind, FORMER_EPISODES)) is not None
+            f"{name}, {kind}": compare_definitions(episodes, former_episodes)
+            for (name, kind), episodes in all_episodes.items()
+            if (former_episodes := read_episodes(name, kind, FORMER_EPISODES)) is not None
         },
-        "driven": {f"{name}, {kind}": dict(found.about) for (name, kind), found in driven.items()},
+        "driven": {
+            f"{name}, {kind}": dict(episodes.about) for (name, kind), episodes in all_episodes.items()
+        },
     }
 
 
-def stratify(driven: Mapping[tuple[str, str], Episodes]) -> list[dict[str, Any]]:
+def stratify(all_episodes: Mapping[tuple[str, str], Episodes]) -> list[dict[str, Any]]:
     """Return the accuracy of every planner in log replay traffic, by tag and value."""
-    with np.load(EPISODES / STRATA, allow_pickle=False) as stored:
-        tags, of = {tag: stored[tag] for tag in TAGS}, str(stored["test"])
-    if any(one.about["test"] != of for one in driven.values()):
+    with np.load(EPISODES / STRATA, allow_pickle=False) as arrays:
+        tags, test_hash = {tag: arrays[tag] for tag in TAGS}, str(arrays["test"])
+    if any(episodes.about["test"] != test_hash for episodes in all_episodes.values()):
         raise SystemExit("the tags are those of another test set: evaluate a planner again")
-    planners = {name: one for (name, kind), one in driven.items() if kind == "log" and name != BOX}
-    found = []
+    planners = {
+        name: episodes for (name, kind), episodes in all_episodes.items() if kind == "log" and name != BOX
+    }
+    strata = []
     for tag, values in tags.items():
         for value in np.unique(values):
             rows = values == value
-            some = {
+            means = {
                 name: mean_interval(
                     replace(
-                        one, values={"accuracy": one.values["accuracy"][:, rows]}, segments=one.segments[rows]
+                        episodes,
+                        values={"accuracy": episodes.values["accuracy"][:, rows]},
+                        segments=episodes.segments[rows],
                     ),
                     "accuracy",
                 )
-                for name, one in planners.items()
+                for name, episodes in planners.items()
             }
-            intervals = {name: one.as_dict() for name, one in some.items()}
-            found.append(
+            intervals = {name: episodes.as_dict() for name, episodes in means.items()}
+            strata.append(
                 {"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": intervals}
             )
-    return found
+    return strata
 
 
 def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -280,10 +295,10 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
         (name for name in planners if name != BOX and "log" in planners[name]),
         key=lambda name: -planners[name]["log"]["vmax_score"]["mean"],
     )
-    heads = ("planner", "seeds", *COLUMNS.values())
-    found = {
+    headings = ("planner", "seeds", *COLUMNS.values())
+    tables = {
         kind: table(
-            heads,
+            headings,
             [
                 (f"`{name}`", str(planners[name]["seeds"]), *format_cells(planners[name][kind], COLUMNS))
                 for name in order
@@ -297,24 +312,24 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
         for name in order
         if name in result["reactive"]
     ]
-    found["reactive"] = table(("planner", *COLUMNS.values()), rows)
-    found["differences"] = table(
+    tables["reactive"] = table(("planner", *COLUMNS.values()), rows)
+    tables["differences"] = table(
         ("difference", "traffic", *(COLUMNS[metric] for metric in DIFFERENCE_METRICS)),
         [
-            (pair, f"`{kind}`", *format_cells(one, DIFFERENCE_METRICS, signed=True))
+            (pair, f"`{kind}`", *format_cells(row, DIFFERENCE_METRICS, signed=True))
             for kind, pairs in result["differences"].items()
-            for pair, one in pairs.items()
+            for pair, row in pairs.items()
         ],
     )
-    shown = {**FAILURE_METRICS, "collision": "collision", "offroad": "off-road"}
+    columns = {**FAILURE_METRICS, "collision": "collision", "offroad": "off-road"}
     rows = [
-        (name, f"`{kind}`", *format_cells(planners[name][kind], shown))
+        (name, f"`{kind}`", *format_cells(planners[name][kind], columns))
         for name in (BOX, "expert")
         for kind in TRAFFIC
         if kind in planners.get(name, {})
     ]
-    found["random"] = table(("planner", "traffic", *shown.values()), rows)
-    found["changes"] = table(
+    tables["random"] = table(("planner", "traffic", *columns.values()), rows)
+    tables["changes"] = table(
         ("planner", "traffic", *CHANGED_METRICS.values()),
         [
             (
@@ -328,47 +343,49 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
         ],
     )
     names = [name for name in order if name in result["strata"][0]["planners"]]
-    found["strata"] = table(
+    tables["strata"] = table(
         ("tag", "value", "scenarios", *(f"`{name}`" for name in names)),
         [
             (
-                one["tag"],
-                one["value"],
-                f"{one['scenarios']:,}",
-                *(interval(one["planners"][n]) for n in names),
+                row["tag"],
+                row["value"],
+                f"{row['scenarios']:,}",
+                *(interval(row["planners"][n]) for n in names),
             )
-            for one in result["strata"]
+            for row in result["strata"]
         ],
     )
-    return found
+    return tables
 
 
 def format_cells(
-    found: Mapping[str, Any], metrics: Sequence[str] | Mapping[str, str], signed: bool = False
+    intervals: Mapping[str, Any], metrics: Sequence[str] | Mapping[str, str], signed: bool = False
 ) -> list[str]:
     """Format means with intervals; metres with one digit."""
     return [
         interval(
-            found[metric], signed=signed, digits=1 if "progress" in metric or metric in FAILURE_METRICS else 3
+            intervals[metric],
+            signed=signed,
+            digits=1 if "progress" in metric or metric in FAILURE_METRICS else 3,
         )
         for metric in metrics
     ]
 
 
-def format_change(one: Mapping[str, float]) -> str:
+def format_change(change: Mapping[str, float]) -> str:
     """Format a mean before and after, with the share of changed episodes, or the mean alone if none changed."""
-    if one["moved"] == 0.0:
-        return f"{one['after']:.3f}"
-    return f"{one['before']:.3f} to {one['after']:.3f} ({one['moved']:.1%})"
+    if change["moved"] == 0.0:
+        return f"{change['after']:.3f}"
+    return f"{change['before']:.3f} to {change['after']:.3f} ({change['moved']:.1%})"
 
 
 def fill_page(text: str, result: Mapping[str, Any]) -> str:
     """Return the page with the stored tables."""
-    for what, lines in page_tables(result).items():
-        begin, end = f"<!-- benchmark.py: {what} -->", "<!-- benchmark.py: end -->"
+    for name, lines in page_tables(result).items():
+        begin, end = f"<!-- benchmark.py: {name} -->", "<!-- benchmark.py: end -->"
         before, rest = text.split(begin)
-        shown = "\n".join(lines)
-        text = f"{before}{begin}\n\n{shown}\n\n{end}{rest.split(end, 1)[1]}"
+        content = "\n".join(lines)
+        text = f"{before}{begin}\n\n{content}\n\n{end}{rest.split(end, 1)[1]}"
     return text
 
 

@@ -59,75 +59,82 @@ def train_preset(args: argparse.Namespace, overrides: list[str]) -> None:
     """
     config = settings.load(TrainConfig, args.preset, overrides)
     name = args.preset.replace("/", "-")
-    out, kept = args.runs / name, POLICIES / name
+    out, policies = args.runs / name, POLICIES / name
     data, validation = (ScenarioSet.open(args.data / split) for split in ("train", "validation"))
     notes: dict[str, Any] = {"kind": "seeds", "seeds": args.seeds, "validation": validation.hash}
     RunFolder.create(out, config, [data], overwrite=True, **notes)
     seeds = range(config.seed + args.first, config.seed + args.first + args.seeds)
     agents = [replace(config, seed=seed) for seed in seeds]
-    took = [seconds for _, seconds in one_core_each(partial(_train_seed, args.data, out), agents)]
-    about: dict[str, Any] = {"seconds": max(took), "curves": learning_curves(out)}
+    durations = [seconds for _, seconds in one_core_each(partial(_train_seed, args.data, out), agents)]
+    record: dict[str, Any] = {"seconds": max(durations), "curves": learning_curves(out)}
     if args.first:
-        before = json.loads((kept / TRAINING).read_text())
-        about["seconds"] = max(about["seconds"], before["seconds"])
-        about["curves"] = {
-            metric: before["curves"][metric] | lines for metric, lines in about["curves"].items()
+        earlier = json.loads((policies / TRAINING).read_text())
+        record["seconds"] = max(record["seconds"], earlier["seconds"])
+        record["curves"] = {
+            metric: earlier["curves"][metric] | lines for metric, lines in record["curves"].items()
         }
     else:
-        shutil.rmtree(kept, ignore_errors=True)
+        shutil.rmtree(policies, ignore_errors=True)
     bank = ScenarioBank.from_scenarios([data[0]])
     for folder in seed_folders(out):
-        export_policy(folder, kept / folder.name, bank, overwrite=True)
-    (kept / TRAINING).write_text(
-        json.dumps(about | {"seeds": len(learned_planners()[name])}, indent=1) + "\n"
+        export_policy(folder, policies / folder.name, bank, overwrite=True)
+    (policies / TRAINING).write_text(
+        json.dumps(record | {"seeds": len(learned_planners()[name])}, indent=1) + "\n"
     )
 
 
 def _train_seed(data: Path, out: Path, config: TrainConfig) -> int:
     """Train one seed, and return the elapsed seconds."""
-    began = time.perf_counter()
+    start = time.perf_counter()
     splits = {split: ScenarioSet.open(data / split) for split in ("train", "validation")}
     train(config, splits["train"], out / f"seed-{config.seed}", validation=splits["validation"], log=print)
-    return round(time.perf_counter() - began)
+    return round(time.perf_counter() - start)
 
 
 def compute_results() -> dict[str, Any]:
     """Compute results and paired differences of all evaluated presets and the references."""
-    found = {name: read_episodes(name, "log") for name in (*REFERENCES, *learned_planners())}
-    driven = {name: one for name, one in found.items() if one is not None}
-    tests = {one.about["test"] for one in driven.values()}
+    candidates = {name: read_episodes(name, "log") for name in (*REFERENCES, *learned_planners())}
+    episodes = {
+        name: planner_episodes
+        for name, planner_episodes in candidates.items()
+        if planner_episodes is not None
+    }
+    tests = {planner_episodes.about["test"] for planner_episodes in episodes.values()}
     if len(tests) != 1:
         raise SystemExit(
             f"{len(tests)} test sets instead of one: evaluate the others again (benchmark.py drive)"
         )
-    stored = {
+    trainings = {
         name: json.loads((POLICIES / name / TRAINING).read_text())
         for name in learned_planners()
-        if name in driven
+        if name in episodes
     }
     return {
         "command": "python -m experiments.learning.presets judge",
-        "test": {"scenarios": len(next(iter(driven.values())).segments), "hash": tests.pop()},
-        "training": {name: {key: one[key] for key in ("seconds", "seeds")} for name, one in stored.items()},
+        "test": {"scenarios": len(next(iter(episodes.values())).segments), "hash": tests.pop()},
+        "training": {
+            name: {key: training[key] for key in ("seconds", "seeds")} for name, training in trainings.items()
+        },
         "planners": {
-            name: {metric: _mean(one, metric) for metric in COLUMNS} for name, one in driven.items()
+            name: {metric: _mean(planner_episodes, metric) for metric in COLUMNS}
+            for name, planner_episodes in episodes.items()
         },
         "differences": {
             f"{name} - {other}": {
-                metric: mean_interval(driven[name], metric, driven[other]).as_dict() for metric in CURVES
+                metric: mean_interval(episodes[name], metric, episodes[other]).as_dict() for metric in CURVES
             }
-            for name in stored
+            for name in trainings
             for other in ("idm", "bc")
-            if other in driven and other != name
+            if other in episodes and other != name
         },
-        "curves": {name: one["curves"] for name, one in stored.items()},
+        "curves": {name: training["curves"] for name, training in trainings.items()},
         "versions": versions(),
     }
 
 
-def _mean(driven: Episodes, metric: str) -> dict[str, Any]:
-    each = [round(float(np.nanmean(row)), 4) for row in driven.values[metric]]
-    return mean_interval(driven, metric).as_dict() | {"by_seed": each}
+def _mean(results: Episodes, metric: str) -> dict[str, Any]:
+    seed_means = [round(float(np.nanmean(row)), 4) for row in results.values[metric]]
+    return mean_interval(results, metric).as_dict() | {"by_seed": seed_means}
 
 
 def learning_curves(run: Path) -> dict[str, dict[str, list[list[float]]]]:

@@ -76,14 +76,14 @@ class Trend:
     def logged(cls, bank: ScenarioBank, context: AgentContext) -> Trend:
         """Return the trend of the log over the last half second; parked agents are stationary."""
         now = bank.agents[context.index, context.step]
-        before = bank.agents[context.index, jnp.maximum(context.step - _TREND_STEPS, 0)]
+        past = bank.agents[context.index, jnp.maximum(context.step - _TREND_STEPS, 0)]
         defined = (
             (now[:, AgentColumn.VALID] > 0)
-            & (before[:, AgentColumn.VALID] > 0)
+            & (past[:, AgentColumn.VALID] > 0)
             & (context.step >= _TREND_STEPS)
         )
-        angle = _turn(before[:, AgentColumn.HEADING], now[:, AgentColumn.HEADING])
-        speed_change = _length(now[:, AgentColumn.VELOCITY]) - _length(before[:, AgentColumn.VELOCITY])
+        angle = _turn(past[:, AgentColumn.HEADING], now[:, AgentColumn.HEADING])
+        speed_change = _length(now[:, AgentColumn.VELOCITY]) - _length(past[:, AgentColumn.VELOCITY])
         parked = bank.agent_box.shape[1] - len(now)
 
         def pad_parked(values: Array) -> Array:
@@ -112,10 +112,10 @@ class Trend:
         return Trend(direction, speed, frame.valid, turning, acceleration, stood_s)
 
 
-def _turn(before: Float[Array, "S 2"], now: Float[Array, "S 2"]) -> Float[Array, " S"]:
+def _turn(last: Float[Array, "S 2"], direction: Float[Array, "S 2"]) -> Float[Array, " S"]:
     """Return the angle from one direction to another, rad."""
-    cross = before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]
-    return jnp.arctan2(cross, jnp.sum(before * now, axis=-1))
+    cross = last[:, 0] * direction[:, 1] - last[:, 1] * direction[:, 0]
+    return jnp.arctan2(cross, jnp.sum(last * direction, axis=-1))
 
 
 @record

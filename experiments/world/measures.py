@@ -60,8 +60,8 @@ def count_overlapping_pairs(scenario: Scenario) -> int:
     vehicles = np.flatnonzero((kind == AgentKind.VEHICLE) & (np.arange(len(kind)) > 0))
     first, second = np.triu_indices(len(vehicles), 1)
     first, second = vehicles[first], vehicles[second]
-    both = valid[:, first] & valid[:, second]
-    return int((overlap(box[:, first], box[:, second]) & both).any(axis=0).sum())
+    pair_valid = valid[:, first] & valid[:, second]
+    return int((overlap(box[:, first], box[:, second]) & pair_valid).any(axis=0).sum())
 
 
 def constant_speed_ttc_s(scenario: Scenario) -> float:

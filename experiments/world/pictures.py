@@ -86,21 +86,21 @@ def family_tiles(domain: str, seed: int) -> list[Tile]:
 def feature_score(scenario: Scenario) -> tuple[float, int]:
     """Return the largest score of map features near ego, and its step: road bends (rad), crosswalks, lane ends."""
     layers = road_lines(scenario)
-    places, weights = [np.zeros((0, 2))], [np.zeros(0)]
+    features, weights = [np.zeros((0, 2))], [np.zeros(0)]
     for line in layers["edge"]:
         steps_xy = np.diff(line, axis=0)
         heading = np.unwrap(np.arctan2(steps_xy[:, 1], steps_xy[:, 0]))
-        places.append(line[1:-1])
+        features.append(line[1:-1])
         weights.append(np.abs(np.diff(heading)))
     for line in layers["crosswalk"]:
-        places.append(line.mean(axis=0, keepdims=True))
+        features.append(line.mean(axis=0, keepdims=True))
         weights.append(np.ones(1))
     starts, ends = (np.array([line[k] for line in layers["lane"]]) for k in (0, -1))
     is_end = np.hypot(*np.moveaxis(ends[:, None] - starts, -1, 0)).min(axis=1) > 0.5
-    places.append(ends[is_end])
+    features.append(ends[is_end])
     weights.append(np.full(int(is_end.sum()), 2.0))
     steps = np.arange(CURRENT_STEP, int(scenario.steps), 4)
-    feature_xy, ego_xy = np.concatenate(places)[None], scenario.agent_xy[steps, None, 0]
+    feature_xy, ego_xy = np.concatenate(features)[None], scenario.agent_xy[steps, None, 0]
     near = np.hypot(*np.moveaxis(feature_xy - ego_xy, -1, 0)) < SIGHT_M
     score = (np.concatenate(weights) * near).sum(axis=1)
     best = int(score.argmax())

@@ -109,8 +109,10 @@ def _leader_gap(subject: Array, others: Array, offset: Array, present: Array) ->
 
 def pool(scenarios: Iterable[Scenario]) -> tuple[dict[str, Array], int]:
     """Pool all scenarios and count them."""
-    parts = [quantities(scenario) for scenario in scenarios]
-    return {name: np.concatenate([part[name] for part in parts]) for name in QUANTITIES}, len(parts)
+    values_by_scenario = [quantities(scenario) for scenario in scenarios]
+    return {
+        name: np.concatenate([values[name] for values in values_by_scenario]) for name in QUANTITIES
+    }, len(values_by_scenario)
 
 
 def read_recordings(data: Path) -> Iterable[Scenario]:

@@ -34,8 +34,8 @@ class Target:
     met: Callable[[float], bool]
 
 
-def _success(planner: str, where: str) -> Callable[[Result], Any]:
-    return lambda result: result["difficulty"][planner][where]
+def _success(planner: str, stratum: str) -> Callable[[Result], Any]:
+    return lambda result: result["difficulty"][planner][stratum]
 
 
 def _count_outside(result: Result) -> int:
@@ -124,7 +124,9 @@ def lines(result: Result) -> list[tuple[str, str]]:
     pairs.append(("noise moves a corner at most", noise_text))
     for name, share in result["difficulty"].items():
         ratio = share["failure_ratio"]
-        pairs += [(f"{name} success, {where}", text(share[where])) for where in ("all", "common", "rare")]
+        pairs += [
+            (f"{name} success, {stratum}", text(share[stratum])) for stratum in ("all", "common", "rare")
+        ]
         pairs.append(("  failures, rare over common", "" if ratio is None else f"{ratio:.2f}"))
     near = result["near_at_constant_speed"]
     pairs += [
@@ -161,8 +163,8 @@ def _generation(result: Result) -> list[tuple[str, str]]:
     for name, generation in result["generation"].items():
         for family, count in generation["families"].items():
             causes = ", ".join(f"{k} {v}" for k, v in sorted(count["causes"].items()))
-            rejected = f"{count['rejection_rate']:.3f} ({causes}); {count['unsuited']} without occasion"
-            pairs.append((f"{name}: {family} rejected", rejected))
+            text = f"{count['rejection_rate']:.3f} ({causes}); {count['unsuited']} without occasion"
+            pairs.append((f"{name}: {family} rejected", text))
     return pairs
 
 

@@ -107,7 +107,7 @@ def measure_set(
 
 
 def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[str, Any]]:
-    loaded = load(scenarios)
+    data = load(scenarios)
     rows = [
         {
             "family": scenario.tags["family"],
@@ -120,10 +120,10 @@ def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[st
             "overlaps": count_overlapping_pairs(scenario),
             "ttc_s": constant_speed_ttc_s(scenario) if "event" in scenario.tags else None,
         }
-        for scenario, name in zip(scenarios, loaded.names, strict=True)
+        for scenario, name in zip(scenarios, data.names, strict=True)
     ]
     for planner in ("expert", *planners):
-        metrics = evaluate(PLANNERS.get(planner, planner), loaded).metrics
+        metrics = evaluate(PLANNERS.get(planner, planner), data).metrics
         names = EXPERT_METRICS if planner == "expert" else ("success", "accuracy")
         for i, row in enumerate(rows):
             row |= {f"{planner}.{name}": float(metrics[name][i]) for name in names}
@@ -159,28 +159,31 @@ def compare_coverage(
     roads that suit their event. Kinds of events are counted over all rare scenarios.
     """
     maps = {row["segment"]: row["family"] for row in rows if row["event"] is None}
-    labelled = [row for row in (*rows, *rare) if row["event"] is not None]
-    families, events = Counter(maps.values()), Counter(row["event"] for row in labelled)
+    events_rows = [row for row in (*rows, *rare) if row["event"] is not None]
+    families, events = Counter(maps.values()), Counter(row["event"] for row in events_rows)
     table: dict[str, Counter[str]] = {}
-    for row in labelled:
+    for row in events_rows:
         table.setdefault(row["event"], Counter())[row["family"]] += 1
-    expected = {family.name: p for family, p in DOMAINS[world.domain].families}
+    probabilities = {family.name: p for family, p in DOMAINS[world.domain].families}
     kinds = [kind.name.lower() for kind in EventKind if kind]
-    count = len(expected) + len(kinds) + 1
+    count = len(probabilities) + len(kinds) + 1
     event_count = sum(row["event"] is not None for row in rows)
     return {
         "families": {
-            name: compare_share(p, families[name], len(maps), count) for name, p in sorted(expected.items())
+            name: compare_share(p, families[name], len(maps), count)
+            for name, p in sorted(probabilities.items())
         },
         "rare_rate": compare_share(world.rare_rate, event_count, len(rows), count),
-        "events": {name: compare_share(1 / len(kinds), events[name], len(labelled), count) for name in kinds},
+        "events": {
+            name: compare_share(1 / len(kinds), events[name], len(events_rows), count) for name in kinds
+        },
         "family_by_event": {event: dict(counts) for event, counts in sorted(table.items())},
     }
 
 
-def severity(labelled: list[dict[str, Any]]) -> dict[str, Any]:
+def severity(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the distribution of required decelerations over thirds of their range, and medians by kind."""
-    values = np.array([row["severity_mps2"] for row in labelled])
+    values = np.array([row["severity_mps2"] for row in rows])
     edges = np.linspace(*SEVERITY_MPS2, 4)
     third = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, 2)
     return {
@@ -189,16 +192,16 @@ def severity(labelled: list[dict[str, Any]]) -> dict[str, Any]:
             for k in range(3)
         },
         "medians": {
-            name: float(np.median([row["severity_mps2"] for row in labelled if row["event"] == name]))
-            for name in sorted({row["event"] for row in labelled})
+            name: float(np.median([row["severity_mps2"] for row in rows if row["event"] == name]))
+            for name in sorted({row["event"] for row in rows})
         },
     }
 
 
-def near_misses(labelled: list[dict[str, Any]]) -> dict[str, Any]:
+def near_misses(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the share of rare scenarios, overall and by kind, where a constant-speed ego nears the actor."""
-    kinds = {"all": labelled}
-    for row in labelled:
+    kinds = {"all": rows}
+    for row in rows:
         kinds.setdefault(row["event"], []).append(row)
     return {
         name: share(sum(row["ttc_s"] < NEAR_S for row in group), len(group))
@@ -208,23 +211,23 @@ def near_misses(labelled: list[dict[str, Any]]) -> dict[str, Any]:
 
 def summary(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig) -> dict[str, Any]:
     """Return all values of the table from the rows of both sets."""
-    both = [*rows, *rare]
+    all_rows = [*rows, *rare]
     common = [row for row in rows if row["event"] is None]
-    labelled = [row for row in both if row["event"] is not None]
+    with_event = [row for row in all_rows if row["event"] is not None]
     planners = [name for name in PLANNERS if f"{name}.success" in rows[0]]
     return {
-        "expert": {name: share_of(both, f"expert.{name}") for name in EXPERT_METRICS},
+        "expert": {name: share_of(all_rows, f"expert.{name}") for name in EXPERT_METRICS},
         "expert_comfortable_common": share_of(common, "expert.comfortable"),
         "within_limits_common": {
             name: share(sum(name not in row["broken_limits"] for row in common), len(common))
             for name in LIMITS
         },
         "critical": share(sum(row["critical"] for row in common), len(common)),
-        "background_overlap": share(sum(row["overlaps"] > 0 for row in both), len(both)),
-        "largest_noise_m": max(row["noise_m"] for row in both),
+        "background_overlap": share(sum(row["overlaps"] > 0 for row in all_rows), len(all_rows)),
+        "largest_noise_m": max(row["noise_m"] for row in all_rows),
         "difficulty": {name: difficulty(rows, rare, name) for name in planners},
-        "near_at_constant_speed": near_misses(labelled),
-        "severity_mps2": severity(labelled),
+        "near_at_constant_speed": near_misses(with_event),
+        "severity_mps2": severity(with_event),
         "coverage": compare_coverage(rows, rare, world),
     }
 

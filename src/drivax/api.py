@@ -75,14 +75,14 @@ def load(
     """
     if isinstance(data, str | Path):
         scenario_set = ScenarioSet.open(data)
-        stored = [scenario_set[row] for row in select_scenarios(scenario_set, filters, scenarios, limit)]
+        selection = [scenario_set[row] for row in select_scenarios(scenario_set, filters, scenarios, limit)]
         # Reading a scenario verifies it; of all others only the sizes matter.
         sizes = Sizes.used(ScenarioSet.open(data, verify=False))
     elif filters or scenarios:
         raise UsageError("only a scenario set can be filtered", cure="leave out filters= and scenarios=")
     else:
-        stored, sizes = list(data[:limit]), Sizes.used(data)
-    return Loaded(stored, ScenarioBank.from_scenarios(stored), scenario_names(stored), sizes)
+        selection, sizes = list(data[:limit]), Sizes.used(data)
+    return Loaded(selection, ScenarioBank.from_scenarios(selection), scenario_names(selection), sizes)
 
 
 def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> Simulator:

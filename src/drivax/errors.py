@@ -46,11 +46,11 @@ class DrivaxError(Exception):
         return type(self), (self.problem,), {"file": self.file, "record": self.record, "cure": self.cure}
 
     def __str__(self) -> str:
-        place = "" if self.file is None else f"{self.file}: "
+        location = "" if self.file is None else f"{self.file}: "
         if self.record is not None:
-            place += f"record {self.record}: "
+            location += f"record {self.record}: "
         cure = "" if self.cure is None else f"; {self.cure}"
-        return " ".join(f"{place}{self.problem}{cure}".split())
+        return " ".join(f"{location}{self.problem}{cure}".split())
 
 
 class DataError(DrivaxError):
@@ -88,9 +88,9 @@ def did_you_mean(
     name: str, names: Iterable[str], *, otherwise: str | None = None, cutoff: float = 0.6
 ) -> str:
     """Return the cure for an unknown name: the closest known name, else ``otherwise``, else all known names."""
-    known = list(names)
-    if close := difflib.get_close_matches(name, known, n=1, cutoff=cutoff):
-        return f"did you mean {close[0]!r}?"
+    candidates = list(names)
+    if matches := difflib.get_close_matches(name, candidates, n=1, cutoff=cutoff):
+        return f"did you mean {matches[0]!r}?"
     if otherwise is not None:
         return otherwise
-    return f"use one of {', '.join(known)}" if known else "there are none"
+    return f"use one of {', '.join(candidates)}" if candidates else "there are none"

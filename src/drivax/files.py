@@ -287,8 +287,8 @@ def _publish(content: Path, path: Path) -> None:
         path.rename(_hidden_path(path, f"old-{os.getpid()}"))
     content.rename(path)
     sync_folder(path.parent)
-    for old in path.parent.glob(f".{glob.escape(path.name)}.old-*"):
-        shutil.rmtree(old, ignore_errors=True)
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.old-*"):
+        shutil.rmtree(leftover, ignore_errors=True)
 
 
 def _read_json(path: Path) -> Any:

@@ -439,5 +439,5 @@ def _ego_path(context: AgentContext, previous: Any = None) -> Any:
     history, step = np.asarray(context.history), int(context.step)
     if previous is not None:
         return np.concatenate([previous, history[-1:]])
-    known = history[-min(step + 1, len(history)) :]
-    return np.concatenate([np.full((step + 1 - len(known), 4), np.nan, np.float32), known])
+    recent = history[-min(step + 1, len(history)) :]
+    return np.concatenate([np.full((step + 1 - len(recent), 4), np.nan, np.float32), recent])

@@ -71,11 +71,11 @@ def run(args: Convert) -> int:
 
 
 def _announce(plan: Plan) -> None:
-    parts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
+    texts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
     unknown = len(plan.data.inputs) - plan.data.formats.total()
     if unknown:
-        parts.append(f"{counted(unknown, 'file')} of unknown format")
-    print(f"found {', '.join(parts)}: {plan.estimate}", flush=True)
+        texts.append(f"{counted(unknown, 'file')} of unknown format")
+    print(f"found {', '.join(texts)}: {plan.estimate}", flush=True)
     if plan.written:
         print(f"continuing after {counted(plan.written, 'scenario')}", flush=True)
 
@@ -83,15 +83,15 @@ def _announce(plan: Plan) -> None:
 def summary(result: Converted) -> str:
     """Return one line about a conversion."""
     rate = (result.scenarios - result.written) / max(result.seconds, 1e-9)
-    parts = [
+    texts = [
         f"{counted(result.scenarios, 'scenario')} from {counted(result.files, 'file')}"
         f" in {result.seconds:.1f} s ({rate:.1f}/s)",
         f"{counted(len(result.skipped), 'record')} skipped",
     ]
     if result.written:
-        parts.insert(1, f"{result.written:,} of them written before")
+        texts.insert(1, f"{result.written:,} of them written before")
     if result.filtered:
-        parts.append(f"{counted(result.filtered, 'scenario')} left out by filters")
+        texts.append(f"{counted(result.filtered, 'scenario')} left out by filters")
     if result.ignored:
-        parts.append(f"{counted(result.ignored, 'file')} of other formats ignored")
-    return f"{result.path}: " + ", ".join(parts)
+        texts.append(f"{counted(result.ignored, 'file')} of other formats ignored")
+    return f"{result.path}: " + ", ".join(texts)

@@ -134,21 +134,21 @@ def score_with_progress(method: str, request: Request) -> ScoreTable:
 def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> None:
     """Refuse flags that the method or --again would ignore."""
     again, subject = args.again is not None, args.method
-    unused: dict[str, object] = {}
+    ignored_values: dict[str, object] = {}
     if again:
         subject = f"{args.again}, which is not scored again,"
-        unused["--like"] = args.like
+        ignored_values["--like"] = args.like
     if again or not has_settings:
-        unused["--config"] = args.config
+        ignored_values["--config"] = args.config
     if again or args.method not in ("ensemble", "random_matched"):
-        unused["--seed"] = args.seed
+        ignored_values["--seed"] = args.seed
     if args.all_windows and args.export is None:
         raise UsageError("--all-windows without a subset to choose", cure="pass --export TOP N")
-    unused_flags = [flag for flag, value in unused.items() if value is not None]
+    ignored_flags = [flag for flag, value in ignored_values.items() if value is not None]
     if again or not has_settings:
-        unused_flags += overrides
-    if unused_flags:
-        raise UsageError(f"{subject} has no such setting", cure="leave out " + " ".join(unused_flags))
+        ignored_flags += overrides
+    if ignored_flags:
+        raise UsageError(f"{subject} has no such setting", cure="leave out " + " ".join(ignored_flags))
     if args.method == "random_matched" and (args.weights is not None or args.scenario is not None):
         raise UsageError(
             "random_matched permutes finished scores, which have no components",

@@ -123,8 +123,8 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     for problem in diagnosis.problems:
         # The path is printed above; name only files inside it.
         file = None if problem.file == diagnosis.path else problem.file
-        place = f"{file}: " if file is not None else ""
-        yield "problem", f"{place}{problem.problem}"
+        prefix = f"{file}: " if file is not None else ""
+        yield "problem", f"{prefix}{problem.problem}"
         if problem.cure:
             yield "instead", problem.cure
     if diagnosis.convertible:
@@ -142,10 +142,10 @@ def _part_rows(part: Part, files: int) -> Iterator[tuple[str, str]]:
     description = part.description
     version = "" if description.version is None else f", version {description.version}"
     yield "data set", f"{description.dataset}: {description.flavour}{version}"
-    number = counted(part.looked if part.whole else files, "file")
-    sampled = "" if part.whole else f" ({part.looked:,} of them looked into)"
+    files_text = counted(part.looked if part.whole else files, "file")
+    sample_text = "" if part.whole else f" ({part.looked:,} of them looked into)"
     recordings = "" if description.recordings is None else f", {counted(description.recordings, 'recording')}"
-    yield "format", f"{part.format}: {number}{sampled}{recordings}{'' if part.whole else ' in those'}"
+    yield "format", f"{part.format}: {files_text}{sample_text}{recordings}{'' if part.whole else ' in those'}"
     yield from (("note", note) for note in description.notes)
     yield from (("missing", name) for name in description.missing)
 

@@ -26,13 +26,13 @@ def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Moti
     After the end of the log, the motion continues at constant velocity.
     """
     step, last = context.step + ahead, bank.last_step[context.index]
-    logged = bank.agents[context.index, jnp.minimum(step, last), context.slot]
-    heading, velocity = logged[AgentColumn.HEADING], logged[AgentColumn.VELOCITY]
+    state = bank.agents[context.index, jnp.minimum(step, last), context.slot]
+    heading, velocity = state[AgentColumn.HEADING], state[AgentColumn.VELOCITY]
     speed = jnp.maximum(jnp.sum(velocity * heading), 0.0)
     time_after_log_s = jnp.maximum(step - last, 0) * 0.1
-    xy = logged[AgentColumn.XY] + time_after_log_s * velocity
-    motion = jnp.stack([xy[0], xy[1], jnp.arctan2(logged[AgentColumn.SIN], logged[AgentColumn.COS]), speed])
-    return jnp.where(logged[AgentColumn.VALID] > 0, motion, context.history[-1])
+    xy = state[AgentColumn.XY] + time_after_log_s * velocity
+    motion = jnp.stack([xy[0], xy[1], jnp.arctan2(state[AgentColumn.SIN], state[AgentColumn.COS]), speed])
+    return jnp.where(state[AgentColumn.VALID] > 0, motion, context.history[-1])
 
 
 def logged_poses(bank: ScenarioBank, context: AgentContext, steps: int) -> Float[Array, "steps1 3"]:

@@ -49,8 +49,8 @@ def chart(
     ``lines`` has the stroke and the points (x, y) of each run. With ``share``, the vertical axis spans 0 to 1 if all
     values fit.
     """
-    binned = {name: (style, _bin_points(points)) for name, (style, points) in lines.items() if len(points)}
-    values = np.concatenate([points for _, points in binned.values()])
+    series = {name: (style, _bin_points(points)) for name, (style, points) in lines.items() if len(points)}
+    values = np.concatenate([points for _, points in series.values()])
     x_ticks = ticks(min(0.0, float(values[:, 0].min())), float(values[:, 0].max()), 5)
     low, high = float(values[:, 1].min()), float(values[:, 1].max())
     y_ticks = [0.0, 0.25, 0.5, 0.75, 1.0] if share and low >= 0 and high <= 1 else ticks(low, high, 5)
@@ -60,7 +60,7 @@ def chart(
     shapes += [axes.tick_label(value) for value in x_ticks if value <= axes.x1 + 1e-9]
     shapes += [
         f'<polyline {style.svg} points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
-        for name, (style, points) in binned.items()
+        for name, (style, points) in series.items()
     ]
     return axes.figure(title, shapes, x_label)
 
@@ -174,8 +174,8 @@ def distribution_charts(runs: Sequence[EpisodeTable]) -> str:
         lines = {run.name: distribution(run.metrics[name]) for run in runs if name in run.metrics}
         values = np.concatenate([line[:, 0] for line in lines.values()]) if lines else np.zeros(0)
         if values.size and values.min() < values.max():
-            styled = {run: (styles[run], line) for run, line in lines.items()}
-            charts.append(chart(metric_label(name, runs).text, styled, share=True))
+            series = {run: (styles[run], line) for run, line in lines.items()}
+            charts.append(chart(metric_label(name, runs).text, series, share=True))
     return f"{series_legend(list(styles))}<div class=charts>{''.join(charts)}</div>" if charts else ""
 
 

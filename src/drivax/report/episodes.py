@@ -56,13 +56,13 @@ class EpisodeGroup:
 
 def outcome(run: EpisodeTable, row: int) -> str:
     """Return the most severe failure of an episode, ``success``, or ``unjudged`` if no metric is defined."""
-    defined = False
+    any_defined = False
     for name, metric, failure_value in FAILURES:
         value = _metric_value(run, metric, row)
-        defined |= not np.isnan(value)
+        any_defined |= not np.isnan(value)
         if value == failure_value:
             return name
-    return "success" if defined else "unjudged"
+    return "success" if any_defined else "unjudged"
 
 
 def sort_worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> list[int]:

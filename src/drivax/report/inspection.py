@@ -246,20 +246,20 @@ def overview(inspection: Inspection) -> Table:
 
 def _skipped_rows(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield the numbers of records that a conversion skipped or filtered, and the first causes."""
-    skipped, filtered = source.get("skipped_records", []), source.get("filtered", 0)
-    if skipped:
+    records, filter_count = source.get("skipped_records", []), source.get("filtered", 0)
+    if records:
         yield (
             "skipped",
-            f"{len(skipped):,} record{'s' if len(skipped) > 1 else ''} that could not be converted",
+            f"{len(records):,} record{'s' if len(records) > 1 else ''} that could not be converted",
         )
-    for entry in skipped[:_MAX_CAUSES]:
+    for entry in records[:_MAX_CAUSES]:
         record = "" if entry["record"] is None else f"record {entry['record']}: "
         yield "", f"{entry['file']}: {record}{entry['problem']}"
-    if len(skipped) > _MAX_CAUSES:
-        yield "", f"{len(skipped) - _MAX_CAUSES:,} more in manifest.json"
-    if filtered:
+    if len(records) > _MAX_CAUSES:
+        yield "", f"{len(records) - _MAX_CAUSES:,} more in manifest.json"
+    if filter_count:
         filters = " and ".join(source["filters"])
-        yield "filtered", f"{filtered:,} scenario{'s' if filtered > 1 else ''} left out by {filters}"
+        yield "filtered", f"{filter_count:,} scenario{'s' if filter_count > 1 else ''} left out by {filters}"
 
 
 def audit_table(inspection: Inspection) -> Table | None:
@@ -289,8 +289,8 @@ def scenarios_table(inspection: Inspection) -> Table:
     """Return the first scenarios with the counts of their source."""
     names = ("steps", "tracks", "now", "lanes", "lines", "edges", "others", "points", "lights", "segments")
     columns = (Column("scenario", label=True, max_width=24), *map(Column, names))
-    listed = inspection.entries[:MAX_LISTED]
-    rows = ((entry["scenario_id"], *(f"{count:,}" for count in _counts(entry))) for entry in listed)
+    entries = inspection.entries[:MAX_LISTED]
+    rows = ((entry["scenario_id"], *(f"{count:,}" for count in _counts(entry))) for entry in entries)
     return Table("scenarios", columns, tuple(tuple(map(Cell, row)) for row in rows))
 
 
@@ -409,13 +409,13 @@ def _places_text(inspection: Inspection) -> str:
     places = inspection.value_counts(
         lambda entry: [entry["tags"]["place"]] if "place" in entry["tags"] else []
     )
-    rest = f" and {len(places) - MAX_NAMED} more" if len(places) > MAX_NAMED else ""
-    return ", ".join(list(places)[:MAX_NAMED]) + rest if places else MISSING
+    suffix = f" and {len(places) - MAX_NAMED} more" if len(places) > MAX_NAMED else ""
+    return ", ".join(list(places)[:MAX_NAMED]) + suffix if places else MISSING
 
 
 def _counts_text(counts: Mapping[str, int], total: int) -> str:
-    shown = list(counts.items())[: 2 * MAX_NAMED]
-    texts = [name if count == total else f"{name} ({count:,} of {total:,})" for name, count in shown]
+    first = list(counts.items())[: 2 * MAX_NAMED]
+    texts = [name if count == total else f"{name} ({count:,} of {total:,})" for name, count in first]
     hidden = len(counts) - len(texts)
     return ", ".join(texts) + (f" and {hidden:,} more" if hidden else "") or "none"
 

@@ -37,8 +37,8 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
     A repeated name gets its folder as suffix.
     """
     folders = [seed_folder for folder in folders for seed_folder in seed_folders(folder)]
-    resolved = [folder.resolve() for folder in folders]
-    if not folders or len(set(resolved)) < len(resolved):
+    paths = [folder.resolve() for folder in folders]
+    if not folders or len(set(paths)) < len(paths):
         raise UsageError(
             "give at least one run folder, and each only once", cure="drivax report RUN [RUN ...]"
         )

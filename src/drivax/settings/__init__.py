@@ -71,9 +71,9 @@ def presets() -> list[str]:
 
 def _configs() -> Path:
     package = Path(__file__).resolve().parent.parent
-    packaged = package / "configs"
+    folder = package / "configs"
     # At the root of a checkout, inside the package of a wheel.
-    return packaged if packaged.is_dir() else package.parent.parent / "configs"
+    return folder if folder.is_dir() else package.parent.parent / "configs"
 
 
 def _find_file(source: str | Path) -> Path:

@@ -92,8 +92,8 @@ def _to_scalar(value: Any, cls: Any) -> Any:
     result = _parse_flag(value)
     if cls is int and isinstance(result, float) and result.is_integer():
         result = int(result)  # steps: 25e6
-    accepted, name = _SCALARS[cls]
-    if isinstance(result, bool) != (cls is bool) or not isinstance(result, accepted):
+    types, name = _SCALARS[cls]
+    if isinstance(result, bool) != (cls is bool) or not isinstance(result, types):
         raise _refuse(value, name)
     return float(result) if cls is float else result
 
@@ -109,13 +109,13 @@ def _to_path(value: Any, _: Any) -> Path:
 
 
 def _to_literal(value: Any, cls: Any) -> Any:
-    allowed = get_args(cls)
-    for option in (value, _parse_flag(value)):
-        for candidate in allowed:
-            if type(option) in (type(candidate), Flag) and option == candidate:
-                return candidate
-    near = did_you_mean(str(value), [str(option) for option in allowed])
-    raise ValueError(f"{str(value)!r} is not one of {', '.join(map(str, allowed))}; {near}")
+    options = get_args(cls)
+    for candidate in (value, _parse_flag(value)):
+        for literal in options:
+            if type(candidate) in (type(literal), Flag) and candidate == literal:
+                return literal
+    near = did_you_mean(str(value), [str(candidate) for candidate in options])
+    raise ValueError(f"{str(value)!r} is not one of {', '.join(map(str, options))}; {near}")
 
 
 def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
@@ -227,8 +227,8 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
         if not isinstance(value, Mapping):
             names = ", ".join(field.name for field in dataclasses.fields(cls))
             raise _refuse(value, f"a section of settings ({names})")
-        renamed = getattr(cls, "renamed", {})
-        value = {renamed.get(key, key): item for key, item in value.items()}
+        new_names = getattr(cls, "renamed", {})
+        value = {new_names.get(key, key): item for key, item in value.items()}
         if _names_preset(cls, value):
             base = cls.preset(str(value["preset"]))
             changes = {name: item for name, item in value.items() if name != "preset"}
@@ -308,13 +308,13 @@ def _first_problem(error: BaseException, path: str) -> tuple[str, str]:
         unknown = sorted(error.extra_fields)[0]
         return f"unknown setting; {did_you_mean(unknown, names)}", _join(path, unknown)
     if isinstance(error, ClassValidationError | IterableValidationError):
-        noted, plain_errors = error.group_exceptions()
-        if noted:
-            inner, note = noted[0]
+        inner_errors, own_errors = error.group_exceptions()
+        if inner_errors:
+            inner, note = inner_errors[0]
             name = getattr(note, "name", None)
-            step = _join(path, name) if name is not None else f"{path}[{getattr(note, 'index', '?')}]"
-            return _first_problem(inner, step)
-        return _first_problem(plain_errors[0], path)
+            inner_path = _join(path, name) if name is not None else f"{path}[{getattr(note, 'index', '?')}]"
+            return _first_problem(inner, inner_path)
+        return _first_problem(own_errors[0], path)
     if isinstance(error, _Problem):
         return error.problem, path + error.path if error.path.startswith("[") else _join(path, error.path)
     if isinstance(error, KeyError):
@@ -377,8 +377,8 @@ def parse_yaml(text: str, file: Path | None = None) -> Any:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or "invalid"
-        place = "YAML" if mark is None else f"line {mark.line + 1}"
-        raise UsageError(f"{place}: {problem}", file=file, cure="fix the file") from error
+        location = "YAML" if mark is None else f"line {mark.line + 1}"
+        raise UsageError(f"{location}: {problem}", file=file, cure="fix the file") from error
 
 
 def write_yaml(values: Any) -> str:

@@ -168,9 +168,9 @@ def compile_program(bank: ScenarioBank, config: BenchConfig) -> Program:
     states = _states(simulator, bank, config.batch)
     keys = jax.random.split(jax.random.key(2), jax.device_count())
     carry = _carry(simulator, config, bank, states)
-    started = time.perf_counter()
+    start = time.perf_counter()
     program = _shard_states(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
-    seconds = time.perf_counter() - started
+    seconds = time.perf_counter() - start
     memory = program.memory_analysis()
     return Program(
         run=lambda: program(bank, carry, keys),
@@ -188,10 +188,10 @@ def steps_per_second(programs: Sequence[Program], repeats: int) -> list[float]:
     times: list[list[float]] = [[] for _ in programs]
     for repeat in range(repeats + 1):
         for program, seconds in zip(programs, times, strict=True):
-            started = time.perf_counter()
+            start = time.perf_counter()
             jax.block_until_ready(program.run())
             if repeat:
-                seconds.append(time.perf_counter() - started)
+                seconds.append(time.perf_counter() - start)
     return [
         program.steps / statistics.median(seconds) for program, seconds in zip(programs, times, strict=True)
     ]
@@ -414,7 +414,7 @@ def _median_seconds(call: Callable[[], Any], repeats: int) -> float:
     jax.block_until_ready(call())
     times = []
     for _ in range(repeats):
-        started = time.perf_counter()
+        start = time.perf_counter()
         jax.block_until_ready(call())
-        times.append(time.perf_counter() - started)
+        times.append(time.perf_counter() - start)
     return statistics.median(times)

@@ -168,10 +168,10 @@ def _microseconds(function: Any, parameters: Any, groups: dict[str, Array], repe
     batch = next(iter(groups.values())).shape[0]
 
     def seconds(calls: int) -> float:
-        started = time.perf_counter()
+        start = time.perf_counter()
         for _ in range(calls):
             jax.block_until_ready(function(parameters, groups))
-        return (time.perf_counter() - started) / calls
+        return (time.perf_counter() - start) / calls
 
     seconds(1)
     calls = math.ceil(_MIN_TIMING_S / seconds(1))

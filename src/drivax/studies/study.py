@@ -222,18 +222,18 @@ def _strata(study: Study, test: ScenarioSet) -> Strata:
     """Return the rare test scenarios (labelled, else the most critical), and their share of ordinary traffic."""
     recordings = recordings_of(test.entries)
     rare = event_kinds(test) > 0
-    labelled = bool(rare.any())
-    if not labelled:
+    has_labels = bool(rare.any())
+    if not has_labels:
         scores = curate("kinematic", Request(test)).scenarios
         rare = scores >= np.quantile(scores, 1.0 - study.config.rare)
     ordinary = event_kinds(ScenarioSet.open(study.sets.test[0])) > 0
-    if labelled and not ordinary.any():
+    if has_labels and not ordinary.any():
         raise UsageError(
             "has no labelled event: the share of events in ordinary traffic is unknown",
             file=study.sets.test[0],
             cure="put a test set with the frequency of ordinary traffic first",
         )
-    return Strata(recordings, rare, float(ordinary.mean()) if labelled else None)
+    return Strata(recordings, rare, float(ordinary.mean()) if has_labels else None)
 
 
 def _train_and_evaluate(jobs: Sequence[Job], cores: int | None, log: Log) -> None:
@@ -256,9 +256,9 @@ def _is_finished(job: Job) -> bool:
         return False
     folder = RunFolder.open(run)
     evaluations = [job.study.evaluation(name, job.seed) for name in job.study.evaluations(job.arm)]
-    expected = hashes(ScenarioSet.open(job.study.sets.validation), job.training_set().weights)
+    job_hashes = hashes(ScenarioSet.open(job.study.sets.validation), job.training_set().weights)
     if folder.config(TrainConfig) != job.study.train_config(job.arm, job.seed) or any(
-        folder.info.get(name) != value for name, value in expected.items()
+        folder.info.get(name) != value for name, value in job_hashes.items()
     ):
         raise UsageError(
             "was trained with other settings or weights than those of this study", file=run,
@@ -291,7 +291,7 @@ def _start_time(run: Path) -> datetime:
 
 def _run_job(job: Job) -> float:
     """Train and evaluate an arm; return the elapsed seconds."""
-    started, study = time.perf_counter(), job.study
+    start, study = time.perf_counter(), job.study
     config, run = study.train_config(job.arm, job.seed), study.run(job.arm, job.seed)
     steps = Checkpoints(run / "checkpoints").steps()
     if config.iterations * config.algorithm.steps_per_iteration not in steps:
@@ -307,7 +307,7 @@ def _run_job(job: Job) -> float:
             planner, task = load_policy(run, bank, step=step)
             planner_name = str(run) if step is None else f"{run}@{step}"
             run_evaluation(EvaluationConfig(planner_name, task=task), planner, test, folder)
-    return time.perf_counter() - started
+    return time.perf_counter() - start
 
 
 def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:

@@ -335,12 +335,12 @@ def _read_states(trajectory: Any) -> list[tuple[float, float, float, float]]:
     return [(time_s, float(pose.x), float(pose.y), float(pose.heading)) for time_s, pose in poses]
 
 
-def _axle_speed(before: Any, now: Any) -> float:
+def _axle_speed(last: Any, now: Any) -> float:
     """Return the speed of the rear axle: the component of the centre's speed along the heading."""
-    dx, dy = now[:2] - before[:2]
+    dx, dy = now[:2] - last[:2]
     if math.hypot(dx, dy) < _STILL_M:
         return float(now[MOTION_SPEED])
-    slip = math.atan2(dy, dx) - before[2] - float(wrap(now[2] - before[2])) / 2
+    slip = math.atan2(dy, dx) - last[2] - float(wrap(now[2] - last[2])) / 2
     return float(now[MOTION_SPEED]) * math.cos(slip)
 
 

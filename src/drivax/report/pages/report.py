@@ -115,9 +115,9 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
 
 def _results(runs: Sequence[EpisodeTable]) -> str:
     names = result_tables.metric_names(runs)
-    shown = _first_metrics(runs, names)
-    others = [name for name in result_tables.sort_metrics(names) if name not in shown]
-    table = result_tables.planners_table(runs, shown).html() if shown else ""
+    headline = _first_metrics(runs, names)
+    others = [name for name in result_tables.sort_metrics(names) if name not in headline]
+    table = result_tables.planners_table(runs, headline).html() if headline else ""
     details = (
         f"<summary>{len(others)} more metrics</summary>{result_tables.planners_table(runs, others).html()}"
     )
@@ -133,8 +133,8 @@ def _results(runs: Sequence[EpisodeTable]) -> str:
 
 def _first_metrics(runs: Sequence[EpisodeTable], names: Sequence[str]) -> list[str]:
     """Return the metrics of the first table: crashes, if there were any, and the headline metrics."""
-    crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
-    return [*(["crashed"] if crashed and "crashed" in names else []), *result_tables.headline_names(names)]
+    any_crash = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
+    return [*(["crashed"] if any_crash and "crashed" in names else []), *result_tables.headline_names(names)]
 
 
 def _comparability_warning(runs: Sequence[EpisodeTable]) -> str:
@@ -169,7 +169,7 @@ def _differences(runs: Sequence[EpisodeTable]) -> str:
 
 def _transfer(runs: Sequence[EpisodeTable]) -> str:
     """Return the results by training and evaluation data, or "" if all runs share one set."""
-    parts = "".join(
+    tables_html = "".join(
         f"<h3>{escape(result_tables.metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
         for table in transfer_tables(runs)
     )
@@ -177,7 +177,7 @@ def _transfer(runs: Sequence[EpisodeTable]) -> str:
         "Rows: planners and their training data (– for no training, or unknown data). Columns: "
         "evaluation data. Sets differ in difficulty: compare along a column."
     )
-    return section("Transfer", parts, note=note)
+    return section("Transfer", tables_html, note=note)
 
 
 def _collisions(runs: Sequence[EpisodeTable]) -> str:
@@ -195,13 +195,13 @@ def _collisions(runs: Sequence[EpisodeTable]) -> str:
 
 def _strata(runs: Sequence[EpisodeTable], tags: Tags) -> str:
     """Return the results by kind of scenario, or "" without tags."""
-    parts = "".join(
+    tables_html = "".join(
         f"<details{'' if index else ' open'}><summary>{escape(table.name.replace('-', ' '))}</summary>"
         f"{table.html()}</details>"
         for index, table in enumerate(strata_tables(runs, tags))
     )
     note = "Tags describe the log. Small strata have wide intervals; of many cells, some stand out by chance."
-    return section("By kind of scenario", parts, note=note)
+    return section("By kind of scenario", tables_html, note=note)
 
 
 def _distributions(runs: Sequence[EpisodeTable]) -> str:

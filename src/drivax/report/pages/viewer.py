@@ -59,14 +59,16 @@ def write_player(
     check_output(out, overwrite)
     if not scenarios:
         raise UsageError("no scenarios to show", cure="name at least one")
-    packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
-    unclean = sum(bool(findings(scenario)) for scenario in scenarios)
-    audited = sum(bool(scenario.audit) for scenario in scenarios)
-    audit = f"the audit finds violations in {unclean} of {audited}" if audited else "not audited"
+    episodes = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
+    violation_count = sum(bool(findings(scenario)) for scenario in scenarios)
+    audit_count = sum(bool(scenario.audit) for scenario in scenarios)
+    audit = (
+        f"the audit finds violations in {violation_count} of {audit_count}" if audit_count else "not audited"
+    )
     lead = f"<p class=lead><b>{len(scenarios)}</b> recorded scenarios; {audit}.</p>"
     browser = _browser(scenarios, details or [""] * len(scenarios))
     scripts = [*player_scripts(), asset("browser.js")]
-    write_text(out, page(title, lead, [browser], asset("browser.css"), player_data(packed), scripts))
+    write_text(out, page(title, lead, [browser], asset("browser.css"), player_data(episodes), scripts))
     return out
 
 

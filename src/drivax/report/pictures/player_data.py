@@ -54,11 +54,11 @@ class Scale:
 
     def poses(self, xy: Array, heading: Array, valid: Bool[Array, "..."]) -> Array:
         """Return poses ``[..., 3]`` as int16: position, and heading in 1e-4 rad; ABSENT where not valid."""
-        packed = np.full((*valid.shape, 3), ABSENT, np.int16)
-        packed[valid, :2] = self.points(xy[valid])
+        result = np.full((*valid.shape, 3), ABSENT, np.int16)
+        result[valid, :2] = self.points(xy[valid])
         angle = (np.asarray(heading[valid], np.float64) + np.pi) % (2 * np.pi) - np.pi
-        packed[valid, 2] = np.round(angle * _RADIAN).astype(np.int16)
-        return packed
+        result[valid, 2] = np.round(angle * _RADIAN).astype(np.int16)
+        return result
 
 
 def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) -> dict[str, Any]:
@@ -119,9 +119,9 @@ def _boxes(scale: Scale, boxes: Boxes, poses: Array) -> dict[str, Any]:
 
 
 def _parked_entries(scale: Scale, parked: Boxes) -> dict[str, Any]:
-    seen = parked.valid
+    valid = parked.valid
     poses = scale.poses(parked.xy[0], parked.heading[0], np.ones(len(parked.size), bool))
-    first, last = seen.argmax(axis=0), len(seen) - 1 - seen[::-1].argmax(axis=0)
+    first, last = valid.argmax(axis=0), len(valid) - 1 - valid[::-1].argmax(axis=0)
     return _boxes(scale, parked, poses) | {"seen": _encode(np.stack((first, last), -1).astype(np.int16))}
 
 
@@ -143,8 +143,10 @@ def _rollout(rollout: Rollout, scale: Scale, steps: int) -> dict[str, Any]:
 def _signals(ego: Float[Array, "step 4"], action: Float[Array, "step 2"] | None) -> list[str]:
     values = signals(ego)
     commands = np.full((len(ego), len(COMMANDS)), np.nan) if action is None else action[: len(ego)]
-    packed = [_signal(signal, values[signal.name]) for signal in SIGNALS]
-    return packed + [_signal(signal, column) for signal, column in zip(COMMANDS, commands.T, strict=True)]
+    encoded_signals = [_signal(signal, values[signal.name]) for signal in SIGNALS]
+    return encoded_signals + [
+        _signal(signal, column) for signal, column in zip(COMMANDS, commands.T, strict=True)
+    ]
 
 
 def _signal(signal: Signal, values: Float[Array, " step"]) -> str:

@@ -91,8 +91,8 @@ def _select_episodes(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGr
             cure = "write worst:N with N at least 1, as worst:20"
             raise UsageError(f"{which!r} is not a selection", cure=cure)
         return groups[: int(count)]
-    if requested := [group for group in groups if group.scenario_id == which]:
-        return requested
+    if matches := [group for group in groups if group.scenario_id == which]:
+        return matches
     near = did_you_mean(which, [group.scenario_id for group in groups])
     cure = near if near.startswith("did") else "write worst:N, all, or an id of its episodes.csv"
     raise UsageError(f"no episode of scenario {which!r} is stored", file=runs[-1].folder, cure=cure)
@@ -291,8 +291,8 @@ def draw_frame(scenery: Scenery, rollout: Rollout, step: int, dt_s: float) -> Pi
         name for name in rollout.events if 0 <= rollout.events[name] <= step and name in EVENT_WORDS
     ]
     for line, name in enumerate(past_events):
-        words = f"✕ {EVENT_WORDS[name]} at {rollout.events[name] * dt_s:.1f} s"
-        canvas.text(10, _BAR + 18 + 16 * line, words, 12, "mark")
+        text = f"✕ {EVENT_WORDS[name]} at {rollout.events[name] * dt_s:.1f} s"
+        canvas.text(10, _BAR + 18 + 16 * line, text, 12, "mark")
     _scale_bar(canvas, scale)
     return canvas.pixels()
 
@@ -330,8 +330,8 @@ def legend_strip(width: int, theme: str) -> Picture:
 
 def _last_position(scenario: Scenario, rollout: Rollout, step: int) -> tuple[float, float]:
     """Return the last known position of ego up to a step, else the logged one."""
-    known = np.flatnonzero(np.isfinite(rollout.ego[: step + 1]).all(axis=1))
-    point = rollout.ego[known[-1], :2] if known.size else scenario.agent_xy[step, 0]
+    steps = np.flatnonzero(np.isfinite(rollout.ego[: step + 1]).all(axis=1))
+    point = rollout.ego[steps[-1], :2] if steps.size else scenario.agent_xy[step, 0]
     return float(point[0]), float(point[1])
 
 
