@@ -134,7 +134,7 @@ def measure_events(bench: Path, only: list[str], results: dict[str, Any]) -> dic
     sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
     hashes = {data.path.name: data.hash for data in sets}
     if only and results.get("sets") != hashes:
-        raise SystemExit("the stored results are of other sets: score all methods, without --method")
+        raise SystemExit("the stored results have other sets: score all methods, without --method")
     truth = Truth.of(sets)
     methods = dict(results["methods"]) if only else {}
     for name, test_table, table in score_methods(sets, bench / "train", only or list(METHODS)):
@@ -245,12 +245,12 @@ def measure_speed(paths: list[Path], count: int) -> dict[str, Any]:
         data = (distinct * -(-count // len(distinct)))[:count]
         sizes = Sizes.used(data)
         result: dict[str, Any] = {"scenarios": count, "different": len(distinct)}
-        result["stacking_s"] = min(
-            stacking_s(data, sizes) for _ in range(2)
-        )  # the first one reads from the disk
-        for name, config in {
+        # The first time includes reads from the disk.
+        result["stacking_s"] = min(stacking_s(data, sizes) for _ in range(2))
+        configs = {
             "kinematic": KinematicConfig(), "published": PublishedConfig(), "action_rarity": ExpertActions()
-        }.items():  # fmt: skip
+        }  # fmt: skip
+        for name, config in configs.items():
             score_steps(data, config)
             cpu_start, wall_start = time.process_time(), time.perf_counter()
             score_steps(data, config)

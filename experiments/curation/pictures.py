@@ -121,9 +121,7 @@ def rarity(data: ScenarioSet, out: Path) -> None:
         scenario_actions = action[row, known[row]]
         axes[0].scatter(*scenario_actions.T, s=14, c=LIGHT["ego"], linewidths=0)
         axes[0].scatter(*action[row, step], s=90, facecolors="none", edgecolors=LIGHT["mark"], linewidths=2.0)
-        axes[0].set(
-            xlabel="acceleration", ylabel="steering", title="the actions of this drive among those of the set"
-        )
+        axes[0].set(xlabel="acceleration", ylabel="steering", title="actions of this scenario and of the set")
         axes[0].title.set_fontsize(10)
 
     draw_picture(data, table, 1, draw_plots, out)

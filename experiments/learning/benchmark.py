@@ -262,7 +262,7 @@ def stratify(all_episodes: Mapping[tuple[str, str], Episodes]) -> list[dict[str,
     with np.load(EPISODES / STRATA, allow_pickle=False) as arrays:
         tags, test_hash = {tag: arrays[tag] for tag in TAGS}, str(arrays["test"])
     if any(episodes.about["test"] != test_hash for episodes in all_episodes.values()):
-        raise SystemExit("the tags are those of another test set: evaluate a planner again")
+        raise SystemExit("the stored tags have another test set: evaluate a planner again")
     planners = {
         name: episodes for (name, kind), episodes in all_episodes.items() if kind == "log" and name != BOX
     }

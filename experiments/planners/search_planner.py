@@ -73,7 +73,7 @@ class Trend:
     stood_s: Float[Array, " S"]
 
     @classmethod
-    def logged(cls, bank: ScenarioBank, context: AgentContext) -> Trend:
+    def from_log(cls, bank: ScenarioBank, context: AgentContext) -> Trend:
         """Return the trend of the log over the last half second; parked agents are stationary."""
         now = bank.agents[context.index, context.step]
         past = bank.agents[context.index, jnp.maximum(context.step - _TREND_STEPS, 0)]
@@ -98,7 +98,7 @@ class Trend:
             pad_parked(jnp.zeros(now.shape[0])),
         )
 
-    def updated(self, frame: Frame) -> Trend:
+    def update(self, frame: Frame) -> Trend:
         """Advance by one step."""
         direction, speed = frame.box[:, COS : SIN + 1], _length(frame.velocity)
         defined = frame.valid & self.valid
@@ -145,7 +145,7 @@ class Others:
     vulnerable: Bool[Array, " K"]
 
     @classmethod
-    def near(
+    def nearest(
         cls,
         bank: ScenarioBank,
         context: AgentContext,
@@ -367,7 +367,7 @@ class SearchPlanner:
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Trend:
         """Return the motion trend of the half second before the start."""
-        return Trend.logged(bank, state.context)
+        return Trend.from_log(bank, state.context)
 
     def act(
         self,
@@ -385,12 +385,12 @@ class SearchPlanner:
         path, exists = route_ahead(bank, context.index, context.route_m, offsets)
         desired_mps = jnp.where(exists[1], desired_speed(path, exists, offsets), 0.0)
         stop_m = stop_line_m(bank, context, frame)
-        trend = carry.updated(frame)
-        others = Others.near(bank, context, frame, trend, (path, exists, offsets))
+        trend = carry.update(frame)
+        others = Others.nearest(bank, context, frame, trend, (path, exists, offsets))
         lateral = jnp.clip(situation.surroundings.route.lateral_m, -5.0, 5.0)
         is_blocked = _is_blocked(path, exists, offsets, others, ego_box, stop_m)
 
-        def line_costs(shift: Array) -> tuple[Array, Array, Array]:
+        def line_costs(shift: Array) -> tuple[Array, Array]:
             line = _shifted_line(path, offsets, (lateral, shift), ego_box, speed)
             poses, distance, first_controls = self._drive_line(
                 line, exists, offsets, others, (ego_box, speed, desired_mps, stop_m)
@@ -403,9 +403,9 @@ class SearchPlanner:
             cost += _OFFSET * jnp.abs(shift) + _SHIFT * jnp.abs(shift - lateral)
             cost += _HURRY * (jnp.asarray(_SPEED_FACTORS) > 1.0)
             cost += _BRAKING * jnp.minimum(first_controls[:, 0], 0.0) ** 2 - _PROGRESS * distance
-            return cost, first_controls, line
+            return cost, first_controls
 
-        costs, controls, _ = jax.vmap(line_costs)(jnp.asarray(_SHIFTS))
+        costs, controls = jax.vmap(line_costs)(jnp.asarray(_SHIFTS))
         best = controls.reshape(-1, 2)[jnp.argmin(costs)]
         motion = context.history[-1]
         action = self.actions.action(motion, best[0], best[1], ego_box[LENGTH])

@@ -67,7 +67,7 @@ def generate_set(folder: Path, scenarios: int, seed: int, workers: int, world: W
     if note.is_file():
         source = json.loads((folder / "manifest.json").read_text())["source"]
         if (source["world"], source["config"]) != (WORLD_VERSION, json.loads(json.dumps(asdict(world)))):
-            raise SystemExit(f"{folder} is of another world; remove it")
+            raise SystemExit(f"{folder} has another world version or configuration; remove it")
     else:
         result = generate(folder, scenarios, seed, Generation(workers=workers, world=world, overwrite=True))
         families = {

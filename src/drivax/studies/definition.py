@@ -63,7 +63,7 @@ class Arm:
             seed: Seed of the permutation.
 
         Raises:
-            UsageError: The table is of another method, or no step has a weight or a label.
+            UsageError: The table has another method, or no step has a weight or a label.
         """
         table = tables(self.method)
         if table.method != self.method:
