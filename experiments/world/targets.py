@@ -101,12 +101,13 @@ def measure_set(
     data, rows = ScenarioSet.open(folder), []
     for first in range(0, len(data), CHUNK):
         scenarios = [data[i] for i in range(first, min(first + CHUNK, len(data)))]
-        rows += _chunk(scenarios, planners if evaluated_count is None or first < evaluated_count else ())
+        rows += _measure_chunk(scenarios, planners if evaluated_count is None or first < evaluated_count else ())
         print(f"  {folder.name}: {len(rows)} of {len(data)} scenarios", flush=True)
     return rows
 
 
-def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[str, Any]]:
+def _measure_chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Return the rows of scenarios that fit on the device together."""
     data = load(scenarios)
     rows = [
         {

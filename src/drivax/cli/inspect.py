@@ -126,7 +126,7 @@ def _check_flags(args: Inspect) -> None:
         if getattr(args, name) is not None and not args.observations:
             raise UsageError(f"--{name} needs --observations", cure="add --observations")
     if args.planner is not None and args.task is not None and is_policy(args.planner.partition("@")[0]):
-        raise UsageError("a trained policy has a task of its own", cure="leave out --task")
+        raise UsageError("a trained policy has its own task", cure="leave out --task")
     if args.draw is not None and args.draw.exists() and not args.overwrite:
         raise UsageError(
             "output file already exists", file=args.draw, cure="choose another name or pass --overwrite"
