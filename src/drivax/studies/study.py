@@ -151,7 +151,7 @@ def _write_pages(
         [data[row] for row in table_of_row],
         study.folder / "critical.html",
         overwrite=True,
-        title="most critical drives",
+        title="most critical scenarios",
         details=[criticality_html(table, row) for row, table in table_of_row.items()],
     )
 

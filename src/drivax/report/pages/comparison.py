@@ -116,12 +116,13 @@ def conditions(comparison: Comparison) -> str:
 
 
 def _test_name(metric: MetricComparison) -> str:
+    """Return the name of the test, with its units or its exactness."""
     evidence = metric.evidence
     if evidence.name.startswith("McNemar"):
         return f"{evidence.name}, {evidence.units:,} discordant pairs"
     if metric.seeds > 1:
         return f"{evidence.name} test over seeds and {evidence.units:,} recordings"
-    return f"{evidence.name} test, {'every sign counted' if evidence.exact else 'drawn by recordings'}"
+    return f"{evidence.name} test, {'exact' if evidence.exact else 'by recording'}"
 
 
 def title(comparison: Comparison) -> str:
