@@ -50,8 +50,8 @@ def all_agents(scenario: Scenario) -> tuple[Array, Array, Array, Array, Array]:
     velocity = concatenate(scenario.agent_velocity[:, moving], np.zeros((len(parked), 2)))
     valid = np.concatenate((scenario.agent_valid[:, moving], scenario.parked_valid[:, parked]), axis=1)
     kind = np.concatenate((scenario.agent_kind[moving], scenario.parked_kind[parked]))
-    number = np.concatenate((scenario.agent_id[moving], scenario.parked_id[parked]))
-    return box, velocity, valid, kind, number
+    ids = np.concatenate((scenario.agent_id[moving], scenario.parked_id[parked]))
+    return box, velocity, valid, kind, ids
 
 
 def count_overlapping_pairs(scenario: Scenario) -> int:
@@ -71,8 +71,8 @@ def constant_speed_ttc_s(scenario: Scenario) -> float:
     already avoid the actor). Boxes move at constant velocity; the time of overlapping boxes is 0.
     """
     start, actors = int(scenario.event_start[0]), scenario.event_actor[0]
-    box, velocity, valid, _, number = all_agents(scenario)
-    rows = np.flatnonzero(np.isin(number, actors[actors >= 0]))
+    box, velocity, valid, _, ids = all_agents(scenario)
+    rows = np.flatnonzero(np.isin(ids, actors[actors >= 0]))
     path = _path_ahead(scenario, start)
     speed = float(np.hypot(*scenario.agent_velocity[start, 0]))
     steps = np.arange(start, len(box))

@@ -138,9 +138,9 @@ def draw_family(axes: Axes, scenario: Scenario) -> None:
 
 def draw_event(axes: Axes, scenario: Scenario) -> None:
     """Draw the step at which ego and an actor are closest during the event, with both paths."""
-    box, _, valid, _, number = all_agents(scenario)
+    box, _, valid, _, ids = all_agents(scenario)
     actors = scenario.event_actor[0]
-    rows = np.flatnonzero(np.isin(number, actors[actors >= 0]))
+    rows = np.flatnonzero(np.isin(ids, actors[actors >= 0]))
     first = int(scenario.event_start[0])
     step, actor = nearest(box, valid, rows, first)
     middle = (box[step, 0, :2] + box[step, actor, :2]) / 2

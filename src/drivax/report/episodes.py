@@ -90,7 +90,7 @@ def sort_worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> 
 def choose(runs: Sequence[EpisodeTable], count: int) -> list[EpisodeGroup]:
     """Choose episodes of the last run: failures of every kind in turn, worst score first, and some successes.
 
-    Ties among failures favour those where other planners succeeded; successes are sorted by the failures of others.
+    Among equal failures, those where other planners succeed come first; among successes, those where they fail.
     """
     kinds: dict[str, list[EpisodeGroup]] = {}
     for group in rank_scenarios(runs):
