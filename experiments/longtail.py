@@ -29,18 +29,18 @@ from drivax.studies import report
 from drivax.studies.definition import Stratum, Study, StudyConfig, StudySets, load_study
 from drivax.studies.study import is_evaluated
 from experiments.learning.tables import table
-from experiments.repository import DOCS, RESULTS, STATE, fetched
+from experiments.repository import DOCS, RESULTS, STATE, fetch
 
 KEPT, RESULT = STATE / "longtail", RESULTS / "longtail.json"
 PAGE = DOCS / "results" / "longtail.md"
 BEGIN, END = "<!-- longtail.py: {} -->", "<!-- longtail.py: end -->"
 DEFINITION = load_study("longtail")
-#: What of a folder is kept.
+#: Stored files of a run or evaluation.
 FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv")
 
 
 def keep(folder: Path) -> None:
-    """Store every evaluated arm that is not stored yet, the study's own files, scores and results."""
+    """Store new evaluated arms, the study's own files, and scores."""
     study = _study(folder)
     KEPT.mkdir(parents=True, exist_ok=True)
     _pack([folder], folder, KEPT / "study.tar.xz")
@@ -60,13 +60,13 @@ def keep(folder: Path) -> None:
 
 
 def restore(folder: Path) -> None:
-    """Restore the stored study, or else the one in the repository's history, to the study's folder."""
-    kept = fetched("benchmarks/results/longtail", KEPT)
+    """Restore the stored study, or the study in the repository's history, to a new folder."""
+    state = fetch("benchmarks/results/longtail", KEPT)
     folder.mkdir(parents=True)
-    for file in sorted(kept.glob("*.tar.xz")):
-        with tarfile.open(file) as packed:
-            packed.extractall(folder, filter="data")
-    shutil.copytree(kept / "scores", folder / "scores")
+    for file in sorted(state.glob("*.tar.xz")):
+        with tarfile.open(file) as archive:
+            archive.extractall(folder, filter="data")
+    shutil.copytree(state / "scores", folder / "scores")
 
 
 def finish(folder: Path) -> None:
@@ -84,7 +84,7 @@ def _study(folder: Path) -> Study:
     return Study(DEFINITION, StudyConfig(), StudySets(folder, folder, ()), folder)
 
 
-def filled(page: str, results: dict[str, Any]) -> str:
+def fill_page(page: str, results: dict[str, Any]) -> str:
     """Return the page with the tables of the results."""
     rule = DEFINITION.checkpoints_by.rpartition("/")[2]
     tables = {
@@ -97,9 +97,9 @@ def filled(page: str, results: dict[str, Any]) -> str:
         **{f"claims {group}": report.claims_table(results, group) for group in DEFINITION.groups},
         **{f"rates {stratum}": report.rates_table(results, stratum) for stratum in get_args(Stratum)},
     }
-    for name, shown in tables.items():
-        headings = [column.heading for column in shown.columns]
-        lines = table(headings, [[cell.text for cell in row] for row in shown.rows])
+    for name, results_table in tables.items():
+        headings = [column.heading for column in results_table.columns]
+        lines = table(headings, [[cell.text for cell in row] for row in results_table.rows])
         before, rest = page.split(BEGIN.format(name))
         page = "\n".join([before + BEGIN.format(name), "", *lines, "", END + rest.split(END, 1)[1]])
     return page
@@ -107,13 +107,13 @@ def filled(page: str, results: dict[str, Any]) -> str:
 
 def _pack(folders: list[Path], study: Path, out: Path) -> None:
     """Pack the files of folders, without local paths."""
-    with tarfile.open(out, "w:xz") as packed:
+    with tarfile.open(out, "w:xz") as archive:
         for file in (folder / name for folder in folders for name in FILES):
             if file.is_file():
                 content = _without_paths(file)
                 entry = tarfile.TarInfo(str(file.relative_to(study)))
                 entry.size = len(content)
-                packed.addfile(entry, io.BytesIO(content))
+                archive.addfile(entry, io.BytesIO(content))
 
 
 def _without_paths(file: Path) -> bytes:
@@ -138,7 +138,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     if args.what == "table":
-        PAGE.write_text(filled(PAGE.read_text(), json.loads(RESULT.read_text())))
+        PAGE.write_text(fill_page(PAGE.read_text(), json.loads(RESULT.read_text())))
     elif args.out is None:
         parser.error("the following arguments are required: --out")
     else:

@@ -14,25 +14,25 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 #: JSON summaries, at most 300 kB each.
 RESULTS = ROOT / "experiments" / "results"
-#: Resumable state of long experiments; it may be committed while they run, and is removed when they end.
+#: Resumable state of long experiments; remove it when they end.
 STATE = ROOT / "experiments" / "state"
 #: The last commit whose tree holds episodes, score tables and the weights of every seed.
 STORED = "03b904f"
 
 
-def fetched(path: str, out: Path) -> Path:
-    """Return ``out``, after extracting ``path`` of commit ``STORED`` into it if it does not exist."""
+def fetch(path: str, out: Path) -> Path:
+    """Extract ``path`` of commit ``STORED`` into ``out`` unless it exists, and return ``out``."""
     if not out.exists():
         archive = subprocess.run(
             ["git", "archive", f"{STORED}:{path}"], cwd=ROOT, check=True, capture_output=True
         ).stdout
-        with tarfile.open(fileobj=io.BytesIO(archive)) as packed:
-            packed.extractall(out, filter="data")
+        with tarfile.open(fileobj=io.BytesIO(archive)) as archive_file:
+            archive_file.extractall(out, filter="data")
     return out
 
 
 def save_picture(figure: Figure, out: Path) -> None:
     """Write a figure as a PNG of 256 colours, a third of the size of true colour."""
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png")
-    Image.open(drawn).convert("RGB").quantize(dither=Image.Dither.NONE).save(out, optimize=True)
+    png = io.BytesIO()
+    figure.savefig(png, format="png")
+    Image.open(png).convert("RGB").quantize(dither=Image.Dither.NONE).save(out, optimize=True)

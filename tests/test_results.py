@@ -31,11 +31,11 @@ def test_algorithm_pages_show_stored_results(script, stored):
     assert {page.stem for page in pages} >= {"learning", "bc", "ppo", "sac", "warm-start"}
     for page in pages:
         text = page.read_text()
-        shown = tables.filled(page, learning, training) == text
+        shown = tables.fill_page(page, learning, training) == text
         assert shown, "run python -m experiments.learning.presets table, and read what the pages say about it"
         assert text.count("<!-- presets.py: end -->") * 2 == text.count("<!-- presets.py: ")
     for name in learning.get("curves", {}):
-        assert tables.picture(name).is_file()
+        assert tables.curve_file(name).is_file()
 
 
 def test_speed_page_shows_stored_measurements(script, stored):
@@ -62,7 +62,7 @@ def test_real_files_page_shows_each_planner(script, stored):
 def test_benchmark_page_shows_stored_results(script, stored):
     benchmark = script("learning.benchmark")
     text = benchmark.PAGE.read_text()
-    shown = benchmark.filled(text, stored("benchmark")) == text
+    shown = benchmark.fill_page(text, stored("benchmark")) == text
     assert shown, "run python -m experiments.learning.benchmark table, and read what the page says about it"
     rows = stored("benchmark")["planners"]
     assert rows["expert"]["log"]["accuracy"]["mean"] == 1.0
@@ -75,7 +75,7 @@ def test_progress_until_failure(script):
     events = {"collision": np.array([13, -1, -1]), "offroad": np.array([14, -1, 10])}
     trajectories = types.SimpleNamespace(events=events, ego=motion, start=10)
     results = types.SimpleNamespace(trajectories=trajectories)
-    found = script("learning.benchmark").until_failure(results)
+    found = script("learning.benchmark").metrics_until_failure(results)
     np.testing.assert_array_equal(found["steps_until_failure"], [3, 5, 0])
     np.testing.assert_array_equal(found["metres_until_failure"], [3, 5, 0])
 
@@ -85,16 +85,18 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     benchmark = script("learning.benchmark")
     monkeypatch.setattr(benchmark, "EPISODES", tmp_path)
     monkeypatch.setattr(benchmark, "POLICIES", tmp_path / "policies")
-    few = {name: name for name in (*benchmark.COMPARED, "collision", "offroad")}
+    few = {name: name for name in (*benchmark.DIFFERENCE_METRICS, "collision", "offroad")}
     monkeypatch.setattr(benchmark, "COLUMNS", few)
     for seed in ("seed-0", "seed-1"):
         (tmp_path / "policies" / "bc" / seed).mkdir(parents=True)
-    columns = dict.fromkeys((*benchmark.COLUMNS, *benchmark.UNTIL), np.array([[0.0, 1.0, np.nan]]))
+    columns = dict.fromkeys((*benchmark.COLUMNS, *benchmark.FAILURE_METRICS), np.array([[0.0, 1.0, np.nan]]))
 
     def keep(name, kind, accuracy, test="a"):
         about = {"planner": name, "traffic": kind, "seeds": len(accuracy), "test": test}
         values = columns | {"accuracy": np.array(accuracy)}
-        np.savez(benchmark.file_of(name, kind), about=json.dumps(about), segment=["s", "s", "t"], **values)
+        np.savez(
+            benchmark.episodes_file(name, kind), about=json.dumps(about), segment=["s", "s", "t"], **values
+        )
 
     tags = {tag: ["few", "many", "many"] for tag in benchmark.TAGS}
     np.savez(tmp_path / benchmark.STRATA, test="a", **tags)
@@ -102,7 +104,7 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     keep("idm", "idm", [[1, 0, 0]])
     keep("bc", "log", [[1, 1, 1], [1, 1, 0]])
     keep(benchmark.BOX, "log", [[0, 0, 0]])
-    found = benchmark.judged()
+    found = benchmark.compute_results()
     assert found["planners"]["bc"]["seeds"] == 2
     np.testing.assert_allclose(found["planners"]["bc"]["log"]["accuracy"]["mean"], 5 / 6)
     assert list(found["reactive"]) == ["idm"]
@@ -112,17 +114,17 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     few, many = found["strata"][:2]
     assert (few["value"], few["scenarios"], few["planners"]["bc"]["mean"]) == ("few", 1, 1.0)
     assert (many["scenarios"], many["planners"]["idm"]["mean"]) == (2, 0.5)
-    shown = benchmark.page(found)
+    shown = benchmark.page_tables(found)
     assert [line.split(" | ")[:2] for line in shown["idm"][2:]] == [["| `idm`", "1"]]
     assert shown["random"][2].startswith(f"| {benchmark.BOX} | `log` | 0.5")
     keep("pdm", "log", [[1, 1, 1]], test="b")
     with pytest.raises(SystemExit, match="2 test sets"):
-        benchmark.judged()
+        benchmark.compute_results()
 
 
 def test_curation_page_shows_stored_results(script, stored):
     curation = script("curation.methods")
-    shown = curation.filled(curation.PAGE.read_text(), stored("curation")) == curation.PAGE.read_text()
+    shown = curation.fill_page(curation.PAGE.read_text(), stored("curation")) == curation.PAGE.read_text()
     assert shown, "run python -m experiments.curation.methods table, and read what the page says about it"
 
 
@@ -153,7 +155,7 @@ def found(script):
 def test_longtail_page_shows_stored_results(script, found):
     longtail = script("longtail")
     text = longtail.PAGE.read_text()
-    assert longtail.filled(text, found) == text, (
+    assert longtail.fill_page(text, found) == text, (
         "run python -m experiments.longtail table, and read what the page says about it"
     )
 
@@ -224,7 +226,7 @@ def test_learning_tables(script, learning):
     }
 
     def lines(what, *names, page=tables.FOLDER / "ppo.md"):
-        return tables.written(what, list(names), learning, training, page).splitlines()
+        return tables.format_block(what, list(names), learning, training, page).splitlines()
 
     rows = [line.split(" | ") for line in lines("reached")]
     assert [row[0] for row in rows[2:]] == ["| ppo", "| idm", "| bc"]
@@ -249,7 +251,7 @@ def test_learning_tables(script, learning):
 
 def test_curves_show_every_seed(script, learning):
     curves = learning["curves"]["ppo"]
-    (axes,) = script("learning.tables").drawn("ppo", curves).axes
+    (axes,) = script("learning.tables").draw_curves("ppo", curves).axes
     assert axes.get_ylabel() == "validation success"
     for line, (seed, points) in zip(axes.lines, curves["success"].items(), strict=True):
         assert line.get_label() == seed

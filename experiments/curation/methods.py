@@ -58,9 +58,9 @@ from experiments.repository import DOCS, RESULTS
 STORED = RESULTS / "curation.json"
 PAGE = DOCS / "results" / "curation.md"
 BEGIN, END = "<!-- methods.py: {} -->", "<!-- methods.py: end -->"
-#: An event forces a reaction where it asks for no less braking than IDM finds comfortable, m/s2.
+#: Minimum required braking of an event that forces a reaction: IDM's comfortable braking, m/s2.
 FORCED_MPS2 = 3.0
-SCORED = (
+METHODS = (
     "kinematic", "published", "ensemble", "ensemble_mixture", "action_rarity", "action_rarity_published"
 )  # fmt: skip
 #: Ensemble of point estimates, and of mixtures, which can disagree about modes.
@@ -71,7 +71,7 @@ ENSEMBLES = {
     ),
 }
 #: Share of scenarios with an event in an ordinary set (``WorldConfig.rare_rate``).
-NATURAL = 0.05
+NATURAL_RATE = 0.05
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Truth:
 
     @classmethod
     def of(cls, sets: list[ScenarioSet]) -> Truth:
-        """Of sets, one after the other."""
+        """Return the facts of several sets, concatenated."""
         entries = [entry for data in sets for entry in data.entries]
         return cls(
             np.concatenate([event_kinds(data) for data in sets]),
@@ -95,19 +95,19 @@ class Truth:
         )
 
     def groups(self) -> dict[str, Any]:
-        """Masks of scenarios to detect: all events, events with and without a forced reaction, each kind."""
-        forced = self.severity >= FORCED_MPS2
-        found = {
-            "all": self.kind > 0, "forced": (self.kind > 0) & forced, "mild": (self.kind > 0) & ~forced
+        """Return masks of scenarios to detect: all events, with and without a forced reaction, and each kind."""
+        is_forced = self.severity >= FORCED_MPS2
+        groups = {
+            "all": self.kind > 0, "forced": (self.kind > 0) & is_forced, "mild": (self.kind > 0) & ~is_forced
         }  # fmt: skip
-        return found | {kind.name.lower(): self.kind == kind for kind in EventKind if kind}
+        return groups | {kind.name.lower(): self.kind == kind for kind in EventKind if kind}
 
 
-def measured(truth: Truth, events: Any, steps: Any, scenarios: Any) -> dict[str, Any]:
-    """Return how well scores detect a group of events among scenarios without an event, at both scales."""
+def measure_detection(truth: Truth, events: Any, steps: Any, scenarios: Any) -> dict[str, Any]:
+    """Measure how well scores detect a group of events among scenarios without an event, at both scales."""
     rows = events | (truth.kind == 0)
     label = events[rows]
-    weight = np.where(label, NATURAL / label.sum(), (1 - NATURAL) / (~label).sum())
+    weight = np.where(label, NATURAL_RATE / label.sum(), (1 - NATURAL_RATE) / (~label).sum())
     _, precision = bootstrap_intervals(scenarios[rows], label, weight, np.arange(len(label)))
     valid = truth.valid[rows]
     step_label = (truth.during & events[:, None])[rows][valid]
@@ -129,172 +129,185 @@ def measured(truth: Truth, events: Any, steps: Any, scenarios: Any) -> dict[str,
     }
 
 
-def events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, Any]:
+def measure_events(bench: Path, only: list[str], results: dict[str, Any]) -> dict[str, Any]:
     """Evaluate methods (default: all) on both test sets and merge them with stored results."""
     sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
     hashes = {data.path.name: data.hash for data in sets}
-    if only and stored.get("sets") != hashes:
-        raise SystemExit("what is stored is of other sets: score all methods, without --method")
+    if only and results.get("sets") != hashes:
+        raise SystemExit("the stored results have other sets: score all methods, without --method")
     truth = Truth.of(sets)
-    methods = dict(stored["methods"]) if only else {}
-    for name, own, both in scored(sets, bench / "train", only or list(SCORED)):
-        methods[name] = found_by(truth, both) | {"draws": draws(own)}
-        methods[name] |= {key: value for key, value in own.config.items() if key.startswith("error_rank_")}
+    methods = dict(results["methods"]) if only else {}
+    for name, test_table, table in score_methods(sets, bench / "train", only or list(METHODS)):
+        methods[name] = measure_method(truth, table) | {"draws": weight_statistics(test_table)}
+        methods[name] |= {
+            key: value for key, value in test_table.config.items() if key.startswith("error_rank_")
+        }
         if name == "kinematic":
-            methods["random_matched"] = found_by(truth, permute_scores(both, 0)) | {
-                "draws": draws(permute_scores(own, 0))
+            methods["random_matched"] = measure_method(truth, permute_scores(table, 0)) | {
+                "draws": weight_statistics(permute_scores(test_table, 0))
             }
         print(f"{name}: {methods[name]['events']['forced']['auc']:.3f}", flush=True)
-    return {"sets": hashes, "forced_mps2": FORCED_MPS2, "natural": NATURAL, "methods": methods}
+    return {"sets": hashes, "forced_mps2": FORCED_MPS2, "natural": NATURAL_RATE, "methods": methods}
 
 
-def scored(
+def score_methods(
     sets: list[ScenarioSet], train: Path, names: list[str]
 ) -> Iterator[tuple[str, ScoreTable, ScoreTable]]:
-    """Return, by method, the score table of the first set and of all sets concatenated."""
+    """Yield each method with the score tables of the first set and of all sets concatenated."""
     for name in ("kinematic", "published"):
         if name in names:
             tables = [curate(name, Request(data)) for data in sets]
-            yield name, tables[0], joined(tables)
+            yield name, tables[0], concatenate_tables(tables)
     for name in ("ensemble", "ensemble_mixture"):
         if name in names:
             ensemble = train_ensemble(ENSEMBLES[name], ScenarioSet.open(train))
             first = ensemble_table(ensemble, sets[0])
             rest = [ensemble_table(ensemble, data, scale=first.config["scale"]) for data in sets[1:]]
             interval = {"error_rank_interval": error_interval(ensemble, first, sets[0])}
-            yield name, replace(first, config={**first.config, **interval}), joined([first, *rest])
+            yield (
+                name,
+                replace(first, config={**first.config, **interval}),
+                concatenate_tables([first, *rest]),
+            )
     rarities = {"action_rarity": KernelRarity(), "action_rarity_published": PublishedRarity()}
     if not rarities.keys() & set(names):
         return
     actions = [score_steps(data, ExpertActions()) for data in sets]
     for name, config in rarities.items():
-        usual = actions[0]["action"][actions[0]["known"]].astype(np.float64)
+        test_actions = actions[0]["action"][actions[0]["known"]].astype(np.float64)
         tables = []
-        for data, found in zip(sets, actions, strict=True):
-            known, steps = found["known"], np.zeros(found["known"].shape)
-            steps[known] = config.scores(usual, found["action"][known].astype(np.float64))
+        for data, expert in zip(sets, actions, strict=True):
+            known, steps = expert["known"], np.zeros(expert["known"].shape)
+            steps[known] = config.scores(test_actions, expert["action"][known].astype(np.float64))
             tables.append(make_table(name, config, data, {"rarity": steps}))
-        yield name, tables[0], joined(tables)
+        yield name, tables[0], concatenate_tables(tables)
 
 
-def checked(paths: list[Path]) -> dict[str, Any]:
-    """Return how well ``kinematic`` detects events that force a reaction, by set."""
-    found = {}
+def check_sets(paths: list[Path]) -> dict[str, Any]:
+    """Measure how well ``kinematic`` detects events that force a reaction, by set."""
+    results = {}
     for path in paths:
         data = ScenarioSet.open(path)
         truth, scores = Truth.of([data]), curate("kinematic", Request(data)).scenarios
         events = truth.groups()["forced"]
         rows = events | (truth.kind == 0)
-        found[path.name] = {
+        results[path.name] = {
             "hash": data.hash,
             "scenarios": int(rows.sum()),
             "events": int(events.sum()),
             "auc": roc_auc(scores[rows], events[rows]),
             "auc_interval": auc_interval(scores[rows], events[rows]),
         }
-    return {"checks": found}
+    return {"checks": results}
 
 
 def error_interval(ensemble: Ensemble, table: ScoreTable, data: ScenarioSet) -> tuple[float, float]:
-    """Bootstrap 95 % interval, over scenarios, of the rank correlation of step scores and errors."""
+    """Return the bootstrap 95 % interval, over scenarios, of the rank correlation of step scores and errors."""
     predictions = ensemble.predictions(data)
     error, known = predictions.error(ensemble.deviation, None), predictions.known
     return correlation_interval(table.steps[known], error[known], np.nonzero(known)[0])
 
 
-def joined(tables: list[ScoreTable]) -> ScoreTable:
+def concatenate_tables(tables: list[ScoreTable]) -> ScoreTable:
     """Concatenate score tables."""
     first = tables[0]
-    stacked = {
+    arrays = {
         name: np.concatenate([getattr(table, name) for table in tables])
         for name in ("valid", "steps", "scenarios")
     }
     ids = sum((table.scenario_ids for table in tables), ())
-    return ScoreTable(first.method, first.config, "both", ids, **stacked)
+    return ScoreTable(first.method, first.config, "both", ids, **arrays)
 
 
-def found_by(truth: Truth, table: ScoreTable) -> dict[str, Any]:
+def measure_method(truth: Truth, table: ScoreTable) -> dict[str, Any]:
     """Measure one method on every group of events."""
     return {
         "events": {
-            name: measured(truth, events, table.steps, table.scenarios)
+            name: measure_detection(truth, events, table.steps, table.scenarios)
             for name, events in truth.groups().items()
         }
     }
 
 
-def draws(table: ScoreTable) -> dict[str, Any]:
-    """Statistics of the default weights of a table."""
+def weight_statistics(table: ScoreTable) -> dict[str, Any]:
+    """Return statistics of the default weights of a table."""
     return {
         scale: vars(draw_statistics(sampling_weights(table, WeightConfig(), scale), table.drawable))
         for scale in ("step", "scenario")
     }
 
 
-def speed(paths: list[Path], count: int) -> dict[str, Any]:
-    """Seconds to score ``count`` scenarios of each set, including reading and stacking, without compilation."""
-    found: dict[str, Any] = {}
+def measure_speed(paths: list[Path], count: int) -> dict[str, Any]:
+    """Time the scoring of ``count`` scenarios of each set, with reading and stacking, without compilation."""
+    results: dict[str, Any] = {}
     for path in paths:
-        known = list(ScenarioSet.open(path)[:count])
-        data = (known * -(-count // len(known)))[:count]
+        distinct = list(ScenarioSet.open(path)[:count])
+        data = (distinct * -(-count // len(distinct)))[:count]
         sizes = Sizes.used(data)
-        one: dict[str, Any] = {"scenarios": count, "different": len(known)}
-        one["stacking_s"] = min(stacking(data, sizes) for _ in range(2))  # the first one reads from the disk
-        for name, of in {
+        result: dict[str, Any] = {"scenarios": count, "different": len(distinct)}
+        # The first time includes reads from the disk.
+        result["stacking_s"] = min(stacking_s(data, sizes) for _ in range(2))
+        configs = {
             "kinematic": KinematicConfig(), "published": PublishedConfig(), "action_rarity": ExpertActions()
-        }.items():  # fmt: skip
-            score_steps(data, of)
-            began, wall = time.process_time(), time.perf_counter()
-            score_steps(data, of)
-            one[name] = {"cpu_s": time.process_time() - began, "wall_s": time.perf_counter() - wall}
-        found[path.name] = one
-    return {"cores": len(os.sched_getaffinity(0)), "sets": found}
+        }  # fmt: skip
+        for name, config in configs.items():
+            score_steps(data, config)
+            cpu_start, wall_start = time.process_time(), time.perf_counter()
+            score_steps(data, config)
+            result[name] = {
+                "cpu_s": time.process_time() - cpu_start,
+                "wall_s": time.perf_counter() - wall_start,
+            }
+        results[path.name] = result
+    return {"cores": len(os.sched_getaffinity(0)), "sets": results}
 
 
-def stacking(data: list[Any], sizes: Sizes) -> float:
-    """CPU seconds to stack scenarios batch by batch, as scoring does."""
-    began = time.process_time()
+def stacking_s(data: list[Any], sizes: Sizes) -> float:
+    """Return the CPU seconds to stack scenarios in batches, as scoring does."""
+    start = time.process_time()
     for first in range(0, len(data), BATCH):
         ScenarioBank.from_scenarios(data[first : first + BATCH], trim=sizes)
-    return time.process_time() - began
+    return time.process_time() - start
 
 
-def events_table(stored: dict[str, Any]) -> str:
+def events_table(results: dict[str, Any]) -> str:
     """Table by method: all events and those that force a reaction, at both scales."""
     lines = [
         "| method | events | scenarios: AUC | precision | steps: AUC | precision |",
         "|---|---|---|---|---|---|",
     ]
-    for method, found in stored["methods"].items():
+    for method, method_results in results["methods"].items():
         for group, words in (("forced", "that force a reaction"), ("mild", "that do not"), ("all", "all")):
-            one = found["events"][group]
+            result = method_results["events"][group]
             measures = (("auc", 3), ("precision", 2), ("step_auc", 3), ("step_precision", 2))
-            cells = " | ".join(cell(one, *measure) for measure in measures)
-            lines.append(f"| `{method}` | {words} ({one['scenarios']}) | {cells} |")
+            cells = " | ".join(format_cell(result, *measure) for measure in measures)
+            lines.append(f"| `{method}` | {words} ({result['scenarios']}) | {cells} |")
     return "\n".join(lines)
 
 
-def cell(one: dict[str, Any], measure: str, digits: int) -> str:
+def format_cell(result: dict[str, Any], measure: str, digits: int) -> str:
     """Format a value with its interval."""
-    low, high = one[f"{measure}_interval"]
-    return f"{one[measure]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    low, high = result[f"{measure}_interval"]
+    return f"{result[measure]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def ensemble_checks_table(stored: dict[str, Any]) -> str:
+def ensemble_checks_table(results: dict[str, Any]) -> str:
     """Table of the correlation of disagreement and errors."""
     lines = ["| ensemble | rank correlation of scores and errors, by step |", "|---|---|"]
     for name in ENSEMBLES:
-        one = stored["methods"][name]
-        low, high = one["error_rank_interval"]
-        lines.append(f"| `{name}` | {one['error_rank_correlation']:.2f} [{low:.2f}, {high:.2f}] |")
+        result = results["methods"][name]
+        low, high = result["error_rank_interval"]
+        lines.append(f"| `{name}` | {result['error_rank_correlation']:.2f} [{low:.2f}, {high:.2f}] |")
     return "\n".join(lines)
 
 
-def checks_table(stored: dict[str, Any]) -> str:
+def checks_table(results: dict[str, Any]) -> str:
     """Table of ``kinematic`` on other sets."""
     lines = ["| set | scenarios | of them with an event that forces a reaction | AUC |", "|---|---|---|---|"]
-    for name, one in stored["checks"].items():
-        lines.append(f"| `{name}` | {one['scenarios']} | {one['events']} | {cell(one, 'auc', 3)} |")
+    for name, result in results["checks"].items():
+        lines.append(
+            f"| `{name}` | {result['scenarios']} | {result['events']} | {format_cell(result, 'auc', 3)} |"
+        )
     return "\n".join(lines)
 
 
@@ -305,9 +318,9 @@ def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
     lines = ["| event | scenarios | " + " | ".join(f"`{name}`" for name in methods) + " |"]
     lines.append("|---|---|" + "---|" * len(methods))
     for kind in kinds:
-        ones = [found["events"][kind] for found in methods.values()]
-        cells = " | ".join(cell(one, measure, digits) for one in ones)
-        lines.append(f"| `{kind}` | {ones[0]['scenarios']} | {cells} |")
+        results = [method_results["events"][kind] for method_results in methods.values()]
+        cells = " | ".join(format_cell(result, measure, digits) for result in results)
+        lines.append(f"| `{kind}` | {results[0]['scenarios']} | {cells} |")
     return "\n".join(lines)
 
 
@@ -317,11 +330,11 @@ def draws_table(stored: dict[str, Any]) -> str:
         "| method | scale | effective sample | of scenarios | tilt | largest | draws from 5 % |",
         "|---|---|---|---|---|---|---|",
     ]
-    for method, found in stored["methods"].items():
-        for scale, one in found["draws"].items():
+    for method, results in stored["methods"].items():
+        for scale, draws in results["draws"].items():
             lines.append(
-                f"| `{method}` | {scale} | {one['effective']:.2f} | {one['effective_scenarios']:.2f} | "
-                f"{one['tilt']:.2f} | {one['largest']:.2f} | {one['concentration']:.2f} |"
+                f"| `{method}` | {scale} | {draws['effective']:.2f} | {draws['effective_scenarios']:.2f} | "
+                f"{draws['tilt']:.2f} | {draws['largest']:.2f} | {draws['concentration']:.2f} |"
             )
     return "\n".join(lines)
 
@@ -333,16 +346,16 @@ def speed_table(stored: dict[str, Any]) -> str:
         f"| set | method | 10,000 scenarios on {cores} cores (s) | processor seconds | over stacking alone |",
         "|---|---|---|---|---|",
     ]
-    for path, one in stored["speed"]["sets"].items():
-        times = 10_000 / one["scenarios"]
+    for path, result in stored["speed"]["sets"].items():
+        factor = 10_000 / result["scenarios"]
         for name in ("kinematic", "published", "action_rarity"):
-            cpu, wall = (one[name][kind] * times for kind in ("cpu_s", "wall_s"))
-            over = cpu / times / one["stacking_s"]
-            lines.append(f"| `{path}` | `{name}` | {wall:,.0f} | {cpu:,.0f} | {over:.1f} |")
+            cpu, wall = (result[name][kind] * factor for kind in ("cpu_s", "wall_s"))
+            ratio = cpu / factor / result["stacking_s"]
+            lines.append(f"| `{path}` | `{name}` | {wall:,.0f} | {cpu:,.0f} | {ratio:.1f} |")
     return "\n".join(lines)
 
 
-def filled(text: str, stored: dict[str, Any]) -> str:
+def fill_page(text: str, stored: dict[str, Any]) -> str:
     """Return the page with the stored tables."""
     tables = {
         "events": events_table(stored),
@@ -369,21 +382,21 @@ def main() -> None:
     )
     parser.add_argument("what", choices=("events", "check", "speed", "table"))
     parser.add_argument("--bench", type=Path)
-    parser.add_argument("--method", nargs="+", choices=SCORED, default=[])
+    parser.add_argument("--method", nargs="+", choices=METHODS, default=[])
     parser.add_argument("--data", type=Path, nargs="+")
     parser.add_argument("--count", type=int, default=1024)
     args = parser.parse_args()
     stored = json.loads(STORED.read_text()) if STORED.exists() else {}
     if args.what == "table":
-        PAGE.write_text(filled(PAGE.read_text(), stored))
+        PAGE.write_text(fill_page(PAGE.read_text(), stored))
         return
     if args.what == "events":
-        made = events(args.bench, args.method, stored)
+        results = measure_events(args.bench, args.method, stored)
     elif args.what == "check":
-        made = checked(args.data)
+        results = check_sets(args.data)
     else:
-        made = {"speed": speed(args.data, args.count)}
-    STORED.write_text(json.dumps(stored | made, indent=1) + "\n")
+        results = {"speed": measure_speed(args.data, args.count)}
+    STORED.write_text(json.dumps(stored | results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

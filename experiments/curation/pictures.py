@@ -28,13 +28,13 @@ from experiments.repository import DOCS, save_picture
 
 mpl.use("Agg")
 
-#: Width, height, inches; dots per inch; half the side of the scene, m.
+#: Width and height, inches; dots per inch; half the side of the drawn map, m.
 SIZE, DPI, REACH_M = (11.0, 4.4), 100, 40.0
-#: Draws the plots next to the scene, for a scenario of the table at a step.
+#: Draws the plots next to the map, for a scenario (row) at a step.
 DrawPlots = Callable[[list[Axes], int, int], None]
 
 
-def picture(data: ScenarioSet, table: ScoreTable, plots: int, draw_plots: DrawPlots, out: Path) -> None:
+def draw_picture(data: ScenarioSet, table: ScoreTable, plots: int, draw_plots: DrawPlots, out: Path) -> None:
     """Draw the most critical scenario at its most critical step, with plots next to it."""
     row = int(table.order[0])
     step = int(table.steps[row].argmax())
@@ -49,10 +49,10 @@ def picture(data: ScenarioSet, table: ScoreTable, plots: int, draw_plots: DrawPl
     print(f"{out.name}: {table.scenario_ids[row]}, step {step}")
 
 
-def over_time(axes: Axes, step: int, what: str) -> None:
+def label_time_axis(axes: Axes, step: int, title: str) -> None:
     """Label the time axis in seconds and mark the drawn step."""
     axes.axvline(step * DT_S, color=LIGHT["log"], linewidth=1.0, linestyle=":")
-    axes.set(xlabel="s", xlim=(0.0, (STEPS - 1) * DT_S), title=what)
+    axes.set(xlabel="s", xlim=(0.0, (STEPS - 1) * DT_S), title=title)
     axes.title.set_fontsize(10)
     axes.spines[["top", "right"]].set_visible(False)
 
@@ -63,16 +63,16 @@ def kinematic(data: ScenarioSet, out: Path) -> None:
 
     def draw_plots(axes: list[Axes], row: int, step: int) -> None:
         valid = np.flatnonzero(table.valid[row])
-        parts = {
+        components = {
             name: weight * table.components[name][row, valid] for name, weight in _weights(table).items()
         }
-        labels = [name.replace("_", " ") for name in parts]
-        axes[0].stackplot(valid * DT_S, list(parts.values()), labels=labels, colors=SERIES)
+        labels = [name.replace("_", " ") for name in components]
+        axes[0].stackplot(valid * DT_S, list(components.values()), labels=labels, colors=SERIES)
         axes[0].legend(fontsize=8, frameon=False, loc="upper left")
         axes[0].set_ylim(0.0, 1.0)
-        over_time(axes[0], step, "components times their weights: the score of a step is their sum")
+        label_time_axis(axes[0], step, "components times their weights: the score of a step is their sum")
 
-    picture(data, table, 1, draw_plots, out)
+    draw_picture(data, table, 1, draw_plots, out)
 
 
 def _weights(table: ScoreTable) -> dict[str, float]:
@@ -86,45 +86,45 @@ def ensemble(data: ScenarioSet, out: Path) -> None:
 
     def draw_plots(axes: list[Axes], row: int, step: int) -> None:
         known = np.flatnonzero(predictions.known[row])
-        for number, (name, part) in enumerate({"acceleration": axes[0], "steering": axes[1]}.items()):
-            part.plot(
+        for number, (name, panel) in enumerate({"acceleration": axes[0], "steering": axes[1]}.items()):
+            panel.plot(
                 known * DT_S, predictions.action[row, known, :, number], color=LIGHT["ego"], linewidth=0.9
             )
-            part.plot(known * DT_S, predictions.expert[row, known, number], color=LIGHT["ink"], linewidth=1.6)
-            over_time(
-                part,
+            panel.plot(
+                known * DT_S, predictions.expert[row, known, number], color=LIGHT["ink"], linewidth=1.6
+            )
+            label_time_axis(
+                panel,
                 step,
-                f"{name}: five members, and (black) what the expert did; units of the action space",
+                f"{name}: five members, and the expert (black); units of the action space",
             )
         valid = np.flatnonzero(table.valid[row])
         axes[2].fill_between(valid * DT_S, table.steps[row, valid], color=LIGHT["mark"])
         axes[2].set_ylim(0.0, 1.0)
-        over_time(axes[2], step, "score, by the variance among them")
+        label_time_axis(axes[2], step, "score, by the variance among them")
 
-    picture(data, table, 3, draw_plots, out)
+    draw_picture(data, table, 3, draw_plots, out)
 
 
 def rarity(data: ScenarioSet, out: Path) -> None:
     """Plot the density of all actions, and the actions of the scenario."""
     table = curate("action_rarity", Request(data))
-    found = score_steps(data, ExpertActions(), None)
-    action, known = np.asarray(found["action"]), np.asarray(found["known"])
-    side = np.linspace(-1.0, 1.0, 201)
-    places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    density = KernelRarity().density(action[known], places).reshape(201, 201)
+    expert = score_steps(data, ExpertActions(), None)
+    action, known = np.asarray(expert["action"]), np.asarray(expert["known"])
+    ticks = np.linspace(-1.0, 1.0, 201)
+    grid = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+    density = KernelRarity().density(action[known], grid).reshape(201, 201)
 
     def draw_plots(axes: list[Axes], row: int, step: int) -> None:
-        seen: Any = axes[0].pcolormesh(side, side, np.log10(density + 1e-4), cmap="Greys", rasterized=True)
-        axes[0].figure.colorbar(seen, ax=axes[0], label="density of all actions, power of ten")
-        mine = action[row, known[row]]
-        axes[0].scatter(*mine.T, s=14, c=LIGHT["ego"], linewidths=0)
+        mesh: Any = axes[0].pcolormesh(ticks, ticks, np.log10(density + 1e-4), cmap="Greys", rasterized=True)
+        axes[0].figure.colorbar(mesh, ax=axes[0], label="density of all actions, power of ten")
+        scenario_actions = action[row, known[row]]
+        axes[0].scatter(*scenario_actions.T, s=14, c=LIGHT["ego"], linewidths=0)
         axes[0].scatter(*action[row, step], s=90, facecolors="none", edgecolors=LIGHT["mark"], linewidths=2.0)
-        axes[0].set(
-            xlabel="acceleration", ylabel="steering", title="the actions of this drive among those of the set"
-        )
+        axes[0].set(xlabel="acceleration", ylabel="steering", title="actions of this scenario and of the set")
         axes[0].title.set_fontsize(10)
 
-    picture(data, table, 1, draw_plots, out)
+    draw_picture(data, table, 1, draw_plots, out)
 
 
 def main() -> None:

@@ -48,40 +48,40 @@ from experiments.repository import RESULTS, ROOT
 
 RESULT = RESULTS / "aggressive.json"
 ZOO = ROOT / "src" / "drivax" / "zoo"
-OWN = tuple(
+OWN_METRICS = tuple(
     f"boldness:{name}"
     for name in ("speed_ratio", "short_ttc", "lane_changes", "max_acceleration", "max_braking")
 )
-BOLD = tuple(name.partition(":")[2] for name in OWN)
+BOLD_METRICS = tuple(name.partition(":")[2] for name in OWN_METRICS)
 FAILURES = ("collision", "at_fault_collision", "offroad", "red_light")
-#: Vehicles per scenario in whose place the policies are measured, and how many are driven side by side.
+#: Number of vehicles per scenario to replace by the policies, and number of parallel simulations.
 OTHERS, BATCH = 2, 64
 
 Table = dict[str, dict[str, Any]]
 
 
-def in_egos_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> dict[str, Any]:
+def evaluate_as_ego(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> dict[str, Any]:
     """Evaluate log, IDM, behaviour cloning and aggressive policy as ego."""
     drivers: dict[str, tuple[Planner, Task]] = {
         "log": (make_planner("expert"), Task()),
         "idm": (make_planner("idm"), Task()),
         **{name: load_policy(runs / name, bank) for name in ("clone", "aggressive")},
     }
-    metrics_shown = (*BOLD, "min_ttc", *FAILURES, "off_route", "progress_ratio", "success")
-    driven = {
-        name: evaluate(planner, bank, names, task=replace(task, metrics=OWN))
+    metrics_shown = (*BOLD_METRICS, "min_ttc", *FAILURES, "off_route", "progress_ratio", "success")
+    episodes = {
+        name: evaluate(planner, bank, names, task=replace(task, metrics=OWN_METRICS))
         for name, (planner, task) in drivers.items()
     }
-    against = {
+    differences = {
         other: {
-            metric: paired_differences(driven["aggressive"], driven[other], metric).as_dict()
+            metric: paired_differences(episodes["aggressive"], episodes[other], metric).as_dict()
             for metric in metrics_shown
         }
         for other in ("clone", "log")
     }
     return {
-        "drivers": {name: _summary(found, metrics_shown) for name, found in driven.items()},
-        "minus": against,
+        "drivers": {name: _summary(table, metrics_shown) for name, table in episodes.items()},
+        "minus": differences,
     }
 
 
@@ -90,7 +90,7 @@ def _summary(episodes: EpisodeTable, names: tuple[str, ...]) -> dict[str, Any]:
     return {name: metrics[name] for name in names}
 
 
-def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
+def evaluate_as_others(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
     """Evaluate both policies in place of the vehicles nearest to ego, one at a time, among logged agents."""
     traffic = policy_traffic(runs / "aggressive", count=OTHERS)
     start = jax.jit(jax.vmap(lambda bank, row: traffic.start(bank, row, CURRENT_STEP), (None, 0)))
@@ -98,94 +98,101 @@ def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path)
     for name in ("clone", "aggressive"):
         planner, task = load_policy(runs / name, bank)
         slots = np.asarray(start(with_driver(bank, planner), jnp.arange(len(bank))).contexts.slot)
-        row, place = np.nonzero(slots < bank.agents.shape[2])
-        values = _driven(
-            Simulator(evaluation_task(replace(task, metrics=OWN))), planner, bank, row, slots[row, place]
+        row, column = np.nonzero(slots < bank.agents.shape[2])
+        values = _agent_metrics(
+            Simulator(evaluation_task(replace(task, metrics=OWN_METRICS))),
+            planner,
+            bank,
+            row,
+            slots[row, column],
         )
         segments = np.array([names[number]["segment"] for number in row])
         table[name] = {
             metric: interval_of(metric, values[metric], segments).as_dict()
-            for metric in (*BOLD, "min_ttc", *FAILURES, "left_map")
+            for metric in (*BOLD_METRICS, "min_ttc", *FAILURES, "left_map")
         }
     return table
 
 
-def _driven(
+def _agent_metrics(
     simulator: Simulator,
     planner: Planner,
     bank: ScenarioBank,
     row: np.ndarray[Any, Any],
     slot: np.ndarray[Any, Any],
 ) -> dict[str, np.ndarray[Any, Any]]:
-    """Return metrics of a planner-driven agent for each row; NaN where undefined."""
+    """Return the metrics of the agent that the planner drives in each row, NaN where undefined."""
 
-    def one(planner: Planner, bank: ScenarioBank, row: jax.Array, slot: jax.Array) -> Any:
+    def drive_agent(planner: Planner, bank: ScenarioBank, row: jax.Array, slot: jax.Array) -> Any:
         keys = jax.random.key(0)[None]
         return drive(simulator, planner, bank, row[None], keys, CURRENT_STEP, slot).metrics
 
-    many = jax.jit(jax.vmap(one, (None, None, 0, 0)))
-    parts = []
+    drive_batch = jax.jit(jax.vmap(drive_agent, (None, None, 0, 0)))
+    batches = []
     for first in range(0, len(row), BATCH):
-        chosen = np.arange(first, first + BATCH).clip(max=len(row) - 1)
-        found = jax.device_get(many(planner, bank, jnp.asarray(row[chosen]), jnp.asarray(slot[chosen])))
-        kept = min(BATCH, len(row) - first)
-        parts.append({name: np.where(v.defined, v.value, np.nan)[:kept, 0] for name, v in found.items()})
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        indices = np.arange(first, first + BATCH).clip(max=len(row) - 1)
+        metrics = jax.device_get(
+            drive_batch(planner, bank, jnp.asarray(row[indices]), jnp.asarray(slot[indices]))
+        )
+        count = min(BATCH, len(row) - first)
+        batches.append({name: np.where(v.defined, v.value, np.nan)[:count, 0] for name, v in metrics.items()})
+    return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
 
 
-def in_traffic(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
+def evaluate_in_traffic(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
     """Evaluate an IDM car along its route in each kind of traffic."""
     kinds = {name: find_traffic(name) for name in ("log", "idm")}
     kinds |= {name: policy_traffic(runs / name) for name in ("clone", "aggressive")}
     metrics_shown = ("short_ttc", "min_ttc", "max_braking", "collision", "at_fault_collision", "success")
     return {
         name: _summary(
-            evaluate(make_planner("idm"), bank, names, task=Task(metrics=OWN), traffic=traffic), metrics_shown
+            evaluate(make_planner("idm"), bank, names, task=Task(metrics=OWN_METRICS), traffic=traffic),
+            metrics_shown,
         )
         for name, traffic in kinds.items()
     }
 
 
-PARTS = {"ego": in_egos_place, "others": in_others_place, "traffic": in_traffic}
+PARTS = {"ego": evaluate_as_ego, "others": evaluate_as_others, "traffic": evaluate_in_traffic}
 
 
-def judged(args: argparse.Namespace) -> None:
+def judge(args: argparse.Namespace) -> None:
     """Measure, print, and with --write merge the result with the stored parts."""
-    stored = ScenarioSet.open(args.data)
-    scenarios = list(stored)
+    scenario_set = ScenarioSet.open(args.data)
+    scenarios = list(scenario_set)
     bank, names = ScenarioBank.from_scenarios(scenarios), [dict(row) for row in scenario_names(scenarios)]
-    found: dict[str, Any] = json.loads(RESULT.read_text()) if RESULT.is_file() else {}
-    found |= {
+    results: dict[str, Any] = json.loads(RESULT.read_text()) if RESULT.is_file() else {}
+    results |= {
         "command": "python -m experiments.learning.aggressive judge --data BENCHMARK/validation --runs RUNS --write",
         "when": datetime.now(UTC).isoformat(timespec="minutes"),
-        "validation": {"scenarios": len(scenarios), "hash": stored.hash},
+        "validation": {"scenarios": len(scenarios), "hash": scenario_set.hash},
         "versions": versions(),
     }
     for name in [args.only] if args.only else PARTS:
-        found[name] = PARTS[name](bank, names, args.runs)
-        print(json.dumps({name: _means(found[name])}, indent=1), flush=True)
+        results[name] = PARTS[name](bank, names, args.runs)
+        print(json.dumps({name: _keep_means(results[name])}, indent=1), flush=True)
         if args.write:
-            RESULT.write_text(json.dumps(found, indent=1) + "\n")
+            RESULT.write_text(json.dumps(results, indent=1) + "\n")
 
 
-def _means(found: Mapping[str, Any]) -> dict[str, Any]:
+def _keep_means(results: Mapping[str, Any]) -> dict[str, Any]:
     """Return the same tables with means only."""
-    if "mean" in found:
-        return found["mean"] if found["mean"] is None else round(found["mean"], 4)
-    return {name: _means(part) for name, part in found.items()}
+    if "mean" in results:
+        return results["mean"] if results["mean"] is None else round(results["mean"], 4)
+    return {name: _keep_means(value) for name, value in results.items()}
 
 
-def packed(args: argparse.Namespace) -> None:
+def pack(args: argparse.Namespace) -> None:
     """Export the policy and its measurements to the package."""
-    found = json.loads(RESULT.read_text())
+    results = json.loads(RESULT.read_text())
     bank = ScenarioBank.from_scenarios([ScenarioSet.open(args.data)[0]])
-    measured = {
-        "validation": found["validation"],
-        "ego": _means(found["ego"]["drivers"]["aggressive"]),
-        "others": _means(found["others"]["aggressive"]),
+    measurements = {
+        "validation": results["validation"],
+        "ego": _keep_means(results["ego"]["drivers"]["aggressive"]),
+        "others": _keep_means(results["others"]["aggressive"]),
     }
     folder = export_policy(
-        args.runs / "aggressive", ZOO / "aggressive", bank, {"measured": measured}, overwrite=True
+        args.runs / "aggressive", ZOO / "aggressive", bank, {"measured": measurements}, overwrite=True
     )
     print(f"wrote {folder.path}")
 
@@ -199,9 +206,9 @@ COLUMNS = {
 
 def tables() -> str:
     """Return the stored results as tables of the guide."""
-    found = json.loads(RESULT.read_text())
-    parts = (found["ego"]["drivers"], found["ego"]["minus"], found["others"], found["traffic"])
-    return "\n".join(_table(rows) for rows in parts)
+    results = json.loads(RESULT.read_text())
+    row_groups = (results["ego"]["drivers"], results["ego"]["minus"], results["others"], results["traffic"])
+    return "\n".join(_table(rows) for rows in row_groups)
 
 
 def _table(rows: Mapping[str, Any]) -> str:
@@ -233,7 +240,7 @@ def main() -> None:
     if args.command == "table":
         print(tables())
         return
-    (judged if args.command == "judge" else packed)(args)
+    (judge if args.command == "judge" else pack)(args)
 
 
 if __name__ == "__main__":

@@ -35,16 +35,16 @@ from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
 from experiments.learning.tables import interval, table
-from experiments.repository import DOCS, RESULTS, STATE, fetched
+from experiments.repository import DOCS, RESULTS, STATE, fetch
 
-#: Weights of all seeds of the learned planners, and episodes of all planners: fetched from history where they are not.
+#: Weights of all seeds of the learned planners, and episodes of all planners; fetched from history if missing.
 POLICIES, EPISODES = STATE / "policies", STATE / "benchmark"
-#: Episodes by the definitions before decisions 0011 and 0012, of the same planners on the same scenarios.
-FORMER = STATE / "benchmark-former"
+#: Episodes of the same planners and scenarios with the definitions before decisions 0011 and 0012.
+FORMER_EPISODES = STATE / "benchmark-former"
 RESULT = RESULTS / "benchmark.json"
 PAGE = DOCS / "results" / "benchmark.md"
 TRAFFIC = ("log", "idm")
-#: Random actions in the box of the published action space; they have a table of their own.
+#: Random actions in the box of the published action space, shown in a separate table.
 BOX = "random in the published box"
 PLANNERS = ("expert", "pdm", "idm", "constant_velocity", "random", BOX)
 #: Columns of the page, with their short names.
@@ -53,28 +53,28 @@ COLUMNS = {
     "red_light": "red light", "progress": "progress (m)", "ttc_ok": "ttc", "comfortable": "comfort",
     "vmax_score": "vmax score",
 }  # fmt: skip
-#: Whom every learned planner is compared with, and in what.
-AGAINST, COMPARED = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
+#: Planners to compare every learned planner with, and the metrics of the comparison.
+REFERENCES, DIFFERENCE_METRICS = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
 #: Metrics that decisions 0011 and 0012 changed.
-CHANGED = {
+CHANGED_METRICS = {
     "at_fault_collision": "at fault", "offroad": "off-road", "comfortable": "comfort",
     "speed_compliance": "speed compliance", "vmax_score": "vmax score", "nuplan_score": "nuplan score",
 }  # fmt: skip
-#: Tags by which accuracy is broken down, and where those of the scenarios are kept.
+#: Tags for the breakdown of accuracy, and the file with the tags of the scenarios.
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
-#: What the table of random actions shows: until the first failure, as published episodes end there.
-UNTIL = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
+#: Metrics of random actions until the first failure, where published episodes end.
+FAILURE_METRICS = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
 
 Metrics = dict[str, np.ndarray[Any, Any]]
 
 
 @dataclass(frozen=True)
-class Driven:
+class Episodes:
     """Episodes of one planner in one kind of traffic.
 
     Attributes:
         values: ``[seeds, scenarios]`` by metric, NaN where undefined.
-        segments: Of each scenario.
+        segments: Segment of each scenario.
         about: ``planner``, ``traffic``, ``seeds``, ``test`` (hash of the set), ``when``, ``versions``.
     """
 
@@ -83,209 +83,224 @@ class Driven:
     about: Mapping[str, Any]
 
 
-def learned() -> dict[str, list[Path]]:
+def learned_planners() -> dict[str, list[Path]]:
     """Return the folders of all seeds of every learned planner."""
     return {path.name: sorted(path.glob("seed-*")) for path in sorted(POLICIES.glob("*")) if path.is_dir()}
 
 
-def drivers(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
-    """Return the planners of a name: one, or one per seed."""
+def load_planners(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
+    """Load the planner of a name, or one planner per seed."""
     if name == BOX:
         return [(RandomActions(), Task(actions=Published()))]
-    folders = learned().get(name)
+    folders = learned_planners().get(name)
     if not folders:
         return [find_planner(name, bank)]
-    # Of one name, all seeds are driven by one program.
-    loaded = [load_policy(folder, bank) for folder in folders]
-    return [(replace(planner, name=name), task) for planner, task in loaded]
+    # With one name, all seeds share a compiled program.
+    policies = [load_policy(folder, bank) for folder in folders]
+    return [(replace(planner, name=name), task) for planner, task in policies]
 
 
-def until_failure(results: EpisodeTable) -> Metrics:
-    """Steps until the first collision, off-road step or red light (else to the end), and metres driven until then."""
-    driven = results.trajectories
-    events = np.stack([*driven.events.values()])
-    last = driven.ego.shape[1] - 1
-    steps = np.where(events < 0, last, events - driven.start).min(axis=0)
-    moved = np.hypot(*np.moveaxis(np.diff(driven.ego[:, :, :2], axis=1), -1, 0))
+def metrics_until_failure(results: EpisodeTable) -> Metrics:
+    """Return steps and metres driven until the first collision, off-road step or red light, or to the end."""
+    trajectories = results.trajectories
+    events = np.stack([*trajectories.events.values()])
+    last = trajectories.ego.shape[1] - 1
+    steps = np.where(events < 0, last, events - trajectories.start).min(axis=0)
+    distances = np.hypot(*np.moveaxis(np.diff(trajectories.ego[:, :, :2], axis=1), -1, 0))
     within = np.arange(last) < steps[:, None]
-    return {"steps_until_failure": steps, "metres_until_failure": np.where(within, moved, 0.0).sum(axis=1)}
+    return {
+        "steps_until_failure": steps,
+        "metres_until_failure": np.where(within, distances, 0.0).sum(axis=1),
+    }
 
 
-def drive(args: argparse.Namespace) -> None:
+def evaluate_planners(args: argparse.Namespace) -> None:
     """Evaluate the requested planners in each kind of traffic and store the episodes."""
-    stored = ScenarioSet.open(args.data / "test")
-    scenarios = list(stored)
+    test_set = ScenarioSet.open(args.data / "test")
+    scenarios = list(test_set)
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
     EPISODES.mkdir(parents=True, exist_ok=True)
-    tags = {tag: np.array([entry["tags"][tag] for entry in stored.entries]) for tag in TAGS}
-    np.savez_compressed(EPISODES / STRATA, allow_pickle=False, test=np.array(stored.hash), **tags)
-    for name in args.planner or (*PLANNERS, *learned()):
+    tags = {tag: np.array([entry["tags"][tag] for entry in test_set.entries]) for tag in TAGS}
+    np.savez_compressed(EPISODES / STRATA, allow_pickle=False, test=np.array(test_set.hash), **tags)
+    for name in args.planner or (*PLANNERS, *learned_planners()):
         for kind in args.traffic:
-            found = [
+            tables = [
                 evaluate(planner, bank, names, task=task, traffic=find_traffic(kind))
-                for planner, task in drivers(name, bank)
+                for planner, task in load_planners(name, bank)
             ]
             about = {
                 "planner": name,
                 "traffic": kind,
-                "seeds": len(found),
-                "test": stored.hash,
+                "seeds": len(tables),
+                "test": test_set.hash,
                 "when": datetime.now(UTC).isoformat(timespec="minutes"),
                 "versions": versions(),
             }
-            values = {metric: [results.metrics[metric] for results in found] for metric in found[0].metrics}
-            for results in found:
-                for metric, row in until_failure(results).items():
+            values = {
+                metric: [episodes.metrics[metric] for episodes in tables] for metric in tables[0].metrics
+            }
+            for episodes in tables:
+                for metric, row in metrics_until_failure(episodes).items():
                     values.setdefault(metric, []).append(row)
             np.savez_compressed(
-                file_of(name, kind),
+                episodes_file(name, kind),
                 allow_pickle=False,
                 about=np.array(json.dumps(about)),
                 segment=np.array([row["segment"] for row in names]),
                 **{metric: np.array(rows, np.float32) for metric, rows in values.items()},
             )
-            print(name, kind, *(round(float(results.metrics["accuracy"].mean()), 3) for results in found))
+            print(name, kind, *(round(float(episodes.metrics["accuracy"].mean()), 3) for episodes in tables))
 
 
-def file_of(name: str, kind: str) -> Path:
-    """File of the stored episodes."""
+def episodes_file(name: str, kind: str) -> Path:
+    """Return the file of the stored episodes."""
     return EPISODES / f"{name.replace(' ', '_')}-{kind}.npz"
 
 
-def episodes(name: str, kind: str, folder: Path | None = None) -> Driven | None:
-    """Return the stored episodes of a planner; None if there are none."""
-    file = (folder or EPISODES) / file_of(name, kind).name
+def read_episodes(name: str, kind: str, folder: Path | None = None) -> Episodes | None:
+    """Return the stored episodes of a planner, or None without any."""
+    file = (folder or EPISODES) / episodes_file(name, kind).name
     if not file.is_file():
         return None
-    with np.load(file, allow_pickle=False) as found:
-        values = {key: found[key] for key in found.files if key not in ("about", "segment")}
-        return Driven(values, found["segment"], json.loads(str(found["about"])))
+    with np.load(file, allow_pickle=False) as arrays:
+        values = {key: arrays[key] for key in arrays.files if key not in ("about", "segment")}
+        return Episodes(values, arrays["segment"], json.loads(str(arrays["about"])))
 
 
-def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval:
-    """Mean or paired mean difference with its interval over segments and, if there are several, seeds."""
-    own, segments = driven.values[metric].astype(np.float64), driven.segments
+def mean_interval(episodes: Episodes, metric: str, against: Episodes | None = None) -> Interval:
+    """Return the mean, or mean paired difference, with its interval over segments and, if several, seeds."""
+    values, segments = episodes.values[metric].astype(np.float64), episodes.segments
     if against is None:
-        if len(own) == 1:
-            return interval_of(metric, own[0], segments)
-        return seeds_interval(own, segments, share=metric in SHARES)
-    other = against.values[metric].astype(np.float64)
-    if len(own) == len(other) == 1:
-        return paired_bootstrap(own[0], other[0], segments, seed=0)
-    return difference_interval(own, other, segments)[0]
+        if len(values) == 1:
+            return interval_of(metric, values[0], segments)
+        return seeds_interval(values, segments, share=metric in SHARES)
+    other_values = against.values[metric].astype(np.float64)
+    if len(values) == len(other_values) == 1:
+        return paired_bootstrap(values[0], other_values[0], segments, seed=0)
+    return difference_interval(values, other_values, segments)[0]
 
 
-def change(driven: Driven, metric: str, before: Driven) -> Interval:
-    """Mean paired difference of the same agents between two kinds of traffic."""
-    apart = driven.values[metric].astype(np.float64) - before.values[metric]
-    if len(apart) == 1:
-        return bootstrap_mean(apart[0], driven.segments, seed=0)
-    return seeds_interval(apart, driven.segments)
+def mean_change(episodes: Episodes, metric: str, reference: Episodes) -> Interval:
+    """Return the mean paired difference of the same planner between two kinds of traffic."""
+    differences = episodes.values[metric].astype(np.float64) - reference.values[metric]
+    if len(differences) == 1:
+        return bootstrap_mean(differences[0], episodes.segments, seed=0)
+    return seeds_interval(differences, episodes.segments)
 
 
-def changes(driven: Driven, former: Driven) -> dict[str, dict[str, float]]:
-    """Means of the changed metrics before and after, and the share of episodes whose value differs."""
-    found = {}
-    for metric in CHANGED:
-        before, now = (one.values[metric].astype(np.float64) for one in (former, driven))
-        moved = ~np.isclose(before, now, rtol=0, atol=1e-5, equal_nan=True)
-        found[metric] = {
-            "before": float(np.nanmean(before)), "after": float(np.nanmean(now)), "moved": float(moved.mean())
-        }  # fmt: skip
-    return found
+def compare_definitions(episodes: Episodes, former: Episodes) -> dict[str, dict[str, float]]:
+    """Return means of the changed metrics before and after, and the share of episodes with a different value."""
+    result = {}
+    for metric in CHANGED_METRICS:
+        old_values, new_values = (version.values[metric].astype(np.float64) for version in (former, episodes))
+        differs = ~np.isclose(old_values, new_values, rtol=0, atol=1e-5, equal_nan=True)
+        result[metric] = {
+            "before": float(np.nanmean(old_values)),
+            "after": float(np.nanmean(new_values)),
+            "moved": float(differs.mean()),
+        }
+    return result
 
 
-def judged() -> dict[str, Any]:
-    """Return all results of the page from the stored episodes."""
-    driven = {
-        (name, kind): found
-        for name in (*PLANNERS, *learned())
+def compute_results() -> dict[str, Any]:
+    """Compute all results of the page from the stored episodes."""
+    all_episodes = {
+        (name, kind): episodes
+        for name in (*PLANNERS, *learned_planners())
         for kind in TRAFFIC
-        if (found := episodes(name, kind)) is not None
+        if (episodes := read_episodes(name, kind)) is not None
     }
-    tests = {found.about["test"] for found in driven.values()}
+    tests = {episodes.about["test"] for episodes in all_episodes.values()}
     if len(tests) != 1:
         raise SystemExit(f"{len(tests)} test sets: drive all planners on one")
     planners: dict[str, Any] = {}
-    for (name, kind), found in driven.items():
-        metrics = (*COLUMNS, *UNTIL) if name in (BOX, "expert") else COLUMNS
-        planners.setdefault(name, {"seeds": found.about["seeds"]})[kind] = {
-            metric: mean(found, metric).as_dict() for metric in metrics
+    for (name, kind), episodes in all_episodes.items():
+        metrics = (*COLUMNS, *FAILURE_METRICS) if name in (BOX, "expert") else COLUMNS
+        planners.setdefault(name, {"seeds": episodes.about["seeds"]})[kind] = {
+            metric: mean_interval(episodes, metric).as_dict() for metric in metrics
         }
     return {
         "command": "python -m experiments.learning.benchmark judge",
-        "test": {"hash": tests.pop(), "scenarios": len(next(iter(driven.values())).segments)},
+        "test": {"hash": tests.pop(), "scenarios": len(next(iter(all_episodes.values())).segments)},
         "planners": planners,
         "reactive": {
             name: {
-                metric: change(driven[name, "idm"], metric, driven[name, "log"]).as_dict()
+                metric: mean_change(all_episodes[name, "idm"], metric, all_episodes[name, "log"]).as_dict()
                 for metric in COLUMNS
             }
             for name in planners
-            if name != BOX and {(name, kind) for kind in TRAFFIC} <= driven.keys()
+            if name != BOX and {(name, kind) for kind in TRAFFIC} <= all_episodes.keys()
         },
         "differences": {
             kind: {
                 f"{name} - {other}": {
-                    metric: mean(driven[name, kind], metric, driven[other, kind]).as_dict()
-                    for metric in COMPARED
+                    metric: mean_interval(
+                        all_episodes[name, kind], metric, all_episodes[other, kind]
+                    ).as_dict()
+                    for metric in DIFFERENCE_METRICS
                 }
-                for other in AGAINST
-                for name in ("expert", *(name for name in ("pdm",) if name != other), *learned())
-                if {(name, kind), (other, kind)} <= driven.keys()
+                for other in REFERENCES
+                for name in ("expert", *(name for name in ("pdm",) if name != other), *learned_planners())
+                if {(name, kind), (other, kind)} <= all_episodes.keys()
             }
             for kind in TRAFFIC
         },
-        "strata": strata(driven),
+        "strata": stratify(all_episodes),
         "changes": {
-            f"{name}, {kind}": changes(found, former)
-            for (name, kind), found in driven.items()
-            if (former := episodes(name, kind, FORMER)) is not None
+            f"{name}, {kind}": compare_definitions(episodes, former_episodes)
+            for (name, kind), episodes in all_episodes.items()
+            if (former_episodes := read_episodes(name, kind, FORMER_EPISODES)) is not None
         },
-        "driven": {f"{name}, {kind}": dict(found.about) for (name, kind), found in driven.items()},
+        "driven": {
+            f"{name}, {kind}": dict(episodes.about) for (name, kind), episodes in all_episodes.items()
+        },
     }
 
 
-def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
-    """Accuracy of every planner in log replay traffic, by tag and value."""
-    with np.load(EPISODES / STRATA, allow_pickle=False) as stored:
-        tags, of = {tag: stored[tag] for tag in TAGS}, str(stored["test"])
-    if any(one.about["test"] != of for one in driven.values()):
-        raise SystemExit("the tags are those of another test set: evaluate a planner again")
-    planners = {name: one for (name, kind), one in driven.items() if kind == "log" and name != BOX}
-    found = []
+def stratify(all_episodes: Mapping[tuple[str, str], Episodes]) -> list[dict[str, Any]]:
+    """Return the accuracy of every planner in log replay traffic, by tag and value."""
+    with np.load(EPISODES / STRATA, allow_pickle=False) as arrays:
+        tags, test_hash = {tag: arrays[tag] for tag in TAGS}, str(arrays["test"])
+    if any(episodes.about["test"] != test_hash for episodes in all_episodes.values()):
+        raise SystemExit("the stored tags have another test set: evaluate a planner again")
+    planners = {
+        name: episodes for (name, kind), episodes in all_episodes.items() if kind == "log" and name != BOX
+    }
+    strata = []
     for tag, values in tags.items():
         for value in np.unique(values):
             rows = values == value
-            some = {
-                name: mean(
+            means = {
+                name: mean_interval(
                     replace(
-                        one, values={"accuracy": one.values["accuracy"][:, rows]}, segments=one.segments[rows]
+                        episodes,
+                        values={"accuracy": episodes.values["accuracy"][:, rows]},
+                        segments=episodes.segments[rows],
                     ),
                     "accuracy",
                 )
-                for name, one in planners.items()
+                for name, episodes in planners.items()
             }
-            intervals = {name: one.as_dict() for name, one in some.items()}
-            found.append(
+            intervals = {name: episodes.as_dict() for name, episodes in means.items()}
+            strata.append(
                 {"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": intervals}
             )
-    return found
+    return strata
 
 
-def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
+def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return the lines of the page's tables by name."""
     planners = result["planners"]
     order = sorted(
         (name for name in planners if name != BOX and "log" in planners[name]),
         key=lambda name: -planners[name]["log"]["vmax_score"]["mean"],
     )
-    heads = ("planner", "seeds", *COLUMNS.values())
-    found = {
+    headings = ("planner", "seeds", *COLUMNS.values())
+    tables = {
         kind: table(
-            heads,
+            headings,
             [
-                (f"`{name}`", str(planners[name]["seeds"]), *cells(planners[name][kind], COLUMNS))
+                (f"`{name}`", str(planners[name]["seeds"]), *format_cells(planners[name][kind], COLUMNS))
                 for name in order
                 if kind in planners[name]
             ],
@@ -293,76 +308,84 @@ def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
         for kind in TRAFFIC
     }
     rows = [
-        (f"`{name}`", *cells(result["reactive"][name], COLUMNS, signed=True))
+        (f"`{name}`", *format_cells(result["reactive"][name], COLUMNS, signed=True))
         for name in order
         if name in result["reactive"]
     ]
-    found["reactive"] = table(("planner", *COLUMNS.values()), rows)
-    found["differences"] = table(
-        ("difference", "traffic", *(COLUMNS[metric] for metric in COMPARED)),
+    tables["reactive"] = table(("planner", *COLUMNS.values()), rows)
+    tables["differences"] = table(
+        ("difference", "traffic", *(COLUMNS[metric] for metric in DIFFERENCE_METRICS)),
         [
-            (pair, f"`{kind}`", *cells(one, COMPARED, signed=True))
+            (pair, f"`{kind}`", *format_cells(row, DIFFERENCE_METRICS, signed=True))
             for kind, pairs in result["differences"].items()
-            for pair, one in pairs.items()
+            for pair, row in pairs.items()
         ],
     )
-    shown = {**UNTIL, "collision": "collision", "offroad": "off-road"}
+    columns = {**FAILURE_METRICS, "collision": "collision", "offroad": "off-road"}
     rows = [
-        (name, f"`{kind}`", *cells(planners[name][kind], shown))
+        (name, f"`{kind}`", *format_cells(planners[name][kind], columns))
         for name in (BOX, "expert")
         for kind in TRAFFIC
         if kind in planners.get(name, {})
     ]
-    found["random"] = table(("planner", "traffic", *shown.values()), rows)
-    found["changes"] = table(
-        ("planner", "traffic", *CHANGED.values()),
+    tables["random"] = table(("planner", "traffic", *columns.values()), rows)
+    tables["changes"] = table(
+        ("planner", "traffic", *CHANGED_METRICS.values()),
         [
-            (f"`{name}`", f"`{kind}`", *(changed(result["changes"][f"{name}, {kind}"][m]) for m in CHANGED))
+            (
+                f"`{name}`",
+                f"`{kind}`",
+                *(format_change(result["changes"][f"{name}, {kind}"][m]) for m in CHANGED_METRICS),
+            )
             for name in order
             for kind in TRAFFIC
             if f"{name}, {kind}" in result["changes"]
         ],
     )
     names = [name for name in order if name in result["strata"][0]["planners"]]
-    found["strata"] = table(
+    tables["strata"] = table(
         ("tag", "value", "scenarios", *(f"`{name}`" for name in names)),
         [
             (
-                one["tag"],
-                one["value"],
-                f"{one['scenarios']:,}",
-                *(interval(one["planners"][n]) for n in names),
+                row["tag"],
+                row["value"],
+                f"{row['scenarios']:,}",
+                *(interval(row["planners"][n]) for n in names),
             )
-            for one in result["strata"]
+            for row in result["strata"]
         ],
     )
-    return found
+    return tables
 
 
-def cells(
-    found: Mapping[str, Any], metrics: Sequence[str] | Mapping[str, str], signed: bool = False
+def format_cells(
+    intervals: Mapping[str, Any], metrics: Sequence[str] | Mapping[str, str], signed: bool = False
 ) -> list[str]:
     """Format means with intervals; metres with one digit."""
     return [
-        interval(found[metric], signed=signed, digits=1 if "progress" in metric or metric in UNTIL else 3)
+        interval(
+            intervals[metric],
+            signed=signed,
+            digits=1 if "progress" in metric or metric in FAILURE_METRICS else 3,
+        )
         for metric in metrics
     ]
 
 
-def changed(one: Mapping[str, float]) -> str:
-    """Format a mean before and after, and the share of episodes that moved; one number if none did."""
-    if one["moved"] == 0.0:
-        return f"{one['after']:.3f}"
-    return f"{one['before']:.3f} to {one['after']:.3f} ({one['moved']:.1%})"
+def format_change(change: Mapping[str, float]) -> str:
+    """Format a mean before and after, with the share of changed episodes, or the mean alone if none changed."""
+    if change["moved"] == 0.0:
+        return f"{change['after']:.3f}"
+    return f"{change['before']:.3f} to {change['after']:.3f} ({change['moved']:.1%})"
 
 
-def filled(text: str, result: Mapping[str, Any]) -> str:
+def fill_page(text: str, result: Mapping[str, Any]) -> str:
     """Return the page with the stored tables."""
-    for what, lines in page(result).items():
-        begin, end = f"<!-- benchmark.py: {what} -->", "<!-- benchmark.py: end -->"
+    for name, lines in page_tables(result).items():
+        begin, end = f"<!-- benchmark.py: {name} -->", "<!-- benchmark.py: end -->"
         before, rest = text.split(begin)
-        shown = "\n".join(lines)
-        text = f"{before}{begin}\n\n{shown}\n\n{end}{rest.split(end, 1)[1]}"
+        content = "\n".join(lines)
+        text = f"{before}{begin}\n\n{content}\n\n{end}{rest.split(end, 1)[1]}"
     return text
 
 
@@ -380,14 +403,14 @@ def main() -> None:
     commands.add_parser("table")
     args = parser.parse_args()
     if args.command != "table":
-        fetched("benchmarks/policies", POLICIES)
-        fetched("benchmarks/results/benchmark", FORMER)
+        fetch("benchmarks/policies", POLICIES)
+        fetch("benchmarks/results/benchmark", FORMER_EPISODES)
     if args.command == "drive":
-        drive(args)
+        evaluate_planners(args)
         return
     if args.command == "judge":
-        RESULT.write_text(json.dumps(judged(), indent=1) + "\n")
-    PAGE.write_text(filled(PAGE.read_text(), json.loads(RESULT.read_text())))
+        RESULT.write_text(json.dumps(compute_results(), indent=1) + "\n")
+    PAGE.write_text(fill_page(PAGE.read_text(), json.loads(RESULT.read_text())))
 
 
 if __name__ == "__main__":

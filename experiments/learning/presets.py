@@ -33,94 +33,112 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.run_folder import RunFolder, seed_folders, versions
 from drivax.tracking.workers import one_core_each
-from experiments.learning.benchmark import EPISODES, POLICIES, Driven, episodes, learned, mean
-from experiments.learning.tables import COLUMNS, CURVES, drawn, filled, pages, picture
-from experiments.repository import RESULTS, fetched, save_picture
+from experiments.learning.benchmark import (
+    EPISODES,
+    POLICIES,
+    Episodes,
+    learned_planners,
+    mean_interval,
+    read_episodes,
+)
+from experiments.learning.tables import COLUMNS, CURVES, curve_file, draw_curves, fill_page, pages
+from experiments.repository import RESULTS, fetch, save_picture
 
 RESULT = RESULTS / "learning.json"
 SPEEDS = RESULT.with_name("training.json")
-#: What is kept of a training next to its policies.
+#: File with training time and curves, next to the policies.
 TRAINING = "training.json"
 REFERENCES = ("expert", "idm", "constant_velocity")
 
 
-def trained(args: argparse.Namespace, overrides: list[str]) -> None:
-    """Train the seeds of one preset, each on one core, as many at a time as there are cores.
+def train_preset(args: argparse.Namespace, overrides: list[str]) -> None:
+    """Train the seeds of one preset in parallel, each on one core.
 
-    Store their policies in experiments/state/policies, with the longest training time and their curves. With --first
-    they join those of the seeds before it.
+    Store their policies in experiments/state/policies, with the longest training time and the curves. With --first, add
+    them to the policies of earlier seeds.
     """
     config = settings.load(TrainConfig, args.preset, overrides)
     name = args.preset.replace("/", "-")
-    out, kept = args.runs / name, POLICIES / name
+    out, policies = args.runs / name, POLICIES / name
     data, validation = (ScenarioSet.open(args.data / split) for split in ("train", "validation"))
     notes: dict[str, Any] = {"kind": "seeds", "seeds": args.seeds, "validation": validation.hash}
     RunFolder.create(out, config, [data], overwrite=True, **notes)
     seeds = range(config.seed + args.first, config.seed + args.first + args.seeds)
     agents = [replace(config, seed=seed) for seed in seeds]
-    took = [seconds for _, seconds in one_core_each(partial(_trained_alone, args.data, out), agents)]
-    about: dict[str, Any] = {"seconds": max(took), "curves": learning_curves(out)}
+    durations = [seconds for _, seconds in one_core_each(partial(_train_seed, args.data, out), agents)]
+    record: dict[str, Any] = {"seconds": max(durations), "curves": learning_curves(out)}
     if args.first:
-        before = json.loads((kept / TRAINING).read_text())
-        about["seconds"] = max(about["seconds"], before["seconds"])
-        about["curves"] = {
-            metric: before["curves"][metric] | lines for metric, lines in about["curves"].items()
+        earlier = json.loads((policies / TRAINING).read_text())
+        record["seconds"] = max(record["seconds"], earlier["seconds"])
+        record["curves"] = {
+            metric: earlier["curves"][metric] | lines for metric, lines in record["curves"].items()
         }
     else:
-        shutil.rmtree(kept, ignore_errors=True)
+        shutil.rmtree(policies, ignore_errors=True)
     bank = ScenarioBank.from_scenarios([data[0]])
     for folder in seed_folders(out):
-        export_policy(folder, kept / folder.name, bank, overwrite=True)
-    (kept / TRAINING).write_text(json.dumps(about | {"seeds": len(learned()[name])}, indent=1) + "\n")
+        export_policy(folder, policies / folder.name, bank, overwrite=True)
+    (policies / TRAINING).write_text(
+        json.dumps(record | {"seeds": len(learned_planners()[name])}, indent=1) + "\n"
+    )
 
 
-def _trained_alone(data: Path, out: Path, config: TrainConfig) -> int:
-    """Train one agent and return the seconds it took."""
-    began = time.perf_counter()
+def _train_seed(data: Path, out: Path, config: TrainConfig) -> int:
+    """Train one seed, and return the elapsed seconds."""
+    start = time.perf_counter()
     splits = {split: ScenarioSet.open(data / split) for split in ("train", "validation")}
     train(config, splits["train"], out / f"seed-{config.seed}", validation=splits["validation"], log=print)
-    return round(time.perf_counter() - began)
+    return round(time.perf_counter() - start)
 
 
-def judged() -> dict[str, Any]:
-    """Return results and paired differences of all evaluated presets and the references."""
-    found = {name: episodes(name, "log") for name in (*REFERENCES, *learned())}
-    driven = {name: one for name, one in found.items() if one is not None}
-    tests = {one.about["test"] for one in driven.values()}
+def compute_results() -> dict[str, Any]:
+    """Compute results and paired differences of all evaluated presets and the references."""
+    candidates = {name: read_episodes(name, "log") for name in (*REFERENCES, *learned_planners())}
+    episodes = {
+        name: planner_episodes
+        for name, planner_episodes in candidates.items()
+        if planner_episodes is not None
+    }
+    tests = {planner_episodes.about["test"] for planner_episodes in episodes.values()}
     if len(tests) != 1:
         raise SystemExit(
             f"{len(tests)} test sets instead of one: evaluate the others again (benchmark.py drive)"
         )
-    stored = {
-        name: json.loads((POLICIES / name / TRAINING).read_text()) for name in learned() if name in driven
+    trainings = {
+        name: json.loads((POLICIES / name / TRAINING).read_text())
+        for name in learned_planners()
+        if name in episodes
     }
     return {
         "command": "python -m experiments.learning.presets judge",
-        "test": {"scenarios": len(next(iter(driven.values())).segments), "hash": tests.pop()},
-        "training": {name: {key: one[key] for key in ("seconds", "seeds")} for name, one in stored.items()},
+        "test": {"scenarios": len(next(iter(episodes.values())).segments), "hash": tests.pop()},
+        "training": {
+            name: {key: training[key] for key in ("seconds", "seeds")} for name, training in trainings.items()
+        },
         "planners": {
-            name: {metric: _mean(one, metric) for metric in COLUMNS} for name, one in driven.items()
+            name: {metric: _mean(planner_episodes, metric) for metric in COLUMNS}
+            for name, planner_episodes in episodes.items()
         },
         "differences": {
             f"{name} - {other}": {
-                metric: mean(driven[name], metric, driven[other]).as_dict() for metric in CURVES
+                metric: mean_interval(episodes[name], metric, episodes[other]).as_dict() for metric in CURVES
             }
-            for name in stored
+            for name in trainings
             for other in ("idm", "bc")
-            if other in driven and other != name
+            if other in episodes and other != name
         },
-        "curves": {name: one["curves"] for name, one in stored.items()},
+        "curves": {name: training["curves"] for name, training in trainings.items()},
         "versions": versions(),
     }
 
 
-def _mean(driven: Driven, metric: str) -> dict[str, Any]:
-    each = [round(float(np.nanmean(row)), 4) for row in driven.values[metric]]
-    return mean(driven, metric).as_dict() | {"by_seed": each}
+def _mean(results: Episodes, metric: str) -> dict[str, Any]:
+    seed_means = [round(float(np.nanmean(row)), 4) for row in results.values[metric]]
+    return mean_interval(results, metric).as_dict() | {"by_seed": seed_means}
 
 
 def learning_curves(run: Path) -> dict[str, dict[str, list[list[float]]]]:
-    """Quantity -> seed -> points (step, value), of every validation of a run or of the agents in it."""
+    """Return quantity -> seed -> points (step, value) of all validations of a run and its seeds."""
     _, agents = read_runs([run])
     return {
         metric: {
@@ -133,13 +151,13 @@ def learning_curves(run: Path) -> dict[str, dict[str, list[list[float]]]]:
     }
 
 
-def tabled() -> None:
+def write_tables() -> None:
     """Write the stored results to the pages, and draw the learning curves."""
     learning, training = (json.loads(path.read_text()) for path in (RESULT, SPEEDS))
     for name, curves in learning.get("curves", {}).items():
-        save_picture(drawn(name, curves), picture(name))
+        save_picture(draw_curves(name, curves), curve_file(name))
     for page in pages():
-        page.write_text(filled(page, learning, training))
+        page.write_text(fill_page(page, learning, training))
 
 
 def main() -> None:
@@ -158,14 +176,14 @@ def main() -> None:
     commands.add_parser("table")
     args, overrides = parser.parse_known_args()
     if args.command != "table":
-        fetched("benchmarks/policies", POLICIES)
-        fetched("benchmarks/results/benchmark", EPISODES)
+        fetch("benchmarks/policies", POLICIES)
+        fetch("benchmarks/results/benchmark", EPISODES)
     if args.command == "train":
-        trained(args, overrides)
+        train_preset(args, overrides)
     elif args.command == "judge":
-        RESULT.write_text(json.dumps(judged(), indent=1) + "\n")
+        RESULT.write_text(json.dumps(compute_results(), indent=1) + "\n")
     else:
-        tabled()
+        write_tables()
 
 
 if __name__ == "__main__":

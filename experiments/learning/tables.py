@@ -21,10 +21,10 @@ FOLDER = DOCS / "algorithms"
 COLUMNS = (
     "success", "accuracy", "accuracy_at_fault", "vmax_score", "collision", "offroad", "progress_ratio",
 )  # fmt: skip
-#: What curves show, of every validation.
+#: Metrics of the learning curves.
 CURVES = ("success", "vmax_score")
-#: What the best preset is to reach, and how fast PPO is to train on two cores, in environment steps a second.
-AIMS, SPEED = {"success": 0.80, "accuracy_at_fault": 0.90}, 8_000
+#: Targets of the best preset, and of PPO's training speed on two cores, environment steps per second.
+AIMS, MIN_SPEED = {"success": 0.80, "accuracy_at_fault": 0.90}, 8_000
 _BLOCK = re.compile(r"(<!-- presets\.py: (?!end)(?P<what>[^>]+?) -->\n).*?(<!-- presets\.py: end -->)", re.S)
 
 Result = dict[str, Any]
@@ -37,103 +37,104 @@ def pages() -> Iterator[Path]:
             yield page
 
 
-def filled(page: Path, learning: Result, training: Result) -> str:
+def fill_page(page: Path, learning: Result, training: Result) -> str:
     """Return the text of a page with the stored results between its markers."""
 
-    def block(found: re.Match[str]) -> str:
-        what, *names = found["what"].split()
-        text = written(what, names, learning, training, page)
-        return f"{found[1]}\n{text}\n\n{found[3]}"
+    def replace_block(match: re.Match[str]) -> str:
+        kind, *names = match["what"].split()
+        text = format_block(kind, names, learning, training, page)
+        return f"{match[1]}\n{text}\n\n{match[3]}"
 
-    return _BLOCK.sub(block, page.read_text())
+    return _BLOCK.sub(replace_block, page.read_text())
 
 
-def written(what: str, names: list[str], learning: Result, training: Result, page: Path) -> str:
+def format_block(kind: str, names: list[str], learning: Result, training: Result, page: Path) -> str:
     """Return a block: ``reached``, ``differences``, ``aims``, ``training``, ``speed`` or ``curves``."""
-    parts: dict[str, Callable[[], list[str]]] = {
-        "reached": lambda: reached(learning),
-        "differences": lambda: differences(learning),
-        "aims": lambda: aims(learning, training),
-        "training": lambda: times(learning),
-        "speed": lambda: speeds(training),
-        "curves": lambda: pictures(learning, names, page),
+    blocks: dict[str, Callable[[], list[str]]] = {
+        "reached": lambda: results_table(learning),
+        "differences": lambda: differences_table(learning),
+        "aims": lambda: aims_table(learning, training),
+        "training": lambda: times_table(learning),
+        "speed": lambda: speeds_table(training),
+        "curves": lambda: curve_images(learning, names, page),
     }
-    return "\n".join(parts[what]())
+    return "\n".join(blocks[kind]())
 
 
-def reached(learning: Result) -> list[str]:
-    """Table with one row per planner, highest score first."""
+def results_table(learning: Result) -> list[str]:
+    """Return a table with a row per planner, highest score first."""
     planners = learning["planners"]
     order = sorted(planners, key=lambda name: -planners[name]["vmax_score"]["mean"])
     rows = [[name, *(interval(planners[name][column]) for column in COLUMNS)] for name in order]
     return table(["driver", *(f"`{column}`" for column in COLUMNS)], rows)
 
 
-def differences(learning: Result) -> list[str]:
-    """Table with one row per pair of planners."""
+def differences_table(learning: Result) -> list[str]:
+    """Return a table with a row per pair of planners."""
     rows = [
-        [pair, *(interval(found[column], signed=True) for column in CURVES)]
-        for pair, found in learning["differences"].items()
+        [pair, *(interval(intervals[column], signed=True) for column in CURVES)]
+        for pair, intervals in learning["differences"].items()
     ]
     return table(["difference", *(f"`{column}`" for column in CURVES)], rows)
 
 
-def best(learning: Result) -> str:
-    """The preset with the highest success."""
+def best_preset(learning: Result) -> str:
+    """Return the preset with the highest success."""
     return max(learning["training"], key=lambda name: learning["planners"][name]["success"]["mean"])
 
 
-def aims(learning: Result, training: Result) -> list[str]:
-    """Table of targets and measurements of the best preset."""
-    name = best(learning)
+def aims_table(learning: Result, training: Result) -> list[str]:
+    """Return a table of targets and measurements of the best preset."""
+    name = best_preset(learning)
     rows = []
-    for metric, aim in AIMS.items():
-        found = learning["planners"][name][metric]
-        rows.append([f"`{metric}` of `{name}`", f"{aim:.2f}", interval(found), found["mean"] >= aim])
+    for metric, target in AIMS.items():
+        result = learning["planners"][name][metric]
+        rows.append([f"`{metric}` of `{name}`", f"{target:.2f}", interval(result), result["mean"] >= target])
     for other in ("idm", "bc"):
         for metric in CURVES:
-            found = learning["differences"].get(f"{name} - {other}", {}).get(metric)
-            nothing = "it is the best itself" if other == name else "not measured"
-            cell = nothing if found is None else interval(found, signed=True)
-            above = found is not None and found["low"] is not None and found["low"] > 0
-            rows.append([f"`{metric}`: `{name}` over `{other}`", "above 0", cell, above])
+            result = learning["differences"].get(f"{name} - {other}", {}).get(metric)
+            reason = "it is the best itself" if other == name else "not measured"
+            cell = reason if result is None else interval(result, signed=True)
+            is_better = result is not None and result["low"] is not None and result["low"] > 0
+            rows.append([f"`{metric}`: `{name}` over `{other}`", "above 0", cell, is_better])
     speed = training["training"]["ppo"]["steps_per_second"]
-    rows.append(["steps per second of training, `ppo`", f"{SPEED:,}", f"{speed:,}", speed >= SPEED])
+    rows.append(["steps per second of training, `ppo`", f"{MIN_SPEED:,}", f"{speed:,}", speed >= MIN_SPEED])
     cells = [[*row[:3], "yes" if row[3] else "**no**"] for row in rows]
     return table(["what", "aim", "measured", "reached"], cells)
 
 
-def times(learning: Result) -> list[str]:
-    """Table of the training time of each preset."""
+def times_table(learning: Result) -> list[str]:
+    """Return a table of the training time of each preset."""
     rows = [
-        [f"`{name}`", str(one["seeds"]), f"{one['seconds']:,}"] for name, one in learning["training"].items()
+        [f"`{name}`", str(training["seeds"]), f"{training['seconds']:,}"]
+        for name, training in learning["training"].items()
     ]
     return table(["preset", "seeds", "each trained on one core for at most (s)"], rows)
 
 
-def speeds(training: Result) -> list[str]:
-    """Table of training speeds and the shares of an iteration."""
+def speeds_table(training: Result) -> list[str]:
+    """Return a table of training speeds and the shares of an iteration."""
     rows = []
-    for name, one in training["training"].items():
-        shares = [f"{share:.0%}" for share in one["share"].values()]
-        rows.append([name, f"{one['steps_per_second']:,}", *shares])
+    for name, result in training["training"].items():
+        shares = [f"{share:.0%}" for share in result["share"].values()]
+        rows.append([name, f"{result['steps_per_second']:,}", *shares])
     first = next(iter(training["training"].values()))
     return table(["training", "steps/s", *first["share"]], rows)
 
 
-def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
+def curve_images(learning: Result, names: list[str], page: Path) -> list[str]:
     """Return the curves of presets (default: all), with their results on the test split."""
-    stored = learning.get("curves", {})
+    curves = learning.get("curves", {})
     lines = []
-    for name in names or stored:
-        if name not in stored:
+    for name in names or curves:
+        if name not in curves:
             lines += [f"No curves of preset `{name}` are stored yet.", ""]
             continue
-        found, count = learning["planners"][name], learning["training"][name]["seeds"]
-        cell = ", ".join(f"`{metric}` {interval(found[metric])}" for metric in CURVES)
-        where = Path("../algorithms" if page.parent != FOLDER else "") / picture(name).name
+        results, count = learning["planners"][name], learning["training"][name]["seeds"]
+        cell = ", ".join(f"`{metric}` {interval(results[metric])}" for metric in CURVES)
+        path = Path("../algorithms" if page.parent != FOLDER else "") / curve_file(name).name
         lines += [
-            f"![Learning curves of {name}]({where.as_posix()})",
+            f"![Learning curves of {name}]({path.as_posix()})",
             "",
             f"Preset `{name}`, {count} seeds, on the validation split during training. On the test split: {cell}.",
             "",
@@ -141,12 +142,12 @@ def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
     return lines[:-1]
 
 
-def picture(name: str) -> Path:
-    """File of a preset's learning curves."""
+def curve_file(name: str) -> Path:
+    """Return the file of a preset's learning curves."""
     return FOLDER / f"curve-{name}.png"
 
 
-def drawn(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> Figure:
+def draw_curves(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> Figure:
     """Draw learning curves of one preset: a panel per quantity, a line per seed.
 
     Args:
@@ -170,9 +171,9 @@ def drawn(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> F
     return figure
 
 
-def interval(found: Mapping[str, Any], signed: bool = False, digits: int = 3) -> str:
+def interval(result: Mapping[str, Any], signed: bool = False, digits: int = 3) -> str:
     """Format a mean with its interval."""
-    numbers = [found[name] for name in ("mean", "low", "high")]
+    numbers = [result[name] for name in ("mean", "low", "high")]
     if numbers[0] is None:
         return "-"
     mean, *ends = (f"{number:{'+' if signed else ''}.{digits}f}" for number in numbers if number is not None)

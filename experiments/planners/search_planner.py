@@ -1,4 +1,4 @@
-"""A planner that searches manoeuvres against predicted traffic; it shows how hard scenarios are for a careful driver.
+"""A planner that searches manoeuvres against predicted traffic, to measure how hard scenarios are to solve.
 
 Run it as ``PYTHONPATH=experiments/planners drivax evaluate --planner search_planner:SearchPlanner ...``.
 """
@@ -31,25 +31,25 @@ from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.types import AgentContext, Frame, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical
 
-#: Times at which others are predicted: how many, and how far apart, s; lanes are followed in longer steps.
+#: Number and spacing (s) of prediction times; predictions along lanes use longer steps.
 HORIZON, STEP_S = 20, 0.25
 _LANE_STEPS, _LANE_STEP_S = 10, 0.5
-#: Others that are looked at: the nearest.
-_OTHERS = 20
-#: Who is slower stands, m/s; who heads the same way within 45 degrees goes along.
-SLOW_MPS, SAME_WAY = 1.0, 0.7
-#: Steps over which trends are measured; how long others are expected to accelerate and to turn, s.
-_PAST, _ACCELERATES_S, _TURNS_S = 5, 1.0, 3.0
-#: For how long, s, and up to which speed, m/s, who accelerates goes on to do so.
-_SPEEDS_UP_S, _USUAL_MPS = 2.0, 13.4
-#: Who moves sideways towards ego's way this fast, m/s, and gets there this soon, s, may stay in it.
-_ENTERS_MPS, _ENTERS_S = 0.4, 2.5
-#: People who walk towards ego's way faster than this may run, at this speed, m/s.
-_STARTS_MPS, _RUNS_MPS = 0.3, 2.0
-#: For how long who comes the other way may swerve into ego's, s.
-_SWERVES_S = 0.3
-#: Who crosses faster than this is expected to cross, m/s.
-_CROSSES_MPS = 4.5
+#: Maximum number of agents to predict: the nearest.
+_MAX_AGENTS = 20
+#: Agents below this speed (m/s) are stationary; those above this cosine, within 45 degrees, go the same direction.
+SLOW_MPS, SAME_DIRECTION = 1.0, 0.7
+#: Steps to measure trends over; durations for which agents keep braking and turning, s.
+_TREND_STEPS, _ACCELERATE_S, _TURN_S = 5, 1.0, 3.0
+#: Duration (s) and maximum speed (m/s) of predicted acceleration.
+_SPEED_UP_S, _USUAL_MPS = 2.0, 13.4
+#: Agents that approach ego's path sideways at this speed (m/s), and reach it within this time (s), may stay in it.
+_ENTER_MPS, _ENTER_S = 0.4, 2.5
+#: Pedestrians that approach ego's path faster than this may start to run, at this speed, m/s.
+_RUN_START_MPS, _RUN_MPS = 0.3, 2.0
+#: Duration for which oncoming agents may swerve into ego's path, s.
+_SWERVE_S = 0.3
+#: Vehicles that cross faster than this leave ego's path again, m/s.
+_CROSS_MPS = 4.5
 
 
 @record
@@ -62,7 +62,7 @@ class Trend:
         valid: Whether the slot had an agent.
         turning: Yaw rate, rad/s.
         acceleration: Along the heading, m/s2.
-        stood_s: How long the agent has stood, s.
+        stood_s: Time at standstill, s.
     """
 
     direction: Float[Array, "S 2"]
@@ -73,55 +73,59 @@ class Trend:
     stood_s: Float[Array, " S"]
 
     @classmethod
-    def logged(cls, bank: ScenarioBank, context: AgentContext) -> Trend:
-        """Build from the log's current step and half a second before; parked agents are stationary."""
+    def from_log(cls, bank: ScenarioBank, context: AgentContext) -> Trend:
+        """Return the trend of the log over the last half second; parked agents are stationary."""
         now = bank.agents[context.index, context.step]
-        before = bank.agents[context.index, jnp.maximum(context.step - _PAST, 0)]
-        known = (now[:, AgentColumn.VALID] > 0) & (before[:, AgentColumn.VALID] > 0) & (context.step >= _PAST)
-        turn = _turn(before[:, AgentColumn.HEADING], now[:, AgentColumn.HEADING])
-        faster = _length(now[:, AgentColumn.VELOCITY]) - _length(before[:, AgentColumn.VELOCITY])
+        past = bank.agents[context.index, jnp.maximum(context.step - _TREND_STEPS, 0)]
+        defined = (
+            (now[:, AgentColumn.VALID] > 0)
+            & (past[:, AgentColumn.VALID] > 0)
+            & (context.step >= _TREND_STEPS)
+        )
+        angle = _turn(past[:, AgentColumn.HEADING], now[:, AgentColumn.HEADING])
+        speed_change = _length(now[:, AgentColumn.VELOCITY]) - _length(past[:, AgentColumn.VELOCITY])
         parked = bank.agent_box.shape[1] - len(now)
 
-        def whole(moving: Array) -> Array:
-            return jnp.pad(moving, ((0, parked), *((0, 0),) * (moving.ndim - 1)))
+        def pad_parked(values: Array) -> Array:
+            return jnp.pad(values, ((0, parked), *((0, 0),) * (values.ndim - 1)))
 
         return cls(
-            whole(now[:, AgentColumn.HEADING]),
-            whole(_length(now[:, AgentColumn.VELOCITY])),
-            whole(now[:, AgentColumn.VALID] > 0),
-            whole(jnp.where(known, turn, 0.0) / (_PAST * DT_S)),
-            whole(jnp.where(known, faster, 0.0) / (_PAST * DT_S)),
-            whole(jnp.zeros(now.shape[0])),
+            pad_parked(now[:, AgentColumn.HEADING]),
+            pad_parked(_length(now[:, AgentColumn.VELOCITY])),
+            pad_parked(now[:, AgentColumn.VALID] > 0),
+            pad_parked(jnp.where(defined, angle, 0.0) / (_TREND_STEPS * DT_S)),
+            pad_parked(jnp.where(defined, speed_change, 0.0) / (_TREND_STEPS * DT_S)),
+            pad_parked(jnp.zeros(now.shape[0])),
         )
 
-    def updated(self, frame: Frame) -> Trend:
+    def update(self, frame: Frame) -> Trend:
         """Advance by one step."""
         direction, speed = frame.box[:, COS : SIN + 1], _length(frame.velocity)
-        known = frame.valid & self.valid
+        defined = frame.valid & self.valid
 
-        def smoothed(old: Array, change: Array) -> Array:
-            return jnp.where(known, old + (change / DT_S - old) / _PAST, 0.0)
+        def smooth(average: Array, change: Array) -> Array:
+            return jnp.where(defined, average + (change / DT_S - average) / _TREND_STEPS, 0.0)
 
-        turning = smoothed(self.turning, _turn(self.direction, direction))
-        acceleration = smoothed(self.acceleration, speed - self.speed)
+        turning = smooth(self.turning, _turn(self.direction, direction))
+        acceleration = smooth(self.acceleration, speed - self.speed)
         stood_s = jnp.where(frame.valid & (speed < SLOW_MPS / 2), self.stood_s + DT_S, 0.0)
         return Trend(direction, speed, frame.valid, turning, acceleration, stood_s)
 
 
-def _turn(before: Float[Array, "S 2"], now: Float[Array, "S 2"]) -> Float[Array, " S"]:
-    """Angle from one direction to another, rad."""
-    cross = before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]
-    return jnp.arctan2(cross, jnp.sum(before * now, axis=-1))
+def _turn(last: Float[Array, "S 2"], direction: Float[Array, "S 2"]) -> Float[Array, " S"]:
+    """Return the angle from one direction to another, rad."""
+    cross = last[:, 0] * direction[:, 1] - last[:, 1] * direction[:, 0]
+    return jnp.arctan2(cross, jnp.sum(last * direction, axis=-1))
 
 
 @record
 class Others:
-    """The nearest agents, predicted in two ways.
+    """The nearest agents with an expected and a possible prediction.
 
     Attributes:
         box: Predicted boxes at each time.
-        maybe: Boxes of agents that may enter ego's path and stay there.
-        enters: Mask of these agents.
+        maybe: Predicted boxes if agents enter ego's path and stay there.
+        enters: Mask of agents that may do so.
         speed: Predicted speeds, m/s.
         valid: Mask of agents.
         behind: Mask of agents that follow ego.
@@ -141,7 +145,7 @@ class Others:
     vulnerable: Bool[Array, " K"]
 
     @classmethod
-    def near(
+    def nearest(
         cls,
         bank: ScenarioBank,
         context: AgentContext,
@@ -156,142 +160,146 @@ class Others:
             context: Ego's context.
             frame: All agents.
             trend: Change of their motion.
-            route: Ego's route: points ahead, whether they exist, their offsets in m.
+            route: Points of ego's route ahead, a mask of those that exist, and their offsets in m.
         """
-        me = frame.box[context.slot]
-        apart = frame.box[:, :2] - me[:2]
+        ego_box = frame.box[context.slot]
+        offset = frame.box[:, :2] - ego_box[:2]
         valid = frame.valid & (jnp.arange(frame.valid.shape[0]) != context.slot)
         valid &= jnp.abs(frame.z - frame.z[context.slot]) <= LEVEL_M
-        # What comes nearer counts as nearer.
-        closing = jnp.sum(apart * frame.velocity, axis=-1) / jnp.maximum(_length(apart), 1.0)
-        rank = jnp.where(valid, _length(apart) + 2.0 * jnp.minimum(closing, 0.0), 1e6)
-        _, rows = jax.lax.top_k(-rank, min(_OTHERS, rank.shape[0]))
+        # Approaching agents rank as nearer.
+        closing = jnp.sum(offset * frame.velocity, axis=-1) / jnp.maximum(_length(offset), 1.0)
+        priority = jnp.where(valid, _length(offset) + 2.0 * jnp.minimum(closing, 0.0), 1e6)
+        _, rows = jax.lax.top_k(-priority, min(_MAX_AGENTS, priority.shape[0]))
         box, velocity, kind = frame.box[rows], frame.velocity[rows], frame.kind[rows]
-        ahead = apart[rows, 0] * me[COS] + apart[rows, 1] * me[SIN]
-        aside = apart[rows, 1] * me[COS] - apart[rows, 0] * me[SIN]
-        follows = box[:, COS] * me[COS] + box[:, SIN] * me[SIN] > SAME_WAY
-        people = kind == AgentKind.PEDESTRIAN
-        # People change their mind within a step.
-        box = box.at[:, LENGTH : WIDTH + 1].add(jnp.where(people, 0.4, 0.0)[:, None])
-        drives = ~people & (_length(velocity) > 2.0 * SLOW_MPS)
-        turning = jnp.where(drives, jnp.clip(trend.turning[rows], -0.8, 0.8), 0.0)
-        faster = jnp.where(people, 0.0, jnp.clip(trend.acceleration[rows], -8.0, 3.0))
-        free, speed = rolled_out(box, velocity, turning, faster)
+        ahead = offset[rows, 0] * ego_box[COS] + offset[rows, 1] * ego_box[SIN]
+        lateral = offset[rows, 1] * ego_box[COS] - offset[rows, 0] * ego_box[SIN]
+        same_direction = box[:, COS] * ego_box[COS] + box[:, SIN] * ego_box[SIN] > SAME_DIRECTION
+        pedestrian = kind == AgentKind.PEDESTRIAN
+        # Pedestrians change direction within a step.
+        box = box.at[:, LENGTH : WIDTH + 1].add(jnp.where(pedestrian, 0.4, 0.0)[:, None])
+        is_driving = ~pedestrian & (_length(velocity) > 2.0 * SLOW_MPS)
+        turning = jnp.where(is_driving, jnp.clip(trend.turning[rows], -0.8, 0.8), 0.0)
+        acceleration = jnp.where(pedestrian, 0.0, jnp.clip(trend.acceleration[rows], -8.0, 3.0))
+        free_boxes, speed = extrapolate(box, velocity, turning, acceleration)
         vehicle = kind == AgentKind.VEHICLE
-        lane, on_lane = _along_lanes(bank, context, box, speed, turning)
-        on_lane &= vehicle & drives
-        entering, may, sure = _entering(box, velocity, speed, route, me, people)
-        may &= ~vehicle | (_length(velocity) < _CROSSES_MPS) | follows
-        rider = kind == AgentKind.CYCLIST
-        comes = box[:, COS] * me[COS] + box[:, SIN] * me[SIN] < -SAME_WAY
-        sure &= may & drives & ((vehicle & follows) | (rider & comes))
-        expected = _chosen(sure, entering, _chosen(on_lane, lane, free))
-        behind = follows & (ahead < -me[LENGTH] / 2) & (jnp.abs(aside) < me[WIDTH])
-        vulnerable = people | rider
+        lane_boxes, on_lane = _predict_along_lanes(bank, context, box, speed, turning)
+        on_lane &= vehicle & is_driving
+        entering_boxes, may_enter, surely_enters = _predict_entering(
+            box, velocity, speed, route, ego_box, pedestrian
+        )
+        may_enter &= ~vehicle | (_length(velocity) < _CROSS_MPS) | same_direction
+        cyclist = kind == AgentKind.CYCLIST
+        oncoming = box[:, COS] * ego_box[COS] + box[:, SIN] * ego_box[SIN] < -SAME_DIRECTION
+        surely_enters &= may_enter & is_driving & ((vehicle & same_direction) | (cyclist & oncoming))
+        boxes = _select(surely_enters, entering_boxes, _select(on_lane, lane_boxes, free_boxes))
+        behind = same_direction & (ahead < -ego_box[LENGTH] / 2) & (jnp.abs(lateral) < ego_box[WIDTH])
+        vulnerable = pedestrian | cyclist
         return cls(
-            expected, entering, may & valid[rows], speed, valid[rows], behind, trend.stood_s[rows], vehicle,
+            boxes, entering_boxes, may_enter & valid[rows], speed, valid[rows], behind, trend.stood_s[rows], vehicle,
             vulnerable,
         )  # fmt: skip
 
 
-def _chosen(one: Bool[Array, " K"], then: Array, otherwise: Array) -> Array:
-    return jnp.where(one[:, None], then, otherwise)
+def _select(mask: Bool[Array, " K"], values: Array, otherwise: Array) -> Array:
+    return jnp.where(mask[:, None], values, otherwise)
 
 
-def rolled_out(
+def extrapolate(
     box: Float[Array, "K 6"], velocity: Float[Array, "K 2"], turning: Float[Array, " K"],
-    faster: Float[Array, " K"],
+    acceleration: Float[Array, " K"],
 ) -> tuple[Float[Array, "H K 6"], Float[Array, "H K"]]:  # fmt: skip
-    """Predict boxes and speeds at each time: constant yaw rate, acceleration for a second, no reversing."""
+    """Predict boxes and speeds with a constant yaw rate and acceleration for a limited time, without reversing."""
     times = prediction_times()[:, None]
-    start = _length(velocity)
-    longer = jnp.minimum(times, jnp.where(faster > 0.0, _SPEEDS_UP_S, _ACCELERATES_S))
-    speed = start + faster * longer
-    speed = jnp.clip(speed, 0.0, jnp.maximum(start, _USUAL_MPS))
-    angle = turning * jnp.minimum(times, _TURNS_S)
+    start_speed = _length(velocity)
+    duration = jnp.minimum(times, jnp.where(acceleration > 0.0, _SPEED_UP_S, _ACCELERATE_S))
+    speed = start_speed + acceleration * duration
+    speed = jnp.clip(speed, 0.0, jnp.maximum(start_speed, _USUAL_MPS))
+    angle = turning * jnp.minimum(times, _TURN_S)
     cos, sin = jnp.cos(angle), jnp.sin(angle)
 
-    def turned(vector: Array) -> Array:
+    def rotate(vector: Array) -> Array:
         x, y = vector[:, 0], vector[:, 1]
         return jnp.stack([x * cos - y * sin, x * sin + y * cos], axis=-1)
 
-    course = turned(velocity / jnp.maximum(start, 1e-3)[:, None])
-    # Who stands and starts goes where it looks.
-    course = jnp.where((start > 0.1)[:, None], course, turned(box[:, COS : SIN + 1]))
+    course = rotate(velocity / jnp.maximum(start_speed, 1e-3)[:, None])
+    # Stationary agents start in the direction of their heading.
+    course = jnp.where((start_speed > 0.1)[:, None], course, rotate(box[:, COS : SIN + 1]))
     xy = box[:, :2] + jnp.cumsum(speed[..., None] * course, axis=0) * STEP_S
     size = jnp.broadcast_to(box[:, LENGTH:], (*speed.shape, 2))
-    return jnp.concatenate([xy, turned(box[:, COS : SIN + 1]), size], axis=-1), speed
+    return jnp.concatenate([xy, rotate(box[:, COS : SIN + 1]), size], axis=-1), speed
 
 
-def _along_lanes(
+def _predict_along_lanes(
     bank: ScenarioBank, context: AgentContext, box: Float[Array, "K 6"], speed: Float[Array, "H K"],
     turning: Float[Array, " K"],
 ) -> tuple[Float[Array, "H K 6"], Bool[Array, " K"]]:  # fmt: skip
-    """Predict boxes of agents that follow their lane, and whether they are on one."""
-    ways = speed.reshape(_LANE_STEPS, -1, speed.shape[1]).mean(axis=1) * _LANE_STEP_S
+    """Predict boxes of agents that follow their lane, with a mask of agents on a lane."""
+    distances = speed.reshape(_LANE_STEPS, -1, speed.shape[1]).mean(axis=1) * _LANE_STEP_S
 
-    def one(start: Array, way: Array, rate: Array) -> tuple[Array, Array]:
-        def step(now: tuple[Array, Array], ahead: tuple[Array, Array]) -> Any:
-            xy, heading = now
-            way, turn = ahead
+    def follow_lane(start: Array, distance: Array, yaw_rate: Array) -> tuple[Array, Array]:
+        def step(carry: tuple[Array, Array], inputs: tuple[Array, Array]) -> Any:
+            xy, heading = carry
+            distance, turn = inputs
             cos, sin = jnp.cos(turn), jnp.sin(turn)
-            bent = jnp.stack([heading[0] * cos - heading[1] * sin, heading[0] * sin + heading[1] * cos])
-            lane, left, there = lane_course(bank, context.index, xy + bent * way / 2, bent, context.z)
-            back = jnp.clip(-left / jnp.maximum(3.0 * way, 4.0), -0.4, 0.4)
-            steered = lane + back * jnp.stack([-lane[1], lane[0]])
-            heading = jnp.where(there, steered / _length(steered), bent)
-            xy = xy + heading * way
-            return (xy, heading), (jnp.concatenate([xy, heading]), there)
+            direction = jnp.stack([heading[0] * cos - heading[1] * sin, heading[0] * sin + heading[1] * cos])
+            lane, left, on_lane = lane_course(
+                bank, context.index, xy + direction * distance / 2, direction, context.z
+            )
+            correction = jnp.clip(-left / jnp.maximum(3.0 * distance, 4.0), -0.4, 0.4)
+            course = lane + correction * jnp.stack([-lane[1], lane[0]])
+            heading = jnp.where(on_lane, course / _length(course), direction)
+            xy = xy + heading * distance
+            return (xy, heading), (jnp.concatenate([xy, heading]), on_lane)
 
-        turns = jnp.where(jnp.arange(_LANE_STEPS) < 2, rate * _LANE_STEP_S / 2, 0.0)
-        _, (poses, there) = jax.lax.scan(step, (start[:2], start[2:4]), (way, turns))
+        turns = jnp.where(jnp.arange(_LANE_STEPS) < 2, yaw_rate * _LANE_STEP_S / 2, 0.0)
+        _, (poses, on_lane) = jax.lax.scan(step, (start[:2], start[2:4]), (distance, turns))
         poses = jnp.concatenate([start[None, :4], poses])
         middle = (poses[:-1] + poses[1:]) / 2
-        return jnp.stack([middle, poses[1:]], axis=1).reshape(-1, 4), there[0]
+        return jnp.stack([middle, poses[1:]], axis=1).reshape(-1, 4), on_lane[0]
 
-    poses, there = jax.vmap(one, in_axes=(0, 1, 0), out_axes=(1, 0))(box, ways, turning)
+    poses, on_lane = jax.vmap(follow_lane, in_axes=(0, 1, 0), out_axes=(1, 0))(box, distances, turning)
     heading = poses[..., 2:] / jnp.maximum(_length(poses[..., 2:]), 1e-3)[..., None]
     size = jnp.broadcast_to(box[:, LENGTH:], (*speed.shape, 2))
-    return jnp.concatenate([poses[..., :2], heading, size], axis=-1), there
+    return jnp.concatenate([poses[..., :2], heading, size], axis=-1), on_lane
 
 
-def _entering(
+def _predict_entering(
     box: Float[Array, "K 6"], velocity: Float[Array, "K 2"], speed: Float[Array, "H K"],
-    route: tuple[Array, Array, Array], me: Float[Array, " 6"], people: Bool[Array, " K"],
+    route: tuple[Array, Array, Array], ego_box: Float[Array, " 6"], pedestrian: Bool[Array, " K"],
 ) -> tuple[Float[Array, "H K 6"], Bool[Array, " K"], Bool[Array, " K"]]:  # fmt: skip
-    """Predict boxes of agents that enter ego's path and stay; masks of possible and certain ones."""
-    path, there, offsets = route
-    along, lateral, cos, sin = project(path, there, offsets, box[:, :2], velocity)
+    """Predict boxes of agents that enter ego's path and stay, with masks of agents that may and surely will."""
+    path, exists, offsets = route
+    along, lateral, cos, sin = project(path, exists, offsets, box[:, :2], velocity)
     toward = -jnp.sign(lateral) * sin
-    toward = jnp.where(people & (toward > _STARTS_MPS), jnp.maximum(toward, _RUNS_MPS), toward)
-    _, _, straight, across = project(path, there, offsets, box[:, :2], box[:, COS : SIN + 1])
+    toward = jnp.where(pedestrian & (toward > _RUN_START_MPS), jnp.maximum(toward, _RUN_MPS), toward)
+    _, _, straight, across = project(path, exists, offsets, box[:, :2], box[:, COS : SIN + 1])
     half = (jnp.abs(across) * box[:, LENGTH] + jnp.abs(straight) * box[:, WIDTH]) / 2
-    gap = jnp.abs(lateral) - half - me[WIDTH] / 2
-    may = (toward > _ENTERS_MPS) & (gap < _ENTERS_S * toward) & (along > -2.0) & jnp.isfinite(lateral)
-    sure = may & (gap < 1.5 * toward) & (toward > 2.0 * _ENTERS_MPS)
+    gap = jnp.abs(lateral) - half - ego_box[WIDTH] / 2
+    may_enter = (toward > _ENTER_MPS) & (gap < _ENTER_S * toward) & (along > -2.0) & jnp.isfinite(lateral)
+    surely_enters = may_enter & (gap < 1.5 * toward) & (toward > 2.0 * _ENTER_MPS)
     times = prediction_times()[:, None]
     share = speed / jnp.maximum(_length(velocity), 0.1)
     forward = jnp.cumsum(cos * share, axis=0) * STEP_S
-    # Who comes the other way swerves for a short time, and then goes on along the way.
-    swerves = jnp.where(cos < -SAME_WAY * _length(velocity), jnp.minimum(times, _SWERVES_S), times)
-    left = jnp.sign(lateral) * jnp.maximum(jnp.abs(lateral) - toward * swerves, 0.0)
-    left = jnp.where(may, left, 0.0)
+    # Oncoming agents swerve for a short time, and then continue along the path.
+    swerve_s = jnp.where(cos < -SAME_DIRECTION * _length(velocity), jnp.minimum(times, _SWERVE_S), times)
+    left = jnp.sign(lateral) * jnp.maximum(jnp.abs(lateral) - toward * swerve_s, 0.0)
+    left = jnp.where(may_enter, left, 0.0)
     row = at(path, offsets, along + forward)
     xy = row[..., :2] + left[..., None] * jnp.stack([-row[..., 3], row[..., 2]], axis=-1)
-    goes_along = jnp.abs(cos) > jnp.abs(sin)
-    way = jnp.sign(cos)[:, None] * row[..., 2:4]
-    facing = jnp.where(goes_along[:, None], way, box[:, COS : SIN + 1])
+    is_parallel = jnp.abs(cos) > jnp.abs(sin)
+    direction = jnp.sign(cos)[:, None] * row[..., 2:4]
+    facing = jnp.where(is_parallel[:, None], direction, box[:, COS : SIN + 1])
     size = jnp.broadcast_to(box[:, LENGTH:], (*speed.shape, 2))
-    return jnp.concatenate([xy, facing, size], axis=-1), may, sure
+    return jnp.concatenate([xy, facing, size], axis=-1), may_enter, surely_enters
 
 
-def at(line: Float[Array, "P 7"], offsets: Float[Array, " P"], way: Array) -> Array:
+def at(line: Float[Array, "P 7"], offsets: Float[Array, " P"], distance: Array) -> Array:
     """Interpolate x, y, cos, sin at arc lengths along a line of evenly spaced points."""
-    place = way / (offsets[1] - offsets[0])
-    low = jnp.clip(place.astype(jnp.int32), 0, line.shape[0] - 2)
-    part = jnp.clip(place - low, 0.0, 1.0)[..., None]
-    row = line[low] * (1.0 - part) + line[low + 1] * part
-    return jnp.concatenate([row[..., :2], row[..., 3:5]], axis=-1)
+    index = distance / (offsets[1] - offsets[0])
+    lower = jnp.clip(index.astype(jnp.int32), 0, line.shape[0] - 2)
+    fraction = jnp.clip(index - lower, 0.0, 1.0)[..., None]
+    point = line[lower] * (1.0 - fraction) + line[lower + 1] * fraction
+    return jnp.concatenate([point[..., :2], point[..., 3:5]], axis=-1)
 
 
 def _length(vector: Float[Array, "... 2"]) -> Float[Array, ...]:
@@ -299,48 +307,55 @@ def _length(vector: Float[Array, "... 2"]) -> Float[Array, ...]:
 
 
 def prediction_times() -> Float[Array, " H"]:
-    """Prediction times, s."""
+    """Return the prediction times, s."""
     return (jnp.arange(HORIZON) + 1.0) * STEP_S
 
 
-#: Lateral offsets from the route to go to, m, and accelerations that are not exceeded on the way, m/s2.
+#: Lateral target offsets from the route, m, and maximum accelerations, m/s2.
 _SHIFTS = (0.0, -1.2, 1.2, -2.4, 2.4, -3.5, 3.5)
 _CAPS = (2.0, 0.0, -1.5, -3.0, -6.0, 2.0)
-#: By how much each exceeds the desired speed: the last one hurries past conflicts.
-_HASTE = (1.0, 1.0, 1.0, 1.0, 1.0, 1.4)
+#: Factors on the desired speed, one per maximum acceleration: the last one hurries past conflicts.
+_SPEED_FACTORS = (1.0, 1.0, 1.0, 1.0, 1.0, 1.4)
 #: Points along the route and their spacing, m.
 _POINTS, _STEP_M = 46, 2.0
-#: Lateral acceleration with which the car goes aside, m/s2.
-_ASIDE_MPS2 = 3.5
-#: Free space ahead of and next to the car: too small, enough, and to uncertain agents, m.
-_TIGHT_M, _FREE_M, _MAYBE_M = (0.1, 0.1), (0.6, 0.5), (0.6, 0.3)
-#: A larger shift leaves the lane, m.
+#: Lateral acceleration of a shift, m/s2.
+_LATERAL_MPS2 = 3.5
+#: Space ahead of and next to the car: too small, enough, and enough for uncertain agents, m.
+_TIGHT_M, _FREE_M, _POSSIBLE_M = (0.1, 0.1), (0.6, 0.5), (0.6, 0.3)
+#: Maximum shift within the lane, m.
 _LANE_M = 2.0
-#: What has stood this long is no queue, s, unless something stands this near before it, or a red light, m.
-_STUCK_S, _QUEUE_M, _LIGHT_M = 2.5, 14.0, 60.0
-#: Who crosses may come sooner or later than expected by this, s, and m per squared s of foresight, at most by m.
+#: An agent blocks the road after this time at standstill (s), unless a queue or a red light is this close ahead (m).
+_BLOCKED_S, _QUEUE_M, _LIGHT_M = 2.5, 14.0, 60.0
+#: Uncertainty of crossing agents: in time, s; in distance per squared prediction time, m/s2; maximum, m.
 _EARLY_S, _EARLY_MPS2, _EARLY_M = 0.25, 0.2, 6.0
 #: Extra lateral space for pedestrians and cyclists, m.
 _VULNERABLE_SPACE_M = 0.6
-#: Prices: of a hit, more the sooner it comes, of one from behind, of one that is only possible, of leaving the road
-#: and of being off it all the time, of driving outside the lanes that go one's way, of passing closely.
-_HIT, _SOONER, _REAR, _MAYBE, _OFF, _ASTRAY, _CLOSE = 60.0, 100.0, 0.3, 40.0, 50.0, 30.0, 4.0
-#: Of crossing the way of who may come early or late, and of doing so all the time; of hurrying.
-_CUTS, _CUTS_LONG, _HURRY = 10.0, 30.0, 4.0
-#: Per metre of way lost, per metre aside, per metre of shifting, of leaving the lane other than to get past what
-#: stands there, per squared m/s2 of braking.
-_WAY, _ASIDE, _SHIFTING, _LEAVES, _BRAKING = 0.2, 0.8, 0.2, 6.0, 0.05
+#: Costs of a collision: basic, extra for an immediate one, factor for one from behind, and of a possible collision;
+#: costs of leaving the road, of leaving the lanes in ego's direction, and of passing closely.
+_COLLISION, _EARLY_COLLISION, _REAR_FACTOR, _POSSIBLE, _OFFROAD, _WRONG_LANE, _CLOSE = (
+    60.0,
+    100.0,
+    0.3,
+    40.0,
+    50.0,
+    30.0,
+    4.0,
+)
+#: Costs of cutting off a crossing agent: basic, and extra if it lasts; cost of hurrying.
+_CUT, _CUT_SHARE, _HURRY = 10.0, 30.0, 4.0
+#: Reward per metre of progress; costs per metre of offset and of shift, of leaving the lane except to pass a blocking
+#: agent, and per squared m/s2 of braking.
+_PROGRESS, _OFFSET, _SHIFT, _LEAVE_LANE, _BRAKING = 0.2, 0.8, 0.2, 6.0, 0.05
 
 
 @record
 class SearchPlanner:
     """Choose among 42 manoeuvres along the route from the true current state.
 
-    A manoeuvre is a lateral offset to go to and an acceleration that is not exceeded; below that, the car follows
-    what is ahead of it by IDM; one more drives faster to clear conflicts. Each is driven for
-    5 s with the dynamics and the steering law that the car really has. It loses by hitting others, the sooner the
-    more, by crossing the way of who may come a little sooner or later than expected, by leaving the road and its
-    lanes, by passing closely, by losing way and by braking.
+    A manoeuvre has a target offset and a maximum acceleration, below which the car follows its leader by IDM; the last
+    acceleration comes with a higher speed, to clear conflicts. Each manoeuvre is simulated for 5 s with the car's own
+    dynamics and steering law. It costs to collide (the sooner, the more), to cut off agents that may arrive earlier or
+    later, to leave the road or its lanes, to pass closely, to lose progress and to brake.
     """
 
     actions: ActionSpace = static(default=Physical())
@@ -352,7 +367,7 @@ class SearchPlanner:
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Trend:
         """Return the motion trend of the half second before the start."""
-        return Trend.logged(bank, state.context)
+        return Trend.from_log(bank, state.context)
 
     def act(
         self,
@@ -365,184 +380,203 @@ class SearchPlanner:
     ) -> tuple[Float[Array, " D"], Any]:
         """Return the first step of the cheapest manoeuvre."""
         context, frame = situation.context, situation.surroundings.frame
-        me, speed = frame.box[context.slot], context.history[-1, 3]
+        ego_box, speed = frame.box[context.slot], context.history[-1, 3]
         offsets = jnp.arange(_POINTS) * _STEP_M
-        path, there = route_ahead(bank, context.index, context.route_m, offsets)
-        desired = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
-        stop = stop_line_m(bank, context, frame)
-        trend = carry.updated(frame)
-        others = Others.near(bank, context, frame, trend, (path, there, offsets))
+        path, exists = route_ahead(bank, context.index, context.route_m, offsets)
+        desired_mps = jnp.where(exists[1], desired_speed(path, exists, offsets), 0.0)
+        stop_m = stop_line_m(bank, context, frame)
+        trend = carry.update(frame)
+        others = Others.nearest(bank, context, frame, trend, (path, exists, offsets))
         lateral = jnp.clip(situation.surroundings.route.lateral_m, -5.0, 5.0)
-        stuck = _stuck(path, there, offsets, others, me, stop)
+        is_blocked = _is_blocked(path, exists, offsets, others, ego_box, stop_m)
 
-        def line_costs(shift: Array) -> tuple[Array, Array, Array]:
-            line = _line(path, offsets, (lateral, shift), me, speed)
-            pose, way, first = self._driven(line, there, offsets, others, (me, speed, desired, stop))
-            cost = jax.vmap(lambda driven: _danger(driven, me, others))(pose)
-            off, astray = _bad_ground(bank, situation, pose[0], (line, there), me)
-            astray_price = jnp.where(stuck, 0.1, 1.0) * _ASTRAY
-            cost += _OFF * ((off > 0.0) + off) + (shift != 0.0) * astray * astray_price
-            cost += (jnp.abs(shift) > _LANE_M) * ~stuck * _LEAVES
-            cost += _ASIDE * jnp.abs(shift) + _SHIFTING * jnp.abs(shift - lateral)
-            cost += _HURRY * (jnp.asarray(_HASTE) > 1.0)
-            cost += _BRAKING * jnp.minimum(first[:, 0], 0.0) ** 2 - _WAY * way
-            return cost, first, line
+        def line_costs(shift: Array) -> tuple[Array, Array]:
+            line = _shifted_line(path, offsets, (lateral, shift), ego_box, speed)
+            poses, distance, first_controls = self._drive_line(
+                line, exists, offsets, others, (ego_box, speed, desired_mps, stop_m)
+            )
+            cost = jax.vmap(lambda poses: _collision_cost(poses, ego_box, others))(poses)
+            offroad, wrong_lane = _road_violations(bank, situation, poses[0], (line, exists), ego_box)
+            wrong_lane_price = jnp.where(is_blocked, 0.1, 1.0) * _WRONG_LANE
+            cost += _OFFROAD * ((offroad > 0.0) + offroad) + (shift != 0.0) * wrong_lane * wrong_lane_price
+            cost += (jnp.abs(shift) > _LANE_M) * ~is_blocked * _LEAVE_LANE
+            cost += _OFFSET * jnp.abs(shift) + _SHIFT * jnp.abs(shift - lateral)
+            cost += _HURRY * (jnp.asarray(_SPEED_FACTORS) > 1.0)
+            cost += _BRAKING * jnp.minimum(first_controls[:, 0], 0.0) ** 2 - _PROGRESS * distance
+            return cost, first_controls
 
-        costs, firsts, _ = jax.vmap(line_costs)(jnp.asarray(_SHIFTS))
-        best = firsts.reshape(-1, 2)[jnp.argmin(costs)]
+        costs, controls = jax.vmap(line_costs)(jnp.asarray(_SHIFTS))
+        best = controls.reshape(-1, 2)[jnp.argmin(costs)]
         motion = context.history[-1]
-        action = self.actions.action(motion, best[0], best[1], me[LENGTH])
+        action = self.actions.action(motion, best[0], best[1], ego_box[LENGTH])
         return action, trend
 
-    def _driven(
-        self, line: Array, there: Array, offsets: Array, others: Others, ego: tuple[Array, ...]
+    def _drive_line(
+        self, line: Array, exists: Array, offsets: Array, others: Others, ego: tuple[Array, ...]
     ) -> tuple[Float[Array, "C H 4"], Float[Array, " C"], Float[Array, "C 2"]]:
-        """Poses along a line for each cap, travelled distances, and first acceleration and curvature."""
-        me, start, desired, stop = ego
-        sharpest = self.actions.sharpest(me[LENGTH])
-        rear, leader_speed = jax.vmap(lambda now: _corridor(line, there, offsets, others, now, me))(
-            (others.box, others.speed)
-        )
-        left_m = jnp.sum(there) * _STEP_M
+        """Simulate each cap along a line; return poses, travelled distances, and first acceleration and curvature."""
+        ego_box, start_mps, desired_mps, stop_m = ego
+        max_curvature = self.actions.sharpest(ego_box[LENGTH])
+        rear, leader_speed = jax.vmap(
+            lambda agents: _agents_in_corridor(line, exists, offsets, others, agents, ego_box)
+        )((others.box, others.speed))
+        route_end_m = jnp.sum(exists) * _STEP_M
 
-        def cap_driven(cap: Array, haste: Array) -> tuple[Array, Array, Array]:
-            hurried = desired * haste
+        def drive_with_cap(cap: Array, speed_factor: Array) -> tuple[Array, Array, Array]:
+            target_mps = desired_mps * speed_factor
 
-            def step(now: tuple[Array, ...], ahead: tuple[Array, Array]) -> Any:
-                pose, way, v = now
-                rear, leader = ahead
-                gaps = jnp.where(rear > way, rear - way, jnp.inf) - me[LENGTH] / 2
+            def step(carry: tuple[Array, ...], agents: tuple[Array, Array]) -> Any:
+                pose, travelled_m, v = carry
+                rear, leader = agents
+                gaps = jnp.where(rear > travelled_m, rear - travelled_m, jnp.inf) - ego_box[LENGTH] / 2
                 nearest = jnp.argmin(gaps)
-                line_gap = stop - way + self.parameters.min_gap_m - STOP_SHORT_M
+                line_gap = stop_m - travelled_m + self.parameters.min_gap_m - STOP_SHORT_M
                 gap = jnp.minimum(gaps[nearest], line_gap)
                 gap = jnp.where(jnp.isfinite(gap), gap, 1e4)
                 leader_v = jnp.where(line_gap < gaps[nearest], 0.0, leader[nearest])
-                a = jnp.minimum(idm_acceleration(v, hurried, gap, leader_v, self.parameters), cap)
-                aim = jnp.minimum(way + jnp.clip(0.5 * v + 2.5, 3.0, 14.0), left_m)
-                k = pursuit(pose, at(line, offsets, aim)[:2] - pose[:2])
-                grip = jnp.minimum(GRIP_MPS2 / jnp.maximum(v * v, 1e-3), sharpest)
+                a = jnp.minimum(idm_acceleration(v, target_mps, gap, leader_v, self.parameters), cap)
+                target_m = jnp.minimum(travelled_m + jnp.clip(0.5 * v + 2.5, 3.0, 14.0), route_end_m)
+                k = pursuit(pose, at(line, offsets, target_m)[:2] - pose[:2])
+                grip = jnp.minimum(GRIP_MPS2 / jnp.maximum(v * v, 1e-3), max_curvature)
                 k = jnp.clip(k, -grip, grip)
-                slower = jnp.maximum(v + a * STEP_S, 0.0)
-                moved = (v + slower) / 2 * STEP_S
-                pose = advanced(pose, k, moved)
-                return (pose, way + moved, slower), (pose, a, k)
+                next_v = jnp.maximum(v + a * STEP_S, 0.0)
+                step_m = (v + next_v) / 2 * STEP_S
+                pose = advance(pose, k, step_m)
+                return (pose, travelled_m + step_m, next_v), (pose, a, k)
 
-            _, (pose, a, k) = jax.lax.scan(step, (me[:4], jnp.zeros(()), start), (rear, leader_speed))
-            final = jnp.sum(jnp.sqrt(jnp.sum((pose[1:, :2] - pose[:-1, :2]) ** 2, -1)))
-            return pose, final, jnp.stack([a[0], k[0]])
+            _, (pose, a, k) = jax.lax.scan(
+                step, (ego_box[:4], jnp.zeros(()), start_mps), (rear, leader_speed)
+            )
+            distance_m = jnp.sum(jnp.sqrt(jnp.sum((pose[1:, :2] - pose[:-1, :2]) ** 2, -1)))
+            return pose, distance_m, jnp.stack([a[0], k[0]])
 
-        return jax.vmap(cap_driven)(jnp.asarray(_CAPS), jnp.asarray(_HASTE))
+        return jax.vmap(drive_with_cap)(jnp.asarray(_CAPS), jnp.asarray(_SPEED_FACTORS))
 
 
-def advanced(pose: Float[Array, " 4"], curvature: Array, distance: Array) -> Float[Array, " 4"]:
+def advance(pose: Float[Array, " 4"], curvature: Array, distance: Array) -> Float[Array, " 4"]:
     """Advance x, y, cos, sin by a distance at a curvature, like the kinematic bicycle."""
 
-    def turned(cos: Array, sin: Array) -> Float[Array, " 2"]:
+    def rotate(cos: Array, sin: Array) -> Float[Array, " 2"]:
         c, s = jnp.cos(curvature * distance / 2), jnp.sin(curvature * distance / 2)
         return jnp.stack([cos * c - sin * s, sin * c + cos * s])
 
-    mean = turned(pose[2], pose[3])
-    return jnp.concatenate([pose[:2] + distance * mean, turned(mean[0], mean[1])])
+    mean_direction = rotate(pose[2], pose[3])
+    return jnp.concatenate(
+        [pose[:2] + distance * mean_direction, rotate(mean_direction[0], mean_direction[1])]
+    )
 
 
-def _line(
+def _shifted_line(
     path: Float[Array, "P 7"],
     offsets: Float[Array, " P"],
-    aside: tuple[Array, Array],
-    me: Array,
+    offsets_m: tuple[Array, Array],
+    ego_box: Array,
     speed: Array,
 ) -> Float[Array, "P 7"]:
     """Shift the route laterally from the car's current offset and heading to a target offset.
 
-    A cubic whose largest lateral acceleration, 6 d / T^2 for a shift by d within T, is 3.5 m/s2.
+    The shift is a cubic with a maximum lateral acceleration of 3.5 m/s2: 6 d / T^2 for a shift by d in time T.
     """
-    lateral, shift = aside
+    lateral, shift = offsets_m
     cos, sin = path[:, RouteColumn.COS], path[:, RouteColumn.SIN]
-    forward, left = me[COS] * cos[0] + me[SIN] * sin[0], me[SIN] * cos[0] - me[COS] * sin[0]
+    forward, left = (
+        ego_box[COS] * cos[0] + ego_box[SIN] * sin[0],
+        ego_box[SIN] * cos[0] - ego_box[COS] * sin[0],
+    )
     slope = jnp.clip(left / jnp.maximum(forward, 0.3), -0.5, 0.5)
-    takes_s = jnp.clip(jnp.sqrt(6.0 * jnp.abs(shift - lateral) / _ASIDE_MPS2), 1.0, 2.5)
-    length = jnp.clip(takes_s * speed, 6.0, 40.0)
+    duration_s = jnp.clip(jnp.sqrt(6.0 * jnp.abs(shift - lateral) / _LATERAL_MPS2), 1.0, 2.5)
+    length = jnp.clip(duration_s * speed, 6.0, 40.0)
     u = jnp.clip(offsets / length, 0.0, 1.0)
     d = lateral + (shift - lateral) * u * u * (3.0 - 2.0 * u) + slope * length * u * (1.0 - u) ** 2
     slopes = (shift - lateral) * 6.0 * u * (1.0 - u) / length + slope * (1.0 - u) * (1.0 - 3.0 * u)
     norm = jnp.sqrt(1.0 + slopes * slopes)
-    turned = jnp.stack([(cos - sin * slopes) / norm, (sin + cos * slopes) / norm], axis=-1)
+    headings = jnp.stack([(cos - sin * slopes) / norm, (sin + cos * slopes) / norm], axis=-1)
     xy = path[:, RouteColumn.XY] + d[:, None] * jnp.stack([-sin, cos], axis=-1)
-    return path.at[:, RouteColumn.XY].set(xy).at[:, RouteColumn.HEADING].set(turned)
+    return path.at[:, RouteColumn.XY].set(xy).at[:, RouteColumn.HEADING].set(headings)
 
 
-def _corridor(
-    line: Array, there: Array, offsets: Array, others: Others, now: tuple[Array, Array], me: Array
+def _agents_in_corridor(
+    line: Array, exists: Array, offsets: Array, others: Others, agents: tuple[Array, Array], ego_box: Array
 ) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
-    """Rear positions of agents in a line's corridor at a time (else infinite), and their speeds."""
-    box, speed = now
-    along, lateral, cos, sin = project(line, there, offsets, box[:, :2], box[:, COS : SIN + 1])
+    """Return the rear positions of agents in a line's corridor (else infinite), and their speeds."""
+    box, speed = agents
+    along, lateral, cos, sin = project(line, exists, offsets, box[:, :2], box[:, COS : SIN + 1])
     half_length = (jnp.abs(cos) * box[:, LENGTH] + jnp.abs(sin) * box[:, WIDTH]) / 2
     half_width = (jnp.abs(sin) * box[:, LENGTH] + jnp.abs(cos) * box[:, WIDTH]) / 2
-    led = others.valid & ((cos > SAME_WAY) | (speed < SLOW_MPS)) & ~others.behind
-    led &= jnp.abs(lateral) < half_width + me[WIDTH] / 2 + _TIGHT_M[1] + 0.1
-    return jnp.where(led, along - half_length, jnp.inf), speed * cos
+    in_corridor = others.valid & ((cos > SAME_DIRECTION) | (speed < SLOW_MPS)) & ~others.behind
+    in_corridor &= jnp.abs(lateral) < half_width + ego_box[WIDTH] / 2 + _TIGHT_M[1] + 0.1
+    return jnp.where(in_corridor, along - half_length, jnp.inf), speed * cos
 
 
-def _stuck(
-    path: Array, there: Array, offsets: Array, others: Others, me: Array, stop: Array
+def _is_blocked(
+    path: Array, exists: Array, offsets: Array, others: Others, ego_box: Array, stop_m: Array
 ) -> Bool[Array, ""]:
-    """Whether the next agent on the route is stationary, so that ego may pass it."""
+    """Return whether the next agent on the route is stationary and may be passed."""
     along, lateral, cos, sin = project(
-        path, there, offsets, others.box[0, :, :2], others.box[0, :, COS : SIN + 1]
+        path, exists, offsets, others.box[0, :, :2], others.box[0, :, COS : SIN + 1]
     )
     half_width = (jnp.abs(sin) * others.box[0, :, LENGTH] + jnp.abs(cos) * others.box[0, :, WIDTH]) / 2
-    on = others.valid & (jnp.abs(lateral) < half_width + me[WIDTH] / 2 + 0.2) & (along > 0.0)
-    ways = jnp.where(on, along, jnp.inf)
-    first = jnp.argmin(ways)
-    queue = (on & others.vehicle & (ways > ways[first]) & (ways < ways[first] + _QUEUE_M)).any()
-    stands = (others.stood_s[first] >= _STUCK_S) | (
+    on_route = others.valid & (jnp.abs(lateral) < half_width + ego_box[WIDTH] / 2 + 0.2) & (along > 0.0)
+    distances = jnp.where(on_route, along, jnp.inf)
+    first = jnp.argmin(distances)
+    queue = (
+        on_route & others.vehicle & (distances > distances[first]) & (distances < distances[first] + _QUEUE_M)
+    ).any()
+    stationary = (others.stood_s[first] >= _BLOCKED_S) | (
         ~others.vehicle[first] & (others.speed[0, first] < SLOW_MPS)
     )
-    return stands & ~(queue & others.vehicle[first]) & (stop > _LIGHT_M) & jnp.isfinite(ways[first])
+    return (
+        stationary & ~(queue & others.vehicle[first]) & (stop_m > _LIGHT_M) & jnp.isfinite(distances[first])
+    )
 
 
-def _danger(pose: Float[Array, "H 4"], me: Array, others: Others) -> Array:
-    """Cost of predicted, possible and near collisions of a manoeuvre."""
+def _collision_cost(pose: Float[Array, "H 4"], ego_box: Array, others: Others) -> Array:
+    """Return the cost of predicted, possible and near collisions of a manoeuvre."""
 
-    def meets(boxes: Array, margin: tuple[float, float]) -> Bool[Array, "H K"]:
-        size = jnp.broadcast_to(me[LENGTH:] + 2.0 * jnp.asarray(margin), (HORIZON, 2))
+    def overlaps(boxes: Array, margin: tuple[float, float]) -> Bool[Array, "H K"]:
+        size = jnp.broadcast_to(ego_box[LENGTH:] + 2.0 * jnp.asarray(margin), (HORIZON, 2))
         return overlap(jnp.concatenate([pose, size], -1)[:, None], boxes) & others.valid
 
-    def sooner(hit: Bool[Array, "H K"]) -> Float[Array, " K"]:
-        return jnp.where(hit.any(axis=0), 1.0 - jnp.argmax(hit, axis=0) / HORIZON, 0.0)
+    def earliness(hits: Bool[Array, "H K"]) -> Float[Array, " K"]:
+        return jnp.where(hits.any(axis=0), 1.0 - jnp.argmax(hits, axis=0) / HORIZON, 0.0)
 
-    early = sooner(meets(others.box, _TIGHT_M))
-    price = jnp.where(early > 0.0, _HIT + _SOONER * early, 0.0)
-    price = jnp.maximum(price, _MAYBE * sooner(meets(others.maybe, _MAYBE_M) & others.enters))
-    worst = jnp.max(price * jnp.where(others.behind, _REAR, 1.0))
-    # Who crosses ego's way, or comes into it, may be there a little sooner or later.
+    hit_earliness = earliness(overlaps(others.box, _TIGHT_M))
+    price = jnp.where(hit_earliness > 0.0, _COLLISION + _EARLY_COLLISION * hit_earliness, 0.0)
+    price = jnp.maximum(price, _POSSIBLE * earliness(overlaps(others.maybe, _POSSIBLE_M) & others.enters))
+    worst = jnp.max(price * jnp.where(others.behind, _REAR_FACTOR, 1.0))
+    # Agents that cross or enter ego's path may arrive earlier or later.
     cos = jnp.einsum("hi,hki->hk", pose[:, 2:4], others.box[..., COS : SIN + 1])
-    crosses = ((cos < SAME_WAY) | others.enters) & (others.speed > SLOW_MPS) & others.vehicle
+    crosses = ((cos < SAME_DIRECTION) | others.enters) & (others.speed > SLOW_MPS) & others.vehicle
     times = prediction_times()[:, None]
-    early = jnp.minimum(_EARLY_S * others.speed + _EARLY_MPS2 * times * times, _EARLY_M)
-    wide = others.box.at[..., LENGTH].add(jnp.where(crosses, 2.0 * early, 0.0))
-    wide = wide.at[..., WIDTH].add(jnp.where(others.vulnerable, 2.0 * _VULNERABLE_SPACE_M, 0.0))
-    near = meets(wide, _FREE_M) & ~others.behind
+    early_m = jnp.minimum(_EARLY_S * others.speed + _EARLY_MPS2 * times * times, _EARLY_M)
+    inflated = others.box.at[..., LENGTH].add(jnp.where(crosses, 2.0 * early_m, 0.0))
+    inflated = inflated.at[..., WIDTH].add(jnp.where(others.vulnerable, 2.0 * _VULNERABLE_SPACE_M, 0.0))
+    near = overlaps(inflated, _FREE_M) & ~others.behind
     cut = (near & crosses).any(axis=1)
-    worst += jnp.where(cut.any(), _CUTS, 0.0) + _CUTS_LONG * jnp.mean(cut)
+    worst += jnp.where(cut.any(), _CUT, 0.0) + _CUT_SHARE * jnp.mean(cut)
     return worst + _CLOSE * jnp.mean((near & ~crosses).any(axis=1))
 
 
-def _bad_ground(
-    bank: ScenarioBank, situation: Situation, pose: Float[Array, "H 4"], line: tuple[Array, Array], me: Array
+def _road_violations(
+    bank: ScenarioBank,
+    situation: Situation,
+    pose: Float[Array, "H 4"],
+    line: tuple[Array, Array],
+    ego_box: Array,
 ) -> tuple[Array, Array]:
-    """Whether the car leaves the road within 3 s, and whether a line leaves the lanes in its direction."""
+    """Return the off-road share of the next 3 s, and whether a line leaves the lanes in its direction."""
     context = situation.context
     ground = context.z - bank.height_m(context.index, context.slot) / 2
 
-    def beyond(at: Array) -> Array:
-        box = jnp.concatenate([at, me[LENGTH:]])
+    def is_offroad(car_pose: Array) -> Array:
+        box = jnp.concatenate([car_pose, ego_box[LENGTH:]])
         left, known = left_of_edges(bank, context.index, box[:2], corners(box), ground)
         return (known & (left < -OFFROAD_TOLERANCE_M / 2)).any()
 
-    def astray(row: Array) -> Array:
-        return around_lanes(bank, context.index, row[:2], row[3:5], row[None, :2], context.z).straddling
+    def leaves_lanes(point: Array) -> Array:
+        return around_lanes(bank, context.index, point[:2], point[3:5], point[None, :2], context.z).straddling
 
-    few = slice(4, 17, 4)
-    return jnp.mean(jax.vmap(beyond)(pose[1:12:2])), (jax.vmap(astray)(line[0][few]) & line[1][few]).any()
+    sample = slice(4, 17, 4)
+    return jnp.mean(jax.vmap(is_offroad)(pose[1:12:2])), (
+        jax.vmap(leaves_lanes)(line[0][sample]) & line[1][sample]
+    ).any()

@@ -15,28 +15,28 @@ from drivax.synthetic.sensing import NoiseConfig, largest_shift_m
 
 Array = np.ndarray[Any, Any]
 
-#: Time to collision that makes an event one, s, and how far it is looked for.
+#: Time to collision of a near miss, and horizon of its computation, s.
 NEAR_S, HORIZON_S = 1.0, 5.0
 
 
-def uncomfortable(scenario: Scenario) -> tuple[str, ...]:
-    """Names of the comfort limits that ego's log violates."""
+def violated_limits(scenario: Scenario) -> tuple[str, ...]:
+    """Return the names of the comfort limits that ego's log violates."""
     speed = np.hypot(*scenario.agent_velocity[:, 0].astype(np.float64).T)
     return broken_limits(scenario.agent_heading[:, 0].astype(np.float64), speed)
 
 
 def all_agents(scenario: Scenario) -> tuple[Array, Array, Array, Array, Array]:
-    """Boxes ``[step, agent, 6]``, velocities, validity, kinds and ids of all agents, ego first."""
+    """Return boxes ``[step, agent, 6]``, velocities, validity, kinds and ids of all agents, ego first."""
     moving = np.flatnonzero(scenario.agent_valid.any(axis=0))
     parked = np.flatnonzero(scenario.parked_valid.any(axis=0))
     steps = scenario.agent_valid.shape[0]
 
-    def both(moves: Array, stands: Array) -> Array:
-        stands = np.broadcast_to(stands, (steps, *stands.shape))
-        return np.concatenate((moves, stands), axis=1).astype(np.float64)
+    def concatenate(moving_values: Array, parked_values: Array) -> Array:
+        parked_values = np.broadcast_to(parked_values, (steps, *parked_values.shape))
+        return np.concatenate((moving_values, parked_values), axis=1).astype(np.float64)
 
-    heading = both(scenario.agent_heading[:, moving], scenario.parked_heading[parked])
-    xy = both(scenario.agent_xy[:, moving], scenario.parked_xy[parked])
+    heading = concatenate(scenario.agent_heading[:, moving], scenario.parked_heading[parked])
+    xy = concatenate(scenario.agent_xy[:, moving], scenario.parked_xy[parked])
     size = np.concatenate((scenario.agent_size[moving], scenario.parked_size[parked]))[:, :2]
     box = np.concatenate(
         [
@@ -47,42 +47,41 @@ def all_agents(scenario: Scenario) -> tuple[Array, Array, Array, Array, Array]:
         ],
         axis=-1,
     )
-    velocity = both(scenario.agent_velocity[:, moving], np.zeros((len(parked), 2)))
+    velocity = concatenate(scenario.agent_velocity[:, moving], np.zeros((len(parked), 2)))
     valid = np.concatenate((scenario.agent_valid[:, moving], scenario.parked_valid[:, parked]), axis=1)
     kind = np.concatenate((scenario.agent_kind[moving], scenario.parked_kind[parked]))
-    number = np.concatenate((scenario.agent_id[moving], scenario.parked_id[parked]))
-    return box, velocity, valid, kind, number
+    ids = np.concatenate((scenario.agent_id[moving], scenario.parked_id[parked]))
+    return box, velocity, valid, kind, ids
 
 
-def overlapping_pairs(scenario: Scenario) -> int:
-    """Pairs of vehicles other than ego whose boxes overlap at some step."""
+def count_overlapping_pairs(scenario: Scenario) -> int:
+    """Count the pairs of vehicles other than ego whose boxes overlap at some step."""
     box, _, valid, kind, _ = all_agents(scenario)
     vehicles = np.flatnonzero((kind == AgentKind.VEHICLE) & (np.arange(len(kind)) > 0))
     first, second = np.triu_indices(len(vehicles), 1)
     first, second = vehicles[first], vehicles[second]
-    both = valid[:, first] & valid[:, second]
-    return int((overlap(box[:, first], box[:, second]) & both).any(axis=0).sum())
+    pair_valid = valid[:, first] & valid[:, second]
+    return int((overlap(box[:, first], box[:, second]) & pair_valid).any(axis=0).sum())
 
 
 def constant_speed_ttc_s(scenario: Scenario) -> float:
-    """Smallest time to collision with the event's actors if ego keeps its speed from the event on.
+    """Return the smallest time to collision with the event's actors if ego keeps its speed from the event on.
 
-    It starts at the event's first step, with the speed that it has then, and goes on along its route, as far off
-    it as it is (the log's own way may already avoid the actor). Time to collision is that of boxes at constant
-    velocity; 0 where they overlap.
+    From the event's first step on, ego keeps its speed and its lateral offset from the route (the logged path may
+    already avoid the actor). Boxes move at constant velocity; the time of overlapping boxes is 0.
     """
     start, actors = int(scenario.event_start[0]), scenario.event_actor[0]
-    box, velocity, valid, _, number = all_agents(scenario)
-    rows = np.flatnonzero(np.isin(number, actors[actors >= 0]))
-    way = _way(scenario, start)
+    box, velocity, valid, _, ids = all_agents(scenario)
+    rows = np.flatnonzero(np.isin(ids, actors[actors >= 0]))
+    path = _path_ahead(scenario, start)
     speed = float(np.hypot(*scenario.agent_velocity[start, 0]))
     steps = np.arange(start, len(box))
-    along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))))
-    at = np.minimum((steps - start) * DT_S * speed, along[-1] - 1e-3)
-    xy = np.stack([np.interp(at, along, way[:, k]) for k in range(2)], axis=-1)
-    ahead = np.stack([np.interp(at + 0.5, along, way[:, k]) for k in range(2)], axis=-1) - xy
-    turned = np.arctan2(ahead[:, 1], ahead[:, 0])
-    heading = np.where(np.hypot(*ahead.T) > 0.1, turned, scenario.agent_heading[start, 0])
+    arc_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
+    travelled_m = np.minimum((steps - start) * DT_S * speed, arc_m[-1] - 1e-3)
+    xy = np.stack([np.interp(travelled_m, arc_m, path[:, k]) for k in range(2)], axis=-1)
+    ahead = np.stack([np.interp(travelled_m + 0.5, arc_m, path[:, k]) for k in range(2)], axis=-1) - xy
+    path_heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+    heading = np.where(np.hypot(*ahead.T) > 0.1, path_heading, scenario.agent_heading[start, 0])
     direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     size = np.broadcast_to(box[start, 0, 4:6], (len(steps), 2))
     ego = np.concatenate([xy, direction, size], axis=-1)[:, None]
@@ -92,20 +91,20 @@ def constant_speed_ttc_s(scenario: Scenario) -> float:
     return float(np.where(valid[steps][:, rows], time, HORIZON_S).min(initial=HORIZON_S))
 
 
-def _way(scenario: Scenario, start: int) -> Array:
-    """Points of the route from ego's position on, at ego's lateral offset."""
+def _path_ahead(scenario: Scenario, start: int) -> Array:
+    """Return points of the route ahead of ego, at ego's lateral offset."""
     count = int(scenario.route_points[0])
     route = scenario.route_xy[0, :count].astype(np.float64)
     heading = scenario.route_heading[0, :count].astype(np.float64)
     normal = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
     ego = scenario.agent_xy[start, 0].astype(np.float64)
     nearest = int(np.hypot(*(route - ego).T).argmin())
-    left = float((ego - route[nearest]) @ normal[nearest])
-    return np.concatenate((ego[None], (route + left * normal)[nearest + 1 :]))
+    lateral = float((ego - route[nearest]) @ normal[nearest])
+    return np.concatenate((ego[None], (route + lateral * normal)[nearest + 1 :]))
 
 
 def binomial(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Clopper-Pearson interval of a share."""
+    """Return the Clopper-Pearson interval of a share."""
     if not trials:
         return 0.0, 1.0
     tail = (1.0 - level) / 2
@@ -120,23 +119,23 @@ def share(successes: int, trials: int) -> dict[str, Any]:
     return {"share": successes / trials if trials else math.nan, "low": low, "high": high, "n": trials}
 
 
-def against(configured: float, successes: int, trials: int, comparisons: int) -> dict[str, Any]:
+def compare_share(configured: float, successes: int, trials: int, comparisons: int) -> dict[str, Any]:
     """Compare a share with its configured probability.
 
-    Of many 95 % intervals one in twenty misses the truth, so ``outside`` says whether the configured value is outside
-    Bonferroni's interval, of level 1 - 0.05 / comparisons; ``outside_95`` says the same of the usual one.
+    ``outside`` is True if the configured value is outside Bonferroni's interval, of level 1 - 0.05 / comparisons;
+    ``outside_95`` if it is outside the 95 % interval, as in one of twenty comparisons by chance.
     """
-    found = share(successes, trials)
+    result = share(successes, trials)
     low, high = binomial(successes, trials, 1.0 - 0.05 / comparisons)
     return {
-        **found,
+        **result,
         "configured": configured,
-        "outside_95": not found["low"] <= configured <= found["high"],
+        "outside_95": not result["low"] <= configured <= result["high"],
         "outside": not low <= configured <= high,
     }
 
 
 def largest_noise_m(scenario: Scenario, config: NoiseConfig) -> float:
-    """Largest displacement of any agent's corner that perception noise can cause in a scenario."""
+    """Return the largest displacement of an agent's corner by perception noise in a scenario."""
     sizes = scenario.agent_size[1:][scenario.agent_valid[:, 1:].any(axis=0), :2]
     return max((largest_shift_m(config, float(length), float(width)) for length, width in sizes), default=0.0)

@@ -24,9 +24,9 @@ from drivax.scenario.recording import Recording, Tracks
 from drivax.scenario.schema import AgentKind
 
 WINDOW, ORDER = 11, 3
-#: Moving: at every step of a run faster than this, m/s. A run is this many steps without a gap.
+#: Minimum speed at all steps of a run, m/s, and its minimum number of steps without a gap.
 MOVING_MPS, RUN = 2.0, 31
-#: Sets whose tracks are annotated at 2 Hz and interpolated tell nothing about 10 Hz.
+#: Data sets with tracks interpolated from 2 Hz, which have no noise at 10 Hz.
 INTERPOLATED = ("nuscenes",)
 QUANTITIES = ("along_m", "across_m", "heading_rad", "speed_mps")
 
@@ -34,13 +34,13 @@ Array = np.ndarray[Any, Any]
 
 
 def residual_filter(steps: int) -> Float[Array, "step step"]:
-    """Matrix that maps a series to its smoothing residual (only inner rows are used)."""
+    """Return the matrix that maps a series to its smoothing residual (only inner rows are used)."""
     smooth = savgol_filter(np.eye(steps), WINDOW, ORDER, axis=0)
     return np.eye(steps) - smooth
 
 
-def expected(correlation: float) -> tuple[float, float]:
-    """Standard deviation and lag-1 autocorrelation of the residual of AR(1) noise of variance 1."""
+def residual_statistics(correlation: float) -> tuple[float, float]:
+    """Return the standard deviation and lag-1 autocorrelation of the residual of AR(1) noise of variance 1."""
     steps = 2 * WINDOW + 1
     rows = residual_filter(steps)[WINDOW : WINDOW + 2]
     covariance = correlation ** np.abs(np.subtract.outer(np.arange(steps), np.arange(steps)))
@@ -48,43 +48,43 @@ def expected(correlation: float) -> tuple[float, float]:
     return float(np.sqrt(outer[0, 0])), float(outer[0, 1] / outer[0, 0])
 
 
-def fitted(deviation: float, lag_one: float) -> tuple[float, float]:
-    """Standard deviation and correlation (0 to 0.95 per step) of the AR(1) noise with a given residual."""
+def fit_noise(deviation: float, lag_one: float) -> tuple[float, float]:
+    """Fit AR(1) noise to a residual: return its standard deviation and correlation (0 to 0.95 per step)."""
     grid = np.linspace(0.0, 0.95, 96)
-    table = np.array([expected(value) for value in grid])
+    table = np.array([residual_statistics(value) for value in grid])
     best = int(np.argmin(np.abs(table[:, 1] - lag_one)))
     return deviation / float(table[best, 0]), float(grid[best])
 
 
-def runs(tracks: Tracks, ego: int) -> list[tuple[int, slice]]:
-    """Rows and steps of other vehicles that move without a gap."""
+def moving_runs(tracks: Tracks, ego: int) -> list[tuple[int, slice]]:
+    """Return rows and steps of other vehicles that move without a gap."""
     speed = np.hypot(*np.moveaxis(tracks.velocity, -1, 0))
-    good = tracks.valid & (speed > MOVING_MPS) & (tracks.kind == AgentKind.VEHICLE)[:, None]
-    good[ego] = False
-    found = []
-    for row in np.flatnonzero(good.any(axis=1)):
-        change = np.flatnonzero(np.diff(np.concatenate(([False], good[row], [False]))))
-        found += [
+    is_moving = tracks.valid & (speed > MOVING_MPS) & (tracks.kind == AgentKind.VEHICLE)[:, None]
+    is_moving[ego] = False
+    result = []
+    for row in np.flatnonzero(is_moving.any(axis=1)):
+        change = np.flatnonzero(np.diff(np.concatenate(([False], is_moving[row], [False]))))
+        result += [
             (int(row), slice(int(a), int(b)))
             for a, b in zip(change[::2], change[1::2], strict=True)
             if b - a >= RUN
         ]
-    return found
+    return result
 
 
 def residuals(recording: Recording) -> dict[str, list[Array]]:
-    """Residuals by quantity and run, without the ends."""
+    """Return the residuals by quantity and run, without the ends."""
     tracks, result = recording.tracks, {name: [] for name in QUANTITIES}
     inner = slice(WINDOW // 2, -(WINDOW // 2))
-    for row, steps in runs(tracks, recording.ego):
+    for row, steps in moving_runs(tracks, recording.ego):
         xy, heading = tracks.xy[row, steps], np.unwrap(tracks.heading[row, steps])
         speed = np.hypot(*tracks.velocity[row, steps].T)
         smooth = savgol_filter(heading, WINDOW, ORDER)
-        left_over = xy - savgol_filter(xy, WINDOW, ORDER, axis=0)
+        xy_residual = xy - savgol_filter(xy, WINDOW, ORDER, axis=0)
         cos, sin = np.cos(smooth), np.sin(smooth)
         values = (
-            left_over[:, 0] * cos + left_over[:, 1] * sin,
-            left_over[:, 1] * cos - left_over[:, 0] * sin,
+            xy_residual[:, 0] * cos + xy_residual[:, 1] * sin,
+            xy_residual[:, 1] * cos - xy_residual[:, 0] * sin,
             heading - smooth,
             speed - savgol_filter(speed, WINDOW, ORDER),
         )
@@ -94,11 +94,11 @@ def residuals(recording: Recording) -> dict[str, list[Array]]:
 
 
 def summary(pieces: list[Array]) -> dict[str, float]:
-    """Median residual, its autocorrelation, and the fitted noise."""
-    # The median over runs: a few tracks with swapped identities must not set the level for all.
+    """Return the median residual, its autocorrelation, and the fitted noise."""
+    # Medians over runs are robust to a few tracks with swapped identities.
     deviation = float(np.median([np.std(piece) for piece in pieces]))
     lag = float(np.median([np.mean(p[1:] * p[:-1]) / max(np.mean(p * p), 1e-12) for p in pieces]))
-    sigma, correlation = fitted(deviation, lag)
+    sigma, correlation = fit_noise(deviation, lag)
     return {
         "residual_std": deviation,
         "residual_p90": float(np.percentile([np.std(piece) for piece in pieces], 90)),
@@ -110,7 +110,7 @@ def summary(pieces: list[Array]) -> dict[str, float]:
 
 def measure(data: Path) -> dict[str, Any]:
     """Measure all recordings under a folder, by data set."""
-    found: dict[str, dict[str, list[Array]]] = {}
+    results: dict[str, dict[str, list[Array]]] = {}
     for item in survey(data).inputs:
         if item.format is None:
             continue
@@ -120,15 +120,15 @@ def measure(data: Path) -> dict[str, Any]:
             name = f"{item.format}:{recording.dataset}"
             if any(word in name for word in INTERPOLATED):
                 continue
-            into = found.setdefault(name, {quantity: [] for quantity in QUANTITIES})
+            data_set_residuals = results.setdefault(name, {quantity: [] for quantity in QUANTITIES})
             for quantity, pieces in residuals(recording).items():
-                into[quantity] += pieces
+                data_set_residuals[quantity] += pieces
     return {
         name: {
             "runs": len(quantities["along_m"]),
             **{quantity: summary(pieces) for quantity, pieces in quantities.items() if pieces},
         }
-        for name, quantities in sorted(found.items())
+        for name, quantities in sorted(results.items())
     }
 
 

@@ -38,13 +38,13 @@ mpl.use("Agg")
 
 #: Tiles in a row, and the side of a tile in inches and dots.
 COLUMNS, TILE_IN, DPI = 3, 3.6, 100
-#: Half the side of a family's tile, and the least and most of an event's, m.
+#: Half the side of a family's tile, and its minimum and maximum for an event's tile, m.
 FAMILY_REACH_M, EVENT_REACH_M = 55.0, (24.0, 45.0)
-#: What is this near to ego counts; ego is drawn so far before the place with the most to see, m.
-SIGHT_M, BEFORE_M = 35.0, 22.0
-#: Scenarios that are looked at in any case, and the most that are kept of one family.
-LEAST, AMONG = 80, 5
-#: Scenarios that are tried before a picture is given up.
+#: Radius of the counted features around ego, and distance of the drawn ego from the best place, m.
+SIGHT_M, LEAD_M = 35.0, 22.0
+#: Minimum number of scenarios to generate, and maximum number of candidates per family.
+MIN_SCENARIOS, MAX_CANDIDATES = 80, 5
+#: Maximum number of scenarios to generate for a picture.
 TRIES = 600
 
 
@@ -68,75 +68,79 @@ def scenarios(domain: str, seed: int, rare_rate: float) -> Iterator[tuple[int, S
 
 
 def family_tiles(domain: str, seed: int) -> list[Tile]:
-    """Return a common scenario of each family: of the first few, the one with the most to see."""
-    found: dict[str, list[tuple[float, Tile]]] = {family.name: [] for family, _ in DOMAINS[domain].families}
+    """Return a common scenario of each family: among the first few, the one with the most map features."""
+    candidates: dict[str, list[tuple[float, Tile]]] = {
+        family.name: [] for family, _ in DOMAINS[domain].families
+    }
     for index, scenario in scenarios(domain, seed, 0.0):
         name = scenario.tags["family"]
-        if len(found[name]) < AMONG:
-            found[name].append((sight(scenario)[0], Tile(name.replace("_", " "), scenario, index)))
-        if index >= LEAST and all(found.values()):
+        if len(candidates[name]) < MAX_CANDIDATES:
+            candidates[name].append(
+                (feature_score(scenario)[0], Tile(name.replace("_", " "), scenario, index))
+            )
+        if index >= MIN_SCENARIOS and all(candidates.values()):
             break
-    return [max(of, key=lambda pair: pair[0])[1] for of in found.values() if of]
+    return [max(tiles, key=lambda pair: pair[0])[1] for tiles in candidates.values() if tiles]
 
 
-def sight(scenario: Scenario) -> tuple[float, int]:
-    """Largest number of map features near ego and its step: road bends (rad), crosswalks, lane ends."""
+def feature_score(scenario: Scenario) -> tuple[float, int]:
+    """Return the largest score of map features near ego, and its step: road bends (rad), crosswalks, lane ends."""
     layers = road_lines(scenario)
-    places, worth = [np.zeros((0, 2))], [np.zeros(0)]
+    features, weights = [np.zeros((0, 2))], [np.zeros(0)]
     for line in layers["edge"]:
-        way = np.diff(line, axis=0)
-        heading = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
-        places.append(line[1:-1])
-        worth.append(np.abs(np.diff(heading)))
+        steps_xy = np.diff(line, axis=0)
+        heading = np.unwrap(np.arctan2(steps_xy[:, 1], steps_xy[:, 0]))
+        features.append(line[1:-1])
+        weights.append(np.abs(np.diff(heading)))
     for line in layers["crosswalk"]:
-        places.append(line.mean(axis=0, keepdims=True))
-        worth.append(np.ones(1))
-    begin, end = (np.array([line[k] for line in layers["lane"]]) for k in (0, -1))
-    alone = np.hypot(*np.moveaxis(end[:, None] - begin, -1, 0)).min(axis=1) > 0.5
-    places.append(end[alone])
-    worth.append(np.full(int(alone.sum()), 2.0))
+        features.append(line.mean(axis=0, keepdims=True))
+        weights.append(np.ones(1))
+    starts, ends = (np.array([line[k] for line in layers["lane"]]) for k in (0, -1))
+    is_end = np.hypot(*np.moveaxis(ends[:, None] - starts, -1, 0)).min(axis=1) > 0.5
+    features.append(ends[is_end])
+    weights.append(np.full(int(is_end.sum()), 2.0))
     steps = np.arange(CURRENT_STEP, int(scenario.steps), 4)
-    place, at = np.concatenate(places)[None], scenario.agent_xy[steps, None, 0]
-    near = np.hypot(*np.moveaxis(place - at, -1, 0)) < SIGHT_M
-    seen = (np.concatenate(worth) * near).sum(axis=1)
-    best = int(seen.argmax())
-    return float(seen[best]), int(steps[best])
+    feature_xy, ego_xy = np.concatenate(features)[None], scenario.agent_xy[steps, None, 0]
+    near = np.hypot(*np.moveaxis(feature_xy - ego_xy, -1, 0)) < SIGHT_M
+    score = (np.concatenate(weights) * near).sum(axis=1)
+    best = int(score.argmax())
+    return float(score[best]), int(steps[best])
 
 
 def event_tiles(seed: int) -> list[Tile]:
     """Return the first scenario of each kind of event, alternating between domains."""
-    found: dict[str, Tile] = {}
+    tiles: dict[str, Tile] = {}
     names = [kind.name.lower() for kind in EventKind if kind]
-    # Kinds are drawn from seed and index, so domains with the same seed would show the same ones.
+    # Kinds depend on seed and index: domains with the same seed would show the same kinds.
     sources = {domain: scenarios(domain, seed + k, 1.0) for k, domain in enumerate(sorted(DOMAINS))}
     for domain, source in (pair for _ in range(TRIES) for pair in sources.items()):
         index, scenario = next(source)
         name = scenario.tags["event"]
         title = f"{name.replace('_', ' ')} ({domain}, {scenario.tags['severity_mps2']} m/s2)"
-        found.setdefault(name, Tile(title, scenario, index))
-        if len(found) == len(names):
+        tiles.setdefault(name, Tile(title, scenario, index))
+        if len(tiles) == len(names):
             break
-    return [found[name] for name in names if name in found]
+    return [tiles[name] for name in names if name in tiles]
 
 
 def draw_family(axes: Axes, scenario: Scenario) -> None:
     """Draw the step just before ego reaches the most map features, and ego's log to its end."""
-    way = scenario.agent_xy[:, 0].astype(np.float64)
-    _, there = sight(scenario)
-    left = np.hypot(*(way[: there + 1] - way[there]).T)
-    step = int(np.flatnonzero(left <= BEFORE_M)[0])
-    draw_on(axes, scenario, step, tuple(way[there]), FAMILY_REACH_M)
-    # In a tile of this size the palette's crosswalks would not be seen.
+    path = scenario.agent_xy[:, 0].astype(np.float64)
+    _, best_step = feature_score(scenario)
+    distance = np.hypot(*(path[: best_step + 1] - path[best_step]).T)
+    step = int(np.flatnonzero(distance <= LEAD_M)[0])
+    draw_on(axes, scenario, step, tuple(path[best_step]), FAMILY_REACH_M)
+    # The palette's colour of crosswalks is too faint in a tile of this size.
     crossings = road_lines(scenario)["crosswalk"]
     axes.add_collection(PolyCollection(crossings, facecolor=LIGHT["parked"], zorder=0.1))
-    axes.plot(*way[step:].T, color=LIGHT["ego"], linewidth=1.0, zorder=4.5)
+    axes.plot(*path[step:].T, color=LIGHT["ego"], linewidth=1.0, zorder=4.5)
 
 
 def draw_event(axes: Axes, scenario: Scenario) -> None:
     """Draw the step at which ego and an actor are closest during the event, with both paths."""
-    box, _, valid, _, number = all_agents(scenario)
+    box, _, valid, _, ids = all_agents(scenario)
     actors = scenario.event_actor[0]
-    rows = np.flatnonzero(np.isin(number, actors[actors >= 0]))
+    rows = np.flatnonzero(np.isin(ids, actors[actors >= 0]))
     first = int(scenario.event_start[0])
     step, actor = nearest(box, valid, rows, first)
     middle = (box[step, 0, :2] + box[step, actor, :2]) / 2
@@ -144,11 +148,11 @@ def draw_event(axes: Axes, scenario: Scenario) -> None:
     draw_on(axes, scenario, step, tuple(middle), reach)
     axes.plot(*box[step:, 0, :2].T, color=LIGHT["ego"], linewidth=1.0, zorder=4.5)
     for row in rows:
-        there = valid[:, row]
+        present = valid[:, row]
         axes.plot(
-            *box[there, row, :2].T, color=LIGHT["mark"], linewidth=1.6, linestyle=(0, (3, 1.5)), zorder=4.6
+            *box[present, row, :2].T, color=LIGHT["mark"], linewidth=1.6, linestyle=(0, (3, 1.5)), zorder=4.6
         )
-        if there[step]:
+        if present[step]:
             axes.add_patch(
                 Polygon(
                     corners(box[step, row]),
@@ -170,14 +174,14 @@ def draw_event(axes: Axes, scenario: Scenario) -> None:
 
 
 def nearest(box: np.ndarray, valid: np.ndarray, rows: np.ndarray, first: int) -> tuple[int, int]:
-    """Step and row at which an actor's box is closest to ego's, from the event's first step on."""
+    """Return the step and row where an actor's box is closest to ego's, from the event's first step on."""
     shapes = shapely.polygons(corners(box[first:, [0, *rows]]))
-    apart = np.where(valid[first:, rows], shapely.distance(shapes[:, :1], shapes[:, 1:]), np.inf)
-    step, column = np.unravel_index(int(apart.argmin()), apart.shape)
+    distance = np.where(valid[first:, rows], shapely.distance(shapes[:, :1], shapes[:, 1:]), np.inf)
+    step, column = np.unravel_index(int(distance.argmin()), distance.shape)
     return first + int(step), int(rows[column])
 
 
-def sheet(tiles: list[Tile], draw: Callable[[Axes, Scenario], None], out: Path) -> None:
+def draw_sheet(tiles: list[Tile], draw: Callable[[Axes, Scenario], None], out: Path) -> None:
     """Draw all tiles on one page."""
     rows = -(-len(tiles) // COLUMNS)
     page = Figure(
@@ -204,9 +208,11 @@ def main() -> None:
     args = parser.parse_args()
     for domain in sorted(DOMAINS):
         if args.only in (None, domain):
-            sheet(family_tiles(domain, args.seed), draw_family, args.folder / f"world-families-{domain}.png")
+            draw_sheet(
+                family_tiles(domain, args.seed), draw_family, args.folder / f"world-families-{domain}.png"
+            )
     if args.only in (None, "events"):
-        sheet(event_tiles(args.seed), draw_event, args.folder / "world-events.png")
+        draw_sheet(event_tiles(args.seed), draw_event, args.folder / "world-events.png")
 
 
 if __name__ == "__main__":

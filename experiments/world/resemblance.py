@@ -36,7 +36,7 @@ FIGURE = DOCS / "guide" / "world-resemblance.png"
 RESULT = RESULTS / "world_resemblance.json"
 
 Array = np.ndarray[Any, Any]
-#: Quantity: label, and the range that the figure shows.
+#: Label, and range in the figure, by quantity.
 QUANTITIES = {
     "speed": ("speed (m/s)", (0.0, 30.0)),
     "acceleration": ("acceleration (m/s2)", (-4.0, 4.0)),
@@ -46,74 +46,77 @@ QUANTITIES = {
     "agents": ("agents within 50 m", (0.0, 80.0)),
     "nearest_m": ("distance to the nearest agent (m)", (0.0, 40.0)),
 }
-#: Panels that begin a row of the figure.
+#: First panels of the rows of the figure.
 FIRST_IN_ROW = tuple(QUANTITIES)[::3]
-#: Who drives less than this is no subject, m.
-DRIVES_M = 5.0
-#: Nor who is farther from ego on average: who surrounds them is not recorded in full, m.
+#: Minimum distance that a compared vehicle drives, m.
+MIN_DISTANCE_M = 5.0
+#: Maximum mean distance of a compared vehicle from ego, whose sensors record its surroundings, m.
 NEAR_EGO_M = 50.0
-#: A leader is this near, within this distance of the subject's axis, and heads the same way within 45 degrees.
-LEADER_M, LEADER_ASIDE_M = 60.0, 1.6
-#: Yaw rates and time gaps of standing cars mean nothing.
-ROLLS_MPS = 2.0
-#: One step in five is looked at: neighbours say the same.
-EVERY = 5
+#: Maximum gap to a leader, and its maximum lateral distance from the subject's axis, m. Headings differ by at most 45
+#: degrees.
+LEADER_M, LEADER_LATERAL_M = 60.0, 1.6
+#: Minimum speed for yaw rates and time gaps, which are meaningless at standstill.
+MIN_SPEED_MPS = 2.0
+#: Use every fifth step, since neighbouring steps are nearly equal.
+STRIDE = 5
 
 
 def quantities(scenario: Scenario) -> dict[str, Array]:
-    """Values of all compared vehicles and steps of one scenario."""
+    """Return the quantities of all compared vehicles and steps of one scenario."""
     box, velocity, valid, kind, _ = all_agents(scenario)
     subjects = np.flatnonzero(valid.all(axis=0) & (kind == AgentKind.VEHICLE))
-    way = np.hypot(*np.moveaxis(np.diff(box[:, subjects, :2], axis=0), -1, 0)).sum(axis=0)
-    apart = np.hypot(*np.moveaxis(box[:, subjects, :2] - box[:, :1, :2], -1, 0)).mean(axis=0)
-    subjects = subjects[(subjects == 0) | ((way >= DRIVES_M) & (apart < NEAR_EGO_M))]
-    parts = [_subject(row, box, velocity, valid, kind) for row in subjects]
-    return {name: np.concatenate([part[name] for part in parts]) for name in QUANTITIES}
+    distance = np.hypot(*np.moveaxis(np.diff(box[:, subjects, :2], axis=0), -1, 0)).sum(axis=0)
+    ego_distance = np.hypot(*np.moveaxis(box[:, subjects, :2] - box[:, :1, :2], -1, 0)).mean(axis=0)
+    subjects = subjects[(subjects == 0) | ((distance >= MIN_DISTANCE_M) & (ego_distance < NEAR_EGO_M))]
+    vehicles = [_subject(row, box, velocity, valid, kind) for row in subjects]
+    return {name: np.concatenate([vehicle[name] for vehicle in vehicles]) for name in QUANTITIES}
 
 
 def _subject(row: int, box: Array, velocity: Array, valid: Array, kind: Array) -> dict[str, Array]:
-    steps = slice(0, None, EVERY)
+    steps = slice(0, None, STRIDE)
     heading = np.unwrap(np.arctan2(box[:, row, 3], box[:, row, 2]))
     speed = np.hypot(*velocity[:, row].T)
     slope = {"window_length": 15, "polyorder": 2, "deriv": 1, "delta": DT_S}
-    acceleration, rate = savgol_filter(speed, **slope)[steps], savgol_filter(heading, **slope)[steps]
-    speed, me, others = speed[steps], box[steps, row], box[steps]
-    there = valid[steps].copy()
-    there[:, row] = False
-    apart = others[..., :2] - me[:, None, :2]
-    distance = np.where(there, np.hypot(apart[..., 0], apart[..., 1]), np.inf)
-    gap = _leader_gap(me, others, apart, there & (kind == AgentKind.VEHICLE))
-    led, rolls, near = gap < LEADER_M, speed > ROLLS_MPS, distance.min(axis=1, initial=np.inf)
+    acceleration, yaw_rate = savgol_filter(speed, **slope)[steps], savgol_filter(heading, **slope)[steps]
+    speed, box_of_subject, others = speed[steps], box[steps, row], box[steps]
+    present = valid[steps].copy()
+    present[:, row] = False
+    offset = others[..., :2] - box_of_subject[:, None, :2]
+    distance = np.where(present, np.hypot(offset[..., 0], offset[..., 1]), np.inf)
+    gap = _leader_gap(box_of_subject, others, offset, present & (kind == AgentKind.VEHICLE))
+    has_leader, is_moving, near = gap < LEADER_M, speed > MIN_SPEED_MPS, distance.min(axis=1, initial=np.inf)
     return {
         "speed": speed,
         "acceleration": acceleration,
-        "yaw_rate": rate[rolls],
-        "leader_m": gap[led],
-        "leader_s": gap[led & rolls] / speed[led & rolls],
+        "yaw_rate": yaw_rate[is_moving],
+        "leader_m": gap[has_leader],
+        "leader_s": gap[has_leader & is_moving] / speed[has_leader & is_moving],
         "agents": (distance < 50.0).sum(axis=1).astype(np.float64),
         "nearest_m": near[np.isfinite(near)],
     }
 
 
-def _leader_gap(me: Array, others: Array, apart: Array, there: Array) -> Array:
-    """Bumper-to-bumper distance to the vehicle ahead at every step, infinite without one."""
-    cos, sin = me[:, None, 2], me[:, None, 3]
-    ahead = apart[..., 0] * cos + apart[..., 1] * sin
-    aside = np.abs(apart[..., 1] * cos - apart[..., 0] * sin)
-    same = others[..., 2] * cos + others[..., 3] * sin > np.cos(np.pi / 4)
-    gap = ahead - (others[..., 4] + me[:, None, 4]) / 2
-    leads = there & same & (aside < LEADER_ASIDE_M) & (gap > 0.0)
-    return np.where(leads, gap, np.inf).min(axis=1, initial=np.inf)
+def _leader_gap(subject: Array, others: Array, offset: Array, present: Array) -> Array:
+    """Return the bumper-to-bumper distance to the leader at every step, infinite without one."""
+    cos, sin = subject[:, None, 2], subject[:, None, 3]
+    ahead = offset[..., 0] * cos + offset[..., 1] * sin
+    lateral = np.abs(offset[..., 1] * cos - offset[..., 0] * sin)
+    same_direction = others[..., 2] * cos + others[..., 3] * sin > np.cos(np.pi / 4)
+    gap = ahead - (others[..., 4] + subject[:, None, 4]) / 2
+    is_leader = present & same_direction & (lateral < LEADER_LATERAL_M) & (gap > 0.0)
+    return np.where(is_leader, gap, np.inf).min(axis=1, initial=np.inf)
 
 
-def pooled(scenarios: Iterable[Scenario]) -> tuple[dict[str, Array], int]:
+def pool(scenarios: Iterable[Scenario]) -> tuple[dict[str, Array], int]:
     """Pool all scenarios and count them."""
-    parts = [quantities(scenario) for scenario in scenarios]
-    return {name: np.concatenate([part[name] for part in parts]) for name in QUANTITIES}, len(parts)
+    values_by_scenario = [quantities(scenario) for scenario in scenarios]
+    return {
+        name: np.concatenate([values[name] for values in values_by_scenario]) for name in QUANTITIES
+    }, len(values_by_scenario)
 
 
-def real(data: Path) -> Iterable[Scenario]:
-    """Yield windows, without overlap, of all recordings that are long enough."""
+def read_recordings(data: Path) -> Iterable[Scenario]:
+    """Yield non-overlapping windows of all recordings that are long enough."""
     for item in survey(data).inputs:
         if item.format is None:
             continue
@@ -127,7 +130,7 @@ def real(data: Path) -> Iterable[Scenario]:
                 print(f"  left out: {error}")
 
 
-def world(scenarios: int, seed: int, domain: str) -> Iterable[Scenario]:
+def generate_scenarios(scenarios: int, seed: int, domain: str) -> Iterable[Scenario]:
     """Yield scenarios of the built-in world."""
     config = replace(WorldConfig(), domain=domain)
     for index in range(scenarios):
@@ -137,24 +140,24 @@ def world(scenarios: int, seed: int, domain: str) -> Iterable[Scenario]:
             print(f"  left out: {error}")
 
 
-def compared(theirs: dict[str, Array], ours: dict[str, Array]) -> dict[str, Any]:
-    """Percentiles of both distributions, and the largest difference of their distribution functions."""
+def compare_distributions(recordings: dict[str, Array], world: dict[str, Array]) -> dict[str, Any]:
+    """Return percentiles of both distributions, and their Kolmogorov-Smirnov distance."""
     result = {}
     for name in QUANTITIES:
         row: dict[str, Any] = {
             key: {f"p{p}": float(np.percentile(v[name], p)) for p in (5, 25, 50, 75, 95)}
             | {"n": len(v[name])}
-            for key, v in (("real", theirs), ("world", ours))
+            for key, v in (("real", recordings), ("world", world))
         }
-        row["ks"] = float(np.asarray(ks_2samp(theirs[name], ours[name]))[0])
+        row["ks"] = float(np.asarray(ks_2samp(recordings[name], world[name]))[0])
         result[name] = row
     return result
 
 
-def figure(sources: dict[str, dict[str, Array]], out: Path) -> None:
-    """One panel per quantity: the first source as an area, the others as lines; shares of the values per bin.
+def draw_figure(sources: dict[str, dict[str, Array]], out: Path) -> None:
+    """Draw histograms of every quantity: the first source as an area, the others as lines.
 
-    The outermost bins hold what lies beyond as well.
+    The outermost bins include values outside the range.
     """
     page = Figure(figsize=(9.0, 8.6), dpi=120, facecolor="white", layout="constrained")
     axes = page.subplots(3, 3).flat
@@ -166,8 +169,14 @@ def figure(sources: dict[str, dict[str, Array]], out: Path) -> None:
     for axis, (name, (label, (low, high))) in zip(axes, QUANTITIES.items(), strict=False):
         edges = np.arange(low, high + 2.0, 2.0) if name == "agents" else np.linspace(low, high, 31)
         for style, (source, values) in zip(styles, sources.items(), strict=True):
-            inside = np.clip(values[name], low, high)
-            axis.hist(inside, edges, weights=np.full(len(inside), 1.0 / len(inside)), label=source, **style)
+            clipped_values = np.clip(values[name], low, high)
+            axis.hist(
+                clipped_values,
+                edges,
+                weights=np.full(len(clipped_values), 1.0 / len(clipped_values)),
+                label=source,
+                **style,
+            )
         axis.set_xlabel(label, fontsize=10.5)
         axis.set_xlim(low, high)
         axis.set_ylabel("share of values" if name in FIRST_IN_ROW else "", fontsize=10.5)
@@ -192,13 +201,13 @@ def main() -> None:
     parser.add_argument("--figure", type=Path, default=Path("world-resemblance.png"))
     parser.add_argument("--write", action="store_true", help=f"store {RESULT.name} and the guide's figure")
     args = parser.parse_args()
-    recorded, count = pooled(real(args.data))
-    sources = {f"recordings ({count} windows)": recorded}
+    recordings, count = pool(read_recordings(args.data))
+    sources = {f"recordings ({count} windows)": recordings}
     result: dict[str, Any] = {"world": WORLD_VERSION, "windows": count, "scenarios": args.scenarios}
     for domain in sorted(DOMAINS):
-        values, _ = pooled(world(args.scenarios, args.seed, domain))
+        values, _ = pool(generate_scenarios(args.scenarios, args.seed, domain))
         sources[f"world, {domain}"] = values
-        result[domain] = compared(recorded, values)
+        result[domain] = compare_distributions(recordings, values)
         print(
             f"\n{domain}\n| quantity | recordings: 5 %, median, 95 % | world | KS distance |\n|---|---|---|---|"
         )
@@ -208,7 +217,7 @@ def main() -> None:
                 ", ".join(f"{row[key][p]:.2f}" for p in ("p5", "p50", "p95")) for key in ("real", "world")
             ]
             print(f"| {label} | {cells[0]} | {cells[1]} | {row['ks']:.2f} |")
-    figure(sources, FIGURE if args.write else args.figure)
+    draw_figure(sources, FIGURE if args.write else args.figure)
     if args.write:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
 

@@ -11,7 +11,7 @@ from drivax.synthetic.expert.violations import EGO_SKIN_M
 from experiments.repository import DOCS
 
 GUIDE = DOCS / "guide" / "world.md"
-#: The table of targets stands between these lines of the guide.
+#: Lines of the guide around the table of targets.
 BEGIN, END = "<!-- targets: python -m experiments.world.targets --table -->\n", "<!-- end of targets -->\n"
 
 Result = dict[str, Any]
@@ -22,10 +22,10 @@ class Target:
     """A target value of the world.
 
     Attributes:
-        what: In words.
-        words: The target in words.
-        value: The number in a result; a share comes with its interval, as a dictionary.
-        met: Whether a number is on target.
+        what: Text of the quantity.
+        words: Text of the target.
+        value: Reads the number from a result; a share comes with its interval, as a dictionary.
+        met: Returns whether a number is on target.
     """
 
     what: str
@@ -34,12 +34,12 @@ class Target:
     met: Callable[[float], bool]
 
 
-def _success(planner: str, where: str) -> Callable[[Result], Any]:
-    return lambda result: result["difficulty"][planner][where]
+def _success(planner: str, stratum: str) -> Callable[[Result], Any]:
+    return lambda result: result["difficulty"][planner][stratum]
 
 
-def _outside(result: Result) -> int:
-    return sum(one["outside"] for _, one in covered(result))
+def _count_outside(result: Result) -> int:
+    return sum(share["outside"] for _, share in configured_shares(result))
 
 
 TARGETS = (
@@ -85,7 +85,7 @@ TARGETS = (
         lambda r: r["near_at_constant_speed"]["all"],
         lambda x: x >= 0.8,
     ),
-    Target("families, events, rate outside their intervals", "0", _outside, lambda x: x == 0),
+    Target("families, events, rate outside their intervals", "0", _count_outside, lambda x: x == 0),
     Target(
         "scenarios per second, 2 workers",
         "at least 15",
@@ -95,70 +95,81 @@ TARGETS = (
 )
 
 
-def covered(result: Result) -> list[tuple[str, Result]]:
+def configured_shares(result: Result) -> list[tuple[str, Result]]:
     """Return every share that has a configured value, with its name."""
-    cover = result["coverage"]
+    coverage = result["coverage"]
     return [
-        ("rare events", cover["rare_rate"]),
-        *(cover["families"].items()),
-        *((f"event {name}", one) for name, one in cover["events"].items()),
+        ("rare events", coverage["rare_rate"]),
+        *(coverage["families"].items()),
+        *((f"event {name}", share) for name, share in coverage["events"].items()),
     ]
 
 
-def text(one: Result, digits: int = 4) -> str:
+def text(share: Result, digits: int = 4) -> str:
     """Format a share with its interval and the number of trials."""
-    return f"{one['share']:.{digits}f} [{one['low']:.{digits}f}, {one['high']:.{digits}f}] of {one['n']}"
+    return (
+        f"{share['share']:.{digits}f} [{share['low']:.{digits}f}, {share['high']:.{digits}f}] of {share['n']}"
+    )
 
 
 def lines(result: Result) -> list[tuple[str, str]]:
-    """Names and values of a result."""
-    found = [(f"expert {name}", text(one)) for name, one in result["expert"].items()]
-    found.append(("expert comfortable, common (0.95)", text(result["expert_comfortable_common"])))
-    found += [(f"  within {name}", text(one)) for name, one in result["within_limits_common"].items()]
-    found.append(("background overlaps (0.005)", text(result["background_overlap"])))
-    found.append(("critical, of the common", text(result["critical"])))
-    room = (
-        f"{result['largest_noise_m']:.3f} m; ego was judged with {EGO_SKIN_M:.2f} m to spare, without noise"
-    )
-    found.append(("noise moves a corner at most", room))
-    for name, one in result["difficulty"].items():
-        ratio = one["failure_ratio"]
-        found += [(f"{name} success, {where}", text(one[where])) for where in ("all", "common", "rare")]
-        found.append(("  failures, rare over common", "" if ratio is None else f"{ratio:.2f}"))
+    """Return names and values of a result."""
+    pairs = [(f"expert {name}", text(share)) for name, share in result["expert"].items()]
+    pairs.append(("expert comfortable, common (0.95)", text(result["expert_comfortable_common"])))
+    pairs += [(f"  within {name}", text(share)) for name, share in result["within_limits_common"].items()]
+    pairs.append(("background overlaps (0.005)", text(result["background_overlap"])))
+    pairs.append(("critical, of the common", text(result["critical"])))
+    margin = f"the expert was checked without noise, with a margin of {EGO_SKIN_M:.2f} m"
+    noise_text = f"{result['largest_noise_m']:.3f} m; {margin}"
+    pairs.append(("noise moves a corner at most", noise_text))
+    for name, share in result["difficulty"].items():
+        ratio = share["failure_ratio"]
+        pairs += [
+            (f"{name} success, {stratum}", text(share[stratum])) for stratum in ("all", "common", "rare")
+        ]
+        pairs.append(("  failures, rare over common", "" if ratio is None else f"{ratio:.2f}"))
     near = result["near_at_constant_speed"]
-    found += [(f"rare, within 1 s at constant speed (0.8): {name}", text(one)) for name, one in near.items()]
+    pairs += [
+        (f"rare, within 1 s at constant speed (0.8): {name}", text(share)) for name, share in near.items()
+    ]
     severity = result["severity_mps2"]
-    found += [(f"severity {name} m/s2", text(one)) for name, one in severity["thirds"].items()]
-    found += [(f"  median of {name}", f"{value:.1f}") for name, value in severity["medians"].items()]
-    return [*found, *_coverage(result), *_generation(result)]
+    pairs += [(f"severity {name} m/s2", text(share)) for name, share in severity["thirds"].items()]
+    pairs += [(f"  median of {name}", f"{value:.1f}") for name, value in severity["medians"].items()]
+    return [*pairs, *_coverage(result), *_generation(result)]
 
 
 def _coverage(result: Result) -> list[tuple[str, str]]:
-    shares = covered(result)
-    found = []
-    for name, one in shares:
-        mark = "  OUTSIDE" if one["outside"] else "  (outside its 95 % interval)" if one["outside_95"] else ""
-        found.append((f"{name} (configured {one['configured']:.3f})", text(one) + mark))
-    count = f"{sum(one['outside_95'] for _, one in shares)} of {len(shares)}; expected by chance"
-    found.append(("outside their 95 % intervals", f"{count} {0.05 * len(shares):.1f}"))
-    found.append(("outside Bonferroni's intervals", f"{_outside(result)} of {len(shares)}"))
+    shares = configured_shares(result)
+    pairs = []
+    for name, share in shares:
+        mark = (
+            "  OUTSIDE"
+            if share["outside"]
+            else "  (outside its 95 % interval)"
+            if share["outside_95"]
+            else ""
+        )
+        pairs.append((f"{name} (configured {share['configured']:.3f})", text(share) + mark))
+    count = f"{sum(share['outside_95'] for _, share in shares)} of {len(shares)}; expected by chance"
+    pairs.append(("outside their 95 % intervals", f"{count} {0.05 * len(shares):.1f}"))
+    pairs.append(("outside Bonferroni's intervals", f"{_count_outside(result)} of {len(shares)}"))
     for event, families in result["coverage"]["family_by_event"].items():
-        found.append((f"  families of {event}", ", ".join(f"{k} {v}" for k, v in sorted(families.items()))))
-    return found
+        pairs.append((f"  families of {event}", ", ".join(f"{k} {v}" for k, v in sorted(families.items()))))
+    return pairs
 
 
 def _generation(result: Result) -> list[tuple[str, str]]:
-    found = []
-    for name, made in result["generation"].items():
-        for family, one in made["families"].items():
-            causes = ", ".join(f"{k} {v}" for k, v in sorted(one["causes"].items()))
-            rejected = f"{one['rejection_rate']:.3f} ({causes}); {one['unsuited']} without occasion"
-            found.append((f"{name}: {family} rejected", rejected))
-    return found
+    pairs = []
+    for name, generation in result["generation"].items():
+        for family, count in generation["families"].items():
+            causes = ", ".join(f"{k} {v}" for k, v in sorted(count["causes"].items()))
+            text = f"{count['rejection_rate']:.3f} ({causes}); {count['unsuited']} without occasion"
+            pairs.append((f"{name}: {family} rejected", text))
+    return pairs
 
 
 def markdown(results: dict[str, Result]) -> str:
-    """Table with targets in rows and domains in columns; missed targets are bold."""
+    """Return a table with targets in rows and domains in columns; missed targets are bold."""
     head = "".join(
         f" {name}: {result['scenarios']:,} + {result['rare_scenarios']:,} rare |"
         for name, result in results.items()
@@ -178,7 +189,7 @@ def markdown(results: dict[str, Result]) -> str:
     return "\n".join(rows) + "\n"
 
 
-def into_guide(results: dict[str, Result]) -> str:
+def write_guide(results: dict[str, Result]) -> str:
     """Write the table of targets to the guide and return it."""
     table, page = markdown(results), GUIDE.read_text()
     before, rest = page.split(BEGIN)

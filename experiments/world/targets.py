@@ -41,142 +41,152 @@ from drivax.tracking.run_folder import versions
 from experiments.repository import RESULTS
 from experiments.world.measures import (
     NEAR_S,
-    against,
+    compare_share,
     constant_speed_ttc_s,
+    count_overlapping_pairs,
     largest_noise_m,
-    overlapping_pairs,
     share,
-    uncomfortable,
+    violated_limits,
 )
-from experiments.world.tables import into_guide, lines
+from experiments.world.tables import lines, write_guide
 
-#: Planners whose success says how difficult the world is.
-DRIVERS = {name: name for name in ("constant_velocity", "random", "idm")} | {
+#: Planners whose success measures the difficulty of the world.
+PLANNERS = {name: name for name in ("constant_velocity", "random", "idm")} | {
     "search": "search_planner:SearchPlanner"
 }
 EXPERT_METRICS = ("accuracy", "collision", "offroad", "red_light", "comfortable", "success")
-#: Scenarios that are on the device at once.
+#: Maximum number of scenarios on the device.
 CHUNK = 512
 #: Errors of the others' recorded poses.
 NOISE = WorldConfig().noise
 
 
-def written(folder: Path, scenarios: int, seed: int, workers: int, world: WorldConfig) -> dict[str, Any]:
+def generate_set(folder: Path, scenarios: int, seed: int, workers: int, world: WorldConfig) -> dict[str, Any]:
     """Generate a set if it does not exist, and return the generation statistics."""
     note = folder.with_suffix(".json")
     if note.is_file():
         source = json.loads((folder / "manifest.json").read_text())["source"]
         if (source["world"], source["config"]) != (WORLD_VERSION, json.loads(json.dumps(asdict(world)))):
-            raise SystemExit(f"{folder} is of another world; remove it")
+            raise SystemExit(f"{folder} has another world version or configuration; remove it")
     else:
-        made = generate(folder, scenarios, seed, Generation(workers=workers, world=world, overwrite=True))
+        result = generate(folder, scenarios, seed, Generation(workers=workers, world=world, overwrite=True))
         families = {
             name: {
-                "kept": c.kept,
-                "rejection_rate": c.rejection_rate,
-                "causes": c.rejected,
-                "unsuited": c.unsuited,
+                "kept": count.kept,
+                "rejection_rate": count.rejection_rate,
+                "causes": count.rejected,
+                "unsuited": count.unsuited,
             }
-            for name, c in made.families.items()
+            for name, count in result.families.items()
         }
         note.write_text(json.dumps({"families": families}))
     return json.loads(note.read_text())
 
 
-def speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
-    """Wall time of the command for a temporary set at the default rare rate."""
+def measure_speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
+    """Time the command that generates a temporary set at the default rare rate."""
     with tempfile.TemporaryDirectory() as folder:
-        call = ["generate", str(Path(folder) / "set"), "--domain", domain, "--seed", "3"]
-        call += ["--scenarios", str(scenarios), "--workers", str(workers)]
-        begin = time.monotonic()
-        subprocess.run([sys.executable, "-m", "drivax", *call], check=True, capture_output=True)
-        seconds = time.monotonic() - begin
+        command = ["generate", str(Path(folder) / "set"), "--domain", domain, "--seed", "3"]
+        command += ["--scenarios", str(scenarios), "--workers", str(workers)]
+        start = time.monotonic()
+        subprocess.run([sys.executable, "-m", "drivax", *command], check=True, capture_output=True)
+        seconds = time.monotonic() - start
     return {"scenarios": scenarios, "workers": workers, "scenarios_per_second": scenarios / seconds}
 
 
-def measured(folder: Path, planners: tuple[str, ...], driven: int | None = None) -> list[dict[str, Any]]:
+def measure_set(
+    folder: Path, planners: tuple[str, ...], evaluated_count: int | None = None
+) -> list[dict[str, Any]]:
     """Return a row per scenario: tags, statistics, and results of the expert and the planners."""
     data, rows = ScenarioSet.open(folder), []
     for first in range(0, len(data), CHUNK):
         scenarios = [data[i] for i in range(first, min(first + CHUNK, len(data)))]
-        rows += _chunk(scenarios, planners if driven is None or first < driven else ())
+        rows += _measure_chunk(
+            scenarios, planners if evaluated_count is None or first < evaluated_count else ()
+        )
         print(f"  {folder.name}: {len(rows)} of {len(data)} scenarios", flush=True)
     return rows
 
 
-def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[str, Any]]:
-    loaded = load(scenarios)
+def _measure_chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Return the rows of scenarios that fit on the device together."""
+    data = load(scenarios)
     rows = [
         {
             "family": scenario.tags["family"],
             "event": scenario.tags.get("event"),
             "critical": "critical" in scenario.tags,
             "segment": name["segment"],
-            "broken_limits": uncomfortable(scenario),
+            "broken_limits": violated_limits(scenario),
             "noise_m": largest_noise_m(scenario, NOISE),
             "severity_mps2": float(scenario.tags.get("severity_mps2", "nan")),
-            "overlaps": overlapping_pairs(scenario),
+            "overlaps": count_overlapping_pairs(scenario),
             "ttc_s": constant_speed_ttc_s(scenario) if "event" in scenario.tags else None,
         }
-        for scenario, name in zip(scenarios, loaded.names, strict=True)
+        for scenario, name in zip(scenarios, data.names, strict=True)
     ]
     for planner in ("expert", *planners):
-        metrics = evaluate(DRIVERS.get(planner, planner), loaded).metrics
+        metrics = evaluate(PLANNERS.get(planner, planner), data).metrics
         names = EXPERT_METRICS if planner == "expert" else ("success", "accuracy")
         for i, row in enumerate(rows):
             row |= {f"{planner}.{name}": float(metrics[name][i]) for name in names}
     return rows
 
 
-def rate_of(rows: list[dict[str, Any]], column: str) -> dict[str, float | int]:
-    """Share of rows in which a metric is 1, where it is defined."""
+def share_of(rows: list[dict[str, Any]], column: str) -> dict[str, float | int]:
+    """Return the share of rows where a metric is 1, among rows where it is defined."""
     values = [row[column] for row in rows if np.isfinite(row.get(column, np.nan))]
     return share(int(sum(value > 0.5 for value in values)), len(values))
 
 
 def difficulty(rows: list[dict[str, Any]], rare: list[dict[str, Any]], planner: str) -> dict[str, Any]:
-    """Success of a planner over all, common and rare scenarios, and its ratio of failures."""
+    """Return a planner's success in all, common and rare scenarios, and the ratio of rare to common failures."""
     column = f"{planner}.success"
-    common = rate_of([row for row in rows if row["event"] is None], column)
-    in_rare = rate_of([row for row in rare if row["event"] is not None], column)
-    fails, fails_rare = 1.0 - common["share"], 1.0 - in_rare["share"]
+    common = share_of([row for row in rows if row["event"] is None], column)
+    rare_rate = share_of([row for row in rare if row["event"] is not None], column)
+    failures, rare_failures = 1.0 - common["share"], 1.0 - rare_rate["share"]
     return {
-        "all": rate_of(rows, column),
+        "all": share_of(rows, column),
         "common": common,
-        "rare": in_rare,
-        "failure_ratio": fails_rare / fails if fails else None,
+        "rare": rare_rate,
+        "failure_ratio": rare_failures / failures if failures else None,
     }
 
 
-def coverage(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig) -> dict[str, Any]:
+def compare_coverage(
+    rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig
+) -> dict[str, Any]:
     """Compare the shares of families and events with the configuration.
 
-    Families are counted over the maps of common scenarios: a rare one takes roads that give occasion to its event, and
-    scenarios on the same map have their family from one draw. Kinds of events are counted over all rare scenarios.
+    Families are counted over the maps of common scenarios: scenarios on one map share a draw, and rare scenarios take
+    roads that suit their event. Kinds of events are counted over all rare scenarios.
     """
     maps = {row["segment"]: row["family"] for row in rows if row["event"] is None}
-    labelled = [row for row in (*rows, *rare) if row["event"] is not None]
-    families, events = Counter(maps.values()), Counter(row["event"] for row in labelled)
+    events_rows = [row for row in (*rows, *rare) if row["event"] is not None]
+    families, events = Counter(maps.values()), Counter(row["event"] for row in events_rows)
     table: dict[str, Counter[str]] = {}
-    for row in labelled:
+    for row in events_rows:
         table.setdefault(row["event"], Counter())[row["family"]] += 1
-    expected = {family.name: p for family, p in DOMAINS[world.domain].families}
+    probabilities = {family.name: p for family, p in DOMAINS[world.domain].families}
     kinds = [kind.name.lower() for kind in EventKind if kind]
-    count = len(expected) + len(kinds) + 1
-    staged = sum(row["event"] is not None for row in rows)
+    count = len(probabilities) + len(kinds) + 1
+    event_count = sum(row["event"] is not None for row in rows)
     return {
         "families": {
-            name: against(p, families[name], len(maps), count) for name, p in sorted(expected.items())
+            name: compare_share(p, families[name], len(maps), count)
+            for name, p in sorted(probabilities.items())
         },
-        "rare_rate": against(world.rare_rate, staged, len(rows), count),
-        "events": {name: against(1 / len(kinds), events[name], len(labelled), count) for name in kinds},
+        "rare_rate": compare_share(world.rare_rate, event_count, len(rows), count),
+        "events": {
+            name: compare_share(1 / len(kinds), events[name], len(events_rows), count) for name in kinds
+        },
         "family_by_event": {event: dict(counts) for event, counts in sorted(table.items())},
     }
 
 
-def severity(labelled: list[dict[str, Any]]) -> dict[str, Any]:
-    """Distribution of required decelerations over thirds of their range; medians by kind."""
-    values = np.array([row["severity_mps2"] for row in labelled])
+def severity(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the distribution of required decelerations over thirds of their range, and medians by kind."""
+    values = np.array([row["severity_mps2"] for row in rows])
     edges = np.linspace(*SEVERITY_MPS2, 4)
     third = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, 2)
     return {
@@ -185,42 +195,43 @@ def severity(labelled: list[dict[str, Any]]) -> dict[str, Any]:
             for k in range(3)
         },
         "medians": {
-            name: float(np.median([row["severity_mps2"] for row in labelled if row["event"] == name]))
-            for name in sorted({row["event"] for row in labelled})
+            name: float(np.median([row["severity_mps2"] for row in rows if row["event"] == name]))
+            for name in sorted({row["event"] for row in rows})
         },
     }
 
 
-def near_misses(labelled: list[dict[str, Any]]) -> dict[str, Any]:
-    """Share of rare scenarios, overall and by kind, in which a constant-speed ego nears the actor."""
-    kinds = {"all": labelled}
-    for row in labelled:
+def near_misses(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the share of rare scenarios, overall and by kind, where a constant-speed ego nears the actor."""
+    kinds = {"all": rows}
+    for row in rows:
         kinds.setdefault(row["event"], []).append(row)
     return {
-        name: share(sum(row["ttc_s"] < NEAR_S for row in of), len(of)) for name, of in sorted(kinds.items())
+        name: share(sum(row["ttc_s"] < NEAR_S for row in group), len(group))
+        for name, group in sorted(kinds.items())
     }
 
 
 def summary(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig) -> dict[str, Any]:
     """Return all values of the table from the rows of both sets."""
-    both = [*rows, *rare]
+    all_rows = [*rows, *rare]
     common = [row for row in rows if row["event"] is None]
-    labelled = [row for row in both if row["event"] is not None]
-    planners = [name for name in DRIVERS if f"{name}.success" in rows[0]]
+    with_event = [row for row in all_rows if row["event"] is not None]
+    planners = [name for name in PLANNERS if f"{name}.success" in rows[0]]
     return {
-        "expert": {name: rate_of(both, f"expert.{name}") for name in EXPERT_METRICS},
-        "expert_comfortable_common": rate_of(common, "expert.comfortable"),
+        "expert": {name: share_of(all_rows, f"expert.{name}") for name in EXPERT_METRICS},
+        "expert_comfortable_common": share_of(common, "expert.comfortable"),
         "within_limits_common": {
             name: share(sum(name not in row["broken_limits"] for row in common), len(common))
             for name in LIMITS
         },
         "critical": share(sum(row["critical"] for row in common), len(common)),
-        "background_overlap": share(sum(row["overlaps"] > 0 for row in both), len(both)),
-        "largest_noise_m": max(row["noise_m"] for row in both),
+        "background_overlap": share(sum(row["overlaps"] > 0 for row in all_rows), len(all_rows)),
+        "largest_noise_m": max(row["noise_m"] for row in all_rows),
         "difficulty": {name: difficulty(rows, rare, name) for name in planners},
-        "near_at_constant_speed": near_misses(labelled),
-        "severity_mps2": severity(labelled),
-        "coverage": coverage(rows, rare, world),
+        "near_at_constant_speed": near_misses(with_event),
+        "severity_mps2": severity(with_event),
+        "coverage": compare_coverage(rows, rare, world),
     }
 
 
@@ -235,9 +246,11 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "rare": (folder / f"{name}-rare-{rare_count}", rare_count, args.seed + 1, rare_world),
     }
     sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
-    planners = tuple(DRIVERS)
-    made = {key: written(path, n, seed, args.workers, w) for key, (path, n, seed, w) in sets.items()}
-    rows = {key: measured(path, planners, args.driven) for key, (path, *_) in sets.items()}
+    planners = tuple(PLANNERS)
+    generation = {
+        key: generate_set(path, n, seed, args.workers, w) for key, (path, n, seed, w) in sets.items()
+    }
+    rows = {key: measure_set(path, planners, args.driven) for key, (path, *_) in sets.items()}
     return {
         "command": command(),
         "scenarios": all_count,
@@ -245,18 +258,18 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "seed": args.seed,
         "domain": args.domain,
         **summary(rows["all"], rows["rare"], world),
-        "generation": made,
-        "versions": made_with(),
+        "generation": generation,
+        "versions": provenance(),
     }
 
 
-def made_with() -> dict[str, Any]:
-    """Provenance of a result."""
+def provenance() -> dict[str, Any]:
+    """Return the provenance of a result."""
     processor = platform.processor() or platform.machine()
     return {**versions(), "world": WORLD_VERSION, "processor": processor, "cores": os.cpu_count()}
 
 
-def stored(name: str, result: dict[str, Any]) -> None:
+def store_result(name: str, result: dict[str, Any]) -> None:
     """Write a result."""
     write_text(RESULTS / name, json.dumps(result, indent=1) + "\n")
 
@@ -267,15 +280,15 @@ def tabulate() -> None:
     results = {name: json.loads((RESULTS / f"world_{name}.json").read_text()) for name in DOMAINS}
     for name, result in results.items():
         result["speed"] = rates[name]
-    print(into_guide(results))
+    print(write_guide(results))
 
 
-def clock(scenarios: int, workers: int) -> None:
+def measure_speeds(scenarios: int, workers: int) -> None:
     """Time both domains, print and store the result."""
-    rates = {name: speed(name, scenarios, workers) for name in DOMAINS}
+    rates = {name: measure_speed(name, scenarios, workers) for name in DOMAINS}
     for name, rate in rates.items():
         print(f"{name}: {rate['scenarios_per_second']:.1f}/s")
-    stored("world_speed.json", {"command": command(), **rates, "versions": made_with()})
+    store_result("world_speed.json", {"command": command(), **rates, "versions": provenance()})
 
 
 def command() -> str:
@@ -318,7 +331,7 @@ def main() -> None:
         tabulate()
         return
     if args.timed is not None:
-        clock(args.timed, args.workers)
+        measure_speeds(args.timed, args.workers)
         return
     if args.keep is not None:
         args.keep.mkdir(parents=True, exist_ok=True)
@@ -330,7 +343,7 @@ def main() -> None:
     width = max(len(name) for name, _ in table)
     print("\n".join(f"{name:<{width}}  {value}" for name, value in table))
     if args.write:
-        stored(f"world_{args.domain}.json", result)
+        store_result(f"world_{args.domain}.json", result)
 
 
 if __name__ == "__main__":

@@ -39,8 +39,8 @@ class Loaded:
     Attributes:
         scenarios: The stored scenarios.
         bank: The scenarios stacked on the device, an argument of all simulation functions.
-        names: ``dataset``, ``scenario_id`` and ``segment`` of each.
-        sizes: Bank sizes of the whole set, so that a subset gives the same results bit for bit.
+        names: ``dataset``, ``scenario_id`` and ``segment`` of each scenario.
+        sizes: Bank sizes of the whole set, which make results of a subset bit-identical.
     """
 
     scenarios: Sequence[Scenario]
@@ -70,14 +70,14 @@ def load(
     """
     if isinstance(data, str | Path):
         scenario_set = ScenarioSet.open(data)
-        loaded = scenario_set.take(select_scenarios(scenario_set, filters, scenarios, limit))
-        # Loaded scenarios have been verified; only the sizes of all others are read.
+        selection = scenario_set.take(select_scenarios(scenario_set, filters, scenarios, limit))
+        # Reading a scenario verifies it; of all others only the sizes matter.
         sizes = Sizes.used(ScenarioSet.open(data, verify=False))
     elif filters or scenarios:
         raise UsageError("only a scenario set can be filtered", cure="leave out filters= and scenarios=")
     else:
-        loaded, sizes = list(data[:limit]), Sizes.used(data)
-    return Loaded(loaded, ScenarioBank.from_scenarios(loaded), scenario_names(loaded), sizes)
+        selection, sizes = list(data[:limit]), Sizes.used(data)
+    return Loaded(selection, ScenarioBank.from_scenarios(selection), scenario_names(selection), sizes)
 
 
 def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> Simulator:
@@ -104,15 +104,15 @@ def evaluate(
     traffic: str | Traffic = "log", start: Start | None = None, sample: bool = False,
     metrics: Sequence[str] = (), **options: Any,
 ) -> EpisodeTable:  # fmt: skip
-    """Evaluate a planner, given by name or as an object, on every scenario; writes nothing.
+    """Evaluate a planner, by name or as an object, on every scenario, without writing files.
 
     Args:
         planner: Name, run folder of a training (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner or its class.
         data: Folder of a scenario set, or scenarios from :func:`load`.
         task: Action space, observation and reward; a trained policy has its own.
-        traffic: As for :func:`make_simulator`; it is prepared here.
-        start: How episodes start: as logged by default, or ``simulator.starts.NoisyStart()``.
-        sample: Whether a policy given by name samples its actions instead of taking the mode.
+        traffic: As for :func:`make_simulator`; the bank is prepared for it.
+        start: Start of the episodes: as logged by default, or ``simulator.starts.NoisyStart()``.
+        sample: Whether a policy by name samples its actions instead of taking the mode.
         metrics: User-defined metrics as ``module:name``, in addition to all built-in ones.
         options: ``start_step``, ``seed``, ``batch`` and ``progress`` of :class:`drivax.evaluation.runner.Options`.
     """
@@ -136,16 +136,16 @@ def evaluate(
 def find_planner(
     name: str, bank: ScenarioBank, sample: bool = False, task: Task | None = None
 ) -> tuple[Planner, Task]:
-    """Return the planner of a name, run folder or zoo policy, and its task.
+    """Return a planner by name, run folder or zoo policy, with its task.
 
     Args:
         name: Name, ``module:name``, run folder (``RUN`` or ``RUN@STEP``) or ``zoo:NAME``.
-        bank: Scenarios of the evaluation; a policy's shapes follow from it.
+        bank: Scenarios of the evaluation, which determine the shapes of a policy.
         sample: Whether a trained policy samples its actions.
-        task: Task of a named planner; None: the default task, with the planner's own action space.
+        task: Task of a named planner; None for the default task with the planner's own action space.
 
     Raises:
-        UsageError: There is no such planner, folder or policy, or a policy was given another task.
+        UsageError: Unknown planner, folder or policy, or a task for a trained policy.
     """
     if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
         planner = make_planner(name, task and task.actions)
@@ -162,7 +162,7 @@ def find_planner(
 def generate(
     out: str | Path, scenarios: int = 256, seed: int = 0, *, options: synthetic.Generation | None = None
 ) -> ScenarioSet:
-    """Generate a scenario set of the built-in world, audited, and open it.
+    """Generate, audit and open a scenario set of the built-in world.
 
     Args:
         out: Folder to write.
@@ -179,15 +179,15 @@ def generate(
 
 
 def convert(src: str | Path, out: str | Path, **options: Any) -> datasets.Converted:
-    """Convert recordings of a public data set to a scenario set, audited.
+    """Convert recordings of a public data set to a scenario set, and audit it.
 
     Args:
-        src: File, or folder that is searched to any depth.
+        src: File, or folder to search to any depth.
         out: Folder to write.
         options: Fields of :class:`drivax.datasets.Conversion`.
 
     Raises:
-        DataError: ``src`` holds nothing that can be converted.
+        DataError: ``src`` has no file of a known format.
         UsageError: ``out`` exists, an option is impossible, or a package is missing.
     """
     return datasets.convert(src, out, datasets.Conversion(**options), audit=audit)
@@ -203,7 +203,7 @@ def compare(
         a: Run folder of ``drivax evaluate``, or a folder with one such run per seed.
         b: The other run.
         plan: Metrics and decision rule.
-        data: The evaluated set, for a stratified split, if it has moved.
+        data: Path of the scenario set, for a stratified split, if it has moved.
         settings: Fields of the plan to change, for example ``primary="success"``.
 
     Raises:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-#: The extra that installs a package, by the name under which the package is imported.
+#: Extra that installs a package, by its import name.
 _EXTRAS = {
     "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
     "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
@@ -46,11 +46,11 @@ class DrivaxError(Exception):
         return type(self), (self.problem,), {"file": self.file, "record": self.record, "cure": self.cure}
 
     def __str__(self) -> str:
-        place = "" if self.file is None else f"{self.file}: "
+        location = "" if self.file is None else f"{self.file}: "
         if self.record is not None:
-            place += f"record {self.record}: "
+            location += f"record {self.record}: "
         cure = "" if self.cure is None else f"; {self.cure}"
-        return " ".join(f"{place}{self.problem}{cure}".split())
+        return " ".join(f"{location}{self.problem}{cure}".split())
 
 
 class DataError(DrivaxError):
@@ -64,7 +64,7 @@ class UsageError(DrivaxError):
 
 
 def missing_package(error: ImportError) -> UsageError | None:
-    """Return the error for an optional package that is not installed, None if no extra installs it."""
+    """Return the error for an optional package that is not installed, or None if no extra has it."""
     package = (error.name or str(error)).split(".")[0]
     if package not in _EXTRAS:
         return None
@@ -73,10 +73,10 @@ def missing_package(error: ImportError) -> UsageError | None:
 
 
 def import_extra(package: str) -> Any:
-    """Return a package that an extra installs.
+    """Import a package of an extra.
 
     Raises:
-        UsageError: It is not installed.
+        UsageError: The package is not installed.
     """
     try:
         return importlib.import_module(package)
@@ -88,9 +88,9 @@ def did_you_mean(
     name: str, names: Iterable[str], *, otherwise: str | None = None, cutoff: float = 0.6
 ) -> str:
     """Return the cure for an unknown name: the closest known name, else ``otherwise``, else all known names."""
-    known = list(names)
-    if close := difflib.get_close_matches(name, known, n=1, cutoff=cutoff):
-        return f"did you mean {close[0]!r}?"
+    candidates = list(names)
+    if matches := difflib.get_close_matches(name, candidates, n=1, cutoff=cutoff):
+        return f"did you mean {matches[0]!r}?"
     if otherwise is not None:
         return otherwise
-    return f"use one of {', '.join(known)}" if known else "there are none"
+    return f"use one of {', '.join(candidates)}" if candidates else "there are none"

@@ -1,9 +1,9 @@
 """Output files and folders: checked before any work, written under a hidden name, and published by a rename.
 
-While the folder ``sets/a`` is being written, ``sets/.a.partial`` holds::
+While a process writes the folder ``sets/a``, ``sets/.a.partial`` has::
 
-    lock           held by the process that writes
-    identity.json  what is being written; only the same content is resumed
+    lock           file locked by that process
+    identity.json  description of the content; only the same content is resumed
     progress/      one note per finished part
     content/       becomes ``sets/a``
     spool*/        temporary files of the writer
@@ -51,7 +51,7 @@ def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
     """Check, before any work, that an output can be written.
 
     Raises:
-        UsageError: The output exists and ``overwrite`` is false, or is not of the kind (file or folder) to write.
+        UsageError: The output exists and ``overwrite`` is false, or it is a file instead of a folder or vice versa.
     """
     if not path.exists():
         return
@@ -65,7 +65,7 @@ def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
 
 
 def free_bytes(path: Path) -> int:
-    """Return the free bytes of the disk on which a path lies, or would."""
+    """Return the free bytes on the disk of a path, which need not exist."""
     path = path.absolute()
     while not path.exists():
         path = path.parent
@@ -81,7 +81,7 @@ def format_bytes(size: float) -> str:
 
 
 def check_space(path: Path, needed: int, cure: str = "make room, or choose another disk") -> None:
-    """Refuse an output of about ``needed`` bytes for which the disk has no space, before any work is done.
+    """Check, before any work, that the disk has space for an output of about ``needed`` bytes.
 
     Raises:
         DataError: The disk has less space left.
@@ -93,10 +93,10 @@ def check_space(path: Path, needed: int, cure: str = "make room, or choose anoth
 
 @contextlib.contextmanager
 def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
-    """Raise a FullDiskError that names ``path`` when the block fills the disk, and the bytes ``needed`` if known.
+    """Raise a FullDiskError that names ``path``, and ``needed`` bytes if known, when the block fills the disk.
 
-    The operating system's error for a write names no file. Of nested blocks the outermost names the output, and the
-    outermost that knows them the bytes.
+    The operating system's error for a write names no file. Of nested blocks, the outermost one names the output, and the
+    outermost one that knows them the bytes.
     """
     try:
         yield
@@ -164,11 +164,11 @@ def replace_folder(path: Path, needed: int = 0) -> Iterator[Path]:
 
 
 class PartialFolder:
-    """A hidden folder whose content becomes ``path``, and that a later process can resume.
+    """A hidden folder whose content becomes ``path``, and which a later process can resume.
 
     Args:
         path: Final name of the content.
-        identity: Description of the content as JSON values by name; without it, nothing is kept after a failure.
+        identity: Description of the content as JSON values by name; without it, a failure removes the content.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any] | None = None) -> None:
@@ -185,12 +185,12 @@ class PartialFolder:
             restart: Discard unfinished content of another identity.
 
         Raises:
-            UsageError: Another process writes it, or it holds unfinished content of another identity.
+            UsageError: Another process is writing the folder, or its unfinished content has another identity.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._take_lock()
         try:
-            notes = self._notes(restart)
+            notes = self._read_notes(restart)
         except BaseException:
             self._release()
             raise
@@ -209,34 +209,34 @@ class PartialFolder:
             write_json(self.root / "progress" / f"{number:05d}.json", value)
 
     def publish(self) -> None:
-        """Rename the content to its final name; an existing folder is replaced."""
+        """Rename the content to its final name, and replace an existing folder."""
         sync_folder(self.content)
         _publish(self.content, self.path)
 
     def close(self) -> None:
-        """Release the lock; keep finished parts for a process that resumes, remove everything else."""
+        """Release the lock, and remove all files but finished parts that a later process can resume."""
         names = ("content", "progress", "identity.json", "lock")
-        finished = self.content.is_dir() and any((self.root / "progress").glob("*.json"))
-        self._clear(names if finished else ("lock",))
-        if not finished:  # The lock goes last: another process must not start while files are being removed.
+        resumable = self.content.is_dir() and any((self.root / "progress").glob("*.json"))
+        self._clear(names if resumable else ("lock",))
+        if not resumable:  # The lock goes last: another process must not start while files are being removed.
             (self.root / "lock").unlink(missing_ok=True)
             with contextlib.suppress(OSError):
                 self.root.rmdir()
         self._release()
 
-    def _notes(self, restart: bool) -> list[dict[str, Any]]:
+    def _read_notes(self, restart: bool) -> list[dict[str, Any]]:
         if self.identity is None:
             return []
-        stored = _read_json(self.root / "identity.json")
-        if isinstance(stored, dict) and stored != self.identity and not restart:
-            different = [name for name in self.identity if stored.get(name) != self.identity[name]]
+        identity = _read_json(self.root / "identity.json")
+        if isinstance(identity, dict) and identity != self.identity and not restart:
+            different = [name for name in self.identity if identity.get(name) != self.identity[name]]
             raise UsageError(
                 f"an unfinished output was started with other data or other options ({', '.join(different)})",
                 file=self.path,
                 cure="finish it with the same options, or pass --overwrite to start again",
             )
         notes: list[dict[str, Any]] = []
-        while stored == self.identity and self.content.is_dir():
+        while identity == self.identity and self.content.is_dir():
             note = _read_json(self.root / "progress" / f"{len(notes):05d}.json")
             if note is None:
                 break
@@ -250,9 +250,9 @@ class PartialFolder:
             (self.root / "progress").mkdir()
             write_json(self.root / "identity.json", self.identity)
 
-    def _clear(self, names: tuple[str, ...]) -> None:
+    def _clear(self, keep: tuple[str, ...]) -> None:
         for entry in self.root.iterdir():
-            if entry.name in names:
+            if entry.name in keep:
                 continue
             if entry.is_dir():
                 shutil.rmtree(entry, ignore_errors=True)
@@ -299,13 +299,13 @@ def _hidden_path(path: Path, suffix: str) -> Path:
 
 
 def _publish(content: Path, path: Path) -> None:
-    """Rename a complete folder to ``path``; remove the folder that it replaces, and leftovers of killed processes."""
+    """Rename a complete folder to ``path``; remove the replaced folder, and leftovers of killed processes."""
     if path.exists():
         path.rename(_hidden_path(path, f"old-{os.getpid()}"))
     content.rename(path)
     sync_folder(path.parent)
-    for old in path.parent.glob(f".{glob.escape(path.name)}.old-*"):
-        shutil.rmtree(old, ignore_errors=True)
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.old-*"):
+        shutil.rmtree(leftover, ignore_errors=True)
 
 
 def _read_json(path: Path) -> Any:

@@ -16,7 +16,7 @@ _FORM = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 
 
 def is_dotted(value: Any) -> bool:
-    """Whether a value has the form ``package.module:name``."""
+    """Return whether a value has the form ``package.module:name``."""
     return isinstance(value, str) and _FORM.fullmatch(value) is not None
 
 
@@ -26,18 +26,18 @@ def find_named(name: str) -> Any:
     Modules are searched on Python's path first, then in the current folder.
 
     Raises:
-        UsageError: The name has another form, its module cannot be imported, or the module lacks the object.
+        UsageError: The name is not dotted, its module cannot be imported, or the module lacks the object.
     """
     if not is_dotted(name):
         raise UsageError(f"{name!r} is not a dotted name", cure="write package.module:name")
     module_name, _, path = name.partition(":")
     target = _import(module_name, name)
-    for part in path.split("."):
-        if not hasattr(target, part):
-            names = [known for known in vars(target) if not known.startswith("_")]
-            cure = did_you_mean(part, names, otherwise=f"define {part} there")
-            raise UsageError(f"{name!r}: {module_name!r} has no {part!r}", cure=cure)
-        target = getattr(target, part)
+    for attribute in path.split("."):
+        if not hasattr(target, attribute):
+            names = [candidate for candidate in vars(target) if not candidate.startswith("_")]
+            cure = did_you_mean(attribute, names, otherwise=f"define {attribute} there")
+            raise UsageError(f"{name!r}: {module_name!r} has no {attribute!r}", cure=cure)
+        target = getattr(target, attribute)
     return target
 
 
@@ -67,14 +67,14 @@ def dotted_name(thing: Any) -> str:
     """Return the dotted name of a function or class.
 
     Raises:
-        UsageError: It has none: a lambda, or defined inside a function.
+        UsageError: The object is a lambda, or defined inside a function.
     """
     name = f"{getattr(thing, '__module__', None)}:{getattr(thing, '__qualname__', None)}"
     try:
-        known = find_named(name)
+        target = find_named(name)
     except UsageError:
-        known = None
-    if known is not thing:
+        target = None
+    if target is not thing:
         label = getattr(thing, "__qualname__", repr(thing))
         raise UsageError(
             f"{label} cannot be saved in a configuration", cure="define it at the top level of a module"
@@ -86,7 +86,7 @@ def check_arguments(function: Any, name: str, arguments: tuple[Any, ...]) -> Non
     """Check that a callable accepts these positional arguments.
 
     Raises:
-        ValueError: Its signature differs.
+        ValueError: The signature differs.
     """
     try:
         signature = inspect.signature(function)
@@ -103,7 +103,7 @@ def check_protocol(thing: Any, name: str, protocol: Any) -> None:
     """Check that an object has all members of a protocol.
 
     Raises:
-        ValueError: Names the first missing member.
+        ValueError: A member is missing.
     """
     for member in protocol_members(protocol):
         if not hasattr(thing, member):

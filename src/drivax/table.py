@@ -17,7 +17,7 @@ from drivax.stats.intervals import Interval
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
-#: Stands for a missing number.
+#: Text of a missing number.
 MISSING = "–"
 #: Columns of an interval in a CSV file.
 _INTERVAL_COLUMNS = ("metric", "mean", "low", "high", "n")
@@ -29,9 +29,9 @@ class Column:
 
     Attributes:
         heading: Heading, with unit and direction.
-        key: Name in CSV files; the heading where it is empty.
+        key: Name in CSV files; by default the heading.
         label: Whether its cells are row headings, which are never wrapped.
-        left: Whether text is aligned left; labels always are.
+        left: Whether to align text left, as labels are.
         title: Tooltip in HTML.
         max_width: Maximum width in a terminal, characters.
         picture: Whether its cells are pictures, which only HTML shows.
@@ -51,7 +51,7 @@ class Cell:
     """A cell.
 
     Attributes:
-        text, bounds, note: Text, its formatted interval, and a note in small print (not in a terminal).
+        text, bounds, note: Text, formatted interval, and a note in small print (not in a terminal).
         interval, metric: The number behind the text with its metric, for CSV files.
         mark: A verdict next to the text, in HTML.
         style: CSS class; ``group`` makes a bold row in a terminal.
@@ -90,7 +90,7 @@ class Table:
     across: str = "metric"
 
     def rich(self, *below: Table) -> RichTable:
-        """Return a table for a terminal, with other tables of as many columns below it in the same widths."""
+        """Return a table for a terminal, with the tables ``below`` it in columns of the same widths."""
         from rich.table import Table as RichTable
 
         visible = [i for i, column in enumerate(self.columns) if not column.picture]
@@ -143,18 +143,19 @@ class Table:
     def csv(self) -> str:
         """Return one line per number: labels, metric, mean, low, high, n; undefined numbers are empty."""
         stream = io.StringIO()
-        lines = csv.writer(stream, lineterminator="\n")
+        writer = csv.writer(stream, lineterminator="\n")
         labels = [i for i, column in enumerate(self.columns) if column.label and column.key != "metric"]
         keys = [self.columns[i].key or self.columns[i].heading for i in labels]
-        across = [] if self.across == "metric" else [self.across]
-        lines.writerow([*(key.replace(" ", "_") for key in (*keys, *across)), *_INTERVAL_COLUMNS])
+        keys += [] if self.across == "metric" else [self.across]
+        writer.writerow([*(key.replace(" ", "_") for key in keys), *_INTERVAL_COLUMNS])
         for row in self.rows:
             for column, cell in zip(self.columns, row, strict=True):
                 if (interval := cell.interval) is not None:
-                    row_labels = [*(row[i].text for i in labels), *([column.key] if across else [])]
+                    row_labels = [row[i].text for i in labels]
+                    row_labels += [] if self.across == "metric" else [column.key]
                     numbers = (interval.mean, interval.low, interval.high)
                     digits = ("" if value is None else repr(value) for value in numbers)
-                    lines.writerow([*row_labels, cell.metric, *digits, interval.n])
+                    writer.writerow([*row_labels, cell.metric, *digits, interval.n])
         return stream.getvalue()
 
     def html(self) -> str:
@@ -214,15 +215,17 @@ def bounds(interval: Interval, unit: str, signed: bool = False) -> str:
     if interval.low == interval.high:
         return "all equal"  # a bootstrap of equal values has no width, which is not certainty
     low, high = number(interval.low, unit, signed), number(interval.high, unit, signed)
-    between = " to " if signed or "−" in low + high else "–"
-    return f"{low}{between}{high}"
+    separator = " to " if signed or "−" in low + high else "–"
+    return f"{low}{separator}{high}"
 
 
 def _cell_texts(cell: Cell) -> list[str]:
     """Return the texts of a cell for Markdown and LaTeX, the interval in brackets."""
     if cell.interval is None:
         return [cell.text]
-    return [cell.text, *([] if cell.interval.mean is None else [f"({cell.bounds})"]), cell.note]
+    if cell.interval.mean is None:
+        return [cell.text, cell.note]
+    return [cell.text, f"({cell.bounds})", cell.note]
 
 
 def _attribute(name: str, value: str) -> str:
@@ -270,8 +273,8 @@ _LATEX: Mapping[str, str] = MappingProxyType(
 
 
 def escape_latex(text: str) -> str:
-    """Escape plain text for LaTeX; characters that its fonts lack become code points."""
-    # The letters of Latin-1 are in every font of LaTeX; control characters, emoji and other scripts are not.
+    """Escape plain text for LaTeX, with code points for characters that its fonts lack."""
+    # Every LaTeX font has the letters of Latin-1, but not control characters, emoji or other scripts.
     latin = re.compile("[ -~À-ÖØ-öø-ÿ]")
     return "".join(
         _LATEX.get(letter) or (letter if latin.match(letter) else rf"\texttt{{U+{ord(letter):04X}}}")

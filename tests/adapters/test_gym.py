@@ -312,7 +312,7 @@ def test_render_draws_ego_at_its_simulated_pose(data):
 @pytest.mark.parametrize(("traffic", "name"), [("idm", "idm"), ("own_terms:Drift", "drift")])
 def test_environments_accept_the_traffic_of_evaluation(data, traffic, name):
     env = gym.make(SMALL, data, traffic=traffic)
-    assert isinstance(env, DrivingEnv) and env._worlds.simulator.traffic.name == name
+    assert isinstance(env, DrivingEnv) and env._backend.simulator.traffic.name == name
     env.reset(options={"scenario": 1})
     assert np.isfinite(env.step(STILL)[1])
     with pytest.raises(UsageError, match="did you mean 'optimal'"):

@@ -269,7 +269,7 @@ def test_a_missing_extra_names_its_pip_line(monkeypatch):
     ],
 )
 def test_devices_are_asked_in_a_process_of_their_own(program, words, monkeypatch):
-    monkeypatch.setattr(doctor, "_ASK_JAX", program)
+    monkeypatch.setattr(doctor, "_LIST_DEVICES", program)
     assert words in doctor.devices(timeout_s=1.0)
 
 

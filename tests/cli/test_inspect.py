@@ -221,6 +221,6 @@ def test_samples_are_evenly_spread(sets, monkeypatch):
     assert [scenario.id for scenario in one.sample()] == ["s0", "s1", "s2", "s3"]
     monkeypatch.setattr(inspection, "SAMPLE", 2)
     assert [scenario.id for scenario in one.sample()] == ["s0", "s3"]
-    speeds = inspection.speeds(one)
+    speeds = inspection.read_speeds(one)
     assert speeds.scenarios == 2
     np.testing.assert_allclose(speeds.ego, [0.0] * 91 + [3.0] * 91, atol=1e-5)

@@ -633,7 +633,7 @@ def test_command_says_that_it_can_be_resumed(thirty, tmp_path, capsys, monkeypat
     first = True
     assert main(["convert", str(thirty), str(tmp_path / "set"), "--workers", "1"]) == 130
     assert capsys.readouterr().err.splitlines() == [
-        "drivax: what is finished is kept, the same command continues",
+        "drivax: finished parts are kept; the same command resumes",
         "drivax: interrupted",
     ]
     first = False

@@ -158,7 +158,7 @@ def check_bench(data, capsys, task):
 @pytest.mark.slow
 def test_bench_by_metric_set(data, capsys, monkeypatch):
     monkeypatch.setattr(bench, "BATCHES", (2,))
-    monkeypatch.setattr(bench, "LARGER", (4,))
+    monkeypatch.setattr(bench, "LARGER_BATCHES", (4,))
     assert main(["bench", "--data", str(data), "--repeats", "1", "--metrics", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert list(dict.fromkeys(row["metrics"] for row in rows)) == ["none", "training", "full"]

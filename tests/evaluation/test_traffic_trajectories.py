@@ -12,7 +12,7 @@ import drivax
 from drivax.cli import main
 from drivax.evaluation.rollout import pack_poses, unpack_poses
 from drivax.report.episodes import EvaluatedSet, rank_scenarios, rollouts_of
-from drivax.report.pictures.drawing import with_traffic_of
+from drivax.report.pictures.drawing import replace_traffic
 from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate
@@ -68,7 +68,7 @@ def test_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
     for choice in rank_scenarios(evaluations):
         scenario = driven.scenario((choice.dataset, choice.scenario_id))
         (drive,) = rollouts_of(evaluations, choice, scenario)
-        seen = with_traffic_of(drive, scenario)
+        seen = replace_traffic(scenario, drive)
         at = drive.events["collision"]
         np.testing.assert_array_equal(seen.agent_xy[:10], scenario.agent_xy[:10])
         if at >= 0:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from search_planner import SearchPlanner, advanced, rolled_out
+from search_planner import SearchPlanner, advance, extrapolate
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
@@ -150,7 +150,7 @@ def test_does_not_overtake_moving_agents():
 def test_accelerations_are_extrapolated_for_a_while():
     boxes = jnp.asarray([[0.0, 0.0, 1.0, 0.0, 4.8, 2.0]] * 3)
     velocity = jnp.asarray([[5.0, 0.0], [12.0, 0.0], [5.0, 0.0]])
-    box, speed = rolled_out(boxes, velocity, jnp.zeros(3), jnp.asarray([1.5, 1.5, -1.5]))
+    box, speed = extrapolate(boxes, velocity, jnp.zeros(3), jnp.asarray([1.5, 1.5, -1.5]))
     # After 2 s 5 + 2 x 1.5 m/s; up to 13.4 m/s; braking lasts 1 s.
     assert np.asarray(speed)[-1] == pytest.approx([8.0, 13.4, 3.5])
     # 2 s of acceleration and 3 s at 8 m/s; the sum over steps of 0.25 s is a little larger.
@@ -176,7 +176,7 @@ def test_predicted_pose_lies_on_a_circle():
     """The pose after 0.25 s of a manoeuvre."""
     speed, curvature = 10.0, 0.02
     pose, moved_m = jnp.asarray([1.0, 2.0, np.cos(0.3), np.sin(0.3)]), speed * 0.25
-    result = np.asarray(advanced(pose, jnp.asarray(curvature), jnp.asarray(moved_m)))
+    result = np.asarray(advance(pose, jnp.asarray(curvature), jnp.asarray(moved_m)))
     # A circle of 50 m radius, driven for 2.5 m.
     angle, radius = moved_m * curvature, 1.0 / curvature
     chord = 2.0 * radius * np.sin(angle / 2)

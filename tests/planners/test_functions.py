@@ -8,7 +8,7 @@ import pytest
 from drivax.errors import UsageError
 from drivax.evaluation.rollout import drive, episode_keys
 from drivax.planners.catalogue import make_planner
-from drivax.planners.functions import python_actions, python_planner, raised
+from drivax.planners.functions import collect_errors, python_actions, python_planner
 from drivax.planners.planner import Planner
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
@@ -52,7 +52,7 @@ def actions(planner, bank, moments, batched=True):
 
 @pytest.mark.slow
 def test_python_and_jax_planners_agree_batched_or_alone(bank, moments):
-    with raised() as errors:
+    with collect_errors() as errors:
         python, in_jax = (actions(planner, bank, moments) for planner in (slow_python, slow_jax))
         np.testing.assert_allclose(
             actions(slow_python, bank, moments, batched=False), python[0, 0], rtol=1e-6
@@ -73,7 +73,7 @@ def test_python_and_jax_planners_have_the_same_episodes(bank):
     """Inside the compiled loop over all steps; both crash at step 15 of the scenario with ego only."""
     rows = jnp.arange(2)
     keys = episode_keys(bank, rows, 0)
-    with raised() as errors:
+    with collect_errors() as errors:
         python, in_jax = (
             jax.device_get(drive(SIMULATOR, planner, bank, rows, keys)) for planner in (slow_python, slow_jax)
         )
@@ -94,7 +94,7 @@ def test_invalid_actions_are_reported(bank, moments):
         pass
 
     for planner, words in ((three, "[3] is not an action; give 2 numbers"), (none, "[] is not an action")):
-        with raised() as errors:
+        with collect_errors() as errors:
             assert np.isnan(actions(planner, bank, moments)).all()
         assert len({who for who, _ in errors}) == 2
         assert all(words in text for text in errors.values()), errors

@@ -343,7 +343,7 @@ def test_vehicle_has_nuplan_proportions():
 def states_of(scenario):
     """Ego and observation of step 10, as planners get them."""
     view = View(scenario)
-    return view.ego(10, np.tile([0.0, 0.0, 0.0, 8.0], (23, 1))), view.logged(10), view.map
+    return view.ego(10, np.tile([0.0, 0.0, 0.0, 8.0], (23, 1))), view.logged_tracks(10), view.map
 
 
 def test_objects_pass_isinstance_for_the_devkit_once_it_is_imported(scenarios, monkeypatch):

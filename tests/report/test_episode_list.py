@@ -72,7 +72,9 @@ def test_episodes_are_ranked_by_failure_score_and_other_planners(runs):
 def test_page_without_rollouts_says_so(runs, tmp_path):
     text = write_report(runs, tmp_path / "report.html", episodes=0).read_text()
     assert (
-        "Rollouts and tags were left out" in text and listed(text)["tags"] == [] and 'id="plots"' not in text
+        "This page has no rollouts and no tags" in text
+        and listed(text)["tags"] == []
+        and 'id="plots"' not in text
     )
 
 

@@ -90,7 +90,7 @@ def test_report_shows_the_results(page):
     assert "oracle: scores" in text and "<th scope=row>oracle" not in text
     assert "ensemble: scores of scenarios" in text and "uniform: scores" not in text
     assert "Better than the matched random control?" in text and "than the baseline?" not in text
-    assert "of which they are 5.0%" in text
+    assert "their share of ordinary traffic, 5.0%" in text
     assert "Common scenarios" not in text  # there are none in these results
 
 

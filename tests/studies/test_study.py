@@ -22,10 +22,10 @@ from drivax.studies.definition import Study, StudyConfig, StudyDefinition, Study
 from drivax.studies.verdicts import (
     Condition,
     Strata,
+    compare_rankings,
     decide_claims,
-    detectable,
-    needed,
-    rankings,
+    describe_needed,
+    detectable_differences,
     rates,
     rule_cost,
 )
@@ -117,26 +117,26 @@ def test_rare_scenarios_count_as_in_ordinary_traffic():
 def test_an_effect_of_the_other_sign_contradicts():
     found = verdicts(EVEN | {"action_rarity": 0.3})
     one = found["action_rarity collides less than the baseline"]
-    assert one.verdict == "contradicted" and one.tested.difference > 0.1
-    assert one.adjusted >= one.tested.p
+    assert one.verdict == "contradicted" and one.effect.difference > 0.1
+    assert one.adjusted_p >= one.effect.p
 
 
 def test_p_values_are_adjusted_within_their_group():
     found = list(verdicts(EVEN | {"heuristic": 0.14}).values())
     for group in {one.claim.group for one in found}:
-        ps = [one.tested.p for one in found if one.claim.group == group]
-        assert [one.adjusted for one in found if one.claim.group == group] == holm_adjust(ps)
+        ps = [one.effect.p for one in found if one.claim.group == group]
+        assert [one.adjusted_p for one in found if one.claim.group == group] == holm_adjust(ps)
     claimed = [(c.arm, c.reference, c.metric, c.rows, c.change) for c in LONGTAIL.claims]
     assert len(claimed) == len(set(claimed)) == 54
 
 
 def test_what_is_undecided_says_what_would_decide():
     few = CrossedEffect(0.02, (4e-5, 4e-5), 1e-5, (5, 5), 400)
-    seeds = int(needed(few, 1).split()[0])
+    seeds = int(describe_needed(few, 1).split()[0])
     assert 10 <= seeds <= 13  # by a normal distribution 4e-4 / ((0.02 / 2.8016)^2 - 1e-5) = 9.75
-    assert int(needed(few, 20).split()[0]) > seeds
-    assert needed(replace(few, difference=1e-6), 1).startswith("neither seeds nor recordings")
-    assert "test recordings" in needed(CrossedEffect(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400), 1)
+    assert int(describe_needed(few, 20).split()[0]) > seeds
+    assert describe_needed(replace(few, difference=1e-6), 1).startswith("neither seeds nor recordings")
+    assert "test recordings" in describe_needed(CrossedEffect(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400), 1)
 
 
 def test_what_can_be_found_is_known_before_the_others_learn():
@@ -144,10 +144,10 @@ def test_what_can_be_found_is_known_before_the_others_learn():
     rng = np.random.default_rng(1)
     tested = drives({"baseline": 0.16, "bc": 0.3}, rng)
     strata = Strata(list(map(str, range(SCENARIOS))), np.arange(SCENARIOS) < 40, 0.05)
-    one, nine = (detectable(tested["baseline"], tested["bc"], strata, METRICS, m) for m in (1, 9))
+    one, nine = (detectable_differences(tested["baseline"], tested["bc"], strata, METRICS, m) for m in (1, 9))
     assert sorted(one) == sorted(METRICS) and 0.02 < one["collision"] < nine["collision"] < 0.2
     undefined = tested["baseline"] | {"vmax_score": np.full((SEEDS, SCENARIOS), np.nan)}
-    assert "vmax_score" not in detectable(undefined, tested["bc"], strata, METRICS, 1)
+    assert "vmax_score" not in detectable_differences(undefined, tested["bc"], strata, METRICS, 1)
 
 
 def test_mean_q_is_judged_in_pairs():
@@ -182,7 +182,7 @@ def test_controls_have_the_effective_sizes_of_their_arms(data):
     for pair in pairs:
         own, control = (
             draw_statistics(
-                ARMS[name].weighted(data, found.__getitem__, WeightConfig(), usable, seed=3).weights,
+                ARMS[name].weigh(data, found.__getitem__, WeightConfig(), usable, seed=3).weights,
                 usable,
             )
             for name in pair
@@ -190,7 +190,7 @@ def test_controls_have_the_effective_sizes_of_their_arms(data):
         assert control.effective == pytest.approx(own.effective, rel=0.02), pair
         assert control.effective_scenarios == pytest.approx(own.effective_scenarios, rel=0.06), pair
     for name, share in (("oracle", 0.115), ("oracle_strong", 0.3)):
-        weights = ARMS[name].weighted(data, found.__getitem__, WeightConfig(), usable).weights
+        weights = ARMS[name].weigh(data, found.__getitem__, WeightConfig(), usable).weights
         during = weights[found["oracle"].steps > 0].sum() / weights.sum()
         # And those that uniform draws find.
         assert during == pytest.approx(share + (1 - share) * (found["oracle"].steps > 0)[usable].mean())
@@ -199,8 +199,8 @@ def test_controls_have_the_effective_sizes_of_their_arms(data):
 
 def test_scores_of_another_method_are_refused(data):
     table = curate("uniform", Request(data))
-    with pytest.raises(UsageError, match="scores of 'uniform' for an arm that is curated by 'action_rarity'"):
-        ARMS["action_rarity"].weighted(data, lambda _: table, WeightConfig())
+    with pytest.raises(UsageError, match="scores of 'uniform' for an arm with the method 'action_rarity'"):
+        ARMS["action_rarity"].weigh(data, lambda _: table, WeightConfig())
 
 
 def test_conditions_look_at_the_chosen_checkpoint_and_at_the_end():
@@ -225,7 +225,7 @@ def test_seeds_do_not_make_up_for_each_other():
 
 def test_rankings_and_rates(data):
     kinematic, labels = curate("kinematic", Request(data)), [f"r{row}" for row in range(len(data))]
-    (same,) = rankings({"kinematic": kinematic, "published": kinematic, "uniform": kinematic}, labels)
+    (same,) = compare_rankings({"kinematic": kinematic, "published": kinematic, "uniform": kinematic}, labels)
     assert (same["methods"], same["orthogonal"]) == (["kinematic", "published"], "contradicted")
     np.testing.assert_allclose([same["rho"], *same["interval"], same["overlap"]], 1.0)
     rng = np.random.default_rng(5)
@@ -237,7 +237,7 @@ def test_rankings_and_rates(data):
         name: ScoreTable(name, {}, "x", ids, np.ones(shape, bool), one, one[:, 0])
         for name, one in scores.items()
     }
-    verdict = {tuple(r["methods"]): r["orthogonal"] for r in rankings(tables, ids)}
+    verdict = {tuple(r["methods"]): r["orthogonal"] for r in compare_rankings(tables, ids)}
     # Correlations of 0 and, within one standard error of the limit, of about 0.3.
     assert verdict == {("a", "b"): "supported", ("a", "c"): "undecided", ("b", "c"): "supported"}
     rng = np.random.default_rng(0)
@@ -333,8 +333,8 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     blocks = [f"claims {group}" for group in LONGTAIL.groups]
     blocks += ["conditions", "detectable", "draws", "rankings", "rule cost", "validations"]
     blocks += [f"rates {kind}" for kind in ("ordinary", "common", "rare")]
-    page = script.filled("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)
-    assert script.filled(page, results) == page and page.count("|---") >= len(blocks)
+    page = script.fill_page("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)
+    assert script.fill_page(page, results) == page and page.count("|---") >= len(blocks)
     assert "heuristic collides less than its matched random control" in page
     # What was trained with other weights, or evaluated before it was trained, belongs to no study.
     run = out / "runs" / "heuristic" / "seed-0" / "run.json"
@@ -392,5 +392,5 @@ def test_changed_claims_are_refused_when_a_study_resumes(data, tmp_path):
 def test_evaluated_run_without_checkpoints_is_not_trained_again(data, tmp_path):
     study = Study(LONGTAIL, StudyConfig(), StudySets(data.path, data.path, (data.path,)), tmp_path)
     study.evaluation("bc", 0).mkdir(parents=True)
-    with pytest.raises(UsageError, match=r"has no checkpoints, but evaluations; remove .*bc.*seed-0"):
+    with pytest.raises(UsageError, match=r"has evaluations, but no checkpoints; remove .*bc.*seed-0"):
         runner._run_job(runner.Job(study, "bc", 0, np.zeros((1, 1), bool)))

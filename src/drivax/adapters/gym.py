@@ -1,8 +1,8 @@
 """Gymnasium environments over scenarios: numpy in, numpy out.
 
-For libraries that expect the Gymnasium interface. ``VectorDrivingEnv`` steps a batch in one compiled call; a loop of
-your own under ``vmap`` and ``scan`` (``docs/start/own_loop.md``) is faster: nothing leaves the device. Importing
-this module registers ``drivax/<task>-v0`` for every name in :data:`TASKS`.
+For libraries that expect the Gymnasium interface. ``VectorDrivingEnv`` steps a batch in one compiled call. Your own
+loop under ``vmap`` and ``scan`` (``docs/start/own_loop.md``) is faster: no array leaves the device. Importing this
+module registers ``drivax/<task>-v0`` for every name in :data:`TASKS`.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ try:
 except ModuleNotFoundError as error:
     raise missing_package(error) or error from error
 
-#: Observations are clipped to this (5 km, 1.5 km/s): Gymnasium needs finite bounds.
+#: Bound of observations (5 km, 1.5 km/s), since Gymnasium needs finite bounds.
 LIMIT = 100.0
 
 
 @runtime_checkable
 class Scenarios(Protocol):
-    """Scenarios on the device and as stored, such as those that ``drivax.load`` returns."""
+    """Scenarios on the device and as stored, as returned by ``drivax.load``."""
 
     @property
     def bank(self) -> ScenarioBank:
@@ -68,13 +68,14 @@ class Scenarios(Protocol):
 
 
 def _open(data: Scenarios | str | Path | int) -> tuple[ScenarioBank, list[str], Sequence[Scenario]]:
-    """Return bank, ids and stored scenarios of loaded data, a set's folder, or ``data`` generated scenarios."""
-    if isinstance(data, int):
-        made = [assemble(generate_recording(seed=0, index=index)) for index in range(data)]
-        return ScenarioBank.from_scenarios(made), [scenario.id for scenario in made], made
-    if isinstance(data, str | Path):
-        stored = ScenarioSet.open(data)
-        return ScenarioBank.from_scenarios(stored), [scenario.id for scenario in stored], stored
+    """Return bank, ids and stored scenarios of loaded data, a set's folder, or a number of generated scenarios."""
+    if isinstance(data, int | str | Path):
+        scenarios: Sequence[Scenario]
+        if isinstance(data, int):
+            scenarios = [assemble(generate_recording(seed=0, index=index)) for index in range(data)]
+        else:
+            scenarios = ScenarioSet.open(data)
+        return ScenarioBank.from_scenarios(scenarios), [scenario.id for scenario in scenarios], scenarios
     if len(data.names) != len(data.bank):
         raise DrivaxError(f"{len(data.names)} scenario names for a bank of {len(data.bank)}")
     return data.bank, [name["scenario_id"] for name in data.names], data.scenarios
@@ -89,7 +90,7 @@ def _reset(simulator: Simulator, bank: ScenarioBank, row: Any) -> tuple[SimState
 
 @partial(jax.jit, static_argnums=0)
 def _reset_all(simulator: Simulator, bank: ScenarioBank, rows: Any) -> tuple[SimState, dict[str, Array]]:
-    """Batched."""
+    """Reset a batch."""
     return jax.vmap(partial(_reset, simulator, bank))(rows)
 
 
@@ -108,14 +109,14 @@ def _step_all(
     simulator: Simulator, bank: ScenarioBank, states: SimState, actions: Float[Any, "B D"],
     begins: Bool[Any, " B"], rows: Any,
 ) -> tuple[SimState, dict[str, Array], tuple[Array, Array, Array]]:  # fmt: skip
-    """Step a batch; where an episode ``begins``, start the scenario of ``rows`` instead, with reward 0."""
+    """Step a batch, or start the scenarios of ``rows`` with reward 0 where an episode ``begins``."""
     begins = jnp.asarray(begins)
-    fresh = map_where(begins, partial(simulator.new_episode, bank), jnp.asarray(rows))
+    starts = map_where(begins, partial(simulator.new_episode, bank), jnp.asarray(rows))
     step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0))
-    states, transition = step(bank, states, jnp.asarray(actions), begins, fresh)
+    states, transition = step(bank, states, jnp.asarray(actions), begins, starts)
     reward = jnp.where(begins, 0.0, transition.reward)
-    seen = jax.vmap(partial(_observe, simulator, bank))(states)
-    return states, seen, (reward, transition.terminated, transition.truncated)
+    observations = jax.vmap(partial(_observe, simulator, bank))(states)
+    return states, observations, (reward, transition.terminated, transition.truncated)
 
 
 _metrics = jax.jit(episode_metrics)
@@ -124,16 +125,16 @@ _metrics_all = jax.jit(jax.vmap(episode_metrics, in_axes=(None, 0)))
 
 def _observe(simulator: Simulator, bank: ScenarioBank, state: SimState) -> dict[str, Array]:
     """Return the observation within the bounds of its space, without empty groups."""
-    seen = simulator.observe(bank, state.context)
+    groups = simulator.observe(bank, state.context)
     return {
         name: leaf.astype(jnp.int8) if leaf.dtype == bool else jnp.clip(leaf, -LIMIT, LIMIT)
-        for name, leaf in seen.items()
+        for name, leaf in groups.items()
         if leaf.size
     }
 
 
-#: Scenarios of the built-in world that an environment drives where no data is given.
-BUILT_IN = 16
+#: Number of generated scenarios of an environment without data.
+DEFAULT_SCENARIOS = 16
 #: Tasks by the name in their id, ``drivax/<name>-v0``.
 TASKS: dict[str, Task] = {name: Task(observation=preset) for name, preset in PRESETS.items()} | {
     "behaviour": Task(rewards=RewardConfig(preset="behaviour")),
@@ -142,8 +143,8 @@ TASKS: dict[str, Task] = {name: Task(observation=preset) for name, preset in PRE
 Observation = dict[str, Any]
 
 
-class _Worlds:
-    """Scenarios on the CPU, a simulator, and the spaces of one agent, for both environments."""
+class _Backend:
+    """Scenarios on the CPU, simulator, and spaces of one environment; shared by both classes of environments."""
 
     def __init__(self, data: Scenarios | str | Path | int, task: Task | None, traffic: str | Traffic) -> None:
         bank, self.ids, self.scenarios = _open(data)
@@ -152,11 +153,11 @@ class _Worlds:
         cpu = jax.devices("cpu")[0]
         self.bank = jax.device_put(prepare_bank(self.simulator.traffic, bank), cpu)
         self.actions = _action_space(self.task)
-        seen = jax.eval_shape(partial(_reset, self.simulator), self.bank, 0)[1]
-        self.observations = gymnasium.spaces.Dict({name: _space(leaf) for name, leaf in seen.items()})
+        _, groups = jax.eval_shape(partial(_reset, self.simulator), self.bank, 0)
+        self.observations = gymnasium.spaces.Dict({name: _space(leaf) for name, leaf in groups.items()})
 
-    def row(self, scenario: Any) -> int:
-        """Return a requested row of the bank."""
+    def check_row(self, scenario: Any) -> int:
+        """Return a row of the bank, checked to be in range."""
         try:
             row = operator.index(scenario)
         except TypeError:
@@ -166,56 +167,56 @@ class _Worlds:
             raise UsageError(f"there is no scenario {scenario!r}", cure=cure)
         return row
 
-    def commands(self, actions: Any, lead: tuple[int, ...]) -> Float[Any, "*lead D"]:
-        """Return actions in the form of the simulator."""
+    def convert_actions(self, actions: Any, lead: tuple[int, ...]) -> Float[Any, "*lead D"]:
+        """Check actions, and convert them to the form of the simulator."""
         space = self.task.actions
         if isinstance(space, Discrete):
-            chosen = np.asarray(actions)
-            valid = chosen.dtype.kind in "iu" and chosen.shape == lead
-            if not valid or ((chosen < 0) | (chosen >= space.choices)).any():
+            choices = np.asarray(actions)
+            valid = choices.dtype.kind in "iu" and choices.shape == lead
+            if not valid or ((choices < 0) | (choices >= space.choices)).any():
                 cure = f"give choices from 0 to {space.choices - 1}"
                 raise UsageError(f"{actions!r} is not an action", cure=cure)
             accelerations, curvatures = (np.asarray(level) for level in space.levels())
-            row, column = np.divmod(chosen, space.curvatures)
+            row, column = np.divmod(choices, space.curvatures)
             return np.stack([accelerations[row], curvatures[column]], axis=-1).astype(np.float32)
-        commands = np.asarray(actions, np.float32)
+        values = np.asarray(actions, np.float32)
         shape = (*lead, space.size)
-        if commands.shape != shape or not np.isfinite(commands).all():
+        if values.shape != shape or not np.isfinite(values).all():
             numbers = " x ".join(map(str, shape))
             raise UsageError(
                 f"{actions!r} is not an action", cure=f"give {numbers} finite numbers in [-1, 1]"
             )
-        return commands
+        return values
 
 
 class DrivingEnv(gymnasium.Env[Observation, Any]):
     """Drive ego from the current step of a scenario to the end of its log, one episode at a time.
 
-    Observations are the task's groups: ``Box`` for features, ``MultiBinary`` for masks (1 where a row is valid).
-    Actions are the task's, in [-1, 1], or ``Discrete`` choices. A failure that ends the episode is ``terminated``, the
-    end of log or map is ``truncated``. ``info`` holds ``scenario_id`` and, after the last step, ``metrics``: all
-    defined episode metrics. Everything runs on the CPU.
+    Observations are the task's groups: ``Box`` for features, ``MultiBinary`` for masks (1 for a valid row). Actions are
+    the task's, in [-1, 1], or ``Discrete`` choices. A failure that ends the episode is ``terminated``, the end of log
+    or map is ``truncated``. ``info`` has ``scenario_id`` and, after the last step, ``metrics``: all defined episode
+    metrics. The simulation runs on the CPU.
 
     Args:
-        data: What ``drivax.load`` returned, the folder of a scenario set, or a number of generated scenarios.
+        data: Result of ``drivax.load``, folder of a scenario set, or number of scenarios to generate.
         task: Action space, observation, reward and termination; by default ``Task()``.
         render_mode: ``rgb_array`` draws the scenario from above (needs the extra ``show``).
-        traffic: How the other agents move: ``log``, ``idm``, the folder of a trained policy, ``zoo:NAME``,
+        traffic: Model of the other agents: ``log``, ``idm``, the folder of a trained policy, ``zoo:NAME``,
             ``package.module:name``, or a traffic model.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own spelling)
 
     def __init__(
-        self, data: Scenarios | str | Path | int = BUILT_IN, task: Task | None = None,
+        self, data: Scenarios | str | Path | int = DEFAULT_SCENARIOS, task: Task | None = None,
         render_mode: str | None = None, traffic: str | Traffic = "log",
     ) -> None:  # fmt: skip
-        self._worlds = _Worlds(data, task, traffic)
+        self._backend = _Backend(data, task, traffic)
         self._state: SimState | None = None
         self._row, self._path = 0, np.zeros((0, 4), np.float32)
         self.render_mode = _check_render_mode(render_mode)
-        self.action_space = self._worlds.actions
-        self.observation_space = self._worlds.observations
+        self.action_space = self._backend.actions
+        self.observation_space = self._backend.observations
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -227,18 +228,20 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
             options: ``{"scenario": i}`` chooses row i; by default rows are drawn uniformly.
 
         Raises:
-            UsageError: There is no such option or no such row.
+            UsageError: Unknown option or row.
         """
         super().reset(seed=seed)
-        chosen = _option(options, "scenario")
-        worlds = self._worlds
-        self._row = int(self.np_random.integers(len(worlds.ids))) if chosen is None else worlds.row(chosen)
-        state, observation = _reset(worlds.simulator, worlds.bank, self._row)
-        self._state, self._path = state, _path_of(state.context)
-        return _plain(observation), {"scenario_id": worlds.ids[self._row]}
+        backend, scenario = self._backend, _option(options, "scenario")
+        if scenario is None:
+            self._row = int(self.np_random.integers(len(backend.ids)))
+        else:
+            self._row = backend.check_row(scenario)
+        state, observation = _reset(backend.simulator, backend.bank, self._row)
+        self._state, self._path = state, _ego_path(state.context)
+        return _plain(observation), {"scenario_id": backend.ids[self._row]}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Drive 0.1 s.
+        """Step the simulation by 0.1 s.
 
         Raises:
             UsageError: The action is not in the action space.
@@ -246,34 +249,34 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("no episode is running; call reset() first")
-        worlds, command = self._worlds, self._worlds.commands(action, ())
-        state, observation, ending = _step(worlds.simulator, worlds.bank, self._state, command)
+        backend, command = self._backend, self._backend.convert_actions(action, ())
+        state, observation, ending = _step(backend.simulator, backend.bank, self._state, command)
         self._state = state
         if self.render_mode is not None:
-            self._path = _path_of(state.context, self._path)
+            self._path = _ego_path(state.context, self._path)
         reward, terminated, truncated = (leaf.item() for leaf in jax.device_get(ending))
-        info: dict[str, Any] = {"scenario_id": worlds.ids[self._row]}
+        info: dict[str, Any] = {"scenario_id": backend.ids[self._row]}
         if terminated or truncated:
-            metrics = jax.device_get(_metrics(worlds.bank, state))
+            metrics = jax.device_get(_metrics(backend.bank, state))
             info["metrics"] = {name: float(v.value) for name, v in metrics.items() if v.defined}
             self._state = None
         return _plain(observation), reward, terminated, truncated, info
 
     def render(self) -> Any:
-        """Return the scenario from above as ``[height, width, 3]`` bytes; None without a render mode."""
+        """Return the scenario from above as ``[height, width, 3]`` bytes, or None without a render mode."""
         if self.render_mode is None:
             return None
         if not len(self._path):
             raise gymnasium.error.ResetNeeded("there is nothing to draw yet; call reset() first")
-        return draw_pixels(self._worlds.scenarios[self._row], self._path)
+        return draw_pixels(self._backend.scenarios[self._row], self._path)
 
 
 class VectorDrivingEnv(VectorEnv):
     """Step ``num_envs`` :class:`DrivingEnv` in one compiled call; the other arguments are the same.
 
-    Autoreset is Gymnasium's ``NEXT_STEP``: the step after the last one of an episode ignores that environment's action
-    and starts its next episode with reward 0. ``info`` holds ``scenario_id`` of every environment and, for those whose
-    episode ended, ``metrics`` as arrays with ``_metrics`` masks. ``render`` returns one picture per environment.
+    Autoreset is Gymnasium's ``NEXT_STEP``: after the last step of an episode, the next step ignores the environment's
+    action and starts its next episode with reward 0. ``info`` has ``scenario_id`` of every environment and, for
+    episodes that end, ``metrics`` as arrays with ``_metrics`` masks. ``render`` returns one picture per environment.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -281,19 +284,19 @@ class VectorDrivingEnv(VectorEnv):
     }  # fmt: skip
 
     def __init__(
-        self, num_envs: int = 1, data: Scenarios | str | Path | int = BUILT_IN, task: Task | None = None,
+        self, num_envs: int = 1, data: Scenarios | str | Path | int = DEFAULT_SCENARIOS, task: Task | None = None,
         render_mode: str | None = None, traffic: str | Traffic = "log",
     ) -> None:  # fmt: skip
-        self._worlds = _Worlds(data, task, traffic)
+        self._backend = _Backend(data, task, traffic)
         self.num_envs = num_envs
         self.render_mode = _check_render_mode(render_mode)
-        self.single_action_space = self._worlds.actions
-        self.single_observation_space = self._worlds.observations
+        self.single_action_space = self._backend.actions
+        self.single_observation_space = self._backend.observations
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._state: SimState | None = None
         self._rows = np.zeros(num_envs, np.int32)
-        self._over = np.zeros(num_envs, bool)
+        self._done = np.zeros(num_envs, bool)
         self._paths: list[Any] = []
 
     def reset(
@@ -306,22 +309,22 @@ class VectorDrivingEnv(VectorEnv):
             options: ``{"scenarios": [i, ...]}`` chooses a row per environment.
 
         Raises:
-            UsageError: There is no such option or no such row.
+            UsageError: Unknown option or row.
         """
         super().reset(seed=seed)
-        chosen = _option(options, "scenarios")
-        rows = self._drawn() if chosen is None else [self._worlds.row(scenario) for scenario in chosen]
+        backend, scenarios = self._backend, _option(options, "scenarios")
+        rows = self._sample_rows() if scenarios is None else list(map(backend.check_row, scenarios))
         self._rows = np.array(rows, np.int32)
         if self._rows.shape != (self.num_envs,):
             problem = f"{len(self._rows)} scenarios for {self.num_envs} environments"
             raise UsageError(problem, cure="give one per environment")
-        self._over[:] = False
-        self._state, observation = _reset_all(self._worlds.simulator, self._worlds.bank, self._rows)
-        self._follow(self._over | True)
+        self._done[:] = False
+        self._state, observation = _reset_all(backend.simulator, backend.bank, self._rows)
+        self._record_paths(np.ones(self.num_envs, bool))
         return _plain(observation), self._info()
 
     def step(self, actions: Any) -> tuple[Observation, Any, Any, Any, dict[str, Any]]:
-        """Drive 0.1 s in every environment; one whose episode is over starts its next episode instead.
+        """Step every environment by 0.1 s; if its episode has ended, start the next one instead.
 
         Raises:
             UsageError: The actions are not in the action space.
@@ -329,54 +332,54 @@ class VectorDrivingEnv(VectorEnv):
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("no episode is running; call reset() first")
-        worlds, begins = self._worlds, self._over
-        commands = worlds.commands(actions, (self.num_envs,))
-        self._rows = np.where(begins, self._drawn(), self._rows)
-        arguments = (worlds.bank, self._state, commands, begins, self._rows)
-        self._state, observation, ending = _step_all(worlds.simulator, *arguments)
+        backend, begins = self._backend, self._done
+        commands = backend.convert_actions(actions, (self.num_envs,))
+        self._rows = np.where(begins, self._sample_rows(), self._rows)
+        arguments = (backend.bank, self._state, commands, begins, self._rows)
+        self._state, observation, ending = _step_all(backend.simulator, *arguments)
         reward, terminated, truncated = (np.array(leaf) for leaf in jax.device_get(ending))
-        self._over = terminated | truncated
-        self._follow(begins)
+        self._done = terminated | truncated
+        self._record_paths(begins)
         info = self._info()
-        if self._over.any():
-            metrics = jax.device_get(_metrics_all(worlds.bank, self._state))
-            for number in np.flatnonzero(self._over):
-                own = {n: float(v.value[number]) for n, v in metrics.items() if v.defined[number]}
-                info = self._add_info(info, {"metrics": own}, int(number))
+        if self._done.any():
+            metrics = jax.device_get(_metrics_all(backend.bank, self._state))
+            for env in np.flatnonzero(self._done):
+                values = {name: float(v.value[env]) for name, v in metrics.items() if v.defined[env]}
+                info = self._add_info(info, {"metrics": values}, int(env))
         return _plain(observation), reward, terminated, truncated, info
 
     def render(self) -> tuple[Any, ...] | None:
-        """Return every scenario from above; None without a render mode."""
+        """Return every scenario from above, or None without a render mode."""
         if self.render_mode is None:
             return None
         if not self._paths:
             raise gymnasium.error.ResetNeeded("there is nothing to draw yet; call reset() first")
-        scenarios = [self._worlds.scenarios[int(row)] for row in self._rows]
+        scenarios = [self._backend.scenarios[int(row)] for row in self._rows]
         return tuple(map(draw_pixels, scenarios, self._paths))
 
-    def _drawn(self) -> Any:
-        return self.np_random.integers(len(self._worlds.ids), size=self.num_envs, dtype=np.int32)
+    def _sample_rows(self) -> Any:
+        return self.np_random.integers(len(self._backend.ids), size=self.num_envs, dtype=np.int32)
 
     def _info(self) -> dict[str, Any]:
-        ids = np.array([self._worlds.ids[row] for row in self._rows], object)
+        ids = np.array([self._backend.ids[row] for row in self._rows], object)
         return {"scenario_id": ids, "_scenario_id": np.ones(self.num_envs, bool)}
 
-    def _follow(self, begins: Any) -> None:
-        """Record the driven paths if they are rendered."""
+    def _record_paths(self, begins: Any) -> None:
+        """Extend the paths of all egos for rendering; start again where an episode ``begins``."""
         if self.render_mode is None or self._state is None:
             return
-        old = self._paths or [None] * self.num_envs
-        before = [None if new else path for path, new in zip(old, begins, strict=True)]
+        paths = self._paths or [None] * self.num_envs
+        previous = [None if start else path for path, start in zip(paths, begins, strict=True)]
         context = self._state.context
-        contexts = [jax.tree.map(operator.itemgetter(number), context) for number in range(self.num_envs)]
-        self._paths = list(map(_path_of, contexts, before))
+        contexts = [jax.tree.map(operator.itemgetter(env), context) for env in range(self.num_envs)]
+        self._paths = list(map(_ego_path, contexts, previous))
 
 
 def make(
-    task: str | Task = "optimal", data: Scenarios | str | Path | int = BUILT_IN, *, num_envs: int | None = None,
-    traffic: str | Traffic = "log", render_mode: str | None = None,
+    task: str | Task = "optimal", data: Scenarios | str | Path | int = DEFAULT_SCENARIOS, *,
+    num_envs: int | None = None, traffic: str | Traffic = "log", render_mode: str | None = None,
 ) -> DrivingEnv | VectorDrivingEnv:  # fmt: skip
-    """Make an environment of a task, or of a name in :data:`TASKS`; a vector environment if ``num_envs`` is given."""
+    """Make an environment for a task or a name in :data:`TASKS`, vectorised if ``num_envs`` is given."""
     if isinstance(task, str):
         if task not in TASKS:
             raise UsageError(f"there is no task {task!r}", cure=did_you_mean(task, TASKS))
@@ -393,6 +396,7 @@ def _check_render_mode(render_mode: str | None) -> Any:
 
 
 def _option(options: Mapping[str, Any] | None, name: str) -> Any:
+    """Return the only known reset option, None if it is not given."""
     unknown = sorted(set(options or {}) - {name})
     if unknown:
         raise UsageError(f"there is no reset option {unknown[0]!r}", cure=f"the only one is {name!r}")
@@ -427,13 +431,13 @@ for _name, _task in TASKS.items():
     )
 
 
-def _path_of(context: AgentContext, before: Any = None) -> Any:
-    """Return ego's motion from the first step of the log to the present one ``[step + 1, 4]``; NaN where unknown.
+def _ego_path(context: AgentContext, previous: Any = None) -> Any:
+    """Return ego's motion since the first step of the log ``[step + 1, 4]``, NaN where unknown.
 
-    ``before`` is the path one step ago, None where an episode starts.
+    ``previous`` is the path one step ago, None at the start of an episode.
     """
     history, step = np.asarray(context.history), int(context.step)
-    if before is not None:
-        return np.concatenate([before, history[-1:]])
-    known = history[-min(step + 1, len(history)) :]
-    return np.concatenate([np.full((step + 1 - len(known), 4), np.nan, np.float32), known])
+    if previous is not None:
+        return np.concatenate([previous, history[-1:]])
+    recent = history[-min(step + 1, len(history)) :]
+    return np.concatenate([np.full((step + 1 - len(recent), 4), np.nan, np.float32), recent])

@@ -27,10 +27,10 @@ from drivax.tracking.progress import Progress
 class Bench(BenchConfig):
     """Time environment steps with observation, reward, metrics and resets, and each part alone, driven by IDM.
 
-    Scenarios of the built-in world are generated unless --data is given. Settings of the task follow as
+    Generates scenarios of the built-in world unless --data is given. Change settings of the task with flags such as
     --task.metrics training.
 
-    With --encoders, time encoders on the observation `optimal` instead; their settings follow as
+    With --encoders, time encoders on the observation `optimal` instead. Change their settings with flags such as
     --only "[lq small]" --batches "[1, 512]".
 
     Example: drivax bench --batch 512 --json
@@ -42,7 +42,7 @@ class Bench(BenchConfig):
     """Number of scenarios to generate without --data."""
     task: tyro.conf.Suppress[tyro.conf.Fixed[Task]] = field(default_factory=Task)
     metrics: bool = False
-    """Compare the metric sets none, training and full at batch 32, 128 and the best one, instead of parts."""
+    """Compare the metric sets none, training and full at batch 32, 128 and the fastest, instead of timing parts."""
     encoders: bool = False
     """Time the encoders and count their parameters, instead of the simulator."""
     json: bool = False
@@ -57,25 +57,24 @@ def run(args: Bench, overrides: Sequence[str] = ()) -> int:
         return 0
     config = settings.load(BenchConfig, settings.plain(record_of(BenchConfig, args)), overrides)
     use_all_cores()
-    if args.data is not None:
-        bank = ScenarioBank.from_scenarios(ScenarioSet.open(args.data))
+    if args.data is None:
+        bank = _generate_bank(args.scenarios)
     else:
-        with (
-            tempfile.TemporaryDirectory() as folder,
-            Progress("generating", "scenarios", args.scenarios) as bar,
-        ):
-            generated = generate(
-                Path(folder) / "set", args.scenarios, 0, Generation(workers=os.cpu_count() or 1),
-                lambda done, total: bar.update(done),
-            )  # fmt: skip
-            bank = ScenarioBank.from_scenarios(ScenarioSet.open(generated.path))
-    result, text = (
-        (bench_metrics(bank, config), _metric_sets_text)
-        if args.metrics
-        else (bench(bank, config), _parts_text)
-    )
-    print(json.dumps(result, indent=1) if args.json else text(result))
+        bank = ScenarioBank.from_scenarios(ScenarioSet.open(args.data))
+    if args.metrics:
+        result, format_text = bench_metrics(bank, config), _metric_sets_text
+    else:
+        result, format_text = bench(bank, config), _parts_text
+    print(json.dumps(result, indent=1) if args.json else format_text(result))
     return 0
+
+
+def _generate_bank(scenarios: int) -> ScenarioBank:
+    with tempfile.TemporaryDirectory() as folder, Progress("generating", "scenarios", scenarios) as bar:
+        options = Generation(workers=os.cpu_count() or 1)
+        out = Path(folder) / "set"
+        generate(out, scenarios, 0, options, lambda done, total: bar.update(done))
+        return ScenarioBank.from_scenarios(ScenarioSet.open(out))
 
 
 def _parts_text(result: dict[str, Any]) -> str:

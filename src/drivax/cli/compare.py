@@ -16,9 +16,9 @@ class Compare:
     """Compare two evaluations: intervals, effect sizes, tests, power, and a recommendation.
 
     A and B are run folders of `drivax evaluate` on the same scenarios, or folders with one such run per seed of a
-    policy. The plan says what is compared and how it is decided; write it before the runs (--save) and pass it as
-    --config. Its settings follow as --primary METRIC, --secondary "[METRIC, ...]", --split paired|random|stratified,
-    --minimum_scenarios N, --smallest_difference X, --confidence 0.95, --power 0.8 (docs/guide/compare.md has all).
+    policy. The plan defines metrics and decision rule: write it before the runs (--save) and pass it as --config.
+    Change its settings with --primary METRIC, --secondary "[METRIC, ...]", --split paired|random|stratified,
+    --minimum_scenarios N, --smallest_difference X, --confidence 0.95, --power 0.8 (all: docs/guide/compare.md).
 
     Example: drivax compare --primary success --minimum_scenarios 500 --save plan.yaml
 
@@ -26,9 +26,9 @@ class Compare:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="A B")] = ()
-    """Two run folders; none if the plan names them."""
+    """Two run folders; not needed if the plan names them."""
     config: Path | None = None
-    """The plan (YAML); the default plan if left out."""
+    """Plan (YAML) to use instead of the default plan."""
     data: Path | None = None
     """Scenario set of the runs, if it has moved since (for a stratified split)."""
     save: Path | None = None
@@ -42,7 +42,7 @@ class Compare:
 
 
 def run(args: Compare, overrides: Sequence[str] = ()) -> int:
-    """Carry out the plan, or write it."""
+    """Compare by the plan, or write the plan."""
     from drivax import settings
     from drivax.errors import UsageError
     from drivax.evaluation.comparison import compare

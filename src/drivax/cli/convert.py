@@ -20,18 +20,19 @@ from drivax.files import can_resume
 from drivax.scenario.schema import CAPACITIES
 from drivax.tracking.progress import Progress
 
-_SHOWN = 20
+#: Maximum number of skipped records to list.
+_MAX_LISTED = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convert(Conversion):  # noqa: D101
     __doc__ = f"""Convert recordings of a public data set to a scenario set.
 
-    Reads one file, or all files of known formats in a folder, and says which records it skipped, and why.
+    Reads one file, or all files of known formats in a folder, and reports skipped records with the reason.
     The same command resumes an interrupted conversion.
 
     Formats: {", ".join(reader.name for reader in READERS)}.
-    docs/data/index.md says how to get them; drivax doctor SRC recognises the format of SRC.
+    docs/data/index.md explains how to get them; drivax doctor SRC recognises the format of SRC.
 
     Example: drivax convert womd/training sets/womd --workers 8 --split 80/10/10
     """
@@ -48,7 +49,7 @@ class Convert(Conversion):  # noqa: D101
 
 
 def run(args: Convert) -> int:
-    """Convert, print what was written and what was skipped."""
+    """Convert, and print a summary and the skipped records."""
     options = record_of(Conversion, args)
     with Progress("converting", "files") as bar:
 
@@ -59,37 +60,38 @@ def run(args: Convert) -> int:
             result = convert(args.src, args.out, options, report, audit, _announce)
         except BaseException as error:
             if not isinstance(error, UsageError) and can_resume(args.out):
-                print("drivax: what is finished is kept, the same command continues", file=sys.stderr)
+                print("drivax: finished parts are kept; the same command resumes", file=sys.stderr)
             raise
     print(summary(result))
-    for bad in result.skipped[:_SHOWN]:
-        print(f"skipped {bad.error()}", file=sys.stderr)
-    if len(result.skipped) > _SHOWN:
-        print(f"skipped {len(result.skipped) - _SHOWN} more; manifest.json lists all", file=sys.stderr)
+    for record in result.skipped[:_MAX_LISTED]:
+        print(f"skipped {record.error()}", file=sys.stderr)
+    if len(result.skipped) > _MAX_LISTED:
+        print(f"skipped {len(result.skipped) - _MAX_LISTED} more; manifest.json lists all", file=sys.stderr)
     return 0
 
 
 def _announce(plan: Plan) -> None:
-    parts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
+    texts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
     unknown = len(plan.data.inputs) - plan.data.formats.total()
-    parts += [f"{counted(unknown, 'file')} of unknown format"] if unknown else []
-    print(f"found {', '.join(parts)}: {plan.estimate}", flush=True)
+    if unknown:
+        texts.append(f"{counted(unknown, 'file')} of unknown format")
+    print(f"found {', '.join(texts)}: {plan.estimate}", flush=True)
     if plan.written:
         print(f"continuing after {counted(plan.written, 'scenario')}", flush=True)
 
 
 def summary(result: Converted) -> str:
-    """One line about a conversion."""
+    """Return one line about a conversion."""
     rate = (result.scenarios - result.written) / max(result.seconds, 1e-9)
-    parts = [
+    texts = [
         f"{counted(result.scenarios, 'scenario')} from {counted(result.files, 'file')}"
         f" in {result.seconds:.1f} s ({rate:.1f}/s)",
         f"{counted(len(result.skipped), 'record')} skipped",
     ]
     if result.written:
-        parts.insert(1, f"{result.written:,} of them written before")
+        texts.insert(1, f"{result.written:,} of them written before")
     if result.filtered:
-        parts.append(f"{counted(result.filtered, 'scenario')} left out by filters")
+        texts.append(f"{counted(result.filtered, 'scenario')} left out by filters")
     if result.ignored:
-        parts.append(f"{counted(result.ignored, 'file')} of other formats ignored")
-    return f"{result.path}: " + ", ".join(parts)
+        texts.append(f"{counted(result.ignored, 'file')} of other formats ignored")
+    return f"{result.path}: " + ", ".join(texts)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 else:
     MethodName = tyro.extras.literal_type_from_choices(METHODS)
 
-#: Number of the most critical scenarios that are printed.
+#: Number of the most critical scenarios to print.
 _PRINTED_SCENARIOS = 10
 
 
@@ -34,9 +34,9 @@ class Curate:
 
     published: the published kinematic heuristic, for comparison.
 
-    ensemble: disagreement of behaviour-cloning policies, which it trains on different recordings.
+    ensemble: disagreement of behaviour cloning policies, trained on different recordings.
 
-    action_rarity: inverse density of the logged driver's action (action_rarity_published: by the published bins).
+    action_rarity: inverse density of the logged driver's action (action_rarity_published: with the published bins).
 
     uniform: equal scores. random_matched: the scores of --like, permuted. oracle: labels of the built-in world.
 
@@ -66,13 +66,13 @@ class Curate:
     ] = None
     """Aggregation over steps: max, mean, std, p99, top10, ...; or one per component: urgency max braking p95."""
     again: Path | None = None
-    """Scores of the same set and METHOD; only the combination of their components is computed again."""
+    """Scores of the same set and METHOD, to combine their components again without scoring."""
     like: Path | None = None
-    """Scores of the same set that random_matched permutes."""
+    """Scores of the same set, for random_matched to permute."""
     seed: int | None = None
     """Seed of random_matched and of an ensemble (default: 0)."""
     config: Path | None = None
-    """YAML file with settings of METHOD; each can be overridden as --key VALUE or --section.key VALUE."""
+    """YAML file with settings of METHOD; override them with --key VALUE or --section.key VALUE."""
     overwrite: bool = False
     """Replace OUT if it is a file, and TOP if it is a scenario set."""
 
@@ -132,23 +132,23 @@ def score_with_progress(method: str, request: Request) -> ScoreTable:
 
 
 def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> None:
-    """Raise UsageError for flags that the method, or --again, would ignore."""
+    """Refuse flags that the method or --again would ignore."""
     again, subject = args.again is not None, args.method
-    unused: dict[str, object] = {}
+    ignored_values: dict[str, object] = {}
     if again:
         subject = f"{args.again}, which is not scored again,"
-        unused["--like"] = args.like
+        ignored_values["--like"] = args.like
     if again or not has_settings:
-        unused["--config"] = args.config
+        ignored_values["--config"] = args.config
     if again or args.method not in ("ensemble", "random_matched"):
-        unused["--seed"] = args.seed
+        ignored_values["--seed"] = args.seed
     if args.all_windows and args.export is None:
         raise UsageError("--all-windows without a subset to choose", cure="pass --export TOP N")
-    unused_flags = [flag for flag, value in unused.items() if value is not None]
+    ignored_flags = [flag for flag, value in ignored_values.items() if value is not None]
     if again or not has_settings:
-        unused_flags += overrides
-    if unused_flags:
-        raise UsageError(f"{subject} has no such setting", cure="leave out " + " ".join(unused_flags))
+        ignored_flags += overrides
+    if ignored_flags:
+        raise UsageError(f"{subject} has no such setting", cure="leave out " + " ".join(ignored_flags))
     if args.method == "random_matched" and (args.weights is not None or args.scenario is not None):
         raise UsageError(
             "random_matched permutes finished scores, which have no components",
@@ -178,6 +178,7 @@ def _export(
 
 
 def _print_statistics(table: ScoreTable, out: Path) -> None:
+    """Print statistics of the scores, and of the sampling weights by step and by scenario."""
     import numpy as np
 
     from drivax.curation.weights import WeightConfig, draw_statistics, sampling_weights

@@ -1,4 +1,4 @@
-"""``drivax doctor``: what is installed on this machine, or what a path contains and its problems."""
+"""``drivax doctor``: installed packages of this machine, or contents and problems of a path."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ _EXTRAS = {
     "track": (("tensorboardX",), "TensorBoard"),
     "gym": (("gymnasium",), "Gymnasium"),
 }
-#: JAX runs in a separate process, which a broken accelerator may hang or crash.
-_ASK_JAX = "import jax, json; print(json.dumps([[d.platform, d.device_kind] for d in jax.devices()]))"
+#: Program that lists the devices; in a separate process, since a broken accelerator may hang or crash JAX.
+_LIST_DEVICES = "import jax, json; print(json.dumps([[d.platform, d.device_kind] for d in jax.devices()]))"
 
 
 @dataclass(frozen=True)
 class Doctor:
-    """Show what is installed, or identify a file or folder of data and its problems.
+    """Show installed packages, or identify a file or folder of data and its problems.
 
-    With PATH: the data set, its flavour and version, the number of recordings and scenarios, missing files, and a
-    substitute for formats that drivax does not read. The exit status is 1 if nothing can be converted.
+    With PATH: data set, flavour, version, number of recordings and scenarios, missing files, and a substitute for
+    formats that drivax does not read. The exit status is 1 if nothing can be converted.
 
     Example: drivax doctor womd/training
     """
@@ -90,7 +90,11 @@ def devices(timeout_s: float = 60.0) -> str:
     """Return the devices of JAX, or its error."""
     try:
         result = subprocess.run(
-            [sys.executable, "-c", _ASK_JAX], capture_output=True, text=True, timeout=timeout_s, check=False
+            [sys.executable, "-c", _LIST_DEVICES],
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
         )
         if result.returncode == 0:
             kinds = json.loads(result.stdout.splitlines()[-1])
@@ -102,7 +106,7 @@ def devices(timeout_s: float = 60.0) -> str:
 
 
 def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
-    """Yield a diagnosis as (name, value)."""
+    """Yield the lines of a diagnosis as (name, value)."""
     yield "path", str(diagnosis.path)
     for part in diagnosis.parts:
         yield from _part_rows(part, diagnosis.files[part.format])
@@ -117,10 +121,10 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
             yield "other files", ", ".join(others)
         yield "input", format_bytes(diagnosis.input_bytes)
     for problem in diagnosis.problems:
-        # The path is printed above; only a file inside it is named.
+        # The path is printed above; name only files inside it.
         file = None if problem.file == diagnosis.path else problem.file
-        place = f"{file}: " if file is not None else ""
-        yield "problem", f"{place}{problem.problem}"
+        prefix = f"{file}: " if file is not None else ""
+        yield "problem", f"{prefix}{problem.problem}"
         if problem.cure:
             yield "instead", problem.cure
     if diagnosis.convertible:
@@ -138,10 +142,10 @@ def _part_rows(part: Part, files: int) -> Iterator[tuple[str, str]]:
     description = part.description
     version = "" if description.version is None else f", version {description.version}"
     yield "data set", f"{description.dataset}: {description.flavour}{version}"
-    number = counted(part.looked if part.whole else files, "file")
-    sampled = "" if part.whole else f" ({part.looked:,} of them looked into)"
+    files_text = counted(part.looked if part.whole else files, "file")
+    sample_text = "" if part.whole else f" ({part.looked:,} of them looked into)"
     recordings = "" if description.recordings is None else f", {counted(description.recordings, 'recording')}"
-    yield "format", f"{part.format}: {number}{sampled}{recordings}{'' if part.whole else ' in those'}"
+    yield "format", f"{part.format}: {files_text}{sample_text}{recordings}{'' if part.whole else ' in those'}"
     yield from (("note", note) for note in description.notes)
     yield from (("missing", name) for name in description.missing)
 

@@ -26,7 +26,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import zoo
 
-#: Profile among the metrics: computed from the finished episodes.
+#: Name among the metrics for nuPlan's devkit profile, computed from the finished episodes.
 _DEVKIT = "devkit"
 
 
@@ -34,9 +34,8 @@ _DEVKIT = "devkit"
 class Evaluate(EvaluationConfig):  # noqa: D101
     __doc__ = f"""Evaluate a planner on every scenario of a set, to the end of each log.
 
-    A planner is {", ".join(PLANNERS)}, module:name of your own, the run folder of `drivax train`, or
-    a policy of the package: {", ".join(zoo())}. Settings of the task follow as --task.KEY VALUE; a trained policy
-    has its own.
+    A planner is {", ".join(PLANNERS)}, your own module:name, the run folder of `drivax train`, or a policy of the
+    package: {", ".join(zoo())}. Change settings of the task with --task.KEY VALUE; a trained policy has its own task.
 
     Writes episodes.csv, summary.json, trajectories.npz, and crashes.json if the planner crashed.
 
@@ -88,7 +87,7 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
 
 
 def _requested_task(overrides: Sequence[str]) -> Task | None:
-    """Parse ``--task.KEY VALUE`` arguments; None without any."""
+    """Return the task of ``--task.KEY VALUE`` arguments, or None without any."""
     if not overrides:
         return None
     for argument in overrides:

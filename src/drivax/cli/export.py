@@ -13,7 +13,7 @@ import tyro
 class Export:
     """Write a scenario set, or a part of it, as a set again or in another format.
 
-    set: a scenario set with the chosen records, bit for bit.
+    set: a scenario set with the selected records, bit for bit.
 
     tfexample: TFRecord shards of WOMD tf.Examples with path_samples, for Waymax and V-Max.
 
@@ -29,7 +29,7 @@ class Export:
     format: Literal["set", "tfexample", "gpudrive"] = "set"
     """Format to write."""
     filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """Only scenarios with this property (NAME=A|B, NAME!=A, NAME>=N); may be given several times."""
+    """Only scenarios with this property (NAME=A|B, NAME!=A, NAME>=N); can be repeated."""
     ids: Path | None = None
     """Only scenarios named in this file: one id per line, or data set, tab and id (a split file)."""
     limit: int | None = None
@@ -43,7 +43,7 @@ class Export:
 
 
 def run(args: Export) -> int:
-    """Export, and print what the format could not hold."""
+    """Export, and print the number of elements that did not fit the format."""
     from drivax.datasets.export import writer as export
     from drivax.tracking.progress import Progress
 
@@ -57,9 +57,9 @@ def run(args: Export) -> int:
         overwrite=args.overwrite,
     )
     with Progress("exporting", "scenarios") as bar:
-        done = export.export(args.set, args.out, options, lambda count, total: bar.update(count, "", total))
-    lost = ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in sorted(done.lost.items()))
-    files = "1 file" if done.files == 1 else f"{done.files:,} files"
-    scenarios = "1 scenario" if done.scenarios == 1 else f"{done.scenarios:,} scenarios"
-    print(f"{done.path}: {scenarios} in {files}" + (f"; no room for {lost}" if lost else ""))
+        result = export.export(args.set, args.out, options, lambda done, total: bar.update(done, "", total))
+    lost = ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in sorted(result.lost.items()))
+    files = "1 file" if result.files == 1 else f"{result.files:,} files"
+    scenarios = "1 scenario" if result.scenarios == 1 else f"{result.scenarios:,} scenarios"
+    print(f"{result.path}: {scenarios} in {files}" + (f"; no room for {lost}" if lost else ""))
     return 0

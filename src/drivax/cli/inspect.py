@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from drivax.report.inspection import Inspection
 
 _COLUMNS = 100
-#: Number of scenarios of --observations, evenly spread over those selected.
+#: Number of scenarios for --observations, evenly spread over the selected ones.
 _OBSERVED_SCENARIOS = 256
 
 
@@ -25,7 +25,7 @@ _OBSERVED_SCENARIOS = 256
 class Inspect:
     """Summarise a scenario set: sources, sizes, tags, flags, audit, integrity.
 
-    Several sets are compared in one table.
+    Compares several sets in one table.
 
     Example: drivax inspect sets/womd sets/nuplan --filter agents>=20 --html sets.html
 
@@ -35,13 +35,13 @@ class Inspect:
     sets: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SET")]
     """Scenario sets (folders), one or more."""
     filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """Only scenarios with this property (NAME=A|B, NAME!=A, NAME>=N); may be given several times."""
+    """Only scenarios with this property (NAME=A|B, NAME!=A, NAME>=N); can be repeated."""
     json: bool = False
     """Print the counts of every scenario as JSON."""
     html: Path | None = None
     """Write a page with histograms to this file instead of printing tables."""
     no_check: bool = False
-    """Skip the checksums, which take reading the whole set."""
+    """Skip the checksums, which read the whole set."""
     observations: bool = False
     """Describe the observations of a planner: distributions, correlation with collisions and actions."""
     planner: str | None = None
@@ -49,7 +49,7 @@ class Inspect:
     traffic: str | None = None
     """Traffic of --observations: log (the default), idm, zoo:NAME, ... as for drivax evaluate."""
     task: str | None = None
-    """Training configuration (file or preset) of the observations; a run has its own."""
+    """Training configuration (file or preset) of the observations; a trained policy has its own."""
     draw: Path | None = None
     """Also draw the observation of the first scenario at its current step into this PNG file."""
     overwrite: bool = False
@@ -86,7 +86,7 @@ def run(args: Inspect) -> int:
 
 
 def _print(inspections: list[Inspection]) -> None:
-    """Print one set in full, or several side by side."""
+    """Print one set in detail, or several side by side."""
     from drivax.report import inspection as tables
 
     console = _console()
@@ -114,6 +114,7 @@ def _console() -> Console:
 
 
 def _check_flags(args: Inspect) -> None:
+    """Refuse flags that exclude each other, and an existing picture."""
     from drivax.errors import UsageError
     from drivax.tracking.run_folder import is_policy
 
@@ -125,7 +126,7 @@ def _check_flags(args: Inspect) -> None:
         if getattr(args, name) is not None and not args.observations:
             raise UsageError(f"--{name} needs --observations", cure="add --observations")
     if args.planner is not None and args.task is not None and is_policy(args.planner.partition("@")[0]):
-        raise UsageError("a trained policy has a task of its own", cure="leave out --task")
+        raise UsageError("a trained policy has its own task", cure="leave out --task")
     if args.draw is not None and args.draw.exists() and not args.overwrite:
         raise UsageError(
             "output file already exists", file=args.draw, cure="choose another name or pass --overwrite"
@@ -133,7 +134,7 @@ def _check_flags(args: Inspect) -> None:
 
 
 def _observe(args: Inspect, inspection: Inspection) -> None:
-    """Run the planner, print statistics of its observations, and draw one observation."""
+    """Evaluate the planner, print statistics of its observations, and draw one observation."""
     from drivax import settings
     from drivax.api import find_planner
     from drivax.evaluation.observation_statistics import observation_statistics

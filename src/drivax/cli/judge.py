@@ -11,10 +11,10 @@ import tyro
 
 @dataclass(frozen=True)
 class Judge:
-    """Evaluate the episodes of a run by the rules of another program, without driving them again.
+    """Evaluate the episodes of a run by the rules of another program, without simulating them again.
 
-    devkit: nuPlan's closed-loop score as its devkit computes it. RUN/devkit.csv holds both scores of every episode, all
-    their terms, and which of them differ (docs/guide/metrics.md says why).
+    devkit: nuPlan's closed-loop score as its devkit computes it. RUN/devkit.csv has both scores of every episode, their
+    terms, and the names of the terms that differ (docs/guide/metrics.md explains why).
 
     Example: drivax judge runs/idm --profile devkit
     """
@@ -22,7 +22,7 @@ class Judge:
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Run folder written by drivax evaluate."""
     profile: Literal["devkit"] = "devkit"
-    """The rules."""
+    """Rules of the evaluation."""
     data: Path | None = None
     """Scenario set of the run, if it has moved since."""
     overwrite: bool = False

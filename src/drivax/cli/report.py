@@ -1,4 +1,4 @@
-"""``drivax report``: one HTML page from run folders; or videos, or tables."""
+"""``drivax report``: an HTML page, videos or tables from run folders."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from tyro.conf import Positional
 
 @dataclass(frozen=True)
 class Report:
-    """Write one self-contained HTML page from evaluation and training runs; or videos, or tables.
+    """Write one self-contained HTML page, videos or tables from evaluation and training runs.
 
-    The page holds tables with intervals, paired differences, kinds of collision, distributions, all episodes, episodes
-    side by side and learning curves; it needs no network. The other planners are compared with the last evaluation.
-    With --video, --side-by-side or --tables, files are written into the folder --out instead.
+    The page has tables with intervals, paired differences, kinds of collision, distributions, all episodes, episodes
+    side by side and learning curves; it needs no network. The last evaluation is compared with the others. --video,
+    --side-by-side and --tables write files into the folder --out instead.
 
     Example: drivax report runs/constant runs/idm runs/policy runs/training --out report.html
 
@@ -33,7 +33,7 @@ class Report:
     data: Path | None = None
     """Scenario set of the runs, if it has moved since."""
     episodes: int = 12
-    """Number of episodes that the page plays; 0 leaves out episodes and tags."""
+    """Number of playable episodes; a page with 0 has no rollouts and no tags."""
     video: str | None = None
     """Write mp4 files of the last run's episodes: worst:N, all, or the id of a scenario."""
     side_by_side: str | None = None
@@ -59,7 +59,7 @@ def run(args: Report) -> int:
     if not args.runs:
         raise UsageError("no run is named", cure="drivax report RUN [RUN ...]")
     if sum((args.video is not None, args.side_by_side is not None, args.tables)) > 1:
-        raise UsageError("--video, --side-by-side and --tables are one at a time", cure="run it twice")
+        raise UsageError("--video, --side-by-side and --tables exclude each other", cure="run it twice")
     if args.metrics and not args.tables:
         raise UsageError("--metrics chooses columns of --tables", cure="pass --tables, or leave it out")
     which = args.video if args.video is not None else args.side_by_side

@@ -23,7 +23,7 @@ class Study:
     longtail: does training on critical moments more often make a safer planner? Scores the training set, trains and
     evaluates all arms and their controls, and tests the claims; OUT/report.html has the verdicts.
 
-    A study that was stopped resumes when it is called again. Settings follow as --total_steps 500000 or
+    The same command resumes an interrupted study. Change settings with flags such as --total_steps 500000 or
     --arms [baseline,bc,heuristic,random_matched].
 
     Example: drivax study longtail --data sets/bench --seeds 5 --out studies/longtail
@@ -36,17 +36,17 @@ class Study:
     out: Path
     """Folder of the study."""
     validation: Path | None = None
-    """Scenario set that chooses checkpoints."""
+    """Scenario set for the choice of checkpoints."""
     test: tuple[Path, ...] = ()
-    """Scenario sets of the test; if events are labelled, half of the scenarios taken have one."""
+    """Scenario sets of the test; if events are labelled, half of the test scenarios have one."""
     seeds: int | None = None
-    """Training runs of each arm; 5 unless the configuration says otherwise."""
+    """Training runs of each arm; by default those of the configuration, or 5."""
     config: Path | None = None
     """YAML file with settings."""
     cores: int | None = None
     """Parallel training runs, one core each; all cores by default."""
     anyway: bool = False
-    """Go on even if the baselines do not drive well enough for a comparison."""
+    """Continue even if the baselines do not drive well enough for a comparison."""
 
 
 def run(args: Study, overrides: Sequence[str] = ()) -> int:
@@ -62,7 +62,7 @@ def run(args: Study, overrides: Sequence[str] = ()) -> int:
         log=lambda line: print(line, file=sys.stderr),
     )
     for claim in results["claims"]:
-        needed = f" ({claim['needed']})" if claim["needed"] else ""
-        print(f"{claim['verdict']:<12} {claim['claim']['words']}{needed}")
+        note = f" ({claim['needed']})" if claim["needed"] else ""
+        print(f"{claim['verdict']:<12} {claim['claim']['words']}{note}")
     print(f"{args.out / 'report.html'}")
     return 0

@@ -36,7 +36,7 @@ class Train:
 
     SIGTERM writes a checkpoint and ends the run; --resume continues it.
 
-    CONFIG is a YAML file or the name of a preset; its settings follow as --section.key VALUE.
+    CONFIG is a YAML file or the name of a preset; override its settings with --section.key VALUE.
 
     Example: drivax train demo --data sets/train --validation sets/test --out runs/ppo --algorithm.learning_rate 1e-3
 
@@ -52,17 +52,17 @@ class Train:
     out: Path
     """Run folder to write."""
     validation: Path | None = None
-    """Scenario set that chooses the best checkpoint."""
+    """Scenario set for the choice of the best checkpoint."""
     scores: Path | None = None
-    """Scores of DATA by drivax curate: bc and offline algorithms draw each logged step by its weight."""
+    """Scores of DATA by drivax curate: bc and offline algorithms draw logged steps by their weights."""
     scale: Literal["step", "scenario"] | None = None
-    """Whether weights are of steps (the default) or of scenarios; with --scores."""
+    """Weigh single steps (the default) or whole scenarios; with --scores."""
     arm: Annotated[ArmName | None, tyro.conf.arg(aliases=["--agent"])] = None
-    """Arm of the long-tail study whose curation is used: scores DATA first, or takes --scores."""
+    """Curate like this arm of the long-tail study: scores DATA first, unless --scores is given."""
     weighting: WeightConfig = field(default_factory=WeightConfig)
-    """How scores become weights; with --scores or --arm."""
+    """Conversion of scores to weights; with --scores or --arm."""
     seeds: int = 1
-    """Number of agents trained in one program, with consecutive seeds; each has a folder in OUT."""
+    """Number of consecutive seeds to train in one program; each has a folder in OUT."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
     """Start from the networks of another run, with a new replay buffer, optimisers and environments."""
     resume: bool = False
@@ -73,9 +73,9 @@ class Train:
 
 def run(args: Train, overrides: Sequence[str] = ()) -> int:
     """Train, then print the run folder."""
-    given = [*overrides, *([] if args.begin_from is None else ["--from", args.begin_from])]
-    if args.resume and given:
-        raise UsageError("a resumed run keeps its configuration", cure="leave out " + " ".join(given))
+    flags = [*overrides, *([] if args.begin_from is None else ["--from", args.begin_from])]
+    if args.resume and flags:
+        raise UsageError("a resumed run keeps its configuration", cure="leave out " + " ".join(flags))
     if args.seeds > 1 or args.resume:
         widen_pool()
     config = settings.load(TrainConfig, args.config, list(overrides))
@@ -97,7 +97,7 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
 
 
 def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
-    """Return the set, with weights if scores or an arm are given."""
+    """Return the training set, weighted if scores or an arm are given."""
     data, weighting = ScenarioSet.open(args.data), args.weighting
     if args.arm is None:
         if args.scores is None:
@@ -113,14 +113,15 @@ def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
     arm = load_study("longtail").arms[args.arm]
     _check_arm(args, arm, config)
     tables = partial(_table, args, data)
-    return arm.weighted(data, tables, weighting, usable_steps(config, data), config.seed)
+    return arm.weigh(data, tables, weighting, usable_steps(config, data), config.seed)
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:
-    """Raise UsageError for another training than that of the arm, or for flags that the arm ignores."""
-    own, expected = (_algorithm(each) for each in (config, settings.load(TrainConfig, arm.preset)))
-    if own != expected:
-        raise UsageError(f"arm {args.arm} is trained by {expected}, not {own}", cure=f"use {arm.preset}")
+    """Refuse another algorithm than the arm's, and flags that the arm ignores."""
+    algorithm, arm_algorithm = _algorithm(config), _algorithm(settings.load(TrainConfig, arm.preset))
+    if algorithm != arm_algorithm:
+        problem = f"arm {args.arm} is trained by {arm_algorithm}, not {algorithm}"
+        raise UsageError(problem, cure=f"use {arm.preset}")
     if args.scale is not None:
         raise UsageError(
             f"arm {args.arm} has its own scale", cure="leave out --scale, or choose another --arm"
@@ -135,17 +136,17 @@ def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:
 
 
 def _algorithm(config: TrainConfig) -> str:
-    """Return the algorithm's name, and whether it has an imitation loss."""
+    """Return the name of the algorithm, ``with imitation`` if it has an imitation loss."""
     imitates = getattr(config.algorithm, "imitation", 0.0) > 0.0
     return settings.kind_of(type(config.algorithm)) + (" with imitation" if imitates else "")
 
 
 def _table(args: Train, data: ScenarioSet, method: str) -> ScoreTable:
-    """Return the scores of an arm's method, from --scores if given."""
+    """Return the scores of an arm's method, read from --scores if given."""
     if args.scores is None:
         return score_with_progress(method, Request(data))
     table = read_scores(args.scores, data)
-    # `Arm.weighted` refuses scores of another method.
+    # `Arm.weigh` refuses scores of another method.
     if table.method == method:
         check_current(table, file=args.scores)
     return table

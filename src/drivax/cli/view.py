@@ -13,7 +13,7 @@ import tyro
 class View:
     """Write one self-contained HTML page that plays the logs of a set.
 
-    It also shows the tags, flags and audit of each scenario, which adds some tens of kilobytes.
+    It also shows tags, flags and audit. Each scenario adds some tens of kilobytes.
 
     Example: drivax view sets/world --limit 20 --out world.html
 
@@ -45,20 +45,19 @@ def run(args: View) -> int:
     folder = args.set.resolve()
     details: list[str] = []
     if args.scores is None:
-        chosen = select(data, args.limit, args.ids)
+        scenarios = select(data, args.limit, args.ids)
     else:
         table = read_scores(args.scores, data)
-        chosen = select(
-            data, args.limit, args.ids or [table.scenario_ids[row] for row in top_rows(table, len(data))]
-        )
-        row = {name: row for row, name in enumerate(table.scenario_ids)}
-        details = [criticality_html(table, row[scenario.id]) for scenario in chosen]
+        ids = args.ids or [table.scenario_ids[row] for row in top_rows(table, len(data))]
+        scenarios = select(data, args.limit, ids)
+        row_of = {scenario_id: row for row, scenario_id in enumerate(table.scenario_ids)}
+        details = [criticality_html(table, row_of[scenario.id]) for scenario in scenarios]
     path = write_player(
-        chosen,
+        scenarios,
         args.out or folder.with_name(f"{folder.name}.html"),
         args.overwrite,
         title=folder.name,
         details=details,
     )
-    print(f"{path} ({len(chosen)} of {len(data)} scenarios, {path.stat().st_size / 1e6:.1f} MB)")
+    print(f"{path} ({len(scenarios)} of {len(data)} scenarios, {path.stat().st_size / 1e6:.1f} MB)")
     return 0

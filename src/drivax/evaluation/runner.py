@@ -27,7 +27,7 @@ from drivax.evaluation.rollout import Episodes, check_actions, drive, episode_ke
 from drivax.files import check_space, explain_full_disk, replace_folder
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import metric_specs, select_metrics
-from drivax.planners.functions import raised
+from drivax.planners.functions import collect_errors
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities, too_short
@@ -250,7 +250,7 @@ def evaluate(
         size = min(batch or _batch_size(simulator.traffic, scenarios, sizes), len(scenarios))
         banks = _banks(scenarios, identity, size, sizes)
     episodes, done = [], 0
-    with raised() as errors, report_out_of_memory(size):
+    with collect_errors() as errors, report_out_of_memory(size):
         for bank in banks:
             for batch_episodes in evaluation.episodes(bank):
                 episodes.append(batch_episodes)

@@ -26,13 +26,14 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
 
 
 def make_planner(name: str, actions: ActionSpace | None = None) -> Planner:
-    """Return the planner of a name in :data:`PLANNERS`, or of ``package.module:name`` (a planner or what makes one).
+    """Make a planner by its name in :data:`PLANNERS` or its dotted name ``package.module:name``.
 
-    ``actions`` replaces the planner's own action space, if it has one.
+    A dotted name leads to a planner, or to a class or function that returns one without arguments. ``actions`` replaces
+    the planner's own action space, if it has one.
 
     Raises:
         KeyError: Unknown name.
-        UsageError: A dotted name leads to no planner.
+        UsageError: The dotted name leads to no planner.
     """
     planner = as_planner(find_named(name), name) if is_dotted(name) else PLANNERS[name]()
     return replace(planner, actions=actions) if actions and hasattr(planner, "actions") else planner  # type: ignore
@@ -44,27 +45,29 @@ def default_task(planner: Planner) -> Task:
 
 
 def as_planner(thing: Any, name: str) -> Planner:
-    """Return a planner of the user's: ``thing`` itself, or what its class or function makes without arguments.
+    """Return a user's planner: ``thing`` itself, or the result of calling it without arguments.
 
-    Objects and classes with nuPlan's interface are adapted (:mod:`drivax.planners.nuplan`).
+    Adapts objects and classes with nuPlan's interface (:mod:`drivax.planners.nuplan`).
 
     Raises:
-        UsageError: The value is not a planner and does not make one; the message uses ``name``.
+        UsageError: ``thing`` is not a planner and does not make one; the message uses ``name``.
     """
     if not isinstance(thing, type) and (is_nuplan(thing) or isinstance(thing, Planner)):
-        return _made(thing, name)
+        return _adapt(thing, name)
     if callable(thing):
         try:
             check_arguments(thing, name, ())
         except ValueError as error:
             cure = "put @drivax.python_planner or @drivax.jax_planner above a function that drives"
-            cure = f"name a function that makes {name} without arguments" if is_nuplan(thing) else cure
+            if is_nuplan(thing):
+                cure = f"name a function that makes {name} without arguments"
             raise UsageError(str(error), cure=cure) from None
-        return _made(thing if is_nuplan(thing) else thing(), name)
-    return _made(thing, name)
+        return _adapt(thing if is_nuplan(thing) else thing(), name)
+    return _adapt(thing, name)
 
 
-def _made(thing: Any, name: str) -> Planner:
+def _adapt(thing: Any, name: str) -> Planner:
+    """Wrap a planner with nuPlan's interface, and check any other."""
     if is_nuplan(thing):
         return NuplanPlanner(Host(thing, name))
     if not isinstance(thing, Planner):

@@ -27,17 +27,17 @@ Drive = Callable[[Situation, Any], Any]
 
 #: Folder of the package.
 _PACKAGE = Path(__file__).parents[1]
-#: Active collectors of errors; the last one receives them.
-_listeners: list[dict[tuple[int, int], str]] = []
+#: Active collectors of errors; the innermost one receives them.
+_collectors: list[dict[tuple[int, int], str]] = []
 
 
 class PlannerError(Exception):
-    """A failure of a planner whose text is complete."""
+    """A failure of a planner; its text needs no location in the user's code."""
 
 
 @record
 class FunctionPlanner(Memoryless):
-    """Drive by a function; created by :func:`jax_planner` and :func:`python_planner`.
+    """A planner that calls a function, created by :func:`jax_planner` and :func:`python_planner`.
 
     Attributes:
         function: ``(situation, observation) -> action``.
@@ -53,14 +53,14 @@ class FunctionPlanner(Memoryless):
         return str(getattr(self.function, "__name__", type(self.function).__name__))
 
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
-        """Return the function's action; NaN where it raised an error."""
+        """Return the function's action, or NaN if it raises an error."""
         if not self.in_python:
             return jnp.ravel(jnp.asarray(self.function(situation, observation), jnp.float32))
-        # The traffic state is internal.
-        seen = replace(situation, context=replace(situation.context, traffic=()))
         context = situation.context
+        # The traffic state is internal.
+        situation = replace(situation, context=replace(context, traffic=()))
         identity, size = bank.identity[context.index], context.action.shape[0]
-        return python_actions(self.function, identity, context.step, (seen, observation), size)
+        return python_actions(self.function, identity, context.step, (situation, observation), size)
 
 
 def jax_planner(function: Drive) -> FunctionPlanner:
@@ -74,8 +74,8 @@ def jax_planner(function: Drive) -> FunctionPlanner:
 def python_planner(function: Drive) -> FunctionPlanner:
     """Create a planner from a Python function ``(situation, observation) -> action``.
 
-    It is called scenario by scenario and step by step with numpy arrays. An error that it raises fails the episode
-    (``evaluation.runner``). It must not call JAX, which waits for it.
+    Each call gets numpy arrays of one scenario at one step. An error fails the episode (``evaluation.runner``). The
+    function must not call JAX, which waits for it.
     """
     return FunctionPlanner(function, in_python=True)
 
@@ -83,18 +83,22 @@ def python_planner(function: Drive) -> FunctionPlanner:
 def python_actions(
     function: Callable[..., Any], identity: Array, step: Array, arguments: tuple[Any, ...], size: int
 ) -> Array:
-    """Return ``size`` numbers of a Python function, called outside the compiled program; NaN where it raised an error.
+    """Return ``size`` numbers of a Python function called outside the compiled program, or NaN if it raises an error.
 
-    ``identity`` and ``step`` are those of the scenario, by which errors are collected (:func:`raised`); ``arguments``
-    are pytrees, which the function gets as numpy arrays of one scenario.
+    Args:
+        function: Gets ``arguments`` as numpy arrays of one scenario.
+        identity: Identity of the scenario, a key of collected errors (:func:`collect_errors`).
+        step: Step of the log, a key of collected errors.
+        arguments: Pytrees of arrays.
+        size: Number of values that the function returns.
     """
 
-    def answer(identity: Any, steps: Any, arguments: Any) -> Any:
+    def call(identity: Any, steps: Any, arguments: Any) -> Any:
         identity, steps = np.asarray(identity), np.asarray(steps)
-        return _answers(function, identity, steps, jax.tree.map(np.asarray, arguments), size)
+        return _call_batch(function, identity, steps, jax.tree.map(np.asarray, arguments), size)
 
     result = jax.ShapeDtypeStruct((size,), jnp.float32)
-    return jax.pure_callback(answer, result, identity, step, arguments, vmap_method="broadcast_all")
+    return jax.pure_callback(call, result, identity, step, arguments, vmap_method="broadcast_all")
 
 
 @record
@@ -122,33 +126,34 @@ class NetworkPlanner(Memoryless):
 
 
 @contextmanager
-def raised() -> Iterator[dict[tuple[int, int], str]]:
-    """Collect errors of Python functions, by the scenario's identity and the step of the log.
+def collect_errors() -> Iterator[dict[tuple[int, int], str]]:
+    """Collect errors of Python functions by scenario identity and step of the log.
 
-    Outside of this context errors end the program.
+    Outside of this context, errors end the program.
     """
-    _listeners.append({})
+    _collectors.append({})
     try:
-        yield _listeners[-1]
+        yield _collectors[-1]
     finally:
-        _listeners.pop()
+        _collectors.pop()
 
 
-def _answers(
-    function: Callable[..., Any], identity: Any, steps: Any, seen: tuple[Any, ...], size: int
+def _call_batch(
+    function: Callable[..., Any], identity: Any, steps: Any, arguments: tuple[Any, ...], size: int
 ) -> Any:
     """Return the function's action for each scenario of a batch of any shape."""
     actions = np.full((*identity.shape, size), np.nan, np.float32)
-    for at in np.ndindex(identity.shape):
+    for index in np.ndindex(identity.shape):
         try:
-            action = np.asarray(function(*jax.tree.map(lambda leaf, at=at: leaf[at], seen)), np.float32)
+            scenario_arguments = jax.tree.map(lambda leaf, index=index: leaf[index], arguments)
+            action = np.asarray(function(*scenario_arguments), np.float32)
             if action.size != size:
                 raise ValueError(f"{list(action.shape)} is not an action; give {size} numbers")
-            actions[at] = action.ravel()
+            actions[index] = action.ravel()
         except Exception as error:
-            if not _listeners:
+            if not _collectors:
                 raise
-            _listeners[-1][int(identity[at]), int(steps[at])] = error_text(error)
+            _collectors[-1][int(identity[index]), int(steps[index])] = error_text(error)
     return actions
 
 
@@ -157,6 +162,8 @@ def error_text(error: Exception) -> str:
     if isinstance(error, PlannerError):
         return str(error)
     text = " ".join(f"{type(error).__name__}: {error}".split())
-    places = traceback.extract_tb(error.__traceback__)
-    theirs = [place for place in places if not Path(place.filename).is_relative_to(_PACKAGE)]
-    return f"{text} ({Path(theirs[0].filename).name}:{theirs[0].lineno})" if theirs else text
+    frames = traceback.extract_tb(error.__traceback__)
+    user_frames = [frame for frame in frames if not Path(frame.filename).is_relative_to(_PACKAGE)]
+    if not user_frames:
+        return text
+    return f"{text} ({Path(user_frames[0].filename).name}:{user_frames[0].lineno})"

@@ -17,8 +17,9 @@ class Planner(Protocol):
     """A driver, unbatched and pure.
 
     Register implementations as pytrees (weights are leaves, settings are static): evaluation passes the planner as an
-    argument of its compiled program. What ``act`` does not read is not computed. A planner that needs stored scenarios
-    has ``prepare(scenario_of)``, which evaluation calls with a function from a scenario's identity to the scenario.
+    argument of its compiled program. The compiler removes inputs that ``act`` does not read. A planner that needs
+    stored scenarios has ``prepare(scenario_of)``, which evaluation calls with a function from a scenario's identity to
+    the scenario.
     """
 
     @property
@@ -44,7 +45,7 @@ class Planner(Protocol):
 
 
 class Memoryless:
-    """Base of planners that carry nothing from step to step; implement ``choose``, or ``act`` itself."""
+    """Base of planners without memory; implement ``choose`` or override ``act``."""
 
     replays: bool = False
 
@@ -65,7 +66,7 @@ class Memoryless:
 
 
 class RuleBased(Memoryless, ABC):
-    """Base of planners that compute acceleration and curvature from the situation; records add ``actions``."""
+    """Base of planners that compute acceleration and curvature from the situation; subclasses define ``actions``."""
 
     actions: ActionSpace
 

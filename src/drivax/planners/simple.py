@@ -21,38 +21,39 @@ from drivax.tasks.actions import ActionSpace, Physical, Trajectory
 
 
 def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Motion:
-    """Return the logged motion of the agent ``ahead`` steps from now; its present motion where the log has none.
+    """Return the agent's logged motion ``ahead`` steps from now, or its present motion if the log is invalid then.
 
-    Beyond the end of the log its last motion continues at constant velocity.
+    After the end of the log, the motion continues at constant velocity.
     """
-    at, last = context.step + ahead, bank.last_step[context.index]
-    logged = bank.agents[context.index, jnp.minimum(at, last), context.slot]
-    heading, velocity = logged[AgentColumn.HEADING], logged[AgentColumn.VELOCITY]
+    step, last = context.step + ahead, bank.last_step[context.index]
+    state = bank.agents[context.index, jnp.minimum(step, last), context.slot]
+    heading, velocity = state[AgentColumn.HEADING], state[AgentColumn.VELOCITY]
     speed = jnp.maximum(jnp.sum(velocity * heading), 0.0)
-    beyond_s = jnp.maximum(at - last, 0) * 0.1
-    xy = logged[AgentColumn.XY] + beyond_s * velocity
-    motion = jnp.stack([xy[0], xy[1], jnp.arctan2(logged[AgentColumn.SIN], logged[AgentColumn.COS]), speed])
-    return jnp.where(logged[AgentColumn.VALID] > 0, motion, context.history[-1])
+    time_after_log_s = jnp.maximum(step - last, 0) * 0.1
+    xy = state[AgentColumn.XY] + time_after_log_s * velocity
+    motion = jnp.stack([xy[0], xy[1], jnp.arctan2(state[AgentColumn.SIN], state[AgentColumn.COS]), speed])
+    return jnp.where(state[AgentColumn.VALID] > 0, motion, context.history[-1])
 
 
 def logged_poses(bank: ScenarioBank, context: AgentContext, steps: int) -> Float[Array, "steps1 3"]:
-    """Return the logged poses from now on; gaps and the time after the log continue at constant velocity."""
-    logged, time = bank.agents[context.index, :, context.slot], jnp.arange(bank.steps)
-    seen = jax.lax.cummax(jnp.where(logged[:, AgentColumn.VALID] > 0, time, 0))
-    at = context.step + jnp.arange(steps + 1)
-    last = seen[jnp.minimum(at, bank.steps - 1)]
-    row = logged[last]
-    xy = row[:, AgentColumn.XY] + ((at - last) * DT_S)[:, None] * row[:, AgentColumn.VELOCITY]
-    heading = jnp.arctan2(row[:, AgentColumn.SIN], row[:, AgentColumn.COS])
+    """Return the logged poses from now on, at constant velocity in gaps and after the log."""
+    track = bank.agents[context.index, :, context.slot]
+    last_valid = jax.lax.cummax(jnp.where(track[:, AgentColumn.VALID] > 0, jnp.arange(bank.steps), 0))
+    step = context.step + jnp.arange(steps + 1)
+    source_step = last_valid[jnp.minimum(step, bank.steps - 1)]
+    states = track[source_step]
+    time_s = (step - source_step) * DT_S
+    xy = states[:, AgentColumn.XY] + time_s[:, None] * states[:, AgentColumn.VELOCITY]
+    heading = jnp.arctan2(states[:, AgentColumn.SIN], states[:, AgentColumn.COS])
     return jnp.concatenate([xy, heading[:, None]], axis=1)
 
 
 def expert_action(bank: ScenarioBank, context: AgentContext, actions: ActionSpace) -> Action:
-    """Return the action that follows the log from here; not clipped, for ``actions.clipped``."""
+    """Return the action that follows the log from the present motion, not yet clipped (see ``actions.clipped``)."""
     if isinstance(actions, Trajectory):
         return actions.plan(logged_poses(bank, context, actions.steps))
-    ahead, beyond = logged_motion(bank, context, 1), logged_motion(bank, context, 2)
-    return actions.expert(context.history[-1], ahead, beyond, bank.length_m(context.index, context.slot))
+    first, second = logged_motion(bank, context, 1), logged_motion(bank, context, 2)
+    return actions.expert(context.history[-1], first, second, bank.length_m(context.index, context.slot))
 
 
 @record
@@ -74,7 +75,7 @@ class Expert(Memoryless):
 
 @record
 class ConstantVelocity(RuleBased):
-    """Keeps speed and heading."""
+    """Keep speed and heading."""
 
     actions: ActionSpace = static(default=Physical())
     name: str = static(default="constant_velocity")
@@ -86,7 +87,7 @@ class ConstantVelocity(RuleBased):
 
 @record
 class RandomActions(Memoryless):
-    """Draws actions uniformly from the action space, independently at every step."""
+    """Draw actions uniformly from the action space, independently at every step."""
 
     name: str = static(default="random")
 
@@ -99,8 +100,8 @@ class RandomActions(Memoryless):
 class IdmPlanner(RuleBased):
     """Follow the leader along the route by IDM, stop for red lights, slow down in curves, steer by pure pursuit.
 
-    Reads the true situation, not observations. The desired speed is the limit, 13.4 m/s where none is known. In a
-    scenario without a route on lanes it follows the path of the log.
+    Reads the true situation, not observations. The desired speed is the speed limit, or 13.4 m/s if it is unknown. In a
+    scenario without a route on lanes, ego follows the path of the log.
     """
 
     actions: ActionSpace = static(default=Physical())
@@ -110,21 +111,22 @@ class IdmPlanner(RuleBased):
     def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Scalar, Scalar]:
         """Return IDM acceleration and pure-pursuit curvature."""
         context, frame = situation.context, situation.surroundings.frame
-        me, speed = frame.box[context.slot], context.history[-1, MOTION_SPEED]
-        seen = ahead(bank, context, frame, self.parameters.min_gap_m)
-        ahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
-        left_m = bank.route_points[context.index, 0] - 1 - context.route_m
-        ahead_m = jnp.minimum(ahead_m, jnp.maximum(left_m, 0.0))
-        points, _ = route_ahead(bank, context.index, context.route_m, ahead_m[None])
-        return seen.acceleration(speed, self.parameters), pursuit(me, points[0, RouteColumn.XY] - me[:2])
+        box, speed = frame.box[context.slot], context.history[-1, MOTION_SPEED]
+        obstacles = ahead(bank, context, frame, self.parameters.min_gap_m)
+        lookahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
+        remaining_m = bank.route_points[context.index, 0] - 1 - context.route_m
+        lookahead_m = jnp.minimum(lookahead_m, jnp.maximum(remaining_m, 0.0))
+        points, _ = route_ahead(bank, context.index, context.route_m, lookahead_m[None])
+        curvature = pursuit(box, points[0, RouteColumn.XY] - box[:2])
+        return obstacles.acceleration(speed, self.parameters), curvature
 
 
-def pursuit(me: Float[Array, " pose"], target: Float[Array, " 2"]) -> Scalar:
-    """Return the curvature of the arc from a pose or box to a point relative to it; 0 where the point lies behind.
+def pursuit(pose: Float[Array, " pose"], offset: Float[Array, " 2"]) -> Scalar:
+    """Return the curvature of the arc from a pose or box to a point at an offset, 0 for a point behind.
 
-    Pure pursuit (Coulter 1992): k = 2 y / L^2, with the point at (x, y) in the box's frame and L away.
+    Pure pursuit (Coulter 1992): k = 2 y / L^2, for a point at (x, y) in the frame of the pose, at distance L.
     """
-    forward = target[0] * me[2] + target[1] * me[3]
-    left = target[1] * me[2] - target[0] * me[3]
-    arc = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
-    return jnp.where(forward > 1.0, arc, 0.0)
+    forward = offset[0] * pose[2] + offset[1] * pose[3]
+    left = offset[1] * pose[2] - offset[0] * pose[3]
+    curvature = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
+    return jnp.where(forward > 1.0, curvature, 0.0)

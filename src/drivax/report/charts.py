@@ -46,27 +46,27 @@ def chart(
 ) -> str:
     """Return one chart as HTML, with a title above and ``x_label`` below.
 
-    ``lines`` has the stroke and the points (x, y) of each run. With ``share``, the vertical axis is from 0 to 1 if all
+    ``lines`` has the stroke and the points (x, y) of each run. With ``share``, the vertical axis spans 0 to 1 if all
     values fit.
     """
-    binned = {name: (style, _bin_points(points)) for name, (style, points) in lines.items() if len(points)}
-    values = np.concatenate([points for _, points in binned.values()])
+    series = {name: (style, _bin_points(points)) for name, (style, points) in lines.items() if len(points)}
+    values = np.concatenate([points for _, points in series.values()])
     x_ticks = ticks(min(0.0, float(values[:, 0].min())), float(values[:, 0].max()), 5)
     low, high = float(values[:, 1].min()), float(values[:, 1].max())
     y_ticks = [0.0, 0.25, 0.5, 0.75, 1.0] if share and low >= 0 and high <= 1 else ticks(low, high, 5)
     last = max(float(values[:, 0].max()), x_ticks[0] + 1e-9)
     axes = Axes(x_ticks[0], last, y_ticks[0], y_ticks[-1], left=52)
-    shapes = [axes.horizontal(value, compact(value)) for value in y_ticks]
-    shapes += [axes.mark(value) for value in x_ticks if value <= axes.x1 + 1e-9]
+    shapes = [axes.grid_line(value, compact(value)) for value in y_ticks]
+    shapes += [axes.tick_label(value) for value in x_ticks if value <= axes.x1 + 1e-9]
     shapes += [
         f'<polyline {style.svg} points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
-        for name, (style, points) in binned.items()
+        for name, (style, points) in series.items()
     ]
     return axes.figure(title, shapes, x_label)
 
 
 def _bin_points(points: Points) -> Float[np.ndarray[Any, Any], "bin 2"]:
-    """Return points in order of their step, averaged into bins if there are too many."""
+    """Sort points by step, and average them into bins if there are too many."""
     points = points[np.argsort(points[:, 0], kind="stable")]
     if len(points) <= _MAX_POINTS:
         return points
@@ -74,10 +74,12 @@ def _bin_points(points: Points) -> Float[np.ndarray[Any, Any], "bin 2"]:
 
 
 def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
-    charts, numbered = [], list(enumerate(runs))
+    charts = []
     for name in names:
         lines = {
-            run.name: (stroke(number), run.curves[name]) for number, run in numbered if name in run.curves
+            run.name: (stroke(index), run.curves[name])
+            for index, run in enumerate(runs)
+            if name in run.curves
         }
         share = name.split("/")[-1] in (*SHARES, "progress_ratio")
         charts.append(chart(name, lines, share, x_label="environment steps"))
@@ -85,7 +87,7 @@ def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
 
 
 class Axes:
-    """Mapping from data to pixels; ``left`` is the margin of the vertical axis."""
+    """Mapping from data to pixels, with a margin ``left`` for the labels of the vertical axis."""
 
     def __init__(self, x0: float, x1: float, y0: float, y1: float, left: int) -> None:
         self.x0, self.x1, self.y0, self.y1, self.left = x0, x1, y0, y1, left
@@ -102,21 +104,21 @@ class Axes:
         """Return points ``[n, 2]`` as an SVG path."""
         return " ".join(f"{self.x(x):.1f},{self.y(y):.1f}" for x, y in points)
 
-    def horizontal(self, value: float, text: str) -> str:
-        """Return a grid line with its label."""
+    def grid_line(self, value: float, text: str) -> str:
+        """Return a horizontal grid line with its label."""
         y = self.y(value)
         return (
             f'<line class="grid" x1="{self.left}" x2="{WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
             f'<text x="{self.left - 6}" y="{y + 4:.1f}" text-anchor="end">{text}</text>'
         )
 
-    def mark(self, value: float) -> str:
+    def tick_label(self, value: float) -> str:
         """Return a label of the horizontal axis."""
         y = HEIGHT - _BOTTOM + 15
         return f'<text x="{self.x(value):.1f}" y="{y}" text-anchor="middle">{compact(value)}</text>'
 
     def figure(self, title: str, shapes: Iterable[str], x_label: str, facts: str = "") -> str:
-        """Return the chart: caption (``facts`` is HTML), shapes, and the label of the horizontal axis."""
+        """Return the chart with its caption, shapes and label of the horizontal axis; ``facts`` is HTML."""
         middle = (self.left + WIDTH - _RIGHT) / 2
         return (
             f"<figure class=chart><figcaption>{escape(title)}{facts}</figcaption>"
@@ -158,29 +160,29 @@ SPREAD = (
     "vmax_score", "progress_ratio", "min_ttc", "average_ttc", "max_jerk", "max_lateral_acceleration", "comfort",
     "speeding_max", "route_deviation_max", "ade", "goal_distance", "distance",
 )  # fmt: skip
-#: Maximum number of steps of a distribution, so that a chart does not average its corners.
+#: Maximum number of steps of a distribution: a chart does not average its corners (2 per step).
 _MAX_STEPS = 75
 #: Maximum number of bins of a histogram.
 BINS = 24
 
 
 def distribution_charts(runs: Sequence[EpisodeTable]) -> str:
-    """Return a chart for each metric of :data:`SPREAD` that differs between episodes; empty without any."""
+    """Return a chart for each metric of :data:`SPREAD` that varies between episodes, or "" if none does."""
     styles = {run.name: stroke(index) for index, run in enumerate(runs)}
     charts = []
     for name in SPREAD:
         lines = {run.name: distribution(run.metrics[name]) for run in runs if name in run.metrics}
         values = np.concatenate([line[:, 0] for line in lines.values()]) if lines else np.zeros(0)
         if values.size and values.min() < values.max():
-            styled = {run: (styles[run], line) for run, line in lines.items()}
-            charts.append(chart(metric_label(name, runs).text, styled, share=True))
+            series = {run: (styles[run], line) for run, line in lines.items()}
+            charts.append(chart(metric_label(name, runs).text, series, share=True))
     return f"{series_legend(list(styles))}<div class=charts>{''.join(charts)}</div>" if charts else ""
 
 
 def distribution(values: Any) -> Float[np.ndarray[Any, Any], "point 2"]:
     """Return the corners of the empirical distribution function of the defined values: value, cumulative share.
 
-    More than 75 values are thinned evenly, so that no corner moves by more than 1 / 75.
+    More than 75 values are thinned evenly; no corner moves by more than 1 / 75.
     """
     sorted_values = np.sort(np.asarray(values, np.float64))
     sorted_values = sorted_values[~np.isnan(sorted_values)]
@@ -201,21 +203,21 @@ def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenari
     levels = ticks(0.0, max(float(share.max()) for share in shares.values()), 4)
     low, high = float(edges[0]), float(edges[-1])
     axes = Axes(low, high, 0.0, levels[-1], left=44)
-    shapes = [axes.horizontal(value, f"{compact(100 * value)} %") for value in levels]
+    shapes = [axes.grid_line(value, f"{compact(100 * value)} %") for value in levels]
     integers = bool((values == np.round(values)).all())
-    marks = [value for value in ticks(low, high, 5) if low <= value <= high]
-    shapes += [axes.mark(value) for value in marks if not integers or value == round(value)]
+    x_ticks = [value for value in ticks(low, high, 5) if low <= value <= high]
+    shapes += [axes.tick_label(value) for value in x_ticks if not integers or value == round(value)]
     draw = _bars if len(shares) == 1 else _outline
     shapes += [draw(axes, edges, share, stroke(index)) for index, share in enumerate(shares.values())]
-    names = {name: escape(f"{name}: ") if len(series) > 1 else "" for name in series}
-    facts = "".join(f"<small>{names[name]}{_facts(numbers)}</small>" for name, numbers in series.items())
+    prefixes = {name: escape(f"{name}: ") if len(series) > 1 else "" for name in series}
+    facts = "".join(f"<small>{prefixes[name]}{_facts(numbers)}</small>" for name, numbers in series.items())
     return axes.figure(title, shapes, unit, facts)
 
 
 def bins(values: Values, maximum: int = BINS) -> Values:
-    """Return the edges of at most ``maximum`` equal bins of a round width that hold all values.
+    """Return the edges of at most ``maximum`` bins of one round width that hold all values.
 
-    Integers get a bin each, centred on them, while there are enough bins.
+    Each integer gets a bin centred on it if there are enough bins.
     """
     low, high = float(values.min()), float(values.max())
     integers = bool((values == np.round(values)).all())
@@ -223,7 +225,8 @@ def bins(values: Values, maximum: int = BINS) -> Values:
         return low + np.array([-1.5, -0.5, 0.5, 1.5])
     if integers and high - low < maximum:
         return np.arange(low - 0.5, high + 1.0)
-    edges = ticks(min(low, 0.0) if low < 0.5 * high else low, high, maximum - 1)
+    start = min(low, 0.0) if low < 0.5 * high else low
+    edges = ticks(start, high, maximum - 1)
     width = edges[1] - edges[0]
     if integers and width < 1.0:
         return np.arange(math.floor(low), math.ceil(high) + 1.5)
@@ -264,13 +267,13 @@ def _outline(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
 
 
 Array = np.ndarray[Any, Any]
-#: Curvature is undefined below this speed, at which headings jitter more than the car moves.
+#: Curvature is undefined below this speed, where noise dominates the change of heading.
 _MIN_SPEED_MPS = 0.5
 
 
 @dataclass(frozen=True)
 class Signal:
-    """One plot: title, unit, resolution of the packed values (``step``), and comfort limits, low and high, if any."""
+    """A plot of the player: title, unit, resolution of packed values (``step``), and low and high comfort limits."""
 
     name: str
     title: str
@@ -292,16 +295,16 @@ COMMANDS = (
     Signal("lengthwise", "command lengthwise", "maximum 1", 0.001),
     Signal("sideways", "command sideways", "maximum 1", 0.001),
 )
-COMMANDED = len(COMMANDS)
 
 
 def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
     """Return the signals of a path by name, differentiated and filtered like the comfort metrics.
 
-    The path has position [m], heading [rad] and speed [m/s]; NaN where the agent is absent. Savitzky-Golay windows of
-    nuPlan: accelerations 8/2, jerk 15/2 of them, yaw rate 5/2 (``metrics.comfort``). Curvature is yaw rate over speed.
-    Steps near the ends take values of the first or last window's polynomial. Values are NaN outside the last contiguous
-    stretch of the path and at its first step; except for speed, all are NaN if it has fewer than 16 steps.
+    The path has position [m], heading [rad] and speed [m/s], NaN where the agent is absent. Filters are nuPlan's
+    Savitzky-Golay windows and orders: 8/2 for accelerations, 15/2 for the jerk of the filtered acceleration, 5/2 for
+    the yaw rate (``metrics.comfort``). Curvature is yaw rate over speed. Steps near the ends take values of the first
+    or last window's polynomial. Values are NaN outside the last contiguous stretch of the path and at its first step;
+    except for speed, all are NaN if it has fewer than 16 steps.
     """
     present = np.asarray(np.isfinite(ego).all(axis=1))
     values = {signal.name: np.full(len(ego), np.nan) for signal in SIGNALS}

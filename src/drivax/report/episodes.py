@@ -16,7 +16,7 @@ from drivax.errors import DataError
 from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable
 from drivax.evaluation.rollout import unpack_poses
-from drivax.report.charts import COMMANDED
+from drivax.report.charts import COMMANDS
 from drivax.report.pictures.drawing import Rollout
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
@@ -37,9 +37,10 @@ _MIN_SUCCESS_SHARE = 0.25
 
 @dataclass(frozen=True)
 class EpisodeGroup:
-    """The episodes of all runs in one scenario: a row of each run, None where it has none.
+    """The episodes of all runs in one scenario.
 
-    ``outcome`` is that of the policy: a kind of failure, or ``success``.
+    ``rows`` has a row of each run's table, or None if the run has no episode. ``outcome`` is the policy's: a kind of
+    failure, or ``success``.
     """
 
     dataset: str
@@ -55,61 +56,61 @@ class EpisodeGroup:
 
 def outcome(run: EpisodeTable, row: int) -> str:
     """Return the most severe failure of an episode, ``success``, or ``unjudged`` if no metric is defined."""
-    defined = False
+    any_defined = False
     for name, metric, failure_value in FAILURES:
         value = _metric_value(run, metric, row)
-        defined |= not np.isnan(value)
+        any_defined |= not np.isnan(value)
         if value == failure_value:
             return name
-    return "success" if defined else "unjudged"
+    return "success" if any_defined else "unjudged"
 
 
 def sort_worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> list[int]:
     """Return the rows of a run, worst episode first, by failure and score.
 
-    Ties are broken by the number of other runs without failure, the largest first, then by scenario id.
+    Ties are broken by the number of other runs that succeed, the largest first, then by scenario id.
     """
     order = (*(name for name, _, _ in FAILURES), "unjudged", "success")
     rank = {name: index for index, name in enumerate(order)}
-    completed: Counter[ScenarioKey] = Counter()
+    success_count: Counter[ScenarioKey] = Counter()
     for other in others:
         if comparable(run, other):
-            keys = enumerate(other.scenarios)
-            completed.update({key for row, key in keys if outcome(other, row) == "success"})
+            episodes = enumerate(other.scenarios)
+            success_count.update({key for row, key in episodes if outcome(other, row) == "success"})
     scenarios = run.scenarios
 
-    def key(row: int) -> tuple[int, float, int, str, int]:
+    def sort_key(row: int) -> tuple[int, float, int, str, int]:
         score = _metric_value(run, "vmax_score", row)
         sort_score = 1.0 if np.isnan(score) else score
-        return rank[outcome(run, row)], sort_score, -completed[scenarios[row]], scenarios[row][1], row
+        return rank[outcome(run, row)], sort_score, -success_count[scenarios[row]], scenarios[row][1], row
 
-    return sorted(range(len(run)), key=key)
+    return sorted(range(len(run)), key=sort_key)
 
 
 def choose(runs: Sequence[EpisodeTable], count: int) -> list[EpisodeGroup]:
     """Choose episodes of the last run: failures of every kind in turn, worst score first, and some successes.
 
-    Ties among failures favour those where other planners succeeded; successes are sorted by the failures of others.
+    Among equal failures, those where other planners succeed come first; among successes, those where they fail.
     """
     kinds: dict[str, list[EpisodeGroup]] = {}
     for group in rank_scenarios(runs):
         kinds.setdefault(group.outcome, []).append(group)
     successes = kinds.pop("success", [])
     successes.sort(key=lambda group: (_count_successes(runs, group), group.scenario_id))
-    in_turn = zip_longest(*kinds.values())  # the first of each kind, then the second of each, and so on
-    failures = [group for turn in in_turn for group in turn if group is not None]
-    failure_count = max(count - len(successes), count - round(_MIN_SUCCESS_SHARE * count))
-    return (failures[:failure_count] + successes[: count - min(failure_count, len(failures))])[:count]
+    rounds = zip_longest(*kinds.values())  # the first of each kind, then the second of each, and so on
+    failures = [group for groups in rounds for group in groups if group is not None]
+    failures = failures[: max(count - len(successes), count - round(_MIN_SUCCESS_SHARE * count))]
+    return failures + successes[: count - len(failures)]
 
 
 def _count_successes(runs: Sequence[EpisodeTable], group: EpisodeGroup) -> int:
-    """Return the number of runs without a failure."""
-    rows = zip(runs, group.rows, strict=True)
-    return sum(outcome(run, row) == "success" for run, row in rows if row is not None)
+    """Return the number of runs that succeed in a scenario."""
+    episodes = zip(runs, group.rows, strict=True)
+    return sum(outcome(run, row) == "success" for run, row in episodes if row is not None)
 
 
 def rank_scenarios(runs: Sequence[EpisodeTable]) -> list[EpisodeGroup]:
-    """Return all scenarios of the last run with a stored trajectory, worst first."""
+    """Return the episodes of every scenario of the last run, worst scenario first."""
     policy = runs[-1]
     others = [_first_rows(run) if comparable(policy, run) else {} for run in runs[:-1]]
     groups = {
@@ -120,8 +121,11 @@ def rank_scenarios(runs: Sequence[EpisodeTable]) -> list[EpisodeGroup]:
 
 
 def _first_rows(run: EpisodeTable) -> dict[ScenarioKey, int]:
-    """Return the first episode of each scenario."""
-    return {key: row for row, key in reversed([*enumerate(run.scenarios)])}
+    """Return the row of the first episode of each scenario."""
+    rows: dict[ScenarioKey, int] = {}
+    for row, key in enumerate(run.scenarios):
+        rows.setdefault(key, row)
+    return rows
 
 
 def _metric_value(run: EpisodeTable, metric: str, row: int) -> float:
@@ -134,14 +138,14 @@ class EvaluatedSet:
 
     def __init__(self, run: EpisodeTable, data: Path | None = None) -> None:
         self.scenarios: ScenarioSet = run.open_set(data)
-        entries = enumerate(self.scenarios.entries)
-        self._rows = {(entry["dataset"], entry["scenario_id"]): row for row, entry in entries}
+        keys = [(entry["dataset"], entry["scenario_id"]) for entry in self.scenarios.entries]
+        self._rows = {key: row for row, key in enumerate(keys)}
 
     def scenario(self, key: ScenarioKey) -> Scenario:
         """Return a scenario by data set and id.
 
         Raises:
-            DataError: It is not in the set.
+            DataError: The scenario is not in the set.
         """
         if key not in self._rows:
             cure = "pass the set that was evaluated with --data SET"
@@ -155,27 +159,27 @@ class EvaluatedSet:
 
 def rollouts_of(runs: Sequence[EpisodeTable], group: EpisodeGroup, scenario: Scenario) -> list[Rollout]:
     """Return the rollout of each run that has an episode in the group."""
-    rows = zip(runs, group.rows, strict=True)
-    return [_rollout(run, row, scenario) for run, row in rows if row is not None]
+    episodes = zip(runs, group.rows, strict=True)
+    return [_rollout(run, row, scenario) for run, row in episodes if row is not None]
 
 
 def _rollout(run: EpisodeTable, row: int, scenario: Scenario) -> Rollout:
-    stored = run.trajectories
-    steps, start = int(scenario.steps), int(stored.start[row])
+    trajectories = run.trajectories
+    steps, start = int(scenario.steps), int(trajectories.start[row])
     ego = np.full((steps, 4), np.nan)
     ego[:start] = logged_motion(scenario)[:start]
-    motion = stored.ego[row, : steps - start]
+    motion = trajectories.ego[row, : steps - start]
     ego[start : start + len(motion)] = motion
-    events = {name: int(at[row]) for name, at in stored.events.items()}
+    events = {name: int(first_step[row]) for name, first_step in trajectories.events.items()}
     crash = run.crash_by_scenario.get(run.scenarios[row])
     events["crashed"] = -1 if crash is None else crash.step
-    action = np.full((steps, COMMANDED), np.nan)
-    commands = stored.action[row, : steps - start, :COMMANDED]
+    action = np.full((steps, len(COMMANDS)), np.nan)
+    commands = trajectories.action[row, : steps - start, : len(COMMANDS)]
     action[start : start + len(commands), : commands.shape[1]] = commands
     others = None
-    if stored.others is not None:
-        others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
-        others[start : start + len(motion)] = unpack_poses(stored.others[row, : steps - start])
+    if trajectories.others is not None:
+        others = np.full((steps, *trajectories.others.shape[2:]), np.nan, np.float32)
+        others[start : start + len(motion)] = unpack_poses(trajectories.others[row, : steps - start])
     return Rollout(run.name, ego, start, events, outcome(run, row), action, others)
 
 

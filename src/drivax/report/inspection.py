@@ -33,10 +33,10 @@ SAMPLE = 1000
 
 @dataclass(frozen=True)
 class Inspection:
-    """An opened scenario set, with the rows of its selected scenarios (at least one).
+    """A scenario set and the rows of its selected scenarios (at least one).
 
-    ``unknown`` has the number of scenarios that lack the value of a filter, by filter; ``checked`` says whether all
-    checksums were tested.
+    ``unknown`` counts the scenarios without the value of a filter, by filter; ``checked`` is True if all checksums were
+    tested.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Inspection:
 
     @classmethod
     def open(cls, path: Path, selection: Selection, check: bool = True) -> Inspection:
-        """Open a set; with ``check``, read all of it and test every checksum.
+        """Open a set, and with ``check`` read all of it and test every checksum.
 
         Raises:
             DataError: The set is damaged, or no scenario is selected.
@@ -73,9 +73,9 @@ class Inspection:
         return [self.scenarios.entries[row] for row in self.rows]
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return the selected scenarios as ``inspect --json`` prints them: a stable contract.
+        """Return the selected scenarios as ``inspect --json`` prints them, in a stable format.
 
-        ``origin`` is the origin of its coordinates in the source's map frame: x, y, z in metres.
+        ``origin`` is the origin of a scenario's coordinates in the map frame of its source: x, y, z in metres.
         """
         return [
             {
@@ -89,23 +89,23 @@ class Inspection:
 
     @property
     def source(self) -> Mapping[str, Any]:
-        """Origin of the set, and what was read and left out; empty for sets that were written by hand."""
+        """Origin of the set, with the records read and skipped; empty for handmade sets."""
         return self.scenarios.manifest["source"]
 
     def sample(self, maximum: int | None = None) -> Iterator[Scenario]:
-        """Return at most ``maximum`` (``SAMPLE`` by default) of the selected scenarios, evenly spread."""
+        """Return at most ``maximum`` (default ``SAMPLE``) selected scenarios at evenly spaced rows."""
         maximum = SAMPLE if maximum is None else maximum
         indices = np.unique(np.linspace(0, len(self.rows) - 1, min(maximum, len(self.rows))).round())
         return (self.scenarios[self.rows[int(index)]] for index in indices)
 
     @property
     def hours(self) -> float:
-        """Driving time of all scenarios; windows of one recording may overlap and count in full."""
+        """Driving time of all scenarios; overlapping windows of one recording count in full."""
         return sum(max(entry["source"]["steps"] - 1, 0) for entry in self.entries) * DT_S / 3600
 
     @property
     def recordings(self) -> int:
-        """Number of recordings: segments of data sets."""
+        """Number of distinct recordings."""
         return len({(entry["dataset"], entry["segment"]) for entry in self.entries})
 
     @property
@@ -120,13 +120,13 @@ class Inspection:
         return min(rates), max(rates)
 
     def values(self, read: Callable[[Entry], Any]) -> Float[Array, " known"]:
-        """Return a number of every scenario that has it."""
+        """Return a quantity of the scenarios that define it."""
         numbers = (read(entry) for entry in self.entries)
-        return np.array([value for value in numbers if value is not None], np.float64)
+        return np.array([number for number in numbers if number is not None], np.float64)
 
     def value_counts(self, read: Callable[[Entry], Sequence[str]]) -> dict[str, int]:
         """Return the number of scenarios with each value, the most frequent first."""
-        counts = Counter(word for entry in self.entries for word in read(entry))
+        counts = Counter(value for entry in self.entries for value in read(entry))
         return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
     def tags(self) -> dict[str, dict[str, int]]:
@@ -164,7 +164,7 @@ class Quantity:
 
     @classmethod
     def of(cls, label: str, *keys: str, unit: str = "", default: int | None = None) -> Quantity:
-        """Return the quantity at nested keys of an entry; ``default`` where the last key is missing."""
+        """Return the quantity at nested keys of an entry, ``default`` if the last key is missing."""
         *path, name = keys
         return cls(label, unit, lambda entry: reduce(getitem, path, entry).get(name, default))
 
@@ -189,15 +189,15 @@ QUANTITIES = (
 
 @dataclass(frozen=True)
 class Speeds:
-    """Speeds in sampled scenarios, m/s: ego's at every step of its log, other moving vehicles' at the current step."""
+    """Speeds in ``scenarios`` sampled scenarios, m/s: ego at every logged step, other vehicles at the current step."""
 
     ego: Float[Array, " step"]
     vehicles: Float[Array, " vehicle"]
     scenarios: int
 
 
-def speeds(inspection: Inspection) -> Speeds:
-    """Return speeds from the records of a sample."""
+def read_speeds(inspection: Inspection) -> Speeds:
+    """Read speeds from the records of a sample."""
     ego, vehicles = [], []
     for scenario in inspection.sample():
         speed = np.linalg.norm(scenario.agent_velocity, axis=-1)
@@ -219,20 +219,20 @@ def overview(inspection: Inspection) -> Table:
     """Return the facts of a set: counts, size, tags, flags, overflow."""
     scenarios, count = inspection.scenarios, len(inspection)
     manifest, capacity = scenarios.manifest, scenarios.capacity
-    segments = f"recorded segments: {inspection.recordings:,}, shards: {len(manifest['shards']):,}"
-    rows = [("set", str(scenarios.path)), ("scenarios", f"{_count_text(inspection)} ({segments})")]
+    segments_text = f"recorded segments: {inspection.recordings:,}, shards: {len(manifest['shards']):,}"
+    rows = [("set", str(scenarios.path)), ("scenarios", f"{_count_text(inspection)} ({segments_text})")]
     unknown = inspection.unknown.items()
     rows += [("", f"{missing:,} lack the value of {name!r} and are left out") for name, missing in unknown]
-    size = f"{inspection.megabytes:,.1f} MB, {manifest['record_bytes'] / 1e3:,.0f} kB per scenario"
-    sizes = (
+    size_text = f"{inspection.megabytes:,.1f} MB, {manifest['record_bytes'] / 1e3:,.0f} kB per scenario"
+    capacity_text = (
         f"{capacity.name}: {capacity.agents} moving and {capacity.parked} parked agents, {capacity.segments:,} map "
         f"segments, {capacity.lanes} lanes, {capacity.lights} lights"
     )
     rows += [
         ("data sets", _counts_text(inspection.value_counts(lambda entry: [entry["dataset"]]), count)),
         ("duration", f"{_hours_text(inspection)} at {_rate_text(inspection)}"),
-        ("size", size),
-        ("capacity", sizes),
+        ("size", size_text),
+        ("capacity", capacity_text),
         ("written by", f"drivax {manifest['drivax_version']}, schema {manifest['schema_version']}"),
         *_skipped_rows(inspection.source),
         *((name, _counts_text(values, count)) for name, values in inspection.tags().items()),
@@ -245,31 +245,31 @@ def overview(inspection: Inspection) -> Table:
 
 
 def _skipped_rows(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield the records that a conversion skipped or filtered: counts, and the first causes."""
-    skipped, filtered = source.get("skipped_records", []), source.get("filtered", 0)
-    if skipped:
+    """Yield the numbers of records that a conversion skipped or filtered, and the first causes."""
+    records, filter_count = source.get("skipped_records", []), source.get("filtered", 0)
+    if records:
         yield (
             "skipped",
-            f"{len(skipped):,} record{'s' if len(skipped) > 1 else ''} that could not be converted",
+            f"{len(records):,} record{'s' if len(records) > 1 else ''} that could not be converted",
         )
-    for row in skipped[:_MAX_CAUSES]:
-        record = "" if row["record"] is None else f"record {row['record']}: "
-        yield "", f"{row['file']}: {record}{row['problem']}"
-    if len(skipped) > _MAX_CAUSES:
-        yield "", f"{len(skipped) - _MAX_CAUSES:,} more in manifest.json"
-    if filtered:
+    for entry in records[:_MAX_CAUSES]:
+        record = "" if entry["record"] is None else f"record {entry['record']}: "
+        yield "", f"{entry['file']}: {record}{entry['problem']}"
+    if len(records) > _MAX_CAUSES:
+        yield "", f"{len(records) - _MAX_CAUSES:,} more in manifest.json"
+    if filter_count:
         filters = " and ".join(source["filters"])
-        yield "filtered", f"{filtered:,} scenario{'s' if filtered > 1 else ''} left out by {filters}"
+        yield "filtered", f"{filter_count:,} scenario{'s' if filter_count > 1 else ''} left out by {filters}"
 
 
 def audit_table(inspection: Inspection) -> Table | None:
-    """Return the findings of the log replay; None where no scenario was audited."""
+    """Return the findings of the log replay, or None if no scenario was audited."""
     names = inspection.findings()
     if not names:
         return None
     columns = (Column("audit", label=True), Column("found", left=True), Column("n"))
-    values = {name: inspection.finding(name) for name in names}
-    rows = ((name, finding_text(known), f"{len(known):,}") for name, known in values.items())
+    findings = {name: inspection.finding(name) for name in names}
+    rows = ((name, finding_text(values), f"{len(values):,}") for name, values in findings.items())
     return Table("audit", columns, tuple(tuple(map(Cell, row)) for row in rows))
 
 
@@ -280,7 +280,7 @@ def finding_text(values: Sequence[Any]) -> str:
     if all(isinstance(value, bool) for value in values):
         return f"{sum(values):,} of {len(values):,} ({_percent(sum(values), len(values))})"
     if all(isinstance(value, str) for value in values):
-        return _counts_text({word: values.count(word) for word in sorted(set(values))}, len(values))
+        return _counts_text({value: values.count(value) for value in sorted(set(values))}, len(values))
     numbers = np.array(values, np.float64)
     return f"mean {short(numbers.mean())}, median {short(np.median(numbers))}, max {short(numbers.max())}"
 
@@ -289,61 +289,62 @@ def scenarios_table(inspection: Inspection) -> Table:
     """Return the first scenarios with the counts of their source."""
     names = ("steps", "tracks", "now", "lanes", "lines", "edges", "others", "points", "lights", "segments")
     columns = (Column("scenario", label=True, max_width=24), *map(Column, names))
-    listed = inspection.entries[:MAX_LISTED]
-    rows = ((entry["scenario_id"], *(f"{count:,}" for count in _counts(entry))) for entry in listed)
+    entries = inspection.entries[:MAX_LISTED]
+    rows = ((entry["scenario_id"], *(f"{count:,}" for count in _counts(entry))) for entry in entries)
     return Table("scenarios", columns, tuple(tuple(map(Cell, row)) for row in rows))
 
 
 def _counts(entry: Entry) -> tuple[int, ...]:
-    source, kinds = entry["source"], entry["source"]["map_features"]
-    shown = [kinds.get(name, 0) for name in ("lane", "road_line", "road_edge")]
-    first = [source[name] for name in ("steps", "tracks", "tracks_valid_now")]
-    others = sum(kinds.values()) - sum(shown)
-    return (*first, *shown, others, source["map_points"], source["lights"], entry["segments"])
+    """Return the counts of a scenario in the order of the columns of :func:`scenarios_table`."""
+    source, features = entry["source"], entry["source"]["map_features"]
+    track_counts = [source[name] for name in ("steps", "tracks", "tracks_valid_now")]
+    feature_counts = [features.get(name, 0) for name in ("lane", "road_line", "road_edge")]
+    others = sum(features.values()) - sum(feature_counts)
+    return (*track_counts, *feature_counts, others, source["map_points"], source["lights"], entry["segments"])
 
 
 def comparison(inspections: Sequence[Inspection]) -> list[Table]:
-    """Return several sets side by side, ``SETS_PER_TABLE`` per table: sizes, averages per scenario, shares of tags."""
+    """Return tables of several sets side by side: sizes, averages per scenario, shares of tags."""
     groups = [
         inspections[first : first + SETS_PER_TABLE] for first in range(0, len(inspections), SETS_PER_TABLE)
     ]
     return [content_table(group, _share_rows(group), max_width=24) for group in groups]
 
 
-def content_table(inspections: Sequence[Inspection], extra: Sequence[Row] = (), **columns: Any) -> Table:
+def content_table(inspections: Sequence[Inspection], extra: Sequence[Row] = (), **options: Any) -> Table:
     """Return sizes of sets and averages of their scenarios, one column per set."""
     rows: list[Row] = [
         (label, [text(inspection) for inspection in inspections]) for label, text in _CONTENT.items()
     ]
     for quantity in QUANTITIES:
-        known = [inspection.values(quantity.read) for inspection in inspections]
+        values_by_set = [inspection.values(quantity.read) for inspection in inspections]
         label = f"{quantity.label}, {quantity.unit}" if quantity.unit else quantity.label
-        rows.append((label, [short(values.mean()) if len(values) else MISSING for values in known]))
+        rows.append((label, [short(values.mean()) if len(values) else MISSING for values in values_by_set]))
     names = ["", *(inspection.name for inspection in inspections)]
-    return _table("sets", names, [*rows, *extra], **columns)
+    return _table("sets", names, [*rows, *extra], **options)
 
 
 #: Rows of the table of contents before the quantities.
 _CONTENT: Mapping[str, Callable[[Inspection], str]] = {
-    "scenarios": lambda of_set: _count_text(of_set),
-    "recordings": lambda of_set: f"{of_set.recordings:,}",
-    "data sets": lambda of_set: ", ".join(of_set.value_counts(lambda entry: [entry["dataset"]])),
-    "places": lambda of_set: _places_text(of_set),
-    "duration": lambda of_set: _hours_text(of_set),
-    "rate": lambda of_set: _rate_text(of_set),
-    "skipped": lambda of_set: f"{of_set.source.get('skipped', 0):,}",
-    "MB": lambda of_set: f"{of_set.megabytes:,.1f}",
+    "scenarios": lambda inspection: _count_text(inspection),
+    "recordings": lambda inspection: f"{inspection.recordings:,}",
+    "data sets": lambda inspection: ", ".join(inspection.value_counts(lambda entry: [entry["dataset"]])),
+    "places": lambda inspection: _places_text(inspection),
+    "duration": lambda inspection: _hours_text(inspection),
+    "rate": lambda inspection: _rate_text(inspection),
+    "skipped": lambda inspection: f"{inspection.source.get('skipped', 0):,}",
+    "MB": lambda inspection: f"{inspection.megabytes:,.1f}",
 }
 
 
-def _table(name: str, headings: Sequence[str], rows: Sequence[Row], **columns: Any) -> Table:
-    """Return a table of texts under one label column."""
-    heads = (Column(headings[0], label=True), *(Column(heading, **columns) for heading in headings[1:]))
-    return Table(name, heads, tuple((Cell(label), *map(Cell, texts)) for label, texts in rows))
+def _table(name: str, headings: Sequence[str], rows: Sequence[Row], **options: Any) -> Table:
+    """Return a table of texts with a label column; ``options`` are those of the other columns."""
+    columns = (Column(headings[0], label=True), *(Column(heading, **options) for heading in headings[1:]))
+    return Table(name, columns, tuple((Cell(label), *map(Cell, texts)) for label, texts in rows))
 
 
 def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
-    """Return shares of scenarios with a finding, a value of a tag, a flag."""
+    """Return the shares of scenarios by audit finding, tag value and flag."""
     sizes = [len(inspection) for inspection in inspections]
     rows = _percents("", true_findings(inspections))
     tags_by_set = [inspection.tags() for inspection in inspections]
@@ -351,38 +352,38 @@ def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
         counts = [tags.get(name, {}) for tags in tags_by_set]
         shares = with_sizes(counts, sizes)
         if len(shares) > 2 * MAX_NAMED:
-            rows.append((name, [f"{len(of_set):,} values" if of_set else MISSING for of_set in counts]))
+            rows.append((name, [f"{len(values):,} values" if values else MISSING for values in counts]))
         else:
             rows += _percents(f"{name} ", shares)
     flags = [inspection.value_counts(lambda entry: entry["flags"]) for inspection in inspections]
     return rows + _percents("flag ", with_sizes(flags, sizes))
 
 
-#: Per value, ``(count, of)`` for each set.
+#: Per value, (count, total) in each set.
 Counts = dict[str, list[tuple[int, int]]]
 
 
 def true_findings(inspections: Sequence[Inspection]) -> Counts:
-    """Return the number of scenarios for which each boolean finding of the audit is true, and known."""
+    """Return the number of scenarios with each boolean finding of the audit, of those where it is defined."""
     findings = {}
     for name in dict.fromkeys(name for inspection in inspections for name in inspection.findings()):
-        known = [inspection.finding(name) for inspection in inspections]
-        if any(isinstance(value, bool) for values in known for value in values):
-            findings[name] = [(sum(map(bool, values)), len(values)) for values in known]
+        values_by_set = [inspection.finding(name) for inspection in inspections]
+        if any(isinstance(value, bool) for values in values_by_set for value in values):
+            findings[name] = [(sum(map(bool, values)), len(values)) for values in values_by_set]
     return findings
 
 
 def with_sizes(counts: Sequence[Mapping[str, int]], sizes: Sequence[int]) -> Counts:
     """Return the counts of each value with the sizes of the sets."""
-    values = dict.fromkeys(value for of_set in counts for value in of_set)
+    values = dict.fromkeys(value for set_counts in counts for value in set_counts)
     return {
-        value: [(of_set.get(value, 0), size) for of_set, size in zip(counts, sizes, strict=True)]
+        value: [(set_counts.get(value, 0), size) for set_counts, size in zip(counts, sizes, strict=True)]
         for value in values
     }
 
 
 def _percents(prefix: str, counts: Counts) -> list[Row]:
-    return [(prefix + value, [_percent(*count) for count in sets]) for value, sets in counts.items()]
+    return [(prefix + value, [_percent(*pair) for pair in pairs]) for value, pairs in counts.items()]
 
 
 def _percent(count: int, total: int) -> str:
@@ -408,13 +409,13 @@ def _places_text(inspection: Inspection) -> str:
     places = inspection.value_counts(
         lambda entry: [entry["tags"]["place"]] if "place" in entry["tags"] else []
     )
-    rest = f" and {len(places) - MAX_NAMED} more" if len(places) > MAX_NAMED else ""
-    return ", ".join(list(places)[:MAX_NAMED]) + rest if places else MISSING
+    suffix = f" and {len(places) - MAX_NAMED} more" if len(places) > MAX_NAMED else ""
+    return ", ".join(list(places)[:MAX_NAMED]) + suffix if places else MISSING
 
 
 def _counts_text(counts: Mapping[str, int], total: int) -> str:
-    shown = list(counts.items())[: 2 * MAX_NAMED]
-    texts = [name if count == total else f"{name} ({count:,} of {total:,})" for name, count in shown]
+    first = list(counts.items())[: 2 * MAX_NAMED]
+    texts = [name if count == total else f"{name} ({count:,} of {total:,})" for name, count in first]
     hidden = len(counts) - len(texts)
     return ", ".join(texts) + (f" and {hidden:,} more" if hidden else "") or "none"
 
@@ -434,7 +435,7 @@ def observation_overview(statistics: ObservationStatistics) -> str:
 
 
 def observation_table(statistics: ObservationStatistics) -> Table:
-    """Return a row per column of each group, under a row for the group."""
+    """Return a table with a row per feature, grouped under a row per observation group."""
     names = ["n", "mean", "std", "min", "max", "NaN, Inf", "r collision"]
     names += ["importance"] if statistics.permuted else []
     rows = []

@@ -20,7 +20,10 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Training:
-    """Learning curves of one training run: points (environment steps, value) by quantity; ``info`` is ``run.json``."""
+    """Learning curves of one training run: points (environment steps, value) by quantity.
+
+    ``info`` is the content of ``run.json``.
+    """
 
     folder: Path
     name: str
@@ -29,22 +32,28 @@ class Training:
 
 
 def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Training]]:
-    """Read run folders of either kind, and every seed of a run; a repeated name gets its folder as suffix."""
-    folders = [inside for folder in folders for inside in seed_folders(folder)]
-    resolved = [folder.resolve() for folder in folders]
-    if not folders or len(set(resolved)) < len(resolved):
-        raise UsageError("name every run once, and at least one", cure="drivax report RUN [RUN ...]")
+    """Read evaluation and training runs, with every seed of a run.
+
+    A repeated name gets its folder as suffix.
+    """
+    folders = [seed_folder for folder in folders for seed_folder in seed_folders(folder)]
+    paths = [folder.resolve() for folder in folders]
+    if not folders or len(set(paths)) < len(paths):
+        raise UsageError(
+            "give at least one run folder, and each only once", cure="drivax report RUN [RUN ...]"
+        )
     evaluations, trainings = [], []
     # A training and the evaluation of its policy may share a name: no table holds both.
-    names, charts = set[str](), set[str]()
+    table_names, chart_names = set[str](), set[str]()
     for folder in folders:
         run = RunFolder.open(folder)
         if run.kind == "training":
-            trainings.append(Training(folder, _unique(folder.name, folder, charts), run.info, _curves(run)))
+            name = _unique_name(folder.name, folder, chart_names)
+            trainings.append(Training(folder, name, run.info, _curves(run)))
         elif run.kind == "evaluation":
             table = EpisodeTable.read(folder)
-            table = replace(table, name=_unique(table.name, folder, names))
-            _ = table.trajectories  # read now, so that damage is reported before any work
+            table = replace(table, name=_unique_name(table.name, folder, table_names))
+            _ = table.trajectories  # reads the file, to report damage before any work
             evaluations.append(table)
         else:
             problem = f"is of kind {run.kind!r}, not evaluation or training"
@@ -54,14 +63,15 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
 
 
 def read_evaluations(folders: Sequence[Path]) -> list[EpisodeTable]:
-    """Read run folders, at least one of them an evaluation; see :func:`read_runs`."""
+    """Read run folders, at least one of them an evaluation, as :func:`read_runs` does."""
     evaluations, _ = read_runs(folders)
     if not evaluations:
         raise UsageError("no run folder is an evaluation", cure="name run folders of drivax evaluate")
     return evaluations
 
 
-def _unique(name: str, folder: Path, names: set[str]) -> str:
+def _unique_name(name: str, folder: Path, names: set[str]) -> str:
+    """Return a name that is not yet in ``names``, and add it."""
     candidate, number = name, 2
     while candidate in names:
         candidate = f"{name} ({folder.name})" if number == 2 else f"{name} ({folder.name} {number - 1})"

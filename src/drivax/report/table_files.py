@@ -26,22 +26,26 @@ TRANSFER_METRICS = ("success", "vmax_score")
 def write_tables(
     runs: Sequence[Path], out: Path, data: Path | None = None, overwrite: bool = False, metrics: Sequence[str] = ()
 ) -> list[Path]:  # fmt: skip
-    """Write every table of a report into a folder, each as ``.csv``, ``.md`` and ``.tex``; returns the files.
+    """Write every table of a report into a folder as ``.csv``, ``.md`` and ``.tex``, and return the files.
 
-    The tables are ``results``; for several runs ``differences``; ``collisions`` if kinds of collision are known;
-    ``by-TAG`` for the tags of the scenarios; ``transfer-METRIC`` if runs were evaluated on several data sets.
+    The tables are ``results``, ``differences`` (several runs), ``collisions`` (known kinds of collision), ``by-TAG``
+    (tags of the scenarios) and ``transfer-METRIC`` (runs on several data sets).
 
-    The last evaluation is the policy. ``data`` is the new path of its scenario set, if it has moved; ``metrics`` are
-    extra columns of ``episodes.csv``, or a set of metrics, for ``results``, ``differences`` and ``by-TAG``.
+    Args:
+        runs: Run folders; the last evaluation is the policy.
+        out: Folder of the tables.
+        data: Path of the policy's scenario set, if it has moved.
+        overwrite: Replace existing files.
+        metrics: Extra columns of ``episodes.csv``, or sets of metrics, for ``results``, ``differences`` and ``by-TAG``.
 
     Raises:
-        DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.
-        UsageError: A file exists, no evaluation was given, or none has one of the metrics.
+        DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
+        UsageError: A file exists, no run is an evaluation, or no run has one of the metrics.
     """
     texts = {}
     for table in _tables(read_evaluations(runs), data, metrics):
-        kinds = {"csv": table.csv(), "md": table.markdown(), "tex": table.latex()}
-        texts |= {f"{table.name}.{kind}": text for kind, text in kinds.items()}
+        formats = {"csv": table.csv(), "md": table.markdown(), "tex": table.latex()}
+        texts |= {f"{table.name}.{suffix}": text for suffix, text in formats.items()}
     for name in texts:
         check_output(out / name, overwrite)
     for name, text in texts.items():
@@ -49,52 +53,49 @@ def write_tables(
     return [out / name for name in texts]
 
 
-def exported_metrics(runs: Sequence[EpisodeTable], extra: Sequence[str] = ()) -> list[str]:
-    """Return the metrics of the files: the headline, progress in metres, user-defined ones, and ``extra``.
+def select_metrics(runs: Sequence[EpisodeTable], extra: Sequence[str] = ()) -> list[str]:
+    """Return the metrics of the files: headline metrics, progress in metres, user-defined metrics, and ``extra``.
 
     Raises:
-        UsageError: No run has such a column.
+        UsageError: No run has a metric of ``extra``.
     """
     names = result_tables.sort_metrics(result_tables.metric_names(runs))
-    requested = {"progress"}
+    selected = {"progress"}
     for entry in extra:
         if entry not in SETS and entry not in names:
             raise UsageError(f"no run has a mean of {entry!r}", cure=did_you_mean(entry, names))
-        requested.update(SETS.get(entry, (entry,)))
-    first = result_tables.headline_names(names)
-    rest = [name for name in names if name in requested or name not in (*METRICS, *ADDED)]
-    return [*first, *(name for name in rest if name not in first)] or names
+        selected.update(SETS.get(entry, (entry,)))
+    headline = result_tables.headline_names(names)
+    others = [name for name in names if name in selected or name not in (*METRICS, *ADDED)]
+    return [*headline, *(name for name in others if name not in headline)] or names
 
 
 def _tables(runs: Sequence[EpisodeTable], data: Path | None, extra: Sequence[str]) -> list[Table]:
-    default_metrics, metrics = exported_metrics(runs), exported_metrics(runs, extra)
+    default_metrics, metrics = select_metrics(runs), select_metrics(runs, extra)
     results = [result_tables.results_table(runs, metrics)]
     if len(runs) > 1:
         others = [run for run in runs[:-1] if comparable(runs[-1], run)]
         results.append(result_tables.differences_table(runs[-1], others, metrics))
     if any("collision_type" in run.metrics for run in runs):
         results.append(result_tables.collisions_table(runs))
-    added = [name for name in metrics if name not in default_metrics]
-    results += strata_tables(runs, EvaluatedSet(runs[-1], data).tags(), added)
+    extra_metrics = [name for name in metrics if name not in default_metrics]
+    results += strata_tables(runs, EvaluatedSet(runs[-1], data).tags(), extra_metrics)
     return results + transfer_tables(runs)
 
 
 def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, extra: Sequence[str] = ()) -> list[Table]:
-    """Return a table for each tag of the scenarios, over the runs on these scenarios, with ``extra`` metrics."""
-    evaluated = [run for run in runs if any(key in tags for key in run.scenarios)]
-    known = {name for values in tags.values() for name in values}
+    """Return a table per tag of the scenarios, with the runs on these scenarios and the ``extra`` metrics."""
+    runs = [run for run in runs if any(key in tags for key in run.scenarios)]
+    tag_names = {name for scenario_tags in tags.values() for name in scenario_tags}
     names = dict.fromkeys((*KEY_METRICS, *extra))
-    metrics = [name for name in names if any(name in run.metrics for run in evaluated)]
-    return [
-        result_tables.strata_table(evaluated, tags, tag, metrics)
-        for tag in result_tables.STRATA
-        if tag in known
-    ]
+    metrics = [name for name in names if any(name in run.metrics for run in runs)]
+    strata = [tag for tag in result_tables.STRATA if tag in tag_names]
+    return [result_tables.strata_table(runs, tags, tag, metrics) for tag in strata]
 
 
 def transfer_tables(runs: Sequence[EpisodeTable]) -> list[Table]:
-    """Return a matrix of training and evaluation data for each metric; none where all runs share one set."""
+    """Return a matrix of training and evaluation data for each metric, or no table if all runs share one set."""
     if len({result_tables.set_key(run.data) for run in runs}) < 2:
         return []
-    known = [name for name in TRANSFER_METRICS if any(result_tables.summarise(run, name).n for run in runs)]
-    return [result_tables.transfer_table(runs, name) for name in known]
+    metrics = [name for name in TRANSFER_METRICS if any(result_tables.summarise(run, name).n for run in runs)]
+    return [result_tables.transfer_table(runs, name) for name in metrics]

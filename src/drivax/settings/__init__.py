@@ -2,9 +2,9 @@
 
 A configuration record holds scalars, strings, literals, paths, tuples, other records, and unions of records, which
 carry a ``kind`` key in YAML (:func:`kind_of`). Missing keys keep the defaults of the enclosing record. In a record with
-presets (a class method ``preset(name)``) the key ``preset`` names one to start from. An unknown key or a value of the
-wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. A class variable
-``renamed`` maps former keys to present ones.
+presets (a class method ``preset(name)``), the key ``preset`` names the preset to start from. An unknown key or a value
+of the wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. A class
+variable ``renamed`` maps former keys to present ones.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ def load(cls: type[Record], source: str | Path | Mapping[str, Any], overrides: S
     """Return a configuration record from YAML and command-line overrides.
 
     Args:
-        cls: The dataclass to build; keys that ``source`` lacks take its defaults.
+        cls: The dataclass to build; its defaults apply to keys that ``source`` lacks.
         source: A YAML file, the name of a preset, or a mapping.
         overrides: ``["--optimizer.lr", "1e-3", "--resume"]`` or ``["--optimizer.lr=1e-3"]``; hyphens in names
-            count as underscores. Another ``kind`` drops the settings of the previous one.
+            count as underscores. A new ``kind`` discards the settings of the previous one.
 
     Raises:
         UsageError: File or preset not found, invalid YAML, unknown key, or a value of the wrong type.
     """
-    file = None if isinstance(source, Mapping) else _find(source)
+    file = None if isinstance(source, Mapping) else _find_file(source)
     values = parse_yaml(_read(file), file) if file else source
     if values is None:
         values = {}
@@ -52,7 +52,11 @@ def dump(record: Any) -> str:
 
 
 def preset(name: str) -> Path:
-    """Return the path of the packaged configuration file ``configs/<name>.yaml``; UsageError for an unknown name."""
+    """Return the path of the packaged configuration file ``configs/<name>.yaml``.
+
+    Raises:
+        UsageError: Unknown name.
+    """
     names = presets()
     if name not in names:
         raise UsageError(f"no preset or file {name!r}", cure=did_you_mean(name, names))
@@ -67,12 +71,12 @@ def presets() -> list[str]:
 
 def _configs() -> Path:
     package = Path(__file__).resolve().parent.parent
-    packaged = package / "configs"
+    folder = package / "configs"
     # At the root of a checkout, inside the package of a wheel.
-    return packaged if packaged.is_dir() else package.parent.parent / "configs"
+    return folder if folder.is_dir() else package.parent.parent / "configs"
 
 
-def _find(source: str | Path) -> Path:
+def _find_file(source: str | Path) -> Path:
     path = Path(source)
     if path.is_file():
         return path
@@ -94,30 +98,32 @@ def _read(file: Path) -> str:
 
 
 def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    for path, text in _pairs(overrides):
-        *parents, last = path
+    """Set the values of command-line flags in nested mappings, in place."""
+    for path, text in _parse_flags(overrides):
+        *parents, key = path
         section = values
         for name in parents:
             # A record that is missing, null or set by a flag starts from its defaults.
             if not isinstance(section.get(name), dict):
                 section[name] = {}
             section = section[name]
-        if last == "kind" and str(section.get("kind")) != text:
+        if key == "kind" and str(section.get("kind")) != text:
             section.clear()
-        section[last] = Flag(text)
+        section[key] = Flag(text)
     return values
 
 
-def _pairs(overrides: Sequence[str]) -> list[tuple[list[str], str]]:
+def _parse_flags(overrides: Sequence[str]) -> list[tuple[list[str], str]]:
+    """Return the path of keys and the text of each flag."""
     pairs = []
-    rest = list(overrides)
-    while rest:
-        flag = rest.pop(0)
+    arguments = list(overrides)
+    while arguments:
+        flag = arguments.pop(0)
         if not flag.startswith("--") or flag == "--":
             raise UsageError(f"{flag!r} is not a setting", cure="write --section.key value")
         name, sign, text = flag[2:].partition("=")
         if not sign:
-            text = rest.pop(0) if rest and not rest[0].startswith("--") else "true"
+            text = arguments.pop(0) if arguments and not arguments[0].startswith("--") else "true"
         pairs.append((name.replace("-", "_").split("."), text))
     return pairs
 

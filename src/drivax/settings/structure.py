@@ -1,6 +1,7 @@
-"""YAML to plain values to configuration records and back; errors name the line, or the dotted path of the wrong value.
+"""Conversion of YAML to plain values, of plain values to configuration records, and back.
 
-YAML follows the 1.2 core rules: ``3e-4`` is a number, ``no`` a string, ``010`` ten; duplicate keys are errors.
+Errors name the line, or the dotted path of the wrong value. YAML follows the 1.2 core rules: ``3e-4`` is a number,
+``no`` a string, ``010`` ten; duplicate keys are errors.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from drivax.errors import DrivaxError, UsageError, did_you_mean
 from drivax.plugins import check_arguments, check_protocol, dotted_name, find_named, is_dotted
 
 _UNIONS = (Union, types.UnionType)
-#: Types of values that are accepted for a scalar, and its name in messages.
+#: Accepted types of values by scalar type, and its name in messages.
 _SCALARS: dict[Any, tuple[Any, str]] = {
     bool: (bool, "true or false"),
     int: (int, "an integer"),
@@ -33,7 +34,7 @@ _SCALARS: dict[Any, tuple[Any, str]] = {
 
 
 class _Problem(ValueError):
-    """A wrong value and its path inside the enclosing one."""
+    """A wrong value, with its path inside the enclosing value."""
 
     def __init__(self, problem: str, path: str) -> None:
         super().__init__(problem)
@@ -48,7 +49,11 @@ class Flag(str):
 
 
 def structure(values: Any, cls: Any) -> Any:
-    """Return an instance of ``cls`` from plain values; ValueError ``path: problem; cure`` of the first wrong value."""
+    """Return an instance of ``cls`` from plain values.
+
+    Raises:
+        ValueError: ``path: problem; cure`` of the first wrong value.
+    """
     try:
         return _converter().structure(values, cls)
     except Exception as error:
@@ -69,7 +74,8 @@ def kind_of(cls: type) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", cls.__name__).lower()
 
 
-def _value(value: Any) -> Any:
+def _parse_flag(value: Any) -> Any:
+    """Parse the text of a command-line flag; return any other value unchanged."""
     if not isinstance(value, Flag):
         return value
     try:
@@ -83,11 +89,11 @@ def _refuse(value: Any, expected: str) -> ValueError:
 
 
 def _to_scalar(value: Any, cls: Any) -> Any:
-    result = _value(value)
+    result = _parse_flag(value)
     if cls is int and isinstance(result, float) and result.is_integer():
         result = int(result)  # steps: 25e6
-    accepted, name = _SCALARS[cls]
-    if isinstance(result, bool) != (cls is bool) or not isinstance(result, accepted):
+    types, name = _SCALARS[cls]
+    if isinstance(result, bool) != (cls is bool) or not isinstance(result, types):
         raise _refuse(value, name)
     return float(result) if cls is float else result
 
@@ -103,17 +109,17 @@ def _to_path(value: Any, _: Any) -> Path:
 
 
 def _to_literal(value: Any, cls: Any) -> Any:
-    allowed = get_args(cls)
-    for option in (value, _value(value)):
-        for candidate in allowed:
-            if type(option) in (type(candidate), Flag) and option == candidate:
-                return candidate
-    near = did_you_mean(str(value), [str(option) for option in allowed])
-    raise ValueError(f"{str(value)!r} is not one of {', '.join(map(str, allowed))}; {near}")
+    options = get_args(cls)
+    for candidate in (value, _parse_flag(value)):
+        for literal in options:
+            if type(candidate) in (type(literal), Flag) and candidate == literal:
+                return literal
+    near = did_you_mean(str(value), [str(candidate) for candidate in options])
+    raise ValueError(f"{str(value)!r} is not one of {', '.join(map(str, options))}; {near}")
 
 
 def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
-    items = _value(value)
+    items = _parse_flag(value)
     if not isinstance(items, list | tuple):
         raise _refuse(value, "a list")
     members: tuple[Any, ...] = get_args(cls)
@@ -133,18 +139,19 @@ def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
 
 
 def _to_union(value: Any, cls: Any) -> Any:
+    """Convert to a user-defined object, to a record by its kind, or to the first scalar type that fits."""
     members = get_args(cls)
     records = {kind_of(member): member for member in members if _is_record(member)}
-    value = _value(value) if isinstance(value, Flag) and records else value
+    value = _parse_flag(value) if isinstance(value, Flag) and records else value
     for member in members:
         if _is_open(member) and is_dotted(_kind(value)):
-            return _to_own(value, member)
+            return _to_user_object(value, member)
     if isinstance(value, str) and value in records:
         return _converter().structure({}, records[value])
     if isinstance(value, Mapping) and records:
         return _to_record_of_kind(dict(value), records)
     problems = []
-    for member in sorted(members, key=_specific):
+    for member in sorted(members, key=_rank_member):
         if not _is_record(member):
             try:
                 return _converter().structure(value, member)
@@ -160,18 +167,20 @@ def _kind(value: Any) -> Any:
     return value.get("kind") if isinstance(value, Mapping) else value
 
 
-def _to_own(value: Any, cls: Any) -> Any:
-    """Return the user's own object, named by a dotted name or the kind of a section, whose rest a dataclass takes."""
-    value = _value(value)
+def _to_user_object(value: Any, cls: Any) -> Any:
+    """Return a user-defined object by its dotted name, or from a section with that ``kind`` and settings."""
+    value = _parse_flag(value)
     name = _kind(value)
     if not isinstance(name, str):
         expected = "a dotted name (package.module:name) nor a section with such a kind"
         raise ValueError(f"{value!r} is neither {expected}")
     thing = find_named(name)
-    rest = {key: item for key, item in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
+    options = (
+        {key: item for key, item in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
+    )
     if _is_record(thing):
-        thing = _converter().structure(rest, thing)
-    elif rest:
+        thing = _converter().structure(options, thing)
+    elif options:
         raise ValueError(f"{name!r} takes no settings; make it a frozen dataclass")
     if _is_protocol(cls):
         check_protocol(thing, name, cls)
@@ -184,13 +193,14 @@ def _to_own(value: Any, cls: Any) -> Any:
     return thing
 
 
-def _specific(member: Any) -> int:
-    """Return the order in which members of a union are tried: numbers from narrow to wide, text last."""
+def _rank_member(member: Any) -> int:
+    """Rank a member of a union in the order of attempts: numbers from narrow to wide, text last."""
     order = (type(None), bool, int, float)
     return order.index(member) if member in order else len(order) + (member is str)
 
 
 def _to_record_of_kind(value: dict[str, Any], records: dict[str, Any]) -> Any:
+    """Convert a section to the record of its ``kind``, which may be missing if there is only one."""
     if len(records) == 1 and "kind" not in value:
         return _converter().structure(value, next(iter(records.values())))
     if "kind" not in value:
@@ -208,7 +218,7 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
     build = make_dict_structure_fn(cls, converter, **options)
 
     def hook(value: Any, _: Any) -> Any:
-        value = {} if value is None else _value(value)
+        value = {} if value is None else _parse_flag(value)
         if is_dotted(value):
             record = find_named(value)
             if not isinstance(record, cls):
@@ -217,46 +227,47 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
         if not isinstance(value, Mapping):
             names = ", ".join(field.name for field in dataclasses.fields(cls))
             raise _refuse(value, f"a section of settings ({names})")
-        renamed = getattr(cls, "renamed", {})
-        value = {renamed.get(key, key): item for key, item in value.items()}
+        new_names = getattr(cls, "renamed", {})
+        value = {new_names.get(key, key): item for key, item in value.items()}
         if _names_preset(cls, value):
             base = cls.preset(str(value["preset"]))
-            rest = {name: given for name, given in value.items() if name != "preset"}
-            value = _merge_defaults(_to_plain(base, cls), base, rest)
-        return build(_on_defaults(cls, value), cls)
+            changes = {name: item for name, item in value.items() if name != "preset"}
+            value = _merge_defaults(_to_plain(base, cls), base, changes)
+        return build(_complete_sections(cls, value), cls)
 
     return hook
 
 
-def _on_defaults(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``given`` with nested sections completed from the defaults of this record, not from their own."""
-    result = dict(given)
+def _complete_sections(cls: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Complete nested sections with the defaults of the enclosing record, not with those of their own class."""
+    result = dict(values)
     hints = typing.get_type_hints(cls)
     for field in dataclasses.fields(cls):
         default = field.default
         if field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
-        section = _value(given.get(field.name)) if _is_record(type(default)) else None
+        section = _parse_flag(values.get(field.name)) if _is_record(type(default)) else None
         if isinstance(section, Mapping):
             result[field.name] = _merge_defaults(_to_plain(default, hints[field.name]), default, section)
     return result
 
 
-def _names_preset(cls: Any, given: Mapping[str, Any]) -> bool:
-    """Whether a section starts from a preset of its record, ``cls.preset(name)``."""
-    named = {field.name for field in dataclasses.fields(cls)}
-    return "preset" in given and "preset" not in named and callable(getattr(cls, "preset", None))
+def _names_preset(cls: Any, values: Mapping[str, Any]) -> bool:
+    """Return whether a section starts from a preset of its record, ``cls.preset(name)``."""
+    field_names = {field.name for field in dataclasses.fields(cls)}
+    return "preset" in values and "preset" not in field_names and callable(getattr(cls, "preset", None))
 
 
 def _merge_defaults(base: dict[str, Any], default: Any, values: Mapping[str, Any]) -> dict[str, Any]:
-    other_kind = "kind" in values and str(values["kind"]) != kind_of(type(default))
-    if other_kind or _names_preset(type(default), values):
+    """Return ``values`` on top of ``base`` (``default`` as plain values), unless they name a kind or preset."""
+    changes_kind = "kind" in values and str(values["kind"]) != kind_of(type(default))
+    if changes_kind or _names_preset(type(default), values):
         return dict(values)
     result = base | dict(values)
     for name, value in values.items():
-        inner = getattr(default, name, None)
-        if _is_record(type(inner)) and isinstance(value, Mapping):
-            result[name] = _merge_defaults(base[name], inner, value)
+        nested_default = getattr(default, name, None)
+        if _is_record(type(nested_default)) and isinstance(value, Mapping):
+            result[name] = _merge_defaults(base[name], nested_default, value)
     return result
 
 
@@ -273,7 +284,7 @@ def _is_callable(cls: Any) -> bool:
 
 
 def _is_open(cls: Any) -> bool:
-    """Whether the type accepts the user's own object."""
+    """Return whether a type accepts user-defined objects."""
     return _is_protocol(cls) or _is_callable(cls)
 
 
@@ -285,7 +296,7 @@ def _converter() -> cattrs.Converter:
     converter.register_structure_hook_func(lambda cls: get_origin(cls) is Literal, _to_literal)
     converter.register_structure_hook_func(lambda cls: cls is tuple or get_origin(cls) is tuple, _to_tuple)
     converter.register_structure_hook_func(lambda cls: get_origin(cls) in _UNIONS, _to_union)
-    converter.register_structure_hook_func(_is_open, _to_own)
+    converter.register_structure_hook_func(_is_open, _to_user_object)
     converter.register_structure_hook_factory(_is_record, _record_hook)
     return converter
 
@@ -297,13 +308,13 @@ def _first_problem(error: BaseException, path: str) -> tuple[str, str]:
         unknown = sorted(error.extra_fields)[0]
         return f"unknown setting; {did_you_mean(unknown, names)}", _join(path, unknown)
     if isinstance(error, ClassValidationError | IterableValidationError):
-        noted, plain_errors = error.group_exceptions()
-        if noted:
-            inner, note = noted[0]
+        inner_errors, own_errors = error.group_exceptions()
+        if inner_errors:
+            inner, note = inner_errors[0]
             name = getattr(note, "name", None)
-            step = _join(path, name) if name is not None else f"{path}[{getattr(note, 'index', '?')}]"
-            return _first_problem(inner, step)
-        return _first_problem(plain_errors[0], path)
+            inner_path = _join(path, name) if name is not None else f"{path}[{getattr(note, 'index', '?')}]"
+            return _first_problem(inner, inner_path)
+        return _first_problem(own_errors[0], path)
     if isinstance(error, _Problem):
         return error.problem, path + error.path if error.path.startswith("[") else _join(path, error.path)
     if isinstance(error, KeyError):
@@ -319,46 +330,55 @@ def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _to_plain(value: Any, declared: Any) -> Any:
+def _to_plain(value: Any, annotation: Any) -> Any:
     """Convert a value to the mappings, lists and scalars of YAML."""
     if _is_record(type(value)):
         hints = typing.get_type_hints(type(value))
         fields = {f.name: _to_plain(getattr(value, f.name), hints[f.name]) for f in dataclasses.fields(value)}
-        if any(map(_is_open, (declared, *_members(declared)))) and type(value) not in _members(declared):
+        members = _members(annotation)
+        if any(map(_is_open, (annotation, *members))) and type(value) not in members:
             return {"kind": dotted_name(type(value))} | {k: v for k, v in fields.items() if k != "kind"}
-        tagged = "kind" not in fields and any(_is_record(member) for member in _members(declared))
-        return {"kind": kind_of(type(value))} | fields if tagged else fields
+        needs_kind = "kind" not in fields and any(_is_record(member) for member in members)
+        return {"kind": kind_of(type(value))} | fields if needs_kind else fields
     if isinstance(value, Mapping):
-        member = get_args(declared)[-1] if get_args(declared) else Any
-        return {str(key): _to_plain(item, member) for key, item in value.items()}
+        item_type = get_args(annotation)[-1] if get_args(annotation) else Any
+        return {str(key): _to_plain(item, item_type) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_to_plain(item, _item_type(declared, number)) for number, item in enumerate(value)]
+        return [_to_plain(item, _item_type(annotation, number)) for number, item in enumerate(value)]
     if callable(value):
         return dotted_name(value)
     return str(value) if isinstance(value, Path) else value
 
 
-def _members(declared: Any) -> tuple[Any, ...]:
-    return get_args(declared) if get_origin(declared) in _UNIONS else ()
+def _members(annotation: Any) -> tuple[Any, ...]:
+    """Return the members of a union, none for other types."""
+    return get_args(annotation) if get_origin(annotation) in _UNIONS else ()
 
 
-def _item_type(declared: Any, number: int) -> Any:
-    for candidate in (declared, *_members(declared)):
+def _item_type(annotation: Any, number: int) -> Any:
+    """Return the type of an item of a tuple or list."""
+    for candidate in (annotation, *_members(annotation)):
         if get_origin(candidate) in (tuple, list):
-            members = get_args(candidate)
-            return members[0] if members[-1] is Ellipsis or len(members) <= number else members[number]
+            types_of_items = get_args(candidate)
+            if types_of_items[-1] is Ellipsis or len(types_of_items) <= number:
+                return types_of_items[0]
+            return types_of_items[number]
     return Any
 
 
 def parse_yaml(text: str, file: Path | None = None) -> Any:
-    """Return the plain values of a YAML text; raises UsageError with the line of invalid YAML or a duplicate key."""
+    """Return the plain values of a YAML text.
+
+    Raises:
+        UsageError: Invalid YAML or a duplicate key, with its line.
+    """
     try:
         return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or "invalid"
-        place = "YAML" if mark is None else f"line {mark.line + 1}"
-        raise UsageError(f"{place}: {problem}", file=file, cure="fix the file") from error
+        location = "YAML" if mark is None else f"line {mark.line + 1}"
+        raise UsageError(f"{location}: {problem}", file=file, cure="fix the file") from error
 
 
 def write_yaml(values: Any) -> str:
@@ -368,22 +388,22 @@ def write_yaml(values: Any) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads YAML 1.2 core scalars and refuses duplicate keys."""
+    """Loader of YAML 1.2 core scalars that refuses duplicate keys."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
+        keys: set[Any] = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str) or key in seen:
+            if not isinstance(key, str) or key in keys:
                 problem = "appears twice" if isinstance(key, str) else "is not a string"
                 mark = key_node.start_mark
                 raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} {problem}", mark)
-            seen.add(key)
+            keys.add(key)
         return super().construct_mapping(node, deep)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes strings that the loader would read as other types."""
+    """Dumper that quotes strings that the loader would read as other types."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

@@ -1,7 +1,7 @@
 """Speed of the simulator on this machine: as a whole, by part, and by set of metrics.
 
-Every device steps its share of the environments. A CPU is one device unless :func:`use_all_cores` makes each core one,
-which is faster: most operations of a step are too small to divide between cores.
+Every device steps its share of the environments. A CPU is one device unless :func:`use_all_cores` makes each core a
+device, which is faster: most operations of a step are too small to divide between cores.
 """
 
 from __future__ import annotations
@@ -37,12 +37,15 @@ from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
 
-#: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table; larger ones count if fastest.
-METRIC_SETS, BATCHES, LARGER = ("none", "training", "full"), (32, 128), (256, 512, 1024)
+#: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table.
+METRIC_SETS, BATCHES = ("none", "training", "full"), (32, 128)
+#: Larger batch sizes, reported only if they are fastest.
+LARGER_BATCHES = (256, 512, 1024)
 #: Number of environments in the compiler's cost analysis.
 _COST_BATCH = 16384
-#: Actions, observations and frames; and the carry of the loop: states, which episodes have ended, rewards, outputs.
+#: Actions, observations and frames.
 _PlannerOutputs = tuple[Array, Mapping[str, Array], Frame]
+#: Carry of the loop: states, mask of ended episodes, sums of rewards and metrics, outputs of the planner.
 _Carry = tuple[SimState, Bool[Array, " B"], Float[Array, " B"], _PlannerOutputs]
 
 
@@ -66,7 +69,7 @@ class BenchConfig:
 
 
 def use_all_cores() -> None:
-    """Make every core of this process a JAX device; without effect once JAX has started."""
+    """Make every core of this process a JAX device; has no effect once JAX has started."""
     with suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
 
@@ -75,7 +78,7 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
     """Time steps with resets, observation, reward and metrics, driven by IDM, and each part alone.
 
     Args:
-        bank: Distinct scenarios; when an episode ends, a random one starts.
+        bank: Distinct scenarios; when an episode ends, another starts in a random one.
         config: Sizes.
 
     Returns:
@@ -120,11 +123,10 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
         return compile_program(bank, replace(config, batch=batch, task=task))
 
     bank = replicate(bank)
-    kinds = [(metrics, batch) for metrics in METRIC_SETS for batch in (*BATCHES, *LARGER)]
-    speeds = dict(
-        zip(kinds, steps_per_second([program(*kind) for kind in kinds], config.repeats), strict=True)
-    )
-    return {"scenarios": len(bank), "rows": metric_rows(speeds), "versions": versions()}
+    cases = [(metrics, batch) for metrics in METRIC_SETS for batch in (*BATCHES, *LARGER_BATCHES)]
+    speeds = steps_per_second([program(metrics, batch) for metrics, batch in cases], config.repeats)
+    rows = metric_rows(dict(zip(cases, speeds, strict=True)))
+    return {"scenarios": len(bank), "rows": rows, "versions": versions()}
 
 
 def metric_rows(speeds: Mapping[tuple[str, int], float]) -> list[dict[str, Any]]:
@@ -146,8 +148,8 @@ class Program:
     """A compiled program that steps a batch.
 
     Attributes:
-        run: Runs it asynchronously.
-        steps: Environment steps of a run, without those that only reset.
+        run: Runs the program asynchronously.
+        steps: Environment steps of a run, without steps that only reset.
         compile_seconds: Time to compile.
         state_bytes: Size of the state of one environment.
         temporary_bytes: Temporary memory per environment.
@@ -166,9 +168,9 @@ def compile_program(bank: ScenarioBank, config: BenchConfig) -> Program:
     states = _states(simulator, bank, config.batch)
     keys = jax.random.split(jax.random.key(2), jax.device_count())
     carry = _carry(simulator, config, bank, states)
-    started = time.perf_counter()
+    start = time.perf_counter()
     program = _shard_states(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
-    seconds = time.perf_counter() - started
+    seconds = time.perf_counter() - start
     memory = program.memory_analysis()
     return Program(
         run=lambda: program(bank, carry, keys),
@@ -186,10 +188,10 @@ def steps_per_second(programs: Sequence[Program], repeats: int) -> list[float]:
     times: list[list[float]] = [[] for _ in programs]
     for repeat in range(repeats + 1):
         for program, seconds in zip(programs, times, strict=True):
-            started = time.perf_counter()
+            start = time.perf_counter()
             jax.block_until_ready(program.run())
             if repeat:
-                seconds.append(time.perf_counter() - started)
+                seconds.append(time.perf_counter() - start)
     return [
         program.steps / statistics.median(seconds) for program, seconds in zip(programs, times, strict=True)
     ]
@@ -239,7 +241,7 @@ def _shard_states(function: Callable[..., Any]) -> Any:
 def _run(
     simulator: Simulator, config: BenchConfig, bank: ScenarioBank, carry: _Carry, keys: Array
 ) -> tuple[Any, Array]:
-    """Step a batch; return the number of steps, and all results, so that the compiler removes none."""
+    """Step a batch. Return all results, to keep the compiler from removing any, and the number of steps."""
     key, batch = keys[0], carry[1].shape[0]
     step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0, 0))
 
@@ -251,16 +253,16 @@ def _run(
         states, done, total, (action, _, frame) = carry
         starts = map_where(done, partial(simulator.new_episode, bank), index)
         states, transition = step(bank, states, action, done, starts, frame)
-        ended = transition.terminated | transition.truncated
+        next_done = transition.terminated | transition.truncated
         # As in training: metrics are computed when some episode of the batch ends.
-        total += jax.lax.cond(ended.any(), sum_metrics, lambda _: jnp.zeros(()), states)
+        total += jax.lax.cond(next_done.any(), sum_metrics, lambda _: jnp.zeros(()), states)
         total += transition.reward
-        # Computed here, where the frame of all agents is known, not at the start of the next iteration.
-        return (states, ended, total, _planner_outputs(simulator, config, bank, states)), (~done).sum()
+        # Computed in this iteration, which knows the frame of all agents, not at the start of the next one.
+        return (states, next_done, total, _planner_outputs(simulator, config, bank, states)), (~done).sum()
 
     start_index = jax.random.randint(key, (config.steps, batch), 0, len(bank))
-    (_, _, total, outputs), stepped = jax.lax.scan(iteration, carry, start_index)
-    return (total, outputs), stepped.sum()[None]
+    (_, _, total, outputs), step_counts = jax.lax.scan(iteration, carry, start_index)
+    return (total, outputs), step_counts.sum()[None]
 
 
 def _planner_outputs(
@@ -281,15 +283,15 @@ def _carry(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states
     """Return the initial carry, which makes the first iteration reset every environment."""
     outputs = jax.eval_shape(lambda: _planner_outputs(simulator, config, bank, states))
     outputs = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outputs)
-    ended = jnp.ones(config.batch, bool), jnp.zeros(config.batch)
-    return states, *jax.device_put((*ended, outputs), NamedSharding(_mesh(), PartitionSpec("device")))
+    done, total = jnp.ones(config.batch, bool), jnp.zeros(config.batch)
+    return states, *jax.device_put((done, total, outputs), NamedSharding(_mesh(), PartitionSpec("device")))
 
 
 Part = Callable[[ScenarioBank, SimState], Any]
 
 
 def without_grid(bank: ScenarioBank) -> ScenarioBank:
-    """Return the bank with a grid of a single cell, so that a query visits all segments."""
+    """Return the bank with a grid of one cell, where each query visits all segments."""
     n = len(bank)
     return replace(
         bank,
@@ -300,7 +302,7 @@ def without_grid(bank: ScenarioBank) -> ScenarioBank:
 
 
 def _parts(simulator: Simulator) -> Mapping[str, Part]:
-    """Return the parts of a step, unbatched; shared work counts in each part."""
+    """Return the parts of a step, unbatched; work that parts share counts in each of them."""
 
     def frame(bank: ScenarioBank, state: SimState) -> Any:
         return simulator.frame(bank, state.context, alone(state.context), 0)
@@ -330,7 +332,7 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
         return time_to_collision(frame(bank, state), state.context.slot, state.contacts == Contact.IGNORED)
 
     def metrics(bank: ScenarioBank, state: SimState) -> Any:
-        # No metric here reads the surroundings, so they are not computed.
+        # No metric reads the surroundings, and the compiler removes their computation.
         situation = simulator.situation(bank, state)
         return episode_add(state.episode, situation, state.start, jnp.zeros((), bool))
 
@@ -350,6 +352,7 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
 
 
 def _total(part: Part, bank: ScenarioBank, state: SimState) -> Array:
+    """Return the sum of all results of a part, which keeps the compiler from removing any."""
     leaves = jax.tree.leaves(part(bank, state))
     return sum((jnp.sum(leaf, dtype=jnp.float32) for leaf in leaves), start=jnp.zeros(()))
 
@@ -357,7 +360,12 @@ def _total(part: Part, bank: ScenarioBank, state: SimState) -> Array:
 def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimState) -> float:
     """Return the time of a part in microseconds per environment and step."""
     program = _repeat_part(config, part)
-    return _median(lambda: program(bank, states, None), config.repeats) / config.steps / config.batch * 1e6
+    return (
+        _median_seconds(lambda: program(bank, states, None), config.repeats)
+        / config.steps
+        / config.batch
+        * 1e6
+    )
 
 
 def _repeat_part(config: BenchConfig, part: Part) -> Any:
@@ -368,7 +376,7 @@ def _repeat_part(config: BenchConfig, part: Part) -> Any:
             totals = jax.vmap(lambda state, distance: _total(part, bank, _shift(state, distance)))(
                 states, shift
             )
-            # Each iteration depends on the last one, so that the compiler moves nothing out of the loop.
+            # Each iteration depends on the last one, which keeps the compiler from hoisting work out of the loop.
             return shift + 1e-20 * jnp.where(jnp.isfinite(totals), totals, 0.0), None
 
         return jax.lax.scan(iteration, jnp.zeros(states.start.shape), None, config.steps)[0]
@@ -376,18 +384,18 @@ def _repeat_part(config: BenchConfig, part: Part) -> Any:
     return _shard_states(run)
 
 
-def _shift(state: SimState, by_m: Array) -> SimState:
-    """Return the state moved by a negligible distance."""
-    context = state.context
-    moved = replace(context, history=context.history + by_m, index=context.index + by_m.astype(jnp.int32))
-    return replace(state, context=moved)
+def _shift(state: SimState, distance: Array) -> SimState:
+    """Shift the state by a negligible distance."""
+    history = state.context.history + distance
+    index = state.context.index + distance.astype(jnp.int32)
+    return replace(state, context=replace(state.context, history=history, index=index))
 
 
 def _cost(part: Part, bank: ScenarioBank, states: SimState) -> dict[str, float]:
     """Return a part's operations and bytes per environment by the compiler's cost analysis.
 
-    The analysis counts an indexed array as read in full; many environments in a bank of one scenario make that
-    negligible.
+    The analysis counts an indexed array as read in full, which is negligible for many environments in a bank of one
+    scenario.
     """
 
     def with_rows(tree: Any, rows: int) -> Any:
@@ -401,11 +409,12 @@ def _cost(part: Part, bank: ScenarioBank, states: SimState) -> dict[str, float]:
     }
 
 
-def _median(call: Callable[[], Any], repeats: int) -> float:
+def _median_seconds(call: Callable[[], Any], repeats: int) -> float:
+    """Return the median duration of a call in seconds, after one call that warms up."""
     jax.block_until_ready(call())
     times = []
     for _ in range(repeats):
-        started = time.perf_counter()
+        start = time.perf_counter()
         jax.block_until_ready(call())
-        times.append(time.perf_counter() - started)
+        times.append(time.perf_counter() - start)
     return statistics.median(times)

@@ -58,8 +58,8 @@ class EncoderBench:
     """Settings of :func:`bench_encoders`.
 
     Attributes:
-        only: Names of :data:`ENCODERS` and :data:`VARIANTS`; none: all.
-        batches: Batch sizes of the forward pass; the last one is also that of the backward pass.
+        only: Names of encoders in :data:`ENCODERS` and :data:`VARIANTS`; empty for all.
+        batches: Batch sizes of the forward pass; the backward pass uses the last.
         repeats: Number of timings; the median is reported.
         observation: The observation that is encoded.
     """
@@ -75,7 +75,8 @@ class EncoderBench:
                 raise UsageError(f"unknown encoder {name!r}", cure=did_you_mean(name, [*ENCODERS, *VARIANTS]))
         if not self.batches or min(*self.batches, self.repeats, 1) < 1:
             raise UsageError(
-                f"batches {self.batches}, repeats {self.repeats}", cure="use at least one, of 1 or more"
+                f"invalid batches {self.batches} or repeats {self.repeats}",
+                cure="use at least one batch size, and numbers of 1 or more",
             )
 
 
@@ -84,7 +85,7 @@ def bench_encoders(config: EncoderBench | None = None, *, times: bool = True) ->
 
     Args:
         config: Settings.
-        times: Whether to time them; sizes need no computation.
+        times: Whether to measure times; sizes need no computation.
 
     Returns:
         The object of ``drivax bench --encoders --json``: ``observation`` with the shapes of the groups, ``device``,
@@ -137,10 +138,13 @@ def random_observations(spec: GroupSpec, batch: int) -> dict[str, Array]:
 
 
 def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[str, Any]:
-    graph, empty = nnx.split(nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0))))
+    """Return the times of the forward pass by batch size, and of the backward pass, microseconds per observation."""
+    graph, shapes = nnx.split(nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0))))
     # Times do not depend on the values of parameters.
     rng = np.random.default_rng(0)
-    parameters = jax.tree.map(lambda leaf: jnp.asarray(0.05 * rng.normal(size=leaf.shape), leaf.dtype), empty)
+    parameters = jax.tree.map(
+        lambda leaf: jnp.asarray(0.05 * rng.normal(size=leaf.shape), leaf.dtype), shapes
+    )
 
     def encode(parameters: Any, groups: Any) -> Array:
         encoder: Any = nnx.merge(graph, parameters)
@@ -164,10 +168,10 @@ def _microseconds(function: Any, parameters: Any, groups: dict[str, Array], repe
     batch = next(iter(groups.values())).shape[0]
 
     def seconds(calls: int) -> float:
-        started = time.perf_counter()
+        start = time.perf_counter()
         for _ in range(calls):
             jax.block_until_ready(function(parameters, groups))
-        return (time.perf_counter() - started) / calls
+        return (time.perf_counter() - start) / calls
 
     seconds(1)
     calls = math.ceil(_MIN_TIMING_S / seconds(1))

@@ -25,9 +25,9 @@ from drivax.metrics.catalogue import METRICS
 from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.store import ScenarioSet
 
-#: Scenarios that a claim is about: all, weighted as in ordinary traffic, or those of one stratum.
+#: Scenarios of a claim: all, weighted as in ordinary traffic, or those of one stratum.
 Stratum = Literal["ordinary", "common", "rare"]
-#: From the name of a curation method to its score table of a set.
+#: Maps the name of a curation method to its score table of a set.
 Tables = Callable[[str], ScoreTable]
 
 
@@ -36,11 +36,11 @@ class Arm:
     """An arm of a study.
 
     Attributes:
-        preset: Its training configuration.
-        method: Name of the curation method that scores its steps.
-        scale: Whether weights are of steps or of scenarios.
-        permuted: Whether the scores are permuted among scenarios: the matched random control of ``method``.
-        weights: Settings of the sampling weights; None: those of the study.
+        preset: Training configuration.
+        method: Name of the curation method that scores the steps.
+        scale: Whether steps or whole scenarios are weighted.
+        permuted: Whether to permute the scores among scenarios, for the matched random control of ``method``.
+        weights: Settings of the sampling weights; None for those of the study.
     """
 
     preset: str = "offline/cql"
@@ -49,26 +49,26 @@ class Arm:
     permuted: bool = False
     weights: WeightConfig | None = None
 
-    def weighted(
+    def weigh(
         self, data: ScenarioSet, tables: Tables, config: WeightConfig, usable: np.ndarray | None = None,
         seed: int = 0,
     ) -> WeightedSet:  # fmt: skip
-        """Return a set with the sampling weights of this arm.
+        """Return a set with the sampling weights of the arm.
 
         Args:
             data: The set.
             tables: Score tables of the set.
             config: Settings of the sampling weights, for arms without ``weights``.
-            usable: Steps that the training learns from (:func:`~drivax.curation.weights.sampling_weights`).
+            usable: Mask of the steps to learn from (:func:`~drivax.curation.weights.sampling_weights`).
             seed: Seed of the permutation.
 
         Raises:
-            UsageError: The table is of another method, or no step has a weight or a label.
+            UsageError: The table has another method, or no step has a weight or a label.
         """
         table = tables(self.method)
         if table.method != self.method:
             raise UsageError(
-                f"scores of {table.method!r} for an arm that is curated by {self.method!r}",
+                f"scores of {table.method!r} for an arm with the method {self.method!r}",
                 cure=f"drivax curate {self.method} --data {data.path} --out SCORES",
             )
         if self.method == "oracle" and not table.steps.any():
@@ -86,12 +86,12 @@ class Claim:
 
     Attributes:
         words: Text of the claim.
-        arm: The arm that is claimed to be better.
-        reference: The arm that it is compared with.
-        group: Claims whose p-values are adjusted together.
+        arm: The arm claimed to be better.
+        reference: The arm to compare with.
+        group: Group of claims whose p-values are adjusted together.
         metric: Metric of the comparison.
         rows: Scenarios of the comparison.
-        change: Claimed relative change, at least; None: only its direction is claimed.
+        change: Minimum claimed relative change; None for a claim about its direction alone.
     """
 
     words: str
@@ -108,16 +108,16 @@ class StudyDefinition:
     """Definition of a study in a YAML file.
 
     Attributes:
-        title: Title of its report.
-        baselines: Arms that must meet the conditions before the others are trained. The smallest detectable difference
-            is estimated from the first two; ``checkpoints_by`` is tested on the first.
-        planners: Planners without training that are evaluated next to the arms.
-        metrics: Metrics that are reported, by name.
+        title: Title of the report.
+        baselines: Arms that must meet the conditions before the others are trained. The first two determine the
+            smallest detectable difference; the first is the one that ``checkpoints_by`` is tested on.
+        planners: Untrained planners to evaluate next to the arms.
+        metrics: Names of the metrics in the report.
         groups: Heading of each group of claims.
         arms: The arms.
         claims: The claims.
-        checkpoints_by: Training metric whose maximum selects another checkpoint of the first baseline; the cost of that
-            rule is reported.
+        checkpoints_by: Training metric for another checkpoint rule, its maximum; the report has the cost of the rule
+            for the first baseline.
     """
 
     title: str
@@ -132,18 +132,21 @@ class StudyDefinition:
     def __post_init__(self) -> None:
         if len(self.baselines) < 2:
             raise ValueError("a study needs two baselines")
-        for names, available, kind in (
-            (self.baselines, self.arms, "baseline"), (self.planners, PLANNERS, "planner"),
-            (self.metrics, METRICS, "metric"), ([arm.method for arm in self.arms.values()], METHODS, "method"),
-        ):  # fmt: skip
+        methods = [arm.method for arm in self.arms.values()]
+        names_by_kind = {
+            "baseline": (self.baselines, self.arms), "planner": (self.planners, PLANNERS),
+            "metric": (self.metrics, METRICS), "method": (methods, METHODS),
+        }  # fmt: skip
+        for kind, (names, available) in names_by_kind.items():
             for name in names:
                 if name not in available:
                     raise ValueError(f"unknown {kind} {name!r}; {did_you_mean(name, list(available))}")
         for claim in self.claims:
-            for name, available in (
+            names_of_claim = (
                 (claim.arm, self.arms), (claim.reference, self.arms), (claim.group, self.groups),
                 (claim.metric, self.metrics),
-            ):  # fmt: skip
+            )  # fmt: skip
+            for name, available in names_of_claim:
                 if name not in available:
                     raise ValueError(f"the claim {claim.words!r} names {name!r}, which the study lacks")
 
@@ -153,7 +156,7 @@ def load_study(source: str | Path) -> StudyDefinition:
     """Return the definition of a study from a YAML file, or by the name of one in ``configs/studies``.
 
     Raises:
-        UsageError: There is none, or it is invalid.
+        UsageError: The definition does not exist, or is invalid.
     """
     name = str(source)
     return settings.load(StudyDefinition, source if name.endswith(".yaml") else f"studies/{name}")
@@ -164,17 +167,17 @@ class StudyConfig:
     """Settings of a study: its arms and their budget.
 
     Attributes:
-        arms: Names of its arms, its baselines among them; empty: all.
+        arms: Names of the arms, including all baselines; empty for all arms.
         seeds: Number of training runs of each arm.
-        total_steps: Logged steps that each training draws; null: those of its preset.
+        total_steps: Number of logged steps to draw in each training; null for that of the preset.
         training: Further settings of every training, as on the command line: ``[--algorithm.batch, "128"]``.
-        validations: Number of validations in closed loop; the best checkpoint is tested.
+        validations: Number of closed-loop validations; the test evaluates the best checkpoint.
         weights: Settings of the sampling weights, the same for all methods.
         ensemble: The ensemble.
-        progress: Every seed of a baseline must make this share of the expert's progress on the validation set.
-        flat: Largest change of a baseline's score, mean over seeds, from the third to the last quarter of its
-            validations.
-        rare: Share of test scenarios that count as rare by the kinematic heuristic, if none are labelled.
+        progress: Minimum share of the expert's progress on the validation set, for every seed of a baseline.
+        flat: Maximum change of a baseline's score from the third to the last quarter of its validations, mean over
+            seeds.
+        rare: Share of test scenarios that count as rare by the kinematic heuristic, if there are no labels.
     """
 
     renamed: ClassVar[dict[str, str]] = {"agents": "arms", "scouts": "ensemble"}
@@ -193,7 +196,8 @@ class StudyConfig:
     def __post_init__(self) -> None:
         if self.seeds < 2 or self.validations < 4:
             raise UsageError(
-                f"{self.seeds} seeds and {self.validations} validations", cure="use 2 or more, and 4 or more"
+                f"{self.seeds} seeds and {self.validations} validations are too few",
+                cure="use at least 2 seeds and 4 validations",
             )
 
 
@@ -203,9 +207,9 @@ class StudySets:
 
     Attributes:
         train: Training set.
-        validation: Validation set, which chooses checkpoints.
-        test: One test set or several; of labelled sets all scenarios with an event are taken, and as many without.
-            Events are as frequent in the first set as in ordinary traffic.
+        validation: Validation set, for the choice of checkpoints.
+        test: Test sets. If scenarios are labelled, the test has as many with as without an event. The first set has
+            events as often as ordinary traffic.
     """
 
     train: Path
@@ -214,10 +218,10 @@ class StudySets:
 
     @classmethod
     def of(cls, data: Path, validation: Path | None, test: Sequence[Path]) -> StudySets:
-        """Return the sets as given, or those of a benchmark's folder.
+        """Return the sets at these paths, or those of a benchmark's folder.
 
         Raises:
-            UsageError: One is missing.
+            UsageError: A set is missing.
         """
         if (data / "train").is_dir():
             test_sets = tuple(path for path in (data / "test", data / "test-rare") if path.is_dir())
@@ -238,7 +242,7 @@ class StudySets:
 
 @dataclass(frozen=True)
 class Study:
-    """A study on given sets, and the names of the files in its folder.
+    """A study on scenario sets, with the paths of its files.
 
     Raises:
         UsageError: ``config`` names an unknown arm or lacks a baseline.
@@ -261,7 +265,7 @@ class Study:
 
     @property
     def arms(self) -> Mapping[str, Arm]:
-        """The arms that are compared."""
+        """The arms of the study."""
         return {name: self.definition.arms[name] for name in self.config.arms}
 
     @property
@@ -280,10 +284,10 @@ class Study:
 
     def evaluations(self, arm: str) -> tuple[str, ...]:
         """Return the names of an arm's evaluations: the first baseline is evaluated at other checkpoints, too."""
-        return (arm, self.rival) if arm == self.definition.baselines[0] else (arm,)
+        return (arm, self.rule_evaluation) if arm == self.definition.baselines[0] else (arm,)
 
     @property
-    def rival(self) -> str:
+    def rule_evaluation(self) -> str:
         """Name of the evaluations of the first baseline at checkpoints chosen by ``checkpoints_by``."""
         return f"{self.definition.baselines[0]}_by_{self.definition.checkpoints_by.rpartition('/')[2]}"
 
@@ -305,7 +309,7 @@ class Study:
         """Return the training configuration of an arm with one seed."""
         config = settings.load(TrainConfig, self.definition.arms[arm].preset, self.config.training)
         config = replace(config, seed=seed, total_steps=self.config.total_steps or config.total_steps)
-        every = max(config.iterations // self.config.validations, 1)
+        interval = max(config.iterations // self.config.validations, 1)
         # All checkpoints of the first baseline stay: another rule chooses among them afterwards.
         keep = config.iterations if arm == self.definition.baselines[0] else config.keep
-        return replace(config, evaluate_every=every, checkpoint_every=every, keep=keep)
+        return replace(config, evaluate_every=interval, checkpoint_every=interval, keep=keep)

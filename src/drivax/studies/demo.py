@@ -27,11 +27,11 @@ from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import describe_run
 
-#: Planners that the trained policy is compared with.
+#: Planners to compare the trained policy with.
 REFERENCES = ("expert", "constant_velocity", "idm")
 #: Metrics of the paired comparison.
 _METRICS = ("success", "vmax_score")
-#: Training and held-out sets draw their maps from different seeds.
+#: Seeds of the training and the held-out set.
 _TRAINING_SEED, _HELD_OUT_SEED = 0, 1_000_000
 
 
@@ -67,7 +67,7 @@ class Demo:
         return {"summaries": self.summaries, "policy_minus": self.differences, **describe_run()}
 
     def text(self) -> str:
-        """Return the table, and one line per comparison."""
+        """Return a table of the planners, and a line per comparison."""
         lines = [format_summary(self.summaries), ""]
         for planner, metrics in self.differences.items():
             for name, difference in metrics.items():
@@ -101,8 +101,8 @@ def run_demo(
         )
     out.mkdir(parents=True, exist_ok=True)
     log(f"1/4  {config.training} training and {config.held_out} held-out scenarios of the built-in world")
-    training = _scenarios(out / "sets" / "train", config.training, _TRAINING_SEED, config)
-    held_out = _scenarios(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
+    training = _generate_set(out / "sets" / "train", config.training, _TRAINING_SEED, config)
+    held_out = _generate_set(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
     log("2/4  training PPO")
     training_config = settings.load(TrainConfig, config.preset, list(config.overrides))
     run = train(training_config, training, out / "training" / "policy", overwrite=True).path
@@ -128,7 +128,7 @@ def run_demo(
     return demo
 
 
-def _scenarios(path: Path, count: int, seed: int, config: DemoConfig) -> ScenarioSet:
+def _generate_set(path: Path, count: int, seed: int, config: DemoConfig) -> ScenarioSet:
     path.parent.mkdir(parents=True, exist_ok=True)
     options = Generation(workers=config.workers or os.cpu_count() or 1, overwrite=True)
     with Progress("generating", "scenarios", count) as bar:

@@ -23,7 +23,7 @@ _STRATA: Mapping[Stratum, str] = {
     "ordinary": "Ordinary traffic", "common": "Common scenarios", "rare": "Rare scenarios",
 }  # fmt: skip
 _VERDICT_TEXTS = {"supported": "▲ supported", "contradicted": "▼ contradicted", "undecided": "undecided"}
-#: Cells of the map of actions along either dimension, and its size in pixels.
+#: Number of cells of the action map along each axis, and its size in pixels.
 _MAP_CELLS, _MAP_SIZE = 48, 336
 _STYLE = """
 .claims td, .claims th { text-align: left; }
@@ -101,17 +101,11 @@ def conditions_table(results: Results) -> Table:
     """Return the validation results of every arm, and whether its score has converged."""
     rows = [
         (
-            arm["arm"],
-            *(
-                f"{arm['progress']:.1%}",
-                f"{arm['least']:.1%}",
-                f"{arm['change']:+.3f}",
-                f"{arm['moved']:.3f}",
-            ),
-            "yes" if arm["met"] else "no",
+            arm["arm"], f"{arm['progress']:.1%}", f"{arm['least']:.1%}", f"{arm['change']:+.3f}",
+            f"{arm['moved']:.3f}", "yes" if arm["met"] else "no",
         )
         for arm in results["conditions"]
-    ]
+    ]  # fmt: skip
     return _table(
         "dense",
         ("arm", "progress ratio", "worst seed", "change of the score", "absolute change", "good enough"),
@@ -127,12 +121,12 @@ def detectable_table(results: Results) -> Table:
 
 def claims_table(results: Results, group: str) -> Table:
     """Return the verdicts on the claims of a group."""
-    rows = [_claim(claim) for claim in results["claims"] if claim["claim"]["group"] == group]
+    rows = [_claim_row(claim) for claim in results["claims"] if claim["claim"]["group"] == group]
     headings = ("claim", "metric", "difference", "relative", "adjusted p", "verdict", "what would decide")
     return _table("claims", headings, rows)
 
 
-def _claim(result: Mapping[str, Any]) -> tuple[str, ...]:
+def _claim_row(result: Mapping[str, Any]) -> tuple[str, ...]:
     claim, interval, change, p = (result[name] for name in ("claim", "interval", "change", "adjusted"))
     return (
         claim["words"],
@@ -198,27 +192,26 @@ def validations_table(results: Results, rule: str) -> Table:
         name: np.array([seed[key] for seed in results["validations"]])
         for name, key in ((rule, "rule"), ("score", "score"))
     }
-    numbers = range(curves["score"].shape[1])
+    validations = range(curves["score"].shape[1])
     rows = [
         (f"{name}, mean over seeds", *(f"{value:.3f}" for value in values.mean(axis=0)))
         for name, values in curves.items()
     ]
     rows += [
-        (f"seeds with their highest {name}", *(str((values.argmax(axis=1) == k).sum()) for k in numbers))
+        (f"seeds with their highest {name}", *(str((values.argmax(axis=1) == k).sum()) for k in validations))
         for name, values in curves.items()
     ]
-    return _table("dense", ("validation", *(str(k + 1) for k in numbers)), rows)
+    return _table("dense", ("validation", *(str(k + 1) for k in validations)), rows)
 
 
 def _conditions(definition: StudyDefinition, results: Results) -> str:
     baselines = escape(" and ".join(definition.baselines))
     smallest = ", ".join(f"{_label(name)} {value:.3f}" for name, value in results["detectable"].items())
     return conditions_table(results).html() + (
-        "<p>Progress is a share of the expert's, at the best checkpoint; scores change from the third to the last "
-        "quarter of the validations. The smallest difference in ordinary traffic that this study detects with a "
-        "probability of 80 %, at the strictest level of the first group of claims, if seeds vary as the baseline's: "
-        f"{escape(smallest)}. {baselines} had to be good enough before the others were "
-        "trained; the others are shown next to them.</p>"
+        "<p>Progress is relative to the expert's, at the best checkpoint. The change of the score is from the third to "
+        "the last quarter of the validations. Smallest differences in ordinary traffic that this study detects with a "
+        "power of 80 %, at the strictest level of the first group of claims, if all seeds vary like the baseline's: "
+        f"{escape(smallest)}. {baselines} had to be good enough before the other arms were trained.</p>"
     )
 
 
@@ -240,9 +233,10 @@ def _rates(definition: StudyDefinition, results: Results, stratum: Stratum) -> s
     table, share = rates_table(results, stratum), results["about"]["share"]
     if not table.rows:
         return ""
-    note = "" if stratum != "ordinary" or share is None else (
-        f"<p><small>Scenarios with an event count as in ordinary traffic, of which they are {share:.1%}.</small></p>"
-    )  # fmt: skip
+    note = ""
+    if stratum == "ordinary" and share is not None:
+        text = f"Scenarios with an event are weighted by their share of ordinary traffic, {share:.1%}."
+        note = f"<p><small>{text}</small></p>"
     return f"<h3>{_STRATA[stratum]}</h3>{table.html()}{note}"
 
 
@@ -256,11 +250,11 @@ def _rankings(results: Results) -> str:
 
 def _rule_cost(results: Results, rule: str) -> str:
     seeds = results["validations"]
-    agreeing = sum(int(np.argmax(seed["rule"]) == np.argmax(seed["score"])) for seed in seeds)
+    agreements = sum(int(np.argmax(seed["rule"]) == np.argmax(seed["score"])) for seed in seeds)
     return (
-        f"{rule_cost_table(results, rule).html()}<p><small>The baseline's checkpoints with the highest {escape(rule)} "
-        "on held-out steps against those with the best validation score, on the test set: the same runs, seed by seed. "
-        f"Both rules choose the same checkpoint for {agreeing} of the {len(seeds)} seeds.</small></p>"
+        f"{rule_cost_table(results, rule).html()}<p><small>Test results of the baseline's checkpoints with the highest "
+        f"{escape(rule)} on held-out steps, minus those of the checkpoints with the best validation score, paired by "
+        f"seed. Both rules choose the same checkpoint for {agreements} of the {len(seeds)} seeds.</small></p>"
         f"{validations_table(results, rule).html()}"
     )
 
@@ -273,12 +267,12 @@ def _scores(tables: Mapping[str, ScoreTable]) -> str:
     top_rows = [
         (name, *(table.scenario_ids[row] for row in table.order[:3]))
         for name, table in tables.items()
-        if name != "oracle"  # labels do not rank what they mark
+        if name != "oracle"  # labels do not rank scenarios
     ]
     return (
         f"<div class=charts>{charts}</div>"
         + _table("dense", ("method", "most critical", "second", "third"), top_rows).html()
-        + "<p>These drives can be watched in <a href=critical.html>critical.html</a>.</p>"
+        + "<p>Play these scenarios in <a href=critical.html>critical.html</a>.</p>"
     )
 
 

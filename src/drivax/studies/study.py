@@ -1,7 +1,7 @@
 """The study runner: score, train, evaluate, test the claims, write the report.
 
-Arms differ in how logged steps are drawn. Each is trained with several seeds under one budget and evaluated on one test
-set; claims compare arms scenario by scenario. An interrupted study resumes without repeating finished work.
+Arms differ in how they draw logged steps. Each arm is trained with several seeds and the same budget, and evaluated on
+one test set. Claims compare arms scenario by scenario. An interrupted study resumes without repeating finished work.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,9 +44,9 @@ from drivax.studies.verdicts import (
     Condition,
     Episodes,
     Strata,
+    compare_rankings,
     decide_claims,
-    detectable,
-    rankings,
+    detectable_differences,
     rates,
     rule_cost,
 )
@@ -62,23 +63,22 @@ Log = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Job:
-    """One training of a study, and the logged steps that it draws from."""
+    """A training run of a study, with a mask of the logged steps to draw from."""
 
     study: Study
     arm: str
     seed: int
     usable: Bool[np.ndarray, "N T"]
 
-    def weighted(self) -> WeightedSet:
+    def training_set(self) -> WeightedSet:
         """Return the training set with the arm's weights."""
         data = ScenarioSet.open(self.study.sets.train)
 
         def table(method: str) -> ScoreTable:
             return read_scores(self.study.scores(method), data)
 
-        return self.study.arms[self.arm].weighted(
-            data, table, self.study.config.weights, self.usable, self.seed
-        )
+        arm, config = self.study.arms[self.arm], self.study.config
+        return arm.weigh(data, table, config.weights, self.usable, self.seed)
 
 
 def run_study(
@@ -96,7 +96,7 @@ def run_study(
         The contents of ``results.json``.
 
     Raises:
-        UsageError: The baselines do not drive well enough, the folder holds another study, or a run in it is of other
+        UsageError: The baselines do not drive well enough, or the folder holds another study or runs with other
             settings.
     """
     _open_folder(study)
@@ -112,9 +112,10 @@ def run_study(
     jobs = [Job(study, arm, seed, usable) for seed in range(config.seeds) for arm in config.arms]
     _train_and_evaluate([job for job in jobs if job.arm in definition.baselines], cores, log)
     baseline_conditions, strata = _conditions(study, definition.baselines), _strata(study, test)
-    in_first_group = [claim for claim in study.claims if claim.group == next(iter(definition.groups))]
+    first_group = next(iter(definition.groups))
+    claim_count = sum(claim.group == first_group for claim in study.claims)
     first, second = (_episodes(study, name) for name in definition.baselines[:2])
-    smallest = detectable(first, second, strata, definition.metrics, max(len(in_first_group), 1))
+    smallest = detectable_differences(first, second, strata, definition.metrics, max(claim_count, 1))
     for condition in baseline_conditions:
         log(str(condition))
     log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in smallest.items()))
@@ -142,23 +143,21 @@ def _write_pages(
     expert = score_steps(data, ExpertActions())
     actions = expert["action"][expert["known"]]
     write_report(study.definition, results, tables, actions, study.folder / "report.html")
-    tops = {
-        row: tables[name]
-        for name in _PLAYER_METHODS
-        if name in tables
-        for row in top_rows(tables[name], _PLAYER_TOP)
-    }
+    table_of_row: dict[int, ScoreTable] = {}
+    for name in _PLAYER_METHODS:
+        if name in tables:
+            table_of_row |= dict.fromkeys(top_rows(tables[name], _PLAYER_TOP), tables[name])
     write_player(
-        [data[row] for row in tops],
+        [data[row] for row in table_of_row],
         study.folder / "critical.html",
         overwrite=True,
-        title="most critical drives",
-        details=[criticality_html(table, row) for row, table in tops.items()],
+        title="most critical scenarios",
+        details=[criticality_html(table, row) for row, table in table_of_row.items()],
     )
 
 
 def _open_folder(study: Study) -> None:
-    """Create the folder of a study, or check that it holds this one."""
+    """Create the folder of a study, or check that it holds this study."""
     sets = study.sets
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
     check_lengths(*data)
@@ -175,9 +174,9 @@ def _open_folder(study: Study) -> None:
         return
     folder = RunFolder.open(study.folder)
     sources = [entry["hash"] for entry in folder.info.get("data", [])]
-    if folder.config(StudyConfig) != study.config or sources != [part.hash for part in data]:
+    if folder.config(StudyConfig) != study.config or sources != [scenarios.hash for scenarios in data]:
         raise UsageError(
-            "contains a study with other settings, or of other scenarios",
+            "contains a study with other settings or scenarios",
             file=study.folder,
             cure="choose another name",
         )
@@ -189,7 +188,7 @@ def _open_folder(study: Study) -> None:
 
 
 def _score(study: Study, log: Log) -> dict[str, ScoreTable]:
-    """Return the scores of the training set by every method of the arms, read if they exist."""
+    """Return the score tables of the training set by method; compute those without a file."""
     data, tables = ScenarioSet.open(study.sets.train), {}
     for method in dict.fromkeys(arm.method for arm in study.arms.values()):
         file = study.scores(method)
@@ -203,38 +202,38 @@ def _score(study: Study, log: Log) -> dict[str, ScoreTable]:
 
 
 def _test_set(study: Study) -> ScenarioSet:
-    """Return the test scenarios as one set; if events are labelled, half of them have one."""
+    """Return the test scenarios as one set, half of them with an event if events are labelled."""
     if not study.test.is_dir():
-        parts = [ScenarioSet.open(path) for path in study.sets.test]
-        rows = [(part, row) for part in parts for row in range(len(part))]
-        with_event = np.concatenate([event_kinds(part) for part in parts]) > 0
-        if with_event.any() and not with_event.all():
-            count = min(with_event.sum(), (~with_event).sum())
-            selected = [np.flatnonzero(stratum)[:count] for stratum in (with_event, ~with_event)]
-            rows = [rows[index] for index in np.sort(np.concatenate(selected))]
-        source = {"command": "study", "sets": [part.hash for part in parts]}
-        with ScenarioWriter(study.test, parts[0].capacity, source) as writer:
-            for part, row in rows:
-                writer.add(part[row])
+        test_sets = [ScenarioSet.open(path) for path in study.sets.test]
+        rows = [(scenarios, row) for scenarios in test_sets for row in range(len(scenarios))]
+        has_event = np.concatenate([event_kinds(scenarios) for scenarios in test_sets]) > 0
+        if has_event.any() and not has_event.all():
+            count = min(has_event.sum(), (~has_event).sum())
+            indices = [np.flatnonzero(stratum)[:count] for stratum in (has_event, ~has_event)]
+            rows = [rows[index] for index in np.sort(np.concatenate(indices))]
+        source = {"command": "study", "sets": [scenarios.hash for scenarios in test_sets]}
+        with ScenarioWriter(study.test, test_sets[0].capacity, source) as writer:
+            for scenarios, row in rows:
+                writer.add(scenarios[row])
     return ScenarioSet.open(study.test)
 
 
 def _strata(study: Study, test: ScenarioSet) -> Strata:
-    """Return the rare test scenarios (labelled, else most critical), and their share in ordinary traffic."""
+    """Return the rare test scenarios (labelled, else the most critical), and their share of ordinary traffic."""
     recordings = recordings_of(test.entries)
     rare = event_kinds(test) > 0
-    labelled = bool(rare.any())
-    if not labelled:
+    has_labels = bool(rare.any())
+    if not has_labels:
         scores = curate("kinematic", Request(test)).scenarios
         rare = scores >= np.quantile(scores, 1.0 - study.config.rare)
     ordinary = event_kinds(ScenarioSet.open(study.sets.test[0])) > 0
-    if labelled and not ordinary.any():
+    if has_labels and not ordinary.any():
         raise UsageError(
-            "has no labelled event, so that their share of ordinary traffic is unknown",
+            "has no labelled event: the share of events in ordinary traffic is unknown",
             file=study.sets.test[0],
-            cure="name a test set with events as frequent as on the road first",
+            cure="put a test set with the frequency of ordinary traffic first",
         )
-    return Strata(recordings, rare, float(ordinary.mean()) if labelled else None)
+    return Strata(recordings, rare, float(ordinary.mean()) if has_labels else None)
 
 
 def _train_and_evaluate(jobs: Sequence[Job], cores: int | None, log: Log) -> None:
@@ -250,20 +249,20 @@ def _is_finished(job: Job) -> bool:
     """Return whether an arm is trained and evaluated.
 
     Raises:
-        UsageError: Its run has other settings, or its evaluation is of a former run.
+        UsageError: The run has other settings, or an evaluation is older than the run.
     """
     run = job.study.run(job.arm, job.seed)
     if not (run / "config.yaml").is_file():
         return False
     folder = RunFolder.open(run)
     evaluations = [job.study.evaluation(name, job.seed) for name in job.study.evaluations(job.arm)]
-    expected = hashes(ScenarioSet.open(job.study.sets.validation), job.weighted().weights)
+    job_hashes = hashes(ScenarioSet.open(job.study.sets.validation), job.training_set().weights)
     if folder.config(TrainConfig) != job.study.train_config(job.arm, job.seed) or any(
-        folder.info.get(name) != value for name, value in expected.items()
+        folder.info.get(name) != value for name, value in job_hashes.items()
     ):
         raise UsageError(
             "was trained with other settings or weights than those of this study", file=run,
-            cure=f"remove it and {' and '.join(map(str, evaluations))}; all are made again",
+            cure=f"remove it and {' and '.join(map(str, evaluations))}, and run the study again",
         )  # fmt: skip
     return is_evaluated(job.study, job.arm, job.seed)
 
@@ -272,30 +271,33 @@ def is_evaluated(study: Study, arm: str, seed: int) -> bool:
     """Return whether an arm has all its evaluations.
 
     Raises:
-        UsageError: One of them is older than the run.
+        UsageError: An evaluation is older than the run.
     """
-    evaluations = [study.evaluation(name, seed) for name in study.evaluations(arm)]
-    for folder in filter(lambda folder: folder.is_dir(), evaluations):
-        evaluated, trained = (
-            datetime.fromisoformat(RunFolder.open(path).info["started"])
-            for path in (folder, study.run(arm, seed))
-        )
-        if evaluated < trained:
+    folders = [study.evaluation(name, seed) for name in study.evaluations(arm)]
+    existing = [folder for folder in folders if folder.is_dir()]
+    for folder in existing:
+        if _start_time(folder) < _start_time(study.run(arm, seed)):
             raise UsageError(
-                "is older than the run that it evaluates", file=folder, cure="remove it; it is made again"
+                "is older than the run that it evaluates",
+                file=folder,
+                cure="remove it, and run the study again",
             )
-    return all(folder.is_dir() for folder in evaluations)
+    return len(existing) == len(folders)
+
+
+def _start_time(run: Path) -> datetime:
+    return datetime.fromisoformat(RunFolder.open(run).info["started"])
 
 
 def _run_job(job: Job) -> float:
     """Train and evaluate an arm; return the elapsed seconds."""
-    started, study = time.perf_counter(), job.study
+    start, study = time.perf_counter(), job.study
     config, run = study.train_config(job.arm, job.seed), study.run(job.arm, job.seed)
     steps = Checkpoints(run / "checkpoints").steps()
     if config.iterations * config.algorithm.steps_per_iteration not in steps:
         _check_not_evaluated(job, steps)
         validation = ScenarioSet.open(study.sets.validation)
-        train(config, job.weighted(), run, validation=validation, resume=bool(steps), overwrite=not steps)
+        train(config, job.training_set(), run, validation=validation, resume=bool(steps), overwrite=not steps)
     test = ScenarioSet.open(study.test)
     bank = ScenarioBank.from_scenarios([test[0]])
     for name in study.evaluations(job.arm):
@@ -305,19 +307,23 @@ def _run_job(job: Job) -> float:
             planner, task = load_policy(run, bank, step=step)
             planner_name = str(run) if step is None else f"{run}@{step}"
             run_evaluation(EvaluationConfig(planner_name, task=task), planner, test, folder)
-    return time.perf_counter() - started
+    return time.perf_counter() - start
 
 
 def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:
-    """Raise UsageError if an evaluated run has lost its checkpoints: training again would mix two training runs."""
-    names = job.study.evaluations(job.arm)
-    evaluated = [folder for name in names if (folder := job.study.evaluation(name, job.seed)).is_dir()]
-    if not steps and evaluated:
+    """Check that a run with evaluations has checkpoints: training again would mix two training runs.
+
+    Raises:
+        UsageError: The run has evaluations, but no checkpoints.
+    """
+    folders = [job.study.evaluation(name, job.seed) for name in job.study.evaluations(job.arm)]
+    evaluations = [folder for folder in folders if folder.is_dir()]
+    if not steps and evaluations:
         run = job.study.run(job.arm, job.seed)
         raise UsageError(
-            "has no checkpoints, but evaluations",
+            "has evaluations, but no checkpoints",
             file=run,
-            cure=f"remove {' and '.join(map(str, evaluated))}",
+            cure=f"remove {' and '.join(map(str, evaluations))}",
         )
 
 
@@ -357,9 +363,9 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
 
 
 def _validation_score(row: Mapping[str, float]) -> float:
-    ranked = rank("score", row)
-    assert ranked is not None
-    return ranked[0]
+    ranking = rank("score", row)
+    assert ranking is not None
+    return ranking[0]
 
 
 def _episodes(study: Study, name: str) -> Episodes:
@@ -379,6 +385,10 @@ def _results(
         episodes[name] = {metric: table.metrics[metric][None] for metric in metrics}
     episodes |= {arm: _episodes(study, arm) for arm in study.arms}
     baseline = definition.baselines[0]
+    weights = {
+        name: arm.weigh(data, tables.__getitem__, study.config.weights, usable).weights
+        for name, arm in study.arms.items()
+    }
     return {
         "about": {
             "seeds": study.config.seeds,
@@ -390,15 +400,8 @@ def _results(
         },
         "claims": [result.plain() for result in decide_claims(study.claims, episodes, strata)],
         "rates": {name: rates(values, strata, metrics) for name, values in episodes.items()},
-        "draws": {
-            name: asdict(
-                draw_statistics(
-                    arm.weighted(data, tables.__getitem__, study.config.weights, usable).weights, usable
-                )
-            )
-            for name, arm in study.arms.items()
-        },
-        "rankings": rankings(tables, recordings_of(data.entries)),
-        "rule_cost": rule_cost(_episodes(study, study.rival), episodes[baseline], strata, metrics),
+        "draws": {name: asdict(draw_statistics(weights[name], usable)) for name in study.arms},
+        "rankings": compare_rankings(tables, recordings_of(data.entries)),
+        "rule_cost": rule_cost(_episodes(study, study.rule_evaluation), episodes[baseline], strata, metrics),
         "validations": _validations(study, baseline),
     }

@@ -22,8 +22,9 @@ from drivax.studies.definition import Claim, Stratum
 
 #: Rankings are unrelated if their correlation's interval is within ±UNRELATED, related if it is beyond ±RELATED.
 UNRELATED, RELATED = 0.1, 0.3
-#: Share of the scenarios that are compared as the most critical ones of two methods.
+#: Share of the scenarios that count as a method's most critical.
 _TOP = 0.05
+#: Significance level.
 _LEVEL = 0.05
 #: Metrics that lie between 0 and 1.
 _SHARES = (*SHARES, "progress_ratio")
@@ -40,45 +41,45 @@ class Strata:
     """Recordings and rarity of the test scenarios.
 
     Attributes:
-        recordings: Recording of every scenario: scenarios of one recording are dependent.
-        rare: Whether a scenario is rare.
-        share: Share of rare scenarios in ordinary traffic; None: as in the test set.
+        recordings: Recording of every scenario; scenarios of one recording are dependent.
+        rare: Mask of the rare scenarios.
+        share: Share of rare scenarios in ordinary traffic; None if it is that of the test set.
     """
 
     recordings: Sequence[str]
     rare: Bool[np.ndarray, " scenario"]
     share: float | None = None
 
-    def weights(self, rows: Stratum) -> Weights:
+    def weights(self, stratum: Stratum) -> Weights:
         """Return the weight of every scenario.
 
         Args:
-            rows: ``common`` or ``rare`` scenarios alone; or ``ordinary``: all, rare ones with their share of ordinary
-                traffic, of which the test set may hold more.
+            stratum: ``common`` or ``rare`` for these scenarios alone, ``ordinary`` for all: rare scenarios are weighted
+                by their share of ordinary traffic, since the test set may hold more.
         """
-        if rows != "ordinary":
-            return (self.rare if rows == "rare" else ~self.rare).astype(np.float64)
+        if stratum != "ordinary":
+            return (self.rare if stratum == "rare" else ~self.rare).astype(np.float64)
         if self.share is None or self.rare.all() or not self.rare.any():
             return np.ones(len(self.rare))
         return np.where(self.rare, self.share / self.rare.sum(), (1.0 - self.share) / (~self.rare).sum())
 
     def is_comparable(self, values: Values, weights: Weights) -> bool:
-        """Return whether at least two recordings have weight and all values."""
+        """Return whether at least two recordings have scenarios with a weight and without undefined values."""
         labels = np.asarray(self.recordings)
         return np.unique(labels[(weights > 0.0) & ~np.isnan(values).any(axis=0)]).size > 1
 
 
 @dataclass(frozen=True)
 class Condition:
-    """Result of an arm on the validation set, before arms are compared.
+    """Result of an arm on the validation set, which decides whether to compare arms.
 
     Attributes:
-        arm: Its name.
+        arm: Name of the arm.
         progress: Share of the expert's progress on the validation set at the best checkpoints, mean over seeds.
         least: Progress of the worst seed.
         change: Change of the validation score from the third to the last quarter of the validations, mean over seeds.
         moved: Absolute value of that change, mean over seeds.
-        met: Whether every seed makes enough progress, and scores no longer move.
+        met: Whether every seed makes enough progress, and scores have converged.
     """
 
     arm: str
@@ -90,7 +91,11 @@ class Condition:
 
     @classmethod
     def of(
-        cls, arm: str, curves: Sequence[Mapping[str, Sequence[float]]], least: float, flat: float
+        cls,
+        arm: str,
+        curves: Sequence[Mapping[str, Sequence[float]]],
+        min_progress: float,
+        max_change: float,
     ) -> Condition:
         """Return the condition of an arm from ``score`` and ``progress`` at the validations of every seed."""
         progress, changes = [], []
@@ -99,14 +104,14 @@ class Condition:
             quarter = max(len(scores) // 4, 1)
             progress.append(curve["progress"][int(scores.argmax())])
             changes.append(scores[-quarter:].mean() - scores[-2 * quarter : -quarter].mean())
-        moved = float(np.abs(changes).mean())
-        met = bool(min(progress) >= least and moved <= flat)
-        return cls(arm, float(np.mean(progress)), min(progress), float(np.mean(changes)), moved, met)
+        mean_change, absolute_change = float(np.mean(changes)), float(np.abs(changes).mean())
+        met = bool(min(progress) >= min_progress and absolute_change <= max_change)
+        return cls(arm, float(np.mean(progress)), min(progress), mean_change, absolute_change, met)
 
     def __str__(self) -> str:
         return (
-            f"{self.arm}: {self.progress:.0%} of the expert's progress (worst seed {self.least:.0%}), score moves by "
-            f"{self.change:+.3f} ({self.moved:.3f} either way): {'good enough' if self.met else 'NOT good enough'}"
+            f"{self.arm}: {self.progress:.0%} of the expert's progress (worst seed {self.least:.0%}), score changes by "
+            f"{self.change:+.3f} (absolute {self.moved:.3f}): {'good enough' if self.met else 'NOT good enough'}"
         )
 
 
@@ -116,20 +121,20 @@ class ClaimResult:
 
     Attributes:
         claim: The claim.
-        tested: The effect that is tested against 0: the difference, arm minus reference; for a claimed size the log
-            ratio minus the claimed one. None if the stratum is empty, or the ratio undefined.
-        difference: The difference.
+        effect: The effect to test against 0: the difference, or for a claimed size the log ratio minus its claimed
+            value. None if the stratum is empty, or the ratio undefined.
+        difference: Arm minus reference.
         change: Relative change and its interval; None if undefined.
-        adjusted: P-value adjusted within the group (Holm).
+        adjusted_p: P-value adjusted within the group (Holm).
         verdict: The verdict.
-        needed: If undecided, the number of seeds or recordings that would decide, if the true effect were the estimate.
+        needed: Number of seeds or recordings that would decide an undecided claim, if the estimated effect is true.
     """
 
     claim: Claim
-    tested: CrossedEffect | None
+    effect: CrossedEffect | None
     difference: CrossedEffect | None
     change: tuple[float, float, float] | None
-    adjusted: float | None
+    adjusted_p: float | None
     verdict: Verdict = "undecided"
     needed: str = ""
 
@@ -142,8 +147,8 @@ class ClaimResult:
             "needed": self.needed,
             "difference": None if difference is None else difference.difference,
             "interval": None if difference is None else list(difference.interval()),
-            "p": None if self.tested is None else self.tested.p,
-            "adjusted": self.adjusted,
+            "p": None if self.effect is None else self.effect.p,
+            "adjusted": self.adjusted_p,
             "change": None if self.change is None else list(self.change),
         }
 
@@ -162,49 +167,52 @@ def decide_claims(
     groups = [claim.group for claim in claims]
     for group in set(groups):
         members = [index for index, name in enumerate(groups) if name == group]
-        tested = [results[index].tested for index in members]
-        adjusted = holm_adjust([None if effect is None else effect.p for effect in tested])
-        for index, p in zip(members, adjusted, strict=True):
-            results[index] = _decide(replace(results[index], adjusted=p), len(members))
+        effects = [results[index].effect for index in members]
+        adjusted_ps = holm_adjust([None if effect is None else effect.p for effect in effects])
+        for index, p in zip(members, adjusted_ps, strict=True):
+            results[index] = _decide(replace(results[index], adjusted_p=p), len(members))
     return results
 
 
 def _effects(claim: Claim, episodes: Mapping[str, Episodes], strata: Strata) -> ClaimResult:
+    """Return the effects of a claim, without a verdict."""
     weights = strata.weights(claim.rows)
     arm, reference = (episodes[name][claim.metric] for name in (claim.arm, claim.reference))
     if not strata.is_comparable(np.concatenate([arm, reference]), weights):
         return ClaimResult(claim, None, None, None, None)
-    difference = tested = crossed_difference(arm, reference, strata.recordings, weights)
+    difference = crossed_difference(arm, reference, strata.recordings, weights)
     ratio = log_ratio(arm, reference, strata.recordings, weights)
-    if claim.change is not None:
-        tested = ratio and replace(ratio, difference=ratio.difference - math.log1p(claim.change))
     if ratio is None:
-        return ClaimResult(claim, tested, difference, None, None)
+        return ClaimResult(claim, difference if claim.change is None else None, difference, None, None)
+    effect = difference
+    if claim.change is not None:
+        effect = replace(ratio, difference=ratio.difference - math.log1p(claim.change))
     low, high = map(math.expm1, ratio.interval())
-    return ClaimResult(claim, tested, difference, (math.expm1(ratio.difference), low, high), None)
+    return ClaimResult(claim, effect, difference, (math.expm1(ratio.difference), low, high), None)
 
 
 def _decide(result: ClaimResult, claims: int) -> ClaimResult:
-    if result.tested is None or result.adjusted is None:
+    """Return the result with its verdict; ``claims`` are adjusted together."""
+    if result.effect is None or result.adjusted_p is None:
         reason = "fewer than two recordings define it"
         if result.difference is not None:
             reason = "the mean of an arm is 0: no ratio"
         return replace(result, needed=reason)
-    if result.adjusted >= _LEVEL:
-        return replace(result, needed=needed(result.tested, claims))
+    if result.adjusted_p >= _LEVEL:
+        return replace(result, needed=describe_needed(result.effect, claims))
     lower_is_better = METRICS[result.claim.metric].better == "low"
-    better = (result.tested.difference < 0) == lower_is_better
+    better = (result.effect.difference < 0) == lower_is_better
     return replace(result, verdict="supported" if better else "contradicted")
 
 
-def needed(effect: CrossedEffect, claims: int) -> str:
+def describe_needed(effect: CrossedEffect, claims: int) -> str:
     """Describe the number of seeds or recordings that would decide.
 
     Args:
-        effect: The effect that is tested.
-        claims: Number of claims that are adjusted together; the strictest of their levels counts.
+        effect: The effect to test.
+        claims: Number of claims adjusted together; the strictest of their levels applies.
     """
-    confidence = level(claims)
+    confidence = confidence_level(claims)
     seeds = effect.seeds_needed(confidence=confidence)
     recordings = effect.clusters_needed(confidence=confidence)
     numbers = [f"{seeds:,} seeds each"] if seeds is not None else []
@@ -214,25 +222,25 @@ def needed(effect: CrossedEffect, claims: int) -> str:
     return "neither seeds nor recordings alone would decide"
 
 
-def level(claims: int) -> float:
-    """Return the confidence at which the first of some claims is tested (Holm)."""
+def confidence_level(claims: int) -> float:
+    """Return the confidence of Holm's first and strictest test among a number of claims."""
     return 1.0 - _LEVEL / claims
 
 
-def detectable(
+def detectable_differences(
     first: Episodes, second: Episodes, strata: Strata, metrics: Sequence[str], claims: int
 ) -> dict[str, float]:
-    """Return the smallest differences in ordinary traffic that the study detects with a probability of 80 %.
+    """Estimate the smallest differences in ordinary traffic that the study detects with a power of 80 %.
 
-    An estimate before the other arms are trained: assumes that seeds of all arms vary like those of the first baseline,
-    and that arms differ by scenario like the two baselines.
+    Assumes that the seeds of every arm vary like those of the first baseline, and that arms differ by scenario like the
+    two baselines.
 
     Args:
         first: Values of the first baseline.
         second: Values of the second baseline.
         strata: The test scenarios.
-        metrics: Names of metrics; those undefined in the test are left out.
-        claims: Number of claims that are adjusted together.
+        metrics: Names of metrics; skips metrics that are undefined in the test.
+        claims: Number of claims adjusted together.
     """
     weights, smallest = strata.weights("ordinary"), {}
     for name in metrics:
@@ -240,25 +248,23 @@ def detectable(
             effect = crossed_difference(first[name], second[name], strata.recordings, weights)
             (seeds, _), (interaction, _) = effect.seeds, effect.interaction
             equal_arms = replace(effect, seeds=(seeds, seeds), interaction=(interaction, interaction))
-            smallest[name] = equal_arms.detectable(confidence=level(claims))
+            smallest[name] = equal_arms.detectable(confidence=confidence_level(claims))
     return smallest
 
 
 def rates(
     episodes: Episodes, strata: Strata, metrics: Sequence[str]
 ) -> dict[Stratum, dict[str, dict[str, float | int | None]]]:
-    """Return the mean over seeds and scenarios of an arm with its interval, by stratum and metric.
+    """Return an arm's mean over seeds and scenarios with its interval, by stratum and metric.
 
-    Metrics that fewer than two recordings define are left out.
+    Skips metrics that fewer than two recordings define.
     """
     means: dict[Stratum, dict[str, dict[str, float | int | None]]] = {}
     for stratum in ("ordinary", "common", "rare"):
         weights = strata.weights(stratum)
-        known = {name: episodes[name] for name in metrics if strata.is_comparable(episodes[name], weights)}
-        if known:
-            means[stratum] = {
-                name: _rate(values, strata, weights, name in _SHARES) for name, values in known.items()
-            }
+        names = [name for name in metrics if strata.is_comparable(episodes[name], weights)]
+        if names:
+            means[stratum] = {name: _rate(episodes[name], strata, weights, name in _SHARES) for name in names}
     return means
 
 
@@ -270,10 +276,10 @@ def _rate(values: Values, strata: Strata, weights: Weights, share: bool) -> dict
 def rule_cost(
     rule: Episodes, best: Episodes, strata: Strata, metrics: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
-    """Return the cost of another checkpoint rule in ordinary traffic: paired differences, by metric.
+    """Return the cost of another checkpoint rule in ordinary traffic: paired differences by metric.
 
     Args:
-        rule: Values of every seed with the checkpoint of the rule.
+        rule: Values of every seed with the rule's checkpoint.
         best: Values of the same seeds with the best checkpoint.
         strata: The test scenarios.
         metrics: Names of metrics.
@@ -287,12 +293,12 @@ def rule_cost(
     return costs
 
 
-def rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]) -> list[dict[str, Any]]:
-    """Compare the rankings of scenarios by methods: rank correlation, overlap of the top 5 %, and a verdict.
+def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]) -> list[dict[str, Any]]:
+    """Compare the methods' rankings of scenarios: rank correlation, overlap of the top 5 %, and a verdict.
 
     Args:
         tables: Score tables of one set by method.
-        recordings: Recording of every scenario, which are resampled for the interval.
+        recordings: Recording of every scenario; the interval resamples recordings.
     """
     pairs = []
     for first, second in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):

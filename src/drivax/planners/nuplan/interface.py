@@ -1,7 +1,7 @@
-"""What planners with nuPlan's interface are given: ego, tracked objects, history and lights.
+"""Inputs of planners with nuPlan's interface: ego, tracked objects, history and lights.
 
-Names and meanings are those of nuplan-devkit 1.2 (Apache-2.0). Its enumerations compare equal to these, and objects
-pass ``isinstance`` for its classes once it is imported. SI units; positions in the source's frame.
+Names and meanings are those of nuplan-devkit 1.2 (Apache-2.0). The devkit's enumerations compare equal to these, and
+objects pass ``isinstance`` for the devkit's classes once it is imported. SI units; positions in the source's frame.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any
 
 from drivax.planners.nuplan.poses import (
     DevkitObject,
+    HalfExtents,
     OrientedBox,
     Point2D,
-    Sized,
     StateSE2,
     StateVector2D,
     TimePoint,
@@ -29,7 +29,7 @@ _GRAVITY = 1.67 / 5.176
 
 
 class TrackedObjectType(enum.Enum):
-    """Class of a tracked object; equal to the devkit's member of this name."""
+    """Class of a tracked object; compares equal to the devkit's member of the same name."""
 
     VEHICLE = 0
     PEDESTRIAN = 1
@@ -56,7 +56,7 @@ class TrackedObjectType(enum.Enum):
 
 
 AGENT_TYPES = (TrackedObjectType.VEHICLE, TrackedObjectType.PEDESTRIAN, TrackedObjectType.BICYCLE)
-#: Sources do not tell cones, barriers and signs apart.
+#: Sources do not distinguish cones, barriers and signs.
 TYPE_OF_KIND = {
     AgentKind.VEHICLE: TrackedObjectType.VEHICLE,
     AgentKind.PEDESTRIAN: TrackedObjectType.PEDESTRIAN,
@@ -86,7 +86,7 @@ STATUS_OF_LIGHT = {
 
 
 @dataclass(frozen=True)
-class VehicleParameters(Sized):
+class VehicleParameters(HalfExtents):
     """Ego's dimensions, in nuPlan's proportions (5.176 m long, 1.461 m from rear axle to centre, wheelbase 3.089 m)."""
 
     length: float
@@ -163,7 +163,7 @@ class DynamicCarState(DevkitObject):
 
     @property
     def acceleration(self) -> float:
-        """Size of the acceleration of the rear axle."""
+        """Magnitude of the acceleration of the rear axle."""
         return self.rear_axle_acceleration_2d.magnitude()
 
     @property
@@ -175,14 +175,14 @@ class DynamicCarState(DevkitObject):
     @property
     def center_acceleration_2d(self) -> StateVector2D:
         """Acceleration of the box centre."""
-        # As the devkit's get_acceleration_shifted, which is not a rigid body's (x - d w^2, y + d alpha).
+        # As in the devkit's get_acceleration_shifted; a rigid body's would be (x - d w^2, y + d alpha).
         shift = self.rear_axle_to_center_dist * (self.angular_velocity**2 + self.angular_acceleration)
         return StateVector2D(self.rear_axle_acceleration_2d.x + shift, self.rear_axle_acceleration_2d.y)
 
 
 @dataclass(frozen=True)
 class SplitState(DevkitObject):
-    """Numbers of a state by the way they are interpolated."""
+    """Components of a state by kind of interpolation."""
 
     linear_states: list[float]
     angular_states: list[float]
@@ -243,7 +243,7 @@ class EgoState(DevkitObject):
 
     @property
     def agent(self) -> TrackedObject:
-        """Ego as a tracked object; its velocity is along and across its heading, as the devkit's."""
+        """Ego as a tracked object, with its velocity along and across its heading, as in the devkit."""
         velocity = self.dynamic_car_state.center_velocity_2d
         return TrackedObject(TrackedObjectType.EGO, self.car_footprint, velocity, "ego", -1, self.time_us)
 
@@ -258,7 +258,7 @@ class EgoState(DevkitObject):
         return iter([*split.linear_states[:3], *split.angular_states, *split.linear_states[3:]])
 
     def to_split_state(self) -> SplitState:
-        """Return the state as the devkit interpolates it."""
+        """Return the components that the devkit interpolates."""
         axle, car = self.rear_axle, self.dynamic_car_state
         vectors = *car.rear_axle_velocity_2d, *car.rear_axle_acceleration_2d
         linear = [self.time_us, axle.x, axle.y, *vectors, self.tire_steering_angle]
@@ -266,7 +266,7 @@ class EgoState(DevkitObject):
 
     @staticmethod
     def from_split_state(split: Any) -> EgoState:
-        """Return the state of interpolated numbers; it does not turn, as in the devkit."""
+        """Return the state with these components and without a yaw rate, as in the devkit."""
         time_us, x, y, vx, vy, ax, ay, steering = split.linear_states
         vehicle = split.fixed_states[0]
         ahead = vehicle.rear_axle_to_center
@@ -278,7 +278,7 @@ class EgoState(DevkitObject):
 
 @dataclass(frozen=True)
 class TrackedObject(DevkitObject):
-    """Another road user or thing; its velocity is in the source's frame. Also stands for its own ``metadata``."""
+    """Another road user or object, with its velocity in the source's frame; also its own ``metadata``."""
 
     tracked_object_type: TrackedObjectType
     box: OrientedBox
@@ -329,7 +329,7 @@ class TrackedObjects(DevkitObject):
         return [item for item in self if item.tracked_object_type == tracked_object_type]
 
     def get_tracked_objects_of_types(self, tracked_object_types: Iterable[Any]) -> list[TrackedObject]:
-        """Return the objects of some types, type after type."""
+        """Return the objects of several types, grouped by type."""
         return [item for kind in tracked_object_types for item in self.get_tracked_objects_of_type(kind)]
 
     def get_agents(self) -> list[TrackedObject]:
@@ -337,7 +337,7 @@ class TrackedObjects(DevkitObject):
         return self.get_tracked_objects_of_types(AGENT_TYPES)
 
     def get_static_objects(self) -> list[TrackedObject]:
-        """Return everything else."""
+        """Return all other objects."""
         return [item for item in self if item.tracked_object_type not in AGENT_TYPES]
 
 
@@ -381,7 +381,7 @@ class SimulationIteration(DevkitObject):
 
 @dataclass(frozen=True)
 class SimulationHistoryBuffer(DevkitObject):
-    """States and observations of the last seconds, the present ones last."""
+    """Recent states and observations, oldest first."""
 
     ego_states: Sequence[EgoState]
     observations: Sequence[DetectionsTracks]
@@ -418,7 +418,7 @@ class SimulationHistoryBuffer(DevkitObject):
 
 @dataclass(frozen=True)
 class PlannerInitialization(DevkitObject):
-    """What a planner knows of a scenario before it starts."""
+    """Route, goal and map, which a planner gets before it starts."""
 
     route_roadblock_ids: list[str]
     mission_goal: StateSE2
@@ -427,7 +427,7 @@ class PlannerInitialization(DevkitObject):
 
 @dataclass(frozen=True)
 class PlannerInput(DevkitObject):
-    """What a planner knows at a step."""
+    """Input of a planner at a step."""
 
     iteration: SimulationIteration
     history: SimulationHistoryBuffer

@@ -1,7 +1,7 @@
 """A map with nuPlan's interface, from the lanes of a stored scenario: lanes, lane connectors and roadblocks.
 
-Lanes are strips of their width around the centre line. The drivable area is that of all lanes, an intersection that
-of a roadblock connector. There are no surveyed polygons, crosswalks, stop lines or rasters.
+Lanes are strips of their width around the centre line. The drivable area is the area of all lanes, an intersection
+the area of a roadblock connector. There are no surveyed polygons, crosswalks, stop lines or rasters.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Points = Float[np.ndarray, "point 2"]
 
 
 class SemanticMapLayer(enum.IntEnum):
-    """Layers of the map; car parks are not known, so that layer is empty."""
+    """Layers of the map; the layer of car parks is empty, since sources have none."""
 
     LANE = 0
     INTERSECTION = 1
@@ -58,7 +58,7 @@ class Polyline(DevkitObject):
 
     @cached_property
     def linestring(self) -> Any:
-        """The line as shapely has it."""
+        """The line as a shapely geometry."""
         return import_extra("shapely").LineString(self.points)
 
     @cached_property
@@ -71,19 +71,19 @@ class Polyline(DevkitObject):
         return float(project(self.points, _xy(point))[0][0])
 
     def get_nearest_pose_from_position(self, point: Any) -> StateSE2:
-        """Return the pose nearest to a point; its heading is that of the segment."""
-        at = self.get_nearest_arc_length_from_position(point)
-        segment = min(int(np.searchsorted(self.arc, at, side="right")) - 1, len(self.arc) - 2)
-        along = self.points[segment + 1] - self.points[segment]
-        span = self.arc[segment + 1] - self.arc[segment]
-        x, y = self.points[segment] + along * (at - self.arc[segment]) / max(span, 1e-9)
-        return StateSE2(float(x), float(y), float(np.arctan2(along[1], along[0])))
+        """Return the pose nearest to a point, with the heading of its segment."""
+        arc_m = self.get_nearest_arc_length_from_position(point)
+        segment = min(int(np.searchsorted(self.arc, arc_m, side="right")) - 1, len(self.arc) - 2)
+        direction = self.points[segment + 1] - self.points[segment]
+        length = self.arc[segment + 1] - self.arc[segment]
+        x, y = self.points[segment] + direction * (arc_m - self.arc[segment]) / max(length, 1e-9)
+        return StateSE2(float(x), float(y), float(np.arctan2(direction[1], direction[0])))
 
     def get_curvature_at_arc_length(self, arc_length: float) -> float:
         """Return the curvature at an arc length, left positive, 1/m."""
-        turn, span = wrap(np.diff(self.heading)), np.diff(self.arc)
-        segment = np.clip(np.searchsorted(self.arc, arc_length, side="right") - 1, 0, len(span) - 1)
-        return float(turn[segment] / max(span[segment], 1e-9))
+        turn, length = wrap(np.diff(self.heading)), np.diff(self.arc)
+        segment = np.clip(np.searchsorted(self.arc, arc_length, side="right") - 1, 0, len(length) - 1)
+        return float(turn[segment] / max(length[segment], 1e-9))
 
     def get_nearest_curvature_from_position(self, point: Any) -> float:
         """Return the curvature nearest to a point, 1/m."""
@@ -96,7 +96,7 @@ class _Edge(DevkitObject):
     _interface = ""
 
     def devkit_names(self) -> tuple[str, ...]:
-        """Return the devkit's class, or its interface where only that is imported."""
+        """Return the devkit's class, and its interface for when only that is imported."""
         return type(self).__name__, self._interface
 
     def __init__(self, map_api: MapApi, name: str, connector: bool) -> None:
@@ -104,7 +104,7 @@ class _Edge(DevkitObject):
 
     @property
     def stop_lines(self) -> list[Any]:
-        """Nothing: stop lines are not known."""
+        """Empty list, since sources have no stop lines."""
         return []
 
 
@@ -139,19 +139,19 @@ class NuPlanLane(_Edge):
 
     @property
     def incoming_edges(self) -> list[NuPlanLane]:
-        """Lanes that lead into this one."""
-        return self._map.linked(self._map.scenario.lane_predecessor[self.row])
+        """Lanes that lead into this lane."""
+        return self._map.lanes_of(self._map.scenario.lane_predecessor[self.row])
 
     @property
     def outgoing_edges(self) -> list[NuPlanLane]:
-        """Lanes that this one leads into."""
-        return self._map.linked(self._map.scenario.lane_successor[self.row])
+        """Lanes that this lane leads into."""
+        return self._map.lanes_of(self._map.scenario.lane_successor[self.row])
 
     @property
     def adjacent_edges(self) -> tuple[NuPlanLane | None, NuPlanLane | None]:
         """The neighbours of the same direction, on the left and on the right."""
         left, right = self._map.scenario.lane_left[self.row], self._map.scenario.lane_right[self.row]
-        return next(iter(self._map.linked([left])), None), next(iter(self._map.linked([right])), None)
+        return self._map.lanes.get(int(left)), self._map.lanes.get(int(right))
 
     @property
     def parallel_edges(self) -> list[NuPlanLane]:
@@ -165,18 +165,18 @@ class NuPlanLane(_Edge):
 
     @property
     def index(self) -> int:
-        """Number of lanes of the roadblock to the left."""
-        seen, lane = {self.row}, self
-        while (lane := lane.adjacent_edges[0]) is not None and lane.row not in seen:
-            seen.add(lane.row)
-        return len(seen) - 1
+        """Number of lanes to the left in the roadblock."""
+        visited, lane = {self.row}, self
+        while (lane := lane.adjacent_edges[0]) is not None and lane.row not in visited:
+            visited.add(lane.row)
+        return len(visited) - 1
 
     def is_left_of(self, other: NuPlanLane) -> bool:
-        """Return whether the lane is to the left of another one of its roadblock."""
+        """Return whether the lane is to the left of another lane of its roadblock."""
         return self.is_same_roadblock(other) and self.index < other.index
 
     def is_right_of(self, other: NuPlanLane) -> bool:
-        """Return whether the lane is to the right of another one of its roadblock."""
+        """Return whether the lane is to the right of another lane of its roadblock."""
         return other.is_left_of(self)
 
     def get_roadblock_id(self) -> str:
@@ -193,7 +193,7 @@ class NuPlanLane(_Edge):
 
     @cached_property
     def polygon(self) -> Any:
-        """The strip around the centre line as shapely has it."""
+        """The strip around the centre line as a shapely geometry."""
         return self.baseline_path.linestring.buffer(self.half_width_m, cap_style="flat")
 
     def contains_point(self, point: Any) -> bool:
@@ -202,16 +202,16 @@ class NuPlanLane(_Edge):
 
     def distance_m(self, point: Any) -> float:
         """Return the distance of a point from the lane; 0 or less inside."""
-        line = self.baseline_path
-        at, apart = (float(value[0]) for value in project(line.points, _xy(point)))
-        end = 0 if at <= 0.0 else -1 if at >= line.length else None
-        if end is not None:
-            away, heading = _xy(point)[0] - line.points[end], line.heading[end]
-            beyond = (away[0] * np.cos(heading) + away[1] * np.sin(heading)) * (1 if end else -1)
-            if beyond > 0.0:
-                side = abs(away[1] * np.cos(heading) - away[0] * np.sin(heading)) - self.half_width_m
-                return float(np.hypot(beyond, max(side, 0.0)))
-        return apart - self.half_width_m
+        line, xy = self.baseline_path, _xy(point)
+        arc_m, distance_m = (float(value[0]) for value in project(line.points, xy))
+        if not 0.0 < arc_m < line.length:
+            end, outward = (0, -1) if arc_m <= 0.0 else (-1, 1)
+            (x, y), heading = xy[0] - line.points[end], line.heading[end]
+            beyond_m = (x * np.cos(heading) + y * np.sin(heading)) * outward
+            if beyond_m > 0.0:
+                lateral_m = abs(y * np.cos(heading) - x * np.sin(heading)) - self.half_width_m
+                return float(np.hypot(beyond_m, max(lateral_m, 0.0)))
+        return distance_m - self.half_width_m
 
 
 class NuPlanLaneConnector(NuPlanLane):
@@ -221,18 +221,18 @@ class NuPlanLaneConnector(NuPlanLane):
 
 
 class Area:
-    """Strips of some lanes."""
+    """The area of several lanes."""
 
     def __init__(self, name: str, lanes: Sequence[NuPlanLane]) -> None:
         self.id, self.interior_edges = name, list(lanes)
 
     @cached_property
     def polygon(self) -> Any:
-        """The strips of all lanes as shapely has them."""
+        """The strips of all lanes as a shapely geometry."""
         return import_extra("shapely").unary_union([lane.polygon for lane in self.interior_edges])
 
     def contains_point(self, point: Any) -> bool:
-        """Return whether a point is on one of the lanes."""
+        """Return whether a point is on any of the lanes."""
         return self.distance_m(point) <= 0.0
 
     def distance_m(self, point: Any) -> float:
@@ -251,12 +251,12 @@ class NuPlanRoadBlock(Area, _Edge):
 
     @property
     def incoming_edges(self) -> list[NuPlanRoadBlock]:
-        """Roadblocks that lead into this one."""
+        """Roadblocks that lead into this roadblock."""
         return _unique(other.parent for lane in self.interior_edges for other in lane.incoming_edges)
 
     @property
     def outgoing_edges(self) -> list[NuPlanRoadBlock]:
-        """Roadblocks that this one leads into."""
+        """Roadblocks that this roadblock leads into."""
         return _unique(other.parent for lane in self.interior_edges for other in lane.outgoing_edges)
 
 
@@ -275,21 +275,20 @@ class MapApi(DevkitObject):
         self.scenario = scenario
         lines = lane_lines(scenario)
         origin = np.asarray(scenario.origin, np.float64)[:2]
-        inner = scenario.lane_interpolating
+        is_connector = scenario.lane_interpolating
         self.lanes = {
-            row: (NuPlanLaneConnector if inner[row] else NuPlanLane)(self, row, points + origin)
+            row: (NuPlanLaneConnector if is_connector[row] else NuPlanLane)(self, row, points + origin)
             for row, points in enumerate(lines)
             if len(points)
         }
-        numbers = roadblocks(scenario)
-        self.block_of = {row: str(int(scenario.lane_id[numbers[row]])) for row in self.lanes}
-        names = dict.fromkeys(self.block_of.values())
-        members = {
-            name: [lane for row, lane in self.lanes.items() if self.block_of[row] == name] for name in names
-        }
+        first_lanes = roadblocks(scenario)
+        self.block_of = {row: str(int(scenario.lane_id[first_lanes[row]])) for row in self.lanes}
+        lanes_by_block: dict[str, list[NuPlanLane]] = {}
+        for row, lane in self.lanes.items():
+            lanes_by_block.setdefault(self.block_of[row], []).append(lane)
         self.blocks = {
             name: (NuPlanRoadBlockConnector if lanes[0].is_connector else NuPlanRoadBlock)(self, name, lanes)
-            for name, lanes in members.items()
+            for name, lanes in lanes_by_block.items()
         }
 
     @property
@@ -297,8 +296,8 @@ class MapApi(DevkitObject):
         """Name of the place, or of the data set."""
         return self.scenario.tags.get("location", self.scenario.text("dataset"))
 
-    def linked(self, rows: Iterable[Any]) -> list[NuPlanLane]:
-        """Return the lanes of some rows of the lane graph; those without a line are left out."""
+    def lanes_of(self, rows: Iterable[Any]) -> list[NuPlanLane]:
+        """Return the lanes at rows of the lane graph, without lanes that have no centre line."""
         return [self.lanes[int(row)] for row in rows if int(row) in self.lanes]
 
     def get_available_map_objects(self) -> list[SemanticMapLayer]:
@@ -307,11 +306,12 @@ class MapApi(DevkitObject):
 
     def get_all_map_objects(self, point: Any, layer: Any) -> list[Any]:
         """Return the objects of a layer that contain a point, the nearest centre line first."""
-        inside = [(item.distance_m(point), item) for item in self._objects(layer)]
-        return [item for apart, item in sorted(inside, key=lambda pair: pair[0]) if apart <= 0.0]
+        distances = [(item.distance_m(point), item) for item in self._objects(layer)]
+        inside = [pair for pair in distances if pair[0] <= 0.0]
+        return [item for _, item in sorted(inside, key=lambda pair: pair[0])]
 
     def get_one_map_object(self, point: Any, layer: Any) -> Any:
-        """Return the object that contains a point, the nearest centre line of several; None without one."""
+        """Return the first of :meth:`get_all_map_objects`, or None without any."""
         return next(iter(self.get_all_map_objects(point, layer)), None)
 
     def is_in_layer(self, point: Any, layer: Any) -> bool:
@@ -328,7 +328,7 @@ class MapApi(DevkitObject):
         }
 
     def get_map_object(self, object_id: Any, layer: Any) -> Any:
-        """Return an object by its id; None if the layer has none."""
+        """Return an object by its id, or None if the layer lacks it."""
         return next((item for item in self._objects(layer) if item.id == str(object_id)), None)
 
     _get_lane = partialmethod(get_map_object, layer=SemanticMapLayer.LANE)
@@ -337,23 +337,26 @@ class MapApi(DevkitObject):
     _get_roadblock_connector = partialmethod(get_map_object, layer=SemanticMapLayer.ROADBLOCK_CONNECTOR)
 
     def get_distance_to_nearest_map_object(self, point: Any, layer: Any) -> tuple[str | None, float | None]:
-        """Return id and distance of the nearest object of a layer; (None, None) without one."""
-        apart = [(max(item.distance_m(point), 0.0), item.id) for item in self._objects(layer)]
-        return min(apart)[::-1] if apart else (None, None)
+        """Return id and distance of the nearest object of a layer, or (None, None) if the layer is empty."""
+        distances = [(max(item.distance_m(point), 0.0), item.id) for item in self._objects(layer)]
+        if not distances:
+            return None, None
+        distance_m, object_id = min(distances)
+        return object_id, distance_m
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name in ("lanes", "blocks", "block_of", "scenario"):
             raise AttributeError(name)
-        known = [method for method in dir(MapApi) if method.startswith(("get_", "is_"))]
-        raise NotImplementedError(f"the map has no {name}; {did_you_mean(name, known)}")
+        methods = [method for method in dir(MapApi) if method.startswith(("get_", "is_"))]
+        raise NotImplementedError(f"the map has no {name}; {did_you_mean(name, methods)}")
 
     def _objects(self, layer: Any) -> list[Any]:
         try:
-            known = SemanticMapLayer(int(layer))
+            member = SemanticMapLayer(int(layer))
         except ValueError:
             name = getattr(layer, "name", layer)
             raise NotImplementedError(f"the map has no layer {name}; it has {', '.join(_LAYERS)}") from None
-        return self._layers.get(known, [])
+        return self._layers.get(member, [])
 
     @cached_property
     def _layers(self) -> dict[SemanticMapLayer, list[Any]]:
@@ -370,10 +373,10 @@ class MapApi(DevkitObject):
 
 
 def _unique(blocks: Iterable[NuPlanRoadBlock]) -> list[NuPlanRoadBlock]:
-    """Roadblocks without repetitions, in order."""
+    """Return the roadblocks without duplicates, in order."""
     return list({block.id: block for block in blocks}.values())
 
 
 def _xy(point: Any) -> Float[np.ndarray, "1 2"]:
-    """A point as a row."""
+    """Return a point as an array."""
     return np.array([[point.x, point.y]], np.float64)

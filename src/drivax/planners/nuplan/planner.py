@@ -1,6 +1,6 @@
 """Drive by a planner with nuPlan's interface (``AbstractPlanner``), called outside the compiled program.
 
-Each episode gets an instance of its own. What it plans is tracked by the controller of the task.
+Each episode gets its own instance. The controller of the task tracks the planned trajectory.
 """
 
 from __future__ import annotations
@@ -31,9 +31,11 @@ from drivax.scenario.schema import DT_S, AgentKind, LightState, Scenario
 from drivax.simulator.types import HISTORY, MOTION_SPEED, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Trajectory
 
-#: Below these the steering angle of a logged motion (m/s), and its slip (m in a step), are taken as zero.
-_STILL_MPS, _STILL_M = 0.5, 0.02
-#: Latest time at which a plan may start, after the present one, s.
+#: Speed below which the steering angle of a logged motion counts as zero, m/s.
+_STILL_MPS = 0.5
+#: Movement in a step below which the slip of a logged motion counts as zero, m.
+_STILL_M = 0.02
+#: Tolerance for a plan that starts after the present time, s.
 _LATE_S = 1e-3
 _PLANS = "compute_planner_trajectory"
 
@@ -45,7 +47,7 @@ def is_nuplan(thing: Any) -> bool:
 
 @record
 class NuplanPlanner:
-    """A planner with nuPlan's interface; without the action space ``trajectory`` its first poses are followed.
+    """A planner with nuPlan's interface; action spaces other than ``trajectory`` follow its first poses.
 
     Attributes:
         host: Instances and scenarios.
@@ -62,41 +64,41 @@ class NuplanPlanner:
         return self.host.name
 
     def prepare(self, scenario_of: Callable[[int], Scenario]) -> None:
-        """Tell where the scenarios are, by their identity in the bank."""
+        """Set the function that returns a scenario by its identity in the bank."""
         self.host.scenario_of = scenario_of
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
-        """Return an empty carry: the instances remember."""
+        """Return an empty carry; the memory is in the instances."""
         return ()
 
     def act(
         self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any, key: Array
     ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
-        """Return the action that follows the plan; NaN where the planner raised an error."""
+        """Return the action that follows the plan, or NaN if the planner raises an error."""
         context, frame = situation.context, situation.surroundings.frame
-        tracked = self.actions if isinstance(self.actions, Trajectory) else None
-        steps = tracked.steps if tracked else 2
-        # Under another action space the actuators are not known.
-        actuators = context.action[:3] if tracked else jnp.full(3, jnp.nan)
+        trajectory = self.actions if isinstance(self.actions, Trajectory) else None
+        steps = trajectory.steps if trajectory else 2
+        # In other action spaces, the actuators are unknown.
+        actuators = context.action[:3] if trajectory else jnp.full(3, jnp.nan)
         identity = bank.identity[context.index]
-        seen = (identity, state.start, context.step, context.history, actuators, frame)
-        plan = python_actions(partial(self.host.plan, steps), identity, context.step, seen, 3 * (steps + 1))
-        if tracked:
+        inputs = (identity, state.start, context.step, context.history, actuators, frame)
+        plan = python_actions(partial(self.host.plan, steps), identity, context.step, inputs, 3 * (steps + 1))
+        if trajectory:
             return plan, carry
         poses, motion = plan.reshape(-1, 3), context.history[-1]
         speeds = jnp.linalg.norm(jnp.diff(poses[:, :2], axis=0), axis=-1) / DT_S
-        target, beyond = (jnp.append(poses[k], speeds[k - 1]) for k in (1, 2))
-        return self.actions.expert(motion, target, beyond, bank.length_m(context.index, context.slot)), carry
+        first, second = (jnp.append(poses[k], speeds[k - 1]) for k in (1, 2))
+        return self.actions.expert(motion, first, second, bank.length_m(context.index, context.slot)), carry
 
 
 @dataclass
 class _Episode:
-    """A planner in a scenario: its memory, and its last plan."""
+    """An instance of a planner in a scenario, with its history and its last plan."""
 
     planner: Any
     view: View
     egos: deque[nuplan.EgoState]
-    seen: deque[nuplan.DetectionsTracks]
+    observations: deque[nuplan.DetectionsTracks]
     step: int
     inputs: Any = None
     plan: Any = None
@@ -106,8 +108,8 @@ class Host:
     """Instances of a planner, one per episode.
 
     Args:
-        thing: Class of the planner, or an instance, which is copied.
-        name: Its dotted name, for messages.
+        thing: Class of the planner, or an instance to copy.
+        name: Dotted name of the planner, for messages.
     """
 
     def __init__(self, thing: Any, name: str) -> None:
@@ -117,51 +119,55 @@ class Host:
             self.name = str(planner.name())
         except Exception as error:
             raise UsageError(f"planner {name!r}: {error_text(error)}", cure="fix the planner") from error
-        kind = (
-            getattr(planner.observation_type(), "__name__", "")
-            if hasattr(planner, "observation_type")
-            else ""
-        )
-        if kind not in ("", "DetectionsTracks"):
-            raise UsageError(f"planner {name!r} observes {kind}", cure="only DetectionsTracks are known")
+        observation = ""
+        if hasattr(planner, "observation_type"):
+            observation = getattr(planner.observation_type(), "__name__", "")
+        if observation not in ("", "DetectionsTracks"):
+            cure = "only DetectionsTracks are known"
+            raise UsageError(f"planner {name!r} observes {observation}", cure=cure)
         self.scenario_of: Callable[[int], Scenario] | None = None
         self._episodes: dict[int, _Episode] = {}
         self._failures: dict[int, PlannerError] = {}
 
-    def plan(self, steps: int, identity: Any, start: Any, step: Any, *seen: Any) -> Float[np.ndarray, "n 3"]:
+    def plan(
+        self, steps: int, identity: Any, start: Any, step: Any, *inputs: Any
+    ) -> Float[np.ndarray, "n 3"]:
         """Return the planned poses of the box centre from now on, in the scenario's frame."""
-        number, step = int(identity), int(step)
-        episode = self._episodes.get(number)
+        identity, start, step = int(identity), int(start), int(step)
+        episode = self._episodes.get(identity)
         # A short batch repeats its last scenario.
-        if episode is not None and episode.step == step and _equal(episode.inputs, seen):
+        if episode is not None and episode.step == step and _equal(episode.inputs, inputs):
             return episode.plan
         try:
-            if step == int(start):
-                episode = self._begin(number, step, seen[0])
+            if step == start:
+                episode = self._start_episode(identity, step, inputs[0])
             if episode is None or episode.step != step - 1:
-                raise self._failures.get(number) or PlannerError("the episode did not start here")
-            episode.plan = self._plan(episode, steps, step, int(start), *seen)
+                raise self._failures.get(identity) or PlannerError(
+                    "the episode did not start with this planner"
+                )
+            episode.plan = self._plan(episode, steps, step, start, *inputs)
         except PlannerError as error:
-            self._failures[number] = error
-            self._episodes.pop(number, None)
+            self._failures[identity] = error
+            self._episodes.pop(identity, None)
             raise
-        episode.step, episode.inputs = step, seen
+        episode.step, episode.inputs = step, inputs
         return episode.plan
 
-    def _begin(self, number: int, step: int, history: Any) -> _Episode:
+    def _start_episode(self, identity: int, step: int, history: Any) -> _Episode:
+        """Make and initialize an instance with the logged history; forget episodes that are further on."""
         if self.scenario_of is None:
             raise UsageError(
                 f"planner {self.name} needs stored scenarios", cure="evaluate a set or drivax.load"
             )
-        self._episodes = {key: old for key, old in self._episodes.items() if old.step <= step}
-        self._failures.pop(number, None)
-        view, planner = View(self.scenario_of(number)), self._make()
-        earlier, size = range(step - BUFFER, step), BUFFER + 1
-        egos = [view.ego(past, history[: HISTORY - step + past]) for past in earlier]
-        seen = [view.logged(past) for past in earlier]
+        self._episodes = {key: episode for key, episode in self._episodes.items() if episode.step <= step}
+        self._failures.pop(identity, None)
+        view, planner = View(self.scenario_of(identity)), self._make()
+        past_steps, size = range(step - BUFFER, step), BUFFER + 1
+        egos = [view.ego(past, history[: HISTORY - step + past]) for past in past_steps]
+        observations = [view.logged_tracks(past) for past in past_steps]
         _call(planner.initialize, view.initialization())
-        episode = _Episode(planner, view, deque(egos, size), deque(seen, size), step - 1)
-        self._episodes[number] = episode
+        episode = _Episode(planner, view, deque(egos, size), deque(observations, size), step - 1)
+        self._episodes[identity] = episode
         return episode
 
     def _plan(
@@ -170,11 +176,11 @@ class Host:
         view = episode.view
         last = episode.egos[-1].dynamic_car_state if step > start else None
         episode.egos.append(view.ego(step, history, actuators, last))
-        episode.seen.append(view.tracks(step, frame.box, frame.velocity, frame.valid, frame.kind))
+        episode.observations.append(view.tracks(step, frame.box, frame.velocity, frame.valid, frame.kind))
         iteration = nuplan.SimulationIteration(nuplan.TimePoint.of_step(step), step - start)
-        buffer = nuplan.SimulationHistoryBuffer(list(episode.egos), list(episode.seen))
-        known = nuplan.PlannerInput(iteration, buffer, view.lights(step, frame.lights))
-        return view.poses(_call(getattr(episode.planner, _PLANS), known), step, steps)
+        buffer = nuplan.SimulationHistoryBuffer(list(episode.egos), list(episode.observations))
+        planner_input = nuplan.PlannerInput(iteration, buffer, view.lights(step, frame.lights))
+        return view.poses(_call(getattr(episode.planner, _PLANS), planner_input), step, steps)
 
 
 class View:
@@ -188,9 +194,10 @@ class View:
         moving, parked = (
             int(last_used(valid.any(0)[None])[0]) for valid in (scenario.agent_valid, scenario.parked_valid)
         )
-        self._tracks = np.concatenate([scenario.agent_id[:moving], scenario.parked_id[:parked]]).tolist()
+        self._track_ids = np.concatenate([scenario.agent_id[:moving], scenario.parked_id[:parked]]).tolist()
         sizes = np.concatenate([scenario.agent_size[:moving], scenario.parked_size[:parked]])
-        self._heights, self._moving, self._parked = sizes[:, SizeColumn.HEIGHT].tolist(), moving, parked
+        self._heights = sizes[:, SizeColumn.HEIGHT].tolist()
+        self._moving_count, self._parked_count = moving, parked
 
     def initialization(self) -> nuplan.PlannerInitialization:
         """Return route, goal and map."""
@@ -200,42 +207,45 @@ class View:
         route = [name for k, name in enumerate(blocks) if k == 0 or name != blocks[k - 1]]
         if not route:
             raise PlannerError(f"scenario {scenario.text('scenario_id')} has no route")
-        # The devkit's planners take two roadblocks for granted.
+        # The devkit's planners assume at least two roadblocks.
         if len(route) < 2:
-            following = self.map.blocks[route[0]].outgoing_edges
-            route += [block.id for block in following if block.id not in route][:1]
+            successors = self.map.blocks[route[0]].outgoing_edges
+            route += [block.id for block in successors if block.id not in route][:1]
         goal = np.asarray(scenario.goal_xy, np.float64)
         heading = float(scenario.agent_heading[scenario.current_step, 0])
         if count:
-            away = np.linalg.norm(scenario.route_xy[0, :count] - goal, axis=1)
-            heading = float(scenario.route_heading[0, away.argmin()])
+            distance = np.linalg.norm(scenario.route_xy[0, :count] - goal, axis=1)
+            heading = float(scenario.route_heading[0, distance.argmin()])
         x, y = (goal + self.origin).tolist()
         return nuplan.PlannerInitialization(route, nuplan.StateSE2(x, y, heading), self.map)
 
     def ego(
         self, step: int, history: Any, actuators: Any = None, last: nuplan.DynamicCarState | None = None
     ) -> nuplan.EgoState:
-        """Return ego at a step, measured from its motions until then.
+        """Return ego at a step, computed from its motions until then.
 
-        ``actuators`` (if finite) give acceleration and steering; with the ``last`` driven state, speed and steering
-        give the yaw rate, as in nuPlan's vehicle model.
+        ``actuators`` (if finite) determine acceleration and steering. With the ``last`` simulated state, speed and
+        steering determine the yaw rate, as in nuPlan's vehicle model.
         """
         now, before, earlier = (np.asarray(history[-k], np.float64) for k in (1, 2, 3))
         x, y, heading, speed = now.tolist()
-        turn = [float(wrap(b[2] - a[2])) / DT_S for a, b in ((earlier, before), (before, now))]
-        speeds = _axle_speed(earlier, before), _axle_speed(before, now)
-        wheelbase, yaw_rate, rate = self.vehicle.wheel_base, turn[1], 0.0
-        acceleration, change = (speeds[1] - speeds[0]) / DT_S, (turn[1] - turn[0]) / DT_S
-        steering = math.atan(turn[1] * wheelbase / speed) if speed > _STILL_MPS else 0.0
+        last_yaw_rate, yaw_rate = (
+            float(wrap(b[2] - a[2])) / DT_S for a, b in ((earlier, before), (before, now))
+        )
+        last_axle_speed, axle_speed = _axle_speed(earlier, before), _axle_speed(before, now)
+        wheelbase, steering_rate = self.vehicle.wheel_base, 0.0
+        acceleration = (axle_speed - last_axle_speed) / DT_S
+        yaw_acceleration = (yaw_rate - last_yaw_rate) / DT_S
+        steering = math.atan(yaw_rate * wheelbase / speed) if speed > _STILL_MPS else 0.0
         if actuators is not None and np.isfinite(actuators).all():
-            acceleration, steering, rate = (float(value) for value in actuators)
-            steering += rate * DT_S
+            acceleration, steering, steering_rate = (float(value) for value in actuators)
+            steering += steering_rate * DT_S
             if last is not None:
-                speeds, yaw_rate = (0.0, speed), speed * math.tan(steering) / wheelbase
-                change = (yaw_rate - last.angular_velocity) / DT_S
+                axle_speed, yaw_rate = speed, speed * math.tan(steering) / wheelbase
+                yaw_acceleration = (yaw_rate - last.angular_velocity) / DT_S
         dynamic = nuplan.DynamicCarState(
-            nuplan.StateVector2D(speeds[1], 0.0), nuplan.StateVector2D(acceleration, 0.0),
-            yaw_rate, change, rate, self.vehicle.rear_axle_to_center,
+            nuplan.StateVector2D(axle_speed, 0.0), nuplan.StateVector2D(acceleration, 0.0),
+            yaw_rate, yaw_acceleration, steering_rate, self.vehicle.rear_axle_to_center,
         )  # fmt: skip
         centre = nuplan.StateSE2(x + float(self.origin[0]), y + float(self.origin[1]), heading)
         vehicle = self.vehicle
@@ -244,91 +254,98 @@ class View:
 
     def tracks(self, step: int, box: Any, velocity: Any, valid: Any, kind: Any) -> nuplan.DetectionsTracks:
         """Return the other agents of a frame."""
-        time_us, tracked = nuplan.TimePoint.of_step(step).time_us, []
-        for slot in np.flatnonzero(valid)[1 if valid[0] else 0 :].tolist():
+        time_us, objects = nuplan.TimePoint.of_step(step).time_us, []
+        for slot in np.flatnonzero(valid).tolist():
+            if slot == 0:  # ego
+                continue
             x, y, cos, sin, length, width = np.asarray(box[slot], np.float64).tolist()
             centre = nuplan.StateSE2(x + self.origin[0], y + self.origin[1], math.atan2(sin, cos))
-            own = nuplan.OrientedBox(centre, length, width, self._heights[slot])
-            moves = nuplan.StateVector2D(*np.asarray(velocity[slot], np.float64).tolist())
-            number = self._tracks[slot]
-            of_kind = nuplan.TYPE_OF_KIND.get(
-                AgentKind(int(kind[slot])), nuplan.TrackedObjectType.GENERIC_OBJECT
+            oriented_box = nuplan.OrientedBox(centre, length, width, self._heights[slot])
+            vector = nuplan.StateVector2D(*np.asarray(velocity[slot], np.float64).tolist())
+            track_id, agent_kind = self._track_ids[slot], AgentKind(int(kind[slot]))
+            object_type = nuplan.TYPE_OF_KIND.get(agent_kind, nuplan.TrackedObjectType.GENERIC_OBJECT)
+            objects.append(
+                nuplan.TrackedObject(object_type, oriented_box, vector, str(track_id), track_id, time_us)
             )
-            tracked.append(nuplan.TrackedObject(of_kind, own, moves, str(number), number, time_us))
-        tracked.sort(key=lambda item: item.tracked_object_type.value)
-        return nuplan.DetectionsTracks(nuplan.TrackedObjects(tracked))
+        objects.sort(key=lambda item: item.tracked_object_type.value)
+        return nuplan.DetectionsTracks(nuplan.TrackedObjects(objects))
 
-    def logged(self, step: int) -> nuplan.DetectionsTracks:
-        """Return the other agents as logged; before the log they keep their first velocity."""
-        s, a, p, time, step = self.scenario, self._moving, self._parked, step, max(step, 0)
-        early_s = (time - step) * DT_S
-        xy = np.concatenate([s.agent_xy[step, :a] + early_s * s.agent_velocity[step, :a], s.parked_xy[:p]])
-        heading = np.concatenate([s.agent_heading[step, :a], s.parked_heading[:p]])
-        size = np.concatenate([s.agent_size[:a, :2], s.parked_size[:p, :2]])
+    def logged_tracks(self, step: int) -> nuplan.DetectionsTracks:
+        """Return the other agents as logged; before the log, they keep their first velocity."""
+        scenario, moving, parked = self.scenario, slice(self._moving_count), slice(self._parked_count)
+        log_step = max(step, 0)
+        velocity = scenario.agent_velocity[log_step, moving]
+        moving_xy = scenario.agent_xy[log_step, moving] + (step - log_step) * DT_S * velocity
+        xy = np.concatenate([moving_xy, scenario.parked_xy[parked]])
+        heading = np.concatenate([scenario.agent_heading[log_step, moving], scenario.parked_heading[parked]])
+        size = np.concatenate([scenario.agent_size[moving, :2], scenario.parked_size[parked, :2]])
         box = np.concatenate([xy, np.cos(heading)[:, None], np.sin(heading)[:, None], size], axis=1)
-        velocity = np.concatenate([s.agent_velocity[step, :a], np.zeros((p, 2))])
-        valid = np.concatenate([s.agent_valid[step, :a], s.parked_valid[step, :p]])
-        return self.tracks(time, box, velocity, valid, np.concatenate([s.agent_kind[:a], s.parked_kind[:p]]))
+        velocity = np.concatenate([velocity, np.zeros((self._parked_count, 2))])
+        valid = np.concatenate(
+            [scenario.agent_valid[log_step, moving], scenario.parked_valid[log_step, parked]]
+        )
+        kind = np.concatenate([scenario.agent_kind[moving], scenario.parked_kind[parked]])
+        return self.tracks(step, box, velocity, valid, kind)
 
     def lights(self, step: int, states: Any) -> list[nuplan.TrafficLightStatusData]:
-        """Return the observed traffic lights of lanes of the map."""
+        """Return the observed traffic lights of the map's lanes."""
         time_us, unknown = nuplan.TimePoint.of_step(step).time_us, nuplan.TrafficLightStatusType.UNKNOWN
         statuses = []
         for lane, state in zip(self.scenario.light_lane.tolist(), np.asarray(states).tolist(), strict=False):
             if lane in self.map.lanes and state >= 0:
                 status = nuplan.STATUS_OF_LIGHT.get(LightState(state), unknown)
-                number = int(self.scenario.lane_id[lane])
-                statuses.append(nuplan.TrafficLightStatusData(status, number, time_us))
+                lane_id = int(self.scenario.lane_id[lane])
+                statuses.append(nuplan.TrafficLightStatusData(status, lane_id, time_us))
         return statuses
 
     def poses(self, trajectory: Any, step: int, steps: int) -> Float[np.ndarray, "n 3"]:
         """Return the poses of the box centre on a trajectory, 0.1 s apart from now on.
 
-        Positions and headings are interpolated; beyond the trajectory they continue as at its end.
+        Positions and headings are interpolated, and extrapolated after the end.
         """
-        rows = _call(_rows, trajectory)
-        if len(rows) < 2:
-            raise PlannerError(f"a trajectory of {len(rows)} states; return two or more")
-        time, x, y, heading = np.array(rows).T
+        states = _call(_read_states, trajectory)
+        if len(states) < 2:
+            raise PlannerError(f"a trajectory of {len(states)} states; return two or more")
+        time, x, y, heading = np.array(states).T
         now = nuplan.TimePoint.of_step(step).time_s
         if time[0] > now + _LATE_S or time[-1] <= now:
             raise PlannerError(f"the trajectory is from {time[0]:g} to {time[-1]:g} s, and it is {now:g} s")
         if (np.diff(time) <= 0).any():
             raise PlannerError("the times of the trajectory do not increase")
-        at, heading = now + np.arange(steps + 1) * DT_S, np.unwrap(heading)
-        x, y, heading = (_interpolated(at, time, values) for values in (x, y, heading))
+        times, heading = now + np.arange(steps + 1) * DT_S, np.unwrap(heading)
+        x, y, heading = (_interpolate(times, time, values) for values in (x, y, heading))
         ahead = self.vehicle.rear_axle_to_center
         centre = np.stack([x + ahead * np.cos(heading), y + ahead * np.sin(heading)], axis=-1) - self.origin
         return np.column_stack([centre, wrap(heading)]).astype(np.float32)
 
 
 def _call(function: Callable[[Any], Any], argument: Any) -> Any:
-    """Call the planner; its errors become a line that names their place in its code."""
+    """Call a planner, and turn its errors into one line with their location in its code."""
     try:
         return function(argument)
     except Exception as error:
         raise PlannerError(error_text(error)) from error
 
 
-def _rows(trajectory: Any) -> list[tuple[float, float, float, float]]:
-    """Time (s) and pose of the rear axle of every state of a trajectory."""
-    sampled = getattr(trajectory, "get_sampled_trajectory", None)
-    states = trajectory if sampled is None else sampled()
+def _read_states(trajectory: Any) -> list[tuple[float, float, float, float]]:
+    """Return time (s) and pose of the rear axle of every state of a trajectory."""
+    sample = getattr(trajectory, "get_sampled_trajectory", None)
+    states = trajectory if sample is None else sample()
     poses = [(state.time_point.time_us * 1e-6, state.rear_axle) for state in states]
     return [(time_s, float(pose.x), float(pose.y), float(pose.heading)) for time_s, pose in poses]
 
 
-def _axle_speed(before: Any, now: Any) -> float:
-    """Speed of the rear axle: that of the centre, along the heading."""
-    dx, dy = now[:2] - before[:2]
+def _axle_speed(last: Any, now: Any) -> float:
+    """Return the speed of the rear axle: the component of the centre's speed along the heading."""
+    dx, dy = now[:2] - last[:2]
     if math.hypot(dx, dy) < _STILL_M:
         return float(now[MOTION_SPEED])
-    slip = math.atan2(dy, dx) - before[2] - float(wrap(now[2] - before[2])) / 2
+    slip = math.atan2(dy, dx) - last[2] - float(wrap(now[2] - last[2])) / 2
     return float(now[MOTION_SPEED]) * math.cos(slip)
 
 
-def _interpolated(at: Any, time: Any, values: Any) -> Any:
-    """Linear interpolation; beyond the last time the last slope goes on."""
+def _interpolate(at: Any, time: Any, values: Any) -> Any:
+    """Interpolate linearly; after the last time, extrapolate with the last slope."""
     slope = (values[-1] - values[-2]) / (time[-1] - time[-2])
     return np.interp(at, time, values) + np.maximum(at - time[-1], 0.0) * slope
 

@@ -17,10 +17,10 @@ import numpy as np
 from drivax.errors import import_extra
 from drivax.scenario.schema import DT_S
 
-#: Steps of history that planners get, as in nuPlan's simulation (2 s); time counts from so long before the log.
+#: Steps of history for planners, as in nuPlan's simulation (2 s). Time 0 is this long before the log.
 BUFFER = 20
 _STATE, _PLANNING, _MAPS = "nuplan.common.actor_state", "nuplan.planning.simulation", "nuplan.common.maps"
-#: Modules of the devkit by the classes that are looked for there.
+#: Modules of the devkit by class.
 _MODULES = {
     name: module
     for module, names in {
@@ -52,7 +52,7 @@ _MODULES = {
 
 
 class DevkitObject:
-    """Base of classes whose ``__class__`` is the devkit's where that is imported, which ``isinstance`` honours."""
+    """Base of classes that pass ``isinstance`` for a class of the devkit: ``__class__`` is that class, if imported."""
 
     def devkit_names(self) -> tuple[str, ...]:
         """Return names of the devkit's classes, the first choice first."""
@@ -61,11 +61,11 @@ class DevkitObject:
     @property
     def __class__(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         names = self.devkit_names()
-        theirs = (getattr(sys.modules.get(_MODULES.get(name, "")), name, None) for name in names)
-        return next(filter(None, theirs), type(self))
+        classes = (getattr(sys.modules.get(_MODULES.get(name, "")), name, None) for name in names)
+        return next(filter(None, classes), type(self))
 
     def __reduce__(self) -> Any:
-        # The default refuses an object whose __class__ is another than its type.
+        # The default refuses objects whose __class__ differs from their type.
         return object.__new__, (type(self),), self.__dict__
 
 
@@ -106,7 +106,7 @@ class StateSE2(Point2D):
         return Point2D(self.x, self.y)
 
     def ahead(self, distance_m: float, left_m: float = 0.0) -> StateSE2:
-        """Return the pose moved along its heading, and to its left."""
+        """Return the pose shifted along its heading and to its left."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         x, y = self.x + distance_m * cos - left_m * sin, self.y + distance_m * sin + left_m * cos
         return StateSE2(x, y, self.heading)
@@ -116,13 +116,13 @@ class StateSE2(Point2D):
         return math.hypot(self.x - state.x, self.y - state.y)
 
     def as_matrix(self) -> np.ndarray[Any, Any]:
-        """Return the 3 x 3 matrix that maps points of this frame to the source's."""
+        """Return the 3 x 3 matrix that maps points of the pose's frame to the source's frame."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         return np.array([[cos, -sin, self.x], [sin, cos, self.y], [0.0, 0.0, 1.0]])
 
     @staticmethod
     def from_matrix(matrix: Any) -> StateSE2:
-        """Return the pose of such a matrix."""
+        """Return the pose of a matrix of :meth:`as_matrix`."""
         x, y = matrix[:2, 2].tolist()
         return StateSE2(x, y, math.atan2(matrix[1, 0], matrix[0, 0]))
 
@@ -142,7 +142,7 @@ class StateSE2(Point2D):
 @total_ordering
 @dataclass(frozen=True, eq=False)
 class TimePoint(DevkitObject):
-    """Time since 2 s before the log; compares and adds with whatever has ``time_us``."""
+    """Time since 2 s before the log; compares with and adds any object with ``time_us``."""
 
     time_us: int
 
@@ -157,7 +157,7 @@ class TimePoint(DevkitObject):
         return cls(round((step + BUFFER) * DT_S * 1e6))
 
     def diff(self, other: Any) -> TimeDuration:
-        """Return the time since another."""
+        """Return the time since another point."""
         return TimeDuration(self.time_us - _microseconds(other))
 
     def __add__(self, other: Any) -> TimePoint:
@@ -194,8 +194,8 @@ def _microseconds(time: Any) -> int:
 _POINTS = dict(enumerate(((1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0), (0, 1), (0, -1)), 1))
 
 
-class Sized(DevkitObject):
-    """Half sizes of what has a length and a width."""
+class HalfExtents(DevkitObject):
+    """Half length and half width of an object with length and width."""
 
     length: float
     width: float
@@ -212,7 +212,7 @@ class Sized(DevkitObject):
 
 
 @dataclass(frozen=True)
-class OrientedBox(Sized):
+class OrientedBox(HalfExtents):
     """A box around its centre."""
 
     center: StateSE2
@@ -231,10 +231,10 @@ class OrientedBox(Sized):
         return self.center.ahead(ahead * self.half_length, left * self.half_width).point
 
     def all_corners(self) -> list[Point2D]:
-        """Front left, rear left, rear right, front right."""
+        """Return the corners: front left, rear left, rear right, front right."""
         return [self.corner(point) for point in (3, 5, 6, 4)]
 
     @cached_property
     def geometry(self) -> Any:
-        """The box as a polygon of shapely."""
+        """The box as a shapely polygon."""
         return import_extra("shapely").Polygon([tuple(corner) for corner in self.all_corners()])

@@ -31,7 +31,7 @@ def comparison_text(comparison: Comparison) -> str:
 
 
 def comparison_tables(comparison: Comparison, arms: tuple[str, str] = ("A", "B")) -> list[Table]:
-    """Return the tables of the primary metric and, if there are any, of the secondary ones."""
+    """Return the tables of the primary metric and, if there are any, of the secondary metrics."""
     tables = [_table(comparison, arms, "primary metric", "p", [comparison.primary])]
     if secondary := list(comparison.secondary):
         tables.append(_table(comparison, arms, "secondary metrics", "p (Holm)", secondary))
@@ -53,10 +53,10 @@ def _row(metric: MetricComparison) -> tuple[Cell, ...]:
     effects = ", ".join(f"{name} {value:.3f}" for name, value in metric.effects.items() if value is not None)
     value = metric.effects.get("d_z", metric.effects.get("d"))
     intervals = ((metric.a, False), (metric.b, False), (metric.difference, True))
-    means = (interval_cell(interval, label.unit, metric.metric, signed) for interval, signed in intervals)
+    cells = (interval_cell(interval, label.unit, metric.metric, signed) for interval, signed in intervals)
     return (
         Cell(label.heading, title=label.title or metric.metric),
-        *(replace(cell, note="", style="", title="") for cell in means),  # n has a column of its own
+        *(replace(cell, note="", style="", title="") for cell in cells),  # n has a column of its own
         Cell("", html=_picture(metric, label)),
         Cell(MISSING if value is None else f"{value:+.2f}".replace("-", "−"), title=effects),
         Cell(_p_text(metric.p_adjusted), note=_test_name(metric)), Cell(f"{metric.difference.n:,}"),
@@ -83,12 +83,12 @@ def _picture(metric: MetricComparison, label: MetricLabel) -> str:
 
 def _label(metric: MetricComparison) -> MetricLabel:
     """Return the label of a metric; user-defined metrics keep their names and units."""
-    known = metric_label(metric.metric)
-    if known.explanation or not metric.unit:
-        return known
-    plain = metric.unit == "-"
-    text = known.text if plain else f"{known.text} [{metric.unit}]"
-    return MetricLabel(text, metric.better, "share" if plain else metric.unit, "")
+    label = metric_label(metric.metric)
+    if label.explanation or not metric.unit:
+        return label
+    dimensionless = metric.unit == "-"
+    text = label.text if dimensionless else f"{label.text} [{metric.unit}]"
+    return MetricLabel(text, metric.better, "share" if dimensionless else metric.unit, "")
 
 
 def _p_text(p: float | None) -> str:
@@ -97,7 +97,7 @@ def _p_text(p: float | None) -> str:
 
 
 def effect_name(comparison: Comparison) -> str:
-    """Return the name of the effect size: ``d_z`` of pairs, ``d`` of a split."""
+    """Return the name of the effect size: ``d_z`` of paired, ``d`` of separate scenarios."""
     return "d_z" if "d_z" in comparison.primary.effects else "d"
 
 
@@ -116,12 +116,13 @@ def conditions(comparison: Comparison) -> str:
 
 
 def _test_name(metric: MetricComparison) -> str:
+    """Return the name of the test, with its units or its exactness."""
     evidence = metric.evidence
     if evidence.name.startswith("McNemar"):
         return f"{evidence.name}, {evidence.units:,} discordant pairs"
     if metric.seeds > 1:
         return f"{evidence.name} test over seeds and {evidence.units:,} recordings"
-    return f"{evidence.name} test, {'every sign counted' if evidence.exact else 'drawn by recordings'}"
+    return f"{evidence.name} test, {'exact' if evidence.exact else 'by recording'}"
 
 
 def title(comparison: Comparison) -> str:
@@ -131,7 +132,7 @@ def title(comparison: Comparison) -> str:
 
 
 def reasons(comparison: Comparison) -> list[str]:
-    """Return the reasons of the recommendation in full sentences."""
+    """Return the reasons for the recommendation in full sentences."""
     decision, n = comparison.decision, f"{comparison.primary.difference.n:,}"
     sentences = [_test_sentence(comparison)]
     if decision.because == "minimum":
@@ -140,8 +141,8 @@ def reasons(comparison: Comparison) -> list[str]:
     if decision.because == "seeds":
         sentences.append("Seeds differ so much that more scenarios do not help: more seeds are needed.")
     if decision.because == "equal":
-        same = "the same for A and B in each" if comparison.plan.split == "paired" else "the same in all"
-        sentences = [f"{_label(comparison.primary).text} is {same} of {n} scenarios."]
+        equality = "the same for A and B in each" if comparison.plan.split == "paired" else "the same in all"
+        sentences = [f"{_label(comparison.primary).text} is {equality} of {n} scenarios."]
     sentences += _power_sentences(comparison)
     if decision.caveats:
         names = ", ".join(metric_label(name).text for name in decision.caveats)
@@ -154,9 +155,10 @@ def _test_sentence(comparison: Comparison) -> str:
     """Return the result of the test of the primary metric."""
     metric, label = comparison.primary, _label(comparison.primary)
     if metric.difference.mean is None or metric.evidence.p is None:
-        return f"{label.text} cannot be tested: that takes two recordings at least."
+        return f"{label.text} cannot be tested: a test needs at least two recordings."
     p = _p_text(metric.evidence.p)
-    test = f"{bounds(metric.difference, label.unit, signed=True)}, p {p if p[0] == '<' else '= ' + p}"
+    p_sentence = f"p {p}" if p.startswith("<") else f"p = {p}"
+    test = f"{bounds(metric.difference, label.unit, signed=True)}, {p_sentence}"
     size = number(abs(metric.difference.mean), label.unit) + suffix(label.unit, signed=True)
     direction = "higher" if metric.difference.mean > 0 else "lower"
     if metric.winner is None:
@@ -167,7 +169,7 @@ def _test_sentence(comparison: Comparison) -> str:
 
 def _power_sentences(comparison: Comparison) -> list[str]:
     """Return the detectable difference and the number of scenarios needed."""
-    sensitivity, needed = comparison.sensitivity, comparison.decision.needed
+    sensitivity, count = comparison.sensitivity, comparison.decision.needed
     if sensitivity is None:
         return []
     unit = _label(comparison.primary).unit
@@ -176,9 +178,9 @@ def _power_sentences(comparison: Comparison) -> list[str]:
         size = number(sensitivity.detectable, unit) + suffix(unit, signed=True)
         power = f"{100 * comparison.plan.power:.0f} %"
         sentences.append(f"A difference of {size} would be detected in {power} of such comparisons.")
-    if needed is not None:
+    if count is not None:
         size = number(sensitivity.smallest, unit) + suffix(unit, signed=True)
-        sentences.append(f"{needed:,} scenarios are needed; the smallest difference that matters is {size}.")
+        sentences.append(f"{count:,} scenarios are needed; the smallest difference that matters is {size}.")
     return sentences
 
 
@@ -193,8 +195,8 @@ def notes(comparison: Comparison) -> list[str]:
     for arm, name, seeds in zip("AB", comparison.names, comparison.seeds, strict=True):
         if seeds is not None:
             means = ", ".join(number(mean, unit) for mean in seeds.means)
-            middle = f"{number(seeds.interquartile.mean, unit)} ({bounds(seeds.interquartile, unit)})"
-            lines.append(f"{arm}, {name}: {len(seeds.means)} seeds: {means}; interquartile mean {middle}")
+            iqm = f"{number(seeds.interquartile.mean, unit)} ({bounds(seeds.interquartile, unit)})"
+            lines.append(f"{arm}, {name}: {len(seeds.means)} seeds: {means}; interquartile mean {iqm}")
     if any(comparison.seeds):
         lines.append("seeds are averaged per scenario; intervals and the test hold for other seeds, too")
     return lines
@@ -227,14 +229,14 @@ def _metrics(comparison: Comparison) -> str:
     items = "".join(f"<li>{escape(note)}</li>" for note in notes(comparison))
     a, b = comparison.names
     tables = "".join(f"{table.html()}<br>" for table in comparison_tables(comparison, (f"A: {a}", f"B: {b}")))
-    share, level = (f"{100 * comparison.plan.confidence:.0f} %", f"{1 - comparison.plan.confidence:.2g}")
-    kind = "d, with the pooled standard deviation"
+    confidence, level = f"{100 * comparison.plan.confidence:.0f} %", f"{1 - comparison.plan.confidence:.2g}"
+    effect = "d, with the pooled standard deviation"
     if effect_name(comparison) == "d_z":
-        kind = "d_z, the mean of the differences over their standard deviation"
+        effect = "d_z, the mean of the differences over their standard deviation"
     note = (
-        f"Mean and {share} interval; whole recordings are resampled. n: scenarios where the metric is defined. Effect "
-        f"size: Cohen's {kind}. A planner is called better where the two-sided p-value is below {level}; p-values of "
-        "secondary metrics are adjusted for their number by Holm's method."
+        f"Mean and {confidence} interval; whole recordings are resampled. n: scenarios where the metric is defined. "
+        f"Effect size: Cohen's {effect}. A planner is called better if the two-sided p-value is below {level}; "
+        "p-values of secondary metrics are adjusted for their number by Holm's method."
     )
     return section("Metrics", tables, f"<ul>{items}</ul>" if items else "", note=note)
 
@@ -246,7 +248,7 @@ def _plan(comparison: Comparison) -> str:
         f"<p>With fewer than {plan.minimum_scenarios:,} scenarios there is no verdict. If the p-value is below "
         f"{1 - plan.confidence:.2g}, the verdict is the better planner. Otherwise it is no difference if the "
         f"comparison had a power of {100 * plan.power:.0f} % to detect the smallest difference that matters, and "
-        "not enough scenarios if not.</p>"
+        "not enough scenarios if it had less.</p>"
         f"<details><summary>the plan</summary><pre>{escape(settings.dump(plan))}</pre></details>",
     )
 

@@ -13,7 +13,7 @@ from drivax.report.inspection import (
     Counts,
     Inspection,
     content_table,
-    speeds,
+    read_speeds,
     true_findings,
     with_sizes,
 )
@@ -21,12 +21,12 @@ from drivax.report.pages.page import asset, definitions, page, section
 from drivax.report.pictures.palette import stroke
 from drivax.scenario.select.selection import FINDINGS
 
-#: Tags with more values than this (ids, dates) are left out of the page.
-_MOST_VALUES = 16
+#: Maximum number of values of a shown tag; excludes ids and dates.
+_MAX_TAG_VALUES = 16
 
 
 def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bool = False) -> Path:
-    """Write the page of opened sets to the HTML file ``out``.
+    """Write a page about scenario sets to the HTML file ``out``.
 
     Raises:
         UsageError: ``out`` exists.
@@ -50,8 +50,8 @@ def _lead(inspections: Sequence[Inspection]) -> str:
 
 def _overview(inspections: Sequence[Inspection]) -> str:
     note = (
-        "Numbers of a scenario are means over the scenarios that have them, counted in the source before cropping and "
-        "capping. Windows of one recording may overlap; the duration counts each in full."
+        "Means over the scenarios that define a number, counted in the source before cropping and capping. Windows of "
+        "one recording may overlap; the duration counts each in full."
     )
     return section("In numbers", content_table(inspections).html(), note=note)
 
@@ -62,7 +62,7 @@ def _quantities(inspections: Sequence[Inspection]) -> str:
     for quantity in QUANTITIES:
         values = [inspection.values(quantity.read) for inspection in inspections]
         series.append((quantity.label, quantity.unit or "per scenario", values))
-    samples = [speeds(inspection) for inspection in inspections]
+    samples = [read_speeds(inspection) for inspection in inspections]
     series.append(("speed of ego", "m/s", [sample.ego for sample in samples]))
     series.append(("speed of other vehicles now", "m/s", [sample.vehicles for sample in samples]))
     charts = "".join(
@@ -84,15 +84,15 @@ def _legend(inspections: Sequence[Inspection]) -> str:
 
 
 def _shares(inspections: Sequence[Inspection]) -> str:
-    """Return shares of scenarios by tag, flag and finding of the audit."""
-    tagged = [inspection.tags() for inspection in inspections]
+    """Return the shares of scenarios by tag, flag and audit finding."""
+    tags_by_set = [inspection.tags() for inspection in inspections]
     sizes = [len(inspection) for inspection in inspections]
     groups = {
-        name: with_sizes([tags.get(name, {}) for tags in tagged], sizes)
-        for name in dict.fromkeys(name for tags in tagged for name in tags)
+        name: with_sizes([tags.get(name, {}) for tags in tags_by_set], sizes)
+        for name in dict.fromkeys(name for tags in tags_by_set for name in tags)
     }
     flags = [inspection.value_counts(lambda entry: entry["flags"]) for inspection in inspections]
-    bars = [_bars(name, counts) for name, counts in groups.items() if len(counts) <= _MOST_VALUES]
+    bars = [_bars(name, counts) for name, counts in groups.items() if len(counts) <= _MAX_TAG_VALUES]
     bars += [_bars("flags", with_sizes(flags, sizes)), _bars("audit", true_findings(inspections))]
     return section("Tags, flags, audit", _legend(inspections), f"<div class=bars>{''.join(bars)}</div>")
 
@@ -100,13 +100,13 @@ def _shares(inspections: Sequence[Inspection]) -> str:
 def _bars(title: str, counts: Counts) -> str:
     """Return horizontal bars: one row per value, one bar per set."""
     rows = []
-    for value, sets in counts.items():
+    for value, pairs in counts.items():
         bars = "".join(
-            f'<i style="width:{100 * count / max(of, 1):.2f}%;background:{stroke(place).key}"></i>'
-            for place, (count, of) in enumerate(sets)
+            f'<i style="width:{100 * count / max(total, 1):.2f}%;background:{stroke(index).key}"></i>'
+            for index, (count, total) in enumerate(pairs)
         )
-        words = "<br>".join(f"{count:,} ({100 * count / of:.3g} %)" if of else "–" for count, of in sets)
-        rows.append(f"<tr><th scope=row>{escape(value)}</th><td>{bars}</td><td>{words}</td></tr>")
+        texts = "<br>".join(f"{n:,} ({100 * n / total:.3g} %)" if total else "–" for n, total in pairs)
+        rows.append(f"<tr><th scope=row>{escape(value)}</th><td>{bars}</td><td>{texts}</td></tr>")
     return f"<div><h3>{escape(title)}</h3><table>{''.join(rows)}</table></div>" if rows else ""
 
 

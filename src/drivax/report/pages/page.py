@@ -1,4 +1,4 @@
-"""The frame of every page: one HTML file that carries its styles, scripts and data; and the player as HTML."""
+"""The frame of every page, one HTML file with its styles, scripts and data, and the player as HTML."""
 
 from __future__ import annotations
 
@@ -24,9 +24,15 @@ def page(
     title: str, lead: str, sections: Iterable[str], style: str = "", data: Iterable[str] = (),
     scripts: Iterable[str] = (),
 ) -> str:  # fmt: skip
-    """Return a whole page from a title (plain text), HTML below it and of its sections (empty ones are left out).
+    """Return a page as HTML.
 
-    ``style`` is further CSS, ``data`` are script elements that hold data, ``scripts`` are programs in order.
+    Args:
+        title: Title, plain text.
+        lead: HTML below the title.
+        sections: HTML of the sections; empty ones are skipped.
+        style: CSS in addition to the player's.
+        data: Script elements that hold data.
+        scripts: Programs in order.
     """
     return Template(asset("report.html.template")).substitute(
         title=escape(title),
@@ -40,23 +46,23 @@ def page(
 
 
 def section(title: str, *parts: str, note: str = "", attributes: str = "") -> str:
-    """Return a section with the HTML of its parts and small print below; empty where all parts are."""
+    """Return a section with HTML parts and a note below, or "" if all parts are empty."""
     if not any(parts):
         return ""
-    small = f"<p><small>{note}</small></p>" if note else ""
-    return f"<section{attributes}><h2>{title}</h2>{''.join(parts)}{small}</section>"
+    note_html = f"<p><small>{note}</small></p>" if note else ""
+    return f"<section{attributes}><h2>{title}</h2>{''.join(parts)}{note_html}</section>"
 
 
 def data_element(value: Any, **attributes: str) -> str:
     """Return a script element that holds JSON, with every ``<`` escaped."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    named = "".join(f' {name}="{escape(words)}"' for name, words in attributes.items())
-    return f'<script type="application/json"{named}>{text}</script>'
+    attributes_text = "".join(f' {name}="{escape(text)}"' for name, text in attributes.items())
+    return f'<script type="application/json"{attributes_text}>{text}</script>'
 
 
 def facts_html(headings: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """Return a table of texts: a label and the facts about it in each row."""
-    columns = tuple(Column(heading, label=not place) for place, heading in enumerate(headings))
+    """Return a table with a label and its facts in each row."""
+    columns = tuple(Column(heading, label=index == 0) for index, heading in enumerate(headings))
     return Table("facts", columns, tuple((Cell(label), *map(Cell, facts)) for label, facts in rows)).html()
 
 
@@ -73,13 +79,15 @@ def asset(name: str) -> str:
 
 def _colours() -> str:
     """Return the palette as CSS variables, light and dark."""
-    light, dark = ("".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
-                   for name in ("light", "dark"))  # fmt: skip
+    light, dark = (
+        "".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
+        for name in ("light", "dark")
+    )
     return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
 
 
 def player_html() -> str:
-    """Return stage, controls, legend, keys and plots."""
+    """Return the player: stage, controls, legend, keys and plots."""
     legend = ""
     for name, words in LEGEND:
         fill = "" if name in ("log", "route", "mark", "goal") else f' style="background:var(--{name})"'
@@ -88,7 +96,7 @@ def player_html() -> str:
     keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
     return (
         f"<div id=stage></div>{controls}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
-        "<noscript><p>The player needs JavaScript, which this page carries with it.</p></noscript>"
+        "<noscript><p>The player needs JavaScript; its code is part of this page.</p></noscript>"
         "<h3>Motion and commands</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the "
         "filters of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are "
         "the executed ones: acceleration (or metres ahead) and steering (or metres to the left), as shares of the "
@@ -115,5 +123,5 @@ def player_data(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def player_scripts() -> list[str]:
-    """Return the programs of plots and player; the plots listen to the player, so they come first."""
+    """Return the programs of plots and player; plots come first because they listen to the player."""
     return [asset("plots.js"), asset("player.js")]

@@ -47,12 +47,12 @@ def write_report(
     Args:
         runs: Run folders of ``drivax evaluate`` and ``drivax train``, in the order of the tables.
         out: The file.
-        data: The scenario set of the evaluation, where it has moved.
-        episodes: Number of playable episodes; with 0, there are no rollouts and tags, and no scenario set is needed.
+        data: Path of the policy's scenario set, if it has moved.
+        episodes: Number of playable episodes. A page with 0 has no rollouts or tags, and needs no scenario set.
         overwrite: Replace an existing file.
 
     Raises:
-        DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.
+        DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
         UsageError: ``out`` exists, no run is given, or ``episodes`` is negative.
     """
     check_output(out, overwrite)
@@ -115,26 +115,26 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
 
 def _results(runs: Sequence[EpisodeTable]) -> str:
     names = result_tables.metric_names(runs)
-    shown = _first_metrics(runs, names)
-    others = [name for name in result_tables.sort_metrics(names) if name not in shown]
-    table = result_tables.planners_table(runs, shown).html() if shown else ""
+    headline = _first_metrics(runs, names)
+    others = [name for name in result_tables.sort_metrics(names) if name not in headline]
+    table = result_tables.planners_table(runs, headline).html() if headline else ""
     details = (
         f"<summary>{len(others)} more metrics</summary>{result_tables.planners_table(runs, others).html()}"
     )
     note = (
-        f"Mean, {result_tables.CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; "
-        "undefined episodes are left out. The best mean is underlined, whether or not it is clearly best. Click a "
-        "mean for its episodes. Intervals: Wilson's for rates (with the effective number of episodes where some share "
-        "a recording), a bootstrap over recordings otherwise."
+        f"Mean, {result_tables.CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined. "
+        "The best mean is underlined, whether or not its lead is significant. Click a mean for its episodes. "
+        "Intervals: Wilson's for rates (with the effective number of episodes if some share a recording), a bootstrap "
+        "over recordings otherwise."
     )
     details = f"<details>{details}</details>" if others else ""
     return section("Results", _comparability_warning(runs), table, details, note=note)
 
 
 def _first_metrics(runs: Sequence[EpisodeTable], names: Sequence[str]) -> list[str]:
-    """Return the metrics of the first table: the headline, after crashes where there were any."""
-    crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
-    return [*(["crashed"] if crashed and "crashed" in names else []), *result_tables.headline_names(names)]
+    """Return the metrics of the first table: crashes, if there were any, and the headline metrics."""
+    any_crash = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
+    return [*(["crashed"] if any_crash and "crashed" in names else []), *result_tables.headline_names(names)]
 
 
 def _comparability_warning(runs: Sequence[EpisodeTable]) -> str:
@@ -143,8 +143,8 @@ def _comparability_warning(runs: Sequence[EpisodeTable]) -> str:
     reasons = []
     for run in runs[:-1]:
         scenarios, policy_scenarios = set(run.scenarios), set(policy.scenarios)
-        if unmatched := mismatch(run, policy):
-            reasons.append(f"{run.name} and {policy.name} {unmatched[0]}")
+        if reason := mismatch(run, policy):
+            reasons.append(f"{run.name} and {policy.name} {reason[0]}")
         elif scenarios != policy_scenarios:
             counts = f"{len(scenarios & policy_scenarios)} of {len(scenarios)} and {len(policy_scenarios)}"
             reasons.append(f"{run.name} and {policy.name} have {counts} scenarios in common")
@@ -158,59 +158,59 @@ def _differences(runs: Sequence[EpisodeTable]) -> str:
     if not others or not names:
         return ""
     note = (
-        "Mean of the differences, scenario by scenario, over those where both are defined (n pairs), with a "
+        "Mean of the differences by scenario, over the scenarios where both are defined (n pairs), with a "
         f"{result_tables.CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval "
-        "excludes zero; it is not widened for the number of comparisons. “All equal”: no pair differs from the next, "
-        "so that a bootstrap has no width."
+        "excludes zero; it is not widened for the number of comparisons. “All equal”: all pairs have the same "
+        "difference, which leaves the bootstrap without width."
     )
     table = result_tables.differences_table(policy, others, names).html()
     return section(f"{escape(policy.name)} against the others", table, note=note)
 
 
 def _transfer(runs: Sequence[EpisodeTable]) -> str:
-    """Return the results by training and evaluation data; empty where all runs share one set."""
-    parts = "".join(
+    """Return the results by training and evaluation data, or "" if all runs share one set."""
+    tables_html = "".join(
         f"<h3>{escape(result_tables.metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
         for table in transfer_tables(runs)
     )
     note = (
-        "Rows: planners and their training data (– where nothing was trained, or the run does not say). Columns: "
+        "Rows: planners and their training data (– for no training, or unknown data). Columns: "
         "evaluation data. Sets differ in difficulty: compare along a column."
     )
-    return section("Transfer", parts, note=note)
+    return section("Transfer", tables_html, note=note)
 
 
 def _collisions(runs: Sequence[EpisodeTable]) -> str:
-    """Return the kinds of the first collision with their meanings; empty without collisions of a known kind."""
+    """Return the kinds of the first collision with their meanings, or "" if no kind is known."""
     table = result_tables.collisions_table(runs)
     if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
         return ""
     kinds = result_tables.COLLISION_KINDS.values()
     meanings = definitions((name, f"{meaning[:1].upper()}{meaning[1:]}.") for name, meaning in kinds)
-    counted = [(run, run.metrics["collision_type"] > 0) for run in runs if "collision_type" in run.metrics]
-    total = ", ".join(f"{escape(run.name)} {int(hit.sum())} of {len(run)}" for run, hit in counted)
-    parts = f"<p>Episodes with a collision: {total}.</p>", table.html(), meanings
+    types = [(run, run.metrics["collision_type"]) for run in runs if "collision_type" in run.metrics]
+    counts = ", ".join(f"{escape(run.name)} {int((kind > 0).sum())} of {len(run)}" for run, kind in types)
+    parts = f"<p>Episodes with a collision: {counts}.</p>", table.html(), meanings
     return section("Kinds of collision", *parts, note=f"{escape(table.caption)} (Wilson's).")
 
 
 def _strata(runs: Sequence[EpisodeTable], tags: Tags) -> str:
-    """Return the results by kind of scenario; empty without tags."""
-    parts = "".join(
+    """Return the results by kind of scenario, or "" without tags."""
+    tables_html = "".join(
         f"<details{'' if index else ' open'}><summary>{escape(table.name.replace('-', ' '))}</summary>"
         f"{table.html()}</details>"
         for index, table in enumerate(strata_tables(runs, tags))
     )
     note = "Tags describe the log. Small strata have wide intervals; of many cells, some stand out by chance."
-    return section("By kind of scenario", parts, note=note)
+    return section("By kind of scenario", tables_html, note=note)
 
 
 def _distributions(runs: Sequence[EpisodeTable]) -> str:
-    note = "The height of a line at a value is the share of episodes at or below it; undefined ones are left out."
+    note = "The height of a line at a value is the share of episodes at or below it, where the metric is defined."
     return section("Distributions", distribution_charts(runs), note=note)
 
 
 def _episodes(runs: Sequence[EpisodeTable], packed: Packed) -> str:
-    note = "▶ marks those that play below." if packed else "Rollouts and tags were left out of this page."
+    note = "▶ marks the episodes in the player below." if packed else "This page has no rollouts and no tags."
     text = (
         "<p>All episodes, worst first: by the severity of failures, then by the lowest score. Click a number in the "
         f"tables above for its episodes. {note}</p>"
@@ -230,8 +230,12 @@ def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     )
     policy = escape(runs[-1].name)
     comparable_runs = [run for run in runs if comparable(run, runs[-1])]
-    text = f"Other agents are drawn as they moved around {policy};</b> around the others they reacted differently."
-    caution = f"<p><b>{text}</p>" if len(comparable_runs) > 1 and runs[-1].traffic != "log" else ""
+    caution = ""
+    if len(comparable_runs) > 1 and runs[-1].traffic != "log":
+        caution = (
+            f"<p><b>Other agents are drawn as they moved around {policy};</b> around the others they reacted "
+            "differently.</p>"
+        )
     return (
         f"<h3>Rollouts</h3><p>Selected by rule: failures of {policy} first, each kind in turn, then successes. All "
         f"planners start from the same state at the same time.</p>{caution}"
@@ -269,9 +273,9 @@ def _provenance(runs: Sequence[EpisodeTable | Training]) -> str:
     )
 
 
-#: Maximum number of values of a tag that can be selected; excludes ids and places.
-MOST_VALUES = 24
-#: Columns of the list, as far as a run has them; all other metrics filter and sort it.
+#: Maximum number of values of a selectable tag; excludes ids and places.
+MAX_TAG_VALUES = 24
+#: Columns of the list, if a run has them; all other metrics filter and sort it.
 _SHOWN = (
     "vmax_score", "at_fault_collision", "collision", "offroad", "red_light", "progress_ratio", "min_ttc", "comfortable",
 )  # fmt: skip
@@ -280,9 +284,10 @@ _SHOWN = (
 def episode_data(runs: Sequence[EpisodeTable], tags: Tags, playable: Mapping[ScenarioKey, int]) -> str:
     """Return the data of the list as a script element; ``playable`` has the player's index of each shown episode.
 
-    ``metrics`` has the label of each metric, and the value of a rate that means failure; ``runs[].values`` one column
-    per metric with four significant digits, null where undefined, worst row first; ``runs[].errors`` step and error of
-    each crash by row; ``tags`` the words of each tag, and the indices of each scenario's words.
+    - ``metrics``: label of each metric, and the value of a rate that means failure.
+    - ``runs[].values``: a column per metric, worst row first, with four significant digits; null where undefined.
+    - ``runs[].errors``: step and error of each crash by row.
+    - ``tags``: words of each tag, and their indices for each scenario.
     """
     names = result_tables.sort_metrics(result_tables.metric_names(runs))
     names += [name for name in result_tables.metric_names(runs) if name in result_tables.CODES]
@@ -315,14 +320,14 @@ def _run(
     distinct = list(dict.fromkeys(outcomes))
     keys = run.scenarios
     scenarios, crashes = [keys[row] for row in rows], run.crash_by_scenario
-    row_keys = ((str(row), key) for row, key in enumerate(scenarios))
+    crash_rows = [(row, crashes[key]) for row, key in enumerate(scenarios) if key in crashes]
     return {
         "name": run.name,
         "playable": comparable(run, runs[-1]),
         "scenario": [index_of[key] for key in scenarios],
         "outcomes": distinct,
         "outcome": [distinct.index(name) for name in outcomes],
-        "errors": {row: (crashes[key].step, crashes[key].error) for row, key in row_keys if key in crashes},
+        "errors": {str(row): (crash.step, crash.error) for row, crash in crash_rows},
         "values": [_column(run.metrics.get(name), rows) for name in names],
     }
 
@@ -344,8 +349,8 @@ def _tags(scenario_tags: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     for name in dict.fromkeys(name for tags in scenario_tags for name in tags):
         values = [tags.get(name, result_tables.UNKNOWN).split("|") for tags in scenario_tags]
         distinct = sorted({word for words in values for word in words})
-        if 1 < len(distinct) <= MOST_VALUES:
-            number = {word: index for index, word in enumerate(distinct)}
-            of = [[number[word] for word in words] for words in values]
-            columns.append({"name": name, "words": distinct, "of": of})
+        if 1 < len(distinct) <= MAX_TAG_VALUES:
+            index_of = {word: index for index, word in enumerate(distinct)}
+            indices = [[index_of[word] for word in words] for words in values]
+            columns.append({"name": name, "words": distinct, "of": indices})
     return columns

@@ -26,7 +26,7 @@ _FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red", "log_revers
 
 
 def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ()) -> list[Scenario]:
-    """Return the scenarios with these ids, in that order, or all; then the first ``limit``.
+    """Return the first ``limit`` scenarios of a set, or those with these ids, in that order.
 
     Raises:
         UsageError: An id is not in the set, or ``limit`` leaves nothing.
@@ -49,7 +49,9 @@ def write_player(
     scenarios: Sequence[Scenario], out: Path, overwrite: bool = False, title: str = "scenarios",
     details: Sequence[str] = (),
 ) -> Path:  # fmt: skip
-    """Write a page of logs (some tens of kB each) to the HTML file ``out``; ``details`` is HTML above each one's facts.
+    """Write a page of logs (some tens of kB each) to the HTML file ``out``.
+
+    ``details`` has HTML for each scenario, shown above its facts.
 
     Raises:
         UsageError: ``out`` exists or is a folder, or there is no scenario.
@@ -57,34 +59,36 @@ def write_player(
     check_output(out, overwrite)
     if not scenarios:
         raise UsageError("no scenarios to show", cure="name at least one")
-    packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
-    unclean = sum(bool(findings(scenario)) for scenario in scenarios)
-    audited = sum(bool(scenario.audit) for scenario in scenarios)
-    audit = f"the audit finds violations in {unclean} of {audited}" if audited else "not audited"
+    episodes = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
+    violation_count = sum(bool(findings(scenario)) for scenario in scenarios)
+    audit_count = sum(bool(scenario.audit) for scenario in scenarios)
+    audit = (
+        f"the audit finds violations in {violation_count} of {audit_count}" if audit_count else "not audited"
+    )
     lead = f"<p class=lead><b>{len(scenarios)}</b> recorded scenarios; {audit}.</p>"
     browser = _browser(scenarios, details or [""] * len(scenarios))
     scripts = [*player_scripts(), asset("browser.js")]
-    write_text(out, page(title, lead, [browser], asset("browser.css"), player_data(packed), scripts))
+    write_text(out, page(title, lead, [browser], asset("browser.css"), player_data(episodes), scripts))
     return out
 
 
 def findings(scenario: Scenario) -> str:
     """Return the violations that the audit found in a log, as text."""
-    names = [names for name, names in _FINDINGS.items() if scenario.audit.get(name)]
-    if (share := scenario.audit.get("log_offroad_fraction")) is not None and share > 0:
-        names.append("off-road")
-    return ", ".join(names)
+    texts = [text for name, text in _FINDINGS.items() if scenario.audit.get(name)]
+    if (scenario.audit.get("log_offroad_fraction") or 0.0) > 0.0:
+        texts.append("off-road")
+    return ", ".join(texts)
 
 
 def criticality_html(table: ScoreTable, row: int) -> str:
-    """Return a chart of the criticality of a scenario and its components over time, and its own score."""
+    """Return a chart of a scenario's criticality and its components over time, with the scenario's score."""
     valid = table.valid[row]
     time = np.flatnonzero(valid) * DT_S
-    series = {"score": table.steps[row], **{name: part[row] for name, part in table.components.items()}}
-    points = {
-        name.replace("_", " "): np.column_stack([time, values[valid]]) for name, values in series.items()
+    series = {"score": table.steps[row]} | {name: scores[row] for name, scores in table.components.items()}
+    lines = {
+        name.replace("_", " "): (stroke(index), np.column_stack([time, scores[valid]]))
+        for index, (name, scores) in enumerate(series.items())
     }
-    lines = {name: (stroke(index), line) for index, (name, line) in enumerate(points.items())}
     rank = int(np.flatnonzero(table.order == row)[0]) + 1
     summary = f"score {table.scenarios[row]:.3f}, rank {rank:,} of {len(table.scenarios):,} by {table.method}"
     return (
@@ -94,7 +98,7 @@ def criticality_html(table: ScoreTable, row: int) -> str:
 
 
 def _log(scenario: Scenario) -> Rollout:
-    """Return the log; of its events, the audit stores only the first off-road step."""
+    """Return the log as a rollout; its only known event is the first off-road step."""
     offroad = scenario.audit.get("first_offroad_step")
     events = {"offroad": -1 if offroad is None else int(offroad)}
     return Rollout("log", logged_motion(scenario), 0, events, findings(scenario))
@@ -122,8 +126,8 @@ def _button(scenario: Scenario) -> str:
     )
 
 
-def _details(scenario: Scenario, details: str) -> str:
-    """Return tags, flags, audit and overflow as lists, visible while the scenario is selected."""
+def _details(scenario: Scenario, extra: str) -> str:
+    """Return the ``extra`` HTML, tags, flags, audit and overflow, visible while the scenario is selected."""
     source = scenario.source
     counts = {
         "steps": int(scenario.steps), "tracks": source.tracks, "tracks now": source.tracks_valid_now,
@@ -134,14 +138,15 @@ def _details(scenario: Scenario, details: str) -> str:
         name: "never" if name.endswith("_step") and value == -1 else value
         for name, value in scenario.audit.items()
     }
-    lists = (
+    sections = (
         ("Tags", _facts(scenario.tags)),
         ("Flags", f"<p>{escape(', '.join(_flags(scenario)) or 'none')}</p>"),
         ("Audit", _facts(audit) if audit else "<p>not audited</p>"),
         ("Source", _facts(counts)),
         ("Did not fit", _facts(scenario.overflow) if scenario.overflow else "<p>nothing</p>"),
     )
-    return f"<div hidden>{details}" + "".join(f"<h3>{name}</h3>{text}" for name, text in lists) + "</div>"
+    sections_html = "".join(f"<h3>{name}</h3>{text}" for name, text in sections)
+    return f"<div hidden>{extra}{sections_html}</div>"
 
 
 def _facts(values: Mapping[str, Any]) -> str:

@@ -33,7 +33,7 @@ EVENT_WORDS: Mapping[str, str] = {
 MARGIN_M = 90.0
 #: Radii of a stop sign and of the ring around the goal, metres.
 STOP_M, GOAL_M = 0.9, 2.0
-#: Segments of one feature with ends closer than this are one line, metres.
+#: Maximum gap between consecutive segments of one line, metres.
 _JOINT_M = 0.02
 
 
@@ -46,8 +46,8 @@ class Rollout:
         ego: Position [m], heading [rad], speed [m/s] at every step, local frame; NaN where the agent is absent.
         start: Step at which the planner took over.
         events: Step of the first event by name, -1 for none.
-        action: The first two numbers of its actions, NaN where there are none; None for the log.
-        others: Position [m] and heading [rad] of every agent in reactive traffic, NaN where absent; None for the log's.
+        action: The first two numbers of each action, NaN for steps without one; None for the log.
+        others: Position [m] and heading [rad] of every agent in reactive traffic, NaN where absent; None in log replay.
     """
 
     planner: str
@@ -59,14 +59,14 @@ class Rollout:
     others: Float[Array, "step agent 3"] | None = None
 
 
-def with_traffic_of(rollout: Rollout, scenario: Scenario) -> Scenario:
-    """Return the scenario with all agents but ego as they moved in a rollout, from its start on."""
+def replace_traffic(scenario: Scenario, rollout: Rollout) -> Scenario:
+    """Return the scenario with the trajectories of all agents but ego in a rollout, from its start on."""
     if rollout.others is None:
         return scenario
-    pose = rollout.others[rollout.start :]
-    steps, slots = slice(rollout.start, rollout.start + len(pose)), slice(1, pose.shape[1])
-    present = np.asarray(np.isfinite(pose[:, slots]).all(axis=-1))
-    poses = np.where(present[..., None], pose[:, slots], 0.0)
+    others = rollout.others[rollout.start :, 1:]
+    steps, slots = slice(rollout.start, rollout.start + len(others)), slice(1, 1 + others.shape[1])
+    present = np.asarray(np.isfinite(others).all(axis=-1))
+    poses = np.where(present[..., None], others, 0.0)
     record = scenario.record.copy()
     record["agent_valid"][steps, 1:] = False
     record["agent_valid"][steps, slots] = present
@@ -85,9 +85,10 @@ def surroundings(scenario: Scenario, rollouts: Sequence[Rollout]) -> Box:
 
 @dataclass(frozen=True)
 class Shape:
-    """Lines or polygons ``[n, 2]`` of one style, metres, with the colours of outline and inside (None for none).
+    """Lines or polygons ``[n, 2]`` of one style, metres.
 
-    ``dash`` has the lengths of dashes and gaps in pixels, ``level`` is the drawing order.
+    ``line`` and ``fill`` are the colours of outline and inside, None to draw none. ``dash`` has the lengths of dashes
+    and gaps in pixels, ``level`` is the drawing order.
     """
 
     lines: Sequence[Array]
@@ -104,7 +105,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Boxes:
-    """Poses of agents at every step, their length and width in metres, names of colours, and where they are present."""
+    """Agents as boxes: pose and presence at every step, length and width in metres, and the name of a colour."""
 
     xy: Float[Array, "step agent 2"]
     heading: Float[Array, "step agent"]
@@ -155,7 +156,7 @@ class Drawing:
         return cls(
             road_lines(scenario, box), signs[_within(signs, box)], route[_within(route, box)],
             goal[_within(goal, box)], line[near], state[:, near],
-            _agents(scenario, box), _parked_boxes(scenario, box), _box_of(scenario, slice(0, 1), None),
+            _agent_boxes(scenario, box), _parked_boxes(scenario, box), _boxes(scenario, slice(0, 1)),
         )  # fmt: skip
 
     def ground(self) -> Iterator[Shape]:
@@ -207,17 +208,18 @@ def ring(xy: Array, radius: float) -> Float[Array, "25 2"]:
 
 
 def _within(xy: Array, box: Box) -> Bool[Array, "..."]:
-    """Return which points are inside a box."""
+    """Return a mask of the points inside a box."""
     return np.all((xy >= box[:2]) & (xy <= box[2:]), axis=-1)
 
 
 def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
-    """Return the polylines of every layer, of segments with a midpoint in the box (low x, low y, high x, high y).
+    """Return the polylines of every layer, without segments whose midpoint is outside the box.
 
-    Segments are stored by grid cell; within a feature they are ordered by arc length and chained where ends meet.
+    Segments are stored by grid cell. Those of a feature are sorted by arc length and chained where their ends meet. The
+    box is (low x, low y, high x, high y).
     """
-    used = int(scenario.segment_blocks[3])
-    rows = np.lexsort((scenario.segment_start_m[:used], scenario.segment_feature[:used]))
+    count = int(scenario.segment_blocks[3])
+    rows = np.lexsort((scenario.segment_start_m[:count], scenario.segment_feature[:count]))
     a, b = scenario.segment_a[rows, :2], scenario.segment_b[rows, :2]
     if box is not None:
         inside = _within((a + b) / 2, box)
@@ -226,8 +228,8 @@ def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
     if not len(rows):
         return layers
     feature = scenario.segment_feature[rows]
-    joined = (feature[1:] == feature[:-1]) & (np.abs(a[1:] - b[:-1]).max(axis=1) < _JOINT_M)
-    starts = np.flatnonzero(np.concatenate(([True], ~joined)))
+    continues = (feature[1:] == feature[:-1]) & (np.abs(a[1:] - b[:-1]).max(axis=1) < _JOINT_M)
+    starts = np.flatnonzero(np.concatenate(([True], ~continues)))
     for begin, end in zip(starts, [*starts[1:], len(rows)], strict=True):
         line = np.concatenate((a[begin:end], b[end - 1 : end]))
         layers[road_layer(int(scenario.segment_kind[rows[begin]]))].append(line)
@@ -237,8 +239,8 @@ def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
 def _lights(scenario: Scenario) -> tuple[Float[Array, "light 2 2"], Int[Array, "step light"]]:
     """Return stop lines and codes of the lights that have a stop line and at least one observed state."""
     line, steps = scenario.light_line, int(scenario.steps)
-    drawn = np.abs(line[:, :2] - line[:, 2:]).max(axis=1, initial=0.0) > 0
-    rows = np.flatnonzero(drawn & (scenario.light_state >= 0).any(axis=0))
+    has_stop_line = np.abs(line[:, :2] - line[:, 2:]).max(axis=1, initial=0.0) > 0
+    rows = np.flatnonzero(has_stop_line & (scenario.light_state >= 0).any(axis=0))
     states = scenario.light_state[:steps, rows]
     codes = np.full(states.shape, -1, np.int8)
     for state in np.unique(states[states >= 0]):
@@ -246,7 +248,8 @@ def _lights(scenario: Scenario) -> tuple[Float[Array, "light 2 2"], Int[Array, "
     return line[rows].reshape(-1, 2, 2), codes
 
 
-def _box_of(scenario: Scenario, rows: Any, valid: Any) -> Boxes:
+def _boxes(scenario: Scenario, rows: Any, valid: Any = None) -> Boxes:
+    """Return the boxes of some agents, present where ``valid`` or, by default, as in the scenario."""
     steps = int(scenario.steps)
     colours = [agent_colour(int(kind)) for kind in scenario.agent_kind[rows]]
     return Boxes(
@@ -255,13 +258,13 @@ def _box_of(scenario: Scenario, rows: Any, valid: Any) -> Boxes:
     )  # fmt: skip
 
 
-def _agents(scenario: Scenario, box: Box) -> Boxes:
+def _agent_boxes(scenario: Scenario, box: Box) -> Boxes:
     """Return all moving agents but ego, present while they are inside the box."""
     steps = int(scenario.steps)
     near = scenario.agent_valid[:steps] & _within(scenario.agent_xy[:steps], box)
     near[:, 0] = False
     rows = np.flatnonzero(near.any(axis=0))
-    return _box_of(scenario, rows, near[:, rows])
+    return _boxes(scenario, rows, near[:, rows])
 
 
 def _parked_boxes(scenario: Scenario, box: Box) -> Boxes:

@@ -1,4 +1,4 @@
-"""A picture of an observation: everything that a policy sees, from above, in the ego frame."""
+"""A picture of an observation: the input of a policy from above, in the ego frame."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Values = np.ndarray[Any, Any]
 _KINDS = ("vehicle", "pedestrian", "cyclist", "other")
 _STATES = {"unknown": "unknown", "green": "green", "yellow": "amber", "red": "red"}
 _ROADS = {"lane": ("lane", 1.6), "edge": ("edge", 2.2), "crosswalk": ("line", 5.0)}
-#: Nothing further than this is drawn, m; space around what is drawn, m.
-_FARTHEST_M, _MARGIN_M = 130.0, 4.0
-#: Least ratio of the shorter to the longer side of the picture.
-_SLIMMEST = 0.66
-#: An agent of unknown size is a dot of this radius, m.
+#: Maximum distance of drawn points, and margin around them, m.
+_MAX_DISTANCE_M, _MARGIN_M = 130.0, 4.0
+#: Minimum ratio of the shorter to the longer side of the picture.
+_MIN_ASPECT = 0.66
+#: Radius of the dot for an agent of unknown size, m.
 _DOT_M = 0.9
 _SCALE = {
     "position": POSITION_M, "goal": POSITION_M, "velocity": SPEED_MPS, "length": SIZE_M, "width": SIZE_M
@@ -40,7 +40,7 @@ _SCALE = {
 
 @dataclass(frozen=True)
 class ObservationGroups:
-    """An observation by group and feature ``[..., columns]`` in m and m/s, and the valid rows of each group."""
+    """An observation by group and feature ``[..., columns]`` in m and m/s, and a mask of each group's valid rows."""
 
     values: Mapping[str, Mapping[str, Values]]
     masks: Mapping[str, Values]
@@ -52,12 +52,12 @@ class ObservationGroups:
         names = feature_names(config.features, {name: value.shape for name, value in arrays.items()})
         values, masks = {}, {}
         for group in (name for name in COLUMNS if name in arrays):
-            values[group], place = {}, 0
+            values[group], start = {}, 0
             for feature in getattr(config.features, group):
                 width = sum(name.split()[0] == feature for name in names[group])
                 scale = PIECE_M if (group, feature) == ("road", "length") else _SCALE.get(feature, 1.0)
-                values[group][feature] = arrays[group][..., place : place + width] * scale
-                place += width
+                values[group][feature] = arrays[group][..., start : start + width] * scale
+                start += width
             shape = arrays[group].shape[:-1]
             masks[group] = arrays.get(f"{group}_mask", np.ones(shape, bool))
         return cls(values, masks)
@@ -66,8 +66,9 @@ class ObservationGroups:
         """Return whether a group has all of these features."""
         return group in self.values and all(name in self.values[group] for name in features)
 
-    def __getitem__(self, at: tuple[str, str]) -> Values:
-        return self.values[at[0]][at[1]]
+    def __getitem__(self, key: tuple[str, str]) -> Values:
+        group, feature = key
+        return self.values[group][feature]
 
 
 def draw_observation(config: ObservationConfig, observation: Mapping[str, Any], title: str = "") -> Figure:
@@ -113,21 +114,21 @@ def draw_log_observation(
 
 
 def _to_paper(points: Values) -> Values:
-    """Return points of the ego frame (ahead, left) on paper: ahead is up, left is left."""
+    """Rotate points of the ego frame (ahead, left) so that ahead is up on paper."""
     return np.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
 def _extent(groups: ObservationGroups) -> tuple[Values, Values]:
-    """Return the corners of the rectangle that holds everything within ``_FARTHEST_M``."""
+    """Return the low and high corner of a rectangle around all points, clipped to ``_MAX_DISTANCE_M``."""
     points = [np.zeros((1, 2)), np.array([[20.0, 12.0], [-8.0, -12.0]])]
     for group in ("agents", "road", "lights", "route", "ego"):
         if groups.has(group, "position"):
             points.append(_to_paper(groups[group, "position"][groups.masks[group]]))
-    everything = np.clip(np.concatenate(points), -_FARTHEST_M, _FARTHEST_M)
-    low, high = everything.min(axis=0) - _MARGIN_M, everything.max(axis=0) + _MARGIN_M
+    xy = np.clip(np.concatenate(points), -_MAX_DISTANCE_M, _MAX_DISTANCE_M)
+    low, high = xy.min(axis=0) - _MARGIN_M, xy.max(axis=0) + _MARGIN_M
     width, height = high - low
-    more = np.array([max(_SLIMMEST * height - width, 0.0), max(_SLIMMEST * width - height, 0.0)]) / 2
-    return low - more, high + more
+    padding = np.array([max(_MIN_ASPECT * height - width, 0.0), max(_MIN_ASPECT * width - height, 0.0)]) / 2
+    return low - padding, high + padding
 
 
 def _draw(axes: Axes, config: ObservationConfig, groups: ObservationGroups) -> None:
@@ -172,16 +173,16 @@ def _draw_road(axes: Axes, groups: ObservationGroups) -> None:
     half = direction * length / 2
     pieces = _to_paper(np.stack([middle - half, middle + half], axis=1))
     for number, (colour, width) in enumerate(_ROADS.values()):
-        chosen = kinds[:, number] > 0
+        of_kind = kinds[:, number] > 0
         style: dict[str, Any] = {"linewidths": width, "capstyle": "butt", "zorder": 1.5 - number / 4}
-        collection = LineCollection(list(pieces[chosen]), colors=LIGHT[colour], **style)
+        collection = LineCollection(list(pieces[of_kind]), colors=LIGHT[colour], **style)
         if number == 2:
             collection.set(linestyles=[(0, (0.5, 0.5))], alpha=0.55)
         axes.add_collection(collection)
     lanes = kinds[:, 0] > 0
-    turned = _to_paper(direction[lanes])
+    arrows = _to_paper(direction[lanes])
     axes.quiver(
-        *_to_paper(middle[lanes]).T, *turned.T, color=LIGHT["line"], angles="xy", pivot="mid", scale_units="xy",
+        *_to_paper(middle[lanes]).T, *arrows.T, color=LIGHT["line"], angles="xy", pivot="mid", scale_units="xy",
         scale=0.6, units="xy", width=0.22, headwidth=4.5, headlength=4.5, headaxislength=4, zorder=1.6,
     )  # fmt: skip
 
@@ -201,9 +202,9 @@ def _draw_lights(axes: Axes, groups: ObservationGroups) -> None:
         x, y = _to_paper(groups["lights", "position"][row])
         state = groups["lights", "state"][row] if groups.has("lights", "state") else np.eye(4)[0]
         colour = LIGHT[list(_STATES.values())[int(np.argmax(state))]]
-        mine = groups.has("lights", "on_route") and groups["lights", "on_route"][row, 0] > 0
-        axes.scatter(x, y, s=110 if mine else 45, color=colour, edgecolor=LIGHT["ink"] if mine else "white",
-                     linewidth=1.4 if mine else 0.8, marker="s", zorder=3)  # fmt: skip
+        on_route = groups.has("lights", "on_route") and groups["lights", "on_route"][row, 0] > 0
+        size, edge, width = (110, LIGHT["ink"], 1.4) if on_route else (45, "white", 0.8)
+        axes.scatter(x, y, s=size, color=colour, edgecolor=edge, linewidth=width, marker="s", zorder=3)
 
 
 def _draw_agents(axes: Axes, groups: ObservationGroups) -> None:
@@ -213,12 +214,11 @@ def _draw_agents(axes: Axes, groups: ObservationGroups) -> None:
         kind = groups["agents", "type"][row, -1] if groups.has("agents", "type") else np.eye(4)[0]
         colour = LIGHT[_KINDS[int(np.argmax(kind))]]
         for step in np.flatnonzero(mask[row]):
-            now = step == steps - 1
-            faded = 1.0 if now else 0.12 + 0.3 * step / steps
-            _outline(axes, groups, "agents", (row, step), colour, faded, 4.0 + step / steps)
+            alpha = 1.0 if step == steps - 1 else 0.12 + 0.3 * step / steps
+            _outline(axes, groups, "agents", (row, step), colour, alpha, 4.0 + step / steps)
         if kind[1] + kind[2] > 0:  # pedestrians and cyclists get a halo
-            place = _to_paper(groups["agents", "position"][row, -1])
-            axes.scatter(*place, s=70, color=colour, alpha=0.45, linewidth=0, zorder=3.9)
+            centre = _to_paper(groups["agents", "position"][row, -1])
+            axes.scatter(*centre, s=70, color=colour, alpha=0.45, linewidth=0, zorder=3.9)
         if groups.has("agents", "velocity"):
             _arrow(axes, groups["agents", "position"][row, -1], groups["agents", "velocity"][row, -1])
 
@@ -226,7 +226,7 @@ def _draw_agents(axes: Axes, groups: ObservationGroups) -> None:
 def _outline(
     axes: Axes, groups: ObservationGroups, group: str, index: tuple[Any, ...], colour: str, alpha: float, zorder: float
 ) -> None:  # fmt: skip
-    """Draw a box where heading and size are known, else a dot."""
+    """Draw a box if heading and size are known, else a dot."""
     from matplotlib.patches import Circle, Polygon
 
     xy, style = groups[group, "position"][index], {"alpha": alpha, "zorder": zorder, "linewidth": 0.7}
@@ -238,19 +238,19 @@ def _outline(
         outline = _to_paper(corners(np.array([*xy, cos, sin, *size])))
         axes.add_patch(Polygon(outline, closed=True, facecolor=colour, edgecolor=edge, **style))
         if alpha == 1.0:  # the windscreen shows the front
-            front = _to_paper(corners(np.array([*(xy + 0.22 * size[0] * np.array([cos, sin])), cos, sin,
-                                          0.16 * size[0], 0.72 * size[1]])))  # fmt: skip
+            front_xy = xy + 0.22 * size[0] * np.array([cos, sin])
+            front = _to_paper(corners(np.array([*front_xy, cos, sin, 0.16 * size[0], 0.72 * size[1]])))
             front_style: dict[str, Any] = {"facecolor": LIGHT["ink"], "alpha": 0.65, "zorder": zorder + 0.01}
             axes.add_patch(Polygon(front, closed=True, **front_style))
     else:
         axes.add_patch(Circle(tuple(_to_paper(xy)), _DOT_M, facecolor=colour, edgecolor=edge, **style))
 
 
-def _arrow(axes: Axes, place: Values, velocity: Values) -> None:
+def _arrow(axes: Axes, position: Values, velocity: Values) -> None:
     """Draw an arrow to the position in one second at this velocity."""
     if np.hypot(*velocity) < 0.5:
         return
-    start, end = _to_paper(place), _to_paper(place + velocity)
+    start, end = _to_paper(position), _to_paper(position + velocity)
     axes.annotate(
         "", xy=tuple(end), xytext=tuple(start), zorder=5.5, annotation_clip=True,
         arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0,
@@ -264,8 +264,8 @@ def _draw_ego(axes: Axes, groups: ObservationGroups) -> None:
         return
     steps = len(groups["ego", "position"])
     for step in range(steps):
-        faded = 1.0 if step == steps - 1 else 0.12 + 0.3 * step / steps
-        _outline(axes, groups, "ego", (step,), LIGHT["ego"], faded, 6.0 + step / steps)
+        alpha = 1.0 if step == steps - 1 else 0.12 + 0.3 * step / steps
+        _outline(axes, groups, "ego", (step,), LIGHT["ego"], alpha, 6.0 + step / steps)
     if groups.has("ego", "velocity"):
         _arrow(axes, groups["ego", "position"][-1], groups["ego", "velocity"][-1])
 
@@ -278,15 +278,15 @@ def _scale_bar(axes: Axes, low: Values, high: Values) -> None:
 
 
 def _legend(figure: Figure, left: float, config: ObservationConfig, groups: ObservationGroups) -> None:
-    """Draw the meaning of the signs, and the number of valid rows of each group."""
+    """Draw the legend, and the number of valid rows of each group."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    def line(colour: str, label: str, **more: Any) -> Any:
-        return Line2D([], [], color=LIGHT[colour], label=label, **more)
+    def line(colour: str, label: str, **options: Any) -> Any:
+        return Line2D([], [], color=LIGHT[colour], label=label, **options)
 
-    def sign(colour: str, label: str, marker: str = "s", **more: Any) -> Any:
-        return line(colour, label, linestyle="", marker=marker, markersize=8, **more)
+    def symbol(colour: str, label: str, marker: str = "s", **options: Any) -> Any:
+        return line(colour, label, linestyle="", marker=marker, markersize=8, **options)
 
     handles: list[Any] = [Patch(facecolor=LIGHT["ego"], edgecolor=LIGHT["outline"], label="ego")]
     if groups.has("agents", "position"):
@@ -303,36 +303,36 @@ def _legend(figure: Figure, left: float, config: ObservationConfig, groups: Obse
         handles += [line(colour, name, linewidth=width) for name, (colour, width) in _ROADS.items()]
         handles.append(line("lane", "reach of the road", linestyle="--", linewidth=0.9))
     if groups.has("lights", "position"):
-        handles += [sign(colour, f"{name} light") for name, colour in _STATES.items()]
+        handles += [symbol(colour, f"{name} light") for name, colour in _STATES.items()]
         marker: dict[str, Any] = {"markeredgecolor": LIGHT["ink"], "markeredgewidth": 1.4}
-        handles.append(sign("ground", "light on the route", **marker))
+        handles.append(symbol("ground", "light on the route", **marker))
     if groups.has("route", "position"):
         handles.append(line("route", "route", marker="o", markersize=5, linewidth=1.4))
     if groups.has("route", "goal"):
-        handles.append(sign("route", "goal", marker="*"))
-    up = figure.get_size_inches()[1]
+        handles.append(symbol("route", "goal", marker="*"))
+    height_in = figure.get_size_inches()[1]
     legend = figure.legend(
-        handles=handles, loc="upper left", bbox_to_anchor=(left, 1 - 0.4 / up), frameon=False, fontsize=9,
+        handles=handles, loc="upper left", bbox_to_anchor=(left, 1 - 0.4 / height_in), frameon=False, fontsize=9,
         labelcolor=LIGHT["ink"], borderaxespad=0, handlelength=1.8,
     )  # fmt: skip
     legend.set_in_layout(False)
     counts = "\n".join(_counts(config, groups))
-    figure.text(left, 0.2 / up, counts, fontsize=9, color=LIGHT["ink"], linespacing=1.5)
+    figure.text(left, 0.2 / height_in, counts, fontsize=9, color=LIGHT["ink"], linespacing=1.5)
 
 
 def _counts(config: ObservationConfig, groups: ObservationGroups) -> list[str]:
-    """Return the number of valid rows of each group, and ego's own numbers."""
+    """Return lines with ego's speed and last action, and the number of valid rows of each group."""
     lines = []
     if groups.has("ego", "velocity"):
         lines.append(f"ego speed {np.hypot(*groups['ego', 'velocity'][-1]):.1f} m/s")
     if groups.has("ego_static", "last_action"):
         action = ", ".join(f"{number:.2f}" for number in groups["ego_static", "last_action"])
         lines.append(f"last action {action}")
-    words = {"agents": "agents", "road": "pieces of road", "lights": "lights", "route": "route points"}
-    for group in words:
+    labels = {"agents": "agents", "road": "pieces of road", "lights": "lights", "route": "route points"}
+    for group, label in labels.items():
         if group in groups.masks:
             mask = groups.masks[group]
             valid = mask[:, -1] if mask.ndim > 1 else mask
-            lines.append(f"{words[group]}: {int(valid.sum())} of {valid.size}")
+            lines.append(f"{label}: {int(valid.sum())} of {valid.size}")
     lines += [f"{group.name}: not drawn" for group in config.own]
     return lines

@@ -1,7 +1,7 @@
 """Colours of maps, agents and lights, the same in pictures and in the player.
 
 The hues are those of Okabe and Ito, Color Universal Design, 2008, which differ with any kind of colour vision;
-important things also have a shape of their own (the ego's arrow, crosses at failures, thick bars for red lights).
+important elements also differ in shape (the ego's arrow, crosses at failures, thick bars for red lights).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SERIES = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
 
 @dataclass(frozen=True)
 class Stroke:
-    """Style of a line in a chart; ``dash`` has the lengths of dash and gap as in SVG, empty for a solid line."""
+    """Style of a line in a chart; ``dash`` has the lengths of dash and gap as in SVG, "" for a solid line."""
 
     colour: str
     dash: str = ""
@@ -32,7 +32,7 @@ class Stroke:
 
     @property
     def key(self) -> str:
-        """CSS background of its key in a legend."""
+        """CSS background of the line's key in a legend."""
         if not self.dash:
             return self.colour
         on, off = map(int, self.dash.split())
@@ -43,9 +43,9 @@ class Stroke:
 STROKES = tuple(Stroke(colour, dash) for dash in ("", "6 3", "2 3") for colour in SERIES)
 
 
-def stroke(place: int) -> Stroke:
-    """Return the style of the line at a place."""
-    return STROKES[place % len(STROKES)]
+def stroke(index: int) -> Stroke:
+    """Return the style of a line by its index; styles repeat after the last."""
+    return STROKES[index % len(STROKES)]
 
 
 LIGHT = MappingProxyType(
@@ -103,7 +103,7 @@ def agent_colour(kind: int) -> str:
 
 
 def light_colour(state: int) -> str:
-    """Return the colour name of a light in this state; an unobserved light has the unknown one."""
+    """Return the colour name of a light in this state, ``unknown`` for an unobserved light."""
     return _LIGHTS.get(LightState(state), "unknown")
 
 

@@ -1,4 +1,4 @@
-"""One episode as data of the player: whole numbers of centimetres in base64, a few tens of kilobytes."""
+"""Data of one episode for the player: integer centimetres in base64, a few tens of kilobytes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from drivax.report.charts import COMMANDED, COMMANDS, SIGNALS, Signal, signals
+from drivax.report.charts import COMMANDS, SIGNALS, Signal, signals
 from drivax.report.pictures.drawing import (
     EVENT_WORDS,
     LAYERS,
@@ -18,13 +18,13 @@ from drivax.report.pictures.drawing import (
     Boxes,
     Drawing,
     Rollout,
+    replace_traffic,
     surroundings,
-    with_traffic_of,
 )
 from drivax.scenario.schema import Scenario
 
 Array = np.ndarray[Any, Any]
-#: Stands for "absent" in a packed pose.
+#: Marks an absent pose or value.
 ABSENT = -32768
 _RADIAN = 10_000
 
@@ -54,23 +54,26 @@ class Scale:
 
     def poses(self, xy: Array, heading: Array, valid: Bool[Array, "..."]) -> Array:
         """Return poses ``[..., 3]`` as int16: position, and heading in 1e-4 rad; ABSENT where not valid."""
-        packed = np.full((*valid.shape, 3), ABSENT, np.int16)
-        packed[valid, :2] = self.points(xy[valid])
+        result = np.full((*valid.shape, 3), ABSENT, np.int16)
+        result[valid, :2] = self.points(xy[valid])
         angle = (np.asarray(heading[valid], np.float64) + np.pi) % (2 * np.pi) - np.pi
-        packed[valid, 2] = np.round(angle * _RADIAN).astype(np.int16)
-        return packed
+        result[valid, 2] = np.round(angle * _RADIAN).astype(np.int16)
+        return result
 
 
 def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) -> dict[str, Any]:
     """Return one scenario and its rollouts as JSON values.
 
-    Arrays are little-endian int16 in base64, in C order. ``map`` holds per layer the number of points of each line
-    and the points of all lines; ``agents.pose`` is ``[agent, step, 3]``; ``parked.seen`` the first and last step at
-    which a parked agent was seen; ``lights.state`` ``[step, light]`` indexes ``LIGHTS`` and is -1 where unobserved;
-    ``rollouts[].pose`` is ``[step, 3]``, ``speed`` is in cm/s, and ``signals`` are ``charts.SIGNALS`` and
-    ``charts.COMMANDS`` in order, in units of their steps, ABSENT where missing. Other agents move as in the last one.
+    Arrays are little-endian int16 in base64, in C order. Other agents move as in the last rollout.
+
+    - ``map``: by layer, the number of points of each line and the points of all lines.
+    - ``agents.pose``: ``[agent, step, 3]``.
+    - ``parked.seen``: the first and last step at which a parked agent was seen.
+    - ``lights.state``: ``[step, light]``, indices of ``LIGHTS``, -1 where unobserved.
+    - ``rollouts[].pose``: ``[step, 3]``; ``speed`` is in cm/s.
+    - ``rollouts[].signals``: ``charts.SIGNALS`` and ``charts.COMMANDS`` in units of their steps, ABSENT where missing.
     """
-    scenario = with_traffic_of(rollouts[-1], scenario)
+    scenario = replace_traffic(scenario, rollouts[-1])
     box = surroundings(scenario, rollouts)
     scale, drawing = Scale.of(box), Drawing.of(scenario, box)
     return {
@@ -95,8 +98,8 @@ def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) ->
 
 
 def _encode(array: Array) -> str:
-    kind = "<i2" if array.dtype == np.int16 else "i1"
-    return base64.b64encode(np.ascontiguousarray(array, dtype=kind).tobytes()).decode("ascii")
+    dtype = "<i2" if array.dtype == np.int16 else "i1"
+    return base64.b64encode(np.ascontiguousarray(array, dtype=dtype).tobytes()).decode("ascii")
 
 
 def _lines(scale: Scale, lines: Sequence[Array]) -> dict[str, str]:
@@ -116,9 +119,9 @@ def _boxes(scale: Scale, boxes: Boxes, poses: Array) -> dict[str, Any]:
 
 
 def _parked_entries(scale: Scale, parked: Boxes) -> dict[str, Any]:
-    seen = parked.valid
+    valid = parked.valid
     poses = scale.poses(parked.xy[0], parked.heading[0], np.ones(len(parked.size), bool))
-    first, last = seen.argmax(axis=0), len(seen) - 1 - seen[::-1].argmax(axis=0)
+    first, last = valid.argmax(axis=0), len(valid) - 1 - valid[::-1].argmax(axis=0)
     return _boxes(scale, parked, poses) | {"seen": _encode(np.stack((first, last), -1).astype(np.int16))}
 
 
@@ -139,11 +142,13 @@ def _rollout(rollout: Rollout, scale: Scale, steps: int) -> dict[str, Any]:
 
 def _signals(ego: Float[Array, "step 4"], action: Float[Array, "step 2"] | None) -> list[str]:
     values = signals(ego)
-    commands = np.full((len(ego), COMMANDED), np.nan) if action is None else action[: len(ego)]
-    packed = [_signal(signal, values[signal.name]) for signal in SIGNALS]
-    return packed + [_signal(signal, column) for signal, column in zip(COMMANDS, commands.T, strict=True)]
+    commands = np.full((len(ego), len(COMMANDS)), np.nan) if action is None else action[: len(ego)]
+    encoded_signals = [_signal(signal, values[signal.name]) for signal in SIGNALS]
+    return encoded_signals + [
+        _signal(signal, column) for signal, column in zip(COMMANDS, commands.T, strict=True)
+    ]
 
 
 def _signal(signal: Signal, values: Float[Array, " step"]) -> str:
-    whole = np.clip(np.round(values / signal.step), -32_000, 32_000)
-    return _encode(np.where(np.isnan(whole), ABSENT, whole).astype(np.int16))
+    rounded = np.clip(np.round(values / signal.step), -32_000, 32_000)
+    return _encode(np.where(np.isnan(rounded), ABSENT, rounded).astype(np.int16))

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Colours = Mapping[str, str]
-#: Height of the legend.
-_LEGEND_INCHES = 0.85
+#: Height of the legend, inches.
+_LEGEND_IN = 0.85
 #: Points per pixel of a line's width.
-_POINTS = 0.9
+_POINTS_PER_PIXEL = 0.9
 
 
 def draw_scenario(
@@ -31,8 +31,8 @@ def draw_scenario(
     Args:
         scenario: The scenario.
         step: Step to draw.
-        ego: Path ``[step, 4]`` (x, y, heading, speed; local frame) to draw instead of the log's ego, which is then a
-            dashed box; None draws the log.
+        ego: Path ``[step, 4]`` of ego (x, y, heading, speed; local frame), drawn next to the dashed box of the log;
+            None draws only the log.
         reach_m: Half the side of the square, metres.
         theme: ``light`` or ``dark``.
         legend: Whether to draw a legend below.
@@ -49,9 +49,10 @@ def draw_scenario(
     path = None if ego is None else np.asarray(ego, dtype=np.float64)
     logged = scenario.agent_xy[step, 0]
     centre = logged if path is None or not np.isfinite(path[step]).all() else path[step, :2]
-    colours, below = THEMES[theme], _LEGEND_INCHES if legend else 0.0
-    figure = Figure(figsize=(7, 7 + below), dpi=110, facecolor=colours["ground"])
-    axes = figure.add_axes((0, below / (7 + below), 1, 7 / (7 + below)))
+    colours, legend_in = THEMES[theme], _LEGEND_IN if legend else 0.0
+    height_in = 7 + legend_in
+    figure = Figure(figsize=(7, height_in), dpi=110, facecolor=colours["ground"])
+    axes = figure.add_axes((0, legend_in / height_in, 1, 7 / height_in))
     draw_on(axes, scenario, step, (float(centre[0]), float(centre[1])), reach_m, path, colours)
     if legend:
         _draw_legend(figure, colours)
@@ -76,7 +77,7 @@ def draw_on(
     axes: Axes, scenario: Scenario, step: int, centre: tuple[float, float], reach_m: float, path: Any = None,
     colours: Colours = LIGHT,
 ) -> None:  # fmt: skip
-    """Draw a square of a scenario on given axes; the arguments are those of :func:`draw_scenario`."""
+    """Draw a square of a scenario on axes; the arguments are those of :func:`draw_scenario`."""
     from matplotlib.patches import Rectangle
 
     (x, y), half_size_m = centre, reach_m + 5.0
@@ -99,7 +100,7 @@ def draw_on(
 def _draw(axes: Axes, colours: Colours, shape: Shape) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
-    lines, width = list(shape.lines), _POINTS * shape.width
+    lines, width = list(shape.lines), _POINTS_PER_PIXEL * shape.width
     line = colours[shape.line] if shape.line else "none"
     artist: Any = LineCollection(lines, colors=line, linewidths=width, capstyle="round")
     if shape.fill:
@@ -111,18 +112,19 @@ def _draw(axes: Axes, colours: Colours, shape: Shape) -> None:
 
 
 def _scale_bar(axes: Axes, colours: Colours, reach_m: float) -> None:
-    length = next(nice for nice in (1, 2, 5, 10, 20, 50, 100, 200, 500) if nice >= reach_m / 5 or nice == 500)
+    lengths = (1, 2, 5, 10, 20, 50, 100, 200, 500)
+    length = next((metres for metres in lengths if metres >= reach_m / 5), lengths[-1])
     width = length / (2 * reach_m)
     axes.plot((0.03, 0.03 + width), (0.03, 0.03), color=colours["ink"], linewidth=2, transform=axes.transAxes)
     axes.text(0.03, 0.04, f"{length} m", color=colours["ink"], fontsize=9, transform=axes.transAxes)
 
 
 def _draw_legend(figure: Figure, colours: Colours) -> None:
-    """Draw the meaning of the colours; failures are not marked in a still picture."""
+    """Draw the legend, without failures, which a still picture does not mark."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    def sign(name: str) -> Any:
+    def handle(name: str) -> Any:
         if name in ("route", "log"):
             return Line2D([], [], color=colours[name], linestyle="--")
         if name in LIGHTS:
@@ -132,7 +134,6 @@ def _draw_legend(figure: Figure, colours: Colours) -> None:
             return Line2D([], [], color=colours[name], marker="o", linestyle="none", markerfacecolor=fill)
         return Patch(facecolor=colours[name], edgecolor=colours["outline"])
 
-    shown = [(name, words) for name, words in LEGEND if name != "mark"]
-    signs, words = [sign(name) for name, _ in shown], [words for _, words in shown]
-    figure.legend(signs, words, loc="lower center", ncol=5, frameon=False, fontsize=9, labelcolor=colours["ink"],
-                  columnspacing=1.2, handlelength=1.6)  # fmt: skip
+    labels = {name: label for name, label in LEGEND if name != "mark"}
+    figure.legend([handle(name) for name in labels], list(labels.values()), loc="lower center", ncol=5, frameon=False,
+                  fontsize=9, labelcolor=colours["ink"], columnspacing=1.2, handlelength=1.6)  # fmt: skip

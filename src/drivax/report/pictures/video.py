@@ -1,4 +1,4 @@
-"""Rollouts as mp4 files: one planner each, or all of them side by side.
+"""Rollouts as mp4 files, of one planner or of all side by side.
 
 matplotlib's rasteriser draws frames directly: a figure with artists takes ten times as long.
 """
@@ -26,9 +26,9 @@ from drivax.report.pictures.drawing import (
     Drawing,
     Rollout,
     Shape,
+    replace_traffic,
     ring,
     surroundings,
-    with_traffic_of,
 )
 from drivax.report.pictures.palette import LEGEND, THEMES, rgb
 from drivax.report.runs import read_evaluations
@@ -37,31 +37,31 @@ from drivax.scenario.schema import Scenario
 if TYPE_CHECKING:
     from matplotlib.transforms import Affine2D
 
-#: Side of a picture in pixels: of one planner alone, of several side by side.
+#: Side of a picture of one planner, alone and next to others, pixels.
 ALONE, SIDE_BY_SIDE = 720, 480
-#: Pictures in a row at most.
-_ACROSS = 3
+#: Maximum number of pictures in a row.
+_MAX_COLUMNS = 3
 
 
 def write_videos(
     runs: Sequence[Path], out: Path, which: str, side_by_side: bool = False, data: Path | None = None,
     theme: str = "light", overwrite: bool = False, progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:  # fmt: skip
-    """Write episodes of evaluation runs as mp4 files, in real time; returns the files, worst episode first.
+    """Write episodes of evaluation runs as mp4 files in real time, and return the files, worst episode first.
 
     Args:
-        runs: Run folders; the last evaluation is the policy, whose episodes are ranked and, alone, drawn.
+        runs: Run folders; the last evaluation is the policy, whose episodes are ranked.
         out: Folder for the files.
         which: ``worst:N``, ``all``, or the id of a scenario.
-        side_by_side: Draw every run with an episode of the scenario in one picture.
-        data: The scenario set of the evaluation, where it has moved.
+        side_by_side: Draw every run with an episode of the scenario in one picture, not only the policy.
+        data: Path of the policy's scenario set, if it has moved.
         theme: ``light`` or ``dark``.
         overwrite: Replace existing files.
         progress: Called with (done, total) after every file.
 
     Raises:
-        DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.
-        UsageError: A file exists, there is no such scenario, or a package for videos is not installed.
+        DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
+        UsageError: A file exists, the scenario has no episode, or a package for videos is not installed.
     """
     evaluations = read_evaluations(runs)
     groups = _select_episodes(evaluations, which)
@@ -91,8 +91,8 @@ def _select_episodes(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGr
             cure = "write worst:N with N at least 1, as worst:20"
             raise UsageError(f"{which!r} is not a selection", cure=cure)
         return groups[: int(count)]
-    if requested := [group for group in groups if group.scenario_id == which]:
-        return requested
+    if matches := [group for group in groups if group.scenario_id == which]:
+        return matches
     near = did_you_mean(which, [group.scenario_id for group in groups])
     cure = near if near.startswith("did") else "write worst:N, all, or an id of its episodes.csv"
     raise UsageError(f"no episode of scenario {which!r} is stored", file=runs[-1].folder, cure=cure)
@@ -108,35 +108,38 @@ def _files(out: Path, groups: Sequence[EpisodeGroup], ranked: bool) -> list[Path
 
 
 def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light") -> Iterator[Picture]:
-    """Yield pictures of all rollouts at every step from the first takeover on, with the legend below."""
+    """Yield pictures of all rollouts at every step from the first start on, with the legend below."""
     side = ALONE if len(rollouts) == 1 else SIDE_BY_SIDE
     canvas = Canvas(side, side, theme)
-    recorded = Scenery(canvas, scenario, rollouts)
+    log_scenery = Scenery(canvas, scenario, rollouts)
     sceneries = [
-        recorded if rollout.others is None else Scenery(canvas, with_traffic_of(rollout, scenario), rollouts)
+        log_scenery
+        if rollout.others is None
+        else Scenery(canvas, replace_traffic(scenario, rollout), rollouts)
         for rollout in rollouts
     ]
-    rows = math.ceil(len(rollouts) / _ACROSS)
-    across = math.ceil(len(rollouts) / rows)
-    legend, dt_s = legend_strip(across * side, theme), float(scenario.dt_s)
+    rows = math.ceil(len(rollouts) / _MAX_COLUMNS)
+    columns = math.ceil(len(rollouts) / rows)
+    legend, dt_s = legend_strip(columns * side, theme), float(scenario.dt_s)
     for step in range(min(rollout.start for rollout in rollouts), int(scenario.steps)):
-        drawn = zip(sceneries, rollouts, strict=True)
-        panes = [draw_frame(scenery, rollout, step, dt_s) for scenery, rollout in drawn]
-        for pane in panes if across > 1 else ():
-            pane[:, -1, :3] = rgb(THEMES[theme]["lane"])
-        yield np.concatenate((_tile(panes, across), legend))
+        pairs = zip(sceneries, rollouts, strict=True)
+        panes = [draw_frame(scenery, rollout, step, dt_s) for scenery, rollout in pairs]
+        if columns > 1:
+            for pane in panes:
+                pane[:, -1, :3] = rgb(THEMES[theme]["lane"])
+        yield np.concatenate((_tile(panes, columns), legend))
 
 
-def _tile(panes: Sequence[Picture], across: int) -> Picture:
-    """Return pictures of one size in rows, the last row filled with empty ones."""
-    missing = -len(panes) % across
-    filled = [*panes, *(np.full_like(panes[0], panes[0][-1, -1]) for _ in range(missing))]
-    rows = [np.concatenate(filled[at : at + across], axis=1) for at in range(0, len(filled), across)]
+def _tile(panes: Sequence[Picture], columns: int) -> Picture:
+    """Arrange pictures of one size in rows, and pad the last row with empty pictures."""
+    blank = np.full_like(panes[0], panes[0][-1, -1])
+    padded = [*panes, *[blank] * (-len(panes) % columns)]
+    rows = [np.concatenate(padded[i : i + columns], axis=1) for i in range(0, len(padded), columns)]
     return np.concatenate(rows)
 
 
 def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
-    """Write at least one picture, all of one even size, as H.264, which every browser plays, every ``dt_s`` seconds.
+    """Write pictures (at least one, all of one even size) as an H.264 video with a picture every ``dt_s`` seconds.
 
     Raises:
         UsageError: PyAV is not installed.
@@ -192,15 +195,17 @@ class Canvas:
         pixel = np.array([*rgb(self.colours["ground"]), 255], np.uint8)
         np.asarray(self._agg.buffer_rgba()).view(np.uint32).fill(pixel.view(np.uint32)[0])
 
-    def look(self, x: float, y: float, scale: float) -> None:
-        """Move a point (metres) into the middle, at ``scale`` pixels per metre."""
+    def look_at(self, x: float, y: float, scale: float) -> None:
+        """Centre the camera on a point (metres), at ``scale`` pixels per metre."""
         camera = self._affine().translate(-x, -y).scale(scale)
         self._camera = camera.translate(self.width / 2, self.height / 2)
 
     def path(self, lines: Sequence[Array]) -> Any:
-        """Return lines as one path, which is drawn faster than its parts; None for no lines."""
+        """Combine lines into one path, which is faster to draw; None without lines."""
         paths = [self._path(line) for line in lines if len(line)]
-        return self._path.make_compound_path(*paths) if len(paths) > 1 else paths[0] if paths else None
+        if len(paths) > 1:
+            return self._path.make_compound_path(*paths)
+        return paths[0] if paths else None
 
     def shape(self, shape: Shape) -> None:
         """Draw a shape."""
@@ -209,7 +214,7 @@ class Canvas:
     def draw(
         self, path: Any, line: str | None, width: float = 1.0, fill: str | None = None, dash: Sequence[float] = ()
     ) -> None:  # fmt: skip
-        """Draw a path, metres, with an outline of ``width`` pixels; None draws nothing."""
+        """Draw a path in metres, if there is one, with an outline of ``width`` pixels."""
         if path is None:
             return
         pen = self._agg.new_gc()
@@ -225,7 +230,7 @@ class Canvas:
     def text(
         self, x: float, y: float, words: str, size: float = 13.0, colour: str = "ink", right: bool = False
     ) -> float:
-        """Write one line with its base at a place in pixels, to the right or left of it; returns its width."""
+        """Write a line of text and return its width, pixels; (x, y) is the left or right end of its baseline."""
         font, pen = self._font(size=size), self._agg.new_gc()
         pen.set_foreground(self.colours[colour])
         width = float(self._agg.get_text_width_height_descent(words, font, ismath=False)[0])
@@ -234,14 +239,14 @@ class Canvas:
 
     def ring(self, x: float, y: float, radius: float, line: str | None, fill: str | None = None) -> None:
         """Draw a circle in pixels, 2 pixels wide or filled."""
-        self._flat(ring(np.array((x, y)), radius), line, 2.0, fill)
+        self._draw_pixels(ring(np.array((x, y)), radius), line, 2.0, fill)
 
     def bar(self, x: float, y: float, width: float, height: float, fill: str) -> None:
         """Fill a rectangle in pixels with its upper left corner at (x, y)."""
         edges = np.array([(x, y), (x + width, y), (x + width, y + height), (x, y + height)])
-        self._flat(edges, None, 0.0, fill)
+        self._draw_pixels(edges, None, 0.0, fill)
 
-    def _flat(self, points: Array, line: str | None, width: float, fill: str | None) -> None:
+    def _draw_pixels(self, points: Array, line: str | None, width: float, fill: str | None) -> None:
         camera, self._camera = self._camera, self._affine().scale(1, -1).translate(0, self.height)
         self.draw(self._path(points), line, width, fill)
         self._camera = camera
@@ -252,7 +257,7 @@ class Canvas:
 
 
 class Scenery:
-    """A scenario on a canvas, its map prepared once and cut to the surroundings of the rollouts."""
+    """A scenario on a canvas, with a map prepared once and cropped to the surroundings of the rollouts."""
 
     def __init__(self, canvas: Canvas, scenario: Scenario, rollouts: Sequence[Rollout]) -> None:
         self.canvas, self.scenario = canvas, scenario
@@ -272,8 +277,8 @@ def draw_frame(scenery: Scenery, rollout: Rollout, step: int, dt_s: float) -> Pi
     canvas = scenery.canvas
     canvas.clear()
     scale = (min(canvas.width, canvas.height) - _BAR) / VIEW_M
-    x, y = _middle(scenery.scenario, rollout, step)
-    canvas.look(x, y + _BAR / 2 / scale, scale)
+    x, y = _last_position(scenery.scenario, rollout, step)
+    canvas.look_at(x, y + _BAR / 2 / scale, scale)
     scenery.draw(rollout, step)
     _mark_events(canvas, rollout, step, scale)
     canvas.bar(0, 0, canvas.width, _BAR, "crosswalk")
@@ -282,16 +287,18 @@ def draw_frame(scenery: Scenery, rollout: Rollout, step: int, dt_s: float) -> Pi
     absent = not np.isfinite(rollout.ego[step]).all()
     speed = "gone" if absent else f"{rollout.ego[step, 3]:.1f} m/s"
     canvas.text(canvas.width - 10, 20, f"{speed}   {step * dt_s:.1f} s", 12, right=True)
-    past = [name for name, at in rollout.events.items() if 0 <= at <= step and name in EVENT_WORDS]
-    for line, name in enumerate(past):
-        words = f"✕ {EVENT_WORDS[name]} at {rollout.events[name] * dt_s:.1f} s"
-        canvas.text(10, _BAR + 18 + 16 * line, words, 12, "mark")
+    past_events = [
+        name for name in rollout.events if 0 <= rollout.events[name] <= step and name in EVENT_WORDS
+    ]
+    for line, name in enumerate(past_events):
+        text = f"✕ {EVENT_WORDS[name]} at {rollout.events[name] * dt_s:.1f} s"
+        canvas.text(10, _BAR + 18 + 16 * line, text, 12, "mark")
     _scale_bar(canvas, scale)
     return canvas.pixels()
 
 
 def legend_strip(width: int, theme: str) -> Picture:
-    """Return the legend as wide as a picture, its height an even number of pixels."""
+    """Return the legend, as wide as a picture and an even number of pixels high."""
     entries, x, y = [], 10.0, 0
     for name, words in LEGEND:
         length = 34 + 7.0 * len(words)
@@ -321,25 +328,27 @@ def legend_strip(width: int, theme: str) -> Picture:
     return canvas.pixels()
 
 
-def _middle(scenario: Scenario, rollout: Rollout, step: int) -> tuple[float, float]:
-    """Return the position of ego, or its last one."""
-    known = np.flatnonzero(np.isfinite(rollout.ego[: step + 1]).all(axis=1))
-    point = rollout.ego[known[-1], :2] if known.size else scenario.agent_xy[step, 0]
+def _last_position(scenario: Scenario, rollout: Rollout, step: int) -> tuple[float, float]:
+    """Return the last known position of ego up to a step, else the logged one."""
+    steps = np.flatnonzero(np.isfinite(rollout.ego[: step + 1]).all(axis=1))
+    point = rollout.ego[steps[-1], :2] if steps.size else scenario.agent_xy[step, 0]
     return float(point[0]), float(point[1])
 
 
 def _mark_events(canvas: Canvas, rollout: Rollout, step: int, scale: float) -> None:
-    for at in rollout.events.values():
-        if 0 <= at <= step and np.isfinite(rollout.ego[at]).all():
-            for turn in (-1, 1):
-                arm = np.array((9.0, turn * 9.0)) / scale
-                path = canvas.path([np.array((rollout.ego[at, :2] - arm, rollout.ego[at, :2] + arm))])
+    """Draw a cross at ego's position of each past event."""
+    for event_step in rollout.events.values():
+        if 0 <= event_step <= step and np.isfinite(rollout.ego[event_step]).all():
+            centre = rollout.ego[event_step, :2]
+            for slope in (-1, 1):
+                arm = np.array((9.0, slope * 9.0)) / scale
+                path = canvas.path([np.array((centre - arm, centre + arm))])
                 for colour, width in (("ground", 7.0), ("mark", 3.5)):
                     canvas.draw(path, colour, width)
 
 
 def _scale_bar(canvas: Canvas, scale: float) -> None:
-    length = next(nice for nice in (5, 10, 20, 50, 100) if nice * scale >= 45 or nice == 100)
+    length = next(metres for metres in (5, 10, 20, 50, 100) if metres * scale >= 45 or metres == 100)
     base = canvas.height - 12
     canvas.bar(6, base - 22, length * scale + 12, 28, "ground")
     canvas.bar(12, base, length * scale, 2, "ink")
