@@ -9,7 +9,7 @@ follower a_n and a_o, a dash for after the change, and the politeness p.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import lru_cache, reduce
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -80,6 +80,12 @@ class LaneChains:
         self.lane_m = np.array([lane.length_m for lane in lanes])
         self.exit = np.array([lane.exit_only for lane in lanes])
         self.limit = np.array([lane.limit_mps for lane in lanes])
+
+
+@lru_cache(maxsize=1)
+def lane_chains(network: RoadNetwork) -> LaneChains:
+    """Return the chains of a network."""
+    return LaneChains(network)
 
 
 def _next_in_chain(network: RoadNetwork, lane: int) -> int:
@@ -158,13 +164,13 @@ class LaneChanges:
     """Decides the lane changes of all vehicles."""
 
     def __init__(self, network: RoadNetwork, drivers: Drivers, standing: Boxes) -> None:
-        self.chains, self._drivers, self._idm = LaneChains(network), drivers, drivers.idm
+        self.chains, self._drivers, self._idm = lane_chains(network), drivers, drivers.idm
         self._half = drivers.size_m[:, 0] / 2
         self._obstacle_chain, self._obstacle_m = _on_chains(network, self.chains, standing)
 
     def decide(self, now: Situation, tables: PathTables) -> tuple[list[Change], Helped]:
         """Return lane changes that begin now, and pairs that open gaps for mandatory ones."""
-        lane, along = tables.on(now.at_m, np.arange(len(now.at_m)))
+        lane, along = tables.on(now.at_m)
         own, chains = lane[:, 0], self.chains
         candidates = now.free & now.active & (own >= 0) & ~self._drivers.cyclist
         candidates &= (chains.left[own] >= 0) | (chains.right[own] >= 0)

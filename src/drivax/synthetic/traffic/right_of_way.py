@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float64, Int8, Int64
@@ -71,6 +72,7 @@ class TrafficState:
     committed: int
 
 
+@lru_cache(maxsize=1)
 def conflict_zones(
     network: RoadNetwork,
 ) -> tuple[Float64[np.ndarray, "lane lane"], Float64[np.ndarray, "lane lane"]]:
@@ -320,7 +322,7 @@ class RightOfWay:
         speed, own = state.speed[rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         departure = clear[rows, columns] / np.maximum(speed, 0.3)
-        top = float(tables.at(np.array([request.line_m + 5.0]), np.array([i]))[0, 3])
+        top = float(tables.at(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
         own_speed, push = request.speed, float(self._drivers.acceleration_mps2[i])
         to_zone = request.distance_m + self._zone_begin[connector, own]
         through_zone = request.distance_m + self._zone_end[connector, own] + self._length[i]

@@ -66,6 +66,9 @@ def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
     )
 
 
+_NO_BOXES = boxes_at((), 0)
+
+
 @dataclass(frozen=True)
 class _Log:
     """Recorded motion of vehicles (x, y, heading) and pedestrians (x, y, heading, speed)."""
@@ -116,7 +119,7 @@ class Leaders:
     ) -> tuple[PerVehicle, VehicleRows]:
         """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and its row."""
         own = at_m[:, None]
-        lane, along = tables.on(at_m, self._rows)
+        lane, along = tables.on(at_m)
         lane[~active] = -1
         # position[i, k]: position of the k-th occupied (vehicle, lane) on the path of vehicle i.
         used = (lane.ravel() >= 0).nonzero()[0]
@@ -217,7 +220,7 @@ class _Run:
         # Gap to and speed of the next leader, line and obstacle.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
         self._plan_at = positions_along(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
-        self._moving_users = self._vehicles = boxes_at((), 0)
+        self._moving_users = self._vehicles = _NO_BOXES
         shape = (count, len(traffic.times_s))
         speed, position, acceleration = np.zeros((3, *shape))
         pedestrian_poses = np.zeros((len(roles.pedestrians), shape[1], 4))
@@ -236,14 +239,12 @@ class _Run:
 
     def _step(self, t: int) -> None:
         """Record a step and advance all users to the next one."""
-        count, log = len(self._rows), self._log
-        k = self._plan_step(t)
+        log, k = self._log, self._plan_step(t)
         if self._ego is not None and k >= 0:
             self._at[0], self._speed[0] = self._plan_at[k], self._ego.speed[k]
-        active = self._at + self._half_m < self._tables.last * self._tables.step_m
-        soon = self._at + self._speed * _SPEED_TIME_S
-        sample = self._tables.at(np.concatenate([self._at, soon]), np.tile(self._rows, 2))
-        pose, fastest, fastest_soon = sample[:count, :3], sample[:count, 3], sample[count:, 3]
+        active = self._at + self._half_m < self._tables.length_m
+        sample = self._tables.at(np.stack([self._at, self._at + self._speed * _SPEED_TIME_S]))
+        pose, fastest, fastest_soon = sample[0, :, :3], sample[0, :, 3], sample[1, :, 3]
         if self._ego is not None and k >= 0:
             active[0] = True
             pose[0] = (*self._ego.xy[k], self._ego.heading[k])
@@ -270,13 +271,13 @@ class _Run:
 
     def _advance_pedestrians(self, t: int, active: VehicleMask) -> None:
         """Advance the pedestrians and gather scripted users."""
-        users, colour = boxes_at((), 0), self._fixed.colour[t]
+        users, colour = _NO_BOXES, self._fixed.colour[t]
         if self._pedestrians is not None:
             users, self._occupied_crossings = self._pedestrians.step(t, self._vehicles, active, colour)
-            self._log.pedestrian_poses[:, t] = np.column_stack([users.xy, users.heading, users.speed])
-        self._moving_users = users.concatenate(
-            boxes_at(tuple(user for user in self._movers if user.valid[t]), t)
-        )
+            log = self._log.pedestrian_poses[:, t]
+            log[:, :2], log[:, 2], log[:, 3] = users.xy, users.heading, users.speed
+        movers = tuple(user for user in self._movers if user.valid[t])
+        self._moving_users = users.concatenate(boxes_at(movers, t)) if movers else users
 
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_soon: PerVehicle, active: VehicleMask
