@@ -7,13 +7,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from drivax.errors import UsageError
-from drivax.evaluation.audit import audit
-from drivax.scenario.schema import CAPACITIES
+from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.select.splits import parse_shares, write_splits
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import load
@@ -92,15 +91,22 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
             bar.update(done, total=total)
 
         if args.benchmark:
-            made = generate_benchmark(args.out, options, args.scenarios, further, audit)
+            made = generate_benchmark(args.out, options, args.scenarios, further, _audit)
         else:
-            made = {"": generate(args.out, scenarios, args.seed or 0, options, further, audit)}
+            made = {"": generate(args.out, scenarios, args.seed or 0, options, further, _audit)}
     if shares is not None:
         write_splits(args.out, ScenarioSet.open(args.out).entries, shares)
     if args.benchmark:
         print(f"benchmark {BENCHMARK_VERSION} of world {WORLD_VERSION}, domain {options.world.domain}")
     print("\n".join(map(summary, made.values())))
     return 0
+
+
+def _audit(scenarios: list[Scenario]) -> list[dict[str, Any]]:
+    """Audit scenarios; JAX is imported in the audit's thread, while workers draw."""
+    from drivax.evaluation.audit import audit
+
+    return audit(scenarios)
 
 
 def summary(result: GeneratedSet) -> str:
