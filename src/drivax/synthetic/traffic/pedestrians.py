@@ -193,6 +193,8 @@ class Pedestrians:
         # A standing queue blocks the crossing.
         if len(gap):
             blocked = overlap(conflicts.strip[crossing[gap], None], boxes[None]).any(axis=1)
+            # Copies of this object share its arrays.
+            self._released = self._released.copy()
             self._released[waiting[gap]] = ~blocked
 
     def _advance(self) -> None:

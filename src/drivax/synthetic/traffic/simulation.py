@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -54,6 +54,13 @@ _FIRMLY = 1.3
 _SLOWEST = 6
 #: A planned ego claims junctions this many steps ahead.
 _FORESEEN = 25
+#: Steps between checkpoints, from which a run resumes that differs later.
+_CHECKPOINT_STEPS = 8
+#: Attributes of a run that change.
+_STATE = (
+    "_tables", "_standing", "_right_of_way", "_pedestrians", "_occupied_crossings", "_halting", "_at", "_speed",
+    "_last", "_memory", "_busy_m", "_rest", "_helped", "_leaders", "_gaps", "_leads", "_moving_users", "_vehicles",
+)  # fmt: skip
 
 
 def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
@@ -152,6 +159,7 @@ class Traffic:
         self.standing = StaticObstacles(self.parked, self.tables, roles.drivers.size_m[:, 1])
         self.right_of_way = RightOfWay(roles.network, roles.drivers)
         self.detours = Detours(roles.network)
+        self._latest: _Run | None = None
         shape = (len(times_s), len(roles.network.lanes))
         self.colour, self.to_red = np.zeros(shape, np.int8), np.zeros(shape)
         if roles.network.signals is not None:
@@ -164,19 +172,45 @@ class Traffic:
         return shorter
 
     def run(self, staging: Staging | None = None, ego: EgoPlan | None = None) -> Motion:
-        """Run all steps, with the changes of an event, and with ego on a plan (None: ego drives like the others)."""
-        return _Run(self, staging or Staging(), ego).finish()
+        """Run all steps, with the changes of an event, and with ego on a plan (None: ego drives like the others).
+
+        A run resumes from the latest one where the two begin to differ.
+        """
+        run = _Run(self, staging or Staging(), ego)
+        if self._latest is not None:
+            run.resume(self._latest)
+        self._latest = run
+        return run.finish()
 
 
-_Tables = TypeVar("_Tables", PathTables, StaticObstacles)
+def first_effect(staging: Staging) -> int | None:
+    """First step at which traffic with a staging can differ from traffic without (None: at no step)."""
+    extras = staging.extras
+    if staging.tailgates or staging.removed or any(user.is_static for user in extras):
+        return 0
+    steps = [override.first_step for override in staging.overrides]
+    return min([*steps, *(int(user.valid.argmax()) for user in extras)], default=None)
+
+
+_Tables = TypeVar("_Tables", PathTables, StaticObstacles, RightOfWay)
 
 
 def _copy_tables(tables: _Tables) -> _Tables:
-    """Copy tables with their arrays and lists."""
+    """Copy an object with its arrays and lists."""
     result = copy.copy(tables)
     for name, value in vars(tables).items():
         setattr(result, name, copy.copy(value) if isinstance(value, np.ndarray | list) else value)
     return result
+
+
+def _checkpoint(state: dict[str, Any]) -> dict[str, Any]:
+    """Copy the state of a run, except for tables, which are copied when a path changes."""
+    shared = (PathTables, StaticObstacles)
+    copied = {
+        name: state[name] if isinstance(state[name], shared) else copy.copy(state[name]) for name in _STATE
+    }
+    copied["_right_of_way"] = _copy_tables(copied["_right_of_way"])
+    return copied
 
 
 class _Run:
@@ -192,14 +226,13 @@ class _Run:
         count = len(roles.paths)
         self._rows = np.arange(count)
         self._idm = self._drivers.idm
-        self._tables = _copy_tables(traffic.tables)
+        self._tables, self._owns_tables = traffic.tables, False
+        self._checkpoints: list[tuple[int, dict[str, Any]]] = []
         static = tuple(user for user in staging.extras if user.is_static)
         self._movers = tuple(user for user in staging.extras if not user.is_static)
         boxes = traffic.parked.concatenate(boxes_at(static, 0))
-        self._standing = (
-            StaticObstacles(boxes, self._tables, self._width_m) if static else _copy_tables(traffic.standing)
-        )
-        self._right_of_way = traffic.right_of_way
+        self._standing = StaticObstacles(boxes, self._tables, self._width_m) if static else traffic.standing
+        self._right_of_way = copy.copy(traffic.right_of_way)
         self._right_of_way.reset()
         self._changes = LaneChanges(self._network, roles.drivers, boxes)
         self._pedestrians = (
@@ -228,9 +261,27 @@ class _Run:
             np.zeros((*shape, 3)), speed, np.zeros(shape, bool), position, acceleration, pedestrian_poses
         )
 
+    def resume(self, other: _Run) -> None:
+        """Take over another run's state at its last checkpoint before this one differs from it."""
+        steps = [run._ego.first_step for run in (self, other) if run._ego is not None]
+        mine, theirs = self._staging, other._staging
+        if mine is not theirs:
+            steps += [step for step in map(first_effect, (mine, theirs)) if step is not None]
+        last = min([*steps, len(self._fixed.times_s) - 1])
+        self._checkpoints = [checkpoint for checkpoint in other._checkpoints if checkpoint[0] <= last]
+        if self._checkpoints:
+            step, state = self._checkpoints[-1]
+            vars(self).update(_checkpoint(state))
+            for name, record in vars(self._log).items():
+                record[:, :step] = vars(other._log)[name][:, :step]
+
     def finish(self) -> Motion:
         """Run all steps and collect the motion."""
-        for t in range(len(self._fixed.times_s)):
+        begin = self._checkpoints[-1][0] if self._checkpoints else 0
+        for t in range(begin, len(self._fixed.times_s)):
+            if t % _CHECKPOINT_STEPS == 0 and t > begin:
+                self._checkpoints.append((t, _checkpoint(vars(self))))
+                self._owns_tables = False
             self._step(t)
         if self._ego is not None:
             first, log = self._ego.first_step, self._log
@@ -262,6 +313,9 @@ class _Run:
 
     def _swap(self, t: int, row: int, path: Path, at: float, end_m: float) -> None:
         """Put a vehicle on another path, which it follows undisturbed up to a position."""
+        if not self._owns_tables:
+            self._tables, self._standing = _copy_tables(self._tables), _copy_tables(self._standing)
+            self._owns_tables = True
         self._tables.replace(row, path)
         self._standing.replace(row, path)
         self._at[row] = at
