@@ -218,9 +218,7 @@ class EgoView:
 
     def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
         """The scenario with a new leader, its rear bumper at stations from a step on: IDM slows ego behind it."""
-        drivers, at, speed = self.roles.drivers.idm, self.track.at, self.motion.speed[0]
-        names = ("headway_s", "acceleration_mps2", "comfortable_braking_mps2")
-        law = replace(drivers, **{name: getattr(drivers, name)[:1] for name in names})
+        law, at, speed = self.roles.drivers.idm(slice(1)), self.track.at, self.motion.speed[0]
         ahead = np.gradient(rear_m, DT_S)
         where, how = at.copy(), speed.copy()
         for t in range(since, self.steps - 1):

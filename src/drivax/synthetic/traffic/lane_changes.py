@@ -8,7 +8,7 @@ follower a_n and a_o, a dash for after the change, and the politeness p.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, reduce
 
 import numpy as np
@@ -164,7 +164,7 @@ class LaneChanges:
     """Decides the lane changes of all vehicles."""
 
     def __init__(self, network: RoadNetwork, drivers: Drivers, standing: Boxes) -> None:
-        self.chains, self._drivers, self._idm = lane_chains(network), drivers, drivers.idm
+        self.chains, self._drivers = lane_chains(network), drivers
         self._half = drivers.size_m[:, 0] / 2
         self._obstacle_chain, self._obstacle_m = _on_chains(network, self.chains, standing)
 
@@ -249,9 +249,7 @@ class LaneChanges:
     def _follow(
         self, rows: _Indices, speed: _Values, preferred: _Values, gap: _Stack, leader_speed: _Stack
     ) -> _Stack:
-        names = ("headway_s", "acceleration_mps2", "comfortable_braking_mps2")
-        idm = replace(self._idm, **{name: getattr(self._idm, name)[rows] for name in names})
-        return idm_acceleration(speed, preferred, gap, leader_speed, idm)
+        return idm_acceleration(speed, preferred, gap, leader_speed, self._drivers.idm(rows))
 
     def _neighbours(
         self, now: Situation, vehicles: _Indices, place: _Place, occupied: _Occupied

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -37,10 +37,8 @@ class LaneSpan:
 
     def stretch(self, by: float) -> LaneSpan:
         """Return the span on a path that is longer by a factor."""
-        metres = {
-            name: getattr(self, name) * by for name in ("begin_m", "scale", "from_m", "until_m", "end_m")
-        }
-        return replace(self, **metres)
+        begin, scale, end = self.begin_m * by, self.scale * by, self.end_m * by
+        return LaneSpan(self.lane, begin, scale, self.from_m * by, self.until_m * by, end)
 
 
 @dataclass(frozen=True)
@@ -153,23 +151,25 @@ def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[L
     position = step * np.arange(len(curve.xy))
     lane = np.full((len(position), SLOTS), -1)
     lane_m = np.zeros((len(position), SLOTS))
-    used = np.zeros(len(position), int)
+    occupied = np.zeros(len(position), int)
     limit = np.full(len(position), math.inf)
-    for span in spans:
-        size = span.scale * network.lanes[span.lane].length_m
-        # Samples beyond the last lane's end by rounding still belong to it.
-        first, last = np.searchsorted(position, [span.begin_m - 1e-6, span.begin_m + size - 1e-6])
-        samples = slice(int(first), len(position) if span is spans[-1] else int(last))
-        limit[samples] = np.minimum(limit[samples], network.lanes[span.lane].limit_mps)
-        current = position[samples]
+    begin = np.array([span.begin_m for span in spans])
+    size = np.array([span.scale * network.lanes[span.lane].length_m for span in spans])
+    bounds = np.searchsorted(position, np.concatenate((begin - 1e-6, begin + size - 1e-6))).tolist()
+    # Samples beyond the last lane's end by rounding still belong to it.
+    bounds[-1] = len(position)
+    for span, first, last in zip(spans, bounds, bounds[len(spans) :], strict=False):
+        samples = slice(first, last)
+        np.minimum(limit[samples], network.lanes[span.lane].limit_mps, out=limit[samples])
+        current, slots = position[samples], occupied[samples]
         inside = (current >= span.from_m) & (current <= span.until_m)
         along = np.maximum(current - span.begin_m, 0.0) / span.scale
-        for shared_lane, shared in _lanes_sharing_space(network, span.lane, along):
-            chosen = np.flatnonzero(inside & shared & (used[samples] < SLOTS))
-            slot = used[samples][chosen]
+        for shared_lane, until_m in _lanes_sharing_space(network, span.lane):
+            chosen = (inside & (along < until_m) & (slots < SLOTS)).nonzero()[0]
+            slot = slots[chosen]
             lane[samples][chosen, slot] = shared_lane
             lane_m[samples][chosen, slot] = along[chosen]
-            used[samples][chosen] += 1
+            slots[chosen] += 1
     return Path(curve, step, mean_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 
 
@@ -190,16 +190,14 @@ def mean_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]
     return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
 
 
-def _lanes_sharing_space(
-    network: RoadNetwork, lane: int, along: Float64[np.ndarray, " point"]
-) -> list[tuple[int, np.ndarray]]:
-    """Masks of where a vehicle on a lane occupies it, and lanes that branch off the same lane and are still close."""
-    result = [(lane, np.ones(len(along), bool))]
+def _lanes_sharing_space(network: RoadNetwork, lane: int) -> list[tuple[int, float]]:
+    """A lane, lanes that branch off the same lane, and positions up to which a vehicle on the lane occupies them, m."""
+    result = [(lane, math.inf)]
     for before in network.lanes[lane].predecessors:
         for other in network.lanes[before].successors:
             if other != lane:
                 # Half a vehicle's length longer: its rear leaves after its centre.
-                result.append((other, along < network.shared_m[lane, other] + 2.5))
+                result.append((other, network.shared_m[lane, other] + 2.5))
     return result
 
 

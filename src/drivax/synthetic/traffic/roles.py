@@ -48,13 +48,12 @@ class Drivers:
     reaction_s: Float64[np.ndarray, " vehicle"]
     critical_gap_s: Float64[np.ndarray, " vehicle"]
 
-    @property
-    def idm(self) -> IdmParameters:
-        """Parameters of the IDM."""
+    def idm(self, rows: slice | np.ndarray = slice(None)) -> IdmParameters:
+        """Parameters of the IDM of all or some drivers."""
         return IdmParameters(
-            headway_s=self.headway_s,
-            acceleration_mps2=self.acceleration_mps2,
-            comfortable_braking_mps2=self.braking_mps2,
+            headway_s=self.headway_s[rows],
+            acceleration_mps2=self.acceleration_mps2[rows],
+            comfortable_braking_mps2=self.braking_mps2[rows],
         )
 
     @property

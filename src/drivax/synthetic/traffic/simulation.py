@@ -225,7 +225,7 @@ class _Run:
         self._half_m, self._width_m = roles.drivers.size_m[:, 0] / 2, roles.drivers.size_m[:, 1]
         count = len(roles.paths)
         self._rows = np.arange(count)
-        self._idm = self._drivers.idm
+        self._idm = self._drivers.idm()
         self._tables, self._owns_tables = traffic.tables, False
         self._checkpoints: list[tuple[int, dict[str, Any]]] = []
         static = tuple(user for user in staging.extras if user.is_static)
@@ -294,7 +294,8 @@ class _Run:
         if self._ego is not None and k >= 0:
             self._at[0], self._speed[0] = self._plan_at[k], self._ego.speed[k]
         active = self._at + self._half_m < self._tables.length_m
-        sample = self._tables.at(np.stack([self._at, self._at + self._speed * _SPEED_TIME_S]))
+        soon = self._at + self._speed * _SPEED_TIME_S
+        sample = self._tables.at(np.concatenate((self._at, soon)).reshape(2, -1))
         pose, fastest, fastest_soon = sample[0, :, :3], sample[0, :, 3], sample[1, :, 3]
         if self._ego is not None and k >= 0:
             active[0] = True
@@ -366,8 +367,7 @@ class _Run:
         h = self._helped
         if len(h.behind):
             gap = h.gap_m + self._at[h.ahead] - self._at[h.behind]
-            idm = self._drivers.select(h.behind).idm
-            speed = self._speed[h.behind]
+            idm, speed = self._drivers.idm(h.behind), self._speed[h.behind]
             helpful = idm_acceleration(speed, fastest[h.behind], gap, self._speed[h.ahead], idm)
             # Vehicles that are already past need no gap, and slow ones open none.
             helpful = np.where((gap > -2.0) & (speed > 1.5), np.maximum(helpful, -HELP_MPS2), np.inf)
@@ -472,21 +472,25 @@ class _Run:
 
     def _pass(self, t: int, calm: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
-        halted = self._moving_users.select(np.abs(self._moving_users.speed) < 0.05)
         stuck = np.zeros(len(self._rows), bool)
         for override in self._staging.overrides:
             state = override.first_step <= t <= override.last_step
             stuck[override.vehicle] |= state and self._speed[override.vehicle] < 0.05
-        big = halted.select(halted.size_m[:, 0] > 1.2)
-        any_halted = bool(stuck.any()) or len(big) > 0
-        standing = self._standing.boxes.concatenate(self._vehicles.select(stuck)).concatenate(big)
-        if stuck.any() or len(halted):
+        halted = np.abs(self._moving_users.speed) < 0.05
+        big = halted & (self._moving_users.size_m[:, 0] > 1.2)
+        any_halted = bool(stuck.any() or big.any())
+        if not (any_halted or len(self._standing.boxes)):
+            return
+        if stuck.any() or halted.any():
             near = calm & (self._speed < 3.0)
         else:
             near = calm & (self._standing.gap(self._at + self._half_m) < 45.0)
-        if not len(standing):
+        rows = np.flatnonzero(near & (self._speed < 9.0)).tolist()
+        if not rows:
             return
-        for row in np.flatnonzero(near & (self._speed < 9.0)).tolist():
+        standing = self._standing.boxes.concatenate(self._vehicles.select(stuck))
+        standing = standing.concatenate(self._moving_users.select(big))
+        for row in rows:
             front, half = self._at[row] + self._half_m[row], self._width_m[row] / 2
             if any_halted or self._standing.meets(row, front, half + DETOUR_MARGIN_M, LOOK_M):
                 self._start_detour(t, row, standing, stuck)
