@@ -87,18 +87,18 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
     scenarios = _SCENARIOS if args.scenarios is None else args.scenarios
     with Progress("generating", "scenarios") as bar:
 
-        def further(done: int, total: int) -> None:
+        def report(done: int, total: int) -> None:
             bar.update(done, total=total)
 
         if args.benchmark:
-            made = generate_benchmark(args.out, options, args.scenarios, further, _audit)
+            sets = generate_benchmark(args.out, options, args.scenarios, report, _audit)
         else:
-            made = {"": generate(args.out, scenarios, args.seed or 0, options, further, _audit)}
+            sets = {"": generate(args.out, scenarios, args.seed or 0, options, report, _audit)}
     if shares is not None:
         write_splits(args.out, ScenarioSet.open(args.out).entries, shares)
     if args.benchmark:
         print(f"benchmark {BENCHMARK_VERSION} of world {WORLD_VERSION}, domain {options.world.domain}")
-    print("\n".join(map(summary, made.values())))
+    print("\n".join(map(summary, sets.values())))
     return 0
 
 

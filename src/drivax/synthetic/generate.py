@@ -131,8 +131,8 @@ class FamilyCount:
     @property
     def rejection_rate(self) -> float:
         """Share of rejected draws among those that could have the requested event."""
-        thrown = sum(self.rejected.values())
-        return thrown / max(thrown + self.kept, 1)
+        rejected = sum(self.rejected.values())
+        return rejected / max(rejected + self.kept, 1)
 
 
 @dataclass(frozen=True)
@@ -376,6 +376,8 @@ def generate_benchmark(
             if progress is not None:
                 progress(done + current, sum(counts.values()))
 
-        own = dataclasses.replace(options, world=world)
-        sets[name] = write_set(Path(out) / name, counts[name], split.seed, own, notes, report, audit)
+        split_options = dataclasses.replace(options, world=world)
+        sets[name] = write_set(
+            Path(out) / name, counts[name], split.seed, split_options, notes, report, audit
+        )
     return sets

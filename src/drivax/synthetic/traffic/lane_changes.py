@@ -146,7 +146,7 @@ class _Options:
         length_m: Length of the manoeuvre.
         possible, mandatory: Whether the lanes allow the change, and whether it must be made.
         left_m: Distance to the end of the own chain.
-        there, here: Place on the new and on the own chain.
+        place, own_place: Place on the new and on the own chain.
     """
 
     vehicles: _Indices
@@ -156,8 +156,8 @@ class _Options:
     mandatory: _Mask
     limit_mps: _Values
     left_m: _Values
-    there: _Place
-    here: _Place
+    place: _Place
+    own_place: _Place
 
 
 class LaneChanges:
@@ -212,13 +212,13 @@ class LaneChanges:
         """Apply MOBIL to each option; take mandatory changes first, then those with the largest gain."""
         o, vehicles = options, options.vehicles
         speed = now.speed[vehicles]
-        new_leader, new_follower = self._neighbours(now, vehicles, o.there, occupied)
+        new_leader, new_follower = self._neighbours(now, vehicles, o.place, occupied)
         _, ahead_gap, ahead_speed = new_leader
         behind, behind_gap, _ = new_follower
         own = self._follow(vehicles, speed, o.limit_mps, ahead_gap, ahead_speed)
         # After the change the new follower follows the vehicle, and the old follower the vehicle's old leader.
         new_after, new_before = self._follower_accelerations(now, vehicles, new_follower, new_leader)
-        old_leader, old_follower = self._neighbours(now, vehicles, o.here, occupied)
+        old_leader, old_follower = self._neighbours(now, vehicles, o.own_place, occupied)
         old_before, old_after = self._follower_accelerations(now, vehicles, old_follower, old_leader)
         others = new_after - new_before + old_after - old_before
         gain = own - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
@@ -281,7 +281,7 @@ class LaneChanges:
     def _drop_contested(self, now: Situation, options: _Options, ok: _Mask, gain: _Values) -> list[Change]:
         """Return the best option of each vehicle; only one vehicle enters a gap at a time."""
         changes: dict[int, Change] = {}
-        taken: list[tuple[int, float]] = []
+        entries: list[tuple[int, float]] = []
         order = sorted(
             (-float(gain[k]) - 100.0 * bool(options.mandatory[k]), int(options.vehicles[k]), k)
             for k in np.flatnonzero(ok)
@@ -289,25 +289,25 @@ class LaneChanges:
         for _, row, k in order:
             chain, own = int(self.chains.chain[options.target[k]]), float(now.at_m[row])
             if row not in changes and not any(
-                c == chain and abs(own - position) < 40.0 for c, position in taken
+                c == chain and abs(own - position) < 40.0 for c, position in entries
             ):
-                taken.append((chain, own))
+                entries.append((chain, own))
                 changes[row] = Change(row, int(options.target[k]), float(options.length_m[k]))
         return list(changes.values())
 
 
 def _help_accelerations(
-    now: Situation, options: _Options, moved: set[int], leader: _Neighbour, follower: _Neighbour
+    now: Situation, options: _Options, changing: set[int], leader: _Neighbour, follower: _Neighbour
 ) -> Helped:
     """Pairs that adjust to each other because a mandatory change has found no room yet."""
     pairs: list[tuple[int, int, float]] = []
     for k in np.flatnonzero(options.mandatory):
         row, ahead, behind = (int(rows[k]) for rows in (options.vehicles, leader[0], follower[0]))
-        if row in moved:
+        if row in changing:
             continue
-        if ahead >= 0 and ahead not in moved:
+        if ahead >= 0 and ahead not in changing:
             pairs.append((row, ahead, float(leader[1][k])))
-        if behind >= 0 and behind not in moved:
+        if behind >= 0 and behind not in changing:
             pairs.append((behind, row, float(follower[1][k])))
     behind, ahead = np.array([pair[:2] for pair in pairs], int).reshape(-1, 2).T
     gap = np.array([pair[2] for pair in pairs]) - (now.at_m[ahead] - now.at_m[behind])

@@ -165,11 +165,11 @@ def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[L
         inside = (current >= span.from_m) & (current <= span.until_m)
         along = np.maximum(current - span.begin_m, 0.0) / span.scale
         for shared_lane, until_m in _lanes_sharing_space(network, span.lane):
-            chosen = (inside & (along < until_m) & (slots < SLOTS)).nonzero()[0]
-            slot = slots[chosen]
-            lane[samples][chosen, slot] = shared_lane
-            lane_m[samples][chosen, slot] = along[chosen]
-            slots[chosen] += 1
+            samples_on_lane = (inside & (along < until_m) & (slots < SLOTS)).nonzero()[0]
+            slot = slots[samples_on_lane]
+            lane[samples][samples_on_lane, slot] = shared_lane
+            lane_m[samples][samples_on_lane, slot] = along[samples_on_lane]
+            slots[samples_on_lane] += 1
     return Path(curve, step, mean_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 
 
@@ -217,8 +217,10 @@ class Sway:
         phases = rng.uniform(0.0, 2 * math.pi, size=2)
         # A wave without end is a constant.
         offset = ([aside_m], [0.0], [math.pi / 2]) if aside_m else ([], [], [])
-        drawn = (values.tolist() for values in (share, waves, phases))
-        return cls(*(tuple(values + constant) for values, constant in zip(drawn, offset, strict=True)))
+        waves_by_field = (values.tolist() for values in (share, waves, phases))
+        return cls(
+            *(tuple(values + constant) for values, constant in zip(waves_by_field, offset, strict=True))
+        )
 
     def apply(self, curve: Curve) -> Curve:
         """Return the curve that is driven; its heading is its tangent (to first order in the deviation)."""

@@ -208,9 +208,9 @@ class Pedestrians:
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
         speed = np.minimum(self._free_speed, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
         speed = np.maximum(speed, 0.0)
-        moved = np.minimum((self._speed + speed) / 2 * DT_S, np.maximum(room, 0.0))
-        speed[self._is_blocked], moved[self._is_blocked] = 0.0, 0.0
-        self._at = self._at + moved
+        distance = np.minimum((self._speed + speed) / 2 * DT_S, np.maximum(room, 0.0))
+        speed[self._is_blocked], distance[self._is_blocked] = 0.0, 0.0
+        self._at = self._at + distance
         self._speed = speed
 
 
@@ -218,9 +218,9 @@ def _remaining_red_s(
     network: RoadNetwork, red: Bool[np.ndarray, "crossing lane"], times_s: Float64[np.ndarray, " time"]
 ) -> Float64[np.ndarray, "time crossing"]:
     """Time until a conflicting light turns green, s, by step and crossing (infinite: no lights)."""
-    remaining = np.full((len(times_s), len(red)), math.inf)
+    remaining_s = np.full((len(times_s), len(red)), math.inf)
     if network.signals is None or not red.any():
-        return remaining
+        return remaining_s
     # Extended by one cycle beyond the last step, because pedestrians know the cycle.
     next_cycle_s = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
     colour, _ = network.signals.colours(np.concatenate([times_s, next_cycle_s]), len(network.lanes))
@@ -228,8 +228,8 @@ def _remaining_red_s(
         is_green = (colour[:, red[crossing]] != Colour.RED).any(axis=1)
         steps = np.where(is_green, np.arange(len(is_green)), len(is_green))
         next_green = np.minimum.accumulate(steps[::-1])[::-1]
-        remaining[:, crossing] = ((next_green - np.arange(len(is_green))) * DT_S)[: len(times_s)]
-    return remaining
+        remaining_s[:, crossing] = ((next_green - np.arange(len(is_green))) * DT_S)[: len(times_s)]
+    return remaining_s
 
 
 def _arrivals(

@@ -67,9 +67,9 @@ class Drivers:
 
     def with_headway(self, row: int, headway_s: float) -> Drivers:
         """Return the drivers with one time gap changed."""
-        changed = self.headway_s.copy()
-        changed[row] = headway_s
-        return replace(self, headway_s=changed)
+        headways = self.headway_s.copy()
+        headways[row] = headway_s
+        return replace(self, headway_s=headways)
 
 
 @dataclass(frozen=True)

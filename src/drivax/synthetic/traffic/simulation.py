@@ -129,19 +129,19 @@ class Leaders:
         lane, along = tables.on(at_m)
         lane[~active] = -1
         # position[i, k]: position of the k-th occupied (vehicle, lane) on the path of vehicle i.
-        used = (lane.ravel() >= 0).nonzero()[0]
-        if not len(used):
+        slots = (lane.ravel() >= 0).nonzero()[0]
+        if not len(slots):
             return self._nearest
-        vehicles_ahead, taken = used // SLOTS, lane.ravel().take(used)
+        vehicles_ahead, lanes = slots // SLOTS, lane.ravel().take(slots)
         # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
         begin = np.where((tables.since <= own) & (own <= tables.until), tables.begin, np.nan)
-        position = tables.scale.take(taken, axis=1)
-        position *= along.ravel().take(used)
-        position = begin.take(taken, axis=1) + position
+        position = tables.scale.take(lanes, axis=1)
+        position *= along.ravel().take(slots)
+        position = begin.take(lanes, axis=1) + position
         seen = (position > own) & (vehicles_ahead != self._rows[:, None])
         if self._any_cyclist:
             # Where the lane is wide enough, cyclists are overtaken within it.
-            seen &= ~(self._cyclist[vehicles_ahead] & self._passes.take(taken, axis=1))
+            seen &= ~(self._cyclist[vehicles_ahead] & self._passes.take(lanes, axis=1))
         position -= self._half_m[vehicles_ahead]
         gap = np.where(seen, position, np.inf) - own - self._half_m[:, None]
         nearest = gap.argmin(axis=1)
@@ -264,9 +264,9 @@ class _Run:
     def resume(self, other: _Run) -> None:
         """Take over another run's state at its last checkpoint before this one differs from it."""
         steps = [run._ego.first_step for run in (self, other) if run._ego is not None]
-        mine, theirs = self._staging, other._staging
-        if mine is not theirs:
-            steps += [step for step in map(first_effect, (mine, theirs)) if step is not None]
+        stagings = self._staging, other._staging
+        if stagings[0] is not stagings[1]:
+            steps += [step for step in map(first_effect, stagings) if step is not None]
         last = min([*steps, len(self._fixed.times_s) - 1])
         self._checkpoints = [checkpoint for checkpoint in other._checkpoints if checkpoint[0] <= last]
         if self._checkpoints:
@@ -337,7 +337,7 @@ class _Run:
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_soon: PerVehicle, active: VehicleMask
     ) -> PerVehicle:
-        """The least of the accelerations towards leaders, lines, obstacles and the preferred speed (here and soon)."""
+        """The least of the accelerations towards leaders, lines, obstacles and the preferred speed (now and soon)."""
         gaps, leads = self._gaps, self._leads
         gaps[0], leader = self._leaders.ahead(self._tables, self._at, active)
         leads[0] = self._speed[leader]
@@ -354,11 +354,11 @@ class _Run:
             gaps[2] += (leads[2] - self._speed) * DT_S
         # Only a planned ego reverses; the IDM treats it as standing.
         speed = np.maximum(self._speed, 0.0)
-        following = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
+        accelerations = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
         # Braking for a line is limited to a little more than it takes to stop there.
-        needed = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _STOP_SHORT_M), 0.1))
-        lines = np.maximum(following[1], -_FIRMLY * needed - 0.5)
-        preferred = np.minimum(np.minimum(following[0], lines), following[2])
+        to_stop = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _STOP_SHORT_M), 0.1))
+        lines = np.maximum(accelerations[1], -_FIRMLY * to_stop - 0.5)
+        preferred = np.minimum(np.minimum(accelerations[0], lines), accelerations[2])
         preferred = np.minimum(preferred, (fastest_soon - self._speed) / _SPEED_TIME_S)
         return self._open_gaps(preferred, fastest)
 
@@ -406,11 +406,11 @@ class _Run:
     def _crossings(self, front: PerVehicle) -> PerVehicle:
         """Distance to the next occupied crossing at which a vehicle can stop."""
         away = self._tables.crossing_m - front[:, None]
-        needed = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
+        to_stop = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
         halt = self._occupied_crossings[self._tables.crossing] & (self._tables.crossing >= 0) & (away > -0.5)
         if self._halting.shape != halt.shape:
             self._halting = np.zeros_like(halt)
-        self._halting = halt & (needed < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
+        self._halting = halt & (to_stop < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
         return np.where(self._halting, away, np.inf).min(axis=1)
 
     def _apply_reaction_times(self, t: int, preferred: PerVehicle) -> PerVehicle:
@@ -430,13 +430,13 @@ class _Run:
         jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
         a = np.clip(preferred, self._last - jerk, self._last + self._drivers.jerk_mps3 * DT_S)
         after = self._speed + a * DT_S
-        halted = after <= 0.0
+        stops = after <= 0.0
         # Vehicles that stop within the step travel v^2 / (2 |a|).
-        travelled = np.where(
-            halted, self._speed**2 / (2 * np.maximum(-a, 1e-9)), (self._speed + after) * DT_S / 2
+        distance = np.where(
+            stops, self._speed**2 / (2 * np.maximum(-a, 1e-9)), (self._speed + after) * DT_S / 2
         )
-        self._at = self._at + np.where(active, travelled, 0.0)
-        self._last = np.where(halted, 0.0, a)
+        self._at = self._at + np.where(active, distance, 0.0)
+        self._last = np.where(stops, 0.0, a)
         self._speed = np.where(active, np.maximum(after, 0.0), 0.0)
         return a
 
@@ -462,9 +462,9 @@ class _Run:
         ahead = {span.lane for span in present.spans}
         while self._network.lanes[lanes[-1]].successors:
             after = next_lanes(self._network, lanes)
-            remaining = [lane for lane in after if lane in ahead]
-            # Elsewhere branches take turns: no random number is drawn here.
-            lanes.append(remaining[0] if remaining else after[(row + len(lanes)) % len(after)])
+            on_path = [lane for lane in after if lane in ahead]
+            # Elsewhere branches take turns: this draws no random number.
+            lanes.append(on_path[0] if on_path else after[(row + len(lanes)) % len(after)])
         sway = Sway((0.08,), (0.07,), (float(row),))
         target = lane_path(self._network, tuple(lanes), sway)
         path, position = change_onto(target, present, self._at[row], change.length_m)
@@ -476,12 +476,12 @@ class _Run:
         for override in self._staging.overrides:
             state = override.first_step <= t <= override.last_step
             stuck[override.vehicle] |= state and self._speed[override.vehicle] < 0.05
-        halted = np.abs(self._moving_users.speed) < 0.05
-        big = halted & (self._moving_users.size_m[:, 0] > 1.2)
+        halts = np.abs(self._moving_users.speed) < 0.05
+        big = halts & (self._moving_users.size_m[:, 0] > 1.2)
         any_halted = bool(stuck.any() or big.any())
         if not (any_halted or len(self._standing.boxes)):
             return
-        if stuck.any() or halted.any():
+        if stuck.any() or halts.any():
             near = calm & (self._speed < 3.0)
         else:
             near = calm & (self._standing.gap(self._at + self._half_m) < 45.0)
