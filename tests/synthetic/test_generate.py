@@ -204,16 +204,17 @@ def test_audit_findings_are_stored(tmp_path):
 
 def test_first_audit_runs_while_scenarios_are_drawn():
     (draw,) = generation._draw_chunk(0, 1, 5, Generation())
-    started, sizes = threading.Event(), []
+    later_draws, sizes = threading.Event(), []
 
     def audit(scenarios):
-        started.set()
+        assert later_draws.wait(10.0)
         sizes.append(len(scenarios))
         return [{"number": scenario.tags["number"]} for scenario in scenarios]
 
     def scenarios():
         for number in range(150):
-            assert number < 5 or started.wait(10.0)
+            if number == 20:
+                later_draws.set()
             yield dataclasses.replace(draw.scenario, tags={"number": str(number)})
 
     audited = [

@@ -56,9 +56,9 @@ _SLOWEST = 6
 _FORESEEN = 25
 #: Steps between checkpoints, from which a run resumes that differs later.
 _CHECKPOINT_STEPS = 8
-#: Attributes of a run that change.
+#: Attributes of a run that change, tables of paths apart.
 _STATE = (
-    "_tables", "_standing", "_right_of_way", "_pedestrians", "_occupied_crossings", "_halting", "_at", "_speed",
+    "_right_of_way", "_pedestrians", "_occupied_crossings", "_halting", "_at", "_speed",
     "_last", "_memory", "_busy_m", "_rest", "_helped", "_leaders", "_gaps", "_leads", "_moving_users", "_vehicles",
 )  # fmt: skip
 
@@ -203,14 +203,20 @@ def _copy_tables(tables: _Tables) -> _Tables:
     return result
 
 
-def _checkpoint(state: dict[str, Any]) -> dict[str, Any]:
-    """Copy the state of a run, except for tables, which are copied when a path changes."""
-    shared = (PathTables, StaticObstacles)
-    copied = {
-        name: state[name] if isinstance(state[name], shared) else copy.copy(state[name]) for name in _STATE
-    }
-    copied["_right_of_way"] = _copy_tables(copied["_right_of_way"])
-    return copied
+def _copy_state(state: dict[str, Any]) -> dict[str, Any]:
+    """Copy the attributes of a run that change."""
+    result = {name: copy.copy(state[name]) for name in _STATE}
+    result["_right_of_way"] = _copy_tables(result["_right_of_way"])
+    return result
+
+
+@dataclass(frozen=True)
+class _Checkpoint:
+    """State of a run before a step, and the present path of each vehicle."""
+
+    step: int
+    state: dict[str, Any]
+    paths: list[Path]
 
 
 class _Run:
@@ -227,7 +233,7 @@ class _Run:
         self._rows = np.arange(count)
         self._idm = self._drivers.idm()
         self._tables, self._owns_tables = traffic.tables, False
-        self._checkpoints: list[tuple[int, dict[str, Any]]] = []
+        self._checkpoints: list[_Checkpoint] = []
         static = tuple(user for user in staging.extras if user.is_static)
         self._movers = tuple(user for user in staging.extras if not user.is_static)
         boxes = traffic.parked.concatenate(boxes_at(static, 0))
@@ -268,20 +274,24 @@ class _Run:
         if stagings[0] is not stagings[1]:
             steps += [step for step in map(first_effect, stagings) if step is not None]
         last = min([*steps, len(self._fixed.times_s) - 1])
-        self._checkpoints = [checkpoint for checkpoint in other._checkpoints if checkpoint[0] <= last]
+        self._checkpoints = [checkpoint for checkpoint in other._checkpoints if checkpoint.step <= last]
         if self._checkpoints:
-            step, state = self._checkpoints[-1]
-            vars(self).update(_checkpoint(state))
+            checkpoint = self._checkpoints[-1]
+            vars(self).update(_copy_state(checkpoint.state))
+            for row, path in enumerate(checkpoint.paths):
+                if path is not self._tables.paths[row]:
+                    self._replace_path(row, path)
+            # Columns that no present path needs are gone.
+            self._halting = self._halting[:, : self._tables.crossing.shape[1]]
             for name, record in vars(self._log).items():
-                record[:, :step] = vars(other._log)[name][:, :step]
+                record[:, : checkpoint.step] = vars(other._log)[name][:, : checkpoint.step]
 
     def finish(self) -> Motion:
         """Run all steps and collect the motion."""
-        begin = self._checkpoints[-1][0] if self._checkpoints else 0
+        begin = self._checkpoints[-1].step if self._checkpoints else 0
         for t in range(begin, len(self._fixed.times_s)):
             if t % _CHECKPOINT_STEPS == 0 and t > begin:
-                self._checkpoints.append((t, _checkpoint(vars(self))))
-                self._owns_tables = False
+                self._checkpoints.append(_Checkpoint(t, _copy_state(vars(self)), self._tables.paths.copy()))
             self._step(t)
         if self._ego is not None:
             first, log = self._ego.first_step, self._log
@@ -314,15 +324,18 @@ class _Run:
 
     def _swap(self, t: int, row: int, path: Path, at: float, end_m: float) -> None:
         """Put a vehicle on another path, which it follows undisturbed up to a position."""
+        self._replace_path(row, path)
+        self._at[row] = at
+        self._halting[row : row + 1] = False
+        self._right_of_way.reset_vehicle(row, self._tables, at + self._half_m[row])
+        self._busy_m[row], self._rest[row] = end_m, t + _REST_STEPS
+
+    def _replace_path(self, row: int, path: Path) -> None:
         if not self._owns_tables:
             self._tables, self._standing = _copy_tables(self._tables), _copy_tables(self._standing)
             self._owns_tables = True
         self._tables.replace(row, path)
         self._standing.replace(row, path)
-        self._at[row] = at
-        self._halting[row : row + 1] = False
-        self._right_of_way.reset_vehicle(row, self._tables, at + self._half_m[row])
-        self._busy_m[row], self._rest[row] = end_m, t + _REST_STEPS
 
     def _advance_pedestrians(self, t: int, active: VehicleMask) -> None:
         """Advance the pedestrians and gather scripted users."""
