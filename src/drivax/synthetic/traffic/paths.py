@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import accumulate, pairwise
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -102,12 +104,20 @@ def lane_path(
     network: RoadNetwork, lanes: tuple[int, ...], sway: Sway, change: LaneChange | None = None
 ) -> Path:
     """Build the path along consecutive lanes; with a lane change the new lane comes after the old one."""
+    if change is None:
+        lengths = [network.lanes[lane].length_m for lane in lanes]
+        begins = list(accumulate(lengths, initial=0.0))
+        spans = [
+            LaneSpan(lane, a, 1.0, end_m=b) for lane, (a, b) in zip(lanes, pairwise(begins), strict=True)
+        ]
+        curve = _lane_curve(network, lanes)
+        return _build_path(network, resample(sway.apply(curve), STEP_M), begins[-1], spans)
     pieces, spans, position = [], [], 0.0
     for index, lane in enumerate(lanes):
-        if change is not None and index == change.section + 1:
+        if index == change.section + 1:
             continue
         curve = network.lanes[lane].curve
-        if change is not None and index == change.section:
+        if index == change.section:
             curve, crossing = _lane_change_curve(curve, network.lanes[lanes[index + 1]].curve, change)
             length = float(curve.arc_m[-1])
             spans += [
@@ -120,6 +130,12 @@ def lane_path(
         pieces.append(curve)
         position += length
     return _build_path(network, resample(sway.apply(join_curves(*pieces)), STEP_M), position, spans)
+
+
+@lru_cache(maxsize=64)
+def _lane_curve(network: RoadNetwork, lanes: tuple[int, ...]) -> Curve:
+    """Return the centre of consecutive lanes; vehicles that take the same lanes share it."""
+    return join_curves(*(network.lanes[lane].curve for lane in lanes))
 
 
 def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
@@ -231,6 +247,5 @@ class Sway:
             angle = wave * curve.arc_m + phase
             lateral += amplitude * np.sin(angle)
             slope += amplitude * wave * np.cos(angle)
-        normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
-        stretch = 1.0 - lateral * np.gradient(curve.heading, np.maximum(curve.arc_m, 1e-9))
-        return Curve(curve.xy + lateral[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
+        stretch = 1.0 - lateral * curve.bend
+        return Curve(curve.xy + lateral[:, None] * curve.normal, curve.heading + np.arctan2(slope, stretch))
