@@ -108,13 +108,17 @@ class PathTables:
         for k, (begin, end, lane) in enumerate(sorted(connectors)[: self.connector.shape[1]]):
             self.connector[row, k], self.connector_begin[row, k] = lane, begin
             self.connector_end[row, k] = end
-        extra = len(crossings) - self.crossing.shape[1]
-        if extra > 0:
-            self.crossing = np.pad(self.crossing, ((0, 0), (0, extra)), constant_values=-1)
-            self.crossing_m = np.pad(self.crossing_m, ((0, 0), (0, extra)), constant_values=np.inf)
+        self.widen(len(crossings))
         self.crossing[row], self.crossing_m[row] = -1, np.inf
         for k, (position, number) in enumerate(sorted(crossings)):
             self.crossing_m[row, k], self.crossing[row, k] = position, number
+
+    def widen(self, crossings: int) -> None:
+        """Make room for a number of crossings per path."""
+        extra = crossings - self.crossing.shape[1]
+        if extra > 0:
+            self.crossing = np.pad(self.crossing, ((0, 0), (0, extra)), constant_values=-1)
+            self.crossing_m = np.pad(self.crossing_m, ((0, 0), (0, extra)), constant_values=np.inf)
 
     def _grow(self, points: int) -> None:
         extra = points - self.table.shape[1]

@@ -212,11 +212,12 @@ def _copy_state(state: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Checkpoint:
-    """State of a run before a step, and the present path of each vehicle."""
+    """State of a run before a step, the present path of each vehicle, and the columns of crossings."""
 
     step: int
     state: dict[str, Any]
     paths: list[Path]
+    crossings: int
 
 
 class _Run:
@@ -281,8 +282,7 @@ class _Run:
             for row, path in enumerate(checkpoint.paths):
                 if path is not self._tables.paths[row]:
                     self._replace_path(row, path)
-            # Columns that no present path needs are gone.
-            self._halting = self._halting[:, : self._tables.crossing.shape[1]]
+            self._tables.widen(checkpoint.crossings)
             for name, record in vars(self._log).items():
                 record[:, : checkpoint.step] = vars(other._log)[name][:, : checkpoint.step]
 
@@ -291,7 +291,9 @@ class _Run:
         begin = self._checkpoints[-1].step if self._checkpoints else 0
         for t in range(begin, len(self._fixed.times_s)):
             if t % _CHECKPOINT_STEPS == 0 and t > begin:
-                self._checkpoints.append(_Checkpoint(t, _copy_state(vars(self)), self._tables.paths.copy()))
+                p = self._tables
+                checkpoint = _Checkpoint(t, _copy_state(vars(self)), p.paths.copy(), p.crossing.shape[1])
+                self._checkpoints.append(checkpoint)
             self._step(t)
         if self._ego is not None:
             first, log = self._ego.first_step, self._log
