@@ -218,7 +218,7 @@ def test_first_audit_runs_while_scenarios_are_drawn():
             yield dataclasses.replace(draw.scenario, tags={"number": str(number)})
 
     audited = [
-        (s.tags["number"], finding["number"]) for s, finding in generation._audited(scenarios(), audit)
+        (s.tags["number"], finding["number"]) for s, finding in generation._audit_batches(scenarios(), audit)
     ]
     assert audited == [(str(number), str(number)) for number in range(150)]
     assert sizes == [4, 64, 64, 18]

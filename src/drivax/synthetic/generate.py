@@ -220,14 +220,16 @@ def write_set(
     with (
         ScenarioWriter(out, options.sizes, source, overwrite=options.overwrite) as writer,
         closing(_draws(scenarios, seed, options)) as draws,
-        closing(_audited(_counted(draws, counts, scenarios, progress), audit or _no_audit)) as audited,
+        closing(
+            _audit_batches(_count_draws(draws, counts, scenarios, progress), audit or _no_audit)
+        ) as pairs,
     ):
-        for scenario, finding in audited:
+        for scenario, finding in pairs:
             writer.add(dataclasses.replace(scenario, audit={**scenario.audit, **finding}))
     return GeneratedSet(Path(out), scenarios, time.monotonic() - begin, counts.families())
 
 
-def _counted(
+def _count_draws(
     draws: Iterable[_Draw], counts: _Counts, scenarios: int, progress: Progress | None
 ) -> Iterator[Scenario]:
     """Count draws and report progress."""
@@ -242,7 +244,7 @@ def _no_audit(scenarios: list[Scenario]) -> list[dict[str, Any]]:
     return [{} for _ in scenarios]
 
 
-def _audited(
+def _audit_batches(
     scenarios: Iterator[Scenario], audit: Audit
 ) -> Generator[tuple[Scenario, dict[str, Any]], None, None]:
     """Audit scenarios in batches, in a thread that compiles the audit while others are drawn.
