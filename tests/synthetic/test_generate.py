@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -199,6 +200,28 @@ def test_audit_findings_are_stored(tmp_path):
     assert calls == [2]
     for index, entry in enumerate(scenarios.entries):
         assert entry["audit"]["agents"] == int(scenarios[index].agent_valid[10].sum())
+
+
+def test_first_audit_runs_while_scenarios_are_drawn():
+    (draw,) = generation._draw_chunk(0, 1, 5, Generation())
+    later_draws, sizes = threading.Event(), []
+
+    def audit(scenarios):
+        assert later_draws.wait(10.0)
+        sizes.append(len(scenarios))
+        return [{"number": scenario.tags["number"]} for scenario in scenarios]
+
+    def scenarios():
+        for number in range(150):
+            if number == 20:
+                later_draws.set()
+            yield dataclasses.replace(draw.scenario, tags={"number": str(number)})
+
+    audited = [
+        (s.tags["number"], finding["number"]) for s, finding in generation._audit_batches(scenarios(), audit)
+    ]
+    assert audited == [(str(number), str(number)) for number in range(150)]
+    assert sizes == [4, 64, 64, 18]
 
 
 def test_invalid_requests_are_refused(tmp_path):

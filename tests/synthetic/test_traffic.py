@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
+from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.families import FAMILIES, CurvedRoad
 from drivax.synthetic.roads.network import Crossing, Draft, RoadNetwork
@@ -13,8 +14,9 @@ from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Sway, lane_path, random_lanes
 from drivax.synthetic.traffic.placement import Density, draw_drivers, draw_path, place_vehicles
-from drivax.synthetic.traffic.roles import EgoPlan, Override, Pedestrian, Roles, Scripted, Staging
-from drivax.synthetic.traffic.simulation import Traffic
+from drivax.synthetic.traffic.role_assignment import assign_roles
+from drivax.synthetic.traffic.roles import EgoPlan, Override, Pedestrian, Roles, Scripted, Staging, Tailgate
+from drivax.synthetic.traffic.simulation import Traffic, _Run, first_effect
 
 from . import traffic_scenes
 from .oracles import box_corners, shared_area
@@ -291,3 +293,48 @@ def test_dense_traffic_has_no_overlaps(family, seed):
     moved = np.hypot(*np.moveaxis(np.diff(motion.xy, axis=1), -1, 0))
     there = motion.valid[:, 1:]
     assert np.abs(moved - (motion.speed[:, 1:] + motion.speed[:, :-1]) * 0.05)[there].max() < 0.15
+
+
+def busy_scenario(seed):
+    """Roles on drawn roads, and the times of their steps."""
+    domain, rng, times = DOMAINS["grid"], np.random.default_rng(seed), (np.arange(131) - 40) * 0.1
+    network = domain.draw_family(rng).build(rng, domain.style)
+    return assign_roles(network, domain, times, 0.35, (0.34, 0.33, 0.33), rng, (), False), times
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_resumed_run_equals_run_from_the_start(seed, monkeypatch):
+    cast, times = busy_scenario(seed)
+    traffic = Traffic(cast, times)
+    motion = traffic.run()
+    plan = EgoPlan(53, motion.xy[0, 53:], motion.heading[0, 53:], motion.speed[0, 53:] / 2)
+    braking = Staging(overrides=(Override(1, 66, 90, -5.0),))
+    steps, step = [], _Run._step
+    monkeypatch.setattr(_Run, "_step", lambda self, t: (steps.append(t), step(self, t)))
+    for staging, ego, begin in (
+        (Staging(), plan, 48),
+        (braking, None, 48),
+        (braking, plan, 48),
+        (None, None, 48),
+    ):
+        steps.clear()
+        resumed = traffic.run(staging, ego)
+        assert steps == list(range(begin, len(times)))
+        fresh = Traffic(cast, times).run(staging, ego)
+        for name in ("xy", "heading", "speed", "valid", "distance_m", "acceleration"):
+            np.testing.assert_array_equal(getattr(resumed, name), getattr(fresh, name), err_msg=name)
+        assert [len(path.curve.xy) for path in resumed.paths] == [len(path.curve.xy) for path in fresh.paths]
+    np.testing.assert_array_equal(resumed.xy, motion.xy)
+
+
+def test_staging_takes_effect_when_its_first_part_begins():
+    valid = np.arange(50) >= 30
+    extra = Scripted(AgentKind.VEHICLE, (4.0, 2.0, 1.5), np.zeros((50, 2)), np.zeros(50), np.ones(50), valid)
+    still = Scripted.standing(AgentKind.VEHICLE, (4.0, 2.0, 1.5), Pose(0.0, 0.0, 0.0), 50)
+    brake = Override(1, 35, 40, -3.0)
+    assert first_effect(Staging()) is None
+    assert first_effect(Staging(overrides=(brake,))) == 35
+    assert first_effect(Staging(overrides=(brake,), extras=(extra,))) == 30
+    assert first_effect(Staging(overrides=(brake,), extras=(still,))) == 0
+    assert first_effect(Staging(overrides=(brake,), tailgates=(Tailgate(1, 0.5),))) == 0
+    assert first_effect(Staging(overrides=(brake,), removed=(2,))) == 0

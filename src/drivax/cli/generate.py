@@ -7,13 +7,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from drivax.errors import UsageError
-from drivax.evaluation.audit import audit
-from drivax.scenario.schema import CAPACITIES
+from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.select.splits import parse_shares, write_splits
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import load
@@ -88,19 +87,26 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
     scenarios = _SCENARIOS if args.scenarios is None else args.scenarios
     with Progress("generating", "scenarios") as bar:
 
-        def further(done: int, total: int) -> None:
+        def report(done: int, total: int) -> None:
             bar.update(done, total=total)
 
         if args.benchmark:
-            made = generate_benchmark(args.out, options, args.scenarios, further, audit)
+            sets = generate_benchmark(args.out, options, args.scenarios, report, _audit)
         else:
-            made = {"": generate(args.out, scenarios, args.seed or 0, options, further, audit)}
+            sets = {"": generate(args.out, scenarios, args.seed or 0, options, report, _audit)}
     if shares is not None:
         write_splits(args.out, ScenarioSet.open(args.out).entries, shares)
     if args.benchmark:
         print(f"benchmark {BENCHMARK_VERSION} of world {WORLD_VERSION}, domain {options.world.domain}")
-    print("\n".join(map(summary, made.values())))
+    print("\n".join(map(summary, sets.values())))
     return 0
+
+
+def _audit(scenarios: list[Scenario]) -> list[dict[str, Any]]:
+    """Audit scenarios; JAX is imported in the audit's thread, while workers draw."""
+    from drivax.evaluation.audit import audit
+
+    return audit(scenarios)
 
 
 def summary(result: GeneratedSet) -> str:

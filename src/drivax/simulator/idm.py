@@ -40,9 +40,8 @@ def idm_acceleration(
     p = parameters
     root = 2.0 * (p.acceleration_mps2 * p.comfortable_braking_mps2) ** 0.5
     dynamic = speed * p.headway_s + speed * (speed - leader_speed) / root
-    desired_gap = p.min_gap_m + xp.maximum(dynamic, xp.zeros_like(dynamic))
-    free = (speed / xp.maximum(desired_speed, xp.full_like(desired_speed, 0.1))) ** p.exponent
-    interaction = (desired_gap / xp.maximum(gap, xp.full_like(gap, 0.1))) ** 2
+    desired_gap = p.min_gap_m + xp.maximum(dynamic, 0.0)
+    free = (speed / xp.maximum(desired_speed, 0.1)) ** p.exponent
+    interaction = (desired_gap / xp.maximum(gap, 0.1)) ** 2
     desired = p.acceleration_mps2 * (1.0 - free - interaction)
-    low = xp.full_like(desired, -1.0) * p.max_braking_mps2
-    return xp.maximum(desired, low)
+    return xp.maximum(desired, -p.max_braking_mps2)

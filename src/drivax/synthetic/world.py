@@ -143,12 +143,12 @@ def generate_one(seed: int, index: int, config: WorldConfig, steps: int = STEPS)
     if seed < 0 or index < 0:
         raise UsageError(f"seed {seed} and index {index} must not be negative", cure="choose 0 or more")
     domain = config.check()
-    events, severity = _drawn_events(config, np.random.default_rng([seed, 0, index]))
+    events, severity = _draw_events(config, np.random.default_rng([seed, 0, index]))
     rejected: Counter[tuple[str, str]] = Counter()
     for attempt in range(_ATTEMPTS):
         event = events[attempt // _PER_KIND % len(events)]
         sample = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
-        family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *sample))
+        family, network = _draw_roads(config.domain, event, (seed, 3 if event else 1, *sample))
         rng = np.random.default_rng([seed, 2, index, attempt])
         places = destinations_for(event, network, attempt > 0) if event else ()
         result = _attempt(_Draw(network, places, event, severity, steps), domain, config, rng)
@@ -170,7 +170,7 @@ def generate_one(seed: int, index: int, config: WorldConfig, steps: int = STEPS)
     )
 
 
-def _drawn_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[EventKind], float]:
+def _draw_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[EventKind], float]:
     """Draw the order in which kinds of event are tried (or none), and the deceleration the event demands of ego."""
     kinds = [kind for kind in EventKind if kind]
     rare, order = rng.random() < config.rare_rate, rng.permutation(len(kinds)).tolist()
@@ -178,7 +178,7 @@ def _drawn_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[E
 
 
 @lru_cache(maxsize=1)
-def _drawn_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[RoadFamily, RoadNetwork]:
+def _draw_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[RoadFamily, RoadNetwork]:
     """Draw roads of a domain until they suit the event; cached for consecutive draws."""
     domain, rng = DOMAINS[name], np.random.default_rng(seed)
     for _ in range(_ATTEMPTS):

@@ -34,6 +34,8 @@ _STRIDE = 2
 #: Steps and numbers, one for each start of the driver.
 _Steps = Int64[np.ndarray, " start"]
 _Floats = Float64[np.ndarray, " start"]
+#: :attr:`_Others.extent` at a step for each start.
+_Extent = Float64[np.ndarray, "4 user start"]
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,9 @@ def critical_steps(
     position, speed = motion.distance_m[0, step], motion.speed[0, step]
     fastest = speed_profile(path, 1.0, _LATERAL_MPS2, _SLOWING_MPS2)
     hit, behind = np.zeros(len(step), bool), np.zeros((len(others.box), len(step)), bool)
+    extent = others.extent.take(step, axis=2)
     for _ in range((STEPS - CURRENT_STEP - 1) // _STRIDE):
-        gap, leader = _leader(others, step, position, size_m)
+        gap, leader = _leader(others, extent, step, position, size_m)
         line = _stop_line_m(network, path, colour[step], position + size_m[0] / 2) + 2.0 - _STOP_SHORT_M
         target_mps = fastest[np.minimum((position / path.step_m).astype(int), len(fastest) - 1)]
         a = idm_acceleration(
@@ -76,7 +79,8 @@ def critical_steps(
         ).min(axis=0)
         after = np.maximum(speed + a * _STRIDE * DT_S, 0.0)
         position, speed, step = position + (speed + after) / 2 * _STRIDE * DT_S, after, step + 1
-        hit |= _hits(others, step, path, position, size_m, behind)
+        extent = others.extent.take(step, axis=2)
+        hit |= _hits(others, extent, step, path, position, size_m, behind)
     return hit
 
 
@@ -107,12 +111,12 @@ def _project_others(path: Path, motion: Motion) -> _Others:
 
 
 def _leader(
-    others: _Others, now: _Steps, at: _Floats, size_m: Float64[np.ndarray, " 2"]
+    others: _Others, extent: _Extent, now: _Steps, at: _Floats, size_m: Float64[np.ndarray, " 2"]
 ) -> tuple[_Floats, _Floats]:
-    """Gap to the next agent ahead on the path, and its speed."""
+    """Gap to the next agent ahead on the path, and its speed; ``extent`` is that of the others at these steps."""
     if not len(others.box):
         return np.full(len(at), np.inf), np.zeros(len(at))
-    near, far, right, left = others.extent[..., now]
+    near, far, right, left = extent
     side = size_m[1] / 2 + _SIDE_M
     ahead = ((near + far) / 2 > at) & (right < side) & (left > -side)
     gap = np.where(ahead, near, np.inf) - at - size_m[0] / 2
@@ -134,12 +138,12 @@ def _stop_line_m(
 
 
 def _hits(
-    others: _Others, now: _Steps, path: Path, at: _Floats, size_m: Float64[np.ndarray, " 2"],
+    others: _Others, extent: _Extent, now: _Steps, path: Path, at: _Floats, size_m: Float64[np.ndarray, " 2"],
     behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:  # fmt: skip
     """Whether an agent overlaps ego and did not come from behind; adds agents that did to ``behind``."""
     half, side = size_m / 2
-    near, far, right, left = others.extent[..., now]
+    near, far, right, left = extent
     maybe = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
     behind |= maybe & ((near + far) / 2 <= at - half)
     user, start = np.nonzero(maybe & ~behind)

@@ -69,9 +69,9 @@ def ego_track(motion: Motion) -> Track:
     """Return the track of row 0: its trace, the rest of its path, then straight on."""
     xy, heading = motion.xy[0], np.unwrap(motion.heading[0])
     arc = Curve(xy, heading).arc_m
-    moved = np.concatenate([[True], np.diff(arc) > 1e-3])
+    distinct = np.concatenate([[True], np.diff(arc) > 1e-3])
     # Rounding must not move an ego at rest.
-    points, headings, along = xy[moved], heading[moved], arc[moved]
+    points, headings, along = xy[distinct], heading[distinct], arc[distinct]
     if motion.paths:
         curve = motion.paths[0].curve
         index = int(np.argmin(np.hypot(*(curve.xy - xy[-1]).T))) + 2
@@ -145,8 +145,8 @@ class EgoView:
         if not near.any():
             return -1
         on_route = near & np.isin(lane, self.roles.route)
-        chosen = on_route if on_route.any() else near
-        return int(lane[chosen][np.argmin(gap[chosen])])
+        candidates = on_route if on_route.any() else near
+        return int(lane[candidates][np.argmin(gap[candidates])])
 
     def neighbour(self, station: float, side: int) -> int:
         """Neighbour of ego's lane at a station, left (1) or right (-1); -1 without one."""
@@ -218,24 +218,24 @@ class EgoView:
 
     def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
         """The scenario with a new leader, its rear bumper at stations from a step on: IDM slows ego behind it."""
-        drivers, at, speed = self.roles.drivers.idm, self.track.at, self.motion.speed[0]
-        names = ("headway_s", "acceleration_mps2", "comfortable_braking_mps2")
-        law = replace(drivers, **{name: getattr(drivers, name)[:1] for name in names})
+        law, at, speed = self.roles.drivers.idm(slice(1)), self.track.at, self.motion.speed[0]
         ahead = np.gradient(rear_m, DT_S)
-        where, how = at.copy(), speed.copy()
+        stations, speeds = at.copy(), speed.copy()
         for t in range(since, self.steps - 1):
-            v = how[t : t + 1]
-            gap = rear_m[t : t + 1] - where[t] - self.ego_size_m[0] / 2
+            v = speeds[t : t + 1]
+            gap = rear_m[t : t + 1] - stations[t] - self.ego_size_m[0] / 2
             a = idm_acceleration(v, np.maximum(speed.max(keepdims=True), 1.0), gap, ahead[t : t + 1], law)
             after = max(0.0, float(v[0] + np.clip(a[0], -6.0, 2.0) * DT_S))
-            moved = (float(v[0]) + after) / 2 * DT_S
+            distance = (float(v[0]) + after) / 2 * DT_S
             # Ego is never ahead of where it was without the leader: bends, lights and other agents still hold it.
-            where[t + 1] = min(where[t] + moved, at[t + 1])
-            how[t + 1] = min(after, (where[t + 1] - where[t]) / DT_S if where[t + 1] == at[t + 1] else after)
-        xy, heading = self.track.pose(where)
-        ego = {"xy": xy, "heading": heading, "speed": how}
+            stations[t + 1] = min(stations[t] + distance, at[t + 1])
+            speeds[t + 1] = min(
+                after, (stations[t + 1] - stations[t]) / DT_S if stations[t + 1] == at[t + 1] else after
+            )
+        xy, heading = self.track.pose(stations)
+        ego = {"xy": xy, "heading": heading, "speed": speeds}
         rows = {k: np.concatenate([own[None], getattr(self.motion, k)[1:]]) for k, own in ego.items()}
         result = replace(self, motion=replace(self.motion, **rows))
         # Only ego's stations change.
-        result.__dict__["track"] = replace(self.track, at=where)
+        result.__dict__["track"] = replace(self.track, at=stations)
         return result

@@ -57,6 +57,16 @@ class Curve:
         arc.flags.writeable = False
         return arc
 
+    @cached_property
+    def normal(self) -> Float64[np.ndarray, "point 2"]:
+        """Unit vectors to the left."""
+        return normals(self.heading)
+
+    @cached_property
+    def bend(self) -> Float64[np.ndarray, " point"]:
+        """Curvature: change of the heading per metre of arc."""
+        return np.gradient(self.heading, np.maximum(self.arc_m, 1e-9))
+
     @property
     def start(self) -> Pose:
         """First pose."""

@@ -110,9 +110,9 @@ class Bay:
     along_m: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RoadNetwork:
-    """A road map in its own frame (metres).
+    """A road map in its own frame (metres), equal only to itself: what derives from it can be cached.
 
     Attributes:
         edges: Closed rings without the repeated point: the outer boundary counter-clockwise, islands clockwise.

@@ -8,8 +8,8 @@ follower a_n and a_o, a dash for after the change, and the politeness p.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import reduce
+from dataclasses import dataclass
+from functools import lru_cache, reduce
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -82,6 +82,12 @@ class LaneChains:
         self.limit = np.array([lane.limit_mps for lane in lanes])
 
 
+@lru_cache(maxsize=1)
+def lane_chains(network: RoadNetwork) -> LaneChains:
+    """Return the chains of a network."""
+    return LaneChains(network)
+
+
 def _next_in_chain(network: RoadNetwork, lane: int) -> int:
     after = network.lanes[lane].successors
     single = len(after) == 1 and not network.lanes[after[0]].connector
@@ -140,7 +146,7 @@ class _Options:
         length_m: Length of the manoeuvre.
         possible, mandatory: Whether the lanes allow the change, and whether it must be made.
         left_m: Distance to the end of the own chain.
-        there, here: Place on the new and on the own chain.
+        place, own_place: Place on the new and on the own chain.
     """
 
     vehicles: _Indices
@@ -150,21 +156,21 @@ class _Options:
     mandatory: _Mask
     limit_mps: _Values
     left_m: _Values
-    there: _Place
-    here: _Place
+    place: _Place
+    own_place: _Place
 
 
 class LaneChanges:
     """Decides the lane changes of all vehicles."""
 
     def __init__(self, network: RoadNetwork, drivers: Drivers, standing: Boxes) -> None:
-        self.chains, self._drivers, self._idm = LaneChains(network), drivers, drivers.idm
+        self.chains, self._drivers = lane_chains(network), drivers
         self._half = drivers.size_m[:, 0] / 2
         self._obstacle_chain, self._obstacle_m = _on_chains(network, self.chains, standing)
 
     def decide(self, now: Situation, tables: PathTables) -> tuple[list[Change], Helped]:
         """Return lane changes that begin now, and pairs that open gaps for mandatory ones."""
-        lane, along = tables.on(now.at_m, np.arange(len(now.at_m)))
+        lane, along = tables.on(now.at_m)
         own, chains = lane[:, 0], self.chains
         candidates = now.free & now.active & (own >= 0) & ~self._drivers.cyclist
         candidates &= (chains.left[own] >= 0) | (chains.right[own] >= 0)
@@ -206,13 +212,13 @@ class LaneChanges:
         """Apply MOBIL to each option; take mandatory changes first, then those with the largest gain."""
         o, vehicles = options, options.vehicles
         speed = now.speed[vehicles]
-        new_leader, new_follower = self._neighbours(now, vehicles, o.there, occupied)
+        new_leader, new_follower = self._neighbours(now, vehicles, o.place, occupied)
         _, ahead_gap, ahead_speed = new_leader
         behind, behind_gap, _ = new_follower
         own = self._follow(vehicles, speed, o.limit_mps, ahead_gap, ahead_speed)
         # After the change the new follower follows the vehicle, and the old follower the vehicle's old leader.
         new_after, new_before = self._follower_accelerations(now, vehicles, new_follower, new_leader)
-        old_leader, old_follower = self._neighbours(now, vehicles, o.here, occupied)
+        old_leader, old_follower = self._neighbours(now, vehicles, o.own_place, occupied)
         old_before, old_after = self._follower_accelerations(now, vehicles, old_follower, old_leader)
         others = new_after - new_before + old_after - old_before
         gain = own - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
@@ -243,9 +249,7 @@ class LaneChanges:
     def _follow(
         self, rows: _Indices, speed: _Values, preferred: _Values, gap: _Stack, leader_speed: _Stack
     ) -> _Stack:
-        names = ("headway_s", "acceleration_mps2", "comfortable_braking_mps2")
-        idm = replace(self._idm, **{name: getattr(self._idm, name)[rows] for name in names})
-        return idm_acceleration(speed, preferred, gap, leader_speed, idm)
+        return idm_acceleration(speed, preferred, gap, leader_speed, self._drivers.idm(rows))
 
     def _neighbours(
         self, now: Situation, vehicles: _Indices, place: _Place, occupied: _Occupied
@@ -277,7 +281,7 @@ class LaneChanges:
     def _drop_contested(self, now: Situation, options: _Options, ok: _Mask, gain: _Values) -> list[Change]:
         """Return the best option of each vehicle; only one vehicle enters a gap at a time."""
         changes: dict[int, Change] = {}
-        taken: list[tuple[int, float]] = []
+        entries: list[tuple[int, float]] = []
         order = sorted(
             (-float(gain[k]) - 100.0 * bool(options.mandatory[k]), int(options.vehicles[k]), k)
             for k in np.flatnonzero(ok)
@@ -285,25 +289,25 @@ class LaneChanges:
         for _, row, k in order:
             chain, own = int(self.chains.chain[options.target[k]]), float(now.at_m[row])
             if row not in changes and not any(
-                c == chain and abs(own - position) < 40.0 for c, position in taken
+                c == chain and abs(own - position) < 40.0 for c, position in entries
             ):
-                taken.append((chain, own))
+                entries.append((chain, own))
                 changes[row] = Change(row, int(options.target[k]), float(options.length_m[k]))
         return list(changes.values())
 
 
 def _help_accelerations(
-    now: Situation, options: _Options, moved: set[int], leader: _Neighbour, follower: _Neighbour
+    now: Situation, options: _Options, changing: set[int], leader: _Neighbour, follower: _Neighbour
 ) -> Helped:
     """Pairs that adjust to each other because a mandatory change has found no room yet."""
     pairs: list[tuple[int, int, float]] = []
     for k in np.flatnonzero(options.mandatory):
         row, ahead, behind = (int(rows[k]) for rows in (options.vehicles, leader[0], follower[0]))
-        if row in moved:
+        if row in changing:
             continue
-        if ahead >= 0 and ahead not in moved:
+        if ahead >= 0 and ahead not in changing:
             pairs.append((row, ahead, float(leader[1][k])))
-        if behind >= 0 and behind not in moved:
+        if behind >= 0 and behind not in changing:
             pairs.append((behind, row, float(follower[1][k])))
     behind, ahead = np.array([pair[:2] for pair in pairs], int).reshape(-1, 2).T
     gap = np.array([pair[2] for pair in pairs]) - (now.at_m[ahead] - now.at_m[behind])

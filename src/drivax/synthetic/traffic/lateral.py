@@ -196,7 +196,7 @@ def detour_request(
 ) -> DetourRequest:
     """Build the request of a vehicle at a path position and speed."""
     position, adjacent = float(now[0]), []
-    lane, along = tables.on(np.array([position]), np.array([row]))
+    lane, along = tables.on(np.array([position]), slice(row, row + 1))
     if lane[0, 0] >= 0:
         current = network.lanes[lane[0, 0]]
         for other in (current.left, current.right):

@@ -13,6 +13,9 @@ from drivax.synthetic.traffic.roles import Drivers
 PerVehicle = Float64[np.ndarray, " v"]
 VehicleMask = Bool[np.ndarray, " v"]
 VehicleRows = Int64[np.ndarray, " v"]
+#: Vehicles of a look-up.
+Rows = slice | VehicleRows
+ALL_ROWS = slice(None)
 
 
 def speed_profile(
@@ -39,7 +42,7 @@ class PathTables:
 
     Attributes:
         table: x, y, heading and fastest speed at each sample.
-        step_m, last: Distance between samples and index of the last one.
+        step_m, last, length_m: Distance between samples, index of the last one, and its position.
         lane, lane_m: Lanes occupied at each sample (-1: none), and positions on them.
         begin, scale, since, until: Per lane of the network the fields of its span (``begin`` is nan without a span).
         connector, connector_begin, connector_end: Connectors in order of travel (-1: none), and path positions.
@@ -61,7 +64,8 @@ class PathTables:
         self.table = np.zeros((count, points, 4))
         self.lane = np.full((count, points, SLOTS), -1)
         self.lane_m = np.zeros((count, points, SLOTS))
-        self.step_m, self.last = np.ones(count), np.ones(count, int)
+        self.step_m, self.last, self.length_m = np.ones(count), np.ones(count, int), np.ones(count)
+        self._rows = np.arange(count)
         self.begin, self.scale = np.full((count, lanes), np.nan), np.ones((count, lanes))
         self.since, self.until = np.full((count, lanes), -np.inf), np.full((count, lanes), np.inf)
         self.connector = np.full((count, connectors), -1)
@@ -82,7 +86,7 @@ class PathTables:
         self.table[row, n:] = self.table[row, n - 1]
         self.lane[row, :n], self.lane_m[row, :n] = path.lane, path.lane_m
         self.lane[row, n:] = -1
-        self.step_m[row], self.last[row] = path.step_m, n - 1
+        self.step_m[row], self.last[row], self.length_m[row] = path.step_m, n - 1, path.length_m
         self.begin[row], self.scale[row] = np.nan, 1.0
         self.since[row], self.until[row] = -np.inf, np.inf
         self.connector[row], self.connector_begin[row], self.connector_end[row] = -1, np.inf, np.inf
@@ -104,13 +108,17 @@ class PathTables:
         for k, (begin, end, lane) in enumerate(sorted(connectors)[: self.connector.shape[1]]):
             self.connector[row, k], self.connector_begin[row, k] = lane, begin
             self.connector_end[row, k] = end
-        extra = len(crossings) - self.crossing.shape[1]
-        if extra > 0:
-            self.crossing = np.pad(self.crossing, ((0, 0), (0, extra)), constant_values=-1)
-            self.crossing_m = np.pad(self.crossing_m, ((0, 0), (0, extra)), constant_values=np.inf)
+        self.widen(len(crossings))
         self.crossing[row], self.crossing_m[row] = -1, np.inf
         for k, (position, number) in enumerate(sorted(crossings)):
             self.crossing_m[row, k], self.crossing[row, k] = position, number
+
+    def widen(self, crossings: int) -> None:
+        """Make room for a number of crossings per path."""
+        extra = crossings - self.crossing.shape[1]
+        if extra > 0:
+            self.crossing = np.pad(self.crossing, ((0, 0), (0, extra)), constant_values=-1)
+            self.crossing_m = np.pad(self.crossing_m, ((0, 0), (0, extra)), constant_values=np.inf)
 
     def _grow(self, points: int) -> None:
         extra = points - self.table.shape[1]
@@ -120,21 +128,28 @@ class PathTables:
             self.lane = np.pad(self.lane, pad, constant_values=-1)
             self.lane_m = np.pad(self.lane_m, pad)
 
-    def at(self, position_m: PerVehicle, rows: VehicleRows) -> Float64[np.ndarray, "v 4"]:
-        """x, y, heading and fastest speed at positions on the paths of some vehicles."""
+    def at(
+        self, position_m: Float64[np.ndarray, "*look v"], rows: Rows = ALL_ROWS
+    ) -> Float64[np.ndarray, "*look v 4"]:
+        """x, y, heading and fastest speed at positions on the paths of all or some vehicles."""
         sample = position_m / self.step_m[rows]
         index = np.minimum(np.maximum(sample.astype(int), 0), self.last[rows] - 1)
-        share = np.minimum(np.maximum(sample - index, 0.0), 1.0)[:, None]
-        flat, index = self.table.reshape(-1, 4), index + rows * self.table.shape[1]
-        low = flat.take(index, axis=0)
-        return low + share * (flat.take(index + 1, axis=0) - low)
+        share = np.minimum(np.maximum(sample - index, 0.0), 1.0)[..., None]
+        index += self._rows[rows] * self.table.shape[1]
+        flat = self.table.reshape(-1, 4)
+        low, result = flat.take(index, axis=0), flat.take(index + 1, axis=0)
+        result -= low
+        result *= share
+        result += low
+        return result
 
     def on(
-        self, position_m: PerVehicle, rows: VehicleRows
+        self, position_m: PerVehicle, rows: Rows = ALL_ROWS
     ) -> tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]]:
-        """Lanes occupied at positions on the paths (-1: none), and positions on them, m."""
+        """Lanes occupied at positions on the paths of all or some vehicles (-1: none), and positions on them, m."""
         step = self.step_m[rows]
         index = np.minimum(np.maximum(np.rint(position_m / step).astype(int), 0), self.last[rows])
-        beyond, index = position_m - index * step, index + rows * self.lane.shape[1]
-        along = self.lane_m.reshape(-1, SLOTS).take(index, axis=0) + beyond[:, None]
+        excess, index = position_m - index * step, index + self._rows[rows] * self.lane.shape[1]
+        along = self.lane_m.reshape(-1, SLOTS).take(index, axis=0)
+        along += excess[:, None]
         return self.lane.reshape(-1, SLOTS).take(index, axis=0), along

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import accumulate, pairwise
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -37,10 +39,8 @@ class LaneSpan:
 
     def stretch(self, by: float) -> LaneSpan:
         """Return the span on a path that is longer by a factor."""
-        metres = {
-            name: getattr(self, name) * by for name in ("begin_m", "scale", "from_m", "until_m", "end_m")
-        }
-        return replace(self, **metres)
+        begin, scale, end = self.begin_m * by, self.scale * by, self.end_m * by
+        return LaneSpan(self.lane, begin, scale, self.from_m * by, self.until_m * by, end)
 
 
 @dataclass(frozen=True)
@@ -104,12 +104,20 @@ def lane_path(
     network: RoadNetwork, lanes: tuple[int, ...], sway: Sway, change: LaneChange | None = None
 ) -> Path:
     """Build the path along consecutive lanes; with a lane change the new lane comes after the old one."""
+    if change is None:
+        lengths = [network.lanes[lane].length_m for lane in lanes]
+        begins = list(accumulate(lengths, initial=0.0))
+        spans = [
+            LaneSpan(lane, a, 1.0, end_m=b) for lane, (a, b) in zip(lanes, pairwise(begins), strict=True)
+        ]
+        curve = _lane_curve(network, lanes)
+        return _build_path(network, resample(sway.apply(curve), STEP_M), begins[-1], spans)
     pieces, spans, position = [], [], 0.0
     for index, lane in enumerate(lanes):
-        if change is not None and index == change.section + 1:
+        if index == change.section + 1:
             continue
         curve = network.lanes[lane].curve
-        if change is not None and index == change.section:
+        if index == change.section:
             curve, crossing = _lane_change_curve(curve, network.lanes[lanes[index + 1]].curve, change)
             length = float(curve.arc_m[-1])
             spans += [
@@ -122,6 +130,12 @@ def lane_path(
         pieces.append(curve)
         position += length
     return _build_path(network, resample(sway.apply(join_curves(*pieces)), STEP_M), position, spans)
+
+
+@lru_cache(maxsize=64)
+def _lane_curve(network: RoadNetwork, lanes: tuple[int, ...]) -> Curve:
+    """Return the centre of consecutive lanes; vehicles that take the same lanes share it."""
+    return join_curves(*(network.lanes[lane].curve for lane in lanes))
 
 
 def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
@@ -153,23 +167,25 @@ def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[L
     position = step * np.arange(len(curve.xy))
     lane = np.full((len(position), SLOTS), -1)
     lane_m = np.zeros((len(position), SLOTS))
-    used = np.zeros(len(position), int)
+    occupied = np.zeros(len(position), int)
     limit = np.full(len(position), math.inf)
-    for span in spans:
-        size = span.scale * network.lanes[span.lane].length_m
-        # Samples beyond the last lane's end by rounding still belong to it.
-        first, last = np.searchsorted(position, [span.begin_m - 1e-6, span.begin_m + size - 1e-6])
-        samples = slice(int(first), len(position) if span is spans[-1] else int(last))
-        limit[samples] = np.minimum(limit[samples], network.lanes[span.lane].limit_mps)
-        current = position[samples]
+    begin = np.array([span.begin_m for span in spans])
+    size = np.array([span.scale * network.lanes[span.lane].length_m for span in spans])
+    bounds = np.searchsorted(position, np.concatenate((begin - 1e-6, begin + size - 1e-6))).tolist()
+    # Samples beyond the last lane's end by rounding still belong to it.
+    bounds[-1] = len(position)
+    for span, first, last in zip(spans, bounds, bounds[len(spans) :], strict=False):
+        samples = slice(first, last)
+        np.minimum(limit[samples], network.lanes[span.lane].limit_mps, out=limit[samples])
+        current, slots = position[samples], occupied[samples]
         inside = (current >= span.from_m) & (current <= span.until_m)
         along = np.maximum(current - span.begin_m, 0.0) / span.scale
-        for shared_lane, shared in _lanes_sharing_space(network, span.lane, along):
-            chosen = np.flatnonzero(inside & shared & (used[samples] < SLOTS))
-            slot = used[samples][chosen]
-            lane[samples][chosen, slot] = shared_lane
-            lane_m[samples][chosen, slot] = along[chosen]
-            used[samples][chosen] += 1
+        for shared_lane, until_m in _lanes_sharing_space(network, span.lane):
+            samples_on_lane = (inside & (along < until_m) & (slots < SLOTS)).nonzero()[0]
+            slot = slots[samples_on_lane]
+            lane[samples][samples_on_lane, slot] = shared_lane
+            lane_m[samples][samples_on_lane, slot] = along[samples_on_lane]
+            slots[samples_on_lane] += 1
     return Path(curve, step, mean_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 
 
@@ -190,16 +206,14 @@ def mean_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]
     return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
 
 
-def _lanes_sharing_space(
-    network: RoadNetwork, lane: int, along: Float64[np.ndarray, " point"]
-) -> list[tuple[int, np.ndarray]]:
-    """Masks of where a vehicle on a lane occupies it, and lanes that branch off the same lane and are still close."""
-    result = [(lane, np.ones(len(along), bool))]
+def _lanes_sharing_space(network: RoadNetwork, lane: int) -> list[tuple[int, float]]:
+    """A lane, lanes that branch off the same lane, and positions up to which a vehicle on the lane occupies them, m."""
+    result = [(lane, math.inf)]
     for before in network.lanes[lane].predecessors:
         for other in network.lanes[before].successors:
             if other != lane:
                 # Half a vehicle's length longer: its rear leaves after its centre.
-                result.append((other, along < network.shared_m[lane, other] + 2.5))
+                result.append((other, network.shared_m[lane, other] + 2.5))
     return result
 
 
@@ -219,8 +233,10 @@ class Sway:
         phases = rng.uniform(0.0, 2 * math.pi, size=2)
         # A wave without end is a constant.
         offset = ([aside_m], [0.0], [math.pi / 2]) if aside_m else ([], [], [])
-        drawn = (values.tolist() for values in (share, waves, phases))
-        return cls(*(tuple(values + constant) for values, constant in zip(drawn, offset, strict=True)))
+        waves_by_field = (values.tolist() for values in (share, waves, phases))
+        return cls(
+            *(tuple(values + constant) for values, constant in zip(waves_by_field, offset, strict=True))
+        )
 
     def apply(self, curve: Curve) -> Curve:
         """Return the curve that is driven; its heading is its tangent (to first order in the deviation)."""
@@ -231,6 +247,5 @@ class Sway:
             angle = wave * curve.arc_m + phase
             lateral += amplitude * np.sin(angle)
             slope += amplitude * wave * np.cos(angle)
-        normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
-        stretch = 1.0 - lateral * np.gradient(curve.heading, np.maximum(curve.arc_m, 1e-9))
-        return Curve(curve.xy + lateral[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
+        stretch = 1.0 - lateral * curve.bend
+        return Curve(curve.xy + lateral[:, None] * curve.normal, curve.heading + np.arctan2(slope, stretch))

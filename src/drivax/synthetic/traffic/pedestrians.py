@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
@@ -37,6 +38,9 @@ _DECISION_STEPS = 2
 #: Connectors next to lanes that begin or end this close to a crossing control it, m.
 _NEAR_JUNCTION_M = 25.0
 
+# A plain number: members of enumerations are looked up slowly.
+_RED = int(Colour.RED)
+
 #: A number and a flag per pedestrian.
 _Values = Float64[np.ndarray, " w"]
 _Mask = Bool[np.ndarray, " w"]
@@ -55,6 +59,7 @@ class _CrossingConflicts:
     red: Bool[np.ndarray, "crossing lane"]
 
 
+@lru_cache(maxsize=1)
 def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
     poses, owner = [], []
     for index, crossing in enumerate(network.crossings):
@@ -129,7 +134,8 @@ class Pedestrians:
         self._crosses = self._crossing >= 0
         self._any_crosses = bool(self._crosses.any())
         # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
-        has_priority = self._conflicts.marked & ~self._conflicts.red.any(axis=1)
+        lights = self._conflicts.red.any(axis=1)
+        has_priority, self._yielding = self._conflicts.marked & ~lights, self._conflicts.marked | lights
         self._has_priority = (
             has_priority[self._crossing] if len(has_priority) else np.zeros(len(curves), bool)
         )
@@ -165,25 +171,31 @@ class Pedestrians:
         """Release pedestrians at the kerb if the crossing stays safe for long enough."""
         to_kerb = self._kerb - self._at
         waiting = self._crosses & ~self._released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
-        if not np.count_nonzero(waiting):
+        waiting = waiting.nonzero()[0]
+        if not len(waiting):
             return
         conflicts, crossing = self._conflicts, self._crossing[waiting]
+        crossing_s = (self._across[waiting] - self._at[waiting]) / self._free_speed[waiting]
+        # Starting from standstill takes v / (2 a) longer.
+        crossing_s += self._free_speed[waiting] / (2 * _ACCELERATION_MPS2)
+        red = ~(conflicts.red[crossing] & (colour != _RED)).any(axis=1)
+        red &= self._remaining_red[t, crossing] >= crossing_s
+        # Traffic matters only to those whose conflicting lights stay red.
+        waiting, crossing, crossing_s = waiting[red], crossing[red], crossing_s[red]
+        if not len(waiting):
+            return
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])[active]
         any_s, hard_s = _arrivals(conflicts, boxes, vehicles.speed[active])
-        # Starting from standstill takes v / (2 a) longer.
-        start_s = self._free_speed / (2 * _ACCELERATION_MPS2)
-        needed = ((self._across - self._at) / self._free_speed + start_s)[waiting]
-        # A standing queue blocks the crossing.
-        free = ~overlap(conflicts.strip[:, None], boxes[None]).any(axis=1)
-        red = ~(conflicts.red & (colour != Colour.RED)).any(axis=1)
-        yielding = conflicts.marked | conflicts.red.any(axis=1)
+        yielding = self._yielding[crossing]
         gap = np.where(
-            yielding[crossing],
-            hard_s[crossing] > needed + _MARGIN_S,
-            any_s[crossing] > needed + _GAP_MARGIN_S,
-        )
-        red_lasts = self._remaining_red[t, crossing] >= needed
-        self._released[waiting] = gap & free[crossing] & red[crossing] & red_lasts
+            yielding, hard_s[crossing] > crossing_s + _MARGIN_S, any_s[crossing] > crossing_s + _GAP_MARGIN_S
+        ).nonzero()[0]
+        # A standing queue blocks the crossing.
+        if len(gap):
+            blocked = overlap(conflicts.strip[crossing[gap], None], boxes[None]).any(axis=1)
+            # Copies of this object share its arrays.
+            self._released = self._released.copy()
+            self._released[waiting[gap]] = ~blocked
 
     def _advance(self) -> None:
         """Advance by one step; pedestrians stop before vehicles, and at the kerb unless released."""
@@ -196,9 +208,9 @@ class Pedestrians:
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
         speed = np.minimum(self._free_speed, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
         speed = np.maximum(speed, 0.0)
-        moved = np.minimum((self._speed + speed) / 2 * DT_S, np.maximum(room, 0.0))
-        speed[self._is_blocked], moved[self._is_blocked] = 0.0, 0.0
-        self._at = self._at + moved
+        distance = np.minimum((self._speed + speed) / 2 * DT_S, np.maximum(room, 0.0))
+        speed[self._is_blocked], distance[self._is_blocked] = 0.0, 0.0
+        self._at = self._at + distance
         self._speed = speed
 
 
@@ -206,9 +218,9 @@ def _remaining_red_s(
     network: RoadNetwork, red: Bool[np.ndarray, "crossing lane"], times_s: Float64[np.ndarray, " time"]
 ) -> Float64[np.ndarray, "time crossing"]:
     """Time until a conflicting light turns green, s, by step and crossing (infinite: no lights)."""
-    remaining = np.full((len(times_s), len(red)), math.inf)
+    remaining_s = np.full((len(times_s), len(red)), math.inf)
     if network.signals is None or not red.any():
-        return remaining
+        return remaining_s
     # Extended by one cycle beyond the last step, because pedestrians know the cycle.
     next_cycle_s = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
     colour, _ = network.signals.colours(np.concatenate([times_s, next_cycle_s]), len(network.lanes))
@@ -216,8 +228,8 @@ def _remaining_red_s(
         is_green = (colour[:, red[crossing]] != Colour.RED).any(axis=1)
         steps = np.where(is_green, np.arange(len(is_green)), len(is_green))
         next_green = np.minimum.accumulate(steps[::-1])[::-1]
-        remaining[:, crossing] = ((next_green - np.arange(len(is_green))) * DT_S)[: len(times_s)]
-    return remaining
+        remaining_s[:, crossing] = ((next_green - np.arange(len(is_green))) * DT_S)[: len(times_s)]
+    return remaining_s
 
 
 def _arrivals(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float64, Int8, Int64
@@ -71,6 +72,7 @@ class TrafficState:
     committed: int
 
 
+@lru_cache(maxsize=1)
 def conflict_zones(
     network: RoadNetwork,
 ) -> tuple[Float64[np.ndarray, "lane lane"], Float64[np.ndarray, "lane lane"]]:
@@ -195,16 +197,16 @@ class RightOfWay:
         distance = begin - state.front_m[:, None]
         distance[distance < 0.0] = np.inf
         speed = state.speed[:, None]
-        needed = speed**2 / (2 * np.maximum(distance, 0.05))
+        to_stop = speed**2 / (2 * np.maximum(distance, 0.05))
         colour = state.colour.take(connector)
         late = distance > speed * state.to_red.take(connector)
-        stops_at_yellow = (needed <= self._drivers.yellow_mps2[:, None]) | (late & (needed <= 5.0))
-        halt = ((colour == _YELLOW) & stops_at_yellow) | ((colour == _RED) & (needed <= 8.0))
+        stops_at_yellow = (to_stop <= self._drivers.yellow_mps2[:, None]) | (late & (to_stop <= 5.0))
+        halt = ((colour == _YELLOW) & stops_at_yellow) | ((colour == _RED) & (to_stop <= 8.0))
         halt &= distance < np.inf
         first = halt.argmax(axis=1)
         flat = first + count * self._rows
-        held = halt.ravel().take(flat)
-        return np.where(held, distance.ravel().take(flat), np.inf), np.where(held, first, count)
+        has_line = halt.ravel().take(flat)
+        return np.where(has_line, distance.ravel().take(flat), np.inf), np.where(has_line, first, count)
 
     def _decide(self, state: TrafficState, rows: _Requests, place: VehicleRows, stop: PerVehicle) -> None:
         """Grant or deny requests, nearest in time first, at all-way stops in the order of arrival."""
@@ -281,11 +283,11 @@ class RightOfWay:
         result, tables = [], state.tables
         for j, other in holders:
             if j != request.row and self._conflict[request.connector, other]:
-                past = (
+                clear_m = (
                     tables.begin[j, other] + tables.scale[j, other] * self._zone_end[other, request.connector]
                 )
-                if state.rear_m[j] < past + 0.3:
-                    result.append((j, other, float(past - state.rear_m[j]) + 0.3))
+                if state.rear_m[j] < clear_m + 0.3:
+                    result.append((j, other, float(clear_m - state.rear_m[j]) + 0.3))
         return result
 
     def _clears_in_time(self, state: TrafficState, request: _Request, holders: _Holders) -> bool:
@@ -320,13 +322,13 @@ class RightOfWay:
         speed, own = state.speed[rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         departure = clear[rows, columns] / np.maximum(speed, 0.3)
-        top = float(tables.at(np.array([request.line_m + 5.0]), np.array([i]))[0, 3])
+        top = float(tables.at(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
         own_speed, push = request.speed, float(self._drivers.acceleration_mps2[i])
         to_zone = request.distance_m + self._zone_begin[connector, own]
         through_zone = request.distance_m + self._zone_end[connector, own] + self._length[i]
         enter = time_to_cover(to_zone, own_speed, push, top)
         leave = time_to_cover(through_zone, own_speed, push, top)
-        waited = state.step * DT_S - self._stood[i] if np.isfinite(self._stood[i]) else 0.0
-        patience = 1.0 - min(waited / _IMPATIENT_S, 1.0) / 3.0
-        needed = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)
-        return not np.any((arrival < needed) & (departure > enter - 0.3))
+        wait_s = state.step * DT_S - self._stood[i] if np.isfinite(self._stood[i]) else 0.0
+        patience = 1.0 - min(wait_s / _IMPATIENT_S, 1.0) / 3.0
+        least_gap = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)
+        return not np.any((arrival < least_gap) & (departure > enter - 0.3))

@@ -48,13 +48,12 @@ class Drivers:
     reaction_s: Float64[np.ndarray, " vehicle"]
     critical_gap_s: Float64[np.ndarray, " vehicle"]
 
-    @property
-    def idm(self) -> IdmParameters:
-        """Parameters of the IDM."""
+    def idm(self, rows: slice | np.ndarray = slice(None)) -> IdmParameters:
+        """Parameters of the IDM of all or some drivers."""
         return IdmParameters(
-            headway_s=self.headway_s,
-            acceleration_mps2=self.acceleration_mps2,
-            comfortable_braking_mps2=self.braking_mps2,
+            headway_s=self.headway_s[rows],
+            acceleration_mps2=self.acceleration_mps2[rows],
+            comfortable_braking_mps2=self.braking_mps2[rows],
         )
 
     @property
@@ -68,9 +67,9 @@ class Drivers:
 
     def with_headway(self, row: int, headway_s: float) -> Drivers:
         """Return the drivers with one time gap changed."""
-        changed = self.headway_s.copy()
-        changed[row] = headway_s
-        return replace(self, headway_s=changed)
+        headways = self.headway_s.copy()
+        headways[row] = headway_s
+        return replace(self, headway_s=headways)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -54,6 +54,13 @@ _FIRMLY = 1.3
 _SLOWEST = 6
 #: A planned ego claims junctions this many steps ahead.
 _FORESEEN = 25
+#: Steps between checkpoints, from which a run resumes that differs later.
+_CHECKPOINT_STEPS = 8
+#: Attributes of a run that change, tables of paths apart.
+_STATE = (
+    "_right_of_way", "_pedestrians", "_occupied_crossings", "_halting", "_at", "_speed",
+    "_last", "_memory", "_busy_m", "_rest", "_helped", "_leaders", "_gaps", "_leads", "_moving_users", "_vehicles",
+)  # fmt: skip
 
 
 def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
@@ -64,6 +71,9 @@ def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
         np.array([user.speed[step] for user in scripted], float),
         np.array([user.size_m[:2] for user in scripted]).reshape(-1, 2),
     )
+
+
+_NO_BOXES = boxes_at((), 0)
 
 
 @dataclass(frozen=True)
@@ -116,22 +126,22 @@ class Leaders:
     ) -> tuple[PerVehicle, VehicleRows]:
         """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and its row."""
         own = at_m[:, None]
-        lane, along = tables.on(at_m, self._rows)
+        lane, along = tables.on(at_m)
         lane[~active] = -1
         # position[i, k]: position of the k-th occupied (vehicle, lane) on the path of vehicle i.
-        used = (lane.ravel() >= 0).nonzero()[0]
-        if not len(used):
+        slots = (lane.ravel() >= 0).nonzero()[0]
+        if not len(slots):
             return self._nearest
-        vehicles_ahead, taken = used // SLOTS, lane.ravel().take(used)
+        vehicles_ahead, lanes = slots // SLOTS, lane.ravel().take(slots)
         # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
         begin = np.where((tables.since <= own) & (own <= tables.until), tables.begin, np.nan)
-        position = tables.scale.take(taken, axis=1)
-        position *= along.ravel().take(used)
-        position = begin.take(taken, axis=1) + position
+        position = tables.scale.take(lanes, axis=1)
+        position *= along.ravel().take(slots)
+        position = begin.take(lanes, axis=1) + position
         seen = (position > own) & (vehicles_ahead != self._rows[:, None])
         if self._any_cyclist:
             # Where the lane is wide enough, cyclists are overtaken within it.
-            seen &= ~(self._cyclist[vehicles_ahead] & self._passes.take(taken, axis=1))
+            seen &= ~(self._cyclist[vehicles_ahead] & self._passes.take(lanes, axis=1))
         position -= self._half_m[vehicles_ahead]
         gap = np.where(seen, position, np.inf) - own - self._half_m[:, None]
         nearest = gap.argmin(axis=1)
@@ -149,6 +159,7 @@ class Traffic:
         self.standing = StaticObstacles(self.parked, self.tables, roles.drivers.size_m[:, 1])
         self.right_of_way = RightOfWay(roles.network, roles.drivers)
         self.detours = Detours(roles.network)
+        self._latest: _Run | None = None
         shape = (len(times_s), len(roles.network.lanes))
         self.colour, self.to_red = np.zeros(shape, np.int8), np.zeros(shape)
         if roles.network.signals is not None:
@@ -161,19 +172,52 @@ class Traffic:
         return shorter
 
     def run(self, staging: Staging | None = None, ego: EgoPlan | None = None) -> Motion:
-        """Run all steps, with the changes of an event, and with ego on a plan (None: ego drives like the others)."""
-        return _Run(self, staging or Staging(), ego).finish()
+        """Run all steps, with the changes of an event, and with ego on a plan (None: ego drives like the others).
+
+        A run resumes from the latest one where the two begin to differ.
+        """
+        run = _Run(self, staging or Staging(), ego)
+        if self._latest is not None:
+            run.resume(self._latest)
+        self._latest = run
+        return run.finish()
 
 
-_Tables = TypeVar("_Tables", PathTables, StaticObstacles)
+def first_effect(staging: Staging) -> int | None:
+    """First step at which traffic with a staging can differ from traffic without (None: at no step)."""
+    extras = staging.extras
+    if staging.tailgates or staging.removed or any(user.is_static for user in extras):
+        return 0
+    steps = [override.first_step for override in staging.overrides]
+    return min([*steps, *(int(user.valid.argmax()) for user in extras)], default=None)
+
+
+_Tables = TypeVar("_Tables", PathTables, StaticObstacles, RightOfWay)
 
 
 def _copy_tables(tables: _Tables) -> _Tables:
-    """Copy tables with their arrays and lists."""
+    """Copy an object with its arrays and lists."""
     result = copy.copy(tables)
     for name, value in vars(tables).items():
         setattr(result, name, copy.copy(value) if isinstance(value, np.ndarray | list) else value)
     return result
+
+
+def _copy_state(state: dict[str, Any]) -> dict[str, Any]:
+    """Copy the attributes of a run that change."""
+    result = {name: copy.copy(state[name]) for name in _STATE}
+    result["_right_of_way"] = _copy_tables(result["_right_of_way"])
+    return result
+
+
+@dataclass(frozen=True)
+class _Checkpoint:
+    """State of a run before a step, the present path of each vehicle, and the columns of crossings."""
+
+    step: int
+    state: dict[str, Any]
+    paths: list[Path]
+    crossings: int
 
 
 class _Run:
@@ -188,15 +232,14 @@ class _Run:
         self._half_m, self._width_m = roles.drivers.size_m[:, 0] / 2, roles.drivers.size_m[:, 1]
         count = len(roles.paths)
         self._rows = np.arange(count)
-        self._idm = self._drivers.idm
-        self._tables = _copy_tables(traffic.tables)
+        self._idm = self._drivers.idm()
+        self._tables, self._owns_tables = traffic.tables, False
+        self._checkpoints: list[_Checkpoint] = []
         static = tuple(user for user in staging.extras if user.is_static)
         self._movers = tuple(user for user in staging.extras if not user.is_static)
         boxes = traffic.parked.concatenate(boxes_at(static, 0))
-        self._standing = (
-            StaticObstacles(boxes, self._tables, self._width_m) if static else _copy_tables(traffic.standing)
-        )
-        self._right_of_way = traffic.right_of_way
+        self._standing = StaticObstacles(boxes, self._tables, self._width_m) if static else traffic.standing
+        self._right_of_way = copy.copy(traffic.right_of_way)
         self._right_of_way.reset()
         self._changes = LaneChanges(self._network, roles.drivers, boxes)
         self._pedestrians = (
@@ -217,7 +260,7 @@ class _Run:
         # Gap to and speed of the next leader, line and obstacle.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
         self._plan_at = positions_along(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
-        self._moving_users = self._vehicles = boxes_at((), 0)
+        self._moving_users = self._vehicles = _NO_BOXES
         shape = (count, len(traffic.times_s))
         speed, position, acceleration = np.zeros((3, *shape))
         pedestrian_poses = np.zeros((len(roles.pedestrians), shape[1], 4))
@@ -225,9 +268,32 @@ class _Run:
             np.zeros((*shape, 3)), speed, np.zeros(shape, bool), position, acceleration, pedestrian_poses
         )
 
+    def resume(self, other: _Run) -> None:
+        """Take over another run's state at its last checkpoint before this one differs from it."""
+        steps = [run._ego.first_step for run in (self, other) if run._ego is not None]
+        stagings = self._staging, other._staging
+        if stagings[0] is not stagings[1]:
+            steps += [step for step in map(first_effect, stagings) if step is not None]
+        last = min([*steps, len(self._fixed.times_s) - 1])
+        self._checkpoints = [checkpoint for checkpoint in other._checkpoints if checkpoint.step <= last]
+        if self._checkpoints:
+            checkpoint = self._checkpoints[-1]
+            vars(self).update(_copy_state(checkpoint.state))
+            for row, path in enumerate(checkpoint.paths):
+                if path is not self._tables.paths[row]:
+                    self._replace_path(row, path)
+            self._tables.widen(checkpoint.crossings)
+            for name, record in vars(self._log).items():
+                record[:, : checkpoint.step] = vars(other._log)[name][:, : checkpoint.step]
+
     def finish(self) -> Motion:
         """Run all steps and collect the motion."""
-        for t in range(len(self._fixed.times_s)):
+        begin = self._checkpoints[-1].step if self._checkpoints else 0
+        for t in range(begin, len(self._fixed.times_s)):
+            if t % _CHECKPOINT_STEPS == 0 and t > begin:
+                p = self._tables
+                checkpoint = _Checkpoint(t, _copy_state(vars(self)), p.paths.copy(), p.crossing.shape[1])
+                self._checkpoints.append(checkpoint)
             self._step(t)
         if self._ego is not None:
             first, log = self._ego.first_step, self._log
@@ -236,14 +302,13 @@ class _Run:
 
     def _step(self, t: int) -> None:
         """Record a step and advance all users to the next one."""
-        count, log = len(self._rows), self._log
-        k = self._plan_step(t)
+        log, k = self._log, self._plan_step(t)
         if self._ego is not None and k >= 0:
             self._at[0], self._speed[0] = self._plan_at[k], self._ego.speed[k]
-        active = self._at + self._half_m < self._tables.last * self._tables.step_m
+        active = self._at + self._half_m < self._tables.length_m
         soon = self._at + self._speed * _SPEED_TIME_S
-        sample = self._tables.at(np.concatenate([self._at, soon]), np.tile(self._rows, 2))
-        pose, fastest, fastest_soon = sample[:count, :3], sample[:count, 3], sample[count:, 3]
+        sample = self._tables.at(np.concatenate((self._at, soon)).reshape(2, -1))
+        pose, fastest, fastest_soon = sample[0, :, :3], sample[0, :, 3], sample[1, :, 3]
         if self._ego is not None and k >= 0:
             active[0] = True
             pose[0] = (*self._ego.xy[k], self._ego.heading[k])
@@ -261,27 +326,33 @@ class _Run:
 
     def _swap(self, t: int, row: int, path: Path, at: float, end_m: float) -> None:
         """Put a vehicle on another path, which it follows undisturbed up to a position."""
-        self._tables.replace(row, path)
-        self._standing.replace(row, path)
+        self._replace_path(row, path)
         self._at[row] = at
         self._halting[row : row + 1] = False
         self._right_of_way.reset_vehicle(row, self._tables, at + self._half_m[row])
         self._busy_m[row], self._rest[row] = end_m, t + _REST_STEPS
 
+    def _replace_path(self, row: int, path: Path) -> None:
+        if not self._owns_tables:
+            self._tables, self._standing = _copy_tables(self._tables), _copy_tables(self._standing)
+            self._owns_tables = True
+        self._tables.replace(row, path)
+        self._standing.replace(row, path)
+
     def _advance_pedestrians(self, t: int, active: VehicleMask) -> None:
         """Advance the pedestrians and gather scripted users."""
-        users, colour = boxes_at((), 0), self._fixed.colour[t]
+        users, colour = _NO_BOXES, self._fixed.colour[t]
         if self._pedestrians is not None:
             users, self._occupied_crossings = self._pedestrians.step(t, self._vehicles, active, colour)
-            self._log.pedestrian_poses[:, t] = np.column_stack([users.xy, users.heading, users.speed])
-        self._moving_users = users.concatenate(
-            boxes_at(tuple(user for user in self._movers if user.valid[t]), t)
-        )
+            log = self._log.pedestrian_poses[:, t]
+            log[:, :2], log[:, 2], log[:, 3] = users.xy, users.heading, users.speed
+        movers = tuple(user for user in self._movers if user.valid[t])
+        self._moving_users = users.concatenate(boxes_at(movers, t)) if movers else users
 
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_soon: PerVehicle, active: VehicleMask
     ) -> PerVehicle:
-        """The least of the accelerations towards leaders, lines, obstacles and the preferred speed (here and soon)."""
+        """The least of the accelerations towards leaders, lines, obstacles and the preferred speed (now and soon)."""
         gaps, leads = self._gaps, self._leads
         gaps[0], leader = self._leaders.ahead(self._tables, self._at, active)
         leads[0] = self._speed[leader]
@@ -298,11 +369,11 @@ class _Run:
             gaps[2] += (leads[2] - self._speed) * DT_S
         # Only a planned ego reverses; the IDM treats it as standing.
         speed = np.maximum(self._speed, 0.0)
-        following = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
+        accelerations = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
         # Braking for a line is limited to a little more than it takes to stop there.
-        needed = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _STOP_SHORT_M), 0.1))
-        lines = np.maximum(following[1], -_FIRMLY * needed - 0.5)
-        preferred = np.minimum(np.minimum(following[0], lines), following[2])
+        to_stop = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _STOP_SHORT_M), 0.1))
+        lines = np.maximum(accelerations[1], -_FIRMLY * to_stop - 0.5)
+        preferred = np.minimum(np.minimum(accelerations[0], lines), accelerations[2])
         preferred = np.minimum(preferred, (fastest_soon - self._speed) / _SPEED_TIME_S)
         return self._open_gaps(preferred, fastest)
 
@@ -311,8 +382,7 @@ class _Run:
         h = self._helped
         if len(h.behind):
             gap = h.gap_m + self._at[h.ahead] - self._at[h.behind]
-            idm = self._drivers.select(h.behind).idm
-            speed = self._speed[h.behind]
+            idm, speed = self._drivers.idm(h.behind), self._speed[h.behind]
             helpful = idm_acceleration(speed, fastest[h.behind], gap, self._speed[h.ahead], idm)
             # Vehicles that are already past need no gap, and slow ones open none.
             helpful = np.where((gap > -2.0) & (speed > 1.5), np.maximum(helpful, -HELP_MPS2), np.inf)
@@ -351,11 +421,11 @@ class _Run:
     def _crossings(self, front: PerVehicle) -> PerVehicle:
         """Distance to the next occupied crossing at which a vehicle can stop."""
         away = self._tables.crossing_m - front[:, None]
-        needed = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
+        to_stop = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
         halt = self._occupied_crossings[self._tables.crossing] & (self._tables.crossing >= 0) & (away > -0.5)
         if self._halting.shape != halt.shape:
             self._halting = np.zeros_like(halt)
-        self._halting = halt & (needed < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
+        self._halting = halt & (to_stop < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
         return np.where(self._halting, away, np.inf).min(axis=1)
 
     def _apply_reaction_times(self, t: int, preferred: PerVehicle) -> PerVehicle:
@@ -375,13 +445,13 @@ class _Run:
         jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
         a = np.clip(preferred, self._last - jerk, self._last + self._drivers.jerk_mps3 * DT_S)
         after = self._speed + a * DT_S
-        halted = after <= 0.0
+        stops = after <= 0.0
         # Vehicles that stop within the step travel v^2 / (2 |a|).
-        travelled = np.where(
-            halted, self._speed**2 / (2 * np.maximum(-a, 1e-9)), (self._speed + after) * DT_S / 2
+        distance = np.where(
+            stops, self._speed**2 / (2 * np.maximum(-a, 1e-9)), (self._speed + after) * DT_S / 2
         )
-        self._at = self._at + np.where(active, travelled, 0.0)
-        self._last = np.where(halted, 0.0, a)
+        self._at = self._at + np.where(active, distance, 0.0)
+        self._last = np.where(stops, 0.0, a)
         self._speed = np.where(active, np.maximum(after, 0.0), 0.0)
         return a
 
@@ -407,9 +477,9 @@ class _Run:
         ahead = {span.lane for span in present.spans}
         while self._network.lanes[lanes[-1]].successors:
             after = next_lanes(self._network, lanes)
-            remaining = [lane for lane in after if lane in ahead]
-            # Elsewhere branches take turns: no random number is drawn here.
-            lanes.append(remaining[0] if remaining else after[(row + len(lanes)) % len(after)])
+            on_path = [lane for lane in after if lane in ahead]
+            # Elsewhere branches take turns: this draws no random number.
+            lanes.append(on_path[0] if on_path else after[(row + len(lanes)) % len(after)])
         sway = Sway((0.08,), (0.07,), (float(row),))
         target = lane_path(self._network, tuple(lanes), sway)
         path, position = change_onto(target, present, self._at[row], change.length_m)
@@ -417,21 +487,25 @@ class _Run:
 
     def _pass(self, t: int, calm: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
-        halted = self._moving_users.select(np.abs(self._moving_users.speed) < 0.05)
         stuck = np.zeros(len(self._rows), bool)
         for override in self._staging.overrides:
             state = override.first_step <= t <= override.last_step
             stuck[override.vehicle] |= state and self._speed[override.vehicle] < 0.05
-        big = halted.select(halted.size_m[:, 0] > 1.2)
-        any_halted = bool(stuck.any()) or len(big) > 0
-        standing = self._standing.boxes.concatenate(self._vehicles.select(stuck)).concatenate(big)
-        if stuck.any() or len(halted):
+        halts = np.abs(self._moving_users.speed) < 0.05
+        big = halts & (self._moving_users.size_m[:, 0] > 1.2)
+        any_halted = bool(stuck.any() or big.any())
+        if not (any_halted or len(self._standing.boxes)):
+            return
+        if stuck.any() or halts.any():
             near = calm & (self._speed < 3.0)
         else:
             near = calm & (self._standing.gap(self._at + self._half_m) < 45.0)
-        if not len(standing):
+        rows = np.flatnonzero(near & (self._speed < 9.0)).tolist()
+        if not rows:
             return
-        for row in np.flatnonzero(near & (self._speed < 9.0)).tolist():
+        standing = self._standing.boxes.concatenate(self._vehicles.select(stuck))
+        standing = standing.concatenate(self._moving_users.select(big))
+        for row in rows:
             front, half = self._at[row] + self._half_m[row], self._width_m[row] / 2
             if any_halted or self._standing.meets(row, front, half + DETOUR_MARGIN_M, LOOK_M):
                 self._start_detour(t, row, standing, stuck)
