@@ -7,7 +7,6 @@ Planning" (CoRL 2023), and its published implementation; ``docs/guide/planners.m
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -166,7 +165,12 @@ class PdmPlanner:
         wheelbase, car = self._wheelbase(size[0]), Car(motion, carry.acceleration, carry.steering)
         heading = jnp.arctan2(reference.pose[..., 3:], reference.pose[..., 2:3])
         plans = jnp.concatenate([reference.pose[..., :2], heading], axis=-1)
-        cars = jax.vmap(partial(self._track, car, wheelbase))(reference, plans)
+        # One copy per proposal: XLA vectorises over arrays of one shape.
+        copies = jax.tree.map(
+            lambda part: jnp.broadcast_to(part, (len(plans), *part.shape)), (car, wheelbase)
+        )
+        copies = jax.lax.optimization_barrier(copies)
+        cars = jax.vmap(self._track)(*copies, reference, plans)
         cars = jax.lax.optimization_barrier(cars)
         rows = lines.at(proposals.way).reshape(*plans.shape[:2], -1)
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2

@@ -103,7 +103,8 @@ def ground_along(
     box, few = boxes_of(motion, size), slice(every, None, every)
     look = partial(ground_at, bank, index)
     now = look(box[0, 0], z[0, 0], on_route[0, 0])
-    later = jax.vmap(jax.vmap(look))(box[:, few], z[:, few], on_route[:, few])
+    # One motion after the other: what is read for all of them exceeds the caches.
+    later = jax.lax.map(lambda poses: jax.vmap(look)(*poses), (box[:, few], z[:, few], on_route[:, few]))
 
     def spread(first: Array, rest: Array) -> Array:
         first = jnp.broadcast_to(first, (rest.shape[0], 1))

@@ -105,7 +105,8 @@ def track(
         held = speed + acceleration * DT_S * np.arange(config.horizon)
         speeds = held if about_axle else jnp.maximum(held, 0.0)
         rate = steering_rate((lateral, heading, car.steering), speeds, curvatures, wheelbase, config)
-        rate = jnp.where(stops, 0.0, rate)
+        # XLA vectorises the regulator apart from the car.
+        rate = jax.lax.optimization_barrier(jnp.where(stops, 0.0, rate))
         car = step_car(car, acceleration, rate, wheelbase, config, about_axle)
         return car, car
 
