@@ -67,6 +67,7 @@ def measured(base: Path, planner: str, data: Path, limit: int, turns: int, folde
     for turn in range(turns):
         for name, source in (("base", base), ("new", ROOT / "src")):
             environment = os.environ | {"PYTHONPATH": f"{source.resolve()}:{ROOT}"}
+            environment.pop("JAX_COMPILATION_CACHE_DIR", None)
             own = [
                 sys.executable,
                 "-m",
