@@ -43,7 +43,8 @@ def worker(planner: str, data: Path, limit: int, episodes: Path) -> None:
         wall.append(time.perf_counter())
 
     table = evaluate(make_planner(planner, task.actions), bank, names, task=task, progress=progress)
-    np.savez(episodes, **table.metrics)
+    metrics: dict[str, Any] = dict(table.metrics)
+    np.savez(episodes, **metrics)
     first, rest = cpu[1] - cpu[0], cpu[-1] - cpu[1]
     print(json.dumps({"first_cpu_s": first, "rest_cpu_s": rest, "rest_wall_s": wall[-1] - wall[1]}))
 

@@ -169,8 +169,8 @@ class PdmPlanner:
         copies = jax.tree.map(
             lambda part: jnp.broadcast_to(part, (len(plans), *part.shape)), (car, wheelbase)
         )
-        copies = jax.lax.optimization_barrier(copies)
-        cars = jax.vmap(self._track)(*copies, reference, plans)
+        car, wheelbases = jax.lax.optimization_barrier(copies)
+        cars = jax.vmap(self._track)(car, wheelbases, reference, plans)
         cars = jax.lax.optimization_barrier(cars)
         rows = lines.at(proposals.way).reshape(*plans.shape[:2], -1)
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
