@@ -225,6 +225,27 @@ def test_emergency_brake_applies_when_no_proposal_is_safe():
     assert -3.0 < fast[0] * 6.0 < 0.0
 
 
+def test_proposals_are_unrolled_as_the_simulator_executes_their_plans():
+    """In the action space ``trajectory``: the first step of each proposal, off the lane and with turned wheels."""
+    space = Trajectory(initial_steering="logged")
+    simulator, planner = Simulator(replace(TASK, actions=space)), Watched(space)
+
+    def unrolled_and_executed(bank):
+        state, key = simulator.reset(bank, 0, 10, 0), jax.random.key(0)
+        carry, situation = planner.init(bank, state, key), simulator.situation(bank, state)
+        action, _ = planner.act(carry, bank, state, situation, None, key)
+        scored = THOUGHT.pop()
+        follow = lambda plan: simulator.step(bank, state, space.plan(plan))[0].context.history[-1]  # noqa: E731
+        return scored, action, jax.vmap(follow)(scored.plans)
+
+    bank = bank_of(straight_road([car(0, 0.6, 0.1, 9), car(30, 0, 0, 4)]))
+    scored, action, executed = quick(unrolled_and_executed, bank)
+    np.testing.assert_allclose(scored.cars.motion[:, 1], executed, atol=1e-5)
+    # The chosen plan is handed over.
+    best = int(np.argmax(scored.score))
+    np.testing.assert_allclose(action.reshape(-1, 3)[:41], scored.plans[best], atol=1e-6)
+
+
 def test_agents_that_touched_ego_are_ignored():
     overlapping = straight_road([car(0, 0, 0, 4), car(4.0, 0, 0, 0)])
     action, after, _ = decide(overlapping)

@@ -12,6 +12,7 @@ from scipy.optimize import minimize_scalar
 from drivax.planners.pdm.tracking import Car, Reference, step_car, track
 from drivax.simulator.controller import TrackingConfig, acceleration_to, steering_rate
 from drivax.simulator.dynamics import bicycle
+from drivax.tasks.actions import Trajectory
 from quick import quick
 
 CONFIG, WHEELBASE, DT = TrackingConfig(), 3.0, 0.1
@@ -166,3 +167,47 @@ def test_first_tracked_step_equals_the_simulator(drives):
         np.testing.assert_allclose(
             bicycle(jnp.asarray(now), jnp.asarray(acceleration), jnp.asarray(k)), then, atol=1e-5
         )
+
+
+@pytest.fixture(scope="module")
+def executed():
+    """Plans of 4 s, tracked after one fit and as the task executes them: handed over, and fitted, at every step."""
+    t, space, length = np.arange(81) * DT, Trajectory(steps=40), jnp.float32(WHEELBASE / CONFIG.wheelbase)
+    speed = np.stack([np.full(81, 5.0), 4.0 + np.minimum(t, 4.0), np.maximum(6.0 - 2.0 * t, 0.0)])
+    bend = np.stack([np.full(81, 1 / 20), 0.03 * np.sin(t), 0 * t])
+    heading = np.cumsum(speed * bend * DT, axis=1)
+    x, y = (np.cumsum(speed * DT * part(heading), axis=1) for part in (np.cos, np.sin))
+    poses = jnp.asarray(np.stack([x, y, heading], -1), jnp.float32)
+    motions = jnp.asarray([[0.4, 0.3, 0.05, 5.0], [0.5, 0.0, 0.0, 4.0], [0.6, -0.4, 0.0, 6.0]])
+
+    def both(motion, poses):
+        plan = space.plan(poses[:41]).reshape(-1, 3)
+        more = poses[40] + jnp.arange(1, 41)[:, None] * (poses[40] - poses[39]) * jnp.array([1, 1, 0])
+        car, wheelbase = Car(motion, jnp.float32(0.2), jnp.float32(0.05)), jnp.float32(WHEELBASE)
+        reference = Reference.fitted(plan, 40, wheelbase, CONFIG)
+        cars = track(car, reference, wheelbase, CONFIG, about_axle=True)
+        whole = jnp.concatenate([plan, more])
+
+        def step(now, begin):
+            motion, last = now
+            action = jax.lax.dynamic_slice(whole, (begin, 0), (41, 3)).reshape(-1)
+            last = space.actuated(motion, action, last, length)
+            motion = space.move(motion, last, length)
+            return (motion, last), motion
+
+        last = jnp.zeros(space.size).at[:2].set(jnp.array([0.2, 0.05]))
+        return cars.motion[1:], jax.lax.scan(step, (motion, last), jnp.arange(40))[1]
+
+    return quick(jax.vmap(both), motions, poses)
+
+
+def test_first_step_along_a_plan_equals_the_executed_one(executed):
+    tracked, driven = executed
+    np.testing.assert_allclose(tracked[:, 0], driven[:, 0], atol=1e-5)
+
+
+def test_drive_along_a_plan_stays_near_the_executed_one(executed):
+    """They differ by the fits of later steps only."""
+    tracked, driven = executed
+    away = np.linalg.norm(tracked[..., :2] - driven[..., :2], axis=-1)
+    assert away[:, :10].max() < 0.02 and away.max() < 0.1

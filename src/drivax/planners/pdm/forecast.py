@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, time_to_overlap
+from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, overlap_within
 from drivax.geometry.vectors import norm
 from drivax.scenario.bank.scenario_bank import Integer, Vector
 from drivax.scenario.record import record
@@ -63,31 +63,27 @@ def boxes_of(motion: Float[Array, "*T 4"], size: Vector) -> Float[Array, "*T 6"]
     return jnp.stack(parts, axis=-1)
 
 
-def until_overlap(
-    motion: Float[Array, "T 4"], size: Vector, others: Forecast, horizon_s: float
-) -> Float[Array, "T K"]:
-    """Time from each step of a motion until ego overlaps each agent at constant velocities, s.
-
-    0 where they overlap at that step, ``horizon_s`` where they do not within the horizon.
-    """
+def overlapping(
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, horizon_s: float = 0.0
+) -> Bool[Array, "T K"]:
+    """Mask of the agents that ego overlaps within a horizon from each step of a motion, at constant velocities."""
     me = boxes_of(motion, size)[:, None]
     velocity = me[..., COS : SIN + 1] * motion[:, None, MOTION_SPEED, None]
     then = others.at(jnp.arange(motion.shape[0]) * DT_S)
-    soon = time_to_overlap(me, velocity, then, others.velocity, horizon_s)
-    return jnp.where(others.valid, soon, horizon_s)
+    return overlap_within(me, velocity, then, others.velocity, horizon_s) & others.valid
 
 
 def fault_times(
-    motion: Float[Array, "T 4"], size: Vector, others: Forecast, soon_s: Float[Array, "T K"],
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, touching: Bool[Array, "T K"],
     unlawful: Bool[Array, " T"],
 ) -> Float[Array, " K"]:  # fmt: skip
     """Return the time of the first at-fault collision with each agent, s; infinite for none.
 
-    ``simulator.contact.classify_contacts`` decides the fault at the first overlap (``soon_s``: :func:`until_overlap`);
+    ``simulator.contact.classify_contacts`` decides the fault at the first overlap (``touching``: :func:`overlapping`);
     ``unlawful`` masks the steps at which ego is in several lanes or off the road.
     """
     steps = jnp.arange(motion.shape[0])
-    first = jnp.min(jnp.where(soon_s <= 0.0, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
+    first = jnp.min(jnp.where(touching, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
     hit = jnp.isfinite(first)
     step = jnp.where(hit, first, 0.0).astype(jnp.int32)
     me = boxes_of(motion[step], size)

@@ -20,8 +20,8 @@ from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency, stop
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unroll_idm
 from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig
-from drivax.planners.pdm.tracking import Car, track
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.planners.pdm.tracking import Car, Reference, track
+from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.simulator.ahead import stop_line_m
 from drivax.simulator.contact import overlaps
@@ -124,7 +124,7 @@ class PdmPlanner:
         motion, length = context.history[-1], situation.surroundings.frame.box[context.slot, LENGTH]
         touched = carry.touched | overlaps(situation.surroundings.frame, context.slot)
         carry = replace(carry, touched=touched)
-        tracked = self.actions if isinstance(self.actions, Trajectory) else None
+        tracked = self._plans
         if tracked:
             acceleration, steering = (
                 context.action[ACCELERATION],
@@ -163,9 +163,16 @@ class PdmPlanner:
         proposals = unroll_idm(lines, others, size, speed, desired, stop_m, driver)
         reference = jax.lax.optimization_barrier(proposals.reference(lines))
         wheelbase, car = self._wheelbase(size[0]), Car(motion, carry.acceleration, carry.steering)
-        cars = jax.vmap(lambda path: track(car, path, wheelbase, config.tracking))(reference)
+        heading = jnp.arctan2(reference.pose[..., 3:], reference.pose[..., 2:3])
+        plans = jnp.concatenate([reference.pose[..., :2], heading], axis=-1)
+        # One copy per proposal: XLA vectorises over arrays of one shape.
+        copies = jax.tree.map(
+            lambda part: jnp.broadcast_to(part, (len(plans), *part.shape)), (car, wheelbase)
+        )
+        car, wheelbases = jax.lax.optimization_barrier(copies)
+        cars = jax.vmap(self._track)(car, wheelbases, reference, plans)
         cars = jax.lax.optimization_barrier(cars)
-        rows = lines.at(proposals.way).reshape(*reference.pose.shape[:2], -1)
+        rows = lines.at(proposals.way).reshape(*plans.shape[:2], -1)
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
         every = config.scoring.ground_every
@@ -176,9 +183,22 @@ class PdmPlanner:
         metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, 0, None, None, None, 0, 0, None))(
             cars.motion, cars.acceleration, yaw_rate, size, others, ground, ends, config.scoring
         )
-        heading = jnp.arctan2(reference.pose[..., 3:], reference.pose[..., 2:3])
-        plans = jnp.concatenate([reference.pose[..., :2], heading], axis=-1)
         return ScoredProposals(plans, cars, metrics, scoring.scores(metrics, config.scoring))
 
-    def _wheelbase(self, length_m: Float[Array, ""]) -> Float[Array, ""]:
-        return self.config.tracking.wheelbase * jnp.maximum(length_m, 1.0)
+    def _track(self, car: Car, wheelbase: Scalar, reference: Reference, plan: Float[Array, "T 3"]) -> Car:
+        """Track one proposal as it would be executed."""
+        if self._plans is None:
+            return track(car, reference, wheelbase, self.config.tracking)
+        whole = replace(self._plans, steps=max(self._plans.steps, self.config.steps)).plan(plan)
+        controller = self._plans.controller
+        fitted = Reference.fitted(whole.reshape(-1, 3), self.config.steps, wheelbase, controller)
+        return track(car, fitted, wheelbase, controller, about_axle=True)
+
+    @property
+    def _plans(self) -> Trajectory | None:
+        """Action space of plans, whose controller executes them; None for other action spaces."""
+        return self.actions if isinstance(self.actions, Trajectory) else None
+
+    def _wheelbase(self, length_m: Scalar) -> Scalar:
+        tracking = self._plans.controller if self._plans else self.config.tracking
+        return tracking.wheelbase * jnp.maximum(length_m, 1.0)

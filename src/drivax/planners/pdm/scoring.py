@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from drivax.geometry.boxes import LENGTH, corners
 from drivax.geometry.vectors import norm, wrap
 from drivax.metrics import comfort
-from drivax.planners.pdm.forecast import Forecast, boxes_of, fault_times, until_overlap
+from drivax.planners.pdm.forecast import Forecast, boxes_of, fault_times, overlapping
 from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, is_mapped, offroad_distance
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.record import record
@@ -103,7 +103,8 @@ def ground_along(
     box, few = boxes_of(motion, size), slice(every, None, every)
     look = partial(ground_at, bank, index)
     now = look(box[0, 0], z[0, 0], on_route[0, 0])
-    later = jax.vmap(jax.vmap(look))(box[:, few], z[:, few], on_route[:, few])
+    # One motion after the other: what is read for all of them exceeds the caches.
+    later = jax.lax.map(lambda poses: jax.vmap(look)(*poses), (box[:, few], z[:, few], on_route[:, few]))
 
     def spread(first: Array, rest: Array) -> Array:
         first = jnp.broadcast_to(first, (rest.shape[0], 1))
@@ -118,8 +119,8 @@ def evaluate_proposal(
 ) -> ProposalMetrics:  # fmt: skip
     """Evaluate one proposal: ego's motion and acceleration at each step, with its ``yaw_rate`` now (rad/s)."""
     unlawful = ground.several | ground.off
-    soon = until_overlap(motion, size, others, config.ttc_s + DT_S / 10)
-    faults = fault_times(motion, size, others, soon, unlawful)
+    faults = fault_times(motion, size, others, overlapping(motion, size, others), unlawful)
+    soon = overlapping(motion, size, others, config.ttc_s)
     alive = (others.kind == AgentKind.VEHICLE) | (others.kind == AgentKind.PEDESTRIAN)
     alive |= others.kind == AgentKind.CYCLIST
     passed = jnp.where(jnp.isfinite(faults), jnp.where(alive, 0.0, config.static_collision), 1.0)
@@ -161,7 +162,7 @@ def _direction(motion: Float[Array, "T 4"], astray: Bool[Array, " T"], config: S
 
 
 def _foreseen(
-    motion: Float[Array, "T 4"], size: Vector, others: Forecast, soon_s: Float[Array, "T K"],
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, soon: Bool[Array, "T K"],
     config: ScoringConfig,
 ) -> Bool[Array, ""]:  # fmt: skip
     """Whether some step has a short time to collision with an agent that is not behind ego.
@@ -169,7 +170,7 @@ def _foreseen(
     The first such step decides for each agent. Sources do not mark intersections, so agents next to ego always count.
     """
     steps = jnp.arange(motion.shape[0])
-    sees = (soon_s <= config.ttc_s) & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]
+    sees = soon & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]
     first = jnp.min(jnp.where(sees, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
     seen = jnp.isfinite(first)
     step = jnp.where(seen, first, 0.0).astype(jnp.int32)

@@ -1,8 +1,8 @@
 """Track a trajectory with two one-step linear-quadratic regulators and a bicycle model with actuator lags.
 
-The tracker of ``simulator.controller``, with the speeds and curvatures of a proposal instead of fitted ones. The car
-moves by ``simulator.dynamics.bicycle``, so the first step of a tracked proposal equals the simulator's, except in the
-action space ``trajectory``, whose controller and car are others.
+The tracker of ``simulator.controller``. The car moves as in the simulator, so the first step of a tracked proposal
+equals the executed one: by ``simulator.dynamics.bicycle``, along the speeds and curvatures of a proposal, or, in the
+action space ``trajectory``, about its rear axle, along speeds and curvatures that are fitted to the plan.
 """
 
 from __future__ import annotations
@@ -18,9 +18,18 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.scenario_bank import Scalar
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
-from drivax.simulator.controller import TrackingConfig, acceleration_to, steering_rate
+from drivax.simulator.contact import REAR_AXLE
+from drivax.simulator.controller import (
+    Poses,
+    TrackingConfig,
+    acceleration_to,
+    fit_curvatures,
+    fit_speeds,
+    propagate,
+    steering_rate,
+)
 from drivax.simulator.dynamics import bicycle
-from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED
+from drivax.simulator.types import MOTION_SPEED
 
 
 @record
@@ -34,42 +43,78 @@ class Car:
 
 @record
 class Reference:
-    """Reference trajectory, at steps of 0.1 s from now on."""
+    """Reference trajectory of the tracked point, at steps of 0.1 s from now on; the last values hold afterwards."""
 
     pose: Float[Array, "*batch T 4"]  # x, y, cosine and sine of the heading
-    speed: Float[Array, "*batch T"]  # m/s
-    curvature: Float[Array, "*batch T"]  # Of the path, 1/m
+    speed: Float[Array, "*batch N"]  # m/s
+    curvature: Float[Array, "*batch N"]  # Of the path, 1/m
+
+    @classmethod
+    def fitted(cls, plan: Poses, steps: int, wheelbase: Scalar, config: TrackingConfig) -> Reference:
+        """Return the first ``steps`` steps of planned poses of the box centre as ``simulator.controller`` reads them.
+
+        The reference is that of the rear axle. The controller fits again at every step; this is its first fit.
+        """
+        x, y, heading = plan.T
+        cos, sin, behind = jnp.cos(heading), jnp.sin(heading), _axle_m(wheelbase, config)
+        x, y = x - behind * cos, y - behind * sin
+        poses = jnp.stack([x, y, heading], axis=-1)
+        speeds = fit_speeds(poses, config)
+        pose = jnp.stack([x, y, cos, sin], axis=-1)[: steps + 1]
+        return cls(pose, speeds, fit_curvatures(poses, speeds, config))
 
 
-def step_car(car: Car, acceleration: Array, rate: Array, wheelbase: Scalar, config: TrackingConfig) -> Car:
-    """Return the car one step after a command; each actuator closes ``dt / (dt + lag)`` of its error."""
+def step_car(
+    car: Car, acceleration: Array, rate: Array, wheelbase: Scalar, config: TrackingConfig, about_axle: bool = False
+) -> Car:  # fmt: skip
+    """Return the car one step after a command; each actuator closes ``dt / (dt + lag)`` of its error.
+
+    ``about_axle`` selects the car of the action space ``trajectory``, which turns by the present steering angle.
+    """
     gains = DT_S / (DT_S + config.acceleration_lag_s), DT_S / (DT_S + config.steering_lag_s)
     acceleration = car.acceleration + gains[0] * (acceleration - car.acceleration)
     steering = car.steering + gains[1] * rate * DT_S
     steering = jnp.clip(steering, -config.most_steering, config.most_steering)
-    motion = bicycle(car.motion, acceleration, jnp.tan(steering) / wheelbase)
+    if about_axle:
+        acceleration = jnp.maximum(acceleration, -car.motion[MOTION_SPEED] / DT_S)
+        actuators = jnp.stack([acceleration, car.steering, jnp.zeros(())])
+        motion = propagate(car.motion, actuators, wheelbase / config.wheelbase, config)
+    else:
+        motion = bicycle(car.motion, acceleration, jnp.tan(steering) / wheelbase)
     return Car(motion, acceleration, steering)
 
 
-def track(car: Car, reference: Reference, wheelbase: Scalar, config: TrackingConfig) -> Car:
-    """Return the car at every step of a reference, the present one included."""
-    last = reference.speed.shape[0] - 1
-    ahead = np.minimum(np.arange(last)[:, None] + np.arange(config.horizon), last)
-    target_speed = reference.speed[np.minimum(np.arange(last) + config.horizon, last)]
+def track(
+    car: Car, reference: Reference, wheelbase: Scalar, config: TrackingConfig, about_axle: bool = False
+) -> Car:
+    """Return the car at every step of a reference, the present one included; ``about_axle`` as in :func:`step_car`."""
+    steps, last = reference.pose.shape[0] - 1, reference.speed.shape[0] - 1
+    ahead = np.minimum(np.arange(steps)[:, None] + np.arange(config.horizon), last)
+    target_speed = reference.speed[np.minimum(np.arange(steps) + config.horizon, last)]
+    behind = _axle_m(wheelbase, config) if about_axle else 0.0
 
     def step(car: Car, now: tuple[Any, Array, Array]) -> Any:
         (x, y, cos, sin), desired, curvatures = now
-        motion, speed = car.motion, car.motion[MOTION_SPEED]
+        own_x, own_y, own_heading, speed = car.motion
+        own_x, own_y = own_x - behind * jnp.cos(own_heading), own_y - behind * jnp.sin(own_heading)
         stops = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
         gentle = config.stopping_gain * (desired - speed)
         acceleration = jnp.where(stops, gentle, acceleration_to(speed, desired, config))
-        lateral = (motion[1] - y) * cos - (motion[0] - x) * sin
-        heading = wrap(motion[MOTION_HEADING] - jnp.arctan2(sin, cos))
-        speeds = jnp.maximum(speed + acceleration * DT_S * np.arange(config.horizon), 0.0)
+        lateral = (own_y - y) * cos - (own_x - x) * sin
+        heading = wrap(own_heading - jnp.arctan2(sin, cos))
+        held = speed + acceleration * DT_S * np.arange(config.horizon)
+        speeds = held if about_axle else jnp.maximum(held, 0.0)
         rate = steering_rate((lateral, heading, car.steering), speeds, curvatures, wheelbase, config)
-        car = step_car(car, acceleration, jnp.where(stops, 0.0, rate), wheelbase, config)
+        # XLA vectorises the regulator apart from the car.
+        rate = jax.lax.optimization_barrier(jnp.where(stops, 0.0, rate))
+        car = step_car(car, acceleration, rate, wheelbase, config, about_axle)
         return car, car
 
-    poses = tuple(reference.pose[:last].T)
+    poses = tuple(reference.pose[:steps].T)
     _, cars = jax.lax.scan(step, car, (poses, target_speed, reference.curvature[ahead]))
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), car, cars)
+
+
+def _axle_m(wheelbase: Scalar, config: TrackingConfig) -> Scalar:
+    """Distance of the rear axle behind the box centre, m."""
+    return REAR_AXLE * wheelbase / config.wheelbase
