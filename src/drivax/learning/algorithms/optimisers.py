@@ -1,14 +1,49 @@
-"""Adam with gradient clipping and a linear learning-rate schedule, for all algorithms."""
+"""Gradients accumulated over chunks, and Adam with clipping and a linear schedule, for all algorithms."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array
 
 from drivax.errors import UsageError
+
+#: Samples per chunk and CPU: intermediate results of a gradient stay in the second-level cache.
+_CHUNK = 64
+
+
+def chunk_size(batch: int) -> int:
+    """Return the number of samples whose gradient is computed at a time: on GPUs, and for small batches, all."""
+    devices = max(jax.sharding.get_abstract_mesh().size, 1)
+    sizes = range(_CHUNK * devices, _CHUNK * devices // 4, -1)
+    dividing = (size for size in sizes if batch % size == 0 and size % devices == 0)
+    return next(dividing, batch) if jax.default_backend() == "cpu" else batch
+
+
+def sum_gradients(
+    loss: Callable[[Any, Any], tuple[Array, dict[str, Array]]], parameters: Any, samples: Any
+) -> tuple[dict[str, Array], Any]:
+    """Return the sums of logs and gradients of a loss over chunks, the first axis of ``samples``.
+
+    The loss of a batch must be the sum of that of its chunks.
+    """
+    gradient = jax.grad(loss, has_aux=True)
+    if jax.tree.leaves(samples)[0].shape[0] == 1:
+        sums, logs = gradient(parameters, jax.tree.map(lambda leaf: leaf[0], samples))
+        return logs, sums
+
+    def add(sums: Any, chunk: Any) -> tuple[Any, None]:
+        gradient_of_chunk, logs = gradient(parameters, chunk)
+        return jax.tree.map(jnp.add, sums, (logs, gradient_of_chunk)), None
+
+    first = jax.tree.map(lambda leaf: leaf[0], samples)
+    gradient_shape, log_shape = jax.eval_shape(gradient, parameters, first)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), (log_shape, gradient_shape))
+    return jax.lax.scan(add, zeros, samples)[0]
 
 
 def clipped_adam(
