@@ -11,6 +11,7 @@ import optax
 from jaxtyping import Array
 
 from drivax.errors import UsageError
+from drivax.learning.program import device_count, sum_over_devices
 
 #: Samples per chunk and CPU: intermediate results of a gradient stay in the second-level cache.
 _CHUNK = 64
@@ -18,32 +19,33 @@ _CHUNK = 64
 
 def chunk_size(batch: int) -> int:
     """Return the number of samples whose gradient is computed at a time: on GPUs, and for small batches, all."""
-    devices = max(jax.sharding.get_abstract_mesh().size, 1)
-    sizes = range(_CHUNK * devices, _CHUNK * devices // 4, -1)
-    dividing = (size for size in sizes if batch % size == 0 and size % devices == 0)
+    devices = device_count()
+    sizes = range(_CHUNK * devices, _CHUNK * devices // 4, -devices)
+    dividing = (size for size in sizes if batch % size == 0)
     return next(dividing, batch) if jax.default_backend() == "cpu" else batch
 
 
 def sum_gradients(
     loss: Callable[[Any, Any], tuple[Array, dict[str, Array]]], parameters: Any, samples: Any
 ) -> tuple[dict[str, Array], Any]:
-    """Return the sums of logs and gradients of a loss over chunks, the first axis of ``samples``.
+    """Return the sums of logs and gradients of a loss over ``samples`` (leaves ``[chunk, sample, ...]``).
 
-    The loss of a batch must be the sum of that of its chunks.
+    The loss of a batch must be the sum of that of its chunks. Devices divide the samples of each chunk.
     """
     gradient = jax.grad(loss, has_aux=True)
-    if jax.tree.leaves(samples)[0].shape[0] == 1:
-        sums, logs = gradient(parameters, jax.tree.map(lambda leaf: leaf[0], samples))
-        return logs, sums
 
-    def add(sums: Any, chunk: Any) -> tuple[Any, None]:
-        gradient_of_chunk, logs = gradient(parameters, chunk)
-        return jax.tree.map(jnp.add, sums, (logs, gradient_of_chunk)), None
+    def sum_chunks(parameters: Any, samples: Any) -> tuple[dict[str, Array], Any]:
+        def add(sums: Any, chunk: Any) -> tuple[Any, None]:
+            return jax.tree.map(jnp.add, sums, gradient(parameters, chunk)[::-1]), None
 
-    first = jax.tree.map(lambda leaf: leaf[0], samples)
-    gradient_shape, log_shape = jax.eval_shape(gradient, parameters, first)
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), (log_shape, gradient_shape))
-    return jax.lax.scan(add, zeros, samples)[0]
+        first = jax.tree.map(lambda leaf: leaf[0], samples)
+        if jax.tree.leaves(samples)[0].shape[0] == 1:
+            return gradient(parameters, first)[::-1]
+        shapes = jax.eval_shape(gradient, parameters, first)[::-1]
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        return jax.lax.scan(add, zeros, samples)[0]
+
+    return sum_over_devices(sum_chunks, parameters, samples, axis=1)
 
 
 def clipped_adam(

@@ -243,13 +243,13 @@ class Sac(OffPolicy[SacConfig]):
         """Return values to log, and the gradient of :meth:`loss`, computed in chunks, and of the auxiliary loss."""
         key, auxiliary_key = jax.random.split(key)
         count = len(batch.reward)
-        chunk = chunk_size(count)
 
         def share_of_loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
-            return jax.tree.map(lambda mean: mean * (chunk / count), self.loss(trained, target, *samples))
+            share = len(samples[0].reward) / count
+            return jax.tree.map(lambda mean: share * mean, self.loss(trained, target, *samples))
 
         samples = (batch, jax.random.split(key, (count, 2)))
-        samples = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk, *leaf.shape[1:]), samples)
+        samples = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk_size(count), *leaf.shape[1:]), samples)
         logs, gradient = sum_gradients(share_of_loss, trained, samples)
         if auxiliary_loss is None:
             return logs, gradient
