@@ -158,7 +158,7 @@ def max_pool(
     if activation not in _MONOTONE:
         return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=valid[..., None])
     lead, (count, width) = rows.shape[:-2], rows.shape[-2:]
-    maximum = _dense_and_max(
+    maximum: Array = _dense_and_max(
         activation, tuple(layers), rows.reshape(-1, count, width), valid.reshape(-1, count)
     )
     return maximum.reshape(*lead, -1)
@@ -175,14 +175,14 @@ def _dense_and_max_forward(
     activation: Activation, layers: Layers, rows: Array, valid: Array
 ) -> tuple[Array, Any]:
     """Add the last bias and activate after the maximum, which is equal for a monotone activation."""
-    inputs, activate = [rows.reshape(-1, rows.shape[-1])], partial(jax.vjp, ACTIVATIONS[activation])
-    hidden_vjps = []
+    inputs: list[Array] = [rows.reshape(-1, rows.shape[-1])]
+    activate, hidden_vjps = partial(jax.vjp, ACTIVATIONS[activation]), []
     for kernel, bias in layers[:-1]:
         output, vjp = activate(inputs[-1] @ kernel + bias)
         inputs.append(output)
         hidden_vjps.append(vjp)
     kernel, bias = layers[-1]
-    products = (inputs[-1] @ kernel).reshape(*valid.shape, -1)
+    products: Array = (inputs[-1] @ kernel).reshape(*valid.shape, -1)
     largest = jnp.max(jnp.where(valid[..., None], products, -jnp.inf), axis=1)
     output, vjp = activate(largest + bias)
     residuals = layers, valid, inputs, hidden_vjps, products, largest, output > 0.0, vjp

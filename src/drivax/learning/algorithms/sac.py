@@ -237,18 +237,21 @@ class Sac(OffPolicy[SacConfig]):
         return after, losses
 
     def gradient(
-        self, trained: SacParameters, target: dict[str, Any], batch: Transitions, key: Array,
-        auxiliary_loss: AuxiliaryLoss | None,
-    ) -> tuple[dict[str, Array], SacParameters]:  # fmt: skip
-        """Return values to log, and the gradient of :meth:`loss`, computed in chunks, and of the auxiliary loss."""
+        self, trained: SacParameters, target: dict[str, Any], *batch: Any
+    ) -> tuple[dict[str, Array], SacParameters]:
+        """Return values to log, and the gradient of :meth:`loss` in chunks, and of the auxiliary loss.
+
+        ``batch`` is transitions, a key, and an :data:`AuxiliaryLoss` or None.
+        """
+        transitions, key, auxiliary_loss = batch
         key, auxiliary_key = jax.random.split(key)
-        count = len(batch.reward)
+        count = len(transitions.reward)
 
         def share_of_loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
             share = len(samples[0].reward) / count
             return jax.tree.map(lambda mean: share * mean, self.loss(trained, target, *samples))
 
-        samples = (batch, jax.random.split(key, (count, 2)))
+        samples = (transitions, jax.random.split(key, (count, 2)))
         samples = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk_size(count), *leaf.shape[1:]), samples)
         logs, gradient = sum_gradients(share_of_loss, trained, samples)
         if auxiliary_loss is None:
