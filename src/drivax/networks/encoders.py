@@ -133,7 +133,11 @@ def _weights(layers: Any) -> Layers:
 
 
 def group_names(spec: GroupSpec) -> tuple[str, ...]:
-    """Return the non-empty groups that are not masks, in alphabetical order; raises UsageError if there are none."""
+    """Return the non-empty groups that are not masks, in alphabetical order.
+
+    Raises:
+        UsageError: All groups are empty.
+    """
     groups = (n for n in spec if not (n.endswith("_mask") and n.removesuffix("_mask") in spec))
     names = tuple(sorted(name for name in groups if math.prod(spec[name])))
     if not names:
