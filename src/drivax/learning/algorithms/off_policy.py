@@ -68,7 +68,7 @@ def target_entropy(config: Any, environment: Environment) -> float:
 
 def sample_each(policy: Distribution, keys: Array) -> Float[Array, "B raw"]:
     """Sample a raw action from each distribution with its own key, whatever the others in the batch."""
-    return jax.vmap(lambda one, key: one.sample(key))(policy, keys)
+    return jax.vmap(type(policy).sample)(policy, keys)
 
 
 class OffPolicy(Generic[Config]):

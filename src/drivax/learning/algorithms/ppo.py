@@ -259,13 +259,13 @@ class Ppo:
         policy, value = self.network(parameters).policy_and_value(samples["observation"])
         log_prob, old_log_prob = policy.log_prob(samples["raw_action"]), samples["log_prob"]
         surrogate = clipped_surrogate_loss(log_prob, old_log_prob, samples["advantage"], config.clip)
-        entropy = jax.vmap(lambda one, key: one.entropy_estimate(key))(policy, samples["key"])
-        is_clipped = jnp.abs(jnp.exp(log_prob - old_log_prob) - 1.0) > config.clip
+        entropy = jax.vmap(type(policy).entropy_estimate)(policy, samples["key"])
+        is_outside = jnp.abs(jnp.exp(log_prob - old_log_prob) - 1.0) > config.clip
         values = {
             "policy": surrogate,
             "value": (value - samples["target"]) ** 2,
             "entropy": entropy,
-            "clipped_share": is_clipped.astype(jnp.float32),
+            "clipped_share": is_outside.astype(jnp.float32),
             "kl": old_log_prob - log_prob,
         }
         logs = {name: jnp.sum(value * weight) for name, value in values.items()}
