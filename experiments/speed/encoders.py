@@ -39,17 +39,17 @@ def table(result: dict[str, Any]) -> str:
     for row in rows:
         times = [*row["forward_us"].values(), row["gradient_us"]]
         cells = [row["encoder"], row["dtype"], f"{row['parameters']:,}", str(row["width"])]
-        lines.append(f"| {' | '.join([*cells, *(f'{one:,.1f}' for one in times)])} |")
+        lines.append(f"| {' | '.join([*cells, *(f'{time:,.1f}' for time in times)])} |")
     return "\n".join([*lines, "", f"Per observation, on: {result['device']}."]) + "\n"
 
 
 def into_page(result: dict[str, Any]) -> str:
     """Write the table to the page and return it."""
-    found, page = table(result), PAGE.read_text()
+    text, page = table(result), PAGE.read_text()
     before, rest = page.split(BEGIN)
     _, after = rest.split(END)
-    PAGE.write_text(f"{before}{BEGIN}\n{found}\n{END}{after}")
-    return found
+    PAGE.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}")
+    return text
 
 
 def main() -> None:

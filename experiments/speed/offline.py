@@ -59,9 +59,9 @@ def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any],
     learner = config.algorithm.build(environment, bank, config.iterations)
     began = time.perf_counter()
     weights = np.ones((len(bank), bank.steps))
-    made = jax.block_until_ready(training_data(config.algorithm, environment, bank, weights))
-    prepared = time.perf_counter() - began
-    program = Program(Seeds(learner, (0,)), made, 1)
+    experience = jax.block_until_ready(training_data(config.algorithm, environment, bank, weights))
+    preparation_s = time.perf_counter() - began
+    program = Program(Seeds(learner, (0,)), experience, 1)
     state = [program.initial_state()]
     trained = state[0].parameters, getattr(state[0], "rest", ())
     size = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(trained))
@@ -74,28 +74,28 @@ def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any],
     return iterate, {
         "batch": algorithm.batch,
         "parameters": size,
-        "seconds_to_prepare": round(prepared, 1),
+        "seconds_to_prepare": round(preparation_s, 1),
     }
 
 
 def updates(data: ScenarioSet, repeats: int) -> dict[str, dict[str, Any]]:
     """Updates per second of every algorithm (median, slowest, fastest) and its size, measured alternately."""
     configs = {name: replace(settings.load(TrainConfig, f"offline/{name}"), devices=1) for name in ALGORITHMS}
-    made = {name: training(config, data) for name, config in configs.items()}
+    programs = {name: training(config, data) for name, config in configs.items()}
     rates = {name: list[float]() for name in ALGORITHMS}
     for turn in range(repeats + 1):
-        for name, (iterate, _) in made.items():
-            took = elapsed(iterate)
+        for name, (iterate, _) in programs.items():
+            duration_s = elapsed(iterate)
             if turn:  # the first time it is compiled
                 algorithm: Any = configs[name].algorithm
-                rates[name].append(algorithm.updates / took)
+                rates[name].append(algorithm.updates / duration_s)
     return {
         name: {
             "updates_per_second": round(statistics.median(rates[name]), 1),
             "range": [round(min(rates[name]), 1), round(max(rates[name]), 1)],
             **size,
         }
-        for name, (_, size) in made.items()
+        for name, (_, size) in programs.items()
     }
 
 
@@ -104,34 +104,34 @@ def members(data: ScenarioSet, repeats: int) -> dict[str, Any]:
     config = EnsembleConfig()
     iterate, size = training(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data)
     config = replace(config, total_steps=(repeats + 1) * config.cloning.steps_per_iteration)
-    began, all_of_them, alone = [0.0], list[float](), list[float]()
+    began, ensemble_s, single_s = [0.0], list[float](), list[float]()
 
     def turn(done: int, total: int) -> None:
-        ended = time.perf_counter()
+        end = time.perf_counter()
         jax.block_until_ready(iterate())
         if done > 1:
-            all_of_them.append(ended - began[0])
-            alone.append(time.perf_counter() - ended)
+            ensemble_s.append(end - began[0])
+            single_s.append(time.perf_counter() - end)
         began[0] = time.perf_counter()
 
     train_ensemble(config, data, turn)
-    one, together = statistics.median(alone), statistics.median(all_of_them)
+    single, ensemble = statistics.median(single_s), statistics.median(ensemble_s)
     return {
         "members": config.folds,
         "parameters_of_one": size["parameters"],
         "batch": config.cloning.batch,
         "updates": config.cloning.updates,
-        "seconds_of_one": round(one, 3),
-        "seconds_of_all": round(together, 3),
-        "ratio": round(together / one, 2),
+        "seconds_of_one": round(single, 3),
+        "seconds_of_all": round(ensemble, 3),
+        "ratio": round(ensemble / single, 2),
     }
 
 
 def draws() -> int:
     """Steps drawn per second among 10,000 scenarios of 91 steps, with uneven weights."""
-    made = sampler(np.random.default_rng(0).gamma(0.5, size=(SCENARIOS, 91)))
+    steps = sampler(np.random.default_rng(0).gamma(0.5, size=(SCENARIOS, 91)))
     call = partial(jax.jit, static_argnums=2)(sample_steps)
-    return round(DRAWS / seconds(lambda: call(made, jax.random.key(0), (DRAWS,)), 5))
+    return round(DRAWS / seconds(lambda: call(steps, jax.random.key(0), (DRAWS,)), 5))
 
 
 def table(result: dict[str, Any]) -> str:
@@ -141,14 +141,15 @@ def table(result: dict[str, Any]) -> str:
         "|---|---:|---:|---:|---:|",
     ]
     rows += [
-        f"| `offline/{name}` | {one['updates_per_second']:.0f} | {one['range'][0]:.0f} to {one['range'][1]:.0f} | "
-        f"{one['batch']} | {one['parameters']:,} |"
-        for name, one in result["algorithms"].items()
+        f"| `offline/{name}` | {row['updates_per_second']:.0f} | {row['range'][0]:.0f} to {row['range'][1]:.0f} | "
+        f"{row['batch']} | {row['parameters']:,} |"
+        for name, row in result["algorithms"].items()
     ]
-    one = result["members"]
+    members = result["members"]
+    sizes = f"{members['members']} members of {members['parameters_of_one']:,} parameters, batch {members['batch']}"
+    times = f"{members['seconds_of_all']} s for {members['updates']} updates side by side, {members['ratio']} times"
     return "\n".join(rows) + (
-        f"\n\n{one['members']} members of {one['parameters_of_one']:,} parameters, batch {one['batch']}: "
-        f"{one['seconds_of_all']} s for {one['updates']} updates side by side, {one['ratio']} times as long as one "
+        f"\n\n{sizes}: {times} as long as one "
         f"alone. Steps are drawn {result['draws_per_second']:,} times per second ({', '.join(result['devices'])})."
     )
 
@@ -165,8 +166,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.table:
         before, rest = PAGE.read_text().split(BEGIN)
-        shown = table(json.loads(RESULT.read_text()))
-        PAGE.write_text(f"{before}{BEGIN}\n\n{shown}\n\n{END}{rest.split(END)[1]}")
+        text = table(json.loads(RESULT.read_text()))
+        PAGE.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{rest.split(END)[1]}")
         return
     if args.data is None:
         parser.error("--data is needed")

@@ -34,14 +34,14 @@ from experiments.repository import RESULTS
 
 RESULT = RESULTS / "training.json"
 SCENARIOS = 1024
-_TWO = ("--algorithm.network.shared_encoder", "false")
+_TWO_ENCODERS = ("--algorithm.network.shared_encoder", "false")
 #: What is trained: the preset; with an encoder each for policy and value; with twice the passes over experience; and
 #: with the small latent-query encoder in bfloat16.
 KINDS = {
     "ppo": (),
-    "ppo, two encoders": _TWO,
+    "ppo, two encoders": _TWO_ENCODERS,
     "ppo, two encoders, 4 epochs of 8 minibatches": (
-        *_TWO, "--algorithm.epochs", "4", "--algorithm.minibatches", "8",
+        *_TWO_ENCODERS, "--algorithm.epochs", "4", "--algorithm.minibatches", "8",
     ),
     "ppo, lq small in bfloat16": (
         "--algorithm.network.encoder.kind", "lq", "--algorithm.network.encoder.size", "small",
@@ -57,10 +57,10 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
     program = Program(Seeds(learner, (0,)), bank, config.devices)
     steps = learner.config.unroll
 
-    def collected(bank: ScenarioBank, state: Any, act: Any) -> Any:
-        return collect(learner.environment, bank, state.environments, act, state.key, steps)
+    def rollout(bank: ScenarioBank, state: Any, actor: Any) -> Any:
+        return collect(learner.environment, bank, state.environments, actor, state.key, steps)
 
-    def acting(bank: ScenarioBank, state: Any) -> Any:
+    def act(bank: ScenarioBank, state: Any) -> Any:
         network = learner.network(state.parameters)
 
         def actor(seen: Mapping[str, Array], key: Array) -> tuple[Array, Array, dict[str, Array]]:
@@ -72,14 +72,14 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
                 {"log_prob": policy.log_prob(raw_action), "value": value},
             )
 
-        return collected(bank, state, actor)
+        return rollout(bank, state, actor)
 
-    def simulating(bank: ScenarioBank, state: Any) -> Any:
+    def simulate(bank: ScenarioBank, state: Any) -> Any:
         def actor(seen: Mapping[str, Array], key: Array) -> tuple[Array, Array, dict[str, Array]]:
-            nothing = jnp.zeros((learner.config.environments, learner.environment.action_size))
-            return nothing, nothing, {}
+            zeros = jnp.zeros((learner.config.environments, learner.environment.action_size))
+            return zeros, zeros, {}
 
-        return collected(bank, state, actor)
+        return rollout(bank, state, actor)
 
     def run(part: Callable[..., Any]) -> Callable[[], Any]:
         compiled = jax.jit(part)
@@ -92,13 +92,13 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
         state[0], logs = program.step(state[0])
         return logs
 
-    return {"whole": whole, "acting": run(acting), "simulating": run(simulating)}
+    return {"whole": whole, "acting": run(act), "simulating": run(simulate)}
 
 
-def measured(data: Path, repeats: int, environments: int | None) -> dict[str, Any]:
+def measure(data: Path, repeats: int, environments: int | None) -> dict[str, Any]:
     """Steps per second of training and its shares, measured alternately, as in ``drivax train``."""
-    stored = ScenarioSet.open(data)
-    bank = ScenarioBank.from_scenarios([stored[row] for row in range(SCENARIOS)])
+    scenarios = ScenarioSet.open(data)
+    bank = ScenarioBank.from_scenarios([scenarios[row] for row in range(SCENARIOS)])
     calls, steps = {}, {}
     for name, overrides in KINDS.items():
         more = [] if environments is None else ["--algorithm.environments", str(environments)]
@@ -148,7 +148,7 @@ def main() -> None:
     )
     parser.add_argument("--write", action="store_true", help="store the result")
     args = parser.parse_args()
-    result = measured(args.data, args.repeats, args.environments)
+    result = measure(args.data, args.repeats, args.environments)
     print(json.dumps(result["training"], indent=1))
     if args.write:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")

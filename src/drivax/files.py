@@ -95,8 +95,8 @@ def check_space(path: Path, needed: int, cure: str = "make room, or choose anoth
 def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
     """Raise a FullDiskError that names ``path``, and ``needed`` bytes if known, when the block fills the disk.
 
-    The operating system's error for a write names no file. Of nested blocks, the outermost one names the output, and the
-    outermost one that knows them the bytes.
+    The operating system's error for a write names no file. Of nested blocks, the outermost one names the output, and
+    the outermost one that knows them the bytes.
     """
     try:
         yield

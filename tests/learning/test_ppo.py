@@ -7,7 +7,7 @@ import optax
 import pytest
 
 from drivax.learning.algorithms.behaviour_cloning import Cloning
-from drivax.learning.algorithms.optimisers import clip_per_network, clipped_adam
+from drivax.learning.algorithms.optimisers import chunk_size, clip_per_network, clipped_adam
 from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.environment import Rollout
 from drivax.networks.actor_critic import NetworkConfig
@@ -43,42 +43,102 @@ def test_a_truncated_step_bootstraps_its_own_final_state():
         np.testing.assert_array_equal(batch["alive"], [1, 1, 0, 1])
 
 
-def test_loss_against_numpy():
-    """Of what the networks say; rows between episodes (``alive`` 0) do not count, advantages are normalised."""
-    config = PpoConfig(network=NETWORK, clip=0.1, value_coefficient=0.7, entropy_coefficient=0.03)
-    learner = config.build(Pendulum(), (), 1)
-    parameters, keys = learner.init((), jax.random.key(0)).parameters, jax.random.split(jax.random.key(1), 7)
-    alive = jnp.array([1.0, 1.0, 0.0, 1.0] * 8)
-    part = {
+def minibatch_of(learner, parameters):
+    """Return 32 samples, every fourth between episodes (``alive`` 0)."""
+    keys = jax.random.split(jax.random.key(1), 5)
+    minibatch = {
         "observation": {"pendulum": jax.random.normal(keys[0], (32, 3))},
         "raw_action": jax.random.normal(keys[1], (32, 1)),
         "advantage": 3.0 + 2.0 * jax.random.normal(keys[2], (32,)),
         "target": jax.random.normal(keys[3], (32,)),
-        "alive": alive,
+        "alive": jnp.array([1.0, 1.0, 0.0, 1.0] * 8),
     }
-    policy, value = learner.network(parameters).policy_and_value(part["observation"])
-    now = policy.log_prob(part["raw_action"])
-    part["log_prob"] = now + 0.3 * jax.random.normal(keys[4], (32,))
-    total, logs = learner._loss(
-        parameters, part, keys[5], lambda *_: (jnp.float32(0.5), {"also": jnp.ones(())})
+    policy = learner.network(parameters).policy(minibatch["observation"])
+    log_prob = policy.log_prob(minibatch["raw_action"])
+    return minibatch | {"log_prob": log_prob + 0.3 * jax.random.normal(keys[4], (32,))}
+
+
+def entropy_of(policy, key):
+    """Return the entropy from one sample with a key each."""
+    keys = jax.random.split(jax.random.split(key)[0], 32)
+    return jax.vmap(lambda one, key: one.entropy_estimate(key))(policy, keys)
+
+
+def in_chunks(minibatch, count):
+    return jax.tree.map(lambda leaf: leaf.reshape(count, -1, *leaf.shape[1:]), minibatch)
+
+
+LOSS = PpoConfig(network=NETWORK, clip=0.1, value_coefficient=0.7, entropy_coefficient=0.03)
+
+
+def test_logged_losses_against_numpy():
+    """Samples between episodes do not count, advantages are normalised."""
+    learner = LOSS.build(Pendulum(), (), 1)
+    parameters, key = learner.init((), jax.random.key(0)).parameters, jax.random.key(2)
+    minibatch = minibatch_of(learner, parameters)
+    logs, _ = learner._gradient(
+        parameters, in_chunks(minibatch, 4), key, lambda *_: (jnp.float32(0.5), {"also": jnp.ones(())})
     )
 
-    there = np.asarray(alive, bool)
-    rows = {name: np.asarray(part[name], np.float64)[there] for name in ("advantage", "target", "log_prob")}
-    ratio = np.exp(np.asarray(now, np.float64)[there] - rows["log_prob"])
-    advantage = (rows["advantage"] - rows["advantage"].mean()) / rows["advantage"].std()
-    clipped = np.clip(ratio, 0.9, 1.1)
-    surrogate = -np.minimum(ratio * advantage, clipped * advantage).mean()
-    errors = np.square(np.asarray(value, np.float64)[there] - rows["target"]).mean()
-    spread = np.asarray(policy.entropy_estimate(jax.random.split(keys[5])[0]), np.float64)[there].mean()
-    assert float(total) == pytest.approx(surrogate + 0.7 * errors - 0.03 * spread + 0.5, rel=1e-4)
-    told = {
-        "policy": surrogate, "value": errors, "entropy": spread, "also": 1.0,
-        "clipped_share": (abs(ratio - 1) > 0.1).mean(), "kl": -np.log(ratio).mean(),
-        "explained_variance": 1 - errors / rows["target"].var(),
-    }  # fmt: skip
-    assert {name: float(logs[name]) for name in told} == pytest.approx(told, rel=1e-4, abs=1e-6)
-    assert 0.2 < told["clipped_share"] < 0.9
+    policy, value = learner.network(parameters).policy_and_value(minibatch["observation"])
+    alive = np.asarray(minibatch["alive"], bool)
+    advantage, target, log_prob, new_log_prob, value, entropy = (
+        np.asarray(samples, np.float64)[alive]
+        for samples in (
+            minibatch["advantage"], minibatch["target"], minibatch["log_prob"],
+            policy.log_prob(minibatch["raw_action"]), value, entropy_of(policy, key),
+        )
+    )  # fmt: skip
+    ratio = np.exp(new_log_prob - log_prob)
+    advantage = (advantage - advantage.mean()) / advantage.std()
+    errors = np.square(value - target).mean()
+    expected = {
+        "policy": -np.minimum(ratio * advantage, np.clip(ratio, 0.9, 1.1) * advantage).mean(),
+        "value": errors,
+        "entropy": entropy.mean(),
+        "also": 1.0,
+        "clipped_share": (abs(ratio - 1) > 0.1).mean(),
+        "kl": -np.log(ratio).mean(),
+        "explained_variance": 1 - errors / target.var(),
+    }
+    assert {name: float(value) for name, value in logs.items()} == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    assert 0.2 < expected["clipped_share"] < 0.9
+
+
+@pytest.mark.parametrize("chunks", [1, 4, 16])
+def test_gradient_in_chunks_is_that_of_the_whole_minibatch(chunks):
+    learner = LOSS.build(Pendulum(), (), 1)
+    parameters, key = learner.init((), jax.random.key(0)).parameters, jax.random.key(2)
+    minibatch = minibatch_of(learner, parameters)
+    alive = minibatch["alive"] > 0
+
+    def auxiliary_loss(parameters, key):
+        loss = 0.1 * sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(parameters))
+        return loss * jax.random.uniform(key), {}
+
+    def loss(parameters):
+        policy, value = learner.network(parameters).policy_and_value(minibatch["observation"])
+        ratio = jnp.exp(policy.log_prob(minibatch["raw_action"]) - minibatch["log_prob"])
+        advantage = minibatch["advantage"]
+        advantage = (advantage - advantage[alive].mean()) / advantage[alive].std()
+        surrogate = jnp.minimum(ratio * advantage, jnp.clip(ratio, 0.9, 1.1) * advantage)
+        entropy = entropy_of(policy, key)
+        total = -surrogate + 0.7 * (value - minibatch["target"]) ** 2 - 0.03 * entropy
+        return total[alive].mean() + auxiliary_loss(parameters, jax.random.split(key)[1])[0]
+
+    _, gradient = jax.jit(learner._gradient, static_argnums=3)(
+        parameters, in_chunks(minibatch, chunks), key, auxiliary_loss
+    )
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6),
+        gradient,
+        jax.grad(loss)(parameters),
+    )
+
+
+@pytest.mark.parametrize(("batch", "chunk"), [(2048, 64), (96, 48), (40, 40), (97, 97), (8, 8), (320, 64)])
+def test_chunks_divide_a_batch(batch, chunk):
+    assert chunk_size(batch) == chunk
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
+from drivax.learning.algorithms import optimisers
 from drivax.learning.algorithms.sac import SacConfig, SacParameters
 from drivax.learning.replay import ReplayConfig, Transitions
 from drivax.networks.actor_critic import NetworkConfig
@@ -14,6 +15,8 @@ from pendulum import Pendulum
 
 NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,))
 CONFIG = SacConfig(network=NETWORK, replay=ReplayConfig(64), environments=4, unroll=4, batch=16, warm_up=0)
+#: Two per sample, for the next state's action and for this one's.
+KEYS = jax.random.split(jax.random.key(7), (16, 2))
 
 
 @pytest.fixture(scope="module")
@@ -36,16 +39,15 @@ def sac():
 
 def test_losses_against_numpy(sac):
     learner, trained, target, batch = sac
-    key = jax.random.key(7)
-    _, logs = jax.jit(lambda t: learner.loss(t, target, batch, key, None))(trained)
+    _, logs = jax.jit(lambda t: learner.loss(t, target, batch, KEYS))(trained)
 
     @jax.jit
     def outputs(trained):
         """What the losses are made of: values, log-densities, drawn by the same keys."""
-        next_key, now_key, _ = jax.random.split(key, 3)
         next_policy = learner.distribution(trained.policy, batch.next_observation)
         policy = learner.distribution(trained.policy, batch.observation)
-        then, now = next_policy.sample(next_key), policy.sample(now_key)
+        sample = jax.vmap(lambda one, key: one.sample(key))
+        then, now = sample(next_policy, KEYS[:, 0]), sample(policy, KEYS[:, 1])
         return {
             "target": learner.q_values(target["critic"], batch.next_observation, jnp.tanh(then)),
             "then": next_policy.log_prob(then),
@@ -77,7 +79,7 @@ def test_every_loss_reaches_its_own_parameters_only(sac):
     def slopes_of(trained):
         def part(name):
             def of(trained):
-                total, logs = learner.loss(trained, target, batch, jax.random.key(7), None)
+                total, logs = learner.loss(trained, target, batch, KEYS)
                 return total if name == "total" else logs[name], logs
 
             return jax.grad(of, has_aux=True)(trained)
@@ -94,6 +96,32 @@ def test_every_loss_reaches_its_own_parameters_only(sac):
     # The temperature's slope is alpha (entropy - target): by hand, from what is logged.
     slope = 0.2 * (float(found["total"][1]["entropy"]) + 1.0)
     assert float(slopes["total"].log_temperature) == pytest.approx(slope, rel=1e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("chunk", [4, 16])
+def test_gradient_in_chunks_is_that_of_the_whole_batch(sac, chunk, monkeypatch):
+    monkeypatch.setattr(optimisers, "_CHUNK", chunk)
+    learner, trained, target, batch = sac
+
+    def auxiliary_loss(policy, key):
+        scale = jax.random.uniform(key)
+        return scale * sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(policy)), {"scale": scale}
+
+    def loss(trained):
+        key, auxiliary_key = jax.random.split(jax.random.key(3))
+        total, logs = learner.loss(trained, target, batch, jax.random.split(key, (16, 2)))
+        auxiliary, auxiliary_logs = auxiliary_loss(trained.policy, auxiliary_key)
+        return total + auxiliary, auxiliary_logs | logs
+
+    chunked = jax.jit(
+        lambda trained: learner.gradient(trained, target, batch, jax.random.key(3), auxiliary_loss)
+    )
+    gradient, logs = jax.grad(loss, has_aux=True)(trained)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6),
+        chunked(trained),
+        (logs, gradient),
+    )
 
 
 def test_impossible_settings_are_refused():

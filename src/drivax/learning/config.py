@@ -103,7 +103,11 @@ class TrainConfig:
 
 
 def split_traffic(name: str) -> tuple[str | None, str]:
-    """Return the policy (or None) and the base traffic of a name like ``zoo:NAME+idm``; UsageError for unknown ones."""
+    """Return the policy (or None) and the base traffic of a name like ``zoo:NAME+idm``.
+
+    Raises:
+        UsageError: There is no such traffic.
+    """
     run, plus, base = name.rpartition("+")
     if plus and base in TRAFFIC and is_policy(run):
         return run, base

@@ -52,7 +52,11 @@ class Driving:
 
     @property
     def task(self) -> Task:
-        """The simulator's task; raises UsageError if it has no action space."""
+        """The simulator's task.
+
+        Raises:
+            UsageError: It has no action space.
+        """
         task = self.simulator.task
         if not isinstance(task, Task):
             raise UsageError(f"{type(task).__name__} has no action space", cure="use drivax.tasks.task.Task")
@@ -83,7 +87,11 @@ class Driving:
         return {name: tuple(value.shape) for name, value in observation.items()}
 
     def start(self, data: ScenarioBank, key: Array, count: int) -> Environments:
-        """Reset environments to random steps of their logs; UsageError if ``latest_start`` is too late."""
+        """Reset environments to random steps of their logs.
+
+        Raises:
+            UsageError: ``latest_start`` is too late.
+        """
         if self.latest_start > data.steps - 3:
             cure = f"use {self.earliest_start} (earliest_start) to {data.steps - 3}"
             raise UsageError(f"latest_start is {self.latest_start}", cure=cure)
@@ -206,8 +214,8 @@ def _draw(
     last = last if latest is None else jnp.minimum(last, latest)
     step = jax.random.randint(step_key, (count,), earliest, jnp.maximum(last, earliest) + 1)
     # The ego is always valid at the current step.
-    there = (bank.agents[index, step, 0, AgentColumn.VALID] > 0) & (step <= last)
-    step = jnp.where(there, step, CURRENT_STEP)
+    is_valid = (bank.agents[index, step, 0, AgentColumn.VALID] > 0) & (step <= last)
+    step = jnp.where(is_valid, step, CURRENT_STEP)
     # Unused, and not computed, with logged starts.
     keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
     return index, step, keys

@@ -78,7 +78,11 @@ def sample_steps(sampler: Sampler, key: Array, shape: tuple[int, ...]) -> StepIn
 
 
 def check_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return weights ``[N, T]`` in double precision; UsageError for a wrong shape or a negative or infinite weight."""
+    """Return weights ``[N, T]`` in double precision.
+
+    Raises:
+        UsageError: The shape is wrong, or a weight is negative or infinite.
+    """
     weights = np.asarray(weights)
     if weights.shape != shape:
         problem = f"weights of shape {weights.shape} for {shape[0]} scenarios of {shape[1]} steps"
@@ -121,7 +125,11 @@ class LoggedEnvironment(Environment, Protocol):
 
 
 def require_log(environment: Environment) -> LoggedEnvironment:
-    """Return an environment with expert episodes; raises UsageError for any other."""
+    """Return an environment with expert episodes.
+
+    Raises:
+        UsageError: The environment has no expert episodes.
+    """
     if not isinstance(environment, LoggedEnvironment):
         problem = f"{type(environment).__name__} has no logged episodes"
         raise UsageError(problem, cure="implement `expert_steps`")

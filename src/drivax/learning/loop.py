@@ -116,7 +116,11 @@ def _check_validation(config: TrainConfig, data: ScenarioSet, validation: Scenar
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
-    """Return which logged steps ``[N, T]`` an offline training draws from; UsageError for other algorithms."""
+    """Return which logged steps ``[N, T]`` an offline training draws from.
+
+    Raises:
+        UsageError: The algorithm is not offline.
+    """
     environment, bank = _environment(config, data)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
     return np.asarray(experience.usable)
@@ -169,12 +173,16 @@ def _create_folders(
 def _resumed_folders(
     data: ScenarioSet, notes: Mapping[str, Any], out: Path, seeds: int
 ) -> tuple[TrainConfig, list[RunFolder]]:
-    """Return the configuration of a run, and the folder of each of its seeds; UsageError if inputs differ."""
+    """Return the configuration of a run, and the folder of each of its seeds.
+
+    Raises:
+        UsageError: Data or options differ from those of the run.
+    """
     folder = RunFolder.open(out)
-    stored = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
-    stored |= {name: folder.info.get(name) for name in ("validation", "weights")}
+    previous = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
+    previous |= {name: folder.info.get(name) for name in ("validation", "weights")}
     for name, value in {**notes, "data": [data.hash]}.items():
-        if stored[name] != value:
+        if previous[name] != value:
             problem, option = _RESUMED_WITH_OTHER[name]
             raise UsageError(problem, file=out, cure=f"resume with the same {option}")
     folders = [RunFolder.open(path) for path in seed_folders(out)]
@@ -322,12 +330,12 @@ class PretrainedRun:
     def networks(self, state: Any) -> dict[str, Any]:
         """Return the stored networks by their paths in the initial state of one seed (or its shapes).
 
-        Networks that the checkpoint lacks are left out. Raises DataError for the first array that does not fit.
+        Networks that the checkpoint lacks are omitted. Raises DataError for the first array that does not fit.
         """
         checkpoints = Checkpoints(self.run / "checkpoints")
-        stored = [leaf["name"] for leaf in checkpoints.about(self.step)["leaves"]]
+        leaves = [leaf["name"] for leaf in checkpoints.about(self.step)["leaves"]]
         networks = _networks(state)
-        sources = {path: source for path in networks if (source := _source(path, stored))}
+        sources = {path: source for path in networks if (source := _source(path, leaves))}
         templates = {source: networks[path] for path, source in sources.items()}
         cure = "start from a run with the same network, observation and actions"
         restored = checkpoints.restore_parts(templates, self.step, cure)

@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -97,13 +98,16 @@ class Program:
 
     def __init__(self, seeds: Seeds, data: Any, devices: int | None = 1) -> None:
         self.seeds = seeds
-        shapes = jax.eval_shape(seeds.init, data)
+        # Its trace is reused where the layout is the default.
+        self._init = jax.jit(seeds.init)
+        shapes = self._init.eval_shape(data)
         batch = getattr(seeds.learner, "batch", None)
         self.devices = choose_devices(devices, len(seeds.seeds), shapes, batch)
         self._mesh = Mesh(np.array(self.devices), (_AXIS,))
         self._layout: Any = None
         if len(self.devices) > 1:
             self._layout = _layout(self._mesh, len(seeds.seeds), shapes)
+            self._init = jax.jit(seeds.init, out_shardings=self._layout)
             data = jax.device_put(data, NamedSharding(self._mesh, PartitionSpec()))
             shapes = jax.tree.map(
                 lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
@@ -123,7 +127,7 @@ class Program:
 
     def initial_state(self) -> Any:
         """Return the first state of all seeds."""
-        return jax.jit(self.seeds.init, out_shardings=self._layout)(self.data)
+        return self._init(self.data)
 
     def state_of(self, states: Sequence[Any]) -> Any:
         """Return the state of all seeds, laid out over the devices, given that of each."""
@@ -166,10 +170,34 @@ def shard_axis(tree: Any, axis: int) -> Any:
 
     Without this constraint the compiler may compute the whole update on every device.
     """
-    mesh = jax.sharding.get_abstract_mesh()
-    if mesh.empty or mesh.size == 1 or any(leaf.shape[axis] % mesh.size for leaf in jax.tree.leaves(tree)):
+    count = device_count()
+    if count == 1 or any(leaf.shape[axis] % count for leaf in jax.tree.leaves(tree)):
         return tree
     return jax.lax.with_sharding_constraint(tree, PartitionSpec(*[None] * axis, _AXIS))
+
+
+def device_count() -> int:
+    """Return the number of devices that one seed is divided among, while its iteration is traced."""
+    mesh = jax.sharding.get_abstract_mesh()
+    return 1 if mesh.empty else mesh.size
+
+
+def sum_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any, axis: int) -> Any:
+    """Return a function's result summed over devices, each with its share of ``divided`` along an axis.
+
+    The sum is taken once, where the compiler would take it in every step of a loop. One device takes all if shares
+    would differ.
+    """
+    count = device_count()
+    if count == 1 or any(leaf.shape[axis] % count for leaf in jax.tree.leaves(divided)):
+        return function(whole, divided)
+    specs = (PartitionSpec(), PartitionSpec(*[None] * axis, _AXIS))
+
+    @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
+    def summed(whole: Any, share: Any) -> Any:
+        return jax.lax.psum(function(whole, share), _AXIS)
+
+    return summed(whole, divided)
 
 
 def _layout(mesh: Mesh, seeds: int, state: Any) -> Any:

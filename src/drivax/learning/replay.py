@@ -34,7 +34,11 @@ class ReplayConfig:
     store: Store = "state"
 
     def rows(self, environments: int) -> int:
-        """Return the number of rows; raises UsageError below two, a step and its successor."""
+        """Return the number of rows.
+
+        Raises:
+            UsageError: There are fewer than two, for a step and its successor.
+        """
         rows = self.capacity // environments
         if rows < 2:
             problem = f"replay capacity of {self.capacity} steps is too small for {environments} environments"

@@ -270,7 +270,11 @@ def combinations(levels: tuple[tuple[float, ...], ...]) -> Float[np.ndarray, "co
 
 
 def parameter_count(kind: DistributionName, actions: Actions) -> int:
-    """Return the number of parameters of a distribution; raises UsageError for a grid of actions without levels."""
+    """Return the number of parameters of a distribution.
+
+    Raises:
+        UsageError: The distribution is a grid, but the actions have no levels.
+    """
     if kind == "grid":
         return len(combinations(_levels(actions)))
     return _COMPONENTS * (1 + 2 * actions.size) if kind == "mixture" else 2 * actions.size

@@ -1,8 +1,4 @@
-"""Encoders: from named groups with masks to one vector; dense layers, maximum over rows, and normalisation.
-
-The gradient of a maximum concerns one row per output. Plain differentiation takes the gradients of all rows, mostly
-zeros, through all layers; :func:`largest` embeds only the maximal rows again where that is less work.
-"""
+"""Encoders: from named groups with masks to one vector; dense layers, maximum over rows, and normalisation."""
 
 from __future__ import annotations
 
@@ -10,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
@@ -30,6 +25,8 @@ Layers = Sequence[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
 
 Activation = Literal["relu", "tanh", "gelu", "silu"]
 ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "gelu": jax.nn.gelu, "silu": jax.nn.silu}
+#: Activations that commute with a maximum.
+_MONOTONE = ("relu", "tanh")
 
 #: Lower bound of deviations: a nearly constant feature is not amplified.
 _MIN_DEVIATION = 1e-3
@@ -136,7 +133,11 @@ def _weights(layers: Any) -> Layers:
 
 
 def group_names(spec: GroupSpec) -> tuple[str, ...]:
-    """Return the non-empty groups that are not masks, in alphabetical order; raises UsageError if there are none."""
+    """Return the non-empty groups that are not masks, in alphabetical order.
+
+    Raises:
+        UsageError: All groups are empty.
+    """
     groups = (n for n in spec if not (n.endswith("_mask") and n.removesuffix("_mask") in spec))
     names = tuple(sorted(name for name in groups if math.prod(spec[name])))
     if not names:
@@ -157,82 +158,59 @@ def max_pool(
     activation: Activation, layers: Layers, rows: Float[Array, "*batch row inputs"],
     valid: Bool[Array, "*batch row"],
 ) -> Float[Array, "*batch outputs"]:  # fmt: skip
-    """Return the maximum of zero and the valid rows after the layers."""
-    if recomputes_maxima(rows.shape[-2], [rows.shape[-1], *(bias.shape[0] for _, bias in layers)]):
-        return _encode_and_max(activation, tuple(layers), rows, valid)
-    return _max_over_rows(dense(activation, layers, rows), valid)
-
-
-def recomputes_maxima(rows: int, sizes: Sequence[int]) -> bool:
-    """Whether it is cheaper to encode the maximal rows again than to differentiate all rows.
-
-    ``sizes`` are the widths of a row and of each layer. A backward pass takes two products per layer and row. A maximal
-    row takes three, because it is encoded again, but only one output of the last layer.
-    """
-    products = [inputs * outputs for inputs, outputs in pairwise(sizes)]
-    return 3 * sizes[-1] * (sum(products[:-1]) + sizes[-2]) < 2 * rows * sum(products)
-
-
-@jax.custom_vjp
-def _max_over_rows(
-    embedded: Float[Array, "*batch row outputs"], valid: Bool[Array, "*batch row"]
-) -> Float[Array, "*batch outputs"]:
-    return jnp.max(embedded, axis=-2, initial=0.0, where=valid[..., None])
-
-
-def _max_over_rows_forward(embedded: Array, valid: Array) -> tuple[Array, tuple[Array, Array, int]]:
-    maximum, argmax, positive = _row_maxima(embedded, valid)
-    return maximum, (argmax, positive, embedded.shape[-2])
-
-
-def _max_over_rows_backward(residuals: tuple[Array, Array, int], gradient: Array) -> tuple[Array, None]:
-    argmax, positive, rows = residuals
-    is_maximum = jnp.arange(rows)[:, None] == argmax[..., None, :]
-    return jnp.where(is_maximum, jnp.where(positive, gradient, 0.0)[..., None, :], 0.0), None
-
-
-_max_over_rows.defvjp(_max_over_rows_forward, _max_over_rows_backward)
+    """Return the maximum of zero and the valid rows after the layers; tied rows share its gradient."""
+    if activation not in _MONOTONE:
+        return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=valid[..., None])
+    lead, (count, width) = rows.shape[:-2], rows.shape[-2:]
+    maximum: Array = _dense_and_max(
+        activation, tuple(layers), rows.reshape(-1, count, width), valid.reshape(-1, count)
+    )
+    return maximum.reshape(*lead, -1)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _encode_and_max(
-    activation: Activation, layers: Layers, rows: Float[Array, "*batch row inputs"],
-    valid: Bool[Array, "*batch row"],
-) -> Float[Array, "*batch outputs"]:  # fmt: skip
-    return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=valid[..., None])
+def _dense_and_max(
+    activation: Activation, layers: Layers, rows: Float[Array, "B row inputs"], valid: Bool[Array, "B row"]
+) -> Float[Array, "B outputs"]:
+    return _dense_and_max_forward(activation, layers, rows, valid)[0]
 
 
-def _encode_and_max_forward(
+def _dense_and_max_forward(
     activation: Activation, layers: Layers, rows: Array, valid: Array
 ) -> tuple[Array, Any]:
-    maximum, argmax, positive = _row_maxima(dense(activation, layers, rows), valid)
-    return maximum, (layers, rows, argmax, positive)
+    """Add the last bias and activate after the maximum, which is equal for a monotone activation."""
+    inputs: list[Array] = [rows.reshape(-1, rows.shape[-1])]
+    activate, hidden_vjps = partial(jax.vjp, ACTIVATIONS[activation]), []
+    for kernel, bias in layers[:-1]:
+        output, vjp = activate(inputs[-1] @ kernel + bias)
+        inputs.append(output)
+        hidden_vjps.append(vjp)
+    kernel, bias = layers[-1]
+    products: Array = (inputs[-1] @ kernel).reshape(*valid.shape, -1)
+    largest = jnp.max(jnp.where(valid[..., None], products, -jnp.inf), axis=1)
+    output, vjp = activate(largest + bias)
+    residuals = layers, valid, inputs, hidden_vjps, products, largest, output > 0.0, vjp
+    return jnp.maximum(output, 0.0), residuals
 
 
-def _encode_and_max_backward(
+def _dense_and_max_backward(
     activation: Activation, residuals: Any, gradient: Array
 ) -> tuple[Any, Array, None]:
-    layers, rows, argmax, positive = residuals
+    """Differentiate all rows as one matrix: XLA's gathers and scatters are slower on CPUs than the zeros."""
+    layers, valid, inputs, hidden_vjps, products, largest, is_positive, vjp = residuals
+    (gradient,) = vjp(jnp.where(is_positive, gradient, 0.0))
+    is_largest = (products == largest[:, None]) & valid[..., None]
+    share = gradient / jnp.maximum(jnp.sum(is_largest, axis=1, dtype=jnp.float32), 1.0)
+    by_row = jnp.where(is_largest, share[:, None], 0.0).reshape(-1, share.shape[-1])
+    gradients = [(inputs[-1].T @ by_row, gradient.sum(axis=0))]
+    for number in reversed(range(len(hidden_vjps))):
+        (by_row,) = hidden_vjps[number](by_row @ layers[number + 1][0].T)
+        # A product with ones is several times faster than XLA's sum over the first axis.
+        gradients.append((inputs[number].T @ by_row, jnp.ones(len(by_row)) @ by_row))
+    return tuple(reversed(gradients)), (by_row @ layers[0][0].T).reshape(*valid.shape, -1), None
 
-    def recompute(layers: Layers, rows: Array) -> Array:
-        """Return each output from the row that attains it."""
-        inputs = dense(activation, layers[:-1], jnp.take_along_axis(rows, argmax[..., None], axis=-2))
-        kernel, bias = layers[-1]
-        return ACTIVATIONS[activation](jnp.sum(inputs * kernel.T, axis=-1) + bias)
 
-    _, vjp = jax.vjp(recompute, layers, rows)
-    return *vjp(jnp.where(positive, gradient, 0.0)), None
-
-
-_encode_and_max.defvjp(_encode_and_max_forward, _encode_and_max_backward)
-
-
-def _row_maxima(embedded: Array, valid: Array) -> tuple[Array, Array, Array]:
-    """Return the maximum over rows, its row, and whether it is above zero and so has a gradient."""
-    # Invalid rows are never above zero.
-    candidates = jnp.where(valid[..., None], embedded, 0.0)
-    maximum = jnp.max(candidates, axis=-2)
-    return jnp.maximum(maximum, 0.0), jnp.argmax(candidates, axis=-2), maximum > 0.0
+_dense_and_max.defvjp(_dense_and_max_forward, _dense_and_max_backward)
 
 
 def feature_statistics(groups: Groups) -> dict[str, tuple[Float[Array, " F"], Float[Array, " F"]]]:

@@ -210,7 +210,11 @@ def imitation_update(
 
 
 def require_expert(environment: Environment) -> ExpertEnvironment:
-    """Return an environment with expert actions; raises UsageError for any other."""
+    """Return an environment with expert actions.
+
+    Raises:
+        UsageError: The environment has no expert actions.
+    """
     if not isinstance(environment, ExpertEnvironment):
         problem = f"{type(environment).__name__} has no expert to imitate"
         raise UsageError(problem, cure="implement `demonstrations`")

@@ -66,6 +66,11 @@ def target_entropy(config: Any, environment: Environment) -> float:
     return -float(environment.action_size) if config.target_entropy is None else config.target_entropy
 
 
+def sample_each(policy: Distribution, keys: Array) -> Float[Array, "B raw"]:
+    """Sample a raw action from each distribution with its own key, whatever the others in the batch."""
+    return jax.vmap(type(policy).sample)(policy, keys)
+
+
 class OffPolicy(Generic[Config]):
     """An off-policy algorithm in one environment: a subclass adds its losses and optimisers."""
 
@@ -115,13 +120,20 @@ class OffPolicy(Generic[Config]):
     def update_networks(self, carry: Carry, *batch: Any) -> tuple[Carry, dict[str, Array]]:
         """Take a gradient step of :meth:`loss` on a batch, then move the target networks."""
         trained, target, optimiser = carry
-        (_, logs), gradient = jax.value_and_grad(self.loss, has_aux=True)(trained, target, *batch)
+        logs, gradient = self.gradient(trained, target, *batch)
         for name in ("policy", "critic"):
             logs[f"{name}_gradient_norm"] = optax.tree.norm(gradient[name])
         change, optimiser = self.optimiser.update(gradient, optimiser, trained)
         trained: Any = optax.apply_updates(trained, change)
         online = {name: trained[name] for name in self.targets}
         return (trained, polyak(target, online, self.config.tau), optimiser), logs
+
+    def gradient(
+        self, trained: Trained, target: dict[str, Any], *batch: Any
+    ) -> tuple[dict[str, Array], Trained]:
+        """Return values to log, and the gradient of :meth:`loss`."""
+        gradient, logs = jax.grad(self.loss, has_aux=True)(trained, target, *batch)
+        return logs, gradient
 
     def critic_loss(
         self, trained: Trained, batch: Transitions, next_value: Float[Array, " B"]
@@ -134,10 +146,13 @@ class OffPolicy(Generic[Config]):
     def soft_actor(
         self, trained: Trained, observation: dict[str, Array], entropy: float, key: Array
     ) -> SoftActor:
-        """Return the losses of a policy with entropy bonus and of its temperature, given the target entropy."""
+        """Return the losses of a policy with entropy bonus and of its temperature, given the target entropy.
+
+        ``key`` is one of all samples, or an array with one of each.
+        """
         temperature = jnp.exp(trained["log_temperature"])
         policy = self.distribution(trained["policy"], observation)
-        raw_action = policy.sample(key)
+        raw_action = sample_each(policy, key) if key.ndim else policy.sample(key)
         log_prob = policy.log_prob(raw_action)
         critic = jax.lax.stop_gradient(trained["critic"])
         q_values = self.q_values(critic, observation, policy.action(raw_action))

@@ -1,14 +1,51 @@
-"""Adam with gradient clipping and a linear learning-rate schedule, for all algorithms."""
+"""Gradients accumulated over chunks, and Adam with clipping and a linear schedule, for all algorithms."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array
 
 from drivax.errors import UsageError
+from drivax.learning.program import device_count, sum_over_devices
+
+#: Samples per chunk and CPU: intermediate results of a gradient stay in the second-level cache.
+_CHUNK = 64
+
+
+def chunk_size(batch: int) -> int:
+    """Return the number of samples whose gradient is computed at a time: on GPUs, and for small batches, all."""
+    devices = device_count()
+    sizes = range(_CHUNK * devices, _CHUNK * devices // 4, -devices)
+    dividing = (size for size in sizes if batch % size == 0)
+    return next(dividing, batch) if jax.default_backend() == "cpu" else batch
+
+
+def sum_gradients(
+    loss: Callable[[Any, Any], tuple[Array, dict[str, Array]]], parameters: Any, samples: Any
+) -> tuple[dict[str, Array], Any]:
+    """Return the sums of logs and gradients of a loss over ``samples`` (leaves ``[chunk, sample, ...]``).
+
+    The loss of a batch must be the sum of that of its chunks. Devices divide the samples of each chunk.
+    """
+    gradient = jax.grad(loss, has_aux=True)
+
+    def sum_chunks(parameters: Any, samples: Any) -> tuple[dict[str, Array], Any]:
+        def add(sums: Any, chunk: Any) -> tuple[Any, None]:
+            return jax.tree.map(jnp.add, sums, gradient(parameters, chunk)[::-1]), None
+
+        first = jax.tree.map(lambda leaf: leaf[0], samples)
+        if jax.tree.leaves(samples)[0].shape[0] == 1:
+            return gradient(parameters, first)[::-1]
+        shapes = jax.eval_shape(gradient, parameters, first)[::-1]
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        return jax.lax.scan(add, zeros, samples)[0]
+
+    return sum_over_devices(sum_chunks, parameters, samples, axis=1)
 
 
 def clipped_adam(

@@ -13,7 +13,7 @@ from flax import nnx
 from jaxtyping import Array
 
 from drivax.learning.algorithm import AuxiliaryLoss
-from drivax.learning.algorithms.optimisers import clipped_adam
+from drivax.learning.algorithms.optimisers import chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
     Environment,
     Environments,
@@ -186,16 +186,16 @@ class Ppo:
         def epoch(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
             order_key, noise_key = jax.random.split(key)
             order = jax.random.permutation(order_key, config.steps_per_iteration)
-            order = order.reshape(config.minibatches, -1)
+            chunk = chunk_size(config.steps_per_iteration // config.minibatches)
+            order = order.reshape(config.minibatches, -1, chunk)
             # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
-            shuffled = shard_axis(jax.tree.map(lambda leaf: leaf[order], batch), axis=1)
+            shuffled = shard_axis(jax.tree.map(lambda leaf: leaf[order], batch), axis=2)
             keys = jax.random.split(noise_key, config.minibatches)
             return jax.lax.scan(update, carry, (shuffled, keys))
 
         def update(carry: tuple[Any, Any], inputs: tuple[Any, Array]) -> tuple[Any, dict[str, Array]]:
             (parameters, optimiser), (minibatch, key) = carry, inputs
-            slope = jax.value_and_grad(self._loss, has_aux=True)
-            (_, logs), gradient = slope(parameters, minibatch, key, auxiliary_loss)
+            logs, gradient = self._gradient(parameters, minibatch, key, auxiliary_loss)
             logs["gradient_norm"] = optax.tree.norm(gradient)
             change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
             return (optax.apply_updates(parameters, change), optimiser), logs
@@ -224,33 +224,50 @@ class Ppo:
         }
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
 
-    def _loss(
+    def _gradient(
         self, parameters: Any, minibatch: dict[str, Any], key: Array, auxiliary_loss: AuxiliaryLoss | None
-    ) -> tuple[Array, dict[str, Array]]:
-        config, alive = self.config, minibatch["alive"]
+    ) -> tuple[dict[str, Array], Any]:
+        """Return values to log, and the gradient of the loss of a minibatch ``[chunk, sample]``."""
+        alive, advantage, target = (minibatch[name] for name in ("alive", "advantage", "target"))
+        weight = alive / jnp.maximum(jnp.sum(alive), 1.0)
+
+        def deviations(value: Array) -> tuple[Array, Array]:
+            """Return differences from the mean of the minibatch, and the variance."""
+            difference = value - jnp.sum(value * weight)
+            return difference, jnp.sum(difference**2 * weight)
+
         entropy_key, auxiliary_key = jax.random.split(key)
-
-        def mean(value: Array) -> Array:
-            return jnp.sum(value * alive) / jnp.maximum(jnp.sum(alive), 1.0)
-
-        policy, value = self.network(parameters).policy_and_value(minibatch["observation"])
-        log_prob = policy.log_prob(minibatch["raw_action"])
-        centre = mean(minibatch["advantage"])
-        deviation = jnp.sqrt(mean((minibatch["advantage"] - centre) ** 2)) + 1e-8
-        advantage = (minibatch["advantage"] - centre) / deviation
-        policy_loss = mean(clipped_surrogate_loss(log_prob, minibatch["log_prob"], advantage, config.clip))
-        target = minibatch["target"]
-        value_loss = mean((value - target) ** 2)
-        variance = jnp.maximum(mean((target - mean(target)) ** 2), 1e-8)
-        entropy = mean(policy.entropy_estimate(entropy_key))
-        total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
-        auxiliary, logs = (0.0, {}) if auxiliary_loss is None else auxiliary_loss(parameters, auxiliary_key)
-        ratio = jnp.exp(log_prob - minibatch["log_prob"])
-        return total + auxiliary, logs | {
-            "policy": policy_loss,
-            "value": value_loss,
-            "entropy": entropy,
-            "clipped_share": mean((jnp.abs(ratio - 1.0) > config.clip).astype(jnp.float32)),
-            "kl": mean(minibatch["log_prob"] - log_prob),
-            "explained_variance": 1.0 - value_loss / variance,
+        advantage, variance = deviations(advantage)
+        samples = minibatch | {
+            "advantage": advantage / (jnp.sqrt(variance) + 1e-8),
+            "weight": weight,
+            # A key per sample: its noise does not depend on the chunks.
+            "key": jax.random.split(entropy_key, weight.shape),
         }
+        logs, gradient = sum_gradients(self._loss, parameters, samples)
+        variance = jnp.maximum(deviations(target)[1], 1e-8)
+        logs["explained_variance"] = 1.0 - logs["value"] / variance
+        if auxiliary_loss is None:
+            return logs, gradient
+        auxiliary = jax.grad(auxiliary_loss, has_aux=True)
+        auxiliary_gradient, auxiliary_logs = auxiliary(parameters, auxiliary_key)
+        return auxiliary_logs | logs, jax.tree.map(jnp.add, gradient, auxiliary_gradient)
+
+    def _loss(self, parameters: Any, samples: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
+        """Return the weighted sum of the samples' losses, and sums to log."""
+        config, weight = self.config, samples["weight"]
+        policy, value = self.network(parameters).policy_and_value(samples["observation"])
+        log_prob, old_log_prob = policy.log_prob(samples["raw_action"]), samples["log_prob"]
+        surrogate = clipped_surrogate_loss(log_prob, old_log_prob, samples["advantage"], config.clip)
+        entropy = jax.vmap(type(policy).entropy_estimate)(policy, samples["key"])
+        is_outside = jnp.abs(jnp.exp(log_prob - old_log_prob) - 1.0) > config.clip
+        values = {
+            "policy": surrogate,
+            "value": (value - samples["target"]) ** 2,
+            "entropy": entropy,
+            "clipped_share": is_outside.astype(jnp.float32),
+            "kl": old_log_prob - log_prob,
+        }
+        logs = {name: jnp.sum(value * weight) for name, value in values.items()}
+        value_loss, entropy_bonus = config.value_coefficient * logs["value"], logs["entropy"]
+        return logs["policy"] + value_loss - config.entropy_coefficient * entropy_bonus, logs

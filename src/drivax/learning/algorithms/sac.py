@@ -16,8 +16,8 @@ from jaxtyping import Array
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
-from drivax.learning.algorithms.off_policy import Carry, OffPolicy, target_entropy
-from drivax.learning.algorithms.optimisers import clipped_adam
+from drivax.learning.algorithms.off_policy import Carry, OffPolicy, sample_each, target_entropy
+from drivax.learning.algorithms.optimisers import chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
     Environment,
     Environments,
@@ -236,25 +236,45 @@ class Sac(OffPolicy[SacConfig]):
         )  # fmt: skip
         return after, losses
 
+    def gradient(
+        self, trained: SacParameters, target: dict[str, Any], *batch: Any
+    ) -> tuple[dict[str, Array], SacParameters]:
+        """Return values to log, and the gradient of :meth:`loss` in chunks, and of the auxiliary loss.
+
+        ``batch`` is transitions, a key, and an :data:`AuxiliaryLoss` or None.
+        """
+        transitions, key, auxiliary_loss = batch
+        key, auxiliary_key = jax.random.split(key)
+        count = len(transitions.reward)
+
+        def share_of_loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
+            share = len(samples[0].reward) / count
+            return jax.tree.map(lambda mean: share * mean, self.loss(trained, target, *samples))
+
+        samples = (transitions, jax.random.split(key, (count, 2)))
+        samples = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk_size(count), *leaf.shape[1:]), samples)
+        logs, gradient = sum_gradients(share_of_loss, trained, samples)
+        if auxiliary_loss is None:
+            return logs, gradient
+        auxiliary = jax.grad(auxiliary_loss, has_aux=True)
+        auxiliary_gradient, auxiliary_logs = auxiliary(trained.policy, auxiliary_key)
+        policy = jax.tree.map(jnp.add, gradient.policy, auxiliary_gradient)
+        return auxiliary_logs | logs, replace(gradient, policy=policy)
+
     def loss(
-        self, trained: SacParameters, target: Any, batch: Transitions, key: Array,
-        auxiliary_loss: AuxiliaryLoss | None,
-    ) -> tuple[Array, dict[str, Array]]:  # fmt: skip
-        """Return the sum of the losses of critics, policy and temperature."""
-        next_key, key, auxiliary_key = jax.random.split(key, 3)
+        self, trained: SacParameters, target: Any, batch: Transitions, keys: Array
+    ) -> tuple[Array, dict[str, Array]]:
+        """Return the sum of the losses of critics, policy and temperature; ``keys`` are two per sample."""
         next_policy = self.distribution(trained.policy, batch.next_observation)
-        raw_action = next_policy.sample(next_key)
+        raw_action = sample_each(next_policy, keys[:, 0])
         next_q = self.q_values(target["critic"], batch.next_observation, next_policy.action(raw_action))
         temperature = jnp.exp(trained.log_temperature)
         next_value = soft_value(next_q, next_policy.log_prob(raw_action), temperature)
         critic_loss, q = self.critic_loss(trained, batch, next_value)
-        actor = self.soft_actor(trained, batch.observation, self.target_entropy, key)
+        actor = self.soft_actor(trained, batch.observation, self.target_entropy, keys[:, 1])
         policy_loss = jnp.mean(actor.loss)
-        auxiliary, logs = 0.0, {}
-        if auxiliary_loss is not None:
-            auxiliary, logs = auxiliary_loss(trained.policy, auxiliary_key)
-        logs |= actor.logs | {"critic": critic_loss, "policy": policy_loss, "mean_q": jnp.mean(q)}
-        return critic_loss + policy_loss + actor.temperature_loss + auxiliary, logs
+        logs = actor.logs | {"critic": critic_loss, "policy": policy_loss, "mean_q": jnp.mean(q)}
+        return critic_loss + policy_loss + actor.temperature_loss, logs
 
 
 def _sums(logs: dict[str, Array]) -> dict[str, Array]:

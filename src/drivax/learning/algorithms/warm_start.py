@@ -43,7 +43,11 @@ class WarmStart:
             raise UsageError("a setting of warm_start is negative", cure="use 0 or more")
 
     def online_iterations(self, iterations: int) -> int:
-        """Return the iterations of a run after pretraining; raises UsageError if none are left."""
+        """Return the iterations of a run after pretraining.
+
+        Raises:
+            UsageError: Pretraining leaves none.
+        """
         if iterations <= self.iterations:
             cure = "raise total_steps, or lower warm_start.iterations"
             raise UsageError(f"all {iterations} iterations are behaviour cloning", cure=cure)
