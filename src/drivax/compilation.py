@@ -77,7 +77,7 @@ def report_compilation(report: Callable[[str], None]) -> None:
             waiting[-1].daemon = True
             waiting[-1].start()
 
-    def stop(event: str, duration: float, **_: object) -> None:
+    def stop(event: str, duration_secs: float, **_: object) -> None:
         if event == "/jax/core/compile/backend_compile_duration" and waiting:
             waiting.pop().cancel()
 

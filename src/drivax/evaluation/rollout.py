@@ -160,13 +160,15 @@ def _outcome(
     # Whether a metric is defined must not depend on when the planner crashed.
     names = [name for name in FAILED if name in metrics]
     failed_metrics = {name: replace(metrics[name], defined=full_metrics[name].defined) for name in names}
-    first_others = _others(traffic, bank, first.state)
+    others = _others(traffic, bank, first.state)
+    if others is not None and steps.others is not None:
+        others = jnp.concatenate([others[None], steps.others])
     return Episodes(
         metrics=metrics | failed_metrics,
         events=event_steps(last.metric_state.episode),
         motion=jnp.concatenate([first.state.context.history[-1][None], steps.motion]),
         actions=steps.action,
-        others=None if first_others is None else jnp.concatenate([first_others[None], steps.others]),
+        others=others,
         offroad_steps=steps.offroad.sum().astype(jnp.int32),
         crashed=jnp.where(steps.all_finite.all(), -1, start_step + jnp.argmin(steps.all_finite)),
     )
