@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, gap, overlap, time_to_overlap
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import Integer, Scalar
+from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import Frame
 
@@ -18,6 +19,8 @@ TTC_HORIZON_S = 5.0
 FARTHEST_GAP_M = 50.0
 #: Below this speed a car stands (semantics, ``at_fault_collision`` and ``ttc``).
 STOPPED_MPS = 0.05
+#: Tangent of 30 degrees.
+_TAN_30 = 3.0**-0.5
 #: Rear axle behind the box centre, as a share of the length (nuPlan's vehicle: 1.461 m of 5.176 m).
 REAR_AXLE = 1.461 / 5.176
 
@@ -111,8 +114,8 @@ def classify_contacts(
     """
     me = frame.box[slot]
     ahead, left, cos, _ = relative(frame, slot)
-    bearing = jnp.arctan2(jnp.abs(left), ahead + REAR_AXLE * me[LENGTH])
-    behind = bearing > 5 * jnp.pi / 6
+    # Its bearing from the rear axle is over 150 degrees.
+    behind = jnp.abs(left) < -_TAN_30 * (ahead + REAR_AXLE * me[LENGTH])
     # The front bumper as a thin box.
     x, y = me[X] + me[LENGTH] / 2 * me[COS], me[Y] + me[LENGTH] / 2 * me[SIN]
     bumper = jnp.stack([x, y, me[COS], me[SIN], jnp.full((), 0.02), me[WIDTH]])
@@ -129,7 +132,7 @@ def classify_contacts(
     kind = jnp.full(front.shape, c.SIDE_SWIPE)
     for case, name in reversed(cases):  # jnp.select, an argmax over all cases, is slower
         kind = jnp.where(case, name, kind)
-    nearest = jnp.argmin(jnp.where(fresh, ahead**2 + left**2, jnp.inf))
+    nearest = first_smallest(jnp.where(fresh, ahead**2 + left**2, jnp.inf))
     return fresh & fault, jnp.where(fresh.any(), kind[nearest], c.NONE).astype(jnp.int8)
 
 
