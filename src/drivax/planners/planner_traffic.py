@@ -92,9 +92,9 @@ class PlannerTraffic:
         """Advance all agents by one step of 0.1 s from the present frame."""
         now = context.traffic
 
-        def frames(back: int) -> Frame:
+        def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
             rows = self.agents(bank, context, back)
-            return frame_of(bank, context.index, context.step, rows, alone(context), back) if back else frame
+            return frame_of(bank, context.index, context.step, rows, alone(context), back, slots)
 
         def drive(agent: AgentContext) -> AgentContext:
             apart = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)

@@ -91,10 +91,16 @@ class Simulator:
         context = self.context(bank, index, step, slot, key)
         return EpisodeStart(context, remember_lights(bank, context))
 
-    def frame(self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int) -> Frame:
-        """Return all agents ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses."""
+    def frame(
+        self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int,
+        slots: Int[Array, " S"] | None = None,
+    ) -> Frame:  # fmt: skip
+        """Return all agents ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses.
+
+        ``slots`` selects agents.
+        """
         agents = self.traffic.agents(bank, context, back)
-        return frame_of(bank, context.index, context.step, agents, driven, back)
+        return frame_of(bank, context.index, context.step, agents, driven, back, slots)
 
     def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
         """Return all agents now, around one driven agent."""

@@ -68,6 +68,11 @@ class Frame:
     kind: Int[Array, "*batch S"]
     lights: Int[Array, "*batch L"]
 
+    def at(self, slots: Int[Array, " K"]) -> Frame:
+        """Return the frame of some slots, unbatched."""
+        agents = {name: getattr(self, name)[slots] for name in ("box", "velocity", "z", "valid", "kind")}
+        return Frame(**agents, lights=self.lights)
+
 
 @record
 class Facts:

@@ -61,8 +61,8 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
     }
 )
 
-#: Frame of all agents 0 to 15 steps ago; the number is static.
-Frames = Callable[[int], Frame]
+#: Frame of all agents 0 to 15 steps ago; the number is static. A second argument selects slots.
+Frames = Callable[..., Frame]
 
 
 @record

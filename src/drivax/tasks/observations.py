@@ -223,17 +223,17 @@ def _agents(
     exists = visible[chosen] & (jnp.arange(config.agents) < slots)
 
     def row(back: int) -> tuple[Float[Array, "K F"], Bool[Array, " K"]]:
-        frame = frame_now if back == 0 else frames(back)
-        box, x = frame.box[chosen], context.history[HISTORY - 1 - back]
+        # Of the past only the rows of these agents are read.
+        frame, x = frames(back, chosen), context.history[HISTORY - 1 - back]
         ego_velocity = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
         parts = {
-            "position": lambda: view.point(box[:, :2]) / POSITION_M,
-            "heading": lambda: view.vector(box[:, 2:4])[:, ::-1],
-            "velocity": lambda: view.vector(frame.velocity[chosen]) / SPEED_MPS,
-            "relative_velocity": lambda: view.vector(frame.velocity[chosen] - ego_velocity) / SPEED_MPS,
+            "position": lambda: view.point(frame.box[:, :2]) / POSITION_M,
+            "heading": lambda: view.vector(frame.box[:, 2:4])[:, ::-1],
+            "velocity": lambda: view.vector(frame.velocity) / SPEED_MPS,
+            "relative_velocity": lambda: view.vector(frame.velocity - ego_velocity) / SPEED_MPS,
             "time": lambda: jnp.full((config.agents, 1), -DT_S * back),
         }
-        return features.concatenate_features(chosen_features, parts, (config.agents,)), frame.valid[chosen]
+        return features.concatenate_features(chosen_features, parts, (config.agents,)), frame.valid
 
     past = [row(back) for back in range(config.steps - 1, -1, -1)]
     moving, mask = (jnp.stack(rows, axis=1) for rows in zip(*past, strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -23,6 +22,7 @@ from drivax.simulator.types import (
     Surroundings,
 )
 from drivax.tasks.actions import ActionSpace, Physical
+from drivax.tasks.features import Frames
 from drivax.tasks.observations import Observation, ObservationConfig, observe
 from drivax.tasks.rewards import RewardConfig
 
@@ -76,10 +76,16 @@ class Task:
         return self.actions.first(history, length)
 
     def observe(
-        self, bank: ScenarioBank, context: AgentContext, agents: Callable[[int], Frame], frame: Frame
+        self, bank: ScenarioBank, context: AgentContext, agents: Frames, frame: Frame
     ) -> Observation:
-        """Return the observation of a context; ``agents`` returns the frame of all agents some steps ago."""
-        return observe(self.observation, bank, context, lambda back: agents(back) if back else frame)
+        """Return the observation of a context; ``agents`` returns earlier frames, ``frame`` is the present one."""
+
+        def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
+            if back:
+                return agents(back, slots)
+            return frame if slots is None else frame.at(slots)
+
+        return observe(self.observation, bank, context, frames)
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
         """Return weighted reward terms by name."""
