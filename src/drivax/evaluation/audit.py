@@ -78,8 +78,8 @@ class _Watch:
     def motion(self, motion: Array, action: Array, length: Any) -> Array:
         return PHYSICAL.move(motion, action, length)
 
-    def actuated(self, motion: Array, action: Array, last: Array, length: Any) -> Array:
-        return PHYSICAL.actuated(motion, action, last, length)
+    def actuate(self, motion: Array, action: Array, last: Array, length: Any) -> Array:
+        return PHYSICAL.actuate(motion, action, last, length)
 
     def coast(self, motion: Array, length: Any) -> Array:
         return jnp.zeros(2)
@@ -95,7 +95,7 @@ class _Watch:
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Array]:
         return {}
 
-    def ended(self, bank: ScenarioBank, context: AgentContext, facts: Facts) -> tuple[Array, Array]:
+    def check_end(self, bank: ScenarioBank, context: AgentContext, facts: Facts) -> tuple[Array, Array]:
         return jnp.zeros((), bool), jnp.zeros((), bool)
 
     def episode_start(self) -> None:
@@ -122,7 +122,8 @@ def replay(bank: ScenarioBank, index: Int[Array, " B"], driven: bool = False) ->
             logged = logged_motion(bank, state.context, 1)
             after, _transition = simulator.replay(bank, state, logged, action)
         clipped = {
-            name: space.clipped(expert_action(bank, state.context, space)) for name, space in _SPACES.items()
+            name: space.exceeds_bounds(expert_action(bank, state.context, space))
+            for name, space in _SPACES.items()
         }
         return after, _read(after.facts) | clipped
 

@@ -108,7 +108,7 @@ class PlannerTraffic:
             seen = self.task.observe(bank, situation.context, frames, frame)
             requested, _ = data_of(bank, TrafficPolicy).planner.act((), bank, state, situation, seen, key)
             length_m = bank.length_m(agent.index, agent.slot)
-            action = self.task.actuated(agent.history[-1], requested, agent.action, length_m)
+            action = self.task.actuate(agent.history[-1], requested, agent.action, length_m)
             motion = self.task.motion(agent.history[-1], action, length_m)
             history = jnp.concatenate([agent.history[1:], motion[None]])
             return replace(situation.context, step=agent.step + 1, history=history, action=action)

@@ -48,7 +48,7 @@ def logged_poses(bank: ScenarioBank, context: AgentContext, steps: int) -> Float
 
 
 def expert_action(bank: ScenarioBank, context: AgentContext, actions: ActionSpace) -> Action:
-    """Return the action that follows the log from here; not clipped, for ``actions.clipped``."""
+    """Return the action that follows the log from here; not clipped, for ``actions.exceeds_bounds``."""
     if isinstance(actions, Trajectory):
         return actions.plan(logged_poses(bank, context, actions.steps))
     ahead, beyond = logged_motion(bank, context, 1), logged_motion(bank, context, 2)

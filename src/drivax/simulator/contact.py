@@ -15,7 +15,7 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import Frame
 
 TTC_HORIZON_S = 5.0
-#: Gaps are given up to here, m.
+#: Largest gap, m.
 FARTHEST_GAP_M = 50.0
 #: Below this speed a car stands (semantics, ``at_fault_collision`` and ``ttc``).
 STOPPED_MPS = 0.05
@@ -94,7 +94,7 @@ def next_contacts(
 
 
 def relative(frame: Frame, slot: Integer) -> tuple[Array, Array, Array, Array]:
-    """Return the centre of every slot in the agent's frame (ahead, left), and cosine and sine of its heading there."""
+    """Return the centre of every slot in the agent's frame (ahead, left), and cosine and sine of its heading in it."""
     me = frame.box[slot]
     dx, dy = frame.box[:, X] - me[X], frame.box[:, Y] - me[Y]
     cos = frame.box[:, COS] * me[COS] + frame.box[:, SIN] * me[SIN]
@@ -136,27 +136,27 @@ def classify_contacts(
     return fresh & fault, jnp.where(fresh.any(), kind[nearest], c.NONE).astype(jnp.int8)
 
 
-def time_to_collision(frame: Frame, slot: Integer, left_out: Bool[Array, " S"]) -> Scalar:
+def time_to_collision(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scalar:
     """Return the time to the first overlap at constant velocities and headings, s, at most 5 (semantics, ``ttc``).
 
-    Agents entirely behind the rear axle are followers and never count, nor do those in ``left_out``, such as one that
+    Agents entirely behind the rear axle are followers and never count, nor do those in ``ignored``, such as one that
     ran into the agent without its fault. All others count, in whatever direction: one that overlaps within the horizon
     is ahead or comes into the lane that the agent sweeps.
     """
     me = frame.box[slot]
     ahead, _, cos, sin = relative(frame, slot)
     reach = jnp.abs(cos) * frame.box[:, LENGTH] / 2 + jnp.abs(sin) * frame.box[:, WIDTH] / 2
-    counts = others_on_level(frame, slot) & ~left_out & (ahead + reach > -REAR_AXLE * me[LENGTH])
+    counts = others_on_level(frame, slot) & ~ignored & (ahead + reach > -REAR_AXLE * me[LENGTH])
     times = time_to_overlap(me, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)
     return jnp.min(jnp.where(counts, times, TTC_HORIZON_S))
 
 
-def nearest_gap(frame: Frame, slot: Integer, left_out: Bool[Array, " S"]) -> Scalar:
+def nearest_gap(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scalar:
     """Return the gap to the nearest other box on the agent's level, m, at most 50; 0 where they overlap.
 
-    Agents in ``left_out`` do not count, such as those that have overlapped it since they appeared.
+    Agents in ``ignored`` do not count, such as those that have overlapped it since they appeared.
     """
-    counts = others_on_level(frame, slot) & ~left_out
+    counts = others_on_level(frame, slot) & ~ignored
     # Boxes of empty slots may hold anything; the agent's own one, pushed away, keeps gradients finite.
     gaps = gap(frame.box[slot], jnp.where(counts[:, None], frame.box, frame.box[slot]))
     return jnp.min(jnp.where(counts, jnp.minimum(gaps, FARTHEST_GAP_M), FARTHEST_GAP_M))

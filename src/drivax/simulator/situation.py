@@ -58,11 +58,11 @@ def measure(
     around = surroundings(bank, context, frame)
     lanes, route, me = around.lanes, around.route, frame.box[context.slot]
     ground = _ground(bank, context, frame)
-    beyond, left_map, offroad = off_the_road(bank, context.index, me, ground, lanes)
+    offroad_m, left_map, offroad = off_the_road(bank, context.index, me, ground, lanes)
     z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
     context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
     # Off the map a lateral hit is a fault as it is off the road.
-    beyond_road = lanes.leaving_lane | (beyond > queries.OFFROAD_TOLERANCE_M)
+    beyond_road = lanes.leaving_lane | (offroad_m > queries.OFFROAD_TOLERANCE_M)
     codes, fault, kind, ttc = _touch(context, frame, previous, contacts, beyond_road, reads)
     routed = ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
     red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
@@ -75,7 +75,7 @@ def measure(
         at_fault=fault,
         collision_type=kind,
         offroad=offroad,
-        offroad_m=beyond,
+        offroad_m=offroad_m,
         left_map=left_map,
         red_light=red,
         ttc_s=ttc,
@@ -202,9 +202,9 @@ def off_the_road(
     bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: queries.LaneHits
 ) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
     """Return how far the worst corner of a box is off the road (m), whether it left the map, and whether the road."""
-    beyond = queries.offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
-    off = (beyond > queries.OFFROAD_TOLERANCE_M) & queries.is_mapped(bank, index)
-    return beyond, queries.left_the_map(bank, index, me[:2]), off
+    offroad_m = queries.offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
+    off = (offroad_m > queries.OFFROAD_TOLERANCE_M) & queries.is_mapped(bank, index)
+    return offroad_m, queries.left_the_map(bank, index, me[:2]), off
 
 
 def _rates(history: Float[Array, "history 4"]) -> tuple[Scalar, Scalar, Scalar]:

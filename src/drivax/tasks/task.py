@@ -63,9 +63,9 @@ class Task:
         """Return the next motion by the dynamics of the action space."""
         return self.actions.move(motion, action, length)
 
-    def actuated(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
+    def actuate(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
         """Return the executed action, within bounds and actuator rates."""
-        return self.actions.actuated(motion, action, last, length)
+        return self.actions.actuate(motion, action, last, length)
 
     def coast(self, motion: Motion, length: Any) -> Action:
         """Return the action that keeps speed and heading."""
@@ -75,9 +75,7 @@ class Task:
         """Return the last action at the start of an episode."""
         return self.actions.first(history, length)
 
-    def observe(
-        self, bank: ScenarioBank, context: AgentContext, agents: Frames, frame: Frame
-    ) -> Observation:
+    def observe(self, bank: ScenarioBank, context: AgentContext, agents: Frames, frame: Frame) -> Observation:
         """Return the observation of a context; ``agents`` returns earlier frames, ``frame`` is the present one."""
 
         def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
@@ -91,7 +89,7 @@ class Task:
         """Return weighted reward terms by name."""
         return self.rewards.weigh(before, now, around)
 
-    def ended(
+    def check_end(
         self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Return terminated (by a failure) and truncated (at the end of log or map)."""
