@@ -83,6 +83,13 @@ class View:
         """Transform a position, m."""
         return rotate(xy - self.xy, self.cos, -self.sin)
 
+    def rotate(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Transform the components of a direction, velocity or offset: ahead and left.
+
+        The order of the terms keeps the rounding of :meth:`point` and :meth:`vector`, where products are fused.
+        """
+        return x * self.cos + y * self.sin, -(x * self.sin - y * self.cos)
+
     def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
         """Transform a direction or velocity."""
         return rotate(xy, self.cos, -self.sin)

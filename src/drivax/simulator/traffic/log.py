@@ -81,7 +81,8 @@ def frame_of(
         agents = agents.at[slots].get(mode="fill", fill_value=0.0)
         box, parked, words, more = box[slots], parked[slots], words[slots], 0
         match = (slots[:, None] == driven.slot) & (slots[:, None] < moving)
-        number = jnp.where(match.any(axis=0), jnp.argmax(match, axis=0), len(slots))
+        place = jnp.where(match, jnp.arange(len(slots))[:, None], 0).sum(axis=0)
+        number = jnp.where(match.any(axis=0), place, len(slots))
     # Before the recording no other agent was seen.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
     # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
