@@ -54,7 +54,7 @@ def drive(bank, index):
         situation = simulator.situation(bank, state)
         action, _ = planner.act((), bank, state, situation, seen, jax.random.key(0))
         length_m = bank.length_m(index, 0)
-        action = DRIVING.task.actuated(state.context.history[-1], action, state.context.action, length_m)
+        action = DRIVING.task.actuate(state.context.history[-1], action, state.context.action, length_m)
         after, made = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
         following = simulator.observe(bank, after.context)
         return after, (dict(seen), action, made.reward, made.terminated, dict(following), made.truncated)

@@ -347,7 +347,7 @@ def test_controller_stops_as_with_the_published_poses():
     def step(now, _):
         motion, last = now
         plan = stop(space, motion, braking(motion[3], last[0]), length)
-        last = space.actuated(motion, plan, last, length)
+        last = space.actuate(motion, plan, last, length)
         return (space.move(motion, last, length), last), motion
 
     start = jnp.array([0.0, 0.0, 0.0, 5.0]), jnp.zeros(space.size)

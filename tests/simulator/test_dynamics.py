@@ -41,7 +41,7 @@ def drive(space, motion, action, steps, last=None):
 
     def one(now, _):
         motion, last = now
-        carried = space.actuated(motion, action, last, LENGTH_M)
+        carried = space.actuate(motion, action, last, LENGTH_M)
         motion = space.move(motion, carried, LENGTH_M)
         return (motion, carried), (motion, carried)
 
@@ -127,9 +127,9 @@ def test_zero_action_adds_nothing_and_bounds_clip(name):
         expected = [1.0 + 0.4 * np.cos(0.5), 2.0 + 0.4 * np.sin(0.5), 0.5, 4.0]
         np.testing.assert_allclose(after, expected, rtol=1e-6)
     action = jnp.full(space.size, 7.0)
-    carried = np.asarray(space.actuated(motion, action, action.at[:].set(1.0), LENGTH_M))
+    carried = np.asarray(space.actuate(motion, action, action.at[:].set(1.0), LENGTH_M))
     np.testing.assert_allclose(carried, 1.0, rtol=1e-6)
-    assert bool(space.clipped(action)) and not bool(space.clipped(jnp.ones(space.size)))
+    assert bool(space.exceeds_bounds(action)) and not bool(space.exceeds_bounds(jnp.ones(space.size)))
 
 
 @pytest.mark.parametrize("name", SPACES)
@@ -138,7 +138,7 @@ def test_every_space_maps_controls_to_actions(name):
     space, motion = SPACES[name], jnp.array([1.0, 2.0, 0.5, 9.0])
     action = space.action(motion, jnp.float32(1.0), jnp.float32(0.03), LENGTH_M)
     last = space.action(motion, jnp.float32(0.5), jnp.float32(0.02), LENGTH_M)
-    after = np.asarray(space.move(motion, space.actuated(motion, action, last, LENGTH_M), LENGTH_M))
+    after = np.asarray(space.move(motion, space.actuate(motion, action, last, LENGTH_M), LENGTH_M))
     wanted = np.asarray(bicycle(motion, jnp.float32(1.0), jnp.float32(0.03)))
     near = 0.05 if name == "discrete" else 0.02
     np.testing.assert_allclose(after, wanted, atol=near)
@@ -160,9 +160,9 @@ def test_expert_actions_of_each_space_follow_a_log(name):
         def one(now, t):
             motion, last = now
             wanted = space.expert(motion, log[t + 1], log[t + 2], LENGTH_M)
-            carried = space.actuated(motion, wanted, last, LENGTH_M)
+            carried = space.actuate(motion, wanted, last, LENGTH_M)
             motion = space.move(motion, carried, LENGTH_M)
-            return (motion, carried), (motion, space.clipped(wanted))
+            return (motion, carried), (motion, space.exceeds_bounds(wanted))
 
         history = jnp.broadcast_to(log[0], (16, 4))
         return jax.lax.scan(one, (log[0], space.first(history, LENGTH_M)), jnp.arange(40))[1]
@@ -181,7 +181,7 @@ def test_levels_are_denser_near_zero_and_contain_it():
     assert DISCRETE.choices == 91 and found == list(range(0, 91, 5))
     np.testing.assert_array_equal(DISCRETE.of_index(jnp.int32(45)), [0.0, 0.0])
     # 0.05 is nearer to 1/36 than to 4/36, and 0.3 to 4/9 than to 1/9.
-    snapped = DISCRETE.actuated(jnp.zeros(4), jnp.array([0.3, 0.05]), jnp.zeros(2), LENGTH_M)
+    snapped = DISCRETE.actuate(jnp.zeros(4), jnp.array([0.3, 0.05]), jnp.zeros(2), LENGTH_M)
     np.testing.assert_allclose(snapped, [4 / 9, 1 / 36], rtol=1e-6)
 
 

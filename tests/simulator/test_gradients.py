@@ -30,7 +30,7 @@ SPACES = {
 def rollout(space, motion, actions):
     def one(now, action):
         motion, last = now
-        carried = space.actuated(motion, action, last, LENGTH_M)
+        carried = space.actuate(motion, action, last, LENGTH_M)
         motion = space.move(motion, carried, LENGTH_M)
         return (motion, carried), motion
 

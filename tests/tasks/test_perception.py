@@ -1,6 +1,7 @@
 """Perception: lines of sight against shapely; noise, range and drop-out as of a tracker."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -242,9 +243,7 @@ def test_perception_without_errors_draws_no_random_numbers(bank):
 
         def look(bank):
             context = simulator.context(bank, 0, 20)
-            return observe(
-                config, bank, context, lambda back: simulator.frame(bank, context, _alone(context), back)
-            )
+            return observe(config, bank, context, partial(simulator.frame, bank, context, _alone(context)))
 
         return str(jax.make_jaxpr(look)(bank))
 

@@ -80,13 +80,16 @@ def test_termination_and_truncation_are_separate(measured):
     facts, _ = measured
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
     task, context = Task(), Simulator(Task()).context(bank, 0, 90)
-    ends = jax.tree.map(bool, task.ended(bank, context, facts))
+    ends = jax.tree.map(bool, task.check_end(bank, context, facts))
     assert ends == (False, True)
     crash = replace(facts, collision=jnp.asarray(True))
-    assert jax.tree.map(bool, task.ended(bank, context, crash)) == (True, False)
-    assert jax.tree.map(bool, replace(task, to_the_end=True).ended(bank, context, crash)) == (False, True)
+    assert jax.tree.map(bool, task.check_end(bank, context, crash)) == (True, False)
+    assert jax.tree.map(bool, replace(task, to_the_end=True).check_end(bank, context, crash)) == (False, True)
     away = replace(facts, left_map=jnp.asarray(True))
-    assert jax.tree.map(bool, task.ended(bank, Simulator(task).context(bank, 0, 20), away)) == (False, True)
+    assert jax.tree.map(bool, task.check_end(bank, Simulator(task).context(bank, 0, 20), away)) == (
+        False,
+        True,
+    )
 
 
 @pytest.mark.parametrize(

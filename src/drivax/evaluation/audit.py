@@ -81,8 +81,8 @@ class _EmptyTask:
     def motion(self, motion: Array, action: Array, length: Any) -> Array:
         return PHYSICAL.move(motion, action, length)
 
-    def actuated(self, motion: Array, action: Array, last: Array, length: Any) -> Array:
-        return PHYSICAL.actuated(motion, action, last, length)
+    def actuate(self, motion: Array, action: Array, last: Array, length: Any) -> Array:
+        return PHYSICAL.actuate(motion, action, last, length)
 
     def coast(self, motion: Array, length: Any) -> Array:
         return jnp.zeros(2)
@@ -98,7 +98,7 @@ class _EmptyTask:
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Array]:
         return {}
 
-    def ended(self, bank: ScenarioBank, context: AgentContext, facts: Facts) -> tuple[Array, Array]:
+    def check_end(self, bank: ScenarioBank, context: AgentContext, facts: Facts) -> tuple[Array, Array]:
         return jnp.zeros((), bool), jnp.zeros((), bool)
 
     def episode_start(self) -> None:
@@ -126,7 +126,7 @@ def replay(bank: ScenarioBank, index: Int[Array, " B"], use_dynamics: bool = Fal
             logged_pose = logged_motion(bank, state.context, 1)
             next_state, _transition = simulator.replay(bank, state, logged_pose, action)
         exceeds_bounds = {
-            name: space.clipped(expert_action(bank, state.context, space))
+            name: space.exceeds_bounds(expert_action(bank, state.context, space))
             for name, space in _ACTION_SPACES.items()
         }
         return next_state, _select_facts(next_state.facts) | exceeds_bounds

@@ -188,7 +188,7 @@ def advance(
     context, motion = state.context, state.context.history[-1]
     length_m = bank.length_m(context.index, context.slot)
     if planner.replays:
-        action = simulator.task.actuated(motion, action, context.action, length_m)
+        action = simulator.task.actuate(motion, action, context.action, length_m)
         logged_pose = logged_motion(bank, context, 1)
         return simulator.replay(bank, state, logged_pose, action)[0], carry, jnp.ones((), bool)
     is_finite, coast = jnp.isfinite(action).all(), simulator.task.coast(motion, length_m)

@@ -187,8 +187,8 @@ class Driving:
         space = self.task.actions
         action = expert_action(bank, context, space)
         length_m = bank.length_m(context.index, context.slot)
-        executed = space.actuated(context.history[-1], action, context.action, length_m)
-        return executed, space.clipped(action)
+        executed = space.actuate(context.history[-1], action, context.action, length_m)
+        return executed, space.exceeds_bounds(action)
 
     def _rollout(self, bank: ScenarioBank, index: Int[Array, ""]) -> tuple[Array, ...]:
         """Action, reward, terminated, truncated and clipped of the expert in one scenario from the current step on."""

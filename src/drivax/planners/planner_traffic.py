@@ -92,9 +92,9 @@ class PlannerTraffic:
         """Advance all agents by one step of 0.1 s from the present frame."""
         now = context.traffic
 
-        def frames(back: int) -> Frame:
+        def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
             rows = self.agents(bank, context, back)
-            return frame_of(bank, context.index, context.step, rows, alone(context), back) if back else frame
+            return frame_of(bank, context.index, context.step, rows, alone(context), back, slots)
 
         def drive(agent: AgentContext) -> AgentContext:
             apart = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
@@ -108,7 +108,7 @@ class PlannerTraffic:
             seen = self.task.observe(bank, situation.context, frames, frame)
             requested, _ = data_of(bank, TrafficPolicy).planner.act((), bank, state, situation, seen, key)
             length_m = bank.length_m(agent.index, agent.slot)
-            action = self.task.actuated(agent.history[-1], requested, agent.action, length_m)
+            action = self.task.actuate(agent.history[-1], requested, agent.action, length_m)
             motion = self.task.motion(agent.history[-1], action, length_m)
             history = jnp.concatenate([agent.history[1:], motion[None]])
             return replace(situation.context, step=agent.step + 1, history=history, action=action)

@@ -49,7 +49,7 @@ def logged_poses(bank: ScenarioBank, context: AgentContext, steps: int) -> Float
 
 
 def expert_action(bank: ScenarioBank, context: AgentContext, actions: ActionSpace) -> Action:
-    """Return the action that follows the log from the present motion, not yet clipped (see ``actions.clipped``)."""
+    """Return the action that follows the log from the present motion, unclipped (``actions.exceeds_bounds``)."""
     if isinstance(actions, Trajectory):
         return actions.plan(logged_poses(bank, context, actions.steps))
     first, second = logged_motion(bank, context, 1), logged_motion(bank, context, 2)

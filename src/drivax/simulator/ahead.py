@@ -21,7 +21,7 @@ _STEP_M, _POINTS = 2.0, 46
 _FALLBACK_LIMIT_MPS = 13.4
 #: Free space kept next to the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
-#: Agents further from the route than this and half of ego's width are left out, m.
+#: Agents further from the route than this and half of ego's width are ignored, m.
 _NEAR_M = 0.4
 #: A yellow light counts as red for a car that can stop with this deceleration, m/s2.
 _YELLOW_BRAKING_MPS2 = 3.0
@@ -50,14 +50,14 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     """
     me = frame.box[context.slot]
     offsets = jnp.arange(_POINTS) * _STEP_M
-    path, there = route_ahead(bank, context.index, context.route_m, offsets)
+    path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
     # Only the closest agents near the route are measured against all of its points.
-    nodes = jnp.where(there[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
+    nodes = jnp.where(on_route[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
     near = reaching(boxes, nodes, (me[5:6] / 2 + _NEAR_M)[None], 2.0 * _STEP_M, 2.0 * _STEP_M, 9)
     slots, real = closest(near & others_on_level(frame, context.slot), me[None], boxes)
     box, velocity = frame.box[slots[0]], frame.velocity[slots[0]]
-    along, lateral, cos, sin = project(path, there, offsets, box[:, :2], box[:, 2:4])
+    along, lateral, cos, sin = project(path, on_route, offsets, box[:, :2], box[:, 2:4])
     half_length = jnp.abs(cos) * box[:, 4] / 2 + jnp.abs(sin) * box[:, 5] / 2
     half_width = jnp.abs(sin) * box[:, 4] / 2 + jnp.abs(cos) * box[:, 5] / 2
     blocks = real[0] & (jnp.abs(lateral) < half_width + me[5] / 2 + _SIDE_M) & (along > 0.0)
@@ -67,7 +67,7 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
     gap = jnp.minimum(gaps[nearest], stop)
     leader = jnp.where(stop < gaps[nearest], 0.0, speed[nearest])
-    desired = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
+    desired = jnp.where(on_route[1], desired_speed(path, on_route, offsets), 0.0)
     return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
 
 
@@ -81,19 +81,19 @@ def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scal
     return jnp.min(jnp.where(stops, front, jnp.inf))
 
 
-def desired_speed(path: Array, there: Array, offsets: Array) -> Scalar:
-    """Return the speed limit here, or what the curves ahead allow with gentle braking, m/s."""
+def desired_speed(path: Array, on_route: Array, offsets: Array) -> Scalar:
+    """Return the present speed limit, or what the curves ahead allow with gentle braking, m/s."""
     limit = jnp.where(path[0, RouteColumn.LIMIT] > 0, path[0, RouteColumn.LIMIT], _FALLBACK_LIMIT_MPS)
     cos, sin = path[:, RouteColumn.COS], path[:, RouteColumn.SIN]
     dot, cross = cos[1:] * cos[:-1] + sin[1:] * sin[:-1], cos[:-1] * sin[1:] - cos[1:] * sin[:-1]
     curvature = jnp.arctan2(jnp.abs(cross), dot) / _STEP_M
-    curvature = jnp.where(there[1:], curvature, 0.0)
+    curvature = jnp.where(on_route[1:], curvature, 0.0)
     allowed = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
     return jnp.minimum(limit, jnp.sqrt(jnp.min(allowed)))
 
 
 def project(
-    path: Float[Array, "K 7"], there: Array, offsets: Float[Array, " K"], xy: Float[Array, "S 2"],
+    path: Float[Array, "K 7"], on_route: Array, offsets: Float[Array, " K"], xy: Float[Array, "S 2"],
     heading: Float[Array, "S 2"],
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Return arc length ahead and lateral offset of points on a path, and relative cosine and sine of headings.
@@ -101,7 +101,7 @@ def project(
     Beyond either end of the path the tangent goes on, and the lateral offset is infinite.
     """
     dx, dy = xy[:, None, 0] - path[:, 0], xy[:, None, 1] - path[:, 1]
-    nearest = first_smallest(jnp.where(there, dx * dx + dy * dy, jnp.inf))
+    nearest = first_smallest(jnp.where(on_route, dx * dx + dy * dy, jnp.inf))
     row = path[nearest]
     x, y = xy[:, 0] - row[:, 0], xy[:, 1] - row[:, 1]
     cos, sin = row[:, RouteColumn.COS], row[:, RouteColumn.SIN]

@@ -10,14 +10,17 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, gap, overlap, time_to_overlap
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import Integer, Scalar
+from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import Frame
 
 TTC_HORIZON_S = 5.0
-#: Gaps are given up to here, m.
+#: Largest gap, m.
 FARTHEST_GAP_M = 50.0
 #: Below this speed a car stands (semantics, ``at_fault_collision`` and ``ttc``).
 STOPPED_MPS = 0.05
+#: Tangent of 30 degrees.
+_TAN_30 = 3.0**-0.5
 #: Rear axle behind the box centre, as a share of the length (nuPlan's vehicle: 1.461 m of 5.176 m).
 REAR_AXLE = 1.461 / 5.176
 
@@ -91,7 +94,7 @@ def next_contacts(
 
 
 def relative(frame: Frame, slot: Integer) -> tuple[Array, Array, Array, Array]:
-    """Return the centre of every slot in the agent's frame (ahead, left), and cosine and sine of its heading there."""
+    """Return the centre of every slot in the agent's frame (ahead, left), and cosine and sine of its heading in it."""
     me = frame.box[slot]
     dx, dy = frame.box[:, X] - me[X], frame.box[:, Y] - me[Y]
     cos = frame.box[:, COS] * me[COS] + frame.box[:, SIN] * me[SIN]
@@ -111,8 +114,8 @@ def classify_contacts(
     """
     me = frame.box[slot]
     ahead, left, cos, _ = relative(frame, slot)
-    bearing = jnp.arctan2(jnp.abs(left), ahead + REAR_AXLE * me[LENGTH])
-    behind = bearing > 5 * jnp.pi / 6
+    # Its bearing from the rear axle is over 150 degrees.
+    behind = jnp.abs(left) < -_TAN_30 * (ahead + REAR_AXLE * me[LENGTH])
     # The front bumper as a thin box.
     x, y = me[X] + me[LENGTH] / 2 * me[COS], me[Y] + me[LENGTH] / 2 * me[SIN]
     bumper = jnp.stack([x, y, me[COS], me[SIN], jnp.full((), 0.02), me[WIDTH]])
@@ -129,31 +132,31 @@ def classify_contacts(
     kind = jnp.full(front.shape, c.SIDE_SWIPE)
     for case, name in reversed(cases):  # jnp.select, an argmax over all cases, is slower
         kind = jnp.where(case, name, kind)
-    nearest = jnp.argmin(jnp.where(fresh, ahead**2 + left**2, jnp.inf))
+    nearest = first_smallest(jnp.where(fresh, ahead**2 + left**2, jnp.inf))
     return fresh & fault, jnp.where(fresh.any(), kind[nearest], c.NONE).astype(jnp.int8)
 
 
-def time_to_collision(frame: Frame, slot: Integer, left_out: Bool[Array, " S"]) -> Scalar:
+def time_to_collision(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scalar:
     """Return the time to the first overlap at constant velocities and headings, s, at most 5 (semantics, ``ttc``).
 
-    Agents entirely behind the rear axle are followers and never count, nor do those in ``left_out``, such as one that
+    Agents entirely behind the rear axle are followers and never count, nor do those in ``ignored``, such as one that
     ran into the agent without its fault. All others count, in whatever direction: one that overlaps within the horizon
     is ahead or comes into the lane that the agent sweeps.
     """
     me = frame.box[slot]
     ahead, _, cos, sin = relative(frame, slot)
     reach = jnp.abs(cos) * frame.box[:, LENGTH] / 2 + jnp.abs(sin) * frame.box[:, WIDTH] / 2
-    counts = others_on_level(frame, slot) & ~left_out & (ahead + reach > -REAR_AXLE * me[LENGTH])
+    counts = others_on_level(frame, slot) & ~ignored & (ahead + reach > -REAR_AXLE * me[LENGTH])
     times = time_to_overlap(me, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)
     return jnp.min(jnp.where(counts, times, TTC_HORIZON_S))
 
 
-def nearest_gap(frame: Frame, slot: Integer, left_out: Bool[Array, " S"]) -> Scalar:
+def nearest_gap(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scalar:
     """Return the gap to the nearest other box on the agent's level, m, at most 50; 0 where they overlap.
 
-    Agents in ``left_out`` do not count, such as those that have overlapped it since they appeared.
+    Agents in ``ignored`` do not count, such as those that have overlapped it since they appeared.
     """
-    counts = others_on_level(frame, slot) & ~left_out
+    counts = others_on_level(frame, slot) & ~ignored
     # Boxes of empty slots may hold anything; the agent's own one, pushed away, keeps gradients finite.
     gaps = gap(frame.box[slot], jnp.where(counts[:, None], frame.box, frame.box[slot]))
     return jnp.min(jnp.where(counts, jnp.minimum(gaps, FARTHEST_GAP_M), FARTHEST_GAP_M))

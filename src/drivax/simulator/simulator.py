@@ -91,10 +91,16 @@ class Simulator:
         context = self.context(bank, index, step, slot, key)
         return EpisodeStart(context, remember_lights(bank, context))
 
-    def frame(self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int) -> Frame:
-        """Return all agents ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses."""
+    def frame(
+        self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int,
+        slots: Int[Array, " S"] | None = None,
+    ) -> Frame:  # fmt: skip
+        """Return all agents ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses.
+
+        ``slots`` selects agents.
+        """
         agents = self.traffic.agents(bank, context, back)
-        return frame_of(bank, context.index, context.step, agents, driven, back)
+        return frame_of(bank, context.index, context.step, agents, driven, back, slots)
 
     def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
         """Return all agents now, around one driven agent."""
@@ -166,8 +172,8 @@ class Simulator:
 
         For collectors: the end of an episode costs one call that only resets, with a meaningless transition to mask. In
         exchange nothing is measured or observed twice, and a policy sees every state, final ones included, once.
-        ``fresh`` (:meth:`new_episode`) is read only where ``over``: :func:`map_where` computes it only
-        there. ``seen`` is ``now(bank, state.context)``, if already computed.
+        ``fresh`` (:meth:`new_episode`) is read only where ``over``, so :func:`map_where` need not compute the others.
+        ``seen`` is ``now(bank, state.context)``, if already computed.
         """
         seen = self.now(bank, state.context) if seen is None else seen
         traffic = self.traffic.advance(bank, state.context, seen)
@@ -200,7 +206,7 @@ class Simulator:
         """Move the driven agent one step, given traffic that has already moved."""
         if motion is None:
             now, length_m = context.history[-1], bank.length_m(context.index, context.slot)
-            action = self.task.actuated(now, action, context.action, length_m)
+            action = self.task.actuate(now, action, context.action, length_m)
             motion = self.task.motion(now, action, length_m)
         history = jnp.concatenate([context.history[1:], motion[None]])
         return replace(context, step=context.step + 1, history=history, action=action, traffic=traffic)
@@ -214,7 +220,7 @@ class Simulator:
         situation, contacts, lights = measure(
             bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
         )
-        terminated, truncated = self.task.ended(bank, situation.context, situation.facts)
+        terminated, truncated = self.task.check_end(bank, situation.context, situation.facts)
         terms = self.task.reward(before.facts, situation.facts, situation.surroundings)
         final = terminated | truncated | (moved.step >= bank.last_step[moved.index])
         episode = self.task.episode_add(before.episode, situation, before.start, final)
@@ -230,8 +236,8 @@ def slots_of(
 
     Missing ones are padded with A (an empty slot); further agents are left to traffic.
     """
-    there = mask & (bank.agents[index, step, :, AgentColumn.VALID] > 0)
-    return jnp.nonzero(there, size=count, fill_value=mask.shape[0])[0].astype(jnp.int32)
+    present = mask & (bank.agents[index, step, :, AgentColumn.VALID] > 0)
+    return jnp.nonzero(present, size=count, fill_value=mask.shape[0])[0].astype(jnp.int32)
 
 
 def is_driven(bank: ScenarioBank, states: SimState) -> Bool[Array, " K"]:

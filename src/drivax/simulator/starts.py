@@ -106,7 +106,7 @@ class NoisyStart:
         base = logged_history(bank, index, step - count, slot)
 
         def draw_history(key: Array) -> tuple[History, Bool[Array, ""]]:
-            history = self._driven(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
+            history = self._unroll(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
             return history, _acceptable(bank, index, step, slot, agents, history)
 
         histories, good = jax.vmap(draw_history)(jax.random.split(key, self.tries))
@@ -128,7 +128,7 @@ class NoisyStart:
         bound = _BOUND[0] + (_BOUND[1] - _BOUND[0]) * jnp.minimum(speed / _BOUND_MPS, 1.0)
         return self.scale * _ACCELERATION * share, self.scale * _CURVATURE * bound * turn
 
-    def _driven(self, history: History, count: Integer, acceleration: Scalar, curvature: Scalar) -> History:
+    def _unroll(self, history: History, count: Integer, acceleration: Scalar, curvature: Scalar) -> History:
         """Return a history after ``count`` steps of one action."""
 
         def advance(history: Array, place: Array) -> tuple[Array, None]:

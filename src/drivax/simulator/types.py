@@ -68,6 +68,11 @@ class Frame:
     kind: Int[Array, "*batch S"]
     lights: Int[Array, "*batch L"]
 
+    def at(self, slots: Int[Array, " K"]) -> Frame:
+        """Return the frame of some slots, unbatched."""
+        agents = {name: getattr(self, name)[slots] for name in ("box", "velocity", "z", "valid", "kind")}
+        return Frame(**agents, lights=self.lights)
+
 
 @record
 class Facts:
@@ -237,7 +242,7 @@ class Task(Protocol):
         """Return the next motion of the driven agent."""
         ...
 
-    def actuated(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
+    def actuate(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
         """Return the executed action for a requested ``action``, given the ``last`` executed one."""
         ...
 
@@ -259,7 +264,7 @@ class Task(Protocol):
         """Return the weighted reward terms by name."""
         ...
 
-    def ended(
+    def check_end(
         self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Return whether the episode is terminated, and whether it is truncated."""

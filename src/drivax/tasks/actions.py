@@ -61,11 +61,11 @@ class Physical:
         """Return the action that follows the log, from its motions one and two steps ahead; not clipped."""
         return self.action(motion, *follow(motion, target, beyond), length_m)
 
-    def clipped(self, action: Vector) -> Bool[Array, ""]:
+    def exceeds_bounds(self, action: Vector) -> Bool[Array, ""]:
         """Whether an action is outside the bounds."""
         return (jnp.abs(action) > 1.0 + _ROUNDING).any()
 
-    def actuated(self, motion: Motion, action: Vector, last: Vector, length_m: Any) -> Vector:
+    def actuate(self, motion: Motion, action: Vector, last: Vector, length_m: Any) -> Vector:
         """Clip an action to the bounds, and to the actuator rates given the last executed action.
 
         At standstill, the last acceleration counts as at least zero.
@@ -182,9 +182,9 @@ class Discrete(Physical):
         row = jnp.argmin(jnp.abs(accelerations - action[0]))
         return row * self.curvatures + jnp.argmin(jnp.abs(curvatures - action[1]))
 
-    def actuated(self, motion: Motion, action: Vector, last: Vector, length_m: Any) -> Vector:
+    def actuate(self, motion: Motion, action: Vector, last: Vector, length_m: Any) -> Vector:
         """Return the nearest level, limited as in :class:`Physical`."""
-        return super().actuated(motion, self.of_index(self.index(action)), last, length_m)
+        return super().actuate(motion, self.of_index(self.index(action)), last, length_m)
 
 
 def _levels(count: int, density: float) -> Float[Array, " count"]:
@@ -218,11 +218,11 @@ class DeltaLocal:
         """Return the displacement to the logged motion one step ahead; not clipped."""
         return self._action(*displacement(motion, target))
 
-    def clipped(self, action: Float[Array, " 3"]) -> Bool[Array, ""]:
+    def exceeds_bounds(self, action: Float[Array, " 3"]) -> Bool[Array, ""]:
         """Whether an action is outside the bounds or moves backwards by more than a millimetre."""
         return (jnp.abs(action) > 1.0 + _ROUNDING).any() | (action[0] * self.ahead_m < -1e-3)
 
-    def actuated(
+    def actuate(
         self, motion: Motion, action: Float[Array, " 3"], last: Float[Array, " 3"], length_m: Any
     ) -> Float[Array, " 3"]:
         """Return the action clipped to its bounds."""
@@ -230,7 +230,7 @@ class DeltaLocal:
 
     def move(self, motion: Motion, action: Float[Array, " 3"], length_m: Any) -> Motion:
         """Return the motion one step later."""
-        action = self.actuated(motion, action, action, length_m)
+        action = self.actuate(motion, action, action, length_m)
         shift = action[:2] * jnp.array([self.ahead_m, self.left_m])
         return displace(motion, shift, action[2] * self.turn_rad)
 
@@ -263,17 +263,17 @@ class DirectState:
         """Return the logged motion one step ahead."""
         return target
 
-    def clipped(self, action: Motion) -> Bool[Array, ""]:
+    def exceeds_bounds(self, action: Motion) -> Bool[Array, ""]:
         """Return False."""
         return jnp.zeros((), bool)
 
-    def actuated(self, motion: Motion, action: Motion, last: Motion, length_m: Any) -> Motion:
+    def actuate(self, motion: Motion, action: Motion, last: Motion, length_m: Any) -> Motion:
         """Return the motion with heading in [-pi, pi) and nonnegative speed."""
         return jnp.stack([action[0], action[1], wrap(action[2]), jnp.maximum(action[3], 0.0)])
 
     def move(self, motion: Motion, action: Motion, length_m: Any) -> Motion:
         """Return the motion one step later."""
-        return self.actuated(motion, action, action, length_m)
+        return self.actuate(motion, action, action, length_m)
 
     def sharpest(self, length_m: Any) -> Any:
         """Return the largest curvature: unlimited, 1/m."""
@@ -335,11 +335,11 @@ class Trajectory:
         """Return the plan through the present and two logged poses; ``expert_action`` plans the whole log."""
         return self.plan(jnp.stack([motion, target, beyond])[:, :3])
 
-    def clipped(self, action: Float[Array, " D"]) -> Bool[Array, ""]:
+    def exceeds_bounds(self, action: Float[Array, " D"]) -> Bool[Array, ""]:
         """Return False."""
         return jnp.zeros((), bool)
 
-    def actuated(
+    def actuate(
         self, motion: Motion, action: Float[Array, " D"], last: Float[Array, " D"], length_m: Any
     ) -> Float[Array, " D"]:
         """Return what the actuators do to follow the plan."""

@@ -41,12 +41,12 @@ def relative_velocity(
     Rows are in the order of the group ``agents``.
     """
     now, view, ego = frames(0), View.of(context), context.history[-1]
-    there = now.valid & (jnp.arange(len(now.valid)) != context.slot)
-    distance = jnp.where(there, norm(now.box[:, :2] - view.xy), jnp.inf)
+    present = now.valid & (jnp.arange(len(now.valid)) != context.slot)
+    distance = jnp.where(present, norm(now.box[:, :2] - view.xy), jnp.inf)
     rank = jnp.arange(_OTHERS)
     order = jnp.argsort(distance)[jnp.minimum(rank, len(distance) - 1)]
     own = jnp.stack([ego[3], jnp.zeros(())])
-    return (view.vector(now.velocity[order]) - own) / SPEED_MPS, there[order] & (rank < len(distance))
+    return (view.vector(now.velocity[order]) - own) / SPEED_MPS, present[order] & (rank < len(distance))
 
 
 def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
@@ -72,10 +72,10 @@ def recommended_speed(
 ) -> tuple[Float[Array, "K 1"], Bool[Array, " K"]]:
     """Return the recommended speed at ten route points 5 m apart, ``clip(30 - 25 |k|, 5, 30)`` m/s, in 15 m/s."""
     offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
-    _, there = route_ahead(bank, context.index, context.route_m, offsets)
+    _, valid = route_ahead(bank, context.index, context.route_m, offsets)
     curvature = features.route_curvature(bank, context.index, context.route_m + offsets)
-    there &= features.has_route(bank, context)
-    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there
+    valid &= features.has_route(bank, context)
+    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, valid
 
 
 def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
@@ -122,8 +122,8 @@ def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Floa
     gap = ahead - bank.length_m(context.index, context.slot) / 2
     state = frames(0).lights
     real = bank.light_line[context.index, LightRow.ARC] < NEVER_M
-    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
-    nearest = jnp.argmin(jnp.where(there, gap, jnp.inf))
-    distance = jnp.where(there.any(), gap[nearest] / POSITION_M, 1.0)
-    flags = jnp.stack([there & is_red(state), there])[:, nearest].astype(jnp.float32)
+    counts = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
+    nearest = jnp.argmin(jnp.where(counts, gap, jnp.inf))
+    distance = jnp.where(counts.any(), gap[nearest] / POSITION_M, 1.0)
+    flags = jnp.stack([counts & is_red(state), counts])[:, nearest].astype(jnp.float32)
     return jnp.stack([distance, *flags])

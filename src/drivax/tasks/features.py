@@ -61,8 +61,8 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
     }
 )
 
-#: Frame of all agents 0 to 15 steps ago; the number is static.
-Frames = Callable[[int], Frame]
+#: Frame of all agents 0 to 15 steps ago; the number is static. A second argument selects slots.
+Frames = Callable[..., Frame]
 
 
 @record
@@ -82,6 +82,13 @@ class View:
     def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
         """Transform a position, m."""
         return rotate(xy - self.xy, self.cos, -self.sin)
+
+    def rotate(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Transform the components of a direction, velocity or offset: ahead and left.
+
+        The order of the terms keeps the rounding of :meth:`point` and :meth:`vector`, where products are fused.
+        """
+        return x * self.cos + y * self.sin, -(x * self.sin - y * self.cos)
 
     def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
         """Transform a direction or velocity."""

@@ -74,13 +74,14 @@ class Perception:
 
 
 def perceive(
-    config: Perception, bank: ScenarioBank, context: AgentContext, frames: Callable[[int], Frame]
-) -> Callable[[int], Frame]:
+    config: Perception, bank: ScenarioBank, context: AgentContext, frames: Callable[..., Frame]
+) -> Callable[..., Frame]:
     """Return the perceived frames: undetected agents are not valid, undetected lights -1, and positions have errors.
 
     Ego itself is exact. ``frames`` returns the true frame of all agents some steps ago.
     """
-    return cache(lambda back: _add_errors(config, bank, context, frames(back), back))
+    perceived = cache(lambda back: _add_errors(config, bank, context, frames(back), back))
+    return lambda back, slots=None: perceived(back) if slots is None else perceived(back).at(slots)
 
 
 def _add_errors(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -23,6 +22,7 @@ from drivax.simulator.types import (
     Surroundings,
 )
 from drivax.tasks.actions import ActionSpace, Physical
+from drivax.tasks.features import Frames
 from drivax.tasks.observations import Observation, ObservationConfig, observe
 from drivax.tasks.rewards import RewardConfig
 
@@ -63,9 +63,9 @@ class Task:
         """Return the next motion by the dynamics of the action space."""
         return self.actions.move(motion, action, length)
 
-    def actuated(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
+    def actuate(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
         """Return the executed action, within bounds and actuator rates."""
-        return self.actions.actuated(motion, action, last, length)
+        return self.actions.actuate(motion, action, last, length)
 
     def coast(self, motion: Motion, length: Any) -> Action:
         """Return the action that keeps speed and heading."""
@@ -75,17 +75,21 @@ class Task:
         """Return the last action at the start of an episode."""
         return self.actions.first(history, length)
 
-    def observe(
-        self, bank: ScenarioBank, context: AgentContext, agents: Callable[[int], Frame], frame: Frame
-    ) -> Observation:
-        """Return the observation of a context; ``agents`` returns the frame of all agents some steps ago."""
-        return observe(self.observation, bank, context, lambda back: agents(back) if back else frame)
+    def observe(self, bank: ScenarioBank, context: AgentContext, agents: Frames, frame: Frame) -> Observation:
+        """Return the observation of a context; ``agents`` returns earlier frames, ``frame`` is the present one."""
+
+        def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
+            if back:
+                return agents(back, slots)
+            return frame if slots is None else frame.at(slots)
+
+        return observe(self.observation, bank, context, frames)
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
         """Return weighted reward terms by name."""
         return self.rewards.weigh(before, now, around)
 
-    def ended(
+    def check_end(
         self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Return terminated (by a failure) and truncated (at the end of log or map)."""

@@ -144,7 +144,7 @@ class EmergencyBrake:
 
         def on(now: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
             motion, last = now
-            executed = self.actions.actuated(motion, action, last, length_m)
+            executed = self.actions.actuate(motion, action, last, length_m)
             return (self.actions.move(motion, executed, length_m), executed), motion
 
         (end, _), drive = jax.lax.scan(on, (motion, last), None, steps)

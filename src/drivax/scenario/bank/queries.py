@@ -180,29 +180,35 @@ def around_lanes(
     rank = jnp.where(corridor & routed, 0.0, 0.2) + 1e-3 * (100.0 - rows[LaneRow.LIMIT])
     others = jnp.where(parallel & (own <= LANE_CUTOFF_M**2), 1.0 + own, 100.0 + own)
     rank = jnp.where(fits, rank, jnp.where(aligned, others, _FAR))
-    # Only these two lanes are read again, so that nothing else is stored for all of them.
-    two = jnp.stack([first_smallest(rank), first_smallest(own)])
-    lanes = rows[:, two]
-    (driven, nearest), (away, beyond) = lanes.T, to_segments(lanes, box)
-    near_driven, near = inside[two] & (away[0] <= LANE_CUTOFF_M**2)
+    # Only these lanes are read again, so that nothing else is stored for all of them.
+    numbers = jnp.stack([first_smallest(rank), first_smallest(own)])
+    lanes = rows[:, numbers]
+    (driven, nearest), (lane_squared, lane_side) = lanes.T, to_segments(lanes, box)
+    near_driven, near = inside[numbers] & (lane_squared[0] <= LANE_CUTOFF_M**2)
     has_lane = near_driven & _runs_along(lanes, heading)[0]
     opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
     friendly = jnp.where(aligned, own, _FAR).min()
     if bank.long_ego:
         points_near, outside = jax.vmap(lambda point: _corner_lanes(bank, index, point, heading, z))(points)
     else:
-        points_near = corner.min(axis=1) <= LANE_CUTOFF_M**2
-        outside = _outside_lanes(corner, aligned, half)
-    goes_on = (jnp.abs(beyond[1:, 1]) <= LANE_CUTOFF_M) | ~inside[two[1]] | (away[0, 1] > _GOES_ON_M**2)
-    over = jnp.where(aligned & alongside, reduce(jnp.maximum, jnp.abs(side[1:])) - half, _FAR).min()
-    over = jnp.minimum(over, jnp.abs(beyond[1:, 0]).max() - driven[LaneRow.HALF_WIDTH])
+        # Both flags of each corner by one reduction over one array.
+        flags = (corner <= LANE_CUTOFF_M**2) + 2 * _holds(corner, aligned, half).astype(jnp.int32)
+        flags = jax.lax.reduce(flags, jnp.int32(0), jax.lax.bitwise_or, (1,))
+        points_near, outside = flags & 1 > 0, flags < 2
+    goes_on = (
+        (jnp.abs(lane_side[1:, 1]) <= LANE_CUTOFF_M)
+        | ~inside[numbers[1]]
+        | (lane_squared[0, 1] > _GOES_ON_M**2)
+    )
+    outside_m = jnp.where(aligned & alongside, reduce(jnp.maximum, jnp.abs(side[1:])) - half, _FAR).min()
+    outside_m = jnp.minimum(outside_m, jnp.abs(lane_side[1:, 0]).max() - driven[LaneRow.HALF_WIDTH])
     return LaneHits(
         near=near,
         points_near=points_near | (_outside_box(bank, index, points, 0.0) & goes_on),
         on_corridor=(corridor & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
         wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
         straddling=outside.any(),
-        leaving_lane=has_lane & (over > LANE_MARGIN_M),
+        leaving_lane=has_lane & (outside_m > LANE_MARGIN_M),
         limit=jnp.where(has_lane, driven[LaneRow.LIMIT], -1.0),
         z=jnp.where(near, nearest[LaneRow.Z], z),
     )
@@ -242,11 +248,11 @@ def _nearest_vertex(
     return root(jnp.where(inside, across * across + away * away, _FAR).min())
 
 
-def _outside_lanes(
+def _holds(
     squared: Float[Array, "P K"], aligned: Bool[Array, " K"], half: Float[Array, " K"]
-) -> Bool[Array, " P"]:
-    """Mask of points outside all lanes in the direction of the ego."""
-    return ~(aligned & (squared <= (half + LANE_MARGIN_M) ** 2)).any(axis=1)
+) -> Bool[Array, "P K"]:
+    """Whether lanes in the direction of the ego hold points."""
+    return aligned & (squared <= (half + LANE_MARGIN_M) ** 2)
 
 
 def _corner_lanes(
@@ -256,8 +262,8 @@ def _corner_lanes(
     rows, inside = lanes_around(bank, index, point)
     squared = to_segments(rows, point[None])[0]
     squared = jnp.where(inside & _level(rows[LaneRow.Z], z), squared, _FAR)
-    outside = _outside_lanes(squared, _runs_along(rows, heading), rows[LaneRow.HALF_WIDTH])
-    return squared.min() <= LANE_CUTOFF_M**2, outside[0]
+    holds = _holds(squared, _runs_along(rows, heading), rows[LaneRow.HALF_WIDTH])
+    return squared.min() <= LANE_CUTOFF_M**2, ~holds.any()
 
 
 def offroad_distance(

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
@@ -63,26 +63,34 @@ def agent_rows(
 
 
 def frame_of(
-    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], driven: AgentContext, back: int
-) -> Frame:
+    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], driven: AgentContext, back: int,
+    slots: Int[Array, " S"] | None = None,
+) -> Frame:  # fmt: skip
     """Return the frame of ``step - back`` from the traffic model's rows, driven agents and parked agents.
 
     ``driven`` stacks the contexts of all driven agents of the scenario ``[K]``; slots beyond the last are empty.
-    ``back`` is less than its length; reactive traffic remembers 9.
+    ``back`` is less than its length; reactive traffic remembers 9. ``slots`` selects agents; by default all.
     """
     motion, present = driven.history[:, HISTORY - 1 - back], jnp.ones_like(driven.z)
+    rows, at = agent_rows(motion, jnp.zeros_like(present), present), jnp.clip(step - back, 0, bank.steps - 1)
+    box, parked, words = bank.agent_box[index], bank.parked[index], bank.parked_when[index, at // WORD]
+    moving, number = len(agents), driven.slot
+    if slots is None:
+        more = len(box) - moving
+    else:
+        agents = agents.at[slots].get(mode="fill", fill_value=0.0)
+        box, parked, words, more = box[slots], parked[slots], words[slots], 0
+        match = (slots[:, None] == driven.slot) & (slots[:, None] < moving)
+        place = jnp.where(match, jnp.arange(len(slots))[:, None], 0).sum(axis=0)
+        number = jnp.where(match.any(axis=0), place, len(slots))
     # Before the recording no other agent was seen.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
     # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
-    z = agents[:, AgentColumn.Z].at[driven.slot].set(driven.z, mode="drop")
-    rows = agent_rows(motion, jnp.zeros_like(present), present)
-    agents = agents.at[driven.slot].set(rows, mode="drop")
-    box, at = bank.agent_box[index], jnp.clip(step - back, 0, bank.steps - 1)
-    bit = bank.parked_when[index, at // WORD] >> (at % WORD).astype(jnp.uint32)
-    there = (bit & 1 > 0) & (step >= back)
-    parked, more = bank.parked[index], len(box) - len(agents)
-    z = jnp.where(there, parked[:, AgentColumn.Z], jnp.pad(z, (0, more)))
-    agents = jnp.where(there[:, None], parked, jnp.pad(agents, ((0, more), (0, 0))))
+    z = agents[:, AgentColumn.Z].at[number].set(driven.z, mode="drop")
+    agents = agents.at[number].set(rows, mode="drop")
+    is_parked = ((words >> (at % WORD).astype(jnp.uint32)) & 1 > 0) & (step >= back)
+    z = jnp.where(is_parked, parked[:, AgentColumn.Z], jnp.pad(z, (0, more)))
+    agents = jnp.where(is_parked[:, None], parked, jnp.pad(agents, ((0, more), (0, 0))))
     parts = [agents[:, AgentColumn.XY], agents[:, AgentColumn.HEADING], box[:, SizeColumn.FOOTPRINT]]
     return Frame(
         box=jnp.concatenate(parts, axis=-1),

@@ -30,7 +30,7 @@ class OverrideMotions(TrafficData):
     slot: Int[Array, "N K"]  # Their slots, -1 for none
     motion: Float[Array, "N T K 4"]  # x, y, heading, speed
     z: Float[Array, "N T K"]  # Height of the box centre, m
-    valid: Bool[Array, "N T K"]  # Whether they are there
+    valid: Bool[Array, "N T K"]  # Whether they are present
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,11 @@ class OverrideTraffic:
         return self.base.advance(bank, context, frame)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
-        """Return the rows of ``base`` with the overridden agents as given."""
-        rows, given = self.base.agents(bank, context, back), data_of(bank, OverrideMotions)
+        """Return the rows of ``base`` with the overridden agents at their own motions."""
+        rows, override = self.base.agents(bank, context, back), data_of(bank, OverrideMotions)
         step = jnp.clip(context.step - back, 0, bank.steps - 1)
-        at, slot = (context.index, step), given.slot[context.index]
-        overridden = agent_rows(given.motion[at], given.z[at], given.valid[at].astype(jnp.float32))
+        at, slot = (context.index, step), override.slot[context.index]
+        overridden = agent_rows(override.motion[at], override.z[at], override.valid[at].astype(jnp.float32))
         return rows.at[jnp.where(slot >= 0, slot, rows.shape[0])].set(overridden, mode="drop")
 
 
