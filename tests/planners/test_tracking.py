@@ -191,7 +191,7 @@ def executed():
         def step(now, begin):
             motion, last = now
             action = jax.lax.dynamic_slice(whole, (begin, 0), (41, 3)).reshape(-1)
-            last = space.actuated(motion, action, last, length)
+            last = space.actuate(motion, action, last, length)
             motion = space.move(motion, last, length)
             return (motion, last), motion
 
