@@ -205,8 +205,7 @@ def _dense_and_max_backward(
     gradients = [(inputs[-1].T @ by_row, gradient.sum(axis=0))]
     for number in reversed(range(len(hidden_vjps))):
         (by_row,) = hidden_vjps[number](by_row @ layers[number + 1][0].T)
-        # A product with ones is several times faster than XLA's sum over the first axis.
-        gradients.append((inputs[number].T @ by_row, jnp.ones(len(by_row)) @ by_row))
+        gradients.append((inputs[number].T @ by_row, by_row.sum(axis=0)))
     return tuple(reversed(gradients)), (by_row @ layers[0][0].T).reshape(*valid.shape, -1), None
 
 

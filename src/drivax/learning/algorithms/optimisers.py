@@ -45,7 +45,9 @@ def sum_gradients(
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         return jax.lax.scan(add, zeros, samples)[0]
 
-    return sum_over_devices(sum_chunks, parameters, samples, axis=1)
+    # Fusions with the surrounding program would round differently in each program.
+    inputs = jax.lax.optimization_barrier((parameters, samples))
+    return jax.lax.optimization_barrier(sum_over_devices(sum_chunks, *inputs, axis=1))
 
 
 def clipped_adam(
