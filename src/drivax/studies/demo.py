@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,18 +57,24 @@ class DemoConfig:
 
 @dataclass(frozen=True)
 class Demo:
-    """Result of the demo: the report, a summary of each planner, and paired differences to the policy."""
+    """Result of the demo: the report, a summary of each planner, paired differences to the policy, seconds by stage."""
 
     report: Path
     summaries: list[dict[str, Any]]
     differences: dict[str, dict[str, dict[str, float | int | None]]]
+    stages_s: dict[str, float]
 
     def as_json(self) -> dict[str, Any]:
-        """Return summaries, paired differences to the policy, and versions."""
-        return {"summaries": self.summaries, "policy_minus": self.differences, **describe_run()}
+        """Return summaries, paired differences to the policy, times and versions."""
+        return {
+            "summaries": self.summaries,
+            "policy_minus": self.differences,
+            "stages_s": self.stages_s,
+            **describe_run(),
+        }
 
     def text(self) -> str:
-        """Return a table of the planners, and a line per comparison."""
+        """Return a table of the planners, a line per comparison, and the time of each stage."""
         lines = [format_summary(self.summaries), ""]
         for planner, metrics in self.differences.items():
             for name, difference in metrics.items():
@@ -76,7 +83,27 @@ class Demo:
                     f"policy - {planner}: {name} {difference['mean']:+.3f} [{low:+.3f}, {high:+.3f}] "
                     f"over {difference['n']} scenarios"
                 )
+        lines += ["", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.stages_s.items())]
         return "\n".join(lines)
+
+
+class _Stages:
+    """Announces the four stages, and times them."""
+
+    def __init__(self, log: Callable[[str], None]) -> None:
+        self._log = log
+        self._starts_s: dict[str, float] = {}
+
+    def start(self, name: str, line: str) -> None:
+        """End the stage before, and log the line of this one."""
+        self._starts_s[name] = time.monotonic()
+        self._log(f"{len(self._starts_s)}/4  {line}")
+
+    def seconds(self) -> dict[str, float]:
+        """Return the time of each stage; the last one ends now."""
+        ends = [*self._starts_s.values(), time.monotonic()][1:]
+        pairs = zip(self._starts_s.items(), ends, strict=True)
+        return {name: round(end - start, 1) for (name, start), end in pairs}
 
 
 def run_demo(
@@ -100,13 +127,17 @@ def run_demo(
             "output folder already exists", file=out, cure="choose another --out or pass --overwrite"
         )
     out.mkdir(parents=True, exist_ok=True)
-    log(f"1/4  {config.training} training and {config.held_out} held-out scenarios of the built-in world")
+    stages = _Stages(log)
+    stages.start(
+        "generation",
+        f"{config.training} training and {config.held_out} held-out scenarios of the built-in world",
+    )
     training = _generate_set(out / "sets" / "train", config.training, _TRAINING_SEED, config)
     held_out = _generate_set(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
-    log("2/4  training PPO")
+    stages.start("training", "training PPO")
     training_config = settings.load(TrainConfig, config.preset, list(config.overrides))
     run = train(training_config, training, out / "training" / "policy", overwrite=True).path
-    log("3/4  evaluating on the held-out scenarios")
+    stages.start("evaluation", "evaluating on the held-out scenarios")
     runs, results = [], {}
     planners: dict[str, tuple[Planner, Task]] = {name: (make_planner(name), Task()) for name in REFERENCES}
     planners["policy"] = load_policy(run, ScenarioBank.from_scenarios(held_out[:1]))
@@ -116,14 +147,15 @@ def run_demo(
         evaluation = EvaluationConfig(planner=name if name in REFERENCES else str(run), task=task)
         results[name] = run_evaluation(evaluation, planner, held_out, folder, overwrite=True)
         runs.append(folder)
-    log("4/4  writing the report")
+    stages.start("report", "writing the report")
     report = write_report([run, *runs], out / "report.html", overwrite=True)
     policy = results["policy"]
     differences = {
         name: {metric: paired_differences(policy, results[name], metric).as_dict() for metric in _METRICS}
         for name in REFERENCES
     }
-    demo = Demo(report, [result.summary() for result in results.values()], differences)
+    summaries = [result.summary() for result in results.values()]
+    demo = Demo(report, summaries, differences, stages.seconds())
     write_json(out / "demo.json", demo.as_json())
     return demo
 
