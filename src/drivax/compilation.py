@@ -46,13 +46,12 @@ def use_compilation_cache(folder: str | Path | None = None, *, max_bytes: int = 
     top = _default_folder() if folder is None else Path(folder)
     programs = top / f"jax-{metadata.version('jaxlib')}-{_processor()}"
     try:
-        top.mkdir(0o700, parents=True, exist_ok=True)
-        _prune(top, max_bytes)
-        programs.mkdir(0o700, exist_ok=True)
         for private in (top, programs):
+            private.mkdir(0o700, parents=True, exist_ok=True)
             if private.stat().st_uid != os.getuid():
                 return None
             private.chmod(0o700)
+        _prune(top, max_bytes, keep=programs)
     except OSError:
         return None
     # JAX may not have been imported yet: the environment reaches it, and the processes that this one starts.
@@ -106,10 +105,10 @@ def _processor() -> str:
     return hashlib.sha256(kind.encode()).hexdigest()[:8]
 
 
-def _prune(top: Path, max_bytes: int) -> None:
-    """Delete the least recently used files of all versions until the rest fits in ``max_bytes``."""
+def _prune(top: Path, max_bytes: int, keep: Path) -> None:
+    """Delete the least recently used files of all versions until the rest fits, and empty folders but ``keep``."""
     files = []
-    for path in top.glob("jax-*/*"):
+    for path in top.glob("jax*/*"):
         with suppress(OSError):  # another process deletes as well
             status = path.stat()
             files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
@@ -119,6 +118,6 @@ def _prune(top: Path, max_bytes: int) -> None:
             break
         path.unlink(missing_ok=True)
         total -= size
-    for version in top.glob("jax-*"):
-        with suppress(OSError):  # not empty, or in use
+    for version in set(top.glob("jax*")) - {keep}:
+        with suppress(OSError):  # not empty
             version.rmdir()
