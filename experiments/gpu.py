@@ -45,6 +45,7 @@ from experiments.speed.simulator import TASKS, machine_ms
 #: Share of the time after which the measurements of a stage stop; the long training gets the rest.
 SHARES = {"simulation": 0.35, "training": 0.6, "evaluation": 0.7, "long training": 1.0}
 BATCHES = (1024, 4096, 16384, 65536)
+_NO_WARM_UP = ("--algorithm.warm_up", "512")
 #: Preset and changes of each timed training.
 TRAININGS = {
     "ppo, mlp": ("ppo",),
@@ -55,9 +56,9 @@ TRAININGS = {
         "ppo", "--algorithm.network.encoder.kind", "lq", "--algorithm.network.encoder.size", "small",
         "--algorithm.network.encoder.dtype", "bfloat16",
     ),
-    "sac, mlp": ("sac",),
+    "sac, mlp": ("sac", *_NO_WARM_UP),
     "sac, lq small, float32": (
-        "sac", "--algorithm.network.encoder.kind", "lq", "--algorithm.network.encoder.size", "small",
+        "sac", *_NO_WARM_UP, "--algorithm.network.encoder.kind", "lq", "--algorithm.network.encoder.size", "small",
     ),
 }  # fmt: skip
 PLANNERS = ("constant_velocity", "idm", "pdm")
@@ -109,13 +110,14 @@ def training(bank: ScenarioBank, preset: Sequence[str], environments: int | None
     more = () if environments is None else ("--algorithm.environments", str(environments))
     config = settings.load(TrainConfig, preset[0], [*preset[1:], *more])
     learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
+    begin, seconds = time.perf_counter(), []
     program = Program(Seeds(learner, (0,)), bank, config.devices)
-    state, seconds = program.initial_state(), []
+    state = program.initial_state()
     for _ in range(4):
-        begin = time.perf_counter()
         state, logs = program.step(state)
         jax.block_until_ready((state, logs))
         seconds.append(time.perf_counter() - begin)
+        begin = time.perf_counter()
     return {
         "steps_per_second": round(config.algorithm.steps_per_iteration / statistics.median(seconds[1:])),
         "compile_seconds": round(seconds[0], 1),
