@@ -356,8 +356,7 @@ def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: boo
         raise DataError(f"lacks an array: {error.args[0]}", file=path, cure=_RERUN) from error
     except (ValueError, IndexError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
-    trajectories = Trajectories(ego, action, start, events, others)
-    if not _has_consistent_shapes(trajectories, len(ids)):
+    if not _has_consistent_shapes(len(ids), ego, action, (start, *events.values()), others):
         raise DataError("its arrays disagree in shape", file=path, cure=_RERUN)
     row_of = {key: row for row, key in enumerate(_with_occurrence(ids))}
     try:
@@ -365,18 +364,19 @@ def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: boo
     except KeyError as error:
         raise DataError("lacks an episode", file=path, record=error.args[0][0], cure=_RERUN) from None
     if rows == list(range(len(ids))):
-        return trajectories
+        return Trajectories(ego, action, start, events, others)
     events = {name: steps[rows] for name, steps in events.items()}
     return Trajectories(
         ego[rows], action[rows], start[rows], events, None if others is None else others[rows]
     )
 
 
-def _has_consistent_shapes(trajectories: Trajectories, episodes: int) -> bool:
-    ego, action, others = trajectories.ego, trajectories.action, trajectories.others
+def _has_consistent_shapes(
+    episodes: int, ego: np.ndarray, action: np.ndarray, steps: Sequence[np.ndarray], others: np.ndarray | None
+) -> bool:
     if ego.ndim != 3 or ego.shape[::2] != (episodes, 4) or action.shape[:-1] != (episodes, ego.shape[1] - 1):
         return False
-    if any(steps.shape != (episodes,) for steps in (trajectories.start, *trajectories.events.values())):
+    if any(values.shape != (episodes,) for values in steps):
         return False
     return others is None or (
         others.ndim == 4 and others.shape[:2] == ego.shape[:2] and others.shape[3] == 3 and others.dtype == np.int16
