@@ -59,7 +59,9 @@ def test_thousand_generated_logs_replay_exactly_and_can_be_driven(part):
 @pytest.mark.slow
 def test_every_real_file_replays_exactly_and_can_be_driven(real_data):
     scenarios, findings = real_windows(real_data)
-    clean = [one for one, finding in zip(scenarios, findings, strict=True) if finding["clean"]]
-    assert len(clean) == len(scenarios) >= 19
-    check_exact(clean)
-    assert np.nanmax(driven_by(DRIVEN, clean)["fde"]) <= 0.3
+    assert all(finding["clean"] for finding in findings) and len(scenarios) >= 25
+    check_exact(scenarios)
+    fde_m = driven_by(DRIVEN, scenarios)["fde"]
+    # A car within the bounds cannot follow a log that exceeds them, as logs interpolated from 2 Hz do.
+    within = np.array([finding["clipped_physical"] == 0 for finding in findings])
+    assert fde_m[within].max() <= 0.2 and fde_m.max() <= 0.5
