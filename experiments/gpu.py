@@ -40,7 +40,8 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.studies import bench
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.run_folder import versions
-from experiments.speed.simulator import TASKS, machine_ms
+from experiments.speed.machine import machine_ms
+from experiments.speed.simulator import TASKS
 
 #: Share of the time after which the measurements of a stage stop; the long training gets the rest.
 SHARES = {"simulation": 0.35, "training": 0.6, "evaluation": 0.7, "long training": 1.0}

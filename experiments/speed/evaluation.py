@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.run_folder import versions
 from experiments.repository import DOCS, RESULTS
-from experiments.speed.simulator import machine_ms
+from experiments.speed.machine import HEADINGS, cells, conditions
 
 RESULT = RESULTS / "evaluation.json"
 PAGE = DOCS / "results" / "speed.md"
@@ -57,15 +56,15 @@ def measured(data: Path, planners: list[str]) -> dict[str, Any]:
     stored = ScenarioSet.open(data)
     scenarios = [stored[row] for row in range(SCENARIOS)]
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
-    seconds: dict[str, dict[str, float]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     for planner in planners:
-        seconds[planner] = {kind: round(timed(planner, kind, bank, names), 2) for kind in TRAFFIC}
-        print(planner, seconds[planner], flush=True)
+        with conditions() as record:
+            rows[planner] = {kind: round(timed(planner, kind, bank, names), 2) for kind in TRAFFIC}
+        rows[planner] |= record
+        print(planner, rows[planner], flush=True)
     return {
         "command": "python -m experiments.speed.evaluation --data SET --write",
-        "when": datetime.now(UTC).isoformat(timespec="minutes"),
-        "machine_ms": machine_ms(),
-        "seconds": seconds,
+        "seconds": rows,
         "versions": versions(),
     }
 
@@ -73,12 +72,13 @@ def measured(data: Path, planners: list[str]) -> dict[str, Any]:
 def table(result: dict[str, Any]) -> str:
     """Return a Markdown table of times next to their limits."""
     lines = [
-        "| planner | `log` (s) | may take (s) | `idm` (s) | `idm` / `log` |",
-        "|---|---:|---:|---:|---:|",
+        f"| planner | `log` (s) | may take (s) | `idm` (s) | `idm` / `log` | {HEADINGS} |",
+        "|---|---:|---:|---:|---:|---|---|",
     ]
-    for planner, found in result["seconds"].items():
-        log, idm = (found[kind] for kind in TRAFFIC)
-        lines.append(f"| `{planner}` | {log:,.1f} | {AIMS[planner]} | {idm:,.1f} | {idm / log:.2f} |")
+    for planner, row in result["seconds"].items():
+        log, idm = (row[kind] for kind in TRAFFIC)
+        speed = f"{log:,.1f} | {AIMS[planner]} | {idm:,.1f} | {idm / log:.2f}"
+        lines.append(f"| `{planner}` | {speed} | {cells(row)} |")
     return "\n".join(lines)
 
 

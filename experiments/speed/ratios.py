@@ -22,14 +22,13 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from drivax.files import write_json
 from drivax.tracking.run_folder import versions
 from experiments.repository import DOCS, RESULTS, ROOT
-from experiments.speed.simulator import machine_ms
+from experiments.speed.machine import HEADINGS, cells, conditions
 
 RESULT = RESULTS / "speed_ratios.json"
 PAGE = DOCS / "results" / "speed.md"
@@ -199,13 +198,12 @@ class Worker:
             if line.startswith("done "):
                 _, work, seconds = line.split()
                 return float(work) / float(seconds)
+        self.close()
         raise SystemExit("the timed program failed")
 
     def close(self) -> None:
         """End the process."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
+        self._process.communicate()
 
 
 def repeated(measurement: Repeated, trees: Sequence[Path], data: Path, repeats: int) -> dict[str, Any]:
@@ -290,38 +288,26 @@ def measure(names: Sequence[str], trees: Sequence[Path], data: Path, repeats: in
     rows = {}
     for name in names:
         measurement = MEASUREMENTS[name]
-        machine = [round(machine_ms(), 1)]
-        load = [round(os.getloadavg()[0], 1)]
-        if isinstance(measurement, Repeated):
-            row = repeated(measurement, trees, data, repeats)
-        else:
-            row = timed_command(name, measurement, trees, data, max(1, repeats // 3))
-        machine.append(round(machine_ms(), 1))
-        row |= {"machine_ms": machine, "load": [*load, round(os.getloadavg()[0], 1)]}
-        row["when"] = datetime.now(UTC).isoformat(timespec="minutes")
-        rows[name] = row
+        with conditions() as record:
+            if isinstance(measurement, Repeated):
+                row = repeated(measurement, trees, data, repeats)
+            else:
+                row = timed_command(name, measurement, trees, data, max(1, repeats // 3))
+        rows[name] = row = row | record
         print(f"{name}: {json.dumps(row)}", flush=True)
     return rows
-
-
-def processor() -> str:
-    """Name of the processor, and the number of cores that this process may use."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    name = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "unknown")
-    return f"{name}, {len(os.sched_getaffinity(0))} cores"
 
 
 def table(result: Mapping[str, Any]) -> str:
     """Return the Markdown table of stored ratios."""
     lines = [
-        "| what | ratio | goal (aim) | before | after | unit | fixed program (ms) | load |",
+        f"| what | ratio | goal (aim) | before | after | unit | {HEADINGS} |",
         "|---|---:|---|---:|---:|---|---|---|",
     ]
     for name, row in result["rows"].items():
-        machine, load = (f"{row[key][0]} to {row[key][1]}" for key in ("machine_ms", "load"))
         lines.append(
             f"| {name} | {row['ratio']} | {MEASUREMENTS[name].goal} | {row['before']:,} "
-            f"| {row['after']:,} | {row['unit']} | {machine} | {load} |"
+            f"| {row['after']:,} | {row['unit']} | {cells(row)} |"
         )
     return "\n".join(lines)
 
@@ -356,7 +342,6 @@ def main() -> None:
             result = {
                 "command": "python -m experiments.speed.ratios --data SET --against TREE --write",
                 "commits": {"before": commits[0], "after": commits[1]},
-                "processor": processor(),
                 "rows": {name: stored[name] for name in MEASUREMENTS if name in stored},
                 "versions": versions(),
             }

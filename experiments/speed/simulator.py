@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 import time
 from dataclasses import replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,6 +40,7 @@ from drivax.tasks.task import Task
 from drivax.testing.worlds import pad_agents
 from drivax.tracking.run_folder import versions
 from experiments.repository import DOCS, RESULTS
+from experiments.speed.machine import conditions
 
 RESULT = RESULTS / "simulator.json"
 RUNS = RESULT.with_name("simulator_runs.json")
@@ -93,22 +92,6 @@ def speeds(bank: ScenarioBank, config: BenchConfig) -> dict[str, Any]:
     return result
 
 
-def machine_ms() -> float:
-    """Milliseconds of a fixed program on one core, the current speed of a shared machine.
-
-    It reads rows at random and computes on what it read, as a step does.
-    """
-    table = jnp.arange(1 << 24, dtype=jnp.float32).reshape(-1, 64)
-    rows = jax.random.randint(jax.random.key(0), (1 << 16,), 0, len(table))
-    program = jax.jit(lambda table, rows: jnp.sin(table[rows] * 1e-3).sum(axis=-1))
-    times = []
-    for _ in range(21):
-        began = time.perf_counter()
-        jax.block_until_ready(program(table, rows))
-        times.append(time.perf_counter() - began)
-    return round(statistics.median(times) * 1e3, 2)
-
-
 def again(folder: Path, repeats: int) -> dict[str, Any]:
     """Time the speeds again, alternately, at the best batch sizes of the stored result."""
     use_all_cores()
@@ -122,11 +105,9 @@ def again(folder: Path, repeats: int) -> dict[str, Any]:
         task, traffic = name.split(", ")
         config = BenchConfig(batch=batch, repeats=repeats, task=TASKS[task], traffic=traffic)
         programs.append(compile_program(bank, config))
-    before = machine_ms()
-    speeds = dict(zip(best, map(round, steps_per_second(programs, repeats)), strict=True))
-    when = datetime.now(UTC).isoformat(timespec="minutes")
-    machine = [before, machine_ms()]
-    return {"when": when, "machine_ms": machine, "steps_per_second": speeds, "versions": versions()}
+    with conditions() as record:
+        speeds = dict(zip(best, map(round, steps_per_second(programs, repeats)), strict=True))
+    return {**record, "steps_per_second": speeds, "versions": versions()}
 
 
 def step_compiled(bank: ScenarioBank, task: Task, traffic: str) -> float:
@@ -312,7 +293,9 @@ def main() -> None:
     command = (
         f"python -m experiments.speed.simulator --data {args.data.name} --repeats {args.repeats} --write"
     )
-    result = {"command": command, **measure(args.data, args.repeats), "versions": versions()}
+    with conditions() as record:
+        measured = measure(args.data, args.repeats)
+    result = {"command": command, **record, **measured, "versions": versions()}
     print(table(result, runs))
     if args.write:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")

@@ -13,7 +13,6 @@ import json
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.tracking.run_folder import versions
 from experiments.repository import RESULTS
+from experiments.speed.machine import conditions
 
 RESULT = RESULTS / "training.json"
 SCENARIOS = 1024
@@ -127,7 +127,6 @@ def measure(data: Path, repeats: int, environments: int | None) -> dict[str, Any
         }
     return {
         "command": "python -m experiments.speed.training --data SET --write",
-        "when": datetime.now(UTC).isoformat(timespec="minutes"),
         "devices": [device.device_kind for device in jax.devices()],
         "scenarios": SCENARIOS,
         "environments": environments,
@@ -148,7 +147,9 @@ def main() -> None:
     )
     parser.add_argument("--write", action="store_true", help="store the result")
     args = parser.parse_args()
-    result = measure(args.data, args.repeats, args.environments)
+    with conditions() as record:
+        result = measure(args.data, args.repeats, args.environments)
+    result |= record
     print(json.dumps(result["training"], indent=1))
     if args.write:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")

@@ -1,0 +1,62 @@
+"""Scripts that measure speed: what they store when a measurement fails, and ratios of two trees."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from experiment_scripts import load_script
+
+
+@pytest.fixture
+def ratios():
+    return load_script("speed.ratios")
+
+
+def test_gpu_script_keeps_what_it_has(tmp_path):
+    gpu = load_script("gpu")
+    recorder = gpu.Recorder(tmp_path / "gpu.json", seconds=60)
+
+    def out_of_memory():
+        raise MemoryError("no  room")
+
+    recorder.measure("simulation", "first", lambda: {"steps_per_second": 2})
+    recorder.measure("simulation", "second", out_of_memory)
+    recorder.start_s -= 0.5 * 60
+    recorder.measure("simulation", "third", lambda: pytest.fail("ran after the stage's time"))
+    recorder.measure("training", "ppo", lambda: 3)
+    assert json.loads((tmp_path / "gpu.json").read_text()) == {
+        "simulation": {"first": {"steps_per_second": 2}, "second": "failed: no room", "third": "not run"},
+        "training": {"ppo": 3},
+    }
+
+
+def test_ratio_of_two_trees_is_that_of_their_work(ratios, tmp_path):
+    program = "import time\nimport drivax\ndef call():\n    time.sleep(0.02 * drivax.COST)\n    return 1"
+    for name, cost in (("before", 3), ("after", 1)):
+        (tmp_path / name / "src").mkdir(parents=True)
+        (tmp_path / name / "src" / "drivax.py").write_text(f"COST = {cost}")
+    trees = (tmp_path / "before", tmp_path / "after")
+    row = ratios.repeated(ratios.Repeated("calls/s", program, ""), trees, tmp_path, 3)
+    assert row["ratio"] == pytest.approx(3, rel=0.2)
+    assert row["before"] == pytest.approx(1 / 0.06, rel=0.2)
+
+
+def test_failed_program_is_an_error(ratios, tmp_path):
+    with pytest.raises(SystemExit, match="failed"):
+        ratios.Worker(tmp_path, "def call(): raise ValueError", tmp_path, str(tmp_path)).run()
+
+
+def test_rows_show_their_conditions(ratios):
+    name = "PPO training"
+    row = {
+        "ratio": 1.5,
+        "before": 20,
+        "after": 30,
+        "unit": "steps/s",
+        "machine_ms": [19.6, 17.2],
+        "load": [0, 1.2],
+    }
+    lines = ratios.table({"rows": {name: row}}).splitlines()
+    assert lines[2] == f"| {name} | 1.5 | 1.4 x (1.8 x) | 20 | 30 | steps/s | 17 to 20 | 0.0 to 1.2 |"
