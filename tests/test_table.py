@@ -111,3 +111,22 @@ def test_tables_below_share_the_widths_of_the_first():
         )
         <= 100
     )
+
+
+def test_wide_table_closes_up_before_it_splits_a_heading():
+    headings = (
+        "planner",
+        "collision",
+        "off-road",
+        "progress",
+        "comfort",
+        "success",
+        "accuracy",
+        "red light",
+        "vmax",
+    )
+    columns = tuple(Column(heading, label=heading == "planner") for heading in headings)
+    rows = ((Cell("constant_velocity_long"), *[Cell("0.500")] * 8),)
+    lines = Table("summary", columns, rows).text(width=95).splitlines()
+    assert lines[0].split() == " ".join(headings).split() and len(lines) == 2
+    assert "  collision" in Table("summary", columns, rows).text(width=110)

@@ -117,8 +117,12 @@ class Table:
         """Return plain text of at most ``width`` columns; see :meth:`rich`."""
         from rich.console import Console
 
-        stream = io.StringIO()
-        Console(file=stream, width=width, highlight=False, markup=False, emoji=False).print(self.rich(*below))
+        stream, grid = io.StringIO(), self.rich(*below)
+        console = Console(file=stream, width=width, highlight=False, markup=False, emoji=False)
+        if console.measure(grid, options=console.options.update(width=10 * width)).maximum > width:
+            # One blank between columns, so that no heading is split within a word.
+            grid.padding = (0, 1, 0, 0)
+        console.print(grid)
         return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
     def markdown(self) -> str:
