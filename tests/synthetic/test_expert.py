@@ -12,6 +12,7 @@ from drivax.synthetic.roads.families import CurvedRoad
 from drivax.synthetic.roads.network import Control
 from drivax.synthetic.roads.style import GRID
 from drivax.synthetic.traffic.roles import Override, Staging
+from drivax.synthetic.traffic.simulation import Traffic
 
 from .staged_scenes import CAR, TIMES, crossed, driven, road, scene, user
 
@@ -33,17 +34,29 @@ class Runs:
         return motion if self.reaction is None else self.reaction(motion, len(self.plans))
 
 
+def drive(roles, staging, first_step, runs, aware_step=0):
+    """The motion of :func:`drive_ego`, whose runs are answered, and its cause of rejection."""
+    task = drive_ego(Traffic(roles, TIMES), staging, first_step, aware_step)
+    run = next(task)
+    while True:
+        assert run.staging == staging
+        try:
+            run = task.send(runs(run.staging, run.ego))
+        except StopIteration as end:
+            return end.value
+
+
 def test_good_drive_is_kept():
     roles, motion = scene(road(), 12.0)
     runs = Runs(motion)
-    got, cause = drive_ego(roles, TIMES, Staging(), 0, runs)
+    got, cause = drive(roles, Staging(), 0, runs)
     assert (got, cause, runs.plans) == (motion, "", [])
 
 
 def test_planning_avoids_a_collision():
     roles, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
     runs = Runs(motion)
-    got, cause = drive_ego(roles, TIMES, EVENT, 10, runs)
+    got, cause = drive(roles, EVENT, 10, runs)
     assert cause == ""
     assert [plan.first_step for plan in runs.plans] == [10]
     assert np.array_equal(got.xy[0, :11], motion.xy[0, :11])
@@ -56,14 +69,14 @@ def test_ego_reacts_late_where_possible(aware, begins):
     # 12 m/s: bumpers meet during the 38th step; from 3.2 s on no braking helps.
     roles, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
     runs = Runs(motion)
-    assert drive_ego(roles, TIMES, EVENT, 0, runs, aware)[1] == ""
+    assert drive(roles, EVENT, 0, runs, aware)[1] == ""
     assert [plan.first_step for plan in runs.plans] == begins
 
 
 def test_unavoidable_collisions_are_rejected_by_cause():
     roles, motion = scene(road((1,)), 14.0, [user((40.0, 0.0), size=BARRIER)])
     runs = Runs(motion)
-    _, cause = drive_ego(roles, TIMES, EVENT, 0, runs)
+    _, cause = drive(roles, EVENT, 0, runs)
     assert cause == "ego_collides"
     assert len(runs.plans) == 3
 
@@ -72,15 +85,15 @@ def test_common_driving_must_not_brake_hard():
     # 12^2 / (2 x 5.2) m and a metre ahead of the bumper.
     barrier = user((30.0 + 2.3 + 13.8 + 1.5, 0.0), size=BARRIER)
     roles, motion = scene(road((1,)), 12.0, [barrier])
-    assert drive_ego(roles, TIMES, EVENT, 0, Runs(motion))[1] == ""
-    assert drive_ego(roles, TIMES, Staging(), 0, Runs(motion))[1] == "ego_brakes_hard"
+    assert drive(roles, EVENT, 0, Runs(motion))[1] == ""
+    assert drive(roles, Staging(), 0, Runs(motion))[1] == "ego_brakes_hard"
 
 
 @pytest.mark.parametrize(("staging", "cause", "plans"), [(Staging(), "ego_hardly_moves", 0), (EVENT, "", 1)])
 def test_standing_ego_is_planned_only_for_staged_events(staging, cause, plans):
     roles, motion = scene(road(), 0.0)
     runs = Runs(motion)
-    assert drive_ego(roles, TIMES, staging, 0, runs)[1] == cause
+    assert drive(roles, staging, 0, runs)[1] == cause
     assert len(runs.plans) == plans
 
 
@@ -94,7 +107,7 @@ def test_plans_repeat_after_reactions_of_others():
         return replace(motion, xy=xy)
 
     runs = Runs(motion, reaction)
-    got, cause = drive_ego(roles, TIMES, EVENT, 0, runs)
+    got, cause = drive(roles, EVENT, 0, runs)
     assert cause == ""
     assert 1 <= len(runs.plans) <= 3
     assert got.xy[0, -1, 0] < 77.0 - CAR[0]
@@ -106,7 +119,7 @@ def test_rough_drive_is_smoothed_or_kept():
     speed[0] = 12.0 - 0.5 * np.sin(2 * np.pi * TIMES / 0.9)
     rough = replace(motion, speed=speed)
     runs = Runs(rough)
-    got, cause = drive_ego(roles, TIMES, EVENT, 0, runs)
+    got, cause = drive(roles, EVENT, 0, runs)
     assert cause == ""
     assert np.abs(np.diff(got.speed[0])).max() < np.abs(np.diff(speed[0])).max() / 3
 
@@ -125,7 +138,7 @@ def test_plan_starts_at_the_stop_sign():
     blocked = motion.xy.copy()
     blocked[1, :, 0] = at[-1] - 1.0
     runs = Runs(replace(motion, xy=blocked))
-    got, cause = drive_ego(roles, TIMES, EVENT, 0, runs)
+    got, cause = drive(roles, EVENT, 0, runs)
     assert cause == ""
     assert runs.plans[0].first_step == 47  # 0.4 m/s: still standing
     assert got.xy[0, -1, 0] < blocked[1, 0, 0] - CAR[0]

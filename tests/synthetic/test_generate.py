@@ -28,7 +28,7 @@ from drivax.synthetic.generate import (
     generate_benchmark,
     portable_workers,
 )
-from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
+from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_many, generate_one
 
 SCENARIOS = 7
 
@@ -135,17 +135,17 @@ def test_counts_and_progress_cover_all_scenarios(one_worker):
 def test_rejected_draws_count_for_their_family(tmp_path, monkeypatch):
     drawn = []
 
-    def one(*arguments):
-        made = generate_one(*arguments)
-        causes = {
-            ("nowhere", "ego_collides"): 2,
-            ("nowhere", "no_threat"): 3,
-            (made.family, "no_occasion"): 1,
-        }
-        drawn.append(made.family)
-        return dataclasses.replace(made, rejected=causes)
+    def many(*arguments):
+        for made in generate_many(*arguments):
+            causes = {
+                ("nowhere", "ego_collides"): 2,
+                ("nowhere", "no_threat"): 3,
+                (made.family, "no_occasion"): 1,
+            }
+            drawn.append(made.family)
+            yield dataclasses.replace(made, rejected=causes)
 
-    monkeypatch.setattr(generation, "generate_one", one)
+    monkeypatch.setattr(generation, "generate_many", many)
     made = generate(tmp_path / "set", 2, 5, Generation())
     assert made.families["nowhere"] == FamilyCount(0, {"ego_collides": 4}, 6)
     assert sum(count.unsuited for name, count in made.families.items() if name != "nowhere") == 2

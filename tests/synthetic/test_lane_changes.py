@@ -9,7 +9,7 @@ from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.lane_changes import LaneChains, LaneChanges, Situation
 from drivax.synthetic.traffic.obstacles import Boxes
-from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.path_arrays import PathTables, Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.roles import Override, Staging
 
@@ -29,7 +29,8 @@ def decisions(ways, at, speed, politeness=0.0, network=None, movers=(1,)):
         size_m=np.tile([5.0, 2.0, 1.5], (len(at), 1)),
     )
     paths = [lane_path(network, way, Sway()) for way in ways]
-    tables = PathTables(network, paths, table)
+    worlds = Worlds([network], [len(at)])
+    tables = PathTables(worlds, paths, table)
     at, speed = np.array(at, float), np.array(speed, float)
     fastest = tables.at(at, np.arange(len(at)))[:, 3]
     preferred = np.full(len(at), np.nan)
@@ -39,7 +40,7 @@ def decisions(ways, at, speed, politeness=0.0, network=None, movers=(1,)):
         gap = np.inf if j is None else at[j] - at[i] - 5.0
         preferred[i] = law(speed[i], gap, 0.0 if j is None else speed[j])
     free = np.isin(np.arange(len(at)), movers)
-    changes = LaneChanges(network, table, NOTHING)
+    changes = LaneChanges(worlds, table, [NOTHING])
     now = Situation(at, speed, np.ones(len(at), bool), free, fastest, preferred)
     return changes.decide(now, tables)
 
@@ -105,7 +106,7 @@ def test_only_one_vehicle_takes_a_contested_gap():
 
 def test_chains_span_sections_and_end_at_forks():
     network, columns = road(lanes=2, sections=3)
-    chains = LaneChains(network)
+    chains = LaneChains.of(network)
     assert [chains.offset_m[k] for k in columns[0]] == pytest.approx([0.0, 200.0, 400.0])
     assert len({int(chains.chain[k]) for k in columns[0]}) == 1
     assert chains.chain[columns[1][0]] != chains.chain[columns[0][0]]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.path_arrays import PathTables, Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.simulation import Leaders
 
@@ -15,9 +15,10 @@ from .traffic_scenes import drivers, road
 
 def leaders(ways, at, table, active=None, **roads):
     network, _ = road(300.0, **roads)
-    tables = PathTables(network, [lane_path(network, way, Sway()) for way in ways], table)
+    worlds = Worlds([network], [len(ways)])
+    tables = PathTables(worlds, [lane_path(network, way, Sway()) for way in ways], table)
     there = np.ones(len(at), bool) if active is None else np.array(active)
-    return Leaders(network, table).ahead(tables, np.array(at, float), there)
+    return Leaders(worlds, table).ahead(tables, np.array(at, float), there)
 
 
 @pytest.mark.parametrize("seed", range(5))

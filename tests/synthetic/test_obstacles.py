@@ -11,7 +11,7 @@ from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Line, RoadKind, RoadNetwork
 from drivax.synthetic.traffic.lateral import around, change_onto, displace_path, quintic_step
 from drivax.synthetic.traffic.obstacles import Boxes, StaticObstacles, extents
-from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.path_arrays import Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.roles import Scripted, Staging
 from drivax.synthetic.traffic.simulation import boxes_at
@@ -113,8 +113,8 @@ def test_detours_yield_to_oncoming_traffic():
 ])  # fmt: skip
 def test_obstacles_in_the_band_ahead_are_detected(x, y, meets):
     path = lane_path(street(), (0,), Sway())
-    tables = PathTables(street(), [path], drivers(1))
-    standing = StaticObstacles(boxes_at((parked(x, y, 1),), 0), tables, np.array([1.9]))
+    boxes = boxes_at((parked(x, y, 1),), 0)
+    standing = StaticObstacles(Worlds([street()], [1]), [boxes], [extents(path, boxes)[0]], np.array([1.9]))
     assert standing.meets(0, 22.0, 1.2, 45.0) == meets
 
 

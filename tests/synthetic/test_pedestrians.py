@@ -9,6 +9,7 @@ from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Control, Crossing, Draft, RoadNetwork
 from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
 from drivax.synthetic.traffic.obstacles import Boxes
+from drivax.synthetic.traffic.path_arrays import Worlds
 from drivax.synthetic.traffic.pedestrians import Pedestrians, place_pedestrians
 from drivax.synthetic.traffic.roles import Pedestrian
 
@@ -46,15 +47,12 @@ def over(speed=1.4, before=6.0):
 
 def play(network, pedestrians, cars=None, times=TIMES):
     """``cars``: function of the step that returns (xy, heading, speed) of cars."""
-    pedestrians = Pedestrians(network, pedestrians, times)
-    colours = np.zeros((len(times), len(network.lanes)), np.int8)
-    if network.signals is not None:
-        colours, _ = network.signals.colours(times, len(network.lanes))
+    pedestrians = Pedestrians(Worlds([network], [len(cars(0)[1]) if cars else 0]), [pedestrians], [times])
     out = []
     for t in range(len(times)):
         xy, heading, speed = cars(t) if cars else (np.zeros((0, 2)), np.zeros(0), np.zeros(0))
         vehicles = Boxes(xy, heading, speed, np.tile(CAR[:, :2], (len(xy), 1)))
-        seen, claims = pedestrians.step(t, vehicles, np.ones(len(xy), bool), colours[t])
+        seen, claims = pedestrians.step(t, vehicles, np.ones(len(xy), bool))
         out.append((seen.xy, seen.heading, seen.speed, claims))
     return [np.stack(column) for column in zip(*out, strict=True)]
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -81,7 +83,7 @@ def test_static_users_conflict_at_all_steps():
 def test_red_lights_close_the_stop_line_and_late_yellow_is_avoided():
     plan = SignalPlan((LightGroup((1,), False),), ((0,),), (5.0,), offset_s=-3.0)
     network = crossed(100.0, Control.SIGNAL)
-    network = type(network)(**{**vars(network), "signals": plan})
+    network = replace(network, signals=plan)
     roles, _ = scene(network, 10.0, lanes=(0, 1, 2))
     (wall,) = stop_lines(network, roles.paths[0], (30.0, 2.3), TIMES, 30.0 + 10.0 * TIMES, {})
     # Half a metre before the front bumper reaches the line.
@@ -101,12 +103,8 @@ def test_stop_signs_open_after_stopping_and_yield_signs_after_traffic():
     (wall,) = stop_lines(network, roles.paths[0], (30.0, 2.3), TIMES, 30.0 + 10.0 * TIMES, {})
     assert wall.closed.tolist() == (30.0 + 10.0 * TIMES + 2.3 <= 100.0).tolist()
     lanes = list(crossed(100.0, Control.YIELD).lanes)
-    lanes[1] = type(lanes[1])(
-        **{**{k: v for k, v in vars(lanes[1]).items() if k != "length_m"}, "yields_to": (2,)}
-    )
-    network = type(network)(
-        **{**{k: v for k, v in vars(network).items() if k != "busy"}, "lanes": tuple(lanes)}
-    )
+    lanes[1] = replace(lanes[1], yields_to=(2,))
+    network = replace(network, lanes=tuple(lanes))
     # Another vehicle on the same path is on lane 2 (from 120 m on) from 4.77 s on; it is announced 2 s earlier.
     first = arrivals(
         network, [roles.paths[0]] * 2, np.stack([0 * TIMES, 70.0 + 10.0 * TIMES]),

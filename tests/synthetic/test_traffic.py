@@ -16,7 +16,7 @@ from drivax.synthetic.traffic.paths import Sway, lane_path, random_lanes
 from drivax.synthetic.traffic.placement import Density, draw_drivers, draw_path, place_vehicles
 from drivax.synthetic.traffic.role_assignment import assign_roles
 from drivax.synthetic.traffic.roles import EgoPlan, Override, Pedestrian, Roles, Scripted, Staging, Tailgate
-from drivax.synthetic.traffic.simulation import Traffic, _Run, first_effect
+from drivax.synthetic.traffic.simulation import Run, Traffic, run_all, simulate
 
 from . import traffic_scenes
 from .oracles import box_corners, shared_area
@@ -302,39 +302,47 @@ def busy_scenario(seed):
     return assign_roles(network, domain, times, 0.35, (0.34, 0.33, 0.33), rng, (), False), times
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_resumed_run_equals_run_from_the_start(seed, monkeypatch):
-    cast, times = busy_scenario(seed)
-    traffic = Traffic(cast, times)
-    motion = traffic.run()
-    plan = EgoPlan(53, motion.xy[0, 53:], motion.heading[0, 53:], motion.speed[0, 53:] / 2)
-    braking = Staging(overrides=(Override(1, 66, 90, -5.0),))
-    steps, step = [], _Run._step
-    monkeypatch.setattr(_Run, "_step", lambda self, t: (steps.append(t), step(self, t)))
-    for staging, ego, begin in (
-        (Staging(), plan, 48),
-        (braking, None, 48),
-        (braking, plan, 48),
-        (None, None, 48),
-    ):
-        steps.clear()
-        resumed = traffic.run(staging, ego)
-        assert steps == list(range(begin, len(times)))
-        fresh = Traffic(cast, times).run(staging, ego)
-        for name in ("xy", "heading", "speed", "valid", "distance_m", "acceleration"):
-            np.testing.assert_array_equal(getattr(resumed, name), getattr(fresh, name), err_msg=name)
-        assert [len(path.curve.xy) for path in resumed.paths] == [len(path.curve.xy) for path in fresh.paths]
-    np.testing.assert_array_equal(resumed.xy, motion.xy)
+def staged_run(seed, world):
+    """A run on drawn roads; every second one has a plan of ego, and every third one an event."""
+    cast, times = busy_scenario(2 * seed + world % 2)
+    traffic = Traffic(cast, times[: 131 - 7 * world])
+    ego, staging = None, Staging()
+    if world % 2:
+        motion = traffic.run()
+        ego = EgoPlan(53, motion.xy[0, 53:], motion.heading[0, 53:], motion.speed[0, 53:] / 2)
+    if world % 3 == 0:
+        steps, pose = len(traffic.times_s), Pose(*cast.paths[1].curve.xy[-80], 0.0)
+        comes = Scripted.standing(AgentKind.PEDESTRIAN, (0.6, 0.6, 1.7), pose, steps)
+        comes.valid[:20] = False
+        stands = Scripted.standing(
+            AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(*cast.paths[0].curve.xy[300], 0.0), steps
+        )
+        brakes = Override(1, 66, 90, -5.0)
+        staging = Staging((brakes,), (comes, stands), (Tailgate(2, 0.5),), (3,))
+    return Run(traffic, staging, ego)
 
 
-def test_staging_takes_effect_when_its_first_part_begins():
-    valid = np.arange(50) >= 30
-    extra = Scripted(AgentKind.VEHICLE, (4.0, 2.0, 1.5), np.zeros((50, 2)), np.zeros(50), np.ones(50), valid)
-    still = Scripted.standing(AgentKind.VEHICLE, (4.0, 2.0, 1.5), Pose(0.0, 0.0, 0.0), 50)
-    brake = Override(1, 35, 40, -3.0)
-    assert first_effect(Staging()) is None
-    assert first_effect(Staging(overrides=(brake,))) == 35
-    assert first_effect(Staging(overrides=(brake,), extras=(extra,))) == 30
-    assert first_effect(Staging(overrides=(brake,), extras=(still,))) == 0
-    assert first_effect(Staging(overrides=(brake,), tailgates=(Tailgate(1, 0.5),))) == 0
-    assert first_effect(Staging(overrides=(brake,), removed=(2,))) == 0
+@pytest.mark.parametrize("seed", range(3))
+def test_worlds_simulated_together_equal_worlds_alone(seed):
+    runs = [staged_run(seed, world) for world in range(5)]
+    for run, together in zip(runs, simulate(runs), strict=True):
+        alone = run.traffic.run(run.staging, run.ego)
+        for name in ("kind", "size_m", "xy", "heading", "speed", "valid", "distance_m", "acceleration"):
+            np.testing.assert_array_equal(getattr(together, name), getattr(alone, name), err_msg=name)
+        assert [len(path.curve.xy) for path in together.paths] == [len(path.curve.xy) for path in alone.paths]
+        changed = [a is not b for a, b in zip(alone.paths, run.traffic.roles.paths, strict=True)]
+        assert alone.vehicles > 3 and (run is not runs[0] or any(changed))
+
+
+def test_tasks_return_results_in_order_however_many_runs_they_need():
+    scene = roles(road()[0], [(0,)], drivers(1), [20.0], [10.0])
+
+    def task(number):
+        motions = []
+        for steps in range(2, 2 + (3 * number) % 5):
+            motions.append((yield Run(Traffic(scene, np.arange(steps) / 10))))
+        return number, [motion.xy.shape[1] for motion in motions]
+
+    expected = [(number, list(range(2, 2 + (3 * number) % 5))) for number in range(20)]
+    assert list(run_all(task(number) for number in range(20))) == expected
+    assert list(run_all([])) == []

@@ -223,7 +223,7 @@ def test_negative_seeds_are_refused():
 def test_world_needs_no_jax():
     code = (
         "import sys, drivax.synthetic.generate as g;"
-        "g.generate_one(0, 0, g.WorldConfig()); print('jax' in sys.modules)"
+        "list(g.generate_many(0, [0], g.WorldConfig())); print('jax' in sys.modules)"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"

@@ -20,7 +20,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -29,16 +29,18 @@ from drivax.errors import DrivaxError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Capacity, Scenario
 from drivax.scenario.store import ScenarioWriter, check_set_space
-from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
+from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_many
 from drivax.tracking.workers import await_interrupt, worker_pool
 
 #: CPU features beyond the baseline that NumPy can use, and the variable that disables them.
 _umath = importlib.import_module("numpy._core._multiarray_umath")
 _FEATURES = "NPY_DISABLE_CPU_FEATURES"
-#: Scenarios per audited batch, and per task of a worker.
-_BATCH, _CHUNK = 64, 4
+#: Scenarios per audited batch, and of the first one.
+_BATCH, _FIRST = 64, 4
+#: Most scenarios per task of a worker, and least tasks per worker.
+_CHUNK, _TASKS = 16, 4
 #: Finished tasks per worker, and audited batches, that may wait.
-_AHEAD, _AHEAD_BATCHES = 12, 2
+_AHEAD, _AHEAD_BATCHES = 3, 2
 _EVENT = "event"
 #: First seed of the benchmark's splits.
 RESERVED_SEED = 1_000_000_000
@@ -254,7 +256,7 @@ def _audit_batches(
     auditor = ThreadPoolExecutor(1)
     waiting: deque[tuple[list[Scenario], Future[list[dict[str, Any]]]]] = deque()
     try:
-        size = _CHUNK
+        size = _FIRST
         while batch := list(islice(scenarios, size)):
             waiting.append((batch, auditor.submit(audit, batch)))
             size = _BATCH
@@ -272,27 +274,32 @@ def _pairs(
     return zip(batch, findings.result(), strict=True)
 
 
-def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:
+def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> Iterator[_Draw]:
     """Draw scenarios ``first`` to ``last - 1``."""
     capacity = options.sizes
-    draws = [generate_one(seed, index, options.world, capacity.steps) for index in range(first, last)]
-    return [_Draw(assemble(draw.recording, capacity), draw.family, draw.rejected) for draw in draws]
+    for draw in generate_many(seed, range(first, last), options.world, capacity.steps):
+        yield _Draw(assemble(draw.recording, capacity), draw.family, draw.rejected)
 
 
 def _draw_in_worker(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:
     """:func:`_draw_chunk`; the garbage collector ignores what was imported, which saves 3 % of the time."""
     if not gc.get_freeze_count():
         gc.freeze()
-    return _draw_chunk(first, last, seed, options)
+    return list(_draw_chunk(first, last, seed, options))
+
+
+def _spans(scenarios: int, workers: int) -> list[tuple[int, int]]:
+    """First and last scenario of each task; the first task is short, so that the audit begins early."""
+    size = min(max(scenarios // (_TASKS * workers), _FIRST), _CHUNK)
+    return list(pairwise([0, *range(_FIRST, scenarios, size), scenarios]))
 
 
 def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, None, None]:
     """Draw all scenarios in order."""
-    spans = [(start, min(start + _CHUNK, scenarios)) for start in range(0, scenarios, _CHUNK)]
     if options.workers == 0:
-        for first, last in spans:
-            yield from _draw_chunk(first, last, seed, options)
+        yield from _draw_chunk(0, scenarios, seed, options)
         return
+    spans = _spans(scenarios, options.workers)
     pool = worker_pool(min(options.workers, len(spans)))
     waiting: deque[Future[list[_Draw]]] = deque()
     try:

@@ -7,6 +7,7 @@ of the map): a recording depends neither on the number of workers nor on other r
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -39,7 +40,7 @@ from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m,
 from drivax.synthetic.traffic.placement import LARGEST_VEHICLE_M
 from drivax.synthetic.traffic.role_assignment import SignalTiming, assign_roles, conflicts_on
 from drivax.synthetic.traffic.roles import Motion, Roles, Staging
-from drivax.synthetic.traffic.simulation import Traffic
+from drivax.synthetic.traffic.simulation import Run, Traffic, run_all
 
 #: Raised when the same seed gives another world; part of every scenario id.
 WORLD_VERSION = 2
@@ -132,17 +133,31 @@ def generate_recording(
 
 
 def generate_one(seed: int, index: int, config: WorldConfig, steps: int = STEPS) -> GeneratedRecording:
-    """Generate a recording of at least 91 steps with its family and rejected attempts.
+    """:func:`generate_many` for one index."""
+    return next(generate_many(seed, [index], config, steps))
 
-    The kind of event is drawn first, so that kinds whose draws fail more often are not rarer. A rare scenario has roads
-    of its own, and is redrawn on other roads if these give no occasion for its event.
+
+def generate_many(
+    seed: int, indices: Iterable[int], config: WorldConfig, steps: int = STEPS
+) -> Iterator[GeneratedRecording]:
+    """Generate recordings of at least 91 steps with their families and rejected attempts.
+
+    Their traffic is simulated together, which is faster; each is the same as alone. The kind of event is drawn first,
+    so that kinds whose draws fail more often are not rarer. A rare scenario has roads of its own, and is redrawn on
+    other roads if these give no occasion for its event.
 
     Raises:
         UsageError: Seed or index are negative, or no draw gives a clean expert.
     """
+    domain = config.check()
+    return run_all(_generate(seed, index, config, domain, steps) for index in indices)
+
+
+def _generate(
+    seed: int, index: int, config: WorldConfig, domain: Domain, steps: int
+) -> Generator[Run, Motion, GeneratedRecording]:
     if seed < 0 or index < 0:
         raise UsageError(f"seed {seed} and index {index} must not be negative", cure="choose 0 or more")
-    domain = config.check()
     events, severity = _draw_events(config, np.random.default_rng([seed, 0, index]))
     rejected: Counter[tuple[str, str]] = Counter()
     for attempt in range(_ATTEMPTS):
@@ -151,7 +166,7 @@ def generate_one(seed: int, index: int, config: WorldConfig, steps: int = STEPS)
         family, network = _draw_roads(config.domain, event, (seed, 3 if event else 1, *sample))
         rng = np.random.default_rng([seed, 2, index, attempt])
         places = destinations_for(event, network, attempt > 0) if event else ()
-        result = _attempt(_Draw(network, places, event, severity, steps), domain, config, rng)
+        result = yield from _attempt(_Draw(network, places, event, severity, steps), domain, config, rng)
         if isinstance(result, str):
             rejected[family.name, result] += 1
             continue
@@ -203,7 +218,9 @@ class _Draw:
     steps: int
 
 
-def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Generator) -> Recording | str:
+def _attempt(
+    draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Generator
+) -> Generator[Run, Motion, Recording | str]:
     """Return the recording of one draw, or the cause of its rejection."""
     critical = not draw.event and rng.random() < config.critical_share
     times = (np.arange(_WARM_UP + draw.steps + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
@@ -219,26 +236,24 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
     )
     traffic = Traffic(roles, times)
     if not draw.event:
-        motion, first = traffic.run(), None
+        motion, first = (yield Run(traffic)), None
         if critical:
             first = _critical_step(traffic, motion, rng)
         begin, tags = first or _WARM_UP, {} if first is None else {"critical": "yes"}
         end = begin + draw.steps
         traffic, motion = traffic.before_step(end), motion.before_step(end)
-        motion, cause = expert.drive_ego(
-            roles, traffic.times_s, Staging(), begin, traffic.run, unplanned=motion
-        )
+        motion, cause = yield from expert.drive_ego(traffic, Staging(), begin, unplanned=motion)
         if cause:
             return cause
         recording = _to_recording(roles, motion, begin, None, draw.steps)
         return _add_perception(replace(recording, tags=tags), config, rng)
-    view, cause = EgoView(roles, traffic.run(), _WARM_UP), UNSUITED[0]
+    view, cause = EgoView(roles, (yield Run(traffic)), _WARM_UP), UNSUITED[0]
     for _ in range(_STAGINGS):
         staged = stage(draw.event, view, draw.severity_mps2, rng)
         if staged is None:
             break
         aware = staged.first_step - _FORESEEN
-        motion, cause = expert.drive_ego(roles, times, staged.staging, _WARM_UP, traffic.run, aware)
+        motion, cause = yield from expert.drive_ego(traffic, staged.staging, _WARM_UP, aware)
         if not cause and endangers_ego(view, motion, staged):
             return _add_perception(_to_recording(roles, motion, _WARM_UP, staged, draw.steps), config, rng)
         cause = cause or UNSUITED[1]

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Generator
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64
 
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.expert.plan import plan_ego
 from drivax.synthetic.expert.violations import Violation, discomfort, find_violation, is_staged, last_stop
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.paths import LaneChange, Path, Sway, lane_path, random_lanes
-from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Staging
+from drivax.synthetic.traffic.roles import Drivers, Motion, Roles, Staging
+from drivax.synthetic.traffic.simulation import Run, Traffic
 
 #: Hardest braking of an accepted expert, m/s2: nuPlan's comfort limit, and the IDM's limit in events.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
 #: Causes that no plan can fix, and one that a plan rarely fixes unless an event is staged.
 _HOPELESS, _STUCK = ("ego_leaves_map", "other_runs_red", "others_collide"), "ego_hardly_moves"
-
-#: Runs traffic with a staging and ego's plan.
-TrafficRun = Callable[[Staging, EgoPlan | None], Motion]
 
 
 def draw_expert(rng: np.random.Generator) -> Drivers:
@@ -78,25 +75,26 @@ def expert_path(
 
 
 def drive_ego(
-    roles: Roles, times_s: Float64[np.ndarray, " time"], staging: Staging, first_step: int,
-    traffic_run: TrafficRun, aware_step: int = 0, unplanned: Motion | None = None,
-) -> tuple[Motion, str]:  # fmt: skip
+    traffic: Traffic, staging: Staging, first_step: int, aware_step: int = 0, unplanned: Motion | None = None
+) -> Generator[Run, Motion, tuple[Motion, str]]:
     """Drive ego like other traffic if that is acceptable, else along a plan that knows the others' motion.
 
     Others react to a plan, so each plan is simulated and checked, and replaced where it fails.
 
     Args:
-        roles: All users.
-        times_s: Times of all steps, on the clock of the lights.
+        traffic: All users, and the times of all steps on the clock of the lights.
         staging: The staged event.
         first_step: First step of the recording and, at the earliest, of a plan.
-        traffic_run: Runs the traffic: :meth:`drivax.synthetic.traffic.simulation.Traffic.run`.
         aware_step: Step from which ego reacts to the event, if that is early enough.
-        unplanned: Result of ``traffic_run`` without a plan, if known.
+        unplanned: The motion without a plan, if known.
+
+    Yields:
+        Runs of the traffic, whose motion to send.
 
     Returns:
         The motion, and the cause of its rejection (empty: accepted).
     """
+    roles, times_s = traffic.roles, traffic.times_s
     hardest, hopeless = HARDEST_MPS2, (*_HOPELESS, _STUCK)
     if is_staged(staging):
         hardest, hopeless = HARDEST_IN_EVENT_MPS2, _HOPELESS
@@ -107,7 +105,7 @@ def drive_ego(
     def pleasant(motion: Motion) -> bool:
         return not discomfort(motion.heading[0, first_step:], motion.speed[0, first_step:])
 
-    motion = unplanned or traffic_run(staging, None)
+    motion = unplanned or (yield Run(traffic, staging))
     violation = find(motion)
     if (not violation.cause and pleasant(motion)) or violation.cause in hopeless:
         return motion, violation.cause
@@ -116,7 +114,7 @@ def drive_ego(
     unreactive: frozenset[int] = frozenset()
     for begin in _beginnings(roles, motion, violation, first_step, aware_step):
         plan = plan_ego(roles, motion, times_s, begin, unreactive)
-        motion = traffic_run(staging, plan)
+        motion = yield Run(traffic, staging, plan)
         violation = find(motion)
         unreactive |= set(violation.users)
         if not violation.cause and (rough is None or pleasant(motion)):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, wraps
 from itertools import combinations, permutations
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -21,6 +21,21 @@ from drivax.synthetic.roads.signals import SignalPlan
 CLEARANCE_M = 2.9
 #: Map features have every second sample of a lane, about 1 m apart.
 _STRIDE = 2
+
+
+_T = TypeVar("_T")
+
+
+def per_roads(derive: Callable[[RoadNetwork], _T]) -> Callable[[RoadNetwork], _T]:
+    """Cache what derives from a network for all networks with the same roads (:meth:`RoadNetwork.with_signals`)."""
+
+    @wraps(derive)
+    def look_up(network: RoadNetwork) -> _T:
+        if derive not in network.derived:
+            network.derived[derive] = derive(network)
+        return network.derived[derive]
+
+    return look_up
 
 
 class Control(enum.IntEnum):
@@ -112,12 +127,13 @@ class Bay:
 
 @dataclass(frozen=True, eq=False)
 class RoadNetwork:
-    """A road map in its own frame (metres), equal only to itself: what derives from it can be cached.
+    """A road map in its own frame (metres), equal only to itself.
 
     Attributes:
         edges: Closed rings without the repeated point: the outer boundary counter-clockwise, islands clockwise.
         sidewalks: Sidewalks outside the edges.
         busy: Lanes with denser traffic.
+        derived: What :func:`per_roads` caches.
     """
 
     family: str
@@ -131,13 +147,32 @@ class RoadNetwork:
     sidewalks: tuple[Curve, ...] = ()
     bays: tuple[Bay, ...] = ()
     busy: tuple[int, ...] = ()
+    derived: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 
-    @cached_property
+    def with_signals(self, signals: SignalPlan | None) -> RoadNetwork:
+        """Return the same roads with another clock of their lights."""
+        result = replace(self, signals=signals)
+        result.__dict__["derived"] = self.derived
+        return result
+
+    @property
+    @per_roads
     def conflicts(self) -> Bool[np.ndarray, "lane lane"]:
         """Pairs of connectors that come closer than ``CLEARANCE_M`` and begin at different lanes."""
         return conflict_matrix(self.lanes)
 
-    @cached_property
+    @property
+    @per_roads
+    def marked_crossings(self) -> dict[int, list[tuple[int, float]]]:
+        """Index of each marked crossing on a lane, and the distance along the lane of its near side, m."""
+        result: dict[int, list[tuple[int, float]]] = {}
+        for number, crossing in enumerate(self.crossings):
+            for lane, along in crossing.lanes if crossing.marked else ():
+                result.setdefault(lane, []).append((number, along - crossing.width_m / 2))
+        return result
+
+    @property
+    @per_roads
     def shared_m(self) -> dict[tuple[int, int], float]:
         """Distance along one of two successors of a lane over which they share space, m."""
         pairs = (pair for lane in self.lanes for pair in permutations(lane.successors, 2))

@@ -8,17 +8,18 @@ follower a_n and a_o, a dash for after the change, and the politeness p.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, reduce
+from functools import reduce
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from drivax.scenario.schema import RoadKind
 from drivax.simulator.idm import idm_acceleration
-from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.roads.network import RoadNetwork, per_roads
 from drivax.synthetic.traffic.obstacles import Boxes
-from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, Worlds, pick
 from drivax.synthetic.traffic.roles import Drivers
 
 #: MOBIL: threshold and safe braking, m/s2; the latter grows to the second value as the own lane runs out.
@@ -49,6 +50,7 @@ _Occupied = tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]]
 _Neighbour = tuple[_Indices, _Values, _Values]
 
 
+@dataclass(frozen=True)
 class LaneChains:
     """Lanes that follow each other without a fork or a connector, joined to chains.
 
@@ -56,36 +58,60 @@ class LaneChains:
         chain, offset_m: Chain of each lane (-1: a connector), and position of the lane's start along it.
         length_m, ends: Per chain: its length, and whether it ends while the road continues.
         left, right: Adjacent lane of each lane to which cars may change (-1: none).
+        lane_m, exit, limit: Length of each lane, whether it leads off the road, and its speed limit.
     """
 
-    def __init__(self, network: RoadNetwork) -> None:
+    chain: Int64[np.ndarray, " lane"]
+    offset_m: Float64[np.ndarray, " lane"]
+    length_m: Float64[np.ndarray, " chain"]
+    ends: Bool[np.ndarray, " chain"]
+    left: Int64[np.ndarray, " lane"]
+    right: Int64[np.ndarray, " lane"]
+    lane_m: Float64[np.ndarray, " lane"]
+    exit: Bool[np.ndarray, " lane"]
+    limit: Float64[np.ndarray, " lane"]
+
+    @classmethod
+    def of(cls, network: RoadNetwork) -> LaneChains:
+        """Return the chains of a network."""
         lanes = network.lanes
-        self.chain, self.offset_m = np.full(len(lanes), -1), np.zeros(len(lanes))
+        chain, offset_m = np.full(len(lanes), -1), np.zeros(len(lanes))
         lengths, ends = [], []
         following = {i: _next_in_chain(network, i) for i in range(len(lanes)) if not lanes[i].connector}
         inner = set(following.values())
         for head in [i for i in following if i not in inner]:
             position, last, lane = 0.0, head, head
             while lane >= 0:
-                self.chain[lane], self.offset_m[lane] = len(lengths), position
+                chain[lane], offset_m[lane] = len(lengths), position
                 position += lanes[lane].length_m
                 last, lane = lane, following[lane]
             lengths.append(position)
             ends.append(lanes[last].ends and not lanes[last].successors)
-        self.length_m, self.ends = np.array([*lengths, 0.0]), np.array([*ends, False])
-        self.left, self.right = (
+        left, right = (
             np.array([-1 if other < 0 or _is_closed(network, other) else other for other in side])
             for side in ([lane.left for lane in lanes], [lane.right for lane in lanes])
         )
-        self.lane_m = np.array([lane.length_m for lane in lanes])
-        self.exit = np.array([lane.exit_only for lane in lanes])
-        self.limit = np.array([lane.limit_mps for lane in lanes])
+        return cls(
+            chain, offset_m, np.array(lengths), np.array(ends, bool), left, right,
+            lane_m=np.array([lane.length_m for lane in lanes]),
+            exit=np.array([lane.exit_only for lane in lanes]),
+            limit=np.array([lane.limit_mps for lane in lanes]),
+        )  # fmt: skip
+
+    @classmethod
+    def join(cls, worlds: Worlds) -> LaneChains:
+        """Join the chains of all worlds; a last chain without length stands for connectors."""
+        chains = [lane_chains(network) for network in worlds.networks]
+        first = np.cumsum([0, *(len(chain.length_m) for chain in chains)])
+        result = {name: np.concatenate([getattr(c, name) for c in chains]) for name in vars(chains[0])}
+        world = np.repeat(np.arange(len(worlds)), np.diff(worlds.lane))
+        for name, offset in (("chain", first), ("left", worlds.lane), ("right", worlds.lane)):
+            result[name] = np.where(result[name] < 0, -1, result[name] + offset[world])
+        ends = {"length_m": np.append(result["length_m"], 0.0), "ends": np.append(result["ends"], False)}
+        return cls(**result | ends)
 
 
-@lru_cache(maxsize=1)
-def lane_chains(network: RoadNetwork) -> LaneChains:
-    """Return the chains of a network."""
-    return LaneChains(network)
+lane_chains = per_roads(LaneChains.of)
 
 
 def _next_in_chain(network: RoadNetwork, lane: int) -> int:
@@ -163,10 +189,17 @@ class _Options:
 class LaneChanges:
     """Decides the lane changes of all vehicles."""
 
-    def __init__(self, network: RoadNetwork, drivers: Drivers, standing: Boxes) -> None:
-        self.chains, self._drivers = lane_chains(network), drivers
+    def __init__(self, worlds: Worlds, drivers: Drivers, standing: Sequence[Boxes]) -> None:
+        self.chains, self._drivers, self._worlds = LaneChains.join(worlds), drivers, worlds
         self._half = drivers.size_m[:, 0] / 2
-        self._obstacle_chain, self._obstacle_m = _on_chains(network, self.chains, standing)
+        self._half_of_column = pick(self._half, worlds.rows, 0.0)
+        blocked = [
+            (self.chains.chain[first + lane], self.chains.offset_m[first + lane] + position)
+            for first, network, boxes in zip(worlds.lane[:-1], worlds.networks, standing, strict=True)
+            for lane, position in _blocked_lanes(network, boxes)
+        ]
+        self._obstacle_chain = np.array([chain for chain, _ in blocked], int)
+        self._obstacle_m = np.array([position for _, position in blocked])
 
     def decide(self, now: Situation, tables: PathTables) -> tuple[list[Change], Helped]:
         """Return lane changes that begin now, and pairs that open gaps for mandatory ones."""
@@ -256,17 +289,19 @@ class LaneChanges:
     ) -> tuple[_Neighbour, _Neighbour]:
         """The nearest vehicle or obstacle ahead of each place on its chain, and the nearest vehicle behind."""
         chain, position = place
-        pair = np.arange(len(vehicles))
-        separation = occupied[1] - position[:, None, None]
-        seen = occupied[0] == chain[:, None, None]
-        seen[pair, vehicles] = False
+        pair, world = np.arange(len(vehicles)), self._worlds.of[vehicles]
+        rows = self._worlds.rows[world]
+        separation = occupied[1].take(rows, axis=0) - position[:, None, None]
+        seen = (occupied[0].take(rows, axis=0) == chain[:, None, None]) & (rows >= 0)[..., None]
+        seen[rows == vehicles[:, None]] = False
+        half_of_column = self._half_of_column[world]
         neighbours = []
         for distance in (separation, -separation):
             slots = np.where(seen & (distance >= 0), distance, np.inf)
             # NumPy reduces a last axis this short several times more slowly.
-            gap = reduce(np.minimum, np.moveaxis(slots, -1, 0)) - self._half
-            row = gap.argmin(axis=1)
-            nearest = gap[pair, row]
+            gap = reduce(np.minimum, np.moveaxis(slots, -1, 0)) - half_of_column
+            column = gap.argmin(axis=1)
+            nearest, row = gap[pair, column], rows[pair, column]
             neighbours.append((np.where(np.isfinite(nearest), row, -1), nearest, now.speed[row]))
         (row, nearest, speed), (behind, behind_gap, behind_speed) = neighbours
         if len(self._obstacle_m):
@@ -314,14 +349,12 @@ def _help_accelerations(
     return Helped(behind, ahead, gap)
 
 
-def _on_chains(network: RoadNetwork, chains: LaneChains, boxes: Boxes) -> _Place:
-    """Chain and position of each lane that a standing obstacle blocks."""
-    chain, position_m = [], []
-    for index, lane in enumerate(network.lanes if len(boxes) else ()):
-        if chains.chain[index] < 0:
-            continue
-        gap = np.sum((boxes.xy[:, None] - lane.curve.xy[::2]) ** 2, axis=-1)
+def _blocked_lanes(network: RoadNetwork, boxes: Boxes) -> list[tuple[int, float]]:
+    """Each lane of a chain that a standing obstacle blocks, and the position along it, m."""
+    result, chain = [], lane_chains(network).chain
+    for index in np.flatnonzero(chain >= 0).tolist() if len(boxes) else ():
+        curve = network.lanes[index].curve
+        gap = np.sum((boxes.xy[:, None] - curve.xy[::2]) ** 2, axis=-1)
         for box in np.flatnonzero(gap.min(axis=1) < (0.95 + boxes.size_m[:, 1] / 2) ** 2):
-            chain.append(chains.chain[index])
-            position_m.append(chains.offset_m[index] + float(lane.curve.arc_m[::2][np.argmin(gap[box])]))
-    return np.array(chain, int), np.array(position_m)
+            result.append((index, float(curve.arc_m[::2][np.argmin(gap[box])])))
+    return result

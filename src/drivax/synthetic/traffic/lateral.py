@@ -192,13 +192,14 @@ class DetourRequest:
 
 
 def detour_request(
-    network: RoadNetwork, tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
+    tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
 ) -> DetourRequest:
     """Build the request of a vehicle at a path position and speed."""
-    position, adjacent = float(now[0]), []
+    position, adjacent, world = float(now[0]), [], tables.worlds.of[row]
+    network = tables.worlds.networks[world]
     lane, along = tables.on(np.array([position]), slice(row, row + 1))
     if lane[0, 0] >= 0:
-        current = network.lanes[lane[0, 0]]
+        current = network.lanes[lane[0, 0] - tables.worlds.lane[world]]
         for other in (current.left, current.right):
             if other >= 0:
                 scale = current.length_m / network.lanes[other].length_m

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, Worlds, pick
 from drivax.synthetic.traffic.paths import Path
 
 #: Lateral margin of the corridor, m; less for vehicles, which keep to their lanes.
@@ -119,23 +120,37 @@ def _reach(size_m: Float64[np.ndarray, "k 2"], relative_heading: _Values) -> tup
     return cos * size_m[:, 0] + sin * size_m[:, 1], sin * size_m[:, 0] + cos * size_m[:, 1]
 
 
-class StaticObstacles:
-    """Static obstacles, in the coordinates of every vehicle's path."""
+NO_EXTENTS = Extents(*np.zeros((4, 0)))
 
-    def __init__(self, boxes: Boxes, tables: PathTables, width_m: PerVehicle) -> None:
-        self.boxes, self._half = boxes, width_m / 2
+
+class StaticObstacles:
+    """Static obstacles of each world, in the coordinates of every vehicle's path.
+
+    Args:
+        worlds: The worlds.
+        boxes: Obstacles of each world.
+        seen: Their extents on the path of each vehicle.
+        width_m: Width of each vehicle.
+    """
+
+    def __init__(
+        self, worlds: Worlds, boxes: Sequence[Boxes], seen: Sequence[Extents], width_m: PerVehicle
+    ) -> None:
+        self.boxes, self._worlds, self._half = tuple(boxes), worlds, width_m / 2
         self.near_m = np.full((len(width_m), 1), np.inf)
-        self._seen = [Extents(*np.zeros((4, 0))) for _ in tables.paths]
-        for row, path in enumerate(tables.paths):
-            self.replace(row, path)
+        self._seen = list(seen)
+        for row in np.flatnonzero([len(extents.near_m) > 0 for extents in seen]).tolist():
+            self._enter(row)
 
     def replace(self, row: int, path: Path) -> None:
         """Enter the path of one vehicle."""
-        if not len(self.boxes):
-            return
-        seen, _ = extents(path, self.boxes)
-        self._seen[row] = seen
-        half = self._half[row] + _MARGIN_M
+        boxes = self.boxes[self._worlds.of[row]]
+        if len(boxes):
+            self._seen[row], _ = extents(path, boxes)
+            self._enter(row)
+
+    def _enter(self, row: int) -> None:
+        seen, half = self._seen[row], self._half[row] + _MARGIN_M
         block = np.sort(seen.near_m[(seen.right_m < half) & (seen.left_m > -half)])
         if len(block) > self.near_m.shape[1]:
             extra = len(block) - self.near_m.shape[1]
@@ -157,12 +172,16 @@ class StaticObstacles:
 
 
 def nearest_obstacles(
-    tables: PathTables, vehicles: Boxes, at_m: PerVehicle, active: VehicleMask, others: Boxes
-) -> tuple[PerVehicle, PerVehicle]:
-    """Gap from each front bumper to the nearest obstacle in the corridor of the own path, and its speed along it."""
+    tables: PathTables, vehicles: Boxes, at_m: PerVehicle, active: VehicleMask, others: Boxes,
+    by_world: Int64[np.ndarray, "world most"],
+) -> tuple[PerVehicle, PerVehicle]:  # fmt: skip
+    """Gap from each front bumper to the nearest obstacle in the corridor of the own path, and its speed along it.
+
+    ``others`` are the moving users that are no vehicles; ``by_world`` has their indices, filled up with -1.
+    """
     count, users = len(vehicles), vehicles.concatenate(others)
     gap, speed = np.full(count, np.inf), np.zeros(count)
-    viewer, user = _nearby_pairs(vehicles, users, active)
+    viewer, user = _nearby_pairs(tables.worlds, vehicles, users, by_world, active)
     if not len(viewer):
         return gap, speed
     pose, place_m, apart2 = _nearest(tables, at_m, viewer, users.xy[user])
@@ -192,12 +211,25 @@ def nearest_obstacles(
     return gap, speed
 
 
-def _nearby_pairs(vehicles: Boxes, users: Boxes, active: VehicleMask) -> tuple[_Indices, _Indices]:
-    """Pairs of a vehicle and a user (vehicles first) in a wedge ahead of it."""
-    count = len(vehicles)
-    dx, dy = users.xy[:, 0] - vehicles.xy[:, 0, None], users.xy[:, 1] - vehicles.xy[:, 1, None]
+def _nearby_pairs(
+    worlds: Worlds,
+    vehicles: Boxes,
+    users: Boxes,
+    by_world: Int64[np.ndarray, "world most"],
+    active: VehicleMask,
+) -> tuple[_Indices, _Indices]:
+    """Pairs of a vehicle and a user of its world (vehicles first) in a wedge ahead of it."""
+    count = worlds.rows.shape[1]
+    columns = np.concatenate((worlds.rows, np.where(by_world < 0, -1, by_world + len(vehicles))), axis=1)
+    xy = users.xy.copy()
+    xy[: len(vehicles)][~active] = np.nan
+    dx, dy = (
+        pick(xy[:, axis], columns, np.nan).take(worlds.of, axis=0) - vehicles.xy[:, axis, None]
+        for axis in (0, 1)
+    )
     cos, sin = (component[:, None] for component in vehicles.direction)
-    ahead = dx * cos + dy * sin
+    ahead = dx * cos
+    ahead += dy * sin
     dy *= cos
     dx *= sin
     dy -= dx
@@ -205,28 +237,23 @@ def _nearby_pairs(vehicles: Boxes, users: Boxes, active: VehicleMask) -> tuple[_
     reach = np.where(active, np.minimum(_AHEAD_M, 12.0 + 2.5 * vehicles.speed), 0.0)[:, None]
     near = ahead > 0.5
     near[:, :count] &= ahead[:, :count] < np.minimum(reach, _NEAR_M)
-    near[:, :count] &= active
     near[:, count:] &= ahead[:, count:] < reach
     ahead *= 0.5
     ahead += 3.0
     near &= np.abs(dy, out=dy) < np.minimum(ahead, _ASIDE_M, out=ahead)
-    pairs = near.ravel().nonzero()[0]
-    return pairs // len(users), pairs % len(users)
+    viewer, column = np.divmod(near.ravel().nonzero()[0], near.shape[1])
+    return viewer, columns[worlds.of[viewer], column]
 
 
 def _nearest(
     tables: PathTables, at_m: PerVehicle, viewer: _Indices, xy: Float64[np.ndarray, "k 2"]
 ) -> tuple[Float64[np.ndarray, "k 4"], _Values, _Values]:
     """The sample of a vehicle's path ahead that is nearest to a point, its position, and the squared distance."""
-    step = tables.step_m[viewer]
-    index = np.rint((at_m[viewer, None] + _LOOKS_M) / step[:, None]).astype(int)
-    index = np.minimum(index, tables.last[viewer, None])
-    flat = tables.table.reshape(-1, 4)
-    points = flat.take(index + (viewer * tables.table.shape[1])[:, None], axis=0)
+    points, index = tables.ahead(at_m, viewer, _LOOKS_M)
     dx, dy = points[..., 0] - xy[:, 0, None], points[..., 1] - xy[:, 1, None]
     separation = dx * dx + dy * dy
     pair = np.arange(len(viewer)), separation.argmin(axis=1)
-    return points[pair], index[pair] * step, separation[pair]
+    return points[pair], index[pair] * tables.step_m[viewer], separation[pair]
 
 
 def _leaves_corridor(

@@ -1,6 +1,8 @@
-"""All paths as arrays of one shape, so that a traffic step is a few operations over all vehicles."""
+"""The paths of several worlds as arrays, so that a traffic step is a few operations over all their vehicles."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -16,6 +18,8 @@ VehicleRows = Int64[np.ndarray, " v"]
 #: Vehicles of a look-up.
 Rows = slice | VehicleRows
 ALL_ROWS = slice(None)
+#: Columns for crossings, columns for connectors that a path may have more, and room for samples of later paths.
+_CROSSINGS, _MORE_CONNECTORS, _ROOM = 4, 4, 1.3
 
 
 def speed_profile(
@@ -37,41 +41,90 @@ def driver_profile(path: Path, drivers: Drivers, row: int) -> Float64[np.ndarray
     return speed_profile(path, *(float(getattr(drivers, name)[row]) for name in names))
 
 
+def group_indices(group: Int64[np.ndarray, " item"], groups: int) -> Int64[np.ndarray, "group most"]:
+    """Indices of the items of each group in order, filled up with -1."""
+    size = np.bincount(group, minlength=groups)
+    table = np.full((groups, size.max(initial=0)), -1)
+    table[np.arange(table.shape[1]) < size[:, None]] = np.argsort(group, kind="stable")
+    return table
+
+
+def pick(values: np.ndarray, indices: np.ndarray, missing: float) -> np.ndarray:
+    """Values at indices, and a value for missing ones (-1)."""
+    return np.append(values, np.array([missing], values.dtype)).take(indices)
+
+
+def pad_steps(series: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Repeat the last step of series of a number of steps until all are equally long."""
+    steps = max(map(len, series))
+    return [values.take(np.minimum(np.arange(steps), len(values) - 1), axis=0) for values in series]
+
+
+class Worlds:
+    """Worlds that are simulated together: the vehicles of each are successive rows, its lanes successive indices.
+
+    Attributes:
+        networks: The roads of each world.
+        row, lane, crossing: First row, lane and crossing of each world, and their numbers at the end.
+        of: World of each row.
+        rows: Rows of each world, filled up with -1.
+    """
+
+    def __init__(self, networks: Sequence[RoadNetwork], vehicles: Sequence[int]) -> None:
+        self.networks = tuple(networks)
+        counts = (
+            vehicles, [len(network.lanes) for network in networks], [len(n.crossings) for n in networks]
+        )  # fmt: skip
+        self.row, self.lane, self.crossing = (np.concatenate(([0], np.cumsum(count))) for count in counts)
+        self.of = np.repeat(np.arange(len(vehicles)), vehicles)
+        self.rows = group_indices(self.of, len(vehicles))
+
+    def __len__(self) -> int:
+        return len(self.networks)
+
+    def vehicles(self, world: int) -> slice:
+        """Rows of a world."""
+        return slice(int(self.row[world]), int(self.row[world + 1]))
+
+    def with_any(self, worlds: Int64[np.ndarray, " item"]) -> Bool[np.ndarray, " world"]:
+        """Mask of the worlds that occur."""
+        return np.bincount(worlds, minlength=len(self)) > 0
+
+
 class PathTables:
     """Lookup tables of all paths, one row per vehicle; a row is replaced when its vehicle changes to another path.
 
+    Lanes and crossings count through all worlds. The samples of all paths follow each other, those of later paths last.
+
     Attributes:
+        worlds: The worlds of the vehicles.
         table: x, y, heading and fastest speed at each sample.
         step_m, last, length_m: Distance between samples, index of the last one, and its position.
         lane, lane_m: Lanes occupied at each sample (-1: none), and positions on them.
-        begin, scale, since, until: Per lane of the network the fields of its span (``begin`` is nan without a span).
+        begin, scale, since, until: Per lane of the own world the fields of its span (``begin`` is nan without a span).
+        column: What to add to a lane for its index in these, flattened.
         connector, connector_begin, connector_end: Connectors in order of travel (-1: none), and path positions.
         crossing, crossing_m: Marked crossings in order of travel (-1: none), and positions of their near side.
+        crossings: Columns of crossings that each world has needed.
         stop_m: End of the last lane if the road continues without it, m (else infinite).
     """
 
-    def __init__(self, network: RoadNetwork, paths: list[Path], drivers: Drivers) -> None:
-        self._network, self._drivers = network, drivers
-        self.paths = list(paths)
-        count, lanes = len(paths), len(network.lanes)
-        self._crossings: dict[int, list[tuple[int, float]]] = {}
-        for number, crossing in enumerate(network.crossings):
-            for lane, along in crossing.lanes if crossing.marked else ():
-                self._crossings.setdefault(lane, []).append((number, along - crossing.width_m / 2))
-        # Later paths may be longer.
-        points = int(1.5 * max(len(path.curve.xy) for path in paths))
-        connectors = 4 + max(sum(network.lanes[s.lane].connector for s in path.spans) for path in paths)
-        self.table = np.zeros((count, points, 4))
-        self.lane = np.full((count, points, SLOTS), -1)
-        self.lane_m = np.zeros((count, points, SLOTS))
+    def __init__(self, worlds: Worlds, paths: Sequence[Path], drivers: Drivers) -> None:
+        self.worlds, self.paths, self._drivers = worlds, list(paths), drivers
+        count, lanes = len(paths), int(np.diff(worlds.lane).max())
+        self.crossings = np.full(len(worlds), _CROSSINGS)
+        self._first, self._used = np.zeros(count, int), 0
+        samples = int(_ROOM * sum(len(path.curve.xy) for path in paths))
+        self.table, self.lane_m = np.empty((samples, 4)), np.empty((samples, SLOTS))
+        self.lane = np.empty((samples, SLOTS), np.int32)
         self.step_m, self.last, self.length_m = np.ones(count), np.ones(count, int), np.ones(count)
-        self._rows = np.arange(count)
         self.begin, self.scale = np.full((count, lanes), np.nan), np.ones((count, lanes))
         self.since, self.until = np.full((count, lanes), -np.inf), np.full((count, lanes), np.inf)
-        self.connector = np.full((count, connectors), -1)
-        self.connector_begin, self.connector_end = np.full((2, count, connectors), np.inf)
-        self.crossing = np.full((count, 4), -1)
-        self.crossing_m = np.full((count, 4), np.inf)
+        self._present, self._limited = self.begin.copy(), np.zeros(count, bool)
+        self.column = lanes * np.arange(count) - worlds.lane[worlds.of]
+        self.connector, self.crossing = np.full((count, 0), -1), np.full((count, _CROSSINGS), -1)
+        self.connector_begin, self.connector_end = np.zeros((2, count, 0))
+        self.crossing_m = np.full((count, _CROSSINGS), np.inf)
         self.stop_m = np.full(count, np.inf)
         for row, path in enumerate(paths):
             self.replace(row, path)
@@ -79,54 +132,73 @@ class PathTables:
     def replace(self, row: int, path: Path) -> None:
         """Enter the path of one vehicle."""
         self.paths[row] = path
-        n = len(path.curve.xy)
-        self._grow(n)
-        self.table[row, :n, :2], self.table[row, :n, 2] = path.curve.xy, path.curve.heading
-        self.table[row, :n, 3] = driver_profile(path, self._drivers, row)
-        self.table[row, n:] = self.table[row, n - 1]
-        self.lane[row, :n], self.lane_m[row, :n] = path.lane, path.lane_m
-        self.lane[row, n:] = -1
+        n, world = len(path.curve.xy), self.worlds.of[row]
+        self._grow(self._used + n)
+        samples = slice(self._used, self._used + n)
+        self._first[row], self._used = self._used, self._used + n
+        self.table[samples, :2], self.table[samples, 2] = path.curve.xy, path.curve.heading
+        self.table[samples, 3] = driver_profile(path, self._drivers, row)
+        self.lane[samples], self.lane_m[samples] = path.lane, path.lane_m
+        self.lane[samples][path.lane >= 0] += self.worlds.lane[world]
         self.step_m[row], self.last[row], self.length_m[row] = path.step_m, n - 1, path.length_m
         self.begin[row], self.scale[row] = np.nan, 1.0
         self.since[row], self.until[row] = -np.inf, np.inf
-        self.connector[row], self.connector_begin[row], self.connector_end[row] = -1, np.inf, np.inf
         self._enter_lanes(row, path)
         final = max(path.spans, key=lambda span: span.end_m if span.until_m == np.inf else -1.0)
-        lane = self._network.lanes[final.lane]
+        lane = self.worlds.networks[world].lanes[final.lane]
         self.stop_m[row] = path.length_m if lane.ends and not lane.successors else np.inf
 
     def _enter_lanes(self, row: int, path: Path) -> None:
-        connectors, crossings = [], []
+        connectors, crossings, world = [], [], self.worlds.of[row]
+        network = self.worlds.networks[world]
         for span in path.spans:
             lane = span.lane
             self.begin[row, lane], self.scale[row, lane] = span.begin_m, span.scale
             self.since[row, lane], self.until[row, lane] = span.from_m, span.until_m
-            if self._network.lanes[lane].connector and span.until_m == np.inf:
-                connectors.append((span.begin_m, span.end_m, lane))
-            for number, along in self._crossings.get(lane, ()):
-                crossings.append((span.begin_m + span.scale * along, number))
-        for k, (begin, end, lane) in enumerate(sorted(connectors)[: self.connector.shape[1]]):
-            self.connector[row, k], self.connector_begin[row, k] = lane, begin
-            self.connector_end[row, k] = end
-        self.widen(len(crossings))
+            if network.lanes[lane].connector and span.until_m == np.inf:
+                connectors.append((span.begin_m, span.end_m, lane + self.worlds.lane[world]))
+            for number, along in network.marked_crossings.get(lane, ()):
+                crossings.append((span.begin_m + span.scale * along, number + self.worlds.crossing[world]))
+        self._present[row] = self.begin[row]
+        self._limited[row] = any(span.from_m > -np.inf or span.until_m < np.inf for span in path.spans)
+        self.crossings[world] = max(self.crossings[world], len(crossings))
+        if len(connectors) >= self.connector.shape[1]:
+            self._widen("connector", len(connectors) + _MORE_CONNECTORS, "_begin", "_end")
+        self._widen("crossing", len(crossings), "_m")
+        self.connector[row], self.connector_begin[row], self.connector_end[row] = -1, np.inf, np.inf
+        for k, (begin, end, lane) in enumerate(sorted(connectors)):
+            self.connector[row, k], self.connector_begin[row, k], self.connector_end[row, k] = (
+                lane,
+                begin,
+                end,
+            )
         self.crossing[row], self.crossing_m[row] = -1, np.inf
         for k, (position, number) in enumerate(sorted(crossings)):
             self.crossing_m[row, k], self.crossing[row, k] = position, number
 
-    def widen(self, crossings: int) -> None:
-        """Make room for a number of crossings per path."""
-        extra = crossings - self.crossing.shape[1]
-        if extra > 0:
-            self.crossing = np.pad(self.crossing, ((0, 0), (0, extra)), constant_values=-1)
-            self.crossing_m = np.pad(self.crossing_m, ((0, 0), (0, extra)), constant_values=np.inf)
+    def _widen(self, name: str, columns: int, *positions: str) -> None:
+        """Widen indices and their positions to a number of columns."""
+        extra = ((0, 0), (0, columns - getattr(self, name).shape[1]))
+        if extra[1][1] > 0:
+            setattr(self, name, np.pad(getattr(self, name), extra, constant_values=-1))
+            for suffix in positions:
+                position = np.pad(getattr(self, name + suffix), extra, constant_values=np.inf)
+                setattr(self, name + suffix, position)
 
-    def _grow(self, points: int) -> None:
-        extra = points - self.table.shape[1]
+    def _grow(self, samples: int) -> None:
+        extra = samples - len(self.table)
         if extra > 0:
-            pad = ((0, 0), (0, extra), (0, 0))
-            self.table = np.pad(self.table, pad, mode="edge")
-            self.lane = np.pad(self.lane, pad, constant_values=-1)
-            self.lane_m = np.pad(self.lane_m, pad)
+            pad = ((0, extra + samples // 4), (0, 0))
+            self.table, self.lane, self.lane_m = (
+                np.pad(values, pad) for values in (self.table, self.lane, self.lane_m)
+            )
+
+    def present_begin(self, at_m: PerVehicle) -> Float64[np.ndarray, "v lane"]:
+        """``begin``, with nan where a span does not count at the vehicle's position."""
+        rows = self._limited.nonzero()[0]
+        own, since, until = at_m[rows, None], self.since[rows], self.until[rows]
+        self._present[rows] = np.where((since <= own) & (own <= until), self.begin[rows], np.nan)
+        return self._present
 
     def at(
         self, position_m: Float64[np.ndarray, "*look v"], rows: Rows = ALL_ROWS
@@ -135,9 +207,8 @@ class PathTables:
         sample = position_m / self.step_m[rows]
         index = np.minimum(np.maximum(sample.astype(int), 0), self.last[rows] - 1)
         share = np.minimum(np.maximum(sample - index, 0.0), 1.0)[..., None]
-        index += self._rows[rows] * self.table.shape[1]
-        flat = self.table.reshape(-1, 4)
-        low, result = flat.take(index, axis=0), flat.take(index + 1, axis=0)
+        index += self._first[rows]
+        low, result = self.table.take(index, axis=0), self.table.take(index + 1, axis=0)
         result -= low
         result *= share
         result += low
@@ -149,7 +220,15 @@ class PathTables:
         """Lanes occupied at positions on the paths of all or some vehicles (-1: none), and positions on them, m."""
         step = self.step_m[rows]
         index = np.minimum(np.maximum(np.rint(position_m / step).astype(int), 0), self.last[rows])
-        excess, index = position_m - index * step, index + self._rows[rows] * self.lane.shape[1]
-        along = self.lane_m.reshape(-1, SLOTS).take(index, axis=0)
+        excess, index = position_m - index * step, index + self._first[rows]
+        along = self.lane_m.take(index, axis=0)
         along += excess[:, None]
-        return self.lane.reshape(-1, SLOTS).take(index, axis=0), along
+        return self.lane.take(index, axis=0).astype(int), along
+
+    def ahead(
+        self, at_m: PerVehicle, rows: Int64[np.ndarray, " k"], distance_m: Float64[np.ndarray, " look"]
+    ) -> tuple[Float64[np.ndarray, "k look 4"], Int64[np.ndarray, "k look"]]:
+        """The samples nearest to distances ahead of some vehicles (the last one beyond it), and their indices."""
+        index = np.rint((at_m[rows, None] + distance_m) / self.step_m[rows, None]).astype(int)
+        index = np.minimum(index, self.last[rows, None])
+        return self.table.take(index + self._first[rows, None], axis=0), index

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int8, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from drivax.geometry.boxes import overlap
 from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S
 from drivax.synthetic.roads.curves import STEP_M, Curve, resample
-from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
+from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork, per_roads
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes
-from drivax.synthetic.traffic.path_arrays import PerVehicle, VehicleMask
+from drivax.synthetic.traffic.path_arrays import PerVehicle, VehicleMask, Worlds, pad_steps, pick
 from drivax.synthetic.traffic.roles import Pedestrian
 
 #: Distances from the kerb, m, at which pedestrians wait, occupy the crossing, and start to look for a gap.
@@ -38,12 +38,10 @@ _DECISION_STEPS = 2
 #: Connectors next to lanes that begin or end this close to a crossing control it, m.
 _NEAR_JUNCTION_M = 25.0
 
-# A plain number: members of enumerations are looked up slowly.
-_RED = int(Colour.RED)
-
 #: A number and a flag per pedestrian.
 _Values = Float64[np.ndarray, " w"]
 _Mask = Bool[np.ndarray, " w"]
+_Indices = Int64[np.ndarray, " w"]
 _Point = Float64[np.ndarray, " 2"]
 
 
@@ -59,7 +57,7 @@ class _CrossingConflicts:
     red: Bool[np.ndarray, "crossing lane"]
 
 
-@lru_cache(maxsize=1)
+@per_roads
 def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
     poses, owner = [], []
     for index, crossing in enumerate(network.crossings):
@@ -109,20 +107,35 @@ def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, "
 
 
 class Pedestrians:
-    """Pedestrians, moved step by step."""
+    """The pedestrians of all worlds, moved step by step; crossings count through all worlds.
+
+    Args:
+        worlds: The worlds.
+        by_world: Pedestrians of each world.
+        times_s: Times of the steps of each world, on the clock of its lights.
+
+    Attributes:
+        world: World of each pedestrian.
+    """
 
     def __init__(
-        self, network: RoadNetwork, pedestrians: tuple[Pedestrian, ...], times_s: Float64[np.ndarray, " time"]
-    ) -> None:
-        self._conflicts = _crossing_conflicts(network)
-        self._remaining_red = _remaining_red_s(network, self._conflicts.red, times_s)
+        self, worlds: Worlds, by_world: Sequence[Sequence[Pedestrian]],
+        times_s: Sequence[Float64[np.ndarray, " _"]],
+    ) -> None:  # fmt: skip
+        self._worlds, pedestrians = worlds, [pedestrian for group in by_world for pedestrian in group]
+        self.world = np.repeat(np.arange(len(worlds)), list(map(len, by_world)))
+        self._conflicts = [_crossing_conflicts(network) for network in worlds.networks]
+        red_s = [
+            _remaining_red_s(network, conflicts.red, times)
+            for network, conflicts, times in zip(worlds.networks, self._conflicts, times_s, strict=True)
+        ]
+        self._remaining_red = np.concatenate(pad_steps(red_s), axis=1)
         curves = [resample(pedestrian.curve, STEP_M) for pedestrian in pedestrians]
+        self._table = np.concatenate(
+            [np.zeros((0, 3)), *(np.column_stack([curve.xy, curve.heading]) for curve in curves)]
+        )
         self._last = np.array([len(curve.xy) - 1 for curve in curves], int)
-        self._table = np.zeros((len(curves), max([*self._last, 0]) + 1, 3))
-        self._begin = np.arange(len(curves)) * self._table.shape[1]
-        for row, curve in zip(self._table, curves, strict=True):
-            row[: len(curve.xy)] = np.column_stack([curve.xy, curve.heading])
-            row[len(curve.xy) :] = row[len(curve.xy) - 1]
+        self._begin = np.concatenate(([0], np.cumsum(self._last + 1)))[:-1]
         self._step_m = np.array([float(curve.arc_m[-1]) / (len(curve.xy) - 1) for curve in curves])
         numbers = [[w.start_m, w.speed_mps, w.kerb_m, w.across_m] for w in pedestrians]
         self._at, self._free_speed, self._kerb, self._across = (
@@ -132,17 +145,18 @@ class Pedestrians:
         self._speed = self._free_speed.copy()
         self._crossing = np.array([pedestrian.crossing for pedestrian in pedestrians], int)
         self._crosses = self._crossing >= 0
+        self._crossing += worlds.crossing[self.world]
         self._any_crosses = bool(self._crosses.any())
         # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
-        lights = self._conflicts.red.any(axis=1)
-        has_priority, self._yielding = self._conflicts.marked & ~lights, self._conflicts.marked | lights
-        self._has_priority = (
-            has_priority[self._crossing] if len(has_priority) else np.zeros(len(curves), bool)
-        )
+        marked = np.concatenate([conflicts.marked for conflicts in self._conflicts])
+        lights = np.concatenate([conflicts.red.any(axis=1) for conflicts in self._conflicts])
+        self._yielding = marked | lights
+        self._has_priority = np.zeros(len(curves), bool)
+        self._has_priority[self._crosses] = (marked & ~lights)[self._crossing[self._crosses]]
         self._released, self._is_blocked = np.zeros((2, len(curves)), bool)
 
     def step(
-        self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
+        self, t: int, vehicles: Boxes, active: VehicleMask
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
         """Return all pedestrians at step ``t`` and the occupied crossings, then advance; call it step by step.
 
@@ -150,13 +164,13 @@ class Pedestrians:
         """
         sample = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
         index = np.minimum(sample.astype(int), self._last - 1)
-        flat, rows = self._table.reshape(-1, 3), index + self._begin
-        low = flat.take(rows, axis=0)
-        pose = low + (sample - index)[:, None] * (flat.take(rows + 1, axis=0) - low)
-        occupied = np.zeros(len(self._conflicts.marked), bool)
+        rows = index + self._begin
+        low = self._table.take(rows, axis=0)
+        pose = low + (sample - index)[:, None] * (self._table.take(rows + 1, axis=0) - low)
+        occupied = np.zeros(self._worlds.crossing[-1], bool)
         if t % _DECISION_STEPS == 0:
-            self._is_blocked = _is_blocked_by_vehicle(pose, vehicles, active)
-            self._release(t, vehicles, active, colour)
+            self._is_blocked = self._blocked_by_vehicles(pose, vehicles, active)
+            self._release(t, vehicles, active)
         if self._any_crosses:
             users = self._crosses & (self._at < self._across) & (self._at > self._kerb - _OCCUPY_M)
             users &= self._released | self._has_priority | (self._at > self._kerb)
@@ -165,36 +179,52 @@ class Pedestrians:
         self._advance()
         return result, occupied
 
-    def _release(
-        self, t: int, vehicles: Boxes, active: VehicleMask, colour: Int8[np.ndarray, " lane"]
-    ) -> None:
+    def _blocked_by_vehicles(
+        self, pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask
+    ) -> _Mask:
+        """Mask of pedestrians that would come too close to a vehicle and are not close to one yet."""
+        x, y, angle = pose.T
+        half = vehicles.size_m / 2 + _CLEARANCE_M
+        half[~active] = -1.0
+        boxes = (*vehicles.xy.T, *vehicles.direction, *half.T)
+        near = [pick(values, self._worlds.rows, -1.0).take(self.world, axis=0) for values in boxes]
+        blocked = _is_in_box(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), near)
+        if np.count_nonzero(blocked):
+            blocked &= ~_is_in_box(x, y, near)
+        return blocked
+
+    def _release(self, t: int, vehicles: Boxes, active: VehicleMask) -> None:
         """Release pedestrians at the kerb if the crossing stays safe for long enough."""
         to_kerb = self._kerb - self._at
         waiting = self._crosses & ~self._released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
         waiting = waiting.nonzero()[0]
         if not len(waiting):
             return
-        conflicts, crossing = self._conflicts, self._crossing[waiting]
         crossing_s = (self._across[waiting] - self._at[waiting]) / self._free_speed[waiting]
         # Starting from standstill takes v / (2 a) longer.
         crossing_s += self._free_speed[waiting] / (2 * _ACCELERATION_MPS2)
-        red = ~(conflicts.red[crossing] & (colour != _RED)).any(axis=1)
-        red &= self._remaining_red[t, crossing] >= crossing_s
         # Traffic matters only to those whose conflicting lights stay red.
-        waiting, crossing, crossing_s = waiting[red], crossing[red], crossing_s[red]
-        if not len(waiting):
-            return
-        boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])[active]
-        any_s, hard_s = _arrivals(conflicts, boxes, vehicles.speed[active])
-        yielding = self._yielding[crossing]
+        red = self._remaining_red[t, self._crossing[waiting]] >= crossing_s
+        waiting, crossing_s = waiting[red], crossing_s[red]
+        for world in np.unique(self.world[waiting]).tolist():
+            among = self.world[waiting] == world
+            rows = self._worlds.vehicles(world)
+            rows = np.flatnonzero(active[rows]) + rows.start
+            self._release_in(world, waiting[among], crossing_s[among], vehicles.select(rows))
+
+    def _release_in(self, world: int, waiting: _Indices, crossing_s: _Values, vehicles: Boxes) -> None:
+        """Release pedestrians of one world before its active vehicles."""
+        conflicts = self._conflicts[world]
+        boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
+        any_s, hard_s = _arrivals(conflicts, boxes, vehicles.speed)
+        crossing = self._crossing[waiting]
+        yielding, local = self._yielding[crossing], crossing - self._worlds.crossing[world]
         gap = np.where(
-            yielding, hard_s[crossing] > crossing_s + _MARGIN_S, any_s[crossing] > crossing_s + _GAP_MARGIN_S
+            yielding, hard_s[local] > crossing_s + _MARGIN_S, any_s[local] > crossing_s + _GAP_MARGIN_S
         ).nonzero()[0]
         # A standing queue blocks the crossing.
         if len(gap):
-            blocked = overlap(conflicts.strip[crossing[gap], None], boxes[None]).any(axis=1)
-            # Copies of this object share its arrays.
-            self._released = self._released.copy()
+            blocked = overlap(conflicts.strip[local[gap], None], boxes[None]).any(axis=1)
             self._released[waiting[gap]] = ~blocked
 
     def _advance(self) -> None:
@@ -255,25 +285,15 @@ def _arrivals(
     return any_s, hard_s
 
 
-def _is_blocked_by_vehicle(pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask) -> _Mask:
-    """Mask of pedestrians that would come too close to a vehicle and are not close to one yet."""
-    x, y, angle = pose.T
-    blocked = _is_near_vehicle(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
-    if np.count_nonzero(blocked):
-        blocked &= ~_is_near_vehicle(x, y, vehicles, active)
-    return blocked
-
-
-def _is_near_vehicle(x: _Values, y: _Values, vehicles: Boxes, active: VehicleMask) -> _Mask:
-    """Mask of points in a vehicle's box grown by the pedestrians' clearance."""
-    cos, sin = vehicles.direction
-    half = vehicles.size_m / 2 + _CLEARANCE_M
-    dx, dy = x[:, None] - vehicles.xy[:, 0], y[:, None] - vehicles.xy[:, 1]
+def _is_in_box(x: _Values, y: _Values, boxes: Sequence[Float64[np.ndarray, "w v"]]) -> _Mask:
+    """Mask of points in one of their boxes: x, y, cosine and sine of the heading, half the length and the width."""
+    box_x, box_y, cos, sin, half_length, half_width = boxes
+    dx, dy = x[:, None] - box_x, y[:, None] - box_y
     along = np.abs(dx * cos + dy * sin)
     dy *= cos
     dx *= sin
     dy -= dx
-    inside = (along < np.where(active, half[:, 0], -1.0)) & (np.abs(dy, out=dy) < half[:, 1])
+    inside = (along < half_length) & (np.abs(dy, out=dy) < half_width)
     return np.logical_or.reduce(inside, axis=1)
 
 

@@ -291,8 +291,7 @@ def draw_path(network: RoadNetwork, lanes: tuple[int, ...], cyclist: bool, rng: 
     return lane_path(network, lanes, Sway.draw(rng, 0.1, aside_m=_KERB_M - narrowest / 2))
 
 
-def join_drivers(first: Drivers, rest: Drivers) -> Drivers:
-    """Concatenate two sets of drivers."""
-    return Drivers(
-        **{name: np.concatenate([value, getattr(rest, name)]) for name, value in vars(first).items()}
-    )
+def join_drivers(*drivers: Drivers) -> Drivers:
+    """Concatenate sets of drivers."""
+    names = vars(drivers[0])
+    return Drivers(**{name: np.concatenate([getattr(group, name) for group in drivers]) for name in names})

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from itertools import groupby
 
 import numpy as np
 from jaxtyping import Float64, Int8, Int64
@@ -16,9 +16,9 @@ from jaxtyping import Float64, Int8, Int64
 from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S
 from drivax.synthetic.roads.curves import resample
-from drivax.synthetic.roads.network import CLEARANCE_M, Control, RoadNetwork
+from drivax.synthetic.roads.network import CLEARANCE_M, Control, RoadNetwork, per_roads
 from drivax.synthetic.roads.signals import Colour
-from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows, Worlds
 from drivax.synthetic.traffic.roles import Drivers
 
 #: A driver requests a connector when it can still stop with this braking, m/s2, with this time and distance to spare.
@@ -55,7 +55,7 @@ class TrafficState:
         colour, to_red: Colour of each lane's light, and time until it turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
-        committed: Number of connectors that a planned ego enters without yielding (-1: ego is not planned).
+        committed: Rows of planned vehicles and how many connectors each enters without yielding.
     """
 
     tables: PathTables
@@ -69,10 +69,10 @@ class TrafficState:
     room_m: PerVehicle
     leader: VehicleRows
     leader_speed: PerVehicle
-    committed: int
+    committed: dict[int, int]
 
 
-@lru_cache(maxsize=1)
+@per_roads
 def conflict_zones(
     network: RoadNetwork,
 ) -> tuple[Float64[np.ndarray, "lane lane"], Float64[np.ndarray, "lane lane"]]:
@@ -114,7 +114,7 @@ def time_to_cover(
 
 @dataclass(frozen=True)
 class _Request:
-    """A vehicle's request for the connector at an index (``place``) of its path, and the distance to its stop line."""
+    """A vehicle's request for a connector, at an index (``place``) of its path, and the distance to its stop line."""
 
     row: int
     connector: int
@@ -123,38 +123,40 @@ class _Request:
     distance_m: float
     speed: float
 
-    @classmethod
-    def at(cls, state: TrafficState, row: int, place: int) -> _Request:
-        line = float(state.tables.connector_begin[row, place])
-        connector, distance = int(state.tables.connector[row, place]), float(line - state.front_m[row])
-        return cls(row, connector, place, line, distance, float(state.speed[row]))
-
     @property
     def required_mps2(self) -> float:
         """Deceleration required to stop at the line, m/s2."""
         return self.speed**2 / (2 * max(self.distance_m, 0.05))
 
 
+class Rules:
+    """Rules and conflicts of the connectors of a network."""
+
+    def __init__(self, network: RoadNetwork) -> None:
+        self.zone_begin, self.zone_end = conflict_zones(network)
+        self.conflict = ~np.isnan(self.zone_begin)
+        self.rivals = [set(np.flatnonzero(conflict).tolist()) for conflict in self.conflict]
+        self.control = [int(lane.control) for lane in network.lanes]
+        self.yields = [
+            np.array([b for b in lane.yields_to if self.conflict[a, b]], int)
+            for a, lane in enumerate(network.lanes)
+        ]
+        self.free = [not self.rivals[a] and self.control[a] < _STOP for a in range(len(network.lanes))]
+        self.heading = [float(lane.curve.heading[0]) for lane in network.lanes]
+
+
+_rules = per_roads(Rules)
+
+
 class RightOfWay:
     """Grants connectors to drivers."""
 
-    def __init__(self, network: RoadNetwork, drivers: Drivers) -> None:
-        self._lanes, self._drivers = network.lanes, drivers
-        self._zone_begin, self._zone_end = conflict_zones(network)
-        self._conflict = ~np.isnan(self._zone_begin)
-        self._control = np.array([lane.control for lane in network.lanes])
-        self._yields = [
-            np.array([b for b in lane.yields_to if self._conflict[a, b]], int)
-            for a, lane in enumerate(network.lanes)
-        ]
-        self._free = ~self._conflict.any(axis=1) & (self._control < _STOP)
+    def __init__(self, worlds: Worlds, drivers: Drivers) -> None:
+        self._worlds, self._drivers = worlds, drivers
+        self._rules = [_rules(network) for network in worlds.networks]
         self._length = drivers.size_m[:, 0]
-        self._rows = np.arange(len(self._length))
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset for a new run."""
         count = len(self._length)
+        self._rows = np.arange(count)
         self._granted = np.zeros(count, int)  # number of connectors on the path
         self._stood = np.full(count, np.inf)  # time of the stop at the requested connector, s
         self._requested = np.full(count, -1)
@@ -173,20 +175,46 @@ class RightOfWay:
         self._granted = np.maximum(self._granted, entered)
         stop, halts = self._lights(state)
         self._granted = np.maximum(np.minimum(self._granted, halts), entered)
-        if state.committed >= 0:
-            self._granted[0] = max(state.committed, entered[0])
+        for row, count in state.committed.items():
+            self._granted[row] = max(count, entered[row])
         near = state.speed**2 / (2 * _ASK_MPS2) + _ASK_S * state.speed + _ASK_M
         index = np.minimum(self._granted, connectors - 1)
         # Without a connector ahead the distance is infinite.
         distance = begin.ravel().take(index + connectors * self._rows) - state.front_m
         requests = (distance >= 0) & (distance <= near) & state.active & (halts > index)
-        if state.committed >= 0:
-            requests[0], stop[0] = False, np.inf
+        for row in state.committed:
+            requests[row], stop[row] = False, np.inf
         self._denied &= requests
         rows = requests.nonzero()[0]
         if len(rows):
-            self._decide(state, rows, index, stop)
+            holders = self._holders(state)
+            for world, requested in groupby(self._requests(state, rows, index), self._world):
+                self._decide(state, world, list(requested), holders[world], stop)
         return stop
+
+    def _world(self, request: _Request) -> int:
+        return int(self._worlds.of[request.row])
+
+    def _requests(self, state: TrafficState, rows: _Requests, place: VehicleRows) -> list[_Request]:
+        """Requests of some vehicles for the connectors at an index of their paths."""
+        place = place[rows]
+        connector = state.tables.connector[rows, place] - self._worlds.lane[self._worlds.of[rows]]
+        line = state.tables.connector_begin[rows, place]
+        columns = (rows, connector, place, line, line - state.front_m[rows], state.speed[rows])
+        return [_Request(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
+
+    def _holders(self, state: TrafficState) -> list[_Holders]:
+        """Vehicles of each world that hold a connector."""
+        tables = state.tables
+        is_held = np.arange(tables.connector.shape[1]) < self._granted[:, None]
+        is_held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
+        row, slot = np.nonzero(is_held & (tables.connector >= 0))
+        world = self._worlds.of[row]
+        connector = tables.connector[row, slot] - self._worlds.lane[world]
+        result: list[_Holders] = [[] for _ in self._rules]
+        for w, *holder in zip(world.tolist(), row.tolist(), connector.tolist(), strict=True):
+            result[w].append((holder[0], holder[1]))
+        return result
 
     def _lights(self, state: TrafficState) -> tuple[PerVehicle, VehicleRows]:
         """Distance to the nearest line closed by a light, and index of its connector (their number: none)."""
@@ -208,127 +236,128 @@ class RightOfWay:
         has_line = halt.ravel().take(flat)
         return np.where(has_line, distance.ravel().take(flat), np.inf), np.where(has_line, first, count)
 
-    def _decide(self, state: TrafficState, rows: _Requests, place: VehicleRows, stop: PerVehicle) -> None:
+    def _decide(
+        self, state: TrafficState, world: int, requests: list[_Request], holders: _Holders, stop: PerVehicle
+    ) -> None:
         """Grant or deny requests, nearest in time first, at all-way stops in the order of arrival."""
-        tables = state.tables
-        is_held = np.arange(tables.connector.shape[1]) < self._granted[:, None]
-        is_held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
-        row, slot = np.nonzero(is_held & (tables.connector >= 0))
-        holders = list(zip(row.tolist(), tables.connector[row, slot].tolist(), strict=True))
-        requests = [_Request.at(state, i, int(place[i])) for i in rows.tolist()]
+        rules = self._rules[world]
         for request in requests:
             i = request.row
             if self._requested[i] != request.connector:
                 self._requested[i], self._stood[i] = request.connector, np.inf
             has_stopped = request.speed < _STANDS_MPS and request.distance_m < _STANDS_M
-            if has_stopped and not np.isfinite(self._stood[i]):
+            if has_stopped and self._stood[i] == np.inf:
                 self._stood[i] = state.step * DT_S
         waiting: list[int] = []  # connectors of vehicles that stand at an all-way stop and must still wait
-        for k in self._order(requests):
-            request = requests[k]
+        for request in self._order(rules, requests):
             i, connector = request.row, request.connector
             cannot_stop = request.required_mps2 > _HARDEST_MPS2
-            granted = self._free[connector] or (cannot_stop and state.speed[i] > 2.0)
-            granted = granted or self._may_enter(state, request, holders, waiting)
-            if not granted and self._clears_in_time(state, request, holders):
+            granted = rules.free[connector] or (cannot_stop and request.speed > 2.0)
+            granted = granted or self._may_enter(state, rules, request, holders, waiting)
+            if not granted and self._clears_in_time(state, rules, request, holders):
                 continue
             self._denied[i] = not granted
             if granted:
-                self._granted[i] = place[i] + 1
+                self._granted[i] = request.place + 1
                 self._stood[i] = np.inf
                 holders.append((i, connector))
             else:
                 stop[i] = min(stop[i], request.distance_m)
-                if self._control[connector] == _ALL_WAY_STOP and np.isfinite(self._stood[i]):
+                if rules.control[connector] == _ALL_WAY_STOP and self._stood[i] < np.inf:
                     waiting.append(connector)
 
-    def _order(self, requests: list[_Request]) -> list[int]:
+    def _order(self, rules: Rules, requests: list[_Request]) -> list[_Request]:
         """Order in which requests are decided."""
-        rows = np.array([request.row for request in requests])
-        connectors = np.array([request.connector for request in requests])
-        arrival = [request.distance_m / max(request.speed, 1.0) for request in requests]
-        all_way = self._control[connectors] == _ALL_WAY_STOP
-        stood = self._stood[rows]
-        key = np.where(all_way, 1e3 + np.minimum(stood, 1e6), arrival)
-        for k in np.flatnonzero(all_way & np.isfinite(stood)):
+        stops = [
+            (r, float(self._stood[r.row])) for r in requests if rules.control[r.connector] == _ALL_WAY_STOP
+        ]
+        key = {request.row: request.distance_m / max(request.speed, 1.0) for request in requests}
+        for request, stood in stops:
             # Of vehicles that arrived simultaneously the one without another to its right goes first.
-            tied = all_way & (np.abs(stood - stood[k]) < _TIE_S)
-            heading = self._lanes[connectors[k]].curve.heading[0]
-            angle = np.array([wrap(self._lanes[w].curve.heading[0] - heading) for w in connectors[tied]])
-            key[k] += 0.5 * _TIE_S * bool(np.any((angle > math.pi / 4) & (angle < 3 * math.pi / 4)))
-        return np.lexsort((rows, key)).tolist()
+            tied = (r.connector for r, since in stops if abs(since - stood) < _TIE_S)
+            angles = (wrap(rules.heading[c] - rules.heading[request.connector]) for c in tied)
+            to_right = any(math.pi / 4 < angle < 3 * math.pi / 4 for angle in angles)
+            key[request.row] = 1e3 + min(stood, 1e6) + 0.5 * _TIE_S * to_right
+        return sorted(requests, key=lambda request: (key[request.row], request.row))
 
     def _may_enter(
-        self, state: TrafficState, request: _Request, holders: _Holders, waiting: list[int]
+        self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders, waiting: list[int]
     ) -> bool:
         i, connector, line = request.row, request.connector, request.line_m
-        control = self._control[connector]
+        control = rules.control[connector]
         if control >= _STOP and state.step * DT_S - self._stood[i] < _PAUSE_S:
             return False
-        tail = state.front_m[i] + state.room_m[i]
-        if tail < line and self._denied[int(state.leader[i])]:
+        tail = float(state.front_m[i] + state.room_m[i])
+        if tail < line and self._denied[state.leader[i]]:
             return False
-        if self._blockers(state, request, holders) or self._conflict[connector, waiting].any():
+        if not rules.rivals[connector].isdisjoint(waiting) or self._blockers(state, rules, request, holders):
             return False
         exit_m = state.tables.connector_end[i, request.place]
         full = tail < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
         if full and tail >= line - 1.0 and control != _NONE:
             return False
-        return not len(self._yields[connector]) or self._accepts_gap(state, request)
+        return not len(rules.yields[connector]) or self._accepts_gap(state, rules, request)
 
     def _blockers(
-        self, state: TrafficState, request: _Request, holders: _Holders
+        self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders
     ) -> list[tuple[int, int, float]]:
         """Row and connector of each conflicting vehicle, and distance until its rear bumper clears the zone, m."""
         result, tables = [], state.tables
+        rivals = rules.rivals[request.connector]
         for j, other in holders:
-            if j != request.row and self._conflict[request.connector, other]:
+            if other in rivals and j != request.row:
                 clear_m = (
-                    tables.begin[j, other] + tables.scale[j, other] * self._zone_end[other, request.connector]
+                    tables.begin[j, other] + tables.scale[j, other] * rules.zone_end[other, request.connector]
                 )
                 if state.rear_m[j] < clear_m + 0.3:
                     result.append((j, other, float(clear_m - state.rear_m[j]) + 0.3))
         return result
 
-    def _clears_in_time(self, state: TrafficState, request: _Request, holders: _Holders) -> bool:
+    def _clears_in_time(
+        self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders
+    ) -> bool:
         """Whether a driver with priority need not brake yet because all blockers move and will have cleared."""
-        connector, blockers = request.connector, self._blockers(state, request, holders)
-        yields = {other for _, other, _ in blockers} & set(self._yields[connector].tolist())
-        gentle = request.required_mps2 < _LATEST_MPS2
-        if not blockers or not gentle or self._control[connector] >= _STOP or yields:
+        connector = request.connector
+        if rules.control[connector] >= _STOP or not request.required_mps2 < _LATEST_MPS2:
+            return False
+        blockers = self._blockers(state, rules, request, holders)
+        yields = {other for _, other, _ in blockers} & set(rules.yields[connector].tolist())
+        if not blockers or yields:
             return False
         for j, other, left in blockers:
             leaves = time_to_cover(np.array([left]), float(state.speed[j]), 1.0, _TURNING_MPS)[0]
-            arrives = (request.distance_m + self._zone_begin[connector, other]) / max(request.speed, 1.0)
+            arrives = (request.distance_m + rules.zone_begin[connector, other]) / max(request.speed, 1.0)
             if state.speed[j] < 0.5 or leaves + 1.0 > arrives:
                 return False
         return True
 
-    def _accepts_gap(self, state: TrafficState, request: _Request) -> bool:
+    def _accepts_gap(self, state: TrafficState, rules: Rules, request: _Request) -> bool:
         """Whether the gap to vehicles with priority is large enough."""
         i, connector, tables = request.row, request.connector, state.tables
-        others = self._yields[connector]
-        begin, scale = tables.begin[:, others], tables.scale[:, others]
-        reach = begin + scale * self._zone_begin[others, connector] - state.front_m[:, None]
-        clear = begin + scale * self._zone_end[others, connector] - state.rear_m[:, None]
-        coming = (clear > 0) & state.active[:, None]
-        coming[i] = False
+        world = int(self._worlds.of[i])
+        others, vehicles = rules.yields[connector], self._worlds.vehicles(world)
+        begin, scale = tables.begin[vehicles][:, others], tables.scale[vehicles][:, others]
+        reach = begin + scale * rules.zone_begin[others, connector] - state.front_m[vehicles, None]
+        clear = begin + scale * rules.zone_end[others, connector] - state.rear_m[vehicles, None]
+        coming = (clear > 0) & state.active[vehicles, None]
+        coming[i - vehicles.start] = False
         # Vehicles at a red light or with a denied request are not coming.
-        waits = (state.colour[others] == _RED) | (self._denied & (state.speed < 0.5))[:, None]
+        is_red = state.colour[self._worlds.lane[world] + others] == _RED
+        waits = is_red | (self._denied & (state.speed < 0.5))[vehicles, None]
         coming &= ~(waits & (reach > 0))
         if not coming.any():
             return True
         rows, columns = np.nonzero(coming)
-        speed, own = state.speed[rows], others[columns]
+        speed, own = state.speed[vehicles][rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         departure = clear[rows, columns] / np.maximum(speed, 0.3)
         top = float(tables.at(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
         own_speed, push = request.speed, float(self._drivers.acceleration_mps2[i])
-        to_zone = request.distance_m + self._zone_begin[connector, own]
-        through_zone = request.distance_m + self._zone_end[connector, own] + self._length[i]
+        to_zone = request.distance_m + rules.zone_begin[connector, own]
+        through_zone = request.distance_m + rules.zone_end[connector, own] + self._length[i]
         enter = time_to_cover(to_zone, own_speed, push, top)
         leave = time_to_cover(through_zone, own_speed, push, top)
-        wait_s = state.step * DT_S - self._stood[i] if np.isfinite(self._stood[i]) else 0.0
+        wait_s = state.step * DT_S - self._stood[i] if self._stood[i] < np.inf else 0.0
         patience = 1.0 - min(wait_s / _IMPATIENT_S, 1.0) / 3.0
         least_gap = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)
         return not np.any((arrival < least_gap) & (departure > enter - 0.3))

@@ -104,7 +104,7 @@ def assign_roles(
         network, driver, first_s, lane_change_share, rng, destination_route, attempts
     )
     rivals = add_feeders(network, conflicts_on(network, path)) if critical else frozenset()
-    network = replace(network, signals=_lights(network, lanes, timing, destination_route, rng))
+    network = network.with_signals(_lights(network, lanes, timing, destination_route, rng))
     current = max((span for span in path.spans if span.begin_m <= position), key=lambda span: span.begin_m)
     density, share = domain.density, float(rng.uniform(*domain.parked_share))
     parked = parked_cars(network, share, domain.double_share, rng, len(times_s))

@@ -1,21 +1,22 @@
 """Traffic at 10 Hz: vehicles on paths follow, stop, give way, change lanes and avoid obstacles.
 
-The car-following law is the simulator's (:mod:`drivax.simulator.idm`). All vehicles move at once: one step is a few
-dozen array operations over all vehicles.
+The car-following law is the simulator's (:mod:`drivax.simulator.idm`). All vehicles of several worlds move at once: one
+step is a few dozen array operations over all of them, and a world moves as it does alone.
 """
 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.idm import idm_acceleration
-from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.lane_changes import HELP_MPS2, NO_HELP, Change, LaneChanges, Situation
 from drivax.synthetic.traffic.lateral import (
     DETOUR_MARGIN_M,
@@ -25,10 +26,27 @@ from drivax.synthetic.traffic.lateral import (
     detour_request,
     positions_along,
 )
-from drivax.synthetic.traffic.obstacles import Boxes, StaticObstacles, nearest_obstacles
-from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows
+from drivax.synthetic.traffic.obstacles import (
+    NO_EXTENTS,
+    Boxes,
+    Extents,
+    StaticObstacles,
+    extents,
+    nearest_obstacles,
+)
+from drivax.synthetic.traffic.path_arrays import (
+    PathTables,
+    PerVehicle,
+    VehicleMask,
+    VehicleRows,
+    Worlds,
+    group_indices,
+    pad_steps,
+    pick,
+)
 from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, next_lanes
 from drivax.synthetic.traffic.pedestrians import Pedestrians
+from drivax.synthetic.traffic.placement import join_drivers
 from drivax.synthetic.traffic.right_of_way import RightOfWay, TrafficState
 from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Scripted, Staging
 
@@ -54,13 +72,10 @@ _FIRMLY = 1.3
 _SLOWEST = 6
 #: A planned ego claims junctions this many steps ahead.
 _FORESEEN = 25
-#: Steps between checkpoints, from which a run resumes that differs later.
-_CHECKPOINT_STEPS = 8
-#: Attributes of a run that change, tables of paths apart.
-_STATE = (
-    "_right_of_way", "_pedestrians", "_occupied_crossings", "_halting", "_at", "_speed",
-    "_last", "_memory", "_busy_m", "_rest", "_helped", "_leaders", "_gaps", "_leads", "_moving_users", "_vehicles",
-)  # fmt: skip
+#: Runs that are simulated together.
+_TOGETHER = 8
+
+_T = TypeVar("_T")
 
 
 def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
@@ -80,31 +95,48 @@ _NO_BOXES = boxes_at((), 0)
 class _Log:
     """Recorded motion of vehicles (x, y, heading) and pedestrians (x, y, heading, speed)."""
 
-    pose: Float64[np.ndarray, "v time 3"]
-    speed: Float64[np.ndarray, "v time"]
-    valid: Bool[np.ndarray, "v time"]
-    at_m: Float64[np.ndarray, "v time"]
-    acceleration: Float64[np.ndarray, "v time"]
-    pedestrian_poses: Float64[np.ndarray, "pedestrian time 4"]
+    pose: Float64[np.ndarray, "time v 3"]
+    speed: Float64[np.ndarray, "time v"]
+    valid: Bool[np.ndarray, "time v"]
+    at_m: Float64[np.ndarray, "time v"]
+    acceleration: Float64[np.ndarray, "time v"]
+    pedestrian_poses: Float64[np.ndarray, "time pedestrian 4"]
 
-    def motion(self, roles: Roles, staging: Staging, paths: list[Path]) -> Motion:
-        """Return the motion of all users, the scripted ones included."""
-        scripted, steps = (*roles.parked, *staging.extras), self.speed.shape[1]
+    @classmethod
+    def empty(cls, steps: int, vehicles: int, pedestrians: int) -> _Log:
+        """Return a log to fill."""
+        speed, at_m, acceleration = np.zeros((3, steps, vehicles))
+        valid = np.zeros((steps, vehicles), bool)
+        poses = np.zeros((steps, vehicles, 3)), np.zeros((steps, pedestrians, 4))
+        return cls(poses[0], speed, valid, at_m, acceleration, poses[1])
+
+    def motion(self, run: Run, vehicles: slice, pedestrians: slice, paths: list[Path]) -> Motion:
+        """Return the motion of all users of a run, the scripted ones included."""
+        roles, steps = run.traffic.roles, len(run.traffic.times_s)
+        scripted = (*roles.parked, *run.staging.extras)
         users = [*roles.pedestrians, *scripted]
         kinds = [AgentKind.PEDESTRIAN] * len(roles.pedestrians) + [user.kind for user in scripted]
+
+        def by_user(values: np.ndarray, users: slice = vehicles) -> np.ndarray:
+            return np.ascontiguousarray(np.swapaxes(values[:steps, users], 0, 1))
 
         def concatenate(vehicles: np.ndarray, pedestrians: np.ndarray, name: str) -> np.ndarray:
             return np.concatenate([vehicles, pedestrians, *(vars(s)[name][None, :steps] for s in scripted)])
 
+        pose, speed, acceleration = map(by_user, (self.pose, self.speed, self.acceleration))
+        walk = by_user(self.pedestrian_poses, pedestrians)
+        if run.ego is not None:
+            first = run.ego.first_step
+            acceleration[0, first:-1] = np.diff(speed[0, first:]) / DT_S
         return Motion(
             kind=np.concatenate([roles.drivers.kind, np.array(kinds, np.int8)]),
             size_m=np.concatenate([roles.drivers.size_m, np.array([u.size_m for u in users]).reshape(-1, 3)]),
-            xy=concatenate(self.pose[..., :2], self.pedestrian_poses[..., :2], "xy"),
-            heading=concatenate(self.pose[..., 2], self.pedestrian_poses[..., 2], "heading"),
-            speed=concatenate(self.speed, self.pedestrian_poses[..., 3], "speed"),
-            valid=concatenate(self.valid, np.ones(self.pedestrian_poses.shape[:2], bool), "valid"),
-            distance_m=self.at_m,
-            acceleration=self.acceleration,
+            xy=concatenate(pose[..., :2], walk[..., :2], "xy"),
+            heading=concatenate(pose[..., 2], walk[..., 2], "heading"),
+            speed=concatenate(speed, walk[..., 3], "speed"),
+            valid=concatenate(by_user(self.valid), np.ones(walk.shape[:2], bool), "valid"),
+            distance_m=by_user(self.at_m),
+            acceleration=acceleration,
             paths=paths,
         )
 
@@ -112,54 +144,65 @@ class _Log:
 class Leaders:
     """Finds the leader of every vehicle."""
 
-    def __init__(self, network: RoadNetwork, drivers: Drivers) -> None:
-        self._half_m, width_m = drivers.size_m[:, 0] / 2, drivers.size_m[:, 1]
-        self._rows = np.arange(len(width_m))
+    def __init__(self, worlds: Worlds, drivers: Drivers) -> None:
+        self._worlds, self._half_m, self._half_width_m = (
+            worlds,
+            drivers.size_m[:, 0] / 2,
+            drivers.size_m[:, 1] / 2,
+        )
+        self._rows = np.arange(len(self._half_m))
         self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
         # Half the width of the widest car that may pass a cyclist within the lane.
-        spare_m = np.array([lane.width_m for lane in network.lanes]) / 2 - _PASS_CYCLIST_M
-        self._passes = spare_m >= width_m[:, None] / 2
-        self._nearest = np.full(len(width_m), np.inf), np.zeros(len(width_m), int)
+        widths = [lane.width_m for network in worlds.networks for lane in network.lanes]
+        self._passes_m = np.array(widths) / 2 - _PASS_CYCLIST_M
+        self._nearest = np.full(len(self._rows), np.inf), np.zeros(len(self._rows), int)
 
     def ahead(
         self, tables: PathTables, at_m: PerVehicle, active: VehicleMask
     ) -> tuple[PerVehicle, VehicleRows]:
         """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and its row."""
-        own = at_m[:, None]
+        own, world = at_m[:, None], self._worlds.of
         lane, along = tables.on(at_m)
         lane[~active] = -1
-        # position[i, k]: position of the k-th occupied (vehicle, lane) on the path of vehicle i.
+        # The k-th occupied (vehicle, lane) of each world, and its position on the path of each vehicle.
         slots = (lane.ravel() >= 0).nonzero()[0]
         if not len(slots):
             return self._nearest
-        vehicles_ahead, lanes = slots // SLOTS, lane.ravel().take(slots)
+        vehicle, lane = slots // SLOTS, lane.ravel().take(slots)
+        k = group_indices(world[vehicle], len(self._worlds))
+        index = np.where(k < 0, self._worlds.lane[:-1, None], lane[k]).take(world, axis=0)
+        index += tables.column[:, None]
+        position = tables.scale.take(index)
+        position *= pick(along.ravel().take(slots), k, 0.0).take(world, axis=0)
         # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
-        begin = np.where((tables.since <= own) & (own <= tables.until), tables.begin, np.nan)
-        position = tables.scale.take(lanes, axis=1)
-        position *= along.ravel().take(slots)
-        position = begin.take(lanes, axis=1) + position
-        seen = (position > own) & (vehicles_ahead != self._rows[:, None])
+        position += tables.present_begin(at_m).take(index)
+        vehicle_ahead = pick(vehicle, k, 0)
+        seen = (position > own) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
         if self._any_cyclist:
             # Where the lane is wide enough, cyclists are overtaken within it.
-            seen &= ~(self._cyclist[vehicles_ahead] & self._passes.take(lanes, axis=1))
-        position -= self._half_m[vehicles_ahead]
-        gap = np.where(seen, position, np.inf) - own - self._half_m[:, None]
+            passes_m = np.where(self._cyclist[vehicle], self._passes_m[lane], -np.inf)
+            seen &= pick(passes_m, k, -np.inf).take(world, axis=0) < self._half_width_m[:, None]
+        position -= pick(self._half_m[vehicle], k, -np.inf).take(world, axis=0)
+        gap = np.where(seen, position, np.inf)
+        gap -= own
+        gap -= self._half_m[:, None]
         nearest = gap.argmin(axis=1)
-        self._nearest = gap[self._rows, nearest], vehicles_ahead[nearest]
-        return self._nearest
+        result = gap[self._rows, nearest], vehicle_ahead[world, nearest]
+        # A world without a vehicle on a lane keeps the last result.
+        empty = (k[:, 0] < 0)[world]
+        for values, last in zip(result, self._nearest, strict=True):
+            values[empty] = last[empty]
+        self._nearest = result
+        return result
 
 
 class Traffic:
-    """Traffic of all users, advanced step by step."""
+    """Traffic of all users of a world."""
 
     def __init__(self, roles: Roles, times_s: Float64[np.ndarray, " time"]) -> None:
         self.roles, self.times_s = roles, times_s
-        self.tables = PathTables(roles.network, roles.paths, roles.drivers)
         self.parked = boxes_at(roles.parked, 0)
-        self.standing = StaticObstacles(self.parked, self.tables, roles.drivers.size_m[:, 1])
-        self.right_of_way = RightOfWay(roles.network, roles.drivers)
         self.detours = Detours(roles.network)
-        self._latest: _Run | None = None
         shape = (len(times_s), len(roles.network.lanes))
         self.colour, self.to_red = np.zeros(shape, np.int8), np.zeros(shape)
         if roles.network.signals is not None:
@@ -171,183 +214,196 @@ class Traffic:
         shorter.times_s = self.times_s[:steps]
         return shorter
 
+    @cached_property
+    def parked_extents(self) -> list[Extents]:
+        """Extents of the parked cars on each path."""
+        return self.extents(self.parked)
+
+    def extents(self, boxes: Boxes) -> list[Extents]:
+        """Extents of boxes on each path."""
+        return [extents(path, boxes)[0] if len(boxes) else NO_EXTENTS for path in self.roles.paths]
+
     def run(self, staging: Staging | None = None, ego: EgoPlan | None = None) -> Motion:
-        """Run all steps, with the changes of an event, and with ego on a plan (None: ego drives like the others).
-
-        A run resumes from the latest one where the two begin to differ.
-        """
-        run = _Run(self, staging or Staging(), ego)
-        if self._latest is not None:
-            run.resume(self._latest)
-        self._latest = run
-        return run.finish()
-
-
-def first_effect(staging: Staging) -> int | None:
-    """First step at which traffic with a staging can differ from traffic without (None: at no step)."""
-    extras = staging.extras
-    if staging.tailgates or staging.removed or any(user.is_static for user in extras):
-        return 0
-    steps = [override.first_step for override in staging.overrides]
-    return min([*steps, *(int(user.valid.argmax()) for user in extras)], default=None)
-
-
-_Tables = TypeVar("_Tables", PathTables, StaticObstacles, RightOfWay)
-
-
-def _copy_tables(tables: _Tables) -> _Tables:
-    """Copy an object with its arrays and lists."""
-    result = copy.copy(tables)
-    for name, value in vars(tables).items():
-        setattr(result, name, copy.copy(value) if isinstance(value, np.ndarray | list) else value)
-    return result
-
-
-def _copy_state(state: dict[str, Any]) -> dict[str, Any]:
-    """Copy the attributes of a run that change."""
-    result = {name: copy.copy(state[name]) for name in _STATE}
-    result["_right_of_way"] = _copy_tables(result["_right_of_way"])
-    return result
+        """Run all steps, with the changes of an event, and with ego on a plan (None: ego drives like the others)."""
+        return simulate([Run(self, staging or Staging(), ego)])[0]
 
 
 @dataclass(frozen=True)
-class _Checkpoint:
-    """State of a run before a step, the present path of each vehicle, and the columns of crossings."""
+class Run:
+    """A run of traffic: :meth:`Traffic.run`."""
 
-    step: int
-    state: dict[str, Any]
-    paths: list[Path]
-    crossings: int
+    traffic: Traffic
+    staging: Staging = field(default_factory=Staging)
+    ego: EgoPlan | None = None
 
 
-class _Run:
-    """State of one run."""
+def simulate(runs: Sequence[Run]) -> list[Motion]:
+    """Simulate runs together; each result is that of the run alone."""
+    return _Simulation(runs).finish()
 
-    def __init__(self, traffic: Traffic, staging: Staging, ego: EgoPlan | None) -> None:
-        self._fixed, self._staging, self._ego = traffic, staging, ego
-        roles = traffic.roles
-        self._network, self._drivers = roles.network, roles.drivers
-        for tailgate in staging.tailgates:
-            self._drivers = self._drivers.with_headway(tailgate.vehicle, tailgate.headway_s)
-        self._half_m, self._width_m = roles.drivers.size_m[:, 0] / 2, roles.drivers.size_m[:, 1]
-        count = len(roles.paths)
-        self._rows = np.arange(count)
-        self._idm = self._drivers.idm()
-        self._tables, self._owns_tables = traffic.tables, False
-        self._checkpoints: list[_Checkpoint] = []
-        static = tuple(user for user in staging.extras if user.is_static)
-        self._movers = tuple(user for user in staging.extras if not user.is_static)
-        boxes = traffic.parked.concatenate(boxes_at(static, 0))
-        self._standing = StaticObstacles(boxes, self._tables, self._width_m) if static else traffic.standing
-        self._right_of_way = copy.copy(traffic.right_of_way)
-        self._right_of_way.reset()
-        self._changes = LaneChanges(self._network, roles.drivers, boxes)
-        self._pedestrians = (
-            Pedestrians(self._network, roles.pedestrians, traffic.times_s) if roles.pedestrians else None
-        )
-        self._occupied_crossings = np.zeros(len(self._network.crossings), bool)
-        self._halting = np.zeros((0, 0), bool)  # per vehicle and crossing on its path
-        self._delay = np.rint(roles.drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
-        self._at, self._speed = roles.distance_m.copy(), roles.speed_mps.copy()
-        for row in staging.removed:
-            self._at[row] = roles.paths[row].length_m
+
+def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
+    """Run tasks and return their results in order.
+
+    Runs for which several tasks wait are simulated together; a task starts as soon as there is room for its first run.
+    """
+    remaining = iter(enumerate(tasks))
+    results: dict[int, _T] = {}
+    waiting: dict[int, tuple[Generator[Run, Motion, _T], Run]] = {}
+    first = 0
+
+    def advance(number: int, task: Generator[Run, Motion, _T], motion: Motion | None) -> None:
+        try:
+            waiting[number] = task, next(task) if motion is None else task.send(motion)
+        except StopIteration as end:
+            results[number] = end.value
+
+    while True:
+        while len(waiting) < _TOGETHER and (entry := next(remaining, None)):
+            advance(*entry, None)
+        while first in results:
+            yield results.pop(first)
+            first += 1
+        if not waiting:
+            return
+        batch, waiting = waiting, {}
+        motions = simulate([run for _, run in batch.values()])
+        for (number, (task, _)), motion in zip(batch.items(), motions, strict=True):
+            advance(number, task, motion)
+
+
+class _Simulation:
+    """State of runs that are simulated together."""
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        self._runs, traffics = runs, [run.traffic for run in runs]
+        roles = [traffic.roles for traffic in traffics]
+        self._worlds = worlds = Worlds([r.network for r in roles], [len(r.paths) for r in roles])
+        self._ego_rows = worlds.row[:-1]
+        drivers = join_drivers(*(r.drivers for r in roles))
+        self._half_m, self._width_m = drivers.size_m[:, 0] / 2, drivers.size_m[:, 1]
+        count = len(self._half_m)
+        self._rows, self._size_m = np.arange(count), drivers.size_m[:, :2]
+        self._tables = PathTables(worlds, [path for r in roles for path in r.paths], drivers)
+        static = [tuple(user for user in run.staging.extras if user.is_static) for run in runs]
+        boxes = [t.parked.concatenate(boxes_at(s, 0)) for t, s in zip(traffics, static, strict=True)]
+        seen = [
+            traffic.extents(standing) if extras else traffic.parked_extents
+            for traffic, standing, extras in zip(traffics, boxes, static, strict=True)
+        ]
+        self._standing = StaticObstacles(worlds, boxes, [e for group in seen for e in group], self._width_m)
+        self._has_standing = np.array([len(standing) > 0 for standing in boxes])
+        self._right_of_way = RightOfWay(worlds, drivers)
+        self._changes = LaneChanges(worlds, drivers, boxes)
+        self._leaders = Leaders(worlds, drivers)
+        self._delay = np.rint(drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
+        for world, run in enumerate(runs):
+            for tailgate in run.staging.tailgates:
+                drivers = drivers.with_headway(int(worlds.row[world]) + tailgate.vehicle, tailgate.headway_s)
+        self._drivers, self._idm = drivers, drivers.idm()
+        pedestrians = [r.pedestrians for r in roles]
+        times_s = [traffic.times_s for traffic in traffics]
+        self._pedestrians = Pedestrians(worlds, pedestrians, times_s) if any(pedestrians) else None
+        self._pedestrian_world = np.repeat(np.arange(len(runs)), list(map(len, pedestrians)))
+        self._pedestrians_of = group_indices(self._pedestrian_world, len(runs))
+        self._occupied_crossings = np.zeros(worlds.crossing[-1], bool)
+        self._crossing_world = np.repeat(np.arange(len(runs)), np.diff(worlds.crossing))
+        self._halting = np.zeros(self._tables.crossing.shape, bool)  # per vehicle and crossing on its path
+        self._movers = [
+            (world, user) for world, run in enumerate(runs) for user in run.staging.extras if not user.is_static
+        ]  # fmt: skip
+        self._overrides = [
+            (int(worlds.row[world]) + override.vehicle, override)
+            for world, run in enumerate(runs)
+            for override in run.staging.overrides
+        ]
+        self._plans = [
+            (int(row), run.ego, positions_along(run.traffic.roles.paths[0], run.ego.xy))
+            for row, run in zip(self._ego_rows, runs, strict=True)
+            if run.ego is not None
+        ]
+        self._at = np.concatenate([r.distance_m for r in roles])
+        self._speed = np.concatenate([r.speed_mps for r in roles])
+        for world, run in enumerate(runs):
+            removed = worlds.row[world] + np.array(run.staging.removed, int)
+            self._at[removed] = self._tables.length_m[removed]
         self._last = np.zeros(count)
         self._memory = np.zeros((_SLOWEST + 1, count))
         self._busy_m = np.full(count, -np.inf)  # path position at which a lane change or detour ends
         self._rest = np.zeros(count, int)  # first step of the next decision
         self._helped = NO_HELP
-        self._leaders = Leaders(self._network, self._drivers)
         # Gap to and speed of the next leader, line and obstacle.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
-        self._plan_at = positions_along(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
         self._moving_users = self._vehicles = _NO_BOXES
-        shape = (count, len(traffic.times_s))
-        speed, position, acceleration = np.zeros((3, *shape))
-        pedestrian_poses = np.zeros((len(roles.pedestrians), shape[1], 4))
-        self._log = _Log(
-            np.zeros((*shape, 3)), speed, np.zeros(shape, bool), position, acceleration, pedestrian_poses
+        self._user_world, self._users_of = self._pedestrian_world, self._pedestrians_of
+        self._colour, self._to_red = (
+            np.concatenate(pad_steps(series), axis=1)
+            for series in ([t.colour for t in traffics], [t.to_red for t in traffics])
         )
+        self._steps = np.array([len(times) for times in times_s])[worlds.of]
+        self._log = _Log.empty(max(map(len, times_s)), count, len(self._pedestrian_world))
 
-    def resume(self, other: _Run) -> None:
-        """Take over another run's state at its last checkpoint before this one differs from it."""
-        steps = [run._ego.first_step for run in (self, other) if run._ego is not None]
-        stagings = self._staging, other._staging
-        if stagings[0] is not stagings[1]:
-            steps += [step for step in map(first_effect, stagings) if step is not None]
-        last = min([*steps, len(self._fixed.times_s) - 1])
-        self._checkpoints = [checkpoint for checkpoint in other._checkpoints if checkpoint.step <= last]
-        if self._checkpoints:
-            checkpoint = self._checkpoints[-1]
-            vars(self).update(_copy_state(checkpoint.state))
-            for row, path in enumerate(checkpoint.paths):
-                if path is not self._tables.paths[row]:
-                    self._replace_path(row, path)
-            self._tables.widen(checkpoint.crossings)
-            for name, record in vars(self._log).items():
-                record[:, : checkpoint.step] = vars(other._log)[name][:, : checkpoint.step]
-
-    def finish(self) -> Motion:
-        """Run all steps and collect the motion."""
-        begin = self._checkpoints[-1].step if self._checkpoints else 0
-        for t in range(begin, len(self._fixed.times_s)):
-            if t % _CHECKPOINT_STEPS == 0 and t > begin:
-                p = self._tables
-                checkpoint = _Checkpoint(t, _copy_state(vars(self)), p.paths.copy(), p.crossing.shape[1])
-                self._checkpoints.append(checkpoint)
+    def finish(self) -> list[Motion]:
+        """Run all steps and collect the motions."""
+        for t in range(len(self._log.speed)):
             self._step(t)
-        if self._ego is not None:
-            first, log = self._ego.first_step, self._log
-            log.acceleration[0, first:-1] = np.diff(log.speed[0, first:]) / DT_S
-        return self._log.motion(self._fixed.roles, self._staging, self._tables.paths)
+        return [self._motion(world, run) for world, run in enumerate(self._runs)]
+
+    def _motion(self, world: int, run: Run) -> Motion:
+        pedestrians = slice(*np.searchsorted(self._pedestrian_world, [world, world + 1]).tolist())
+        vehicles = self._worlds.vehicles(world)
+        return self._log.motion(run, vehicles, pedestrians, self._tables.paths[vehicles])
 
     def _step(self, t: int) -> None:
         """Record a step and advance all users to the next one."""
-        log, k = self._log, self._plan_step(t)
-        if self._ego is not None and k >= 0:
-            self._at[0], self._speed[0] = self._plan_at[k], self._ego.speed[k]
+        log = self._log
+        plans = [
+            (row, plan, min(t - plan.first_step, len(plan.speed) - 1), at)
+            for row, plan, at in self._plans
+            if t >= plan.first_step
+        ]
+        for row, plan, k, at in plans:
+            self._at[row], self._speed[row] = at[k], plan.speed[k]
         active = self._at + self._half_m < self._tables.length_m
         soon = self._at + self._speed * _SPEED_TIME_S
         sample = self._tables.at(np.concatenate((self._at, soon)).reshape(2, -1))
         pose, fastest, fastest_soon = sample[0, :, :3], sample[0, :, 3], sample[1, :, 3]
-        if self._ego is not None and k >= 0:
-            active[0] = True
-            pose[0] = (*self._ego.xy[k], self._ego.heading[k])
-        self._vehicles = Boxes(pose[:, :2], pose[:, 2], self._speed, self._drivers.size_m[:, :2])
+        for row, plan, k, _ in plans:
+            active[row] = True
+            pose[row] = (*plan.xy[k], plan.heading[k])
+        self._vehicles = Boxes(pose[:, :2], pose[:, 2], self._speed, self._size_m)
         self._advance_pedestrians(t, active)
-        log.pose[:, t], log.speed[:, t], log.at_m[:, t], log.valid[:, t] = pose, self._speed, self._at, active
+        log.pose[t], log.speed[t], log.at_m[t], log.valid[t] = pose, self._speed, self._at, active
         preferred = self._preferred_acceleration(t, fastest, fastest_soon, active)
         if t % _DECIDE_EVERY == 0:
             self._decide(t, preferred, fastest, active)
-        log.acceleration[:, t] = self._advance(self._apply_reaction_times(t, preferred), active)
-
-    def _plan_step(self, t: int) -> int:
-        """Step of ego's plan (negative: ego is not planned)."""
-        return -1 if self._ego is None else t - self._ego.first_step
+        log.acceleration[t] = self._advance(self._apply_reaction_times(t, preferred), active)
 
     def _swap(self, t: int, row: int, path: Path, at: float, end_m: float) -> None:
         """Put a vehicle on another path, which it follows undisturbed up to a position."""
-        self._replace_path(row, path)
+        world = int(self._worlds.of[row])
+        crossings = self._tables.crossings[world]
+        self._tables.replace(row, path)
+        self._standing.replace(row, path)
         self._at[row] = at
-        self._halting[row : row + 1] = False
+        widened = self._tables.crossings[world] > crossings
+        self._halting[self._worlds.vehicles(world) if widened else row] = False
         self._right_of_way.reset_vehicle(row, self._tables, at + self._half_m[row])
         self._busy_m[row], self._rest[row] = end_m, t + _REST_STEPS
 
-    def _replace_path(self, row: int, path: Path) -> None:
-        if not self._owns_tables:
-            self._tables, self._standing = _copy_tables(self._tables), _copy_tables(self._standing)
-            self._owns_tables = True
-        self._tables.replace(row, path)
-        self._standing.replace(row, path)
-
     def _advance_pedestrians(self, t: int, active: VehicleMask) -> None:
         """Advance the pedestrians and gather scripted users."""
-        users, colour = _NO_BOXES, self._fixed.colour[t]
+        users = _NO_BOXES
         if self._pedestrians is not None:
-            users, self._occupied_crossings = self._pedestrians.step(t, self._vehicles, active, colour)
-            log = self._log.pedestrian_poses[:, t]
+            users, self._occupied_crossings = self._pedestrians.step(t, self._vehicles, active)
+            log = self._log.pedestrian_poses[t]
             log[:, :2], log[:, 2], log[:, 3] = users.xy, users.heading, users.speed
-        movers = tuple(user for user in self._movers if user.valid[t])
-        self._moving_users = users.concatenate(boxes_at(movers, t)) if movers else users
+        movers = [(world, user) for world, user in self._movers if t < len(user.valid) and user.valid[t]]
+        self._moving_users = users.concatenate(boxes_at(tuple(user for _, user in movers), t))
+        self._user_world, self._users_of = self._pedestrian_world, self._pedestrians_of
+        if movers:
+            self._user_world = np.append(self._user_world, [world for world, _ in movers])
+            self._users_of = group_indices(self._user_world, len(self._worlds))
 
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_soon: PerVehicle, active: VehicleMask
@@ -363,7 +419,7 @@ class _Run:
             gaps[1] -= self._speed * DT_S
         if t % 2 == 0:
             gaps[2], leads[2] = nearest_obstacles(
-                self._tables, self._vehicles, self._at, active, self._moving_users
+                self._tables, self._vehicles, self._at, active, self._moving_users, self._users_of
             )
         else:
             gaps[2] += (leads[2] - self._speed) * DT_S
@@ -392,15 +448,16 @@ class _Run:
     def _stops(self, t: int, active: VehicleMask, leader: VehicleRows) -> PerVehicle:
         """Gap to the next place to stop (line, crossing, obstacle, end of the lane), plus the IDM's gap of 2 m."""
         p, front = self._tables, self._at + self._half_m
-        committed, k = -1, self._plan_step(t)
-        if k >= 0:
-            then = min(k + _FORESEEN, len(self._plan_at) - 1)
-            committed = int(np.sum(p.connector_begin[0] < self._plan_at[then] + self._half_m[0]))
+        committed = {}
+        for row, plan, at in self._plans:
+            if t >= plan.first_step:
+                soon = at[min(t - plan.first_step + _FORESEEN, len(at) - 1)] + self._half_m[row]
+                committed[row] = int(np.sum(p.connector_begin[row] < soon))
         state = TrafficState(
             tables=p,
             step=t,
-            colour=self._fixed.colour[t],
-            to_red=self._fixed.to_red[t],
+            colour=self._colour[t],
+            to_red=self._to_red[t],
             front_m=front,
             rear_m=self._at - self._half_m,
             speed=self._speed,
@@ -414,19 +471,22 @@ class _Run:
         if np.count_nonzero(self._occupied_crossings):
             room = np.minimum(room, self._crossings(front) + 2.0 - _STOP_SHORT_M)
         room = np.minimum(room, p.stop_m - front - _END_M)
-        if len(self._standing.boxes):
+        if self._has_standing.any():
             room = np.minimum(room, self._standing.gap(front) + 2.0 - _KEEP_M)
         return room
 
     def _crossings(self, front: PerVehicle) -> PerVehicle:
         """Distance to the next occupied crossing at which a vehicle can stop."""
-        away = self._tables.crossing_m - front[:, None]
+        crossing, away = self._tables.crossing, self._tables.crossing_m - front[:, None]
         to_stop = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
-        halt = self._occupied_crossings[self._tables.crossing] & (self._tables.crossing >= 0) & (away > -0.5)
-        if self._halting.shape != halt.shape:
-            self._halting = np.zeros_like(halt)
-        self._halting = halt & (to_stop < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
-        return np.where(self._halting, away, np.inf).min(axis=1)
+        halt = self._occupied_crossings[crossing] & (crossing >= 0) & (away > -0.5)
+        extra = crossing.shape[1] - self._halting.shape[1]
+        halting = np.pad(self._halting, ((0, 0), (0, extra)))
+        halt &= to_stop < np.where(halting, _HARDEST_MPS2, _YIELD_MPS2)
+        # A world without an occupied crossing keeps its state.
+        occupied_in = self._worlds.with_any(self._crossing_world[self._occupied_crossings])
+        self._halting = np.where(occupied_in[self._worlds.of, None], halt, halting)
+        return np.where(halt, away, np.inf).min(axis=1)
 
     def _apply_reaction_times(self, t: int, preferred: PerVehicle) -> PerVehicle:
         """Return the accelerations preferred a reaction time ago, bounded by overrides."""
@@ -435,9 +495,9 @@ class _Run:
             self._memory[:] = preferred
         self._memory[t % depth] = preferred
         result = self._memory[(t - self._delay) % depth, self._rows]
-        for override in self._staging.overrides:
+        for row, override in self._overrides:
             if override.first_step <= t <= override.last_step:
-                result[override.vehicle] = min(result[override.vehicle], override.acceleration_mps2)
+                result[row] = min(result[row], override.acceleration_mps2)
         return result
 
     def _advance(self, preferred: PerVehicle, active: VehicleMask) -> PerVehicle:
@@ -457,65 +517,78 @@ class _Run:
 
     def _decide(self, t: int, preferred: PerVehicle, fastest: PerVehicle, active: VehicleMask) -> None:
         """Start lane changes and detours."""
-        calm = (self._at > self._busy_m) & (self._rest <= t) & active
-        for override in self._staging.overrides:
-            calm[override.vehicle] &= t < override.first_step
+        # In a world that is over the paths stay.
+        calm = (self._at > self._busy_m) & (self._rest <= t) & active & (t < self._steps)
+        for row, override in self._overrides:
+            calm[row] &= t < override.first_step
         free = calm.copy()
-        free[0] = False
+        free[self._ego_rows] = False
         state = Situation(self._at, self._speed, active, free, fastest, preferred)
         changes, self._helped = self._changes.decide(state, self._tables)
         for change in changes:
             self._change(t, change)
             calm[change.vehicle] = False
-        calm[0] &= self._plan_step(t) < 0
+        for row, plan, _ in self._plans:
+            calm[row] &= t < plan.first_step
         self._pass(t, calm)
 
     def _change(self, t: int, change: Change) -> None:
         """Start a lane change; beyond it the vehicle keeps to its old lanes where it can."""
-        row, present = change.vehicle, self._tables.paths[change.vehicle]
-        lanes = [change.lane]
+        row, world, present = (
+            change.vehicle,
+            self._worlds.of[change.vehicle],
+            self._tables.paths[change.vehicle],
+        )
+        network, number = self._worlds.networks[world], row - int(self._worlds.row[world])
+        lanes = [change.lane - int(self._worlds.lane[world])]
         ahead = {span.lane for span in present.spans}
-        while self._network.lanes[lanes[-1]].successors:
-            after = next_lanes(self._network, lanes)
+        while network.lanes[lanes[-1]].successors:
+            after = next_lanes(network, lanes)
             on_path = [lane for lane in after if lane in ahead]
             # Elsewhere branches take turns: this draws no random number.
-            lanes.append(on_path[0] if on_path else after[(row + len(lanes)) % len(after)])
-        sway = Sway((0.08,), (0.07,), (float(row),))
-        target = lane_path(self._network, tuple(lanes), sway)
+            lanes.append(on_path[0] if on_path else after[(number + len(lanes)) % len(after)])
+        sway = Sway((0.08,), (0.07,), (float(number),))
+        target = lane_path(network, tuple(lanes), sway)
         path, position = change_onto(target, present, self._at[row], change.length_m)
         self._swap(t, row, path, position, position + change.length_m)
 
     def _pass(self, t: int, calm: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
-        stuck = np.zeros(len(self._rows), bool)
-        for override in self._staging.overrides:
+        stuck, worlds = np.zeros(len(self._rows), bool), self._worlds
+        for row, override in self._overrides:
             state = override.first_step <= t <= override.last_step
-            stuck[override.vehicle] |= state and self._speed[override.vehicle] < 0.05
+            stuck[row] |= state and self._speed[row] < 0.05
         halts = np.abs(self._moving_users.speed) < 0.05
         big = halts & (self._moving_users.size_m[:, 0] > 1.2)
-        any_halted = bool(stuck.any() or big.any())
-        if not (any_halted or len(self._standing.boxes)):
+        stuck_in = worlds.with_any(worlds.of[stuck])
+        halted_in = stuck_in | worlds.with_any(self._user_world[big])
+        considered = halted_in | self._has_standing
+        if not considered.any():
             return
-        if stuck.any() or halts.any():
-            near = calm & (self._speed < 3.0)
-        else:
-            near = calm & (self._standing.gap(self._at + self._half_m) < 45.0)
-        rows = np.flatnonzero(near & (self._speed < 9.0)).tolist()
-        if not rows:
-            return
-        standing = self._standing.boxes.concatenate(self._vehicles.select(stuck))
-        standing = standing.concatenate(self._moving_users.select(big))
-        for row in rows:
+        slow_only = (stuck_in | worlds.with_any(self._user_world[halts]))[worlds.of]
+        near = np.where(slow_only, self._speed < 3.0, self._standing.gap(self._at + self._half_m) < 45.0)
+        near &= calm & considered[worlds.of] & (self._speed < 9.0)
+        for row in near.nonzero()[0].tolist():
             front, half = self._at[row] + self._half_m[row], self._width_m[row] / 2
-            if any_halted or self._standing.meets(row, front, half + DETOUR_MARGIN_M, LOOK_M):
-                self._start_detour(t, row, standing, stuck)
+            meets = halted_in[worlds.of[row]] or self._standing.meets(
+                row, front, half + DETOUR_MARGIN_M, LOOK_M
+            )
+            if meets:
+                self._start_detour(t, row, stuck, big)
 
-    def _start_detour(self, t: int, row: int, standing: Boxes, stuck: VehicleMask) -> None:
+    def _start_detour(self, t: int, row: int, stuck: VehicleMask, big: Bool[np.ndarray, " user"]) -> None:
         """Start a detour around an obstacle ahead, if there is one."""
-        others = self._vehicles.select((self._rows != row) & ~stuck & (self._at > 0.0))
-        moving = others.concatenate(self._moving_users.select(np.abs(self._moving_users.speed) >= 0.05))
+        world, worlds = int(self._worlds.of[row]), self._worlds
+        own_users, moves = self._user_world == world, np.abs(self._moving_users.speed) >= 0.05
+        other = (self._at > 0.0) & ~stuck & (worlds.of == world)
+        other[row] = False
+        standing = self._standing.boxes[world].concatenate(
+            self._vehicles.select(stuck & (worlds.of == world))
+        )
+        standing = standing.concatenate(self._moving_users.select(big & own_users))
+        moving = self._vehicles.select(other).concatenate(self._moving_users.select(own_users & moves))
         position, size = float(self._at[row]), (float(2 * self._half_m[row]), float(self._width_m[row]))
-        request = detour_request(self._network, self._tables, row, (position, self._speed[row]), size)
-        detour = self._fixed.detours.find(request, standing, moving)
+        request = detour_request(self._tables, row, (position, self._speed[row]), size)
+        detour = self._runs[world].traffic.detours.find(request, standing, moving)
         if detour is not None:
             self._swap(t, row, detour[0], position, detour[1])
