@@ -27,6 +27,7 @@ STRIDE = 40
 _UNITS = "repair it, or convert it to metres in the reader"
 #: Fields of tracks with a value per step, and the shape of that value.
 _WIDTHS = {"xy": (2,), "z": (), "heading": (), "velocity": (2,), "size": (3,), "valid": ()}
+#: Problem and cure, None if a check passes.
 Finding = tuple[str, str] | None
 
 
@@ -151,7 +152,7 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
         _window(piece, frameless, start, length, recording)
         for piece, frameless in pieces
         for start in range(0, len(frameless) - length + 1, stride)
-    ] or [_window(*max(pieces, key=_usable_steps), 0, length, recording)]
+    ] or [_window(*max(pieces, key=_window_rank), 0, length, recording)]
     usable = [window for window in cut if window.tracks.valid[window.ego, window.current_step]]
     if not usable:
         problem = f"the ego is not valid at the current step of any of {len(cut)} windows"
@@ -160,8 +161,8 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
     yield from (_add_counts(window, **lost) for window in usable)
 
 
-def _usable_steps(piece: tuple[Recording, Array]) -> tuple[bool, int]:
-    """Whether the ego of a piece is valid at its current step, and its length."""
+def _window_rank(piece: tuple[Recording, Array]) -> tuple[bool, int]:
+    """Sort key of pieces that fill no window: first a valid ego at the current step, then length."""
     recording, frameless = piece
     now = min(CURRENT_STEP, len(frameless) - 1)
     return bool(recording.tracks.valid[recording.ego, now]), len(frameless)
@@ -209,6 +210,7 @@ def _interpolate_at(
         series[name] = interpolate(getattr(tracks, name), tracks.valid, at, angle=name == "heading")
 
     def step_of(old: int) -> int:
+        """Return the first new step at or after an old one, at most the last."""
         return min(int(np.searchsorted(at, old)), len(at) - 1)
 
     return replace(
@@ -270,7 +272,7 @@ def _window(
 
 
 def _cut(recording: Recording, part: slice) -> Recording:
-    """These steps of a recording, without another current step."""
+    """The steps ``part`` of a recording and the events in them; the caller sets the current step."""
     last = part.stop - part.start - 1
     series = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
     events = (
@@ -323,7 +325,7 @@ def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
 
 
 def is_even(timestamps_s: Float[Array, " time"]) -> bool:
-    """Whether all steps are near enough to the median to be played as equal."""
+    """Whether no step differs from the median by more than 20 ms."""
     return step_seconds(timestamps_s)[1] <= LATE_S
 
 
@@ -402,7 +404,10 @@ def _ego_position(recording: Recording) -> Float[Array, "3"]:
 
 
 def _check_extent(recording: Recording) -> Finding:
-    """Positions and speeds of any size would not fit into memory or float32; other tracks lose such steps."""
+    """Refuse implausible values of the ego and the lights: they would exhaust memory or float32.
+
+    Other tracks only lose their implausible steps (:func:`plausible`).
+    """
     ego = _ego_position(recording)
     lost = np.flatnonzero(recording.tracks.valid[recording.ego] & ~plausible(recording, recording.ego))
     if len(lost):

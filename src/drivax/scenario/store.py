@@ -51,7 +51,7 @@ _HEADER_LIMIT = 100_000
 #: Scenarios that an iteration reads at a time, and those of a task of a thread.
 _BATCH, _PART = 64, 8
 #: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
-_HEADERS = threading.Lock()
+_HEADER_LOCK = threading.Lock()
 _Bytes = np.ndarray[Any, Any]
 
 
@@ -163,6 +163,7 @@ class ScenarioWriter:
         self._crcs.append(zlib.crc32(data))
 
     def _close_shard(self, note: Any) -> None:
+        """Complete the open shard, if any: header, checksums, and a note for a writer that resumes the set."""
         if self._file is None:
             return
         folder, name, count = self._partial.content, shard_name(len(self._shards)), len(self._crcs)
@@ -184,7 +185,7 @@ class ScenarioWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         try:
             with explain_full_disk(self.path, self._buffer.dtype.itemsize):
-                if isinstance(error, OSError | FullDiskError):
+                if isinstance(error, OSError | FullDiskError):  # Raise it again: the block words a full disk.
                     raise error
                 if kind is None:
                     self._finish()
@@ -216,6 +217,7 @@ class ScenarioWriter:
         self._partial.publish()
 
     def _refuse_existing(self) -> None:
+        """Refuse a path that exists, except an empty folder, or a scenario set if it may be overwritten."""
         path = self.path
         if path.is_dir() and not any(path.iterdir()):
             return
@@ -383,7 +385,7 @@ class Shard:
                 raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
 
     def _map(self) -> _Bytes:
-        with _HEADERS:
+        with _HEADER_LOCK:
             return self._read_map() if self._data is None else self._data
 
     def _read_map(self) -> _Bytes:
