@@ -108,7 +108,7 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     valid = _array(agents, "valid", bool, (None, None))
     count, steps = valid.shape
     at = np.arange(int((steps - 1) * dt_s / DT_S + 1e-6) + 1) * (DT_S / dt_s)
-    # A new step that rounding moves off an old one would need two valid neighbours.
+    # Undo rounding: a new step that falls on an old one must not need its neighbour, too.
     at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
     is_observed = valid[:, np.floor(at).astype(np.int64)] & valid[:, np.ceil(at).astype(np.int64)]
 

@@ -194,6 +194,7 @@ def _resample(recording: Recording) -> tuple[Recording, Bool[np.ndarray, " time"
     count = int((times[-1] - times[0] + STEP_TOLERANCE_S) / step) + 1
     even = times[0] + step * np.arange(count)
     at = np.interp(even, times, np.arange(len(times)))
+    # Steps near enough to a frame take it as it is.
     frame = np.rint(at).astype(np.int64)
     exact = np.abs(times[frame] - even) <= STEP_TOLERANCE_S
     return _interpolate_at(recording, np.where(exact, frame, at), even), ~exact
@@ -290,7 +291,7 @@ def _cut(recording: Recording, part: slice) -> Recording:
 
 
 def with_ego(recording: Recording, row: int) -> Recording:
-    """Return the recording with another vehicle, valid at the current step, as the ego; its route and ``seen`` go."""
+    """Return the recording with another vehicle, valid at the current step, as the ego, without route and ``seen``."""
     tracks = recording.tracks
     is_vehicle = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
     if not is_vehicle or not tracks.valid[row, recording.current_step]:
@@ -304,11 +305,7 @@ def with_ego(recording: Recording, row: int) -> Recording:
 
 
 def check(recording: Recording, capacity: Capacity) -> None:
-    """Check a recording.
-
-    Raises:
-        DataError: It is invalid.
-    """
+    """Refuse an invalid recording."""
     problem = _check_names(recording) or _check_time(recording, capacity.steps) or _check_shapes(recording)
     problem = problem or _check_tracks(recording) or _check_extent(recording)
     problem = problem or _check_map(recording) or _check_lights(recording)
@@ -404,10 +401,7 @@ def _ego_position(recording: Recording) -> Float[Array, "3"]:
 
 
 def _check_extent(recording: Recording) -> Finding:
-    """Refuse implausible values of the ego and the lights: they would exhaust memory or float32.
-
-    Other tracks only lose their implausible steps (:func:`plausible`).
-    """
+    """Refuse implausible values of ego and lights, which exhaust memory or float32; other tracks lose such steps."""
     ego = _ego_position(recording)
     lost = np.flatnonzero(recording.tracks.valid[recording.ego] & ~plausible(recording, recording.ego))
     if len(lost):

@@ -185,7 +185,9 @@ class ScenarioWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         try:
             with explain_full_disk(self.path, self._buffer.dtype.itemsize):
-                if isinstance(error, OSError | FullDiskError):  # Raise it again: the block words a full disk.
+                if isinstance(
+                    error, OSError | FullDiskError
+                ):  # Raised in this block, a full disk is explained.
                     raise error
                 if kind is None:
                     self._finish()
@@ -298,9 +300,6 @@ class ScenarioSet(Sequence[Scenario]):
         """Copy records into a structured array ``[n]``, in the order of ``indices``; negative ones count from the end.
 
         ``out`` is the result of an earlier call with as many indices, to fill again: twice as fast as new memory.
-
-        Raises:
-            DataError: A record is damaged.
         """
         index = np.asarray(indices, np.int64).reshape(-1)
         total = len(self)
@@ -432,11 +431,7 @@ def field_table(capacity: Capacity) -> list[dict[str, Any]]:
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """Read the manifest of the set at ``path``.
-
-    Raises:
-        DataError: It is missing, damaged or of another version.
-    """
+    """Read the manifest of the set at ``path``."""
     file = path / MANIFEST
     if not path.is_dir():
         problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"

@@ -492,10 +492,7 @@ def _fill_segments(
     edges: Float[np.ndarray, "5 edge"], lanes: Float[np.ndarray, "8 lane"], box: Float[np.ndarray, "4"],
     values: Float[np.ndarray, "3 lane1"], log: _Record,
 ) -> None:  # fmt: skip
-    """Write the edges and lanes of a record in place, and the box around them.
-
-    ``values`` are those of :func:`_lane_values`: segments without a lane (-1) take the last column.
-    """
+    """Write the edges and lanes of a record in place, and the box around them; ``values`` are :func:`_lane_values`."""
     edge_end, lane_end = log["segment_blocks"][1:3].tolist()
     a, b, count = log["segment_a"][:lane_end].T, log["segment_b"][:lane_end].T, lane_end - edge_end
     ends = np.empty((5, lane_end), np.float32)
@@ -520,10 +517,7 @@ def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
 
 
 def _lane_limits(records: Sequence[_Record], lanes: Int[np.ndarray, " lane"]) -> Float[np.ndarray, "n lane"]:
-    """Limit of each lane, m/s: of a connector, the highest of the lanes that it joins, if known.
-
-    Lanes without a limit get that of their class, or keep a value of at most 0.
-    """
+    """Limit of each lane, m/s: for connectors the highest of the lanes that they join, if known; else of the class."""
     limit, kind, is_connector, *links = (
         stack_field(records, f"lane_{name}", lanes)
         for name in ("limit", "kind", "interpolating", "predecessor", "successor")

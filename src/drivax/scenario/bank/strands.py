@@ -183,7 +183,7 @@ class _Segments:
 
     def at(self, arc: Float[Array, " lane"]) -> tuple[Float[Array, " lane"], Float[Array, "lane 2"]]:
         """Heading and end of the segment at an arc length of each lane, NaN without one."""
-        # Segments of a lane are sorted by start: as many as start up to ``arc`` end with the one that holds it.
+        # Segments of a lane are sorted by start: the number of those that start at or before ``arc`` gives the last.
         before = np.append(0, np.cumsum(self.start <= arc[self.lane]))[self.first]
         last = self.first[:-1] + np.diff(before) - 1
         lane = np.flatnonzero(np.diff(before))

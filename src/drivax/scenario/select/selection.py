@@ -122,11 +122,7 @@ class Filter:
 
     @classmethod
     def parse(cls, text: str) -> Filter:
-        """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison.
-
-        Raises:
-            UsageError: A part is invalid.
-        """
+        """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison."""
         match = _FILTER.fullmatch(text)
         if match is None or match[3].startswith("="):
             raise _refusal(text, "is not a filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
@@ -259,10 +255,7 @@ def read_names(file: Path) -> list[_Name]:
 
 
 def _rows_by_name(data: Listing, names: Sequence[str | Path]) -> set[int]:
-    """Indices of scenarios by name; an id without a data set selects it in all of them.
-
-    Text that is no name of the set is the path of a file with names, if that exists.
-    """
+    """Indices of scenarios by name, in all data sets for an id alone; an unknown name is the path of a file, if any."""
     rows: dict[str, set[int]] = {}
     for row, entry in enumerate(data.entries):
         for text in (entry["scenario_id"], f"{entry['dataset']}\t{entry['scenario_id']}"):

@@ -74,6 +74,7 @@ class EgoPath:
         keep = space_out(xy, STEP_M)
         arc = arc_lengths(xy[keep])
         lane = routes.routes[1].lane if len(routes.routes) > 1 else np.zeros(0, dtype=np.int64)
+        # The route has a point per metre and goes on beyond the end of the log.
         return cls(arc, np.unwrap(heading[keep]), lane[: int(arc[-1]) + 1])
 
 
@@ -197,6 +198,7 @@ def _ego_distance(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array,
 
 
 def _meets_crossing(tracks: LocalTracks) -> bool:
+    """Whether a vehicle crosses ego's heading nearby at some step (:func:`difficulty_of`)."""
     rows = np.flatnonzero(tracks.kind == AgentKind.VEHICLE)
     rows = rows[rows != tracks.ego]
     angle = np.abs(wrap(tracks.heading[rows] - tracks.heading[tracks.ego]))
@@ -206,6 +208,7 @@ def _meets_crossing(tracks: LocalTracks) -> bool:
 
 
 def _brakes(tracks: LocalTracks) -> bool:
+    """Whether the logged ego loses 2 m/s within some second."""
     speed = np.hypot(*tracks.velocity[tracks.ego].T)
     valid, steps = tracks.valid[tracks.ego], round(1.0 / DT_S)
     both = valid[steps:] & valid[:-steps]
