@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.signal import savgol_filter
 
-from drivax.datasets.formats import reader_named, survey
+from drivax.datasets.formats import find_reader, survey
 from drivax.scenario.recording import Recording, Tracks
 from drivax.scenario.schema import AgentKind
 
@@ -114,7 +114,7 @@ def measure(data: Path) -> dict[str, Any]:
     for item in survey(data).inputs:
         if item.format is None:
             continue
-        for recording in reader_named(item.format).read(item.path):
+        for recording in find_reader(item.format).read(item.path):
             if not isinstance(recording, Recording):
                 continue
             name = f"{item.format}:{recording.dataset}"

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from scipy.signal import savgol_filter
 from scipy.stats import ks_2samp
 
-from drivax.datasets.formats import reader_named, survey
+from drivax.datasets.formats import find_reader, survey
 from drivax.errors import DrivaxError, UsageError
 from drivax.report.pictures.palette import BLUE, VERMILLION
 from drivax.scenario.build.assemble import assemble
@@ -120,7 +120,7 @@ def read_recordings(data: Path) -> Iterable[Scenario]:
     for item in survey(data).inputs:
         if item.format is None:
             continue
-        for recording in reader_named(item.format).read(item.path):
+        for recording in find_reader(item.format).read(item.path):
             if not isinstance(recording, Recording) or len(recording.timestamps_s) < STEPS:
                 continue
             try:

@@ -149,7 +149,7 @@ def test_unsupported_flavours_name_the_alternative(name, tmp_path, capsys):
     content, problem, cure = WRONG[name]
     (tmp_path / name).write_bytes(content())
     status, out = asked(tmp_path / name, capsys)
-    assert status == 1 and problem in out and cure in out.partition("instead")[2], out
+    assert status == 1 and problem in out and cure in out.partition("fix")[2], out
     # The conversion says the same, in one line.
     assert main(["convert", str(tmp_path / name), str(tmp_path / "set"), "--workers", "1"]) == 1
     assert problem in capsys.readouterr().err.splitlines()[-1]
@@ -206,7 +206,7 @@ def test_many_files_are_sampled(tmp_path, monkeypatch, capsys):
     for number in range(8):
         (tmp_path / f"{number}.tfrecord").write_bytes(wire.frame(wire.scenario(steps=11)))
     status, out = asked(tmp_path, capsys)
-    assert status == 0 and "8 files (4 of them looked into), 4 recordings in those" in out
+    assert status == 0 and "8 files (4 of them inspected), 4 recordings in those" in out
     assert "about 8 scenarios" in out
 
 

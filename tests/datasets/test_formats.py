@@ -11,7 +11,7 @@ import pytest
 
 from datasets import samples
 from drivax.datasets.conversion import convert
-from drivax.datasets.formats import READERS, detect, find_files, reader_named, survey
+from drivax.datasets.formats import READERS, detect, find_files, find_reader, survey
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError
 
@@ -147,9 +147,9 @@ def test_errors_for_other_tfrecords_say_what_drivax_reads(wire, write_records):
 
 def test_unknown_format_suggests_a_known_one():
     with pytest.raises(UsageError, match="did you mean 'womd-scenario'"):
-        reader_named("womd_scenario")
+        find_reader("womd_scenario")
     with pytest.raises(UsageError, match=r"use one of auto, av2-motion, .*womd-scenario"):
-        reader_named("parquet")
+        find_reader("parquet")
 
 
 def test_folder_is_searched_to_any_depth_in_order(wire, write_records, tmp_path):

@@ -200,8 +200,8 @@ def broken(scene, *path, value):
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
-        (("metadata",), None, "nothing tells which object is the ego"),
-        (("metadata",), {}, "nothing tells which object is the ego"),
+        (("metadata",), None, "the ego is unknown"),
+        (("metadata",), {}, "the ego is unknown"),
         (("metadata", "sdc_track_index"), 4, "names track 4"),
         (("metadata", "sdc_track_index"), "3", "not an integer"),
         (("metadata", "sdc_track_index"), 1, "not a vehicle"),

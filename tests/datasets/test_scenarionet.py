@@ -514,7 +514,7 @@ BROKEN: dict[str, Callable[[dict[str, Any]], Any]] = {
     "the file has no dictionary 'map_features'": _without("map_features"),
     "the file has no dictionary 'dynamic_map_states'": _without("dynamic_map_states"),
     "the ego 'gone' is not one of 3 tracks": lambda tree: tree["metadata"].update(sdc_id="gone"),
-    "the ego 'is not named' is not one": lambda tree: tree["metadata"].pop("sdc_id"),
+    "the ego 'ego' is not one": lambda tree: tree["metadata"].pop("sdc_id"),
     "has 40 values of heading, 91 steps": lambda tree: tree["tracks"]["17"]["state"].update(heading=np.zeros(40)),
     "has a velocity of shape (91, 1)": lambda tree: tree["tracks"]["17"]["state"].update(velocity=np.zeros(91)),
     "has no position": lambda tree: tree["tracks"]["17"]["state"].pop("position"),

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from drivax.datasets.conversion import Conversion, convert_file
-from drivax.datasets.formats import reader_named
+from drivax.datasets.formats import find_reader
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DrivaxError
 from drivax.scenario.schema import CAPACITIES, Scenario
@@ -131,7 +131,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, help="run this file of the series only, with its traceback")
     args = parser.parse_args(argv)
-    reader_named(args.format)
+    find_reader(args.format)
     sample = importlib.import_module(f"datasets.samples.{args.format.replace('-', '_')}")
     signal.signal(signal.SIGALRM, _alarm)
     ends: Counter[str] = Counter()

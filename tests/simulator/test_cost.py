@@ -88,7 +88,7 @@ def test_optional_facts_cost_nothing_unless_requested(bank, monkeypatch):
 
         monkeypatch.setattr(module, name, call)
 
-    noted(situation, "lane_passage")
+    noted(situation.queries, "lane_passage")
     noted(contact, "nearest_gap")
     less = operations(bank, Simulator(Task(observation=GLIMPSE, rewards=RewardConfig(preset="published"))))
     assert asked == set()

@@ -93,10 +93,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 failed, 2 usage, 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    debug, cached = "--debug" in arguments, "--no-cache" not in arguments
+    debug, use_cache = "--debug" in arguments, "--no-cache" not in arguments
     arguments = [argument for argument in arguments if argument not in ("--debug", "--no-cache")]
     try:
-        status = _dispatch(arguments, cached)
+        status = _dispatch(arguments, use_cache)
         sys.stdout.flush()
     except SystemExit as stop:  # tyro's --help (0) and its usage errors (2)
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
@@ -145,7 +145,8 @@ def overview() -> str:
     )
 
 
-def _dispatch(arguments: list[str], cached: bool) -> int:
+def _dispatch(arguments: list[str], use_cache: bool) -> int:
+    """Run the command that the first argument names, or print the overview or the version."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(overview())
         return 0
@@ -158,13 +159,15 @@ def _dispatch(arguments: list[str], cached: bool) -> int:
         raise UsageError(
             f"unknown {kind} {name!r}", cure=did_you_mean(name, COMMANDS, otherwise="see drivax --help")
         )
-    return _run(name, COMMANDS[name], rest, cached)
+    return _run(name, COMMANDS[name], rest, use_cache)
 
 
-def _run(name: str, command: Command, arguments: list[str], cached: bool) -> int:
+def _run(name: str, command: Command, arguments: list[str], use_cache: bool) -> int:
+    """Parse the arguments of a command and run it."""
     import tyro
 
-    cache = use_compilation_cache() if cached else None
+    # Before the module is imported: JAX reads the setting as it starts.
+    cache = use_compilation_cache() if use_cache else None
     module = importlib.import_module(command.module)
     if cache and "jax" in sys.modules:
         report_compilation(partial(print, file=sys.stderr, flush=True))
@@ -183,4 +186,4 @@ def _wrap(text: str) -> str:
     Tyro joins lines unless they begin with a blank, and doubles empty lines, hence the zero-width spaces.
     """
     fill = textwrap.TextWrapper(shutil.get_terminal_size((_COLUMNS, 0)).columns, "  ", "  ").fill
-    return "\n\u200b\n".join(fill(" ".join(part.split())) for part in text.split("\n\n"))
+    return "\n\u200b\n".join(fill(" ".join(paragraph.split())) for paragraph in text.split("\n\n"))

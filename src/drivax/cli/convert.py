@@ -12,7 +12,7 @@ import tyro
 
 from drivax.cli import record_of
 from drivax.datasets.conversion import Conversion, Converted, Plan, convert
-from drivax.datasets.doctor import counted
+from drivax.datasets.doctor import count_text
 from drivax.datasets.formats import READERS
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
@@ -71,27 +71,28 @@ def run(args: Convert) -> int:
 
 
 def _announce(plan: Plan) -> None:
-    texts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
+    """Print the files by format, the estimated size, and where an interrupted conversion continues."""
+    texts = [f"{name} ({count_text(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
     unknown = len(plan.data.inputs) - plan.data.formats.total()
     if unknown:
-        texts.append(f"{counted(unknown, 'file')} of unknown format")
+        texts.append(f"{count_text(unknown, 'file')} of unknown format")
     print(f"found {', '.join(texts)}: {plan.estimate}", flush=True)
     if plan.written:
-        print(f"continuing after {counted(plan.written, 'scenario')}", flush=True)
+        print(f"continuing after {count_text(plan.written, 'scenario')}", flush=True)
 
 
 def summary(result: Converted) -> str:
     """Return one line about a conversion."""
     rate = (result.scenarios - result.written) / max(result.seconds, 1e-9)
     texts = [
-        f"{counted(result.scenarios, 'scenario')} from {counted(result.files, 'file')}"
+        f"{count_text(result.scenarios, 'scenario')} from {count_text(result.files, 'file')}"
         f" in {result.seconds:.1f} s ({rate:.1f}/s)",
-        f"{counted(len(result.skipped), 'record')} skipped",
+        f"{count_text(len(result.skipped), 'record')} skipped",
     ]
     if result.written:
         texts.insert(1, f"{result.written:,} of them written before")
     if result.filtered:
-        texts.append(f"{counted(result.filtered, 'scenario')} left out by filters")
+        texts.append(f"{count_text(result.filtered, 'scenario')} rejected by filters")
     if result.ignored:
-        texts.append(f"{counted(result.ignored, 'file')} of other formats ignored")
+        texts.append(f"{count_text(result.ignored, 'file')} of other formats ignored")
     return f"{result.path}: " + ", ".join(texts)

@@ -126,6 +126,7 @@ def score_with_progress(method: str, request: Request) -> ScoreTable:
     with Progress("scoring", "scenarios", len(request.data)) as bar:
 
         def training(done: int, total: int) -> None:
+            """Show the training that precedes the scores of an ensemble."""
             bar.update(0, f"training the ensemble, {done} of {total} iterations")
 
         return curate(method, replace(request, progress=lambda done, _: bar.update(done), training=training))

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from drivax.datasets.doctor import Diagnosis, Part, counted, diagnose
+from drivax.datasets.doctor import Diagnosis, Part, count_text, diagnose
 from drivax.files import format_bytes, free_bytes
 
 _COLUMNS = 100
@@ -126,11 +126,11 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
         prefix = f"{file}: " if file is not None else ""
         yield "problem", f"{prefix}{problem.problem}"
         if problem.cure:
-            yield "instead", problem.cure
+            yield "fix", problem.cure
     if diagnosis.convertible:
         yield (
             "after convert",
-            f"about {counted(diagnosis.scenarios, 'scenario')}, {format_bytes(diagnosis.set_bytes)}"
+            f"about {count_text(diagnosis.scenarios, 'scenario')}, {format_bytes(diagnosis.set_bytes)}"
             f" ({format_bytes(diagnosis.free_bytes)} free)",
         )
         yield "next", f"drivax convert {diagnosis.path} OUT"
@@ -139,12 +139,15 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
 
 
 def _part_rows(part: Part, files: int) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a part as (name, value); ``files`` is the number of files of its format."""
     description = part.description
     version = "" if description.version is None else f", version {description.version}"
     yield "data set", f"{description.dataset}: {description.flavour}{version}"
-    files_text = counted(part.looked if part.whole else files, "file")
-    sample_text = "" if part.whole else f" ({part.looked:,} of them looked into)"
-    recordings = "" if description.recordings is None else f", {counted(description.recordings, 'recording')}"
+    files_text = count_text(part.sample_size if part.whole else files, "file")
+    sample_text = "" if part.whole else f" ({part.sample_size:,} of them inspected)"
+    recordings = (
+        "" if description.recordings is None else f", {count_text(description.recordings, 'recording')}"
+    )
     yield "format", f"{part.format}: {files_text}{sample_text}{recordings}{'' if part.whole else ' in those'}"
     yield from (("note", note) for note in description.notes)
     yield from (("missing", name) for name in description.missing)

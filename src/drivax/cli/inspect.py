@@ -107,6 +107,7 @@ def _print(inspections: list[Inspection]) -> None:
 
 
 def _console() -> Console:
+    """Return a console of at most 100 columns that prints text as it is."""
     from rich.console import Console
 
     width = min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS

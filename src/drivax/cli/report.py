@@ -62,12 +62,12 @@ def run(args: Report) -> int:
         raise UsageError("--video, --side-by-side and --tables exclude each other", cure="run it twice")
     if args.metrics and not args.tables:
         raise UsageError("--metrics chooses columns of --tables", cure="pass --tables, or leave it out")
-    which = args.video if args.video is not None else args.side_by_side
-    if which is not None:
+    episodes = args.video if args.video is not None else args.side_by_side
+    if episodes is not None:
         out = args.out or args.runs[-1] / "videos"
         with Progress("drawing", "videos") as bar:
             files = write_videos(
-                args.runs, out, which, args.side_by_side is not None, args.data, args.theme, args.overwrite,
+                args.runs, out, episodes, args.side_by_side is not None, args.data, args.theme, args.overwrite,
                 progress=lambda done, _: bar.update(done),
             )  # fmt: skip
         print(f"{out} ({len(files)} videos)")

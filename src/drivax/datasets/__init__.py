@@ -1,4 +1,7 @@
-"""One reader per public format, conversion to scenario sets, and export to other formats."""
+"""One reader per public format, conversion to scenario sets, and export to other formats.
+
+A new reader is registered in ``formats.READERS``.
+"""
 
 import lazy_loader
 

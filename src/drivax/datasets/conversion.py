@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 from drivax.datasets.doctor import Estimate, estimate
-from drivax.datasets.formats import AUTO, Survey, detect, reader_named, survey
+from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
 from drivax.datasets.reader import BadRecord, of_length
 from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError
@@ -76,13 +76,9 @@ class Conversion:
     shard_size: int = 512
 
     def check(self) -> None:
-        """Check the options.
-
-        Raises:
-            UsageError: An option is invalid.
-        """
+        """Check the options."""
         if self.format != AUTO:
-            reader_named(self.format)
+            find_reader(self.format)
         for name, known in (("capacity", tuple(CAPACITIES)), ("routes", get_args(RouteStyle))):
             if (value := getattr(self, name)) not in known:
                 raise UsageError(f"there is no {name} {value!r}", cure=f"use one of {', '.join(known)}")
@@ -113,7 +109,7 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
             used.
     """
     try:
-        reader = detect(path) if options.format == AUTO else reader_named(options.format)
+        reader = detect(path) if options.format == AUTO else find_reader(options.format)
     except DataError as error:
         yield BadRecord.of(error, path)
         return
@@ -127,17 +123,19 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
 
 
 def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterator[Scenario | BadRecord]:
+    """Yield the scenario of each window of a recording, or a bad record in its place."""
     capacity = options.sizes
     cut = partial(windows, recording, options.stride, capacity.steps)
-    parts = _attempt(lambda: list(cut()), path, recording.scenario_id)
-    if isinstance(parts, BadRecord):
-        yield parts
+    pieces = _attempt(lambda: list(cut()), path, recording.scenario_id)
+    if isinstance(pieces, BadRecord):
+        yield pieces
         return
-    for part in parts:
-        yield _attempt(partial(assemble, part, capacity, options.routes), path, part.scenario_id)
+    for piece in pieces:
+        yield _attempt(partial(assemble, piece, capacity, options.routes), path, piece.scenario_id)
 
 
 def _attempt(call: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
+    """Return the result of a call, or the bad record that its error describes."""
     try:
         return call()
     except DrivaxError as error:
@@ -218,7 +216,7 @@ def convert(
     capacity = options.sizes
     with ScenarioWriter(
         out, capacity, _source(data, options), options.shard_size, options.overwrite, options.shares,
-        _identity(data, options, audited=audit is not None),
+        _identity(data, options, has_audit=audit is not None),
     ) as writer:  # fmt: skip
         written = len(writer)
         sink = _Sink(writer, data, options, audit)
@@ -249,7 +247,7 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
     }
 
 
-def _identity(data: Survey, options: Conversion, audited: bool) -> dict[str, Any]:
+def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
     """All that the bytes of the set depend on; only a conversion with the same identity resumes another."""
     digest = hashlib.sha256()
     for entry in data.inputs:
@@ -259,7 +257,7 @@ def _identity(data: Survey, options: Conversion, audited: bool) -> dict[str, Any
         "drivax": metadata.version("drivax"),
         "schema": SCHEMA_VERSION,
         "files": digest.hexdigest(),
-        "audit": audited,
+        "audit": has_audit,
         **{name: getattr(options, name) for name in names},
     }
 
@@ -283,6 +281,7 @@ class _Sink:
         self.skipped: list[BadRecord] = []
         self.filtered = 0
         self.place = (0, 0)
+        # Continue after the last closed shard of an interrupted conversion.
         for note in writer.notes:
             self.place = tuple(note["place"])
             self.filtered = note["filtered"]
@@ -324,26 +323,28 @@ class _Sink:
         return {"skipped": len(rows), "skipped_records": rows, "filtered": self.filtered}
 
     def _batch_size(self) -> int:
+        """Number of scenarios to wait for: 1 without an audit, else a batch that ends with the shard or the limit."""
         if self._audit is None:
             return 1
         if self._options.filters:  # the number of kept scenarios is unknown
             return _BATCH
-        left = _BATCH if self._options.limit is None else self._options.limit - len(self._writer)
-        return min(_BATCH, self._writer.room, left)
+        remaining = _BATCH if self._options.limit is None else self._options.limit - len(self._writer)
+        return min(_BATCH, self._writer.room, remaining)
 
     def _write_batch(self) -> None:
+        """Audit all that wait, and write it up to the end of the shard or limit; the others wait on."""
         batch, self._waiting, self._scenarios_waiting = self._waiting, [], 0
         items = self._drop_duplicates(batch)
         scenarios = [item for item in items if isinstance(item, Scenario)]
         findings = [{} for _ in scenarios] if self._audit is None else self._audit(scenarios)
         pairs = zip(scenarios, findings, strict=True)
-        audited = iter([replace(scenario, audit=finding) for scenario, finding in pairs])
+        results = iter([replace(scenario, audit=finding) for scenario, finding in pairs])
         for number, item in enumerate(items):
             if isinstance(item, BadRecord):
                 if self._options.strict:
                     raise item.error()
                 self.skipped.append(item)
-            elif self._write(next(audited), batch[number][1]) or self.full:
+            elif self._write(next(results), batch[number][1]) or self.full:
                 # A shard is closed: the rest begins a new batch.
                 self._waiting = batch[number + 1 :]
                 self._scenarios_waiting = sum(isinstance(item, Scenario) for item, _ in self._waiting)
@@ -387,6 +388,7 @@ def _drain(
 ) -> int:
     """Move results into the sink until its limit; return the number of files read."""
     report = progress or (lambda done, total, scenarios: None)
+    # Of the first file, an interrupted conversion has taken ``skip`` items.
     first, skip = sink.place
     total = len(data.inputs)
     with closing(_results(data, options, first, writer.folder)) as results:

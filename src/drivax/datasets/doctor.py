@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from drivax.datasets import unsupported
-from drivax.datasets.formats import AUTO, Survey, reader_named, survey
+from drivax.datasets.formats import AUTO, Survey, find_reader, survey
 from drivax.datasets.reader import BadRecord, Description, Reader, of_length
 from drivax.errors import DataError, UsageError
 from drivax.files import check_space, format_bytes, free_bytes
@@ -24,15 +24,14 @@ _SAMPLE = 24
 _COUNT_FILES = 48
 #: Damaged or unknown files that are named.
 _MOST_NAMES = 10
-#: Notes given on files of one kind.
-_NOTES = 6
-_FLAVOURS = 3
+#: Notes and flavours that are listed for files of one kind, and runs of missing shards for a family.
+_NOTES, _FLAVOURS, _RUNS = 6, 3, 8
 _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 
 
 @dataclass(frozen=True)
 class Part:
-    """Files of one format, data set and version: ``looked`` of them were described, ``whole`` if those are all.
+    """Files of one format, data set and version: ``sample_size`` of them are described, ``whole`` if those are all.
 
     ``recordings`` of the description is the sum over these files, or None if it is unknown for some file; ``notes`` and
     ``missing`` are those of all of them.
@@ -40,7 +39,7 @@ class Part:
 
     format: str
     description: Description
-    looked: int
+    sample_size: int
     whole: bool
 
 
@@ -53,11 +52,11 @@ class Diagnosis:
         parts: What can be read in it.
         files: Number of files by format; ``input_bytes`` is their size.
         companions: Number of files that are read along with them; ``ignored`` ones belong to no format.
-        scenarios: About how many scenarios it will become, of ``set_bytes`` altogether.
-        free_bytes: What the disk of ``path`` has left.
+        scenarios: Estimated number of scenarios after conversion; ``set_bytes`` is their size.
+        free_bytes: Free space on the disk of ``path``.
         shards: One sentence per family of numbered shards.
         problems: What is wrong, and what to do about it; most important first.
-        convertible: Whether ``drivax convert`` would make something of it.
+        convertible: Whether ``drivax convert`` can convert some of it.
     """
 
     path: Path
@@ -75,23 +74,23 @@ class Diagnosis:
 
 
 def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
-    """Find out what a file or folder is; what is wrong with the data is no exception but among the problems.
+    """Identify the content of a file or folder; defects of the data are returned as problems, not raised.
 
     Raises:
         UsageError: There is no such format, or a package that it needs is missing.
     """
     path = Path(path)
     # A scenario set or a run folder holds files, but none to convert.
-    known = unsupported.explain_own(path) if path.is_dir() else None
+    own = unsupported.explain_own(path) if path.is_dir() else None
     try:
-        if known is not None:
-            raise known
+        if own is not None:
+            raise own
         data = survey(path, format)
     except DataError as error:
         return Diagnosis(path, problems=(BadRecord.of(error, path),))
     parts, problems = _parts(data)
-    if not parts and path.is_dir() and (whole := unsupported.explain_folder(path)) is not None:
-        problems.insert(0, BadRecord.of(whole, path))
+    if not parts and path.is_dir() and (error := unsupported.explain_folder(path)) is not None:
+        problems.insert(0, BadRecord.of(error, path))
     expected = estimate(data, path, CAPACITIES["default"], STRIDE, None)
     return Diagnosis(
         path=path,
@@ -110,6 +109,7 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 
 
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
+    """Describe a sample of the files of each format, and list damaged files of it and files of no format."""
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
     unknown = [entry.path for entry in data.inputs if entry.format is None][:_MOST_NAMES]
     problems = [BadRecord.of(unsupported.explain(file), file) for file in unknown]
@@ -118,34 +118,35 @@ def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
         step = -(-len(files) // _SAMPLE)
         for file in files[::step]:
             try:
-                description = reader_named(name).describe(file)
+                description = find_reader(name).describe(file)
             except DataError as error:
                 problems.append(BadRecord.of(error, file))
                 continue
             groups[name, description.dataset, description.version, step == 1].append(description)
-    parts = (Part(name, _merge(many), len(many), whole) for (name, *_, whole), many in groups.items())
-    return tuple(parts), problems
+    return tuple(
+        Part(key[0], _merge(sample), len(sample), key[-1]) for key, sample in groups.items()
+    ), problems
 
 
-def _merge(many: Sequence[Description]) -> Description:
+def _merge(sample: Sequence[Description]) -> Description:
     """One description for files of one data set and version."""
-    flavours = sorted({description.flavour for description in many})
+    flavours = sorted({description.flavour for description in sample})
     more = f" and {len(flavours) - _FLAVOURS} more" if len(flavours) > _FLAVOURS else ""
-    counts = [description.recordings for description in many if description.recordings is not None]
+    counts = [description.recordings for description in sample if description.recordings is not None]
     return replace(
-        many[0],
+        sample[0],
         flavour="; ".join(flavours[:_FLAVOURS]) + more,
-        recordings=sum(counts) if len(counts) == len(many) else None,
-        notes=tuple(_notes(many)),
-        missing=tuple(dict.fromkeys(name for description in many for name in description.missing)),
+        recordings=sum(counts) if len(counts) == len(sample) else None,
+        notes=tuple(_notes(sample)),
+        missing=tuple(dict.fromkeys(name for description in sample for name in description.missing)),
     )
 
 
-def _notes(many: Sequence[Description]) -> Iterator[str]:
-    """The notes that most files share, with how many do where it is not all."""
-    counts = Counter(note for description in many for note in dict.fromkeys(description.notes))
+def _notes(sample: Sequence[Description]) -> Iterator[str]:
+    """The most frequent notes on some files, each with the number of its files unless all have it."""
+    counts = Counter(note for description in sample for note in dict.fromkeys(description.notes))
     for note, times in counts.most_common(_NOTES):
-        yield note if times == len(many) else f"{note} (in {times} of {len(many)} files)"
+        yield note if times == len(sample) else f"{note} (in {times} of {len(sample)} files)"
     if len(counts) > _NOTES:
         yield f"{len(counts) - _NOTES} more notes on single files; name one of them to see its own"
 
@@ -164,7 +165,7 @@ def gaps(paths: Sequence[Path]) -> list[str]:
             continue
         runs = np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1)
         names = (f"{run[0]:05d}" if len(run) == 1 else f"{run[0]:05d} to {run[-1]:05d}" for run in runs)
-        names_text = f", missing {', '.join(names)}" if len(runs) <= 8 else ""
+        names_text = f", missing {', '.join(names)}" if len(runs) <= _RUNS else ""
         sentences.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{names_text}")
     return sentences
 
@@ -180,7 +181,7 @@ class Estimate:
 
     def __str__(self) -> str:
         size, free = format_bytes(self.size_bytes), format_bytes(self.free_bytes)
-        return f"about {counted(self.scenarios, 'scenario')}, {size}; {free} free"
+        return f"about {count_text(self.scenarios, 'scenario')}, {size}; {free} free"
 
     def check(self, out: Path, written: int = 0) -> None:
         """Refuse a set that will not fit; ``written`` of its scenarios are on the disk already."""
@@ -205,7 +206,7 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
         sample = paths[::step]
         sampled |= step > 1
         scale = _size(paths) / max(_size(sample), 1) if step > 1 else 1.0
-        reader = of_length(reader_named(name), capacity.steps)
+        reader = of_length(find_reader(name), capacity.steps)
         total += scale * sum(count(reader, path, stride, capacity.steps) for path in sample)
     scenarios = round(total) if limit is None else min(round(total), limit)
     return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out), sampled)
@@ -222,12 +223,12 @@ def count(reader: Reader, path: Path, stride: int = STRIDE, length: int = STEPS)
         return 0
     if not recordings:
         return scenarios
-    # Readers count windows of the usual stride and length, which tell about how long the recordings are.
+    # Readers count windows of the usual stride and length; estimate the recordings' length from their number.
     steps = STEPS + STRIDE * max(scenarios / recordings - 1, 0)
     return round(recordings * max((steps - length) // stride + 1, 1))
 
 
-def counted(number: int, noun: str) -> str:
+def count_text(number: int, noun: str) -> str:
     """A number with its noun in the singular or plural."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 

@@ -33,16 +33,12 @@ READERS: tuple[Reader, ...] = (
     ScenarioMax(),
 )
 AUTO = "auto"
-#: Sensor data and texts, which data sets hold by the hundred thousand.
+#: Endings of sensor data and texts, which data sets hold by the hundred thousand: such files are never opened.
 _NEVER = (".jpg", ".jpeg", ".png", ".pcd", ".pcd.bin", ".npz", ".md", ".txt", ".csv", ".html", ".pdf")
 
 
-def reader_named(name: str) -> Reader:
-    """The reader of a format.
-
-    Raises:
-        UsageError: There is no such format.
-    """
+def find_reader(name: str) -> Reader:
+    """Return the reader of a format."""
     readers = {reader.name: reader for reader in READERS}
     if name not in readers:
         choices = f"use one of {', '.join((AUTO, *readers))}"
@@ -118,7 +114,7 @@ def survey(src: str | Path, name: str = AUTO) -> Survey:
         UsageError: There is no such format.
     """
     src = Path(src)
-    only = None if name == AUTO else reader_named(name)
+    only = None if name == AUTO else find_reader(name)
     if not src.exists():
         raise DataError("does not exist", file=src, cure="check the path")
     if not src.is_dir():
@@ -130,7 +126,7 @@ def survey(src: str | Path, name: str = AUTO) -> Survey:
     inputs = tuple(kind for kind in kinds if isinstance(kind, Input))
     companions = kinds.count("companion")
     if not inputs:
-        raise _nothing_in(src, len(kinds), readers)
+        raise _no_input_error(src, len(kinds), readers)
     return Survey(src, inputs, companions, len(kinds) - len(inputs) - companions)
 
 
@@ -146,7 +142,7 @@ def _kind(path: Path, readers: tuple[Reader, ...]) -> Input | str:
         return "ignored"
     by_name = any(_matches(path, reader.patterns) for reader in readers)
     if len(readers) == 1:
-        # The reader says record by record what is wrong with a file that only has the name.
+        # With one format, a file that only has the name goes to its reader, which reports what is wrong.
         if by_name or readers[0].recognise(path):
             return Input(path, readers[0].name)
     elif (reader := recognise(path)) is not None:
@@ -164,10 +160,11 @@ def _hidden(path: Path) -> bool:
     return any(part.startswith(".") for part in path.parts)
 
 
-def _nothing_in(folder: Path, files: int, readers: tuple[Reader, ...]) -> DataError:
-    known = ", ".join(reader.name for reader in readers)
+def _no_input_error(folder: Path, files: int, readers: tuple[Reader, ...]) -> DataError:
+    """Return the error for a folder with ``files`` files of which none can be read."""
+    names = ", ".join(reader.name for reader in readers)
     return unsupported.explain_folder(folder) or DataError(
-        f"none of the {files} files in it is of a known format ({known})",
+        f"none of the {files} files in it is of a known format ({names})",
         file=folder,
         cure="name the folder that holds the downloaded data; drivax doctor tells more",
     )

@@ -74,8 +74,8 @@ _KINDS = {int(kind): kind for kind in RoadKind}
 _SPLIT_GAP_M, _DENSE_M = 1.0, 0.75
 #: Fields that other converters to this form omit: heights of the map, of agents and of boxes.
 _ABSENT = ("z", "height")
-#: Written decimals: a tenth of a millimetre.
-_DIGITS = 4
+#: Decimals of metres (a tenth of a millimetre) and of headings.
+_DIGITS, _HEADING_DIGITS = 4, 6
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,7 @@ class GpuDrive:
 
 
 def _load(path: Path) -> Any:
+    """Parse a JSON file of plausible size."""
     try:
         size = path.stat().st_size
     except OSError as error:
@@ -138,16 +139,13 @@ def decode(scene: Any) -> Recording:
     Positions stay in WOMD's map frame, metres, float64; invalid steps (-10000 in the file) are zeros; steps are 0.1 s
     apart, because the file has no timestamps. ``goalPosition`` (an agent's last valid position) and ``mark_as_expert``
     (agents that GPUDrive replays) are dropped.
-
-    Raises:
-        DataError: The scene is damaged.
     """
     if not isinstance(scene, Mapping):
-        raise DataError("is no GPUDrive scene", cure=_SKIP)
+        raise DataError("is not a GPUDrive scene", cure=_SKIP)
     metadata, scenario_id = scene.get("metadata"), scene.get("scenario_id")
     if not isinstance(metadata, Mapping) or "sdc_track_index" not in metadata:
         raise DataError(
-            "has no metadata with sdc_track_index, so nothing tells which object is the ego",
+            "has no metadata with sdc_track_index, so the ego is unknown",
             cure="use files of GPUDrive's present converter; its small hand-made test scenes are not recordings",
         )
     if not isinstance(scenario_id, str) or not scenario_id.isprintable():
@@ -159,11 +157,12 @@ def decode(scene: Any) -> Recording:
     if tracks.kind[ego] != AgentKind.VEHICLE:
         raise DataError(f"sdc_track_index names object {ego}, which is not a vehicle", cure=_SKIP)
     features, unknown = _features(roads)
-    lights, unplaced = _lights(scene.get("tl_states"), steps, features)
+    lights, lost_lights = _lights(scene.get("tl_states"), steps, features)
     spacing = parsing.spacing_m(features)
     rows = {int(track): row for row, track in enumerate(tracks.track_id)}
-    interest = [_whole(track, "objects_of_interest") for track in _read_list(metadata, "objects_of_interest")]
-    predicted = [
+    interest = _read_list(metadata, "objects_of_interest")
+    interest = [_integer(track, "objects_of_interest") for track in interest]
+    to_predict = [
         entry.get("track_index") if isinstance(entry, Mapping) else entry
         for entry in _read_list(metadata, "tracks_to_predict")
     ]
@@ -177,14 +176,14 @@ def decode(scene: Any) -> Recording:
         tracks=tracks,
         features=features,
         lights=lights,
-        to_predict=_row_numbers(predicted, count, "tracks_to_predict"),
+        to_predict=_row_numbers(to_predict, count, "tracks_to_predict"),
         # These are ids, tracks_to_predict are rows.
         of_interest=tuple(rows[track] for track in interest if track in rows),
         tags={"source_format": "gpudrive"},
         lost=parsing.nonzero(
             unknown_roads=unknown,
             one_point_features=parsing.one_point_features(features),
-            lights_without_place=unplaced,
+            lights_without_place=lost_lights,
             unknown_fields=len({str(key) for row in (*objects, *roads) for key in row} - _FIELDS),
         ),
         # In files whose points were thinned a jump looks like any other gap.
@@ -206,14 +205,15 @@ def _read_list(metadata: Mapping[str, Any], name: str) -> list[Any]:
     return values or []
 
 
-def _whole(value: Any, what: str) -> int:
+def _integer(value: Any, what: str) -> int:
+    """Return a value that must be an integer; ``what`` names it in the error."""
     if type(value) is not int:
         raise DataError(f"{what} contains {str(value)[:40]!r}, which is not an integer", cure=_SKIP)
     return value
 
 
 def _row_numbers(values: Sequence[Any], count: int, what: str) -> tuple[int, ...]:
-    return parsing.rows_within([_whole(value, what) for value in values], count, what)
+    return parsing.rows_within([_integer(value, what) for value in values], count, what)
 
 
 def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
@@ -244,13 +244,14 @@ def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
     numbers = [row.get("id") for row in rows]
     if all(number is None for number in numbers):
         return list(range(len(numbers)))
-    ids = [_whole(number, f"the id of {what}") for number in numbers]
+    ids = [_integer(number, f"the id of {what}") for number in numbers]
     if len(set(ids)) < len(ids) or not all(0 <= number < _ID_END for number in ids):
         raise DataError(f"the ids of {what} are not unique, or not from 0 to {_ID_END - 1}", cure=_SKIP)
     return ids
 
 
 def _tracks(objects: Sequence[Mapping[str, Any]]) -> Tracks:
+    """Return the tracks; implausible sizes are 0, which stands for that of the class."""
     table, valid = _states(objects)
     valid &= ~(table[..., :2] == _INVALID).all(axis=-1)
     table = np.where(valid[..., None], table, 0.0)
@@ -301,9 +302,9 @@ def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...
     ids = _ids(roads, "roads")
     features, unknown = [], 0
     for number, road in zip(ids, roads, strict=True):
-        code, word = road.get("map_element_id"), str(road.get("type"))
+        code, type_name = road.get("map_element_id"), str(road.get("type"))
         kind = _KINDS.get(code) if type(code) is int else None
-        kind = _ROADS.get(word) if kind is None else kind
+        kind = _ROADS.get(type_name) if kind is None else kind
         points = _table(road.get("geometry"), "xyz", f"the geometry of road {number}")
         if kind is None or not len(points):
             unknown += 1
@@ -325,22 +326,22 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
         if not (lane.isascii() and lane.isdigit() and len(lane) < 11):
             raise DataError(f"tl_states names lane {lane[:40]!r}, which is not an id", cure=_SKIP)
         what = f"tl_states of lane {lane[:40]}"
-        times, seen_states, *place = _columns(observations, ("time_index", "state", "x", "y", "z"), what)
-        when = parsing.rows_within([_whole(step, what) for step in times], steps, what)
-        rows = [dict(zip("xyz", point, strict=True)) for point in zip(*place, strict=True)]
+        indices, lane_states, *axes = _columns(observations, ("time_index", "state", "x", "y", "z"), what)
+        indices = parsing.rows_within([_integer(step, what) for step in indices], steps, what)
+        rows = [dict(zip("xyz", point, strict=True)) for point in zip(*axes, strict=True)]
         points = _table(rows, "xyz", what)
         if not (np.abs(points) <= _LARGEST).all():
-            raise DataError(f"{what} is not at a finite place", cure=_SKIP)
-        for step, state, point in zip(when, seen_states, points.tolist(), strict=True):
+            raise DataError(f"{what} has a position that is not finite or implausibly large", cure=_SKIP)
+        for step, state, point in zip(indices, lane_states, points.tolist(), strict=True):
             lights.observe(step, int(lane), _light_state(state), point)
     return lights.collect(features)
 
 
 def _light_state(state: Any) -> int:
     """A state by its name, as GPUDrive's converter writes it, or by WOMD's number; UNKNOWN otherwise."""
-    word = str(state).upper()
-    if word in LightState.__members__ and word != LightState.UNOBSERVED.name:
-        return int(LightState[word])
+    name = str(state).upper()
+    if name in LightState.__members__ and name != LightState.UNOBSERVED.name:
+        return int(LightState[name])
     known = type(state) is int and LightState.UNKNOWN <= state <= LightState.FLASHING_CAUTION
     return state if known else int(LightState.UNKNOWN)
 
@@ -359,7 +360,7 @@ def gpudrive_scene(scenario: Scenario, name: str) -> dict[str, Any]:
     recording = restore(scenario)
     count = len(recording.tracks.kind)
     rows = [*(row for row in range(count) if row != recording.ego), recording.ego]
-    place = {row: number for number, row in enumerate(rows)}
+    index = {row: number for number, row in enumerate(rows)}
     ids = recording.tracks.track_id
     return {
         "name": name,
@@ -376,10 +377,10 @@ def gpudrive_scene(scenario: Scenario, name: str) -> dict[str, Any]:
         ],
         "tl_states": {str(light.lane_id): _light(light) for light in recording.lights},
         "metadata": {
-            "sdc_track_index": place[recording.ego],
+            "sdc_track_index": index[recording.ego],
             "objects_of_interest": [int(ids[row]) for row in recording.of_interest],
             "tracks_to_predict": [
-                {"track_index": place[row], "difficulty": 0} for row in recording.to_predict
+                {"track_index": index[row], "difficulty": 0} for row in recording.to_predict
             ],
         },
     }
@@ -390,6 +391,7 @@ def _points(points: _Array) -> list[dict[str, float]]:
 
 
 def _object(recording: Recording, row: int) -> dict[str, Any]:
+    """Return a track as an object of the scene, with the size of its last valid step."""
     tracks = recording.tracks
     valid = tracks.valid[row]
     last = np.flatnonzero(valid)[-1]
@@ -400,7 +402,7 @@ def _object(recording: Recording, row: int) -> dict[str, Any]:
         "width": width,
         "length": length,
         "height": height,
-        "heading": np.round(np.where(valid, tracks.heading[row], _INVALID), _DIGITS + 2).tolist(),
+        "heading": np.round(np.where(valid, tracks.heading[row], _INVALID), _HEADING_DIGITS).tolist(),
         "velocity": _points(np.where(valid[:, None], tracks.velocity[row], _INVALID)),
         "valid": valid.tolist(),
         "goalPosition": _points(position[last : last + 1])[0],

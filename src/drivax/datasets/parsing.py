@@ -17,7 +17,7 @@ from drivax.errors import DataError
 from drivax.geometry.polylines import Polylines, cut_counts
 from drivax.scenario.build.tracks import DEFAULT_SIZES
 from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
+from drivax.scenario.schema import DT_S, LANE_KINDS, POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
 
 Array = np.ndarray[Any, Any]
 
@@ -39,7 +39,7 @@ _LONGEST = 64
 
 
 def place_tags(location: str | None) -> dict[str, str]:
-    """The tags ``place`` (the city, if it is a known one) and ``location`` (the source's own word); none without it."""
+    """The tags ``place`` (the city, if it is a known one) and ``location`` (the source's name); none without it."""
     if not location:
         return {}
     city = _CITY_OF.get(location.lower().replace("_", "-"))
@@ -52,12 +52,13 @@ _UNOBSERVED, _UNKNOWN = int(LightState.UNOBSERVED), int(LightState.UNKNOWN)
 _LAST_STATE = int(max(LightState))
 
 
-#: Names of windows of a drive: of nuScenes' scenes by tokens, drivax' own by their first step and another ego.
+#: Ids of windows: ``scene-0001_<token>`` of nuScenes, with one or two tokens; of drivax ``<id>@<first step>`` or, with
+#: another ego, ``<id>@<first step>#<track>``.
 _WINDOW = re.compile(r"(scene-\d+)(?:_[0-9a-f]{32}){1,2}|(.+)@\d+(?:#\d+)?")
 
 
 def segment_of(scenario_id: str) -> str:
-    """The drive of which a scenario is one of several windows, by its id; the id itself where it tells none."""
+    """The recording that a window is part of, from the window's id; the id itself if it is not that of a window."""
     window = _WINDOW.fullmatch(scenario_id)
     return scenario_id if window is None else segment_of(window[1] or window[2])
 
@@ -71,14 +72,17 @@ class Lights:
         self._lights: dict[int, tuple[tuple[float, ...], list[int]]] = {}
 
     def observe(self, step: int, lane: int, state: int, stop_point: Sequence[float]) -> None:
-        """Note one observation; of several for one lane and step the first that is not UNKNOWN counts."""
-        known, states = self._lights.get(lane, ((), [_UNOBSERVED] * self._steps))
-        self._lights[lane] = known if any(known) else tuple(stop_point), states
+        """Note one observation; of several for one lane and step the first that is not UNKNOWN counts.
+
+        The stop point of a lane is the first that is not zero; states that WOMD lacks count as UNKNOWN.
+        """
+        point, states = self._lights.get(lane, ((), [_UNOBSERVED] * self._steps))
+        self._lights[lane] = point if any(point) else tuple(stop_point), states
         if states[step] <= _UNKNOWN:
             states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
     def collect(self, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
-        """Return the lights in order of first observation, and the number of those dropped for want of a position.
+        """Return the lights in order of first observation, and the number of those dropped without a position.
 
         States are -1 where a light is not observed. A stop point of zeros is none: the light then stands where its lane
         begins.
@@ -101,24 +105,24 @@ def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
     return tuple(int(row) for row in rows)
 
 
-def check_finite(*measured: np.ndarray[Any, Any]) -> None:
+def check_finite(*arrays: np.ndarray[Any, Any]) -> None:
     """Refuse NaN and infinities in valid states."""
-    if not all(np.isfinite(values).all() for values in measured):
+    if not all(np.isfinite(values).all() for values in arrays):
         raise DataError("valid states contain numbers that are not finite", cure="skip this record")
 
 
-def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " time"]:
+def fill_times(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " time"]:
     """Timestamps with unknown ones (NaN) filled at 10 Hz from the nearest known one before, else after."""
     known = np.flatnonzero(np.isfinite(timestamps))
     steps = np.arange(len(timestamps))
     if known.size == 0:
-        return steps * 0.1
+        return steps * DT_S
     nearest = known[np.maximum(np.searchsorted(known, steps, side="right") - 1, 0)]
-    return timestamps[nearest] + (steps - nearest) * 0.1
+    return timestamps[nearest] + (steps - nearest) * DT_S
 
 
 def shift(recording: Recording, offset: Float[np.ndarray, "3"]) -> Recording:
-    """The recording in a map frame in which its present origin lies at ``offset`` (x, y, z), metres."""
+    """The recording moved by ``offset`` (x, y, z), metres."""
     if not offset.any():
         return recording
     tracks = recording.tracks
@@ -133,7 +137,7 @@ def shift(recording: Recording, offset: Float[np.ndarray, "3"]) -> Recording:
 def box_centre(
     rear_axle: Float[np.ndarray, "step 2"], heading: Float[np.ndarray, " step"], ahead_m: float
 ) -> Float[np.ndarray, "step 2"]:
-    """Positions of the box centre, ``ahead_m`` ahead of the rear axle, of which poses of recording cars are."""
+    """Positions of the box centre, ``ahead_m`` ahead of the rear axle, where sources locate the recording car."""
     return rear_axle + ahead_m * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
 
 
@@ -176,13 +180,13 @@ def one_point_features(features: Sequence[MapFeature]) -> int:
     return sum(len(f.points) < 2 and f.kind != RoadKind.STOP_SIGN for f in features)
 
 
-def check_within(most: float, *measured: np.ndarray[Any, Any]) -> None:
-    """Refuse NaN, infinities, and what is further from 0 than ``most``."""
-    if not all((np.abs(values) <= most).all() for values in measured):  # NaN compares false
+def check_within(most: float, *arrays: np.ndarray[Any, Any]) -> None:
+    """Refuse NaN, infinities, and numbers further from 0 than ``most``."""
+    if not all((np.abs(values) <= most).all() for values in arrays):  # NaN compares false
         raise DataError(f"contains numbers that are not finite or beyond {most:g}", cure="skip this record")
 
 
-#: Map lines are sampled at least this densely before the nearest point is looked up, unless that took too many.
+#: Spacing of the samples of map lines among which the nearest point is searched, m; wider if there would be too many.
 SPACING_M = 1.0
 MOST_SAMPLES = 1_000_000
 
@@ -226,5 +230,6 @@ def _samples(features: Sequence[MapFeature]) -> Float[Array, "sample 3"]:
     pieces = cut_counts(length, max(SPACING_M, float(length.sum()) / MOST_SAMPLES))
     owner = np.repeat(np.arange(len(a)), pieces)
     part = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    between = a[owner] + (part / pieces[owner])[:, None] * (b - a)[owner]
-    return np.concatenate((between, lines.points[~inner]))
+    samples = a[owner] + (part / pieces[owner])[:, None] * (b - a)[owner]
+    # Cuts hold the first points of segments; the last point of a line begins none.
+    return np.concatenate((samples, lines.points[~inner]))

@@ -25,7 +25,7 @@ class BadRecord:
 
     @classmethod
     def of(cls, error: DrivaxError, file: Path, record: int | str | None = None) -> BadRecord:
-        """The bad record that an error describes; ``file`` and ``record`` unless the error names them."""
+        """The bad record that an error describes; ``file`` and ``record`` count if the error names none."""
         record = record if error.record is None else error.record
         return cls(error.file or file, record, error.problem, error.cure)
 
@@ -100,5 +100,5 @@ class Reader(Protocol):
 
 def of_length(reader: Reader, steps: int) -> Reader:
     """The reader for scenarios of ``steps`` steps; only those that cut logs into recordings (nuPlan) differ."""
-    cutting: Any = reader
-    return replace(cutting, steps=steps) if hasattr(reader, "steps") else reader
+    record: Any = reader  # a dataclass, which the protocol does not say
+    return replace(record, steps=steps) if hasattr(reader, "steps") else reader

@@ -43,9 +43,9 @@ def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
         raise DataError(problem, cure=_AGAIN)
     try:
         union = shapely.union_all([polygon for area in areas for polygon in _polygons(shapely, area)])
-        # Mitred corners return to their place.
-        joined = union.buffer(GAP_M / 2, join_style="mitre").buffer(-GAP_M / 2, join_style="mitre")
-        outlines = list(_outlines(shapely, joined))
+        # Widening closes the gaps, narrowing restores the outline: mitred corners return to their place.
+        union = union.buffer(GAP_M / 2, join_style="mitre").buffer(-GAP_M / 2, join_style="mitre")
+        outlines = list(_outlines(shapely, union))
     except shapely.errors.GEOSException as error:
         raise DataError(f"drivable areas cannot be joined ({error})", cure=_AGAIN) from error
     heights = _heights(shapely, rings, np.concatenate(outlines) if outlines else np.zeros((0, 2)))
@@ -69,9 +69,9 @@ def _polygons(shapely: Any, area: Area) -> list[Any]:
     return [part for part in shapely.get_parts(polygon) if part.geom_type == "Polygon"]
 
 
-def _outlines(shapely: Any, joined: Any) -> Iterator[Float[Array, "_ 2"]]:
-    """The rings worth keeping as points, exteriors anticlockwise and holes clockwise."""
-    for polygon in shapely.get_parts(shapely.orient_polygons(joined)):
+def _outlines(shapely: Any, union: Any) -> Iterator[Float[Array, "_ 2"]]:
+    """The rings of large enough pieces and holes as points, exteriors anticlockwise and holes clockwise."""
+    for polygon in shapely.get_parts(shapely.orient_polygons(union)):
         if polygon.geom_type != "Polygon" or polygon.area < LEAST_PIECE_M2:
             continue
         yield shapely.get_coordinates(polygon.exterior)
@@ -83,12 +83,12 @@ def _outlines(shapely: Any, joined: Any) -> Iterator[Float[Array, "_ 2"]]:
 def _heights(
     shapely: Any, rings: Sequence[Float[Array, "_ _"]], xy: Float[Array, "query 2"]
 ) -> Float[Array, " query"]:
-    """Height of each point, interpolated along the nearest edge of the input rings."""
-    solid = [ring for ring in rings if ring.shape[1] > 2 and len(ring)]
-    if not solid or not len(xy):
+    """Height of each point, interpolated along the nearest edge of the input rings; 0 if they have no heights."""
+    with_z = [ring for ring in rings if ring.shape[1] > 2 and len(ring)]
+    if not with_z or not len(xy):
         return np.zeros(len(xy))
-    a = np.concatenate(solid)
-    b = np.concatenate([np.roll(ring, -1, axis=0) for ring in solid])
+    a = np.concatenate(with_z)
+    b = np.concatenate([np.roll(ring, -1, axis=0) for ring in with_z])
     edges = shapely.linestrings(np.stack((a[:, :2], b[:, :2]), axis=1))
     points = shapely.points(xy)
     nearest = shapely.STRtree(edges).nearest(points)

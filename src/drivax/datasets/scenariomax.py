@@ -35,8 +35,8 @@ class ScenarioMax(womd.TfRecordReader):
         """Describe the file by its first record."""
         recording = self.first(path)
         notes = [*womd.notes_of(recording), "the file does not say which data set its scenarios come from"]
-        limited = sum(feature.limit_mps is not None for feature in recording.features)
-        notes.append(f"{limited} lanes have a speed limit; no lane graph: lanes are chained by geometry")
+        limits = sum(feature.limit_mps is not None for feature in recording.features)
+        notes.append(f"{limits} lanes have a speed limit; no lane graph: lanes are chained by geometry")
         if Flag.TRUNCATED_MAP in recording.flags:
             notes.append("the list of map points is full, the map is cut off")
         if "paths" in recording.lost:

@@ -43,13 +43,14 @@ def convert_ahead(
     spool.mkdir()
     pool = worker_pool(min(workers, len(tasks)))
     waiting: deque[tuple[Path, Future[list[Scenario | BadRecord]]]] = deque()
-    todo = enumerate(tasks)
+    remaining = enumerate(tasks)
     try:
         while True:
             # Two tasks ahead keep all workers busy and bound the space on the disk.
-            while len(waiting) < workers + 2 and (item := next(todo, None)) is not None:
-                path = spool / f"{item[0]}.records"
-                waiting.append((path, pool.submit(_spool, item[1], convert, path)))
+            while len(waiting) < workers + 2 and (item := next(remaining, None)) is not None:
+                number, task = item
+                path = spool / f"{number}.records"
+                waiting.append((path, pool.submit(_spool, task, convert, path)))
             if not waiting:
                 return
             path, future = waiting.popleft()
@@ -63,7 +64,7 @@ def convert_ahead(
 def _spool(
     task: tuple[Any, ...], convert: Callable[..., Iterator[Scenario | BadRecord]], path: Path
 ) -> list[Scenario | BadRecord]:
-    """Run one task in a worker: its records go to ``path``, the rest comes back."""
+    """Run one task in a worker: write its records to ``path``, return the other fields; stop if the file is removed."""
     items: list[Scenario | BadRecord] = []
     if not path.parent.is_dir():
         return items
@@ -80,6 +81,7 @@ def _spool(
 def _unspool(
     future: Future[list[Scenario | BadRecord]], path: Path, capacity: Capacity
 ) -> Iterator[Scenario | BadRecord]:
+    """Yield the results of a task, with their records from ``path``."""
     try:
         items = future.result()
     except BrokenProcessPool as error:

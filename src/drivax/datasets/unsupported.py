@@ -78,12 +78,13 @@ def explain(path: Path) -> DataError:
             cure = "give the folder that holds its sd_*.pkl files"
         return DataError(problem, file=path, cure=cure)
     if head.lstrip()[:1] in (b"{", b"["):
-        problem, cure = next(known for words, known in _JSON.items() if re.search(words, head))
+        problem, cure = next(entry for words, entry in _JSON.items() if re.search(words, head))
         return DataError(problem, file=path, cure=cure)
     return _tfrecord(path)
 
 
 def _tfrecord(path: Path) -> DataError:
+    """The error for a file by its first TFRecord record, or for one that is no TFRecord file."""
     try:
         _, payload = next(read_records(path))
         if isinstance(payload, DataError):
@@ -127,6 +128,7 @@ _RECORDS: tuple[tuple[Callable[[bytes], bool], str], ...] = (
 )
 
 
+#: Tests of a folder and the names in it, problems and cures.
 _Folders = tuple[tuple[Callable[[Path, set[str]], bool], str, str], ...]
 
 

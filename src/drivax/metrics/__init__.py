@@ -1,4 +1,7 @@
-"""Episode metrics: ``catalogue`` defines the metrics (``METRICS``), ``steps`` their step values (``STEP_VALUES``)."""
+"""Episode metrics: ``catalogue`` defines the metrics (``METRICS``), ``steps`` their step values (``STEP_VALUES``).
+
+Collisions and time to collision are measured in ``simulator.contact``.
+"""
 
 import lazy_loader
 

@@ -108,10 +108,12 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     valid = _array(agents, "valid", bool, (None, None))
     count, steps = valid.shape
     at = np.arange(int((steps - 1) * dt_s / DT_S + 1e-6) + 1) * (DT_S / dt_s)
+    # Undo rounding: a new step that falls on an old one must not need its neighbour, too.
     at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
     is_observed = valid[:, np.floor(at).astype(np.int64)] & valid[:, np.ceil(at).astype(np.int64)]
 
-    def between(name: str, columns: tuple[int, ...]) -> Array:
+    def resample_field(name: str, columns: tuple[int, ...]) -> Array:
+        """Interpolate a field of the agents at the new steps."""
         values = _array(agents, name, float, (count, steps, *columns))
         return interpolate(values, valid, at, angle=name == "heading")
 
@@ -119,9 +121,7 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     widths |= {"z": ()} if "z" in agents else {}
     widths |= {"size": (3,)} if np.ndim(agents.get("size", ())) == 3 else {}
     result = {name: agents[name] for name in ("kind", "id", "size") if name in agents}
-    return (
-        result | {"valid": is_observed} | {name: between(name, columns) for name, columns in widths.items()}
-    )
+    return result | {"valid": is_observed} | {name: resample_field(name, n) for name, n in widths.items()}
 
 
 def _check_keys(mapping: Any, keys: Sequence[str], what: str) -> None:
@@ -151,7 +151,7 @@ def _array(agents: Mapping[str, Any], name: str, kind: type, shape: tuple[int | 
     return values
 
 
-def _where(values: Array, valid: Array) -> Array:
+def _zero_invalid(values: Array, valid: Array) -> Array:
     """Replace invalid entries by zeros."""
     return np.where(valid.reshape(valid.shape + (1,) * (values.ndim - valid.ndim)), values, 0.0)
 
@@ -159,23 +159,24 @@ def _where(values: Array, valid: Array) -> Array:
 def _tracks(agents: Mapping[str, Any], ego: int, needs_height: bool) -> Tracks:
     valid = _array(agents, "valid", bool, (None, None))
     count, steps = valid.shape
-    xy = _where(_array(agents, "xy", float, (count, steps, 2)), valid)
+    xy = _zero_invalid(_array(agents, "xy", float, (count, steps, 2)), valid)
     if not 0 <= ego < count:
         raise UsageError(f"ego is {ego}, there are {count} agents", cure="give its row in agents")
     kind = _kinds(agents, count)
-    size = _where(_sizes(agents, count, steps), valid)
+    size = _zero_invalid(_sizes(agents, count, steps), valid)
     if "velocity" in agents:
-        velocity = _where(_array(agents, "velocity", float, (count, steps, 2)), valid)
+        velocity = _zero_invalid(_array(agents, "velocity", float, (count, steps, 2)), valid)
     else:
         velocity = differentiate(xy, valid, np.arange(steps) * DT_S)
     if "z" in agents:
-        z = _where(_array(agents, "z", float, (count, steps)), valid)
+        z = _zero_invalid(_array(agents, "z", float, (count, steps)), valid)
     elif needs_height:
         raise UsageError('the roads have heights, agents["z"] is missing', cure="give z of the box centres")
     else:
         default = np.array([DEFAULT_SIZES[AgentKind(code)][2] for code in kind])[:, None]
-        z = _where(np.where(size[..., 2] > 0, size[..., 2], default) / 2, valid)
-    heading = _where(_array(agents, "heading", float, (count, steps)), valid)
+        # The roads are at z = 0, so the centre of a box is at half its height.
+        z = _zero_invalid(np.where(size[..., 2] > 0, size[..., 2], default) / 2, valid)
+    heading = _zero_invalid(_array(agents, "heading", float, (count, steps)), valid)
     track_id = _array(agents, "id", np.int64, (count,)) if "id" in agents else np.arange(count)
     return Tracks(xy, z, heading, velocity, size, valid, kind, track_id)
 
@@ -207,7 +208,7 @@ def _member(value: Any, names: Mapping[Any, Any], kinds: type[Any], what: str) -
 
 
 def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
-    """Lanes, edges, crosswalks and stop signs, numbered in this order."""
+    """Lanes, edges, crosswalks and stop signs, numbered in this order: the id of a lane is its index."""
     lanes, number = len(roads.get("lanes", ())), itertools.count()
     for row, lane in enumerate(roads.get("lanes", ())):
         yield _lane(next(number), lane, f'roads["lanes"][{row}]', lanes)
@@ -253,7 +254,7 @@ def _lane(number: int, lane: Any, what: str, lanes: int) -> MapFeature:
 
 
 def _lane_indices(indices: Any, lanes: int, what: str) -> tuple[int, ...]:
-    """Return indices of lanes."""
+    """Check an index of a lane, or several, and return a tuple."""
     rows = [indices] if isinstance(indices, int | np.integer) else list(indices)
     for row in rows:
         if not isinstance(row, int | np.integer) or not 0 <= row < lanes:

@@ -27,6 +27,7 @@ STRIDE = 40
 _UNITS = "repair it, or convert it to metres in the reader"
 #: Fields of tracks with a value per step, and the shape of that value.
 _WIDTHS = {"xy": (2,), "z": (), "heading": (), "velocity": (2,), "size": (3,), "valid": ()}
+#: Problem and cure, None if a check passes.
 Finding = tuple[str, str] | None
 
 
@@ -151,7 +152,7 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
         _window(piece, frameless, start, length, recording)
         for piece, frameless in pieces
         for start in range(0, len(frameless) - length + 1, stride)
-    ] or [_window(*max(pieces, key=_usable_steps), 0, length, recording)]
+    ] or [_window(*max(pieces, key=_window_rank), 0, length, recording)]
     usable = [window for window in cut if window.tracks.valid[window.ego, window.current_step]]
     if not usable:
         problem = f"the ego is not valid at the current step of any of {len(cut)} windows"
@@ -160,8 +161,8 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
     yield from (_add_counts(window, **lost) for window in usable)
 
 
-def _usable_steps(piece: tuple[Recording, Array]) -> tuple[bool, int]:
-    """Whether the ego of a piece is valid at its current step, and its length."""
+def _window_rank(piece: tuple[Recording, Array]) -> tuple[bool, int]:
+    """Sort key of pieces that fill no window: first a valid ego at the current step, then length."""
     recording, frameless = piece
     now = min(CURRENT_STEP, len(frameless) - 1)
     return bool(recording.tracks.valid[recording.ego, now]), len(frameless)
@@ -193,6 +194,7 @@ def _resample(recording: Recording) -> tuple[Recording, Bool[np.ndarray, " time"
     count = int((times[-1] - times[0] + STEP_TOLERANCE_S) / step) + 1
     even = times[0] + step * np.arange(count)
     at = np.interp(even, times, np.arange(len(times)))
+    # Steps near enough to a frame take it as it is.
     frame = np.rint(at).astype(np.int64)
     exact = np.abs(times[frame] - even) <= STEP_TOLERANCE_S
     return _interpolate_at(recording, np.where(exact, frame, at), even), ~exact
@@ -209,6 +211,7 @@ def _interpolate_at(
         series[name] = interpolate(getattr(tracks, name), tracks.valid, at, angle=name == "heading")
 
     def step_of(old: int) -> int:
+        """Return the first new step at or after an old one, at most the last."""
         return min(int(np.searchsorted(at, old)), len(at) - 1)
 
     return replace(
@@ -270,7 +273,7 @@ def _window(
 
 
 def _cut(recording: Recording, part: slice) -> Recording:
-    """These steps of a recording, without another current step."""
+    """The steps ``part`` of a recording and the events in them; the caller sets the current step."""
     last = part.stop - part.start - 1
     series = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
     events = (
@@ -288,7 +291,7 @@ def _cut(recording: Recording, part: slice) -> Recording:
 
 
 def with_ego(recording: Recording, row: int) -> Recording:
-    """Return the recording with another vehicle, valid at the current step, as the ego; its route and ``seen`` go."""
+    """Return the recording with another vehicle, valid at the current step, as the ego, without route and ``seen``."""
     tracks = recording.tracks
     is_vehicle = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
     if not is_vehicle or not tracks.valid[row, recording.current_step]:
@@ -302,11 +305,7 @@ def with_ego(recording: Recording, row: int) -> Recording:
 
 
 def check(recording: Recording, capacity: Capacity) -> None:
-    """Check a recording.
-
-    Raises:
-        DataError: It is invalid.
-    """
+    """Refuse an invalid recording."""
     problem = _check_names(recording) or _check_time(recording, capacity.steps) or _check_shapes(recording)
     problem = problem or _check_tracks(recording) or _check_extent(recording)
     problem = problem or _check_map(recording) or _check_lights(recording)
@@ -323,7 +322,7 @@ def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
 
 
 def is_even(timestamps_s: Float[Array, " time"]) -> bool:
-    """Whether all steps are near enough to the median to be played as equal."""
+    """Whether no step differs from the median by more than 20 ms."""
     return step_seconds(timestamps_s)[1] <= LATE_S
 
 
@@ -402,7 +401,7 @@ def _ego_position(recording: Recording) -> Float[Array, "3"]:
 
 
 def _check_extent(recording: Recording) -> Finding:
-    """Positions and speeds of any size would not fit into memory or float32; other tracks lose such steps."""
+    """Refuse implausible values of ego and lights, which exhaust memory or float32; other tracks lose such steps."""
     ego = _ego_position(recording)
     lost = np.flatnonzero(recording.tracks.valid[recording.ego] & ~plausible(recording, recording.ego))
     if len(lost):

@@ -14,19 +14,25 @@ def lane_count(scenario: Scenario) -> int:
 
 
 def lane_lines(scenario: Scenario) -> list[Float[np.ndarray, "point 2"]]:
-    """Centre line of every car lane in the local frame, in the order of the lane graph; empty without segments."""
+    """Centre line of every car lane in the local frame, in the order of the lane graph.
+
+    A lane of which no segment is stored has no points.
+    """
     first, last = (int(end) for end in scenario.segment_blocks[1:3])
-    lane, at = scenario.segment_lane[first:last], scenario.segment_start_m[first:last]
+    lane, start_m = scenario.segment_lane[first:last], scenario.segment_start_m[first:last]
     lines = []
     for index in range(lane_count(scenario)):
-        own = first + np.flatnonzero(lane == index)[np.argsort(at[lane == index], kind="stable")]
-        points = np.concatenate([scenario.segment_a[own, :2], scenario.segment_b[own[-1:], :2]])
+        segments = first + np.flatnonzero(lane == index)[np.argsort(start_m[lane == index], kind="stable")]
+        points = np.concatenate([scenario.segment_a[segments, :2], scenario.segment_b[segments[-1:], :2]])
         lines.append(points.astype(np.float64))
     return lines
 
 
 def roadblocks(scenario: Scenario) -> list[int]:
-    """Roadblock of every lane: parallel lanes, and connectors between the same two blocks, share one."""
+    """Roadblock of every lane, by the number of its first lane.
+
+    Parallel lanes share a roadblock, and so do connectors between the same two blocks, by their first links.
+    """
     count = lane_count(scenario)
     blocks = list(range(count))
     for index in range(count):

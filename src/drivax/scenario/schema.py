@@ -218,7 +218,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
         "log_progress": ("f4", (t,)),  # arc length of the logged ego along route 0
         # Uniform grid over the square [grid_origin, +cell * grid).
         "grid_origin": ("f4", (2,)), "grid_edge": ("i2", (cells + 1,)), "grid_lane": ("i2", (cells + 1,)),
-        "grid_side": ("i4", (cells,)),  # drivable or not, 3 x 3 side cells per cell (scenario.build.grid.packed)
+        "grid_side": ("i4", (cells,)),  # drivable or not, 3 x 3 side cells per cell (scenario.build.grid.pack_sides)
         # Observation polylines: pieces of at most 10 m, in order of rank.
         "road_xy": ("f4", (o, 2)), "road_direction": ("f4", (o, 2)), "road_length": ("f4", (o,)),
         "road_kind": ("i1", (o,)), "road_limit": ("f4", (o,)), "road_curvature": ("f4", (o,)),
@@ -301,6 +301,7 @@ class Scenario:
     names: dict[str, str] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Any:
+        # Copying and unpickling ask before the fields of the class are set, so ``record`` would recurse.
         if name.startswith("__") or name in _OWN_FIELDS:
             raise AttributeError(name)
         try:

@@ -51,7 +51,7 @@ _HEADER_LIMIT = 100_000
 #: Scenarios that an iteration reads at a time, and those of a task of a thread.
 _BATCH, _PART = 64, 8
 #: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
-_HEADERS = threading.Lock()
+_HEADER_LOCK = threading.Lock()
 _Bytes = np.ndarray[Any, Any]
 
 
@@ -163,6 +163,7 @@ class ScenarioWriter:
         self._crcs.append(zlib.crc32(data))
 
     def _close_shard(self, note: Any) -> None:
+        """Complete the open shard, if any: header, checksums, and a note for a writer that resumes the set."""
         if self._file is None:
             return
         folder, name, count = self._partial.content, shard_name(len(self._shards)), len(self._crcs)
@@ -184,7 +185,9 @@ class ScenarioWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         try:
             with explain_full_disk(self.path, self._buffer.dtype.itemsize):
-                if isinstance(error, OSError | FullDiskError):
+                if isinstance(
+                    error, OSError | FullDiskError
+                ):  # Raised in this block, a full disk is explained.
                     raise error
                 if kind is None:
                     self._finish()
@@ -216,6 +219,7 @@ class ScenarioWriter:
         self._partial.publish()
 
     def _refuse_existing(self) -> None:
+        """Refuse a path that exists, except an empty folder, or a scenario set if it may be overwritten."""
         path = self.path
         if path.is_dir() and not any(path.iterdir()):
             return
@@ -296,9 +300,6 @@ class ScenarioSet(Sequence[Scenario]):
         """Copy records into a structured array ``[n]``, in the order of ``indices``; negative ones count from the end.
 
         ``out`` is the result of an earlier call with as many indices, to fill again: twice as fast as new memory.
-
-        Raises:
-            DataError: A record is damaged.
         """
         index = np.asarray(indices, np.int64).reshape(-1)
         total = len(self)
@@ -383,7 +384,7 @@ class Shard:
                 raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
 
     def _map(self) -> _Bytes:
-        with _HEADERS:
+        with _HEADER_LOCK:
             return self._read_map() if self._data is None else self._data
 
     def _read_map(self) -> _Bytes:
@@ -430,11 +431,7 @@ def field_table(capacity: Capacity) -> list[dict[str, Any]]:
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """Read the manifest of the set at ``path``.
-
-    Raises:
-        DataError: It is missing, damaged or of another version.
-    """
+    """Read the manifest of the set at ``path``."""
     file = path / MANIFEST
     if not path.is_dir():
         problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"

@@ -52,11 +52,7 @@ def dump(record: Any) -> str:
 
 
 def preset(name: str) -> Path:
-    """Return the path of the packaged configuration file ``configs/<name>.yaml``.
-
-    Raises:
-        UsageError: Unknown name.
-    """
+    """Return the path of the packaged configuration file ``configs/<name>.yaml``."""
     names = presets()
     if name not in names:
         raise UsageError(f"no preset or file {name!r}", cure=did_you_mean(name, names))
@@ -70,6 +66,7 @@ def presets() -> list[str]:
 
 
 def _configs() -> Path:
+    """Folder of the packaged configuration files."""
     package = Path(__file__).resolve().parent.parent
     folder = package / "configs"
     # At the root of a checkout, inside the package of a wheel.
@@ -77,6 +74,7 @@ def _configs() -> Path:
 
 
 def _find_file(source: str | Path) -> Path:
+    """Return the file at a path, or else that of the preset of this name."""
     path = Path(source)
     if path.is_file():
         return path
@@ -108,13 +106,13 @@ def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any
                 section[name] = {}
             section = section[name]
         if key == "kind" and str(section.get("kind")) != text:
-            section.clear()
+            section.clear()  # Settings of the former kind do not apply.
         section[key] = Flag(text)
     return values
 
 
 def _parse_flags(overrides: Sequence[str]) -> list[tuple[list[str], str]]:
-    """Return the path of keys and the text of each flag."""
+    """Return the path of keys and the text of each flag, ``true`` for a flag without a value."""
     pairs = []
     arguments = list(overrides)
     while arguments:
@@ -129,4 +127,5 @@ def _parse_flags(overrides: Sequence[str]) -> list[tuple[list[str], str]]:
 
 
 def _copy(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Copy nested mappings, so that overrides leave those of the caller alone."""
     return {key: _copy(value) if isinstance(value, Mapping) else value for key, value in values.items()}

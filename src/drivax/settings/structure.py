@@ -81,20 +81,21 @@ def _parse_flag(value: Any) -> Any:
     try:
         return parse_yaml(str(value))
     except UsageError as error:
-        raise _refuse(value, "a value that YAML can read") from error
+        raise _refusal(value, "a value that YAML can read") from error
 
 
-def _refuse(value: Any, expected: str) -> ValueError:
+def _refusal(value: Any, expected: str) -> ValueError:
     return ValueError(f"{str(value) if isinstance(value, Flag) else value!r} is not {expected}")
 
 
 def _to_scalar(value: Any, cls: Any) -> Any:
+    """Convert to a boolean, number or null; integers may be written as floats, floats as integers."""
     result = _parse_flag(value)
     if cls is int and isinstance(result, float) and result.is_integer():
         result = int(result)  # steps: 25e6
     types, name = _SCALARS[cls]
     if isinstance(result, bool) != (cls is bool) or not isinstance(result, types):
-        raise _refuse(value, name)
+        raise _refusal(value, name)
     return float(result) if cls is float else result
 
 
@@ -109,6 +110,7 @@ def _to_path(value: Any, _: Any) -> Path:
 
 
 def _to_literal(value: Any, cls: Any) -> Any:
+    """Return the option that equals a value; for a flag its text, or else what YAML reads in it."""
     options = get_args(cls)
     for candidate in (value, _parse_flag(value)):
         for literal in options:
@@ -121,7 +123,7 @@ def _to_literal(value: Any, cls: Any) -> Any:
 def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
     items = _parse_flag(value)
     if not isinstance(items, list | tuple):
-        raise _refuse(value, "a list")
+        raise _refusal(value, "a list")
     members: tuple[Any, ...] = get_args(cls)
     if len(members) == 2 and members[1] is Ellipsis:
         members = (members[0],) * len(items)
@@ -142,9 +144,10 @@ def _to_union(value: Any, cls: Any) -> Any:
     """Convert to a user-defined object, to a record by its kind, or to the first scalar type that fits."""
     members = get_args(cls)
     records = {kind_of(member): member for member in members if _is_record(member)}
+    # A flag may hold a section, {kind: ...}. Without records its type decides, so that text stays text.
     value = _parse_flag(value) if isinstance(value, Flag) and records else value
     for member in members:
-        if _is_open(member) and is_dotted(_kind(value)):
+        if _accepts_user_objects(member) and is_dotted(_kind(value)):
             return _to_user_object(value, member)
     if isinstance(value, str) and value in records:
         return _converter().structure({}, records[value])
@@ -164,6 +167,7 @@ def _to_union(value: Any, cls: Any) -> Any:
 
 
 def _kind(value: Any) -> Any:
+    """Return the kind of a section, or any other value, which may name a kind itself."""
     return value.get("kind") if isinstance(value, Mapping) else value
 
 
@@ -174,23 +178,23 @@ def _to_user_object(value: Any, cls: Any) -> Any:
     if not isinstance(name, str):
         expected = "a dotted name (package.module:name) nor a section with such a kind"
         raise ValueError(f"{value!r} is neither {expected}")
-    thing = find_named(name)
+    user_object = find_named(name)
     options = (
         {key: item for key, item in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
     )
-    if _is_record(thing):
-        thing = _converter().structure(options, thing)
+    if _is_record(user_object):
+        user_object = _converter().structure(options, user_object)
     elif options:
         raise ValueError(f"{name!r} takes no settings; make it a frozen dataclass")
     if _is_protocol(cls):
-        check_protocol(thing, name, cls)
-        return thing
-    if not callable(thing):
+        check_protocol(user_object, name, cls)
+        return user_object
+    if not callable(user_object):
         raise ValueError(f"{name!r} is not callable; name a function")
     arguments = get_args(cls)[0] if get_args(cls) else ...
     if arguments is not ...:
-        check_arguments(thing, name, tuple(arguments))
-    return thing
+        check_arguments(user_object, name, tuple(arguments))
+    return user_object
 
 
 def _rank_member(member: Any) -> int:
@@ -214,10 +218,12 @@ def _to_record_of_kind(value: dict[str, Any], records: dict[str, Any]) -> Any:
 
 
 def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
+    """Return the hook of a record class: it accepts null, a mapping (with ``preset``), or an instance's dotted name."""
     options: dict[str, Any] = {"_cattrs_forbid_extra_keys": True, "_cattrs_detailed_validation": True}
     build = make_dict_structure_fn(cls, converter, **options)
 
     def hook(value: Any, _: Any) -> Any:
+        """Return the record of a value, with the defaults of ``cls`` or of the preset that it names."""
         value = {} if value is None else _parse_flag(value)
         if is_dotted(value):
             record = find_named(value)
@@ -226,7 +232,7 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
             return record
         if not isinstance(value, Mapping):
             names = ", ".join(field.name for field in dataclasses.fields(cls))
-            raise _refuse(value, f"a section of settings ({names})")
+            raise _refusal(value, f"a section of settings ({names})")
         new_names = getattr(cls, "renamed", {})
         value = {new_names.get(key, key): item for key, item in value.items()}
         if _names_preset(cls, value):
@@ -283,7 +289,7 @@ def _is_callable(cls: Any) -> bool:
     return cls is Callable or get_origin(cls) is Callable
 
 
-def _is_open(cls: Any) -> bool:
+def _accepts_user_objects(cls: Any) -> bool:
     """Return whether a type accepts user-defined objects."""
     return _is_protocol(cls) or _is_callable(cls)
 
@@ -296,7 +302,7 @@ def _converter() -> cattrs.Converter:
     converter.register_structure_hook_func(lambda cls: get_origin(cls) is Literal, _to_literal)
     converter.register_structure_hook_func(lambda cls: cls is tuple or get_origin(cls) is tuple, _to_tuple)
     converter.register_structure_hook_func(lambda cls: get_origin(cls) in _UNIONS, _to_union)
-    converter.register_structure_hook_func(_is_open, _to_user_object)
+    converter.register_structure_hook_func(_accepts_user_objects, _to_user_object)
     converter.register_structure_hook_factory(_is_record, _record_hook)
     return converter
 
@@ -319,7 +325,7 @@ def _first_problem(error: BaseException, path: str) -> tuple[str, str]:
         return error.problem, path + error.path if error.path.startswith("[") else _join(path, error.path)
     if isinstance(error, KeyError):
         return f"the setting {error.args[0]!r} is missing", path
-    if isinstance(error, TypeError) and "missing" in str(error):
+    if isinstance(error, TypeError) and "missing" in str(error):  # "Cls.__init__() missing 1 required ..."
         return str(error).split(") ")[-1], path
     if isinstance(error, DrivaxError):
         return error.problem + (f"; {error.cure}" if error.cure else ""), path
@@ -336,7 +342,7 @@ def _to_plain(value: Any, annotation: Any) -> Any:
         hints = typing.get_type_hints(type(value))
         fields = {f.name: _to_plain(getattr(value, f.name), hints[f.name]) for f in dataclasses.fields(value)}
         members = _members(annotation)
-        if any(map(_is_open, (annotation, *members))) and type(value) not in members:
+        if any(map(_accepts_user_objects, (annotation, *members))) and type(value) not in members:
             return {"kind": dotted_name(type(value))} | {k: v for k, v in fields.items() if k != "kind"}
         needs_kind = "kind" not in fields and any(_is_record(member) for member in members)
         return {"kind": kind_of(type(value))} | fields if needs_kind else fields
@@ -406,11 +412,13 @@ class _Dumper(yaml.SafeDumper):
     """Dumper that quotes strings that the loader would read as other types."""
 
     def ignore_aliases(self, data: Any) -> bool:
+        """Write values that occur several times in full, without YAML anchors."""
         return True
 
 
 _NUMBER = r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
 _FLOAT = rf"^(?:{_NUMBER}|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+#: Tag, pattern and possible first characters of the scalars that are no strings.
 _RULES = (
     ("tag:yaml.org,2002:bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
     ("tag:yaml.org,2002:int", r"^[-+]?[0-9][0-9_]*$", "-+0123456789"),
@@ -420,6 +428,7 @@ _RULES = (
 
 
 def _set_rules(cls: Any) -> None:
+    """Replace PyYAML's rules (YAML 1.1) for scalars."""
     cls.yaml_implicit_resolvers = {}
     for tag, pattern, first in _RULES:
         cls.add_implicit_resolver(tag, re.compile(pattern), list(first))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from drivax.geometry.boxes import COS, LENGTH, WIDTH, X
 from drivax.scenario.bank.columns import LightRow, RouteColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
@@ -14,10 +15,10 @@ from drivax.simulator.contact import others_on_level
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.traffic.corridor import FREE_M, LEAST_GAP_M, closest, reaching
-from drivax.simulator.types import AgentContext, Frame
+from drivax.simulator.types import MOTION_SPEED, AgentContext, Frame
 
-#: Look-ahead along the route and its spacing, m.
-_STEP_M, _POINTS = 2.0, 46
+#: Spacing of the points ahead on the route, m; their number; and the number of rectangles around them.
+_STEP_M, _POINTS, _RECTANGLES = 2.0, 46, 9
 _FALLBACK_LIMIT_MPS = 13.4
 #: Free space kept next to the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
@@ -33,7 +34,8 @@ STOP_SHORT_M = 1.0
 class Ahead:
     """Inputs of a car-following driver."""
 
-    # To the nearest obstacle, bumper to bumper, or a little less than to a light that requires a stop, m; else 10 km
+    # Bumper to bumper to the nearest obstacle, or to a standing car behind the stop line of a light that requires a
+    # stop, placed so that the driver stands 1 m before the line, m; 10 km if free
     gap: Scalar
     leader: Scalar  # Speed of the obstacle along the route, m/s; 0 for a light
     desired: Scalar  # Limit (13.4 if unknown), or what curves ahead allow; 0 at the route's end, m/s
@@ -48,25 +50,28 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 
     ``min_gap_m`` is the gap that the driver keeps at standstill; it stops 1 m before a stop line.
     """
-    me = frame.box[context.slot]
+    ego = frame.box[context.slot]
     offsets = jnp.arange(_POINTS) * _STEP_M
     path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
     # Only the closest agents near the route are measured against all of its points.
     nodes = jnp.where(on_route[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
-    near = reaching(boxes, nodes, (me[5:6] / 2 + _NEAR_M)[None], 2.0 * _STEP_M, 2.0 * _STEP_M, 9)
-    slots, real = closest(near & others_on_level(frame, context.slot), me[None], boxes)
+    half_m = (ego[WIDTH : WIDTH + 1] / 2 + _NEAR_M)[None]
+    near = reaching(boxes, nodes, half_m, 2.0 * _STEP_M, 2.0 * _STEP_M, _RECTANGLES)
+    slots, valid = closest(near & others_on_level(frame, context.slot), ego[None], boxes)
     box, velocity = frame.box[slots[0]], frame.velocity[slots[0]]
-    along, lateral, cos, sin = project(path, on_route, offsets, box[:, :2], box[:, 2:4])
-    half_length = jnp.abs(cos) * box[:, 4] / 2 + jnp.abs(sin) * box[:, 5] / 2
-    half_width = jnp.abs(sin) * box[:, 4] / 2 + jnp.abs(cos) * box[:, 5] / 2
-    blocks = real[0] & (jnp.abs(lateral) < half_width + me[5] / 2 + _SIDE_M) & (along > 0.0)
-    gaps = jnp.where(blocks, along - half_length - me[4] / 2, jnp.inf)
+    along, lateral, cos, sin = project(path, on_route, offsets, box[:, X:COS], box[:, COS:LENGTH])
+    half_length = jnp.abs(cos) * box[:, LENGTH] / 2 + jnp.abs(sin) * box[:, WIDTH] / 2
+    half_width = jnp.abs(sin) * box[:, LENGTH] / 2 + jnp.abs(cos) * box[:, WIDTH] / 2
+    blocks = valid[0] & (jnp.abs(lateral) < half_width + ego[WIDTH] / 2 + _SIDE_M) & (along > 0.0)
+    gaps = jnp.where(blocks, along - half_length - ego[LENGTH] / 2, jnp.inf)
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
+    # The driver stands min_gap_m behind a leader, but only STOP_SHORT_M before a line.
     stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
     gap = jnp.minimum(gaps[nearest], stop)
     leader = jnp.where(stop < gaps[nearest], 0.0, speed[nearest])
+    # Without a second point the route ends within 2 m.
     desired = jnp.where(on_route[1], desired_speed(path, on_route, offsets), 0.0)
     return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
 
@@ -74,8 +79,8 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
     """Return the distance from the front bumper to the nearest stop line that requires a stop, m; infinite for none."""
     line, state = bank.light_line[context.index], frame.lights
-    front = line[LightRow.ARC] - context.route_m - frame.box[context.slot, 4] / 2
-    speed = context.history[-1, 3]
+    front = line[LightRow.ARC] - context.route_m - frame.box[context.slot, LENGTH] / 2
+    speed = context.history[-1, MOTION_SPEED]
     can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
     stops = (is_red(state) | (is_yellow(state) & can_stop)) & (front > 0.0) & (front < _POINTS * _STEP_M)
     return jnp.min(jnp.where(stops, front, jnp.inf))
@@ -88,8 +93,9 @@ def desired_speed(path: Array, on_route: Array, offsets: Array) -> Scalar:
     dot, cross = cos[1:] * cos[:-1] + sin[1:] * sin[:-1], cos[:-1] * sin[1:] - cos[1:] * sin[:-1]
     curvature = jnp.arctan2(jnp.abs(cross), dot) / _STEP_M
     curvature = jnp.where(on_route[1:], curvature, 0.0)
-    allowed = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
-    return jnp.minimum(limit, jnp.sqrt(jnp.min(allowed)))
+    # The square of the speed from which braking to that of the curve takes the distance to it.
+    squared = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
+    return jnp.minimum(limit, jnp.sqrt(jnp.min(squared)))
 
 
 def project(
@@ -98,15 +104,15 @@ def project(
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Return arc length ahead and lateral offset of points on a path, and relative cosine and sine of headings.
 
-    Beyond either end of the path the tangent goes on, and the lateral offset is infinite.
+    Beyond either end the path continues along its tangent; the lateral offset is infinite more than 4 m beyond it.
     """
     dx, dy = xy[:, None, 0] - path[:, 0], xy[:, None, 1] - path[:, 1]
     nearest = first_smallest(jnp.where(on_route, dx * dx + dy * dy, jnp.inf))
-    row = path[nearest]
-    x, y = xy[:, 0] - row[:, 0], xy[:, 1] - row[:, 1]
-    cos, sin = row[:, RouteColumn.COS], row[:, RouteColumn.SIN]
+    point = path[nearest]
+    x, y = xy[:, 0] - point[:, 0], xy[:, 1] - point[:, 1]
+    cos, sin = point[:, RouteColumn.COS], point[:, RouteColumn.SIN]
     forward, left = x * cos + y * sin, y * cos - x * sin
-    on = jnp.abs(forward) <= 2.0 * _STEP_M
+    is_alongside = jnp.abs(forward) <= 2.0 * _STEP_M
     relative_cos = heading[:, 0] * cos + heading[:, 1] * sin
     relative_sin = heading[:, 1] * cos - heading[:, 0] * sin
-    return offsets[nearest] + forward, jnp.where(on, left, jnp.inf), relative_cos, relative_sin
+    return offsets[nearest] + forward, jnp.where(is_alongside, left, jnp.inf), relative_cos, relative_sin

@@ -19,8 +19,10 @@ TTC_HORIZON_S = 5.0
 FARTHEST_GAP_M = 50.0
 #: Below this speed a car stands (semantics, ``at_fault_collision`` and ``ttc``).
 STOPPED_MPS = 0.05
-#: Tangent of 30 degrees.
-_TAN_30 = 3.0**-0.5
+#: Tangent of 30 and cosine of 45 degrees.
+_TAN_30, _COS_45 = 3.0**-0.5, 0.5**0.5
+#: Length of the box that stands for the front bumper, m.
+_BUMPER_M = 0.02
 #: Rear axle behind the box centre, as a share of the length (nuPlan's vehicle: 1.461 m of 5.176 m).
 REAR_AXLE = 1.461 / 5.176
 
@@ -84,10 +86,11 @@ def next_contacts(
     ``fault`` tells for contacts that begin now whether they are the evaluated agent's fault.
     """
     c = Contact
-    appears = (before == c.IGNORED) | (before == c.ABSENT) | (before == c.GONE)
-    known = jnp.where(before == c.PARTED, c.HIT, before)
-    known = jnp.where(before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), known)
-    contact = jnp.where(appears, c.IGNORED, known)
+    # A slot that overlaps as it appears is ignored. A second contact is never a new fault.
+    ignored = (before == c.IGNORED) | (before == c.ABSENT) | (before == c.GONE)
+    code = jnp.where(before == c.PARTED, c.HIT, before)
+    code = jnp.where(before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), code)
+    contact = jnp.where(ignored, c.IGNORED, code)
     hit = (before == c.HIT) | (before == c.AT_FAULT) | (before == c.PARTED) | (before == c.GONE)
     apart, absent = jnp.where(hit, c.PARTED, c.APART), jnp.where(hit, c.GONE, c.ABSENT)
     return jnp.where(valid, jnp.where(touching, contact, apart), absent).astype(jnp.int8)
@@ -116,14 +119,13 @@ def classify_contacts(
     ahead, left, cos, _ = relative(frame, slot)
     # Its bearing from the rear axle is over 150 degrees.
     behind = jnp.abs(left) < -_TAN_30 * (ahead + REAR_AXLE * me[LENGTH])
-    # The front bumper as a thin box.
     x, y = me[X] + me[LENGTH] / 2 * me[COS], me[Y] + me[LENGTH] / 2 * me[SIN]
-    bumper = jnp.stack([x, y, me[COS], me[SIN], jnp.full((), 0.02), me[WIDTH]])
+    bumper = jnp.stack([x, y, me[COS], me[SIN], jnp.full((), _BUMPER_M), me[WIDTH]])
     front = overlap(bumper, frame.box)
     stopped, other_stopped = speed < STOPPED_MPS, others_speed < STOPPED_MPS
     fault = ~stopped & (other_stopped | (~behind & (front | unlawful)))
     vulnerable = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
-    head_on, same_way = cos < -(0.5**0.5), cos > 0.5**0.5
+    head_on, same_way = cos < -_COS_45, cos > _COS_45
     c = CollisionType
     cases = (
         (vulnerable, c.VULNERABLE), (other_stopped & front, c.STOPPED_OBJECT), (head_on & (front | ~behind), c.HEAD_ON),
@@ -157,6 +159,6 @@ def nearest_gap(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scal
     Agents in ``ignored`` do not count, such as those that have overlapped it since they appeared.
     """
     counts = others_on_level(frame, slot) & ~ignored
-    # Boxes of empty slots may hold anything; the agent's own one, pushed away, keeps gradients finite.
+    # Boxes of empty slots may hold anything; the agent's own box in their place keeps gradients finite.
     gaps = gap(frame.box[slot], jnp.where(counts[:, None], frame.box, frame.box[slot]))
     return jnp.min(jnp.where(counts, jnp.minimum(gaps, FARTHEST_GAP_M), FARTHEST_GAP_M))

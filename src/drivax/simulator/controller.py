@@ -86,9 +86,9 @@ def steering_rate(
     e, h, d = error
     be, bh, bd = (jnp.zeros(()) for _ in range(3))
     for step in range(config.horizon):
-        way, k = speeds[step] * DT_S, curvatures[step]
-        e, h = e + way * h, h + way * (d / wheelbase - k)
-        be, bh, bd = be + way * bh, bh + way * bd / wheelbase, bd + DT_S
+        moved_m, k = speeds[step] * DT_S, curvatures[step]
+        e, h = e + moved_m * h, h + moved_m * (d / wheelbase - k)
+        be, bh, bd = be + moved_m * bh, bh + moved_m * bd / wheelbase, bd + DT_S
     h, d = wrap(h), wrap(d)
     q_e, q_h, q_d = config.lateral_weight, config.heading_weight, config.steering_weight
     gain = q_e * be * be + q_h * bh * bh + q_d * bd * bd + config.rate_weight
@@ -109,6 +109,7 @@ def fit_speeds(poses: Poses, config: TrackingConfig) -> Float[Array, " m"]:
 @functools.cache
 def _speed_fit(steps: int, penalty: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Matrix from displacements to fitted speeds."""
+    # Matrices that give the speeds and the changes of acceleration from the unknowns v_0, a_0, a_1, ...
     speeds = np.tri(steps) * DT_S
     speeds[:, 0] = 1.0
     jerk = np.diff(np.eye(steps)[1:], axis=0)
@@ -141,7 +142,7 @@ def track(
     Args:
         motion: Motion of the box centre.
         plan: Planned poses of the box centre from now on, 0.1 s apart.
-        last: What they did in the step before.
+        last: What the actuators did in the step before.
         length_m: Length of the car.
         config: Tracker and vehicle model.
     """
@@ -151,19 +152,19 @@ def track(
     desired = speeds[min(config.horizon, speeds.shape[0] - 1)]
     curvatures = fit_curvatures(poses, speeds, config)
     curvatures = curvatures[np.minimum(np.arange(config.horizon), speeds.shape[0] - 1)]
-    stops = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
+    is_stopping = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
     gentle = config.stopping_gain * (desired - speed)
-    acceleration = jnp.where(stops, gentle, acceleration_to(speed, desired, config))
-    cos, sin, away = jnp.cos(poses[0, 2]), jnp.sin(poses[0, 2]), axle - poses[0]
-    error = away[1] * cos - away[0] * sin, wrap(away[2]), steering
-    held = speed + acceleration * DT_S * np.arange(config.horizon)
-    rate = jnp.where(stops, 0.0, steering_rate(error, held, curvatures, wheelbase, config))
-    acceleration = last[ACCELERATION] + _share(config.acceleration_lag_s) * (
+    acceleration = jnp.where(is_stopping, gentle, acceleration_to(speed, desired, config))
+    cos, sin, offset = jnp.cos(poses[0, 2]), jnp.sin(poses[0, 2]), axle - poses[0]
+    error = offset[1] * cos - offset[0] * sin, wrap(offset[2]), steering
+    speeds_ahead = speed + acceleration * DT_S * np.arange(config.horizon)
+    rate = steering_rate(error, speeds_ahead, curvatures, wheelbase, config)
+    rate = jnp.where(is_stopping, 0.0, rate)
+    acceleration = last[ACCELERATION] + _lag_share(config.acceleration_lag_s) * (
         acceleration - last[ACCELERATION]
     )
-    return jnp.stack(
-        [jnp.maximum(acceleration, -speed / DT_S), steering, _share(config.steering_lag_s) * rate]
-    )
+    acceleration = jnp.maximum(acceleration, -speed / DT_S)  # Never reverse.
+    return jnp.stack([acceleration, steering, _lag_share(config.steering_lag_s) * rate])
 
 
 def recent_actuators(history: History, length_m: Scalar, config: TrackingConfig) -> Actuators:
@@ -201,6 +202,6 @@ def _rear_axle(poses: Poses, length_m: Scalar) -> Poses:
     return jnp.stack([x - behind * jnp.cos(heading), y - behind * jnp.sin(heading), heading], axis=-1)
 
 
-def _share(lag_s: float) -> float:
-    """Share of its error that an actuator closes in a step."""
+def _lag_share(lag_s: float) -> float:
+    """Share of its error that an actuator with a time constant closes in a step."""
     return DT_S / (DT_S + lag_s)

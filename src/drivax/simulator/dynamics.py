@@ -33,7 +33,7 @@ def bicycle(motion: Motion, acceleration: Scalar, curvature: Scalar) -> Motion:
     unclipped = speed + acceleration * DT_S
     stops = unclipped < 0.0
     after = jnp.where(stops, 0.0, unclipped)
-    braking = jnp.where(stops, -acceleration, 1.0)
+    braking = jnp.where(stops, -acceleration, 1.0)  # 1 if unused: gradients stay finite.
     distance = jnp.where(stops, speed * speed / (2.0 * braking), (speed + after) / 2.0 * DT_S)
     turn = curvature * distance
     mean = heading + turn / 2.0

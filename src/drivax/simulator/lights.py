@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.geometry.boxes import COS, LENGTH, SIN
 from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import light_crossing
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
@@ -14,9 +15,9 @@ from drivax.simulator.types import MOTION_SPEED, AgentContext, LightMemory
 #: A stop before a right turn on red: slower than this, this near, within this many steps.
 _PAUSE_MPS, _PAUSE_M, PAUSE_STEPS = 0.5, 3.0, 30
 #: Steps of the history in which a stop before the episode is looked for.
-_REMEMBERED = 16
-#: Off the route, which of the lights it crossed an agent obeyed is evaluated by its heading this many steps later.
-JUDGED_AFTER = 20
+_LOOK_BACK_STEPS = 16
+#: Off the route, the heading of an agent this many steps after it crossed lines decides whose light counted.
+_DECISION_STEPS = 20
 
 
 def _fronts(context: AgentContext, length_m: Float[Array, ""]) -> Float[Array, "history 2"]:
@@ -32,16 +33,17 @@ def remember_lights(bank: ScenarioBank, context: AgentContext) -> LightMemory:
     ground = context.z - bank.height_m(context.index, context.slot) / 2
     pause = jnp.full(bank.light_line.shape[2], PAUSE_STEPS + 1, jnp.int32)
     fronts = _fronts(context, length)
-    for age in range(_REMEMBERED - 1, -1, -1):
+    for age in range(_LOOK_BACK_STEPS - 1, -1, -1):
         front = fronts[-1 - age]
+        # Only the distance before each line is needed, not the crossing between two steps.
         _, before_m = light_crossing(bank, context.index, front, front, ground)
         stands = context.history[-1 - age, MOTION_SPEED] < _PAUSE_MPS
         pause = jnp.where(stands & (before_m >= 0.0) & (before_m < _PAUSE_M), age, pause)
     return LightMemory(pause.astype(jnp.int8), jnp.zeros_like(pause, jnp.int8))
 
 
-def nothing_crossed(memory: LightMemory) -> LightMemory:
-    """Return the memory at the start of an episode, which is not charged with lines crossed before."""
+def forget_crossings(memory: LightMemory) -> LightMemory:
+    """Return the memory without lines that were crossed before the episode: they do not count in it."""
     return LightMemory(memory.pause, jnp.zeros_like(memory.crossed))
 
 
@@ -54,28 +56,30 @@ def check_lights(
     On the route only its own lights count, at once. Off it, of the lines crossed together the one counts whose lane
     ends closest to the heading that the agent has two seconds later, or at the end of the log.
     """
-    front_before, front = _fronts(context, me[4])[-2:]
+    front_before, front = _fronts(context, me[LENGTH])[-2:]
     crossed, before_m = light_crossing(bank, context.index, front_before, front, ground)
     last = bank.last_step[context.index]
-    now = bank.light_state[context.index, jnp.clip(context.step, 0, last)]
-    then = bank.light_state[context.index, jnp.clip(context.step - 1, 0, last)]
-    red = is_red(now) & is_red(then)
+    state = bank.light_state[context.index, jnp.clip(context.step, 0, last)]
+    state_before = bank.light_state[context.index, jnp.clip(context.step - 1, 0, last)]
+    red = is_red(state) & is_red(state_before)
     # A stop shortly before the line, then a right turn, is lawful unless the light is a red arrow.
-    arrow = (now == LightState.ARROW_STOP) | (then == LightState.ARROW_STOP)
+    arrow = (state == LightState.ARROW_STOP) | (state_before == LightState.ARROW_STOP)
     line = bank.light_line[context.index]
     red &= ~((line[LightRow.RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
-    ran = (crossed & red & (line[LightRow.ARC] < NEVER_M)).any() & on_route
+    violation = (crossed & red & (line[LightRow.ARC] < NEVER_M)).any() & on_route
 
+    # Steps since a line was crossed off the route: positive if at red, else negative.
     begins = crossed & ~on_route
     age = jnp.where(begins, jnp.where(red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
-    # What is still open when the log ends is evaluated then.
-    due = (jnp.abs(age) > JUDGED_AFTER) | ((age != 0) & (context.step >= last))
-    fit = jnp.where(due, line[LightRow.EXIT_COS] * me[2] + line[LightRow.EXIT_SIN] * me[3], -2.0)
-    ran |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
+    # Crossings that are undecided when the log ends are decided then.
+    due = (jnp.abs(age) > _DECISION_STEPS) | ((age != 0) & (context.step >= last))
+    # Cosine of the angle to the end of the line's lane; -2 is below any cosine.
+    fit = jnp.where(due, line[LightRow.EXIT_COS] * me[COS] + line[LightRow.EXIT_SIN] * me[SIN], -2.0)
+    violation |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
     age = jnp.where(due, 0, age)
     stands = (context.history[-1, MOTION_SPEED] < _PAUSE_MPS) & (before_m >= 0.0) & (before_m < _PAUSE_M)
     pause = jnp.where(stands, 0, jnp.minimum(memory.pause.astype(jnp.int32) + 1, PAUSE_STEPS + 1))
-    return ran, LightMemory(pause.astype(jnp.int8), age.astype(jnp.int8))
+    return violation, LightMemory(pause.astype(jnp.int8), age.astype(jnp.int8))
 
 
 def is_red(state: Int[Array, "*L"]) -> Bool[Array, "*L"]:

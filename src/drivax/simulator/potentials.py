@@ -78,11 +78,12 @@ def offroad_potential(
 def fault_potential(bank: ScenarioBank, context: AgentContext, frame: Frame, margin_m: float = 0.5) -> Scalar:
     """Return the sum of both potentials of the driven agent; ``frame`` holds all agents (``Simulator.frame``)."""
     ground = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
-    away = offroad_potential(bank, context.index, frame.box[context.slot], ground, margin_m)
-    return away + collision_potential(frame, context.slot, margin_m).sum()
+    offroad = offroad_potential(bank, context.index, frame.box[context.slot], ground, margin_m)
+    return offroad + collision_potential(frame, context.slot, margin_m).sum()
 
 
 def _rise(distance: Float[Array, " K"], margin_m: float) -> Float[Array, " K"]:
+    """Return the potential of a distance: 0 from the margin on, 1 at 0, more below."""
     return jnp.maximum(1.0 - distance / margin_m, 0.0) ** 2
 
 

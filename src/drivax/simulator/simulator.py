@@ -15,7 +15,7 @@ from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
-from drivax.simulator.lights import nothing_crossed, remember_lights
+from drivax.simulator.lights import forget_crossings, remember_lights
 from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
@@ -32,7 +32,7 @@ from drivax.simulator.types import (
     Transition,
 )
 
-#: Elements computed together: more than start in most steps, and enough to fill vectors.
+#: Elements that :func:`map_where` computes at a time: in most steps fewer episodes start, and vectors are filled.
 AT_ONCE = 8
 #: The next state, and the step to it.
 Step = tuple[SimState, Transition]
@@ -66,7 +66,7 @@ class Simulator:
         lights = remember_lights(bank, context)
         situation, contacts, lights = measure(bank, context, now, now, contacts, lights, self.task.reads)
         episode, step = self.task.episode_start(), situation.context.step
-        return SimState(situation.context, situation.facts, contacts, nothing_crossed(lights), episode, step)
+        return SimState(situation.context, situation.facts, contacts, forget_crossings(lights), episode, step)
 
     def context(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
@@ -79,6 +79,7 @@ class Simulator:
         context = AgentContext(index, step, slot, history, action, route_m, z, traffic)
         if isinstance(self.start, LogStart):
             return context
+        # Other starts avoid the agents around, whose rows the traffic model gives for the logged context.
         agents = self.traffic.agents(bank, context, 0)
         history, route_m = self.start.begin(bank, index, step, slot, agents, key)
         action = self.task.first_action(history, bank.length_m(index, slot))
@@ -136,15 +137,15 @@ class Simulator:
         seen = self.frame(bank, first, states.context, 0)
         traffic = self.traffic.advance(bank, first, seen)
         moved = jax.vmap(lambda s, a: self._move_agent(bank, s.context, a, None, traffic))(states, actions)
-        settle = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))
-        after, done = settle(states, moved, actions)
+        finish = jax.vmap(lambda s, m, a: self._finish_step(bank, s, m, moved, seen, a))
+        after, transition = finish(states, moved, actions)
         counts = is_driven(bank, states) & (True if over is None else ~over)
         choose = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
         after = replace(after, episode=choose(counts, after.episode, states.episode))
-        terms = {name: jnp.where(counts, term, 0.0) for name, term in done.reward_terms.items()}
-        ends = {name: getattr(done, name) & counts for name in ("terminated", "truncated")}
-        reward = jnp.where(counts, done.reward, 0.0)
-        return after, replace(done, after=after, reward=reward, reward_terms=terms, **ends)
+        terms = {name: jnp.where(counts, term, 0.0) for name, term in transition.reward_terms.items()}
+        ends = {name: getattr(transition, name) & counts for name in ("terminated", "truncated")}
+        reward = jnp.where(counts, transition.reward, 0.0)
+        return after, replace(transition, after=after, reward=reward, reward_terms=terms, **ends)
 
     def observe_together(self, bank: ScenarioBank, states: SimState) -> Mapping[str, Any]:
         """Return the stacked observations of K agents of one scenario."""
@@ -179,6 +180,7 @@ class Simulator:
         traffic = self.traffic.advance(bank, state.context, seen)
         moved = self._move_agent(bank, state.context, action, None, traffic)
         context = jax.tree.map(partial(jnp.where, over), fresh.context, moved)
+        # Nothing that the last episode remembers may reach the new one.
         before = replace(
             state,
             facts=forget_strand(state.facts, over),
@@ -186,19 +188,20 @@ class Simulator:
             lights=jax.tree.map(partial(jnp.where, over), fresh.lights, state.lights),
             start=jnp.where(over, fresh.context.step, state.start),
         )
-        after, transition = self._settle(bank, before, context, alone(context), seen, action)
+        after, transition = self._finish_step(bank, before, context, alone(context), seen, action)
         first = self.task.episode_start()
         episode = jax.tree.map(partial(jnp.where, over), first, after.episode)
-        lights = jax.tree.map(partial(jnp.where, over), nothing_crossed(after.lights), after.lights)
+        lights = jax.tree.map(partial(jnp.where, over), forget_crossings(after.lights), after.lights)
         after = replace(after, episode=episode, lights=lights)
         flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
         return after, replace(transition, after=after, **flags)
 
     def _drive(self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None) -> Step:
+        """Drive one step by ``action``, or to ``motion`` if that is given."""
         seen = self.now(bank, state.context)
         traffic = self.traffic.advance(bank, state.context, seen)
         moved = self._move_agent(bank, state.context, action, motion, traffic)
-        return self._settle(bank, state, moved, alone(moved), seen, action)
+        return self._finish_step(bank, state, moved, alone(moved), seen, action)
 
     def _move_agent(
         self, bank: ScenarioBank, context: AgentContext, action: Array, motion: Array | None, traffic: Any
@@ -211,11 +214,14 @@ class Simulator:
         history = jnp.concatenate([context.history[1:], motion[None]])
         return replace(context, step=context.step + 1, history=history, action=action, traffic=traffic)
 
-    def _settle(
+    def _finish_step(
         self, bank: ScenarioBank, before: SimState, moved: AgentContext, driven: AgentContext, seen: Frame,
         action: Array,
     ) -> Step:  # fmt: skip
-        """Measure an agent after all agents have moved, and build the transition."""
+        """Measure an agent after all agents have moved, and build the transition.
+
+        ``driven`` stacks the contexts of all driven agents; ``seen`` is the frame before the step.
+        """
         now = self.frame(bank, moved, driven, 0)
         situation, contacts, lights = measure(
             bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
@@ -259,11 +265,12 @@ def map_where(requested: Bool[Array, " B"], function: Callable[..., Any], *argum
     rank = jnp.arange(count, 0, -1).astype(jnp.float32)
 
     def compute(carry: tuple[Array, Any]) -> tuple[Array, Any]:
-        left, results = carry
-        top_rank, index = jax.lax.top_k(jnp.where(left, rank, 0.0), chunk)
+        """Compute the next elements; those that fill up the last chunk have index ``count``, which is dropped."""
+        remaining, results = carry
+        top_rank, index = jax.lax.top_k(jnp.where(remaining, rank, 0.0), chunk)
         index = jnp.where(top_rank > 0.0, index, count)
         values = batched(*jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), arguments))
         results = jax.tree.map(lambda total, value: total.at[index].set(value, mode="drop"), results, values)
-        return left.at[index].set(False, mode="drop"), results
+        return remaining.at[index].set(False, mode="drop"), results
 
     return jax.lax.while_loop(lambda carry: carry[0].any(), compute, (requested, zeros))[1]

@@ -35,6 +35,8 @@ from drivax.simulator.types import (
 _ON_ROUTE_M = 2.0
 #: How far back a lane change at the start of an episode is looked for, steps.
 _ENTRY_STEPS = 16
+#: Steps over which accelerations and yaw rates are differences.
+_RATE_STEPS = 5
 #: Facts that need fault classification, and those that need contacts.
 _FAULTS = frozenset({"at_fault", "collision_type", "ttc_s"})
 _CONTACTS = _FAULTS | {"collision", "ignored", "gap_m"}
@@ -48,9 +50,10 @@ def measure(
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
     """Measure the driven agent.
 
-    ``context``, ``contacts`` and ``lights`` are those of the step before (its ``route_m`` and ``z``), ``frame`` and
-    ``previous`` are all agents now and one step ago, ``strand`` is the previous fact of that name (None at the start of
-    an episode). Facts that ``reads`` does not name are None and not computed.
+    ``context`` has the present step and motion, but ``route_m`` and ``z`` of the step before; ``contacts`` and
+    ``lights`` are those of the step before. ``frame`` and ``previous`` are all agents now and one step ago. ``strand``
+    is the previous fact of that name (None at the start of an episode). Facts that ``reads`` does not name are None and
+    not computed.
 
     Returns:
         The situation (with present ``route_m`` and ``z``), new contact codes, new light memory.
@@ -61,9 +64,9 @@ def measure(
     offroad_m, left_map, offroad = off_the_road(bank, context.index, me, ground, lanes)
     z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
     context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
-    # Off the map a lateral hit is a fault as it is off the road.
-    beyond_road = lanes.leaving_lane | (offroad_m > queries.OFFROAD_TOLERANCE_M)
-    codes, fault, kind, ttc = _touch(context, frame, previous, contacts, beyond_road, reads)
+    # Not ``offroad``: a lateral hit is a fault in a scenario without a map, too.
+    unlawful = lanes.leaving_lane | (offroad_m > queries.OFFROAD_TOLERANCE_M)
+    codes, fault, kind, ttc = _measure_contacts(context, frame, previous, contacts, unlawful, reads)
     routed = ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
     red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
     if "red_light" in reads:
@@ -102,11 +105,12 @@ def measure(
 
 
 def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
-    """Reset the ``strand`` fact where the episode is ``over``."""
+    """Set the ``strand`` fact, if it is measured, to -1 (none) where the episode is ``over``."""
 
     def forget(path: tuple[Any, ...], fact: Array) -> Array:
         return jnp.where(over, jnp.int16(-1), fact) if path[0].name == "strand" else fact
 
+    # As a tree: facts that are not read are None, which the constructor refuses under type checks.
     return jax.tree_util.tree_map_with_path(forget, facts)
 
 
@@ -116,6 +120,7 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     ground = _ground(bank, context, frame)
     # The route is that of ego.
     lanes = queries.around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground, context.slot == 0)
+    # Room for the step itself and for the way along a bend, which is longer on the route.
     ahead_m = 1.5 * _step_length(context) + 2.0
     return Surroundings(
         frame, lanes, queries.project_on_route(bank, context.index, me[:2], context.route_m, ahead_m)
@@ -132,7 +137,7 @@ def _step_length(context: AgentContext) -> Scalar:
     return norm(context.history[-1, :2] - context.history[-2, :2])
 
 
-def _touch(
+def _measure_contacts(
     context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
     reads: frozenset[str],
 ) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:  # fmt: skip
@@ -193,6 +198,7 @@ def _drop_unread(facts: Facts, reads: frozenset[str]) -> Facts:
     desired = reads | ({"strand"} if reads & _PASSAGES else frozenset())
 
     def keep(path: tuple[Any, ...], fact: Array) -> Array | None:
+        """Return the fact if it is read; as a tree, for the reason in :func:`forget_strand`."""
         return fact if path[0].name in desired else None
 
     return facts if desired >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(keep, facts)
@@ -201,16 +207,20 @@ def _drop_unread(facts: Facts, reads: frozenset[str]) -> Facts:
 def off_the_road(
     bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: queries.LaneHits
 ) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
-    """Return how far the worst corner of a box is off the road (m), whether it left the map, and whether the road."""
+    """Return how far the worst corner of a box is off the road (m), whether the box left the map, and the road.
+
+    Without a map it left neither, whatever the distance.
+    """
     offroad_m = queries.offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
     off = (offroad_m > queries.OFFROAD_TOLERANCE_M) & queries.is_mapped(bank, index)
     return offroad_m, queries.left_the_map(bank, index, me[:2]), off
 
 
 def _rates(history: Float[Array, "history 4"]) -> tuple[Scalar, Scalar, Scalar]:
-    """Return causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
-    speed, heading = history[:, 3], history[:, 2]
-    acceleration = (speed[-1] - speed[-6]) / (5 * DT_S)
-    before = (speed[-6] - speed[-11]) / (5 * DT_S)
-    yaw_rate = wrap(heading[-1] - heading[-6]) / (5 * DT_S)
-    return acceleration, (acceleration - before) / (5 * DT_S), yaw_rate * speed[-1]
+    """Return causal acceleration, jerk and lateral acceleration: differences over 0.5 s."""
+    speed, heading = history[:, MOTION_SPEED], history[:, MOTION_HEADING]
+    n, span_s = _RATE_STEPS, _RATE_STEPS * DT_S
+    acceleration = (speed[-1] - speed[-1 - n]) / span_s
+    before = (speed[-1 - n] - speed[-1 - 2 * n]) / span_s
+    yaw_rate = wrap(heading[-1] - heading[-1 - n]) / span_s
+    return acceleration, (acceleration - before) / span_s, yaw_rate * speed[-1]

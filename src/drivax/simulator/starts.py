@@ -91,11 +91,7 @@ class NoisyStart:
     def begin(
         self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Rows, key: Any
     ) -> tuple[History, Scalar]:
-        """Return the first acceptable of ``tries`` draws.
-
-        Raises:
-            UsageError: Without a key.
-        """
+        """Return the first acceptable of ``tries`` draws, or the logged motion if there is none."""
         if key is None:
             raise UsageError("a noisy start needs a random key", cure="reset(bank, index, step, slot, key)")
         # Only steps at which the log has the agent are replaced.
@@ -106,6 +102,7 @@ class NoisyStart:
         base = logged_history(bank, index, step - count, slot)
 
         def draw_history(key: Array) -> tuple[History, Bool[Array, ""]]:
+            """Draw a history and whether it is acceptable."""
             history = self._unroll(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
             return history, _acceptable(bank, index, step, slot, agents, history)
 
@@ -131,9 +128,10 @@ class NoisyStart:
     def _unroll(self, history: History, count: Integer, acceleration: Scalar, curvature: Scalar) -> History:
         """Return a history after ``count`` steps of one action."""
 
-        def advance(history: Array, place: Array) -> tuple[Array, None]:
+        def advance(history: Array, step: Array) -> tuple[Array, None]:
+            """Append a motion, unless ``count`` steps are done."""
             later = jnp.concatenate([history[1:], bicycle(history[-1], acceleration, curvature)[None]])
-            return jnp.where(place < count, later, history), None
+            return jnp.where(step < count, later, history), None
 
         return jax.lax.scan(advance, history, jnp.arange(self.steps))[0]
 

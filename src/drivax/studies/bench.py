@@ -43,6 +43,8 @@ METRIC_SETS, BATCHES = ("none", "training", "full"), (32, 128)
 LARGER_BATCHES = (256, 512, 1024)
 #: Number of environments in the compiler's cost analysis.
 _COST_BATCH = 16384
+#: Factor that makes the results of a part too small to change a state.
+_NEGLIGIBLE = 1e-20
 #: Actions, observations and frames.
 _PlannerOutputs = tuple[Array, Mapping[str, Array], Frame]
 #: Carry of the loop: states, mask of ended episodes, sums of rewards and metrics, outputs of the planner.
@@ -169,7 +171,7 @@ def compile_program(bank: ScenarioBank, config: BenchConfig) -> Program:
     keys = jax.random.split(jax.random.key(2), jax.device_count())
     carry = _carry(simulator, config, bank, states)
     start = time.perf_counter()
-    program = _shard_states(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
+    program = _jit_sharded(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
     seconds = time.perf_counter() - start
     memory = program.memory_analysis()
     return Program(
@@ -214,6 +216,7 @@ def replicate(bank: ScenarioBank) -> ScenarioBank:
 
 
 def _states(simulator: Simulator, bank: ScenarioBank, batch: int) -> SimState:
+    """Return the states of a batch in random scenarios, sharded over the devices."""
     index = jax.random.randint(jax.random.key(1), (batch,), 0, len(bank))
     states = _reset(simulator, bank, index)
     return jax.device_put(states, NamedSharding(_mesh(), PartitionSpec("device")))
@@ -225,31 +228,35 @@ def _reset(simulator: Simulator, bank: ScenarioBank, index: Int[Array, " B"]) ->
 
 
 def _mesh() -> Mesh:
+    """Return all devices as one axis, ``device``."""
     return jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
 
 
-def _shard_states(function: Callable[..., Any]) -> Any:
+def _jit_sharded(function: Callable[..., Any]) -> Any:
     """Jit a function of bank, states and keys, with the states and keys sharded over the devices."""
-    share = PartitionSpec("device")
+    sharded, whole = PartitionSpec("device"), PartitionSpec()
     return jax.jit(
         jax.shard_map(
-            function, mesh=_mesh(), in_specs=(PartitionSpec(), share, share), out_specs=share, check_vma=False
+            function, mesh=_mesh(), in_specs=(whole, sharded, sharded), out_specs=sharded,
+            check_vma=False,  # It would refuse loops whose carry starts from constants, which do not vary by device.
         )
-    )
+    )  # fmt: skip
 
 
 def _run(
     simulator: Simulator, config: BenchConfig, bank: ScenarioBank, carry: _Carry, keys: Array
 ) -> tuple[Any, Array]:
-    """Step a batch. Return all results, to keep the compiler from removing any, and the number of steps."""
+    """Step the share of a device. Return all results, so that the compiler removes none, and the number of steps."""
     key, batch = keys[0], carry[1].shape[0]
     step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0, 0))
 
     def sum_metrics(states: SimState) -> Array:
+        """Return the sum of the metrics of all episodes so far."""
         values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
         return jnp.sum(jnp.asarray([value.value for value in values.values()], jnp.float32))
 
     def iteration(carry: _Carry, index: Int[Array, " B"]) -> tuple[_Carry, Array]:
+        """Step every environment, or start an episode in scenario ``index``; count the steps."""
         states, done, total, (action, _, frame) = carry
         starts = map_where(done, partial(simulator.new_episode, bank), index)
         states, transition = step(bank, states, action, done, starts, frame)
@@ -271,12 +278,12 @@ def _planner_outputs(
     """Return the planner's actions, the task's observations and the frame of all agents."""
     planner = IdmPlanner(config.task.actions)
 
-    def drive(state: SimState) -> _PlannerOutputs:
+    def outputs(state: SimState) -> _PlannerOutputs:
         situation = simulator.situation(bank, state)
         action, _ = planner.act((), bank, state, situation, None, jax.random.key(0))
         return action, simulator.observe(bank, state.context), situation.surroundings.frame
 
-    return jax.vmap(drive)(states)
+    return jax.vmap(outputs)(states)
 
 
 def _carry(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Carry:
@@ -292,12 +299,11 @@ Part = Callable[[ScenarioBank, SimState], Any]
 
 def without_grid(bank: ScenarioBank) -> ScenarioBank:
     """Return the bank with a grid of one cell, where each query visits all segments."""
-    n = len(bank)
     return replace(
         bank,
         grid_edge=jnp.stack([jnp.zeros_like(bank.grid_edge[:, 0]), bank.grid_edge[:, -1]], axis=1),
         grid_lane=jnp.stack([jnp.zeros_like(bank.grid_lane[:, 0]), bank.grid_lane[:, -1]], axis=1),
-        grid_side=jnp.zeros((n, 1), bank.grid_side.dtype),
+        grid_side=jnp.zeros((len(bank), 1), bank.grid_side.dtype),
     )
 
 
@@ -332,7 +338,7 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
         return time_to_collision(frame(bank, state), state.context.slot, state.contacts == Contact.IGNORED)
 
     def metrics(bank: ScenarioBank, state: SimState) -> Any:
-        # No metric reads the surroundings, and the compiler removes their computation.
+        # Time of the accumulators alone: no metric reads the surroundings, and the compiler removes their computation.
         situation = simulator.situation(bank, state)
         return episode_add(state.episode, situation, state.start, jnp.zeros((), bool))
 
@@ -369,19 +375,20 @@ def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimS
 
 
 def _repeat_part(config: BenchConfig, part: Part) -> Any:
-    """Return a program that computes a part ``config.steps`` times in sequence."""
+    """Return a program that computes a part ``config.steps`` times in sequence; its keys are not read."""
 
     def run(bank: ScenarioBank, states: SimState, _: Any) -> Array:
         def iteration(shift: Array, _: None) -> tuple[Array, None]:
+            """Compute the part in shifted states."""
             totals = jax.vmap(lambda state, distance: _total(part, bank, _shift(state, distance)))(
                 states, shift
             )
             # Each iteration depends on the last one, which keeps the compiler from hoisting work out of the loop.
-            return shift + 1e-20 * jnp.where(jnp.isfinite(totals), totals, 0.0), None
+            return shift + _NEGLIGIBLE * jnp.where(jnp.isfinite(totals), totals, 0.0), None
 
         return jax.lax.scan(iteration, jnp.zeros(states.start.shape), None, config.steps)[0]
 
-    return _shard_states(run)
+    return _jit_sharded(run)
 
 
 def _shift(state: SimState, distance: Array) -> SimState:
@@ -399,6 +406,7 @@ def _cost(part: Part, bank: ScenarioBank, states: SimState) -> dict[str, float]:
     """
 
     def with_rows(tree: Any, rows: int) -> Any:
+        """Return the shapes of a tree with another number of rows."""
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((rows, *leaf.shape[1:]), leaf.dtype), tree)
 
     program = jax.jit(jax.vmap(part, in_axes=(None, 0)))

@@ -151,6 +151,7 @@ def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[
         return encoder(groups)
 
     def loss(parameters: Any, groups: Any) -> Array:
+        """Return a number that depends on every parameter."""
         return jnp.mean(encode(parameters, groups) ** 2)
 
     forward, gradient = jax.jit(encode), jax.jit(jax.grad(loss))
@@ -168,6 +169,7 @@ def _microseconds(function: Any, parameters: Any, groups: dict[str, Array], repe
     batch = next(iter(groups.values())).shape[0]
 
     def seconds(calls: int) -> float:
+        """Return the mean duration of some calls."""
         start = time.perf_counter()
         for _ in range(calls):
             jax.block_until_ready(function(parameters, groups))

@@ -23,8 +23,8 @@ _STRATA: Mapping[Stratum, str] = {
     "ordinary": "Ordinary traffic", "common": "Common scenarios", "rare": "Rare scenarios",
 }  # fmt: skip
 _VERDICT_TEXTS = {"supported": "▲ supported", "contradicted": "▼ contradicted", "undecided": "undecided"}
-#: Number of cells of the action map along each axis, and its size in pixels.
-_MAP_CELLS, _MAP_SIZE = 48, 336
+#: Number of cells of the action map along each axis, its size, and the margins for its labels, in pixels.
+_MAP_CELLS, _MAP_SIZE, _MAP_LEFT, _MAP_RIGHT, _MAP_BOTTOM = 48, 336, 30, 10, 30
 _STYLE = """
 .claims td, .claims th { text-align: left; }
 .claims th[scope=row] { min-width: 19em; }
@@ -68,6 +68,7 @@ def write_report(
 
 
 def _lead(definition: StudyDefinition, results: Results) -> str:
+    """Return the first paragraph: counts of verdicts, sizes, and a warning if a baseline is not good enough."""
     verdicts = [claim["verdict"] for claim in results["claims"]]
     counts = ", ".join(f"{verdicts.count(name)} {name}" for name in _VERDICT_TEXTS)
     about, caution = results["about"], ""
@@ -84,6 +85,7 @@ def _lead(definition: StudyDefinition, results: Results) -> str:
 
 
 def _table(name: str, headings: Iterable[str], rows: Iterable[Sequence[str]]) -> Table:
+    """Return a table of texts whose first column labels the rows; ``name`` is its CSS class."""
     columns = tuple(Column(heading, label=not index) for index, heading in enumerate(headings))
     return Table(name, columns, tuple(tuple(map(Cell, row)) for row in rows))
 
@@ -127,6 +129,7 @@ def claims_table(results: Results, group: str) -> Table:
 
 
 def _claim_row(result: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the cells of a claim, from :meth:`ClaimResult.plain`; undefined values are empty."""
     claim, interval, change, p = (result[name] for name in ("claim", "interval", "change", "adjusted"))
     return (
         claim["words"],
@@ -230,6 +233,7 @@ def _verdicts(definition: StudyDefinition, results: Results) -> str:
 
 
 def _rates(definition: StudyDefinition, results: Results, stratum: Stratum) -> str:
+    """Return the section of a stratum, empty without results."""
     table, share = rates_table(results, stratum), results["about"]["share"]
     if not table.rows:
         return ""
@@ -260,6 +264,7 @@ def _rule_cost(results: Results, rule: str) -> str:
 
 
 def _scores(tables: Mapping[str, ScoreTable]) -> str:
+    """Return histograms of the scores and the three most critical scenarios of each method."""
     charts = "".join(
         histogram(f"{name}: scores of scenarios", {name: table.scenarios}, "score")
         for name, table in tables.items()
@@ -277,20 +282,22 @@ def _scores(tables: Mapping[str, ScoreTable]) -> str:
 
 
 def _action_map(actions: Float[np.ndarray, "n 2"]) -> str:
+    """Return a map of the frequencies of actions: steering to the right, acceleration upwards."""
     counts, _, _ = np.histogram2d(actions[:, 0], actions[:, 1], bins=_MAP_CELLS, range=((-1, 1), (-1, 1)))
     opacity = np.log1p(counts) / np.log1p(counts.max())
     side = _MAP_SIZE / _MAP_CELLS
     cells = "".join(
-        f'<rect x="{30 + column * side:.1f}" y="{(_MAP_CELLS - 1 - row) * side:.1f}" width="{side:.1f}" '
+        f'<rect x="{_MAP_LEFT + column * side:.1f}" y="{(_MAP_CELLS - 1 - row) * side:.1f}" width="{side:.1f}" '
         f'height="{side:.1f}" fill="var(--ink)" fill-opacity="{opacity[row, column]:.2f}"/>'
         for row, column in np.argwhere(counts > 0)
     )
     return (
         f'<figure class="chart map"><figcaption>Frequency of the experts\' actions<small>logarithmic; '
         f"{len(actions):,} steps</small></figcaption>"
-        f'<svg viewBox="0 0 {_MAP_SIZE + 40} {_MAP_SIZE + 30}" role="img" aria-label="map of actions">{cells}'
-        f'<text x="{30 + _MAP_SIZE / 2:.0f}" y="{_MAP_SIZE + 20}" text-anchor="middle">steering, left is positive'
-        "</text>"
+        f'<svg viewBox="0 0 {_MAP_LEFT + _MAP_SIZE + _MAP_RIGHT} {_MAP_SIZE + _MAP_BOTTOM}" role="img" '
+        f'aria-label="map of actions">{cells}'
+        f'<text x="{_MAP_LEFT + _MAP_SIZE / 2:.0f}" y="{_MAP_SIZE + 20}" text-anchor="middle">'
+        "steering, left is positive</text>"
         f'<text transform="translate(18 {_MAP_SIZE / 2:.0f}) rotate(-90)" text-anchor="middle">acceleration</text>'
         "</svg></figure>"
     )

@@ -246,11 +246,7 @@ def _train_and_evaluate(jobs: Sequence[Job], cores: int | None, log: Log) -> Non
 
 
 def _is_finished(job: Job) -> bool:
-    """Return whether an arm is trained and evaluated.
-
-    Raises:
-        UsageError: The run has other settings, or an evaluation is older than the run.
-    """
+    """Return whether an arm is trained and evaluated; refuse a run with other settings and outdated evaluations."""
     run = job.study.run(job.arm, job.seed)
     if not (run / "config.yaml").is_file():
         return False
@@ -268,11 +264,7 @@ def _is_finished(job: Job) -> bool:
 
 
 def is_evaluated(study: Study, arm: str, seed: int) -> bool:
-    """Return whether an arm has all its evaluations.
-
-    Raises:
-        UsageError: An evaluation is older than the run.
-    """
+    """Return whether an arm has all its evaluations; refuse those that are older than the run."""
     folders = [study.evaluation(name, seed) for name in study.evaluations(arm)]
     existing = [folder for folder in folders if folder.is_dir()]
     for folder in existing:
@@ -311,11 +303,7 @@ def _run_job(job: Job) -> float:
 
 
 def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:
-    """Check that a run with evaluations has checkpoints: training again would mix two training runs.
-
-    Raises:
-        UsageError: The run has evaluations, but no checkpoints.
-    """
+    """Check that a run with evaluations has checkpoints: training again would mix two training runs."""
     folders = [job.study.evaluation(name, job.seed) for name in job.study.evaluations(job.arm)]
     evaluations = [folder for folder in folders if folder.is_dir()]
     if not steps and evaluations:
@@ -328,11 +316,7 @@ def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:
 
 
 def _best_step(job: Job) -> int:
-    """Return the step of the validation at which ``checkpoints_by`` is largest.
-
-    Raises:
-        UsageError: The training never logged it at a validation.
-    """
+    """Return the step of the validation at which ``checkpoints_by`` is largest."""
     metric, file = job.study.definition.checkpoints_by, job.study.run(job.arm, job.seed) / "metrics.jsonl"
     rows = [row for row in read_rows(file) if _PROGRESS in row and row.get(metric) is not None]
     if not rows:
@@ -343,6 +327,7 @@ def _best_step(job: Job) -> int:
 
 
 def _conditions(study: Study, arms: Sequence[str]) -> list[Condition]:
+    """Return the validation results of arms that are trained."""
     config = study.config
     return [Condition.of(arm, _validations(study, arm), config.progress, config.flat) for arm in arms]
 
@@ -363,6 +348,7 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
 
 
 def _validation_score(row: Mapping[str, float]) -> float:
+    """Return the score by which a training chooses its best checkpoint."""
     ranking = rank("score", row)
     assert ranking is not None
     return ranking[0]
@@ -378,6 +364,7 @@ def _results(
     study: Study, test: ScenarioSet, strata: Strata, tables: Mapping[str, ScoreTable],
     usable: Bool[np.ndarray, "N T"],
 ) -> dict[str, Any]:  # fmt: skip
+    """Return the contents of ``results.json``, except the conditions and the detectable differences."""
     definition, metrics, data = study.definition, study.definition.metrics, ScenarioSet.open(study.sets.train)
     episodes = {}
     for name in definition.planners:

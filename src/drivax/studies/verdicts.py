@@ -156,13 +156,7 @@ class ClaimResult:
 def decide_claims(
     claims: Sequence[Claim], episodes: Mapping[str, Episodes], strata: Strata
 ) -> list[ClaimResult]:
-    """Test every claim, with p-values adjusted within its group (Holm).
-
-    Args:
-        claims: The claims.
-        episodes: Values of every arm.
-        strata: The test scenarios.
-    """
+    """Test every claim on the values of all arms, with p-values adjusted within its group (Holm)."""
     results = [_effects(claim, episodes, strata) for claim in claims]
     groups = [claim.group for claim in claims]
     for group in set(groups):
@@ -206,12 +200,7 @@ def _decide(result: ClaimResult, claims: int) -> ClaimResult:
 
 
 def describe_needed(effect: CrossedEffect, claims: int) -> str:
-    """Describe the number of seeds or recordings that would decide.
-
-    Args:
-        effect: The effect to test.
-        claims: Number of claims adjusted together; the strictest of their levels applies.
-    """
+    """Describe the number of seeds or recordings that would decide, at the strictest level of ``claims`` claims."""
     confidence = confidence_level(claims)
     seeds = effect.seeds_needed(confidence=confidence)
     recordings = effect.clusters_needed(confidence=confidence)
@@ -232,15 +221,8 @@ def detectable_differences(
 ) -> dict[str, float]:
     """Estimate the smallest differences in ordinary traffic that the study detects with a power of 80 %.
 
-    Assumes that the seeds of every arm vary like those of the first baseline, and that arms differ by scenario like the
-    two baselines.
-
-    Args:
-        first: Values of the first baseline.
-        second: Values of the second baseline.
-        strata: The test scenarios.
-        metrics: Names of metrics; skips metrics that are undefined in the test.
-        claims: Number of claims adjusted together.
+    Assumes that the seeds of every arm vary like those of the ``first`` baseline, and that arms differ by scenario like
+    the two baselines. ``claims`` are adjusted together. Metrics that are undefined in the test are skipped.
     """
     weights, smallest = strata.weights("ordinary"), {}
     for name in metrics:
@@ -269,6 +251,7 @@ def rates(
 
 
 def _rate(values: Values, strata: Strata, weights: Weights, share: bool) -> dict[str, float | int | None]:
+    """Return mean and interval; ``share`` keeps the interval in [0, 1]."""
     interval = seeds_interval(values, strata.recordings, weights, share=share).as_dict()
     return {"scenarios" if name == "n" else name: value for name, value in interval.items()}
 
@@ -278,11 +261,7 @@ def rule_cost(
 ) -> dict[str, dict[str, Any]]:
     """Return the cost of another checkpoint rule in ordinary traffic: paired differences by metric.
 
-    Args:
-        rule: Values of every seed with the rule's checkpoint.
-        best: Values of the same seeds with the best checkpoint.
-        strata: The test scenarios.
-        metrics: Names of metrics.
+    ``rule`` are the values of every seed with the rule's checkpoint, ``best`` those with the best checkpoint.
     """
     weights, costs = strata.weights("ordinary"), {}
     for name in metrics:
@@ -296,9 +275,7 @@ def rule_cost(
 def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]) -> list[dict[str, Any]]:
     """Compare the methods' rankings of scenarios: rank correlation, overlap of the top 5 %, and a verdict.
 
-    Args:
-        tables: Score tables of one set by method.
-        recordings: Recording of every scenario; the interval resamples recordings.
+    ``recordings`` is that of every scenario; the interval resamples recordings.
     """
     pairs = []
     for first, second in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):

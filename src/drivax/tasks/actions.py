@@ -28,6 +28,8 @@ from drivax.simulator.types import History, Motion
 _WHEELBASE = 0.6
 #: Tolerance of rounding outside [-1, 1].
 _ROUNDING = 1e-4
+#: Lower bound of lengths in divisions, m: empty slots have length 0.
+_LEAST_LENGTH_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -103,17 +105,21 @@ class Physical:
         return jnp.clip(self.action(history[-1], *command, length_m), -1.0, 1.0)
 
     def _quantities(self, action: Vector) -> tuple[Scalar, Scalar]:
+        """Return acceleration (m/s2) and steering, in the unit of ``steering``."""
         scale = jnp.where(action[0] < 0, self.braking_mps2, self.acceleration_mps2)
         return action[0] * scale, action[1] * self.steering
 
     def _action(self, acceleration: Scalar, steering: Scalar) -> Vector:
+        """Return the action of acceleration and steering; the inverse of :meth:`_quantities`."""
         scale = jnp.where(acceleration < 0, self.braking_mps2, self.acceleration_mps2)
         return jnp.stack([acceleration / scale, steering / self.steering])
 
     def _curvature(self, steering: Scalar, length_m: Any) -> Scalar:
+        """Return the curvature of a steering, 1/m: the same in this action space."""
         return steering
 
     def _steering(self, curvature: Scalar, length_m: Any) -> Scalar:
+        """Return the steering of a curvature; the inverse of :meth:`_curvature`."""
         return curvature
 
 
@@ -132,10 +138,10 @@ class Published(Physical):
     acceleration_mps2: float = 2.0
 
     def _curvature(self, steering: Scalar, length_m: Any) -> Scalar:
-        return jnp.tan(steering) / (_WHEELBASE * jnp.maximum(length_m, 1.0))
+        return jnp.tan(steering) / (_WHEELBASE * jnp.maximum(length_m, _LEAST_LENGTH_M))
 
     def _steering(self, curvature: Scalar, length_m: Any) -> Scalar:
-        return jnp.arctan(curvature * _WHEELBASE * jnp.maximum(length_m, 1.0))
+        return jnp.arctan(curvature * _WHEELBASE * jnp.maximum(length_m, _LEAST_LENGTH_M))
 
 
 @dataclass(frozen=True)
@@ -188,6 +194,7 @@ class Discrete(Physical):
 
 
 def _levels(count: int, density: float) -> Float[Array, " count"]:
+    """Return the levels of :class:`Discrete` in [-1, 1], ascending."""
     half = count // 2
     return jnp.array([math.copysign((abs(i) / half) ** density, i) for i in range(-half, half + 1)])
 
@@ -307,17 +314,20 @@ class Trajectory:
 
     @property
     def size(self) -> int:
-        """Number of numbers."""
+        """Length of an action: three numbers per pose."""
         return 3 * (self.steps + 1)
 
     def plan(self, poses: Float[Array, "n 3"]) -> Float[Array, " D"]:
-        """Return the action of two or more poses from now on; beyond them the car keeps its last velocity."""
+        """Return the action of two or more poses from now on.
+
+        After the last one the car keeps its velocity; poses that exceed the horizon are dropped.
+        """
         moved = poses[-1, :2] - poses[-2, :2]
-        more = jnp.arange(1, max(self.steps + 2 - len(poses), 1))[:, None]
-        beyond = jnp.concatenate(
-            [poses[-1, :2] + more * moved, jnp.full_like(more, poses[-1, 2], poses.dtype)], axis=1
+        step = jnp.arange(1, max(self.steps + 2 - len(poses), 1))[:, None]
+        extension = jnp.concatenate(
+            [poses[-1, :2] + step * moved, jnp.full_like(step, poses[-1, 2], poses.dtype)], axis=1
         )
-        return jnp.concatenate([poses, beyond])[: self.steps + 1].reshape(-1)
+        return jnp.concatenate([poses, extension])[: self.steps + 1].reshape(-1)
 
     def action(
         self, motion: Motion, acceleration: Scalar, curvature: Scalar, length_m: Any
@@ -343,26 +353,29 @@ class Trajectory:
         self, motion: Motion, action: Float[Array, " D"], last: Float[Array, " D"], length_m: Any
     ) -> Float[Array, " D"]:
         """Return what the actuators do to follow the plan."""
-        length_m = jnp.maximum(length_m, 1.0)
-        now = controller.track(motion, action.reshape(-1, 3), last[:3], length_m, self.controller)
-        return jnp.zeros(self.size).at[:3].set(now)
+        length_m = jnp.maximum(length_m, _LEAST_LENGTH_M)
+        actuators = controller.track(motion, action.reshape(-1, 3), last[:3], length_m, self.controller)
+        return jnp.zeros(self.size).at[:3].set(actuators)
 
     def move(self, motion: Motion, action: Float[Array, " D"], length_m: Any) -> Motion:
         """Return the motion one step later, from an executed action."""
-        return controller.propagate(motion, action[:3], jnp.maximum(length_m, 1.0), self.controller)
+        return controller.propagate(
+            motion, action[:3], jnp.maximum(length_m, _LEAST_LENGTH_M), self.controller
+        )
 
     def sharpest(self, length_m: Any) -> Any:
         """Return the largest curvature of the rear axle, 1/m."""
         return math.tan(self.controller.most_steering) / (
-            self.controller.wheelbase * jnp.maximum(length_m, 1.0)
+            self.controller.wheelbase * jnp.maximum(length_m, _LEAST_LENGTH_M)
         )
 
     def first(self, history: History, length_m: Any) -> Float[Array, " D"]:
         """Return the acceleration of the log's last half second, and the initial steering angle."""
-        now = controller.recent_actuators(history, jnp.maximum(length_m, 1.0), self.controller)
+        length_m = jnp.maximum(length_m, _LEAST_LENGTH_M)
+        actuators = controller.recent_actuators(history, length_m, self.controller)
         if self.initial_steering == "zero":
-            now = now.at[controller.STEERING].set(0.0)
-        return jnp.zeros(self.size).at[:3].set(now)
+            actuators = actuators.at[controller.STEERING].set(0.0)
+        return jnp.zeros(self.size).at[:3].set(actuators)
 
 
 #: Types of ``task.actions``; ``kind:`` in YAML is ``physical``, ``published``, ``discrete``, ``delta_local``,

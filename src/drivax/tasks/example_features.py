@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drivax.geometry.boxes import COS, LENGTH, WIDTH
 from drivax.geometry.vectors import norm
 from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer
 from drivax.scenario.bank.queries import route_ahead
@@ -24,6 +25,8 @@ from drivax.tasks.features import POSITION_M, SPEED_MPS, Frames, View
 
 #: Number of agents with a relative velocity; spacing (m) and number of route points.
 _OTHERS, _STEP_M, _POINTS = 8, 5.0, 10
+#: Largest distance of a lane piece, m; least cosine of the angle to it; metres per sine of the angle in its rank.
+_LANE_M, _LANE_COS, _M_PER_SINE = 2.5, 0.5, 4.0
 #: Half the width of the strip ahead in which a leader drives, m; cap of time gaps, s.
 _STRIPE_M, _LONGEST_S = 1.5, 10.0
 #: Driver model, its hardest braking, m/s2, and its look-ahead, m.
@@ -45,8 +48,9 @@ def relative_velocity(
     distance = jnp.where(present, norm(now.box[:, :2] - view.xy), jnp.inf)
     rank = jnp.arange(_OTHERS)
     order = jnp.argsort(distance)[jnp.minimum(rank, len(distance) - 1)]
-    own = jnp.stack([ego[3], jnp.zeros(())])
-    return (view.vector(now.velocity[order]) - own) / SPEED_MPS, present[order] & (rank < len(distance))
+    own_velocity = jnp.stack([ego[MOTION_SPEED], jnp.zeros(())])
+    velocity = (view.vector(now.velocity[order]) - own_velocity) / SPEED_MPS
+    return velocity, present[order] & (rank < len(distance))
 
 
 def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
@@ -60,9 +64,9 @@ def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) ->
     middle, direction = view.point(rows[:, RoadColumn.XY]), view.vector(rows[:, RoadColumn.DIRECTION])
     half = rows[:, RoadColumn.LENGTH] / 2
     along = jnp.clip(-jnp.sum(middle * direction, axis=-1), -half, half)
-    apart = norm(middle + along[:, None] * direction)
-    fits = (layer == RoadLayer.LANE) & (apart < 2.5) & (direction[:, 0] > 0.5)
-    best = first_smallest(jnp.where(fits, apart**2 + (4.0 * direction[:, 1]) ** 2, 1e9))
+    distance = norm(middle + along[:, None] * direction)
+    fits = (layer == RoadLayer.LANE) & (distance < _LANE_M) & (direction[:, 0] > _LANE_COS)
+    best = first_smallest(jnp.where(fits, distance**2 + (_M_PER_SINE * direction[:, 1]) ** 2, jnp.inf))
     curvature = jnp.where(fits[best], features.scale_curvature(bank.road_curvature[context.index, best]), 0.0)
     return jnp.stack([curvature, fits[best].astype(jnp.float32)])
 
@@ -85,16 +89,16 @@ def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float
     count as 1 m/s. Without a leader the first number is 1.
     """
     now, view = frames(0), View.of(context)
-    place = view.point(now.box[:, :2])
+    position = view.point(now.box[:, :2])
     others = now.valid & (jnp.arange(len(now.valid)) != context.slot)
-    leading = others & (place[:, 0] > 0) & (jnp.abs(place[:, 1]) < _STRIPE_M)
+    leads = others & (position[:, 0] > 0) & (jnp.abs(position[:, 1]) < _STRIPE_M)
     half = bank.length_m(context.index, context.slot) / 2
-    direction = jnp.abs(view.vector(now.box[:, 2:4]))
+    direction = jnp.abs(view.vector(now.box[:, COS:LENGTH]))
     # How far boxes extend from their centres along ego's heading.
-    reach = (direction[:, 0] * now.box[:, 4] + direction[:, 1] * now.box[:, 5]) / 2
-    gap = jnp.where(leading, jnp.maximum(place[:, 0] - half - reach, 0.0), jnp.inf)
-    time = jnp.min(gap) / jnp.maximum(context.history[-1, 3], _SLOWEST_MPS)
-    return jnp.stack([jnp.minimum(time / _LONGEST_S, 1.0), leading.any().astype(jnp.float32)])
+    reach = (direction[:, 0] * now.box[:, LENGTH] + direction[:, 1] * now.box[:, WIDTH]) / 2
+    gap = jnp.where(leads, jnp.maximum(position[:, 0] - half - reach, 0.0), jnp.inf)
+    time = jnp.min(gap) / jnp.maximum(context.history[-1, MOTION_SPEED], _SLOWEST_MPS)
+    return jnp.stack([jnp.minimum(time / _LONGEST_S, 1.0), leads.any().astype(jnp.float32)])
 
 
 def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 6"]:
@@ -105,12 +109,12 @@ def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> 
     Driver Model with default parameters (6 m/s2). Without a leader both speeds are 0.
     """
     speed = context.history[-1, MOTION_SPEED]
-    seen = ahead(bank, context, frames(0), _IDM.min_gap_m)
-    leads = seen.gap < _FARTHEST_M
-    gap = jnp.minimum(seen.gap, _FARTHEST_M) / POSITION_M
-    speeds = jnp.stack([speed - seen.leader, seen.leader]) * leads / SPEED_MPS
-    acceleration = seen.acceleration(speed, _IDM) / _HARDEST_MPS2
-    return jnp.stack([gap, *speeds, leads.astype(jnp.float32), seen.desired / SPEED_MPS, acceleration])
+    inputs = ahead(bank, context, frames(0), _IDM.min_gap_m)
+    leads = inputs.gap < _FARTHEST_M
+    gap = jnp.minimum(inputs.gap, _FARTHEST_M) / POSITION_M
+    speeds = jnp.stack([speed - inputs.leader, inputs.leader]) * leads / SPEED_MPS
+    acceleration = inputs.acceleration(speed, _IDM) / _HARDEST_MPS2
+    return jnp.stack([gap, *speeds, leads.astype(jnp.float32), inputs.desired / SPEED_MPS, acceleration])
 
 
 def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
@@ -118,11 +122,11 @@ def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Floa
 
     Lines beyond 50 m or behind the bumper do not count; the distance is then 1.
     """
-    ahead = bank.light_line[context.index, LightRow.ARC] - context.route_m
-    gap = ahead - bank.length_m(context.index, context.slot) / 2
+    line_m = bank.light_line[context.index, LightRow.ARC] - context.route_m
+    gap = line_m - bank.length_m(context.index, context.slot) / 2
     state = frames(0).lights
-    real = bank.light_line[context.index, LightRow.ARC] < NEVER_M
-    counts = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
+    on_route = bank.light_line[context.index, LightRow.ARC] < NEVER_M
+    counts = on_route & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
     nearest = jnp.argmin(jnp.where(counts, gap, jnp.inf))
     distance = jnp.where(counts.any(), gap[nearest] / POSITION_M, 1.0)
     flags = jnp.stack([counts & is_red(state), counts])[:, nearest].astype(jnp.float32)

@@ -124,6 +124,7 @@ class Features:
                     raise UsageError(f"{place} has no {name!r}", cure=did_you_mean(name, available))
                 if name in selected[:number]:
                     raise UsageError(f"{place} names {name!r} twice", cure="name it once")
+            # In the order of COLUMNS, on which encoders and checkpoints rely.
             object.__setattr__(self, field.name, tuple(name for name in available if name in selected))
 
 
@@ -140,8 +141,9 @@ def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> di
             names[group] = tuple(str(column) for column in range(shape[-1]))
             continue
         columns = [(name, COLUMNS[group][name]) for name in getattr(features, group)]
-        unnamed = shape[-1] - sum(len(parts) for _, parts in columns)
-        columns = [(name, parts or tuple(map(str, range(unnamed)))) for name, parts in columns]
+        # ``last_action`` has no fixed columns: it gets the others, numbered.
+        others = shape[-1] - sum(len(parts) for _, parts in columns)
+        columns = [(name, parts or tuple(map(str, range(others)))) for name, parts in columns]
         names[group] = tuple(f"{name} {part}".strip() for name, parts in columns for part in parts)
     return names
 

@@ -19,7 +19,7 @@ from drivax.errors import UsageError, did_you_mean
 from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer, RouteColumn, SizeColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
-from drivax.scenario.schema import DT_S, LightState
+from drivax.scenario.schema import DT_S, AgentKind, LightState
 from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.types import HISTORY, MOTION_HEADING, MOTION_SPEED, AgentContext
 from drivax.tasks import features
@@ -35,8 +35,10 @@ from drivax.tasks.perception import (
 
 #: Block size of the running count.
 _BLOCK = 8
-#: A stop line this far behind the ego is passed, m.
-_PASSED_M = 5.0
+#: A stop line this far behind the ego is passed, m. Lights off the route rank after those on it by this distance, m.
+_PASSED_M, _OFF_ROUTE_M = 5.0, 1e4
+#: Kinds of the columns of the feature ``type`` of agents.
+_TYPES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST, AgentKind.OTHER)
 Observation = dict[str, Array]
 #: Names of the groups of this module.
 GROUPS = tuple(COLUMNS)
@@ -120,11 +122,7 @@ class ObservationConfig:
 
     @classmethod
     def preset(cls, name: str) -> ObservationConfig:
-        """Return one of ``PRESETS``.
-
-        Raises:
-            UsageError: Unknown name.
-        """
+        """Return one of ``PRESETS``."""
         if name not in PRESETS:
             raise UsageError(f"unknown observation preset {name!r}", cure=did_you_mean(name, list(PRESETS)))
         return PRESETS[name]
@@ -182,6 +180,7 @@ def observe(
 
 
 def _masked_group(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> Observation:
+    """Return a group, with zeros in masked rows, and its mask."""
     return {name: jnp.where(mask[..., None], rows, 0.0), f"{name}_mask": mask}
 
 
@@ -195,6 +194,7 @@ def _masked_columns(name: str, columns: Sequence[Array], mask: Bool[Array, "*row
 
 
 def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
+    """Return the groups ``ego`` [steps, F] and ``ego_static`` [F]."""
     past = context.history[HISTORY - config.steps :]
     direction = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
     size = bank.agent_box[context.index, context.slot, : SizeColumn.KIND] / SIZE_M
@@ -223,6 +223,7 @@ def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
 def _agents(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, frames: Frames
 ) -> Observation:
+    """Return the group ``agents`` [agents, steps, F]: the agents that are nearest now, nearest first."""
     now = frames(0)
     slots = now.valid.shape[0]
     visible = now.valid & (jnp.arange(slots) != context.slot)
@@ -240,19 +241,19 @@ def _agents(
     speed, heading = ego[:, MOTION_SPEED, None], ego[:, MOTION_HEADING, None]
     ego_vx, ego_vy = speed * jnp.cos(heading), speed * jnp.sin(heading)
 
-    def scaled(unit: float, *columns: Array) -> list[Array]:
+    def scale(unit: float, *columns: Array) -> list[Array]:
         return [column / unit for column in columns]
 
     parts = {
-        "position": lambda: scaled(POSITION_M, *view.rotate(x - view.xy[0], y - view.xy[1])),
+        "position": lambda: scale(POSITION_M, *view.rotate(x - view.xy[0], y - view.xy[1])),
         "heading": lambda: view.rotate(cos, sin)[::-1],
-        "velocity": lambda: scaled(SPEED_MPS, *view.rotate(vx, vy)),
-        "relative_velocity": lambda: scaled(SPEED_MPS, *view.rotate(vx - ego_vx, vy - ego_vy)),
+        "velocity": lambda: scale(SPEED_MPS, *view.rotate(vx, vy)),
+        "relative_velocity": lambda: scale(SPEED_MPS, *view.rotate(vx - ego_vx, vy - ego_vy)),
         "time": lambda: [-DT_S * jnp.asarray(steps, jnp.float32)[:, None]],
-        "length": lambda: scaled(SIZE_M, length),
-        "width": lambda: scaled(SIZE_M, width),
-        "height": lambda: scaled(SIZE_M, bank.agent_box[context.index, nearest, SizeColumn.HEIGHT]),
-        "type": lambda: [(past[-1].kind == kind).astype(jnp.float32) for kind in range(1, 5)],
+        "length": lambda: scale(SIZE_M, length),
+        "width": lambda: scale(SIZE_M, width),
+        "height": lambda: scale(SIZE_M, bank.agent_box[context.index, nearest, SizeColumn.HEIGHT]),
+        "type": lambda: [(past[-1].kind == kind).astype(jnp.float32) for kind in _TYPES],
     }
     columns = [column for name in config.features.agents for column in parts[name]()]
     group = _masked_columns("agents", columns, mask)
@@ -275,12 +276,16 @@ def _road_group(
         errors = position_errors(config.perception, bank, context, ROAD_NOISE_STREAM, config.road)
         rows = rows.at[:, :2].add(errors / POSITION_M)
     columns = features.columns_of("road", selected)
+    # Curvature is no default feature; :func:`_road` appends it.
     columns += [rows.shape[-1] - 1] if "curvature" in selected else []
     return _masked_group("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
 
 def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
+    """Return the road group with all default features, and the curvature if it is selected."""
+
     def rotate(x: Array, y: Array) -> tuple[Array, Array]:
+        """Return the components ahead and left; unlike :meth:`View.rotate`, which rounds differently."""
         return x * view.cos + y * view.sin, y * view.cos - x * view.sin
 
     x, y, layer = bank.road_at[context.index]
@@ -291,7 +296,8 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
     kinds = (RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA)
     for included, kind in zip((config.lanes, config.edges, config.crosswalks), kinds, strict=True):
         inside &= included or layer != kind
-    # Compact without sorting: the running count is the target index of each row inside.
+    # Compact without sorting: the running count is the target index of each row inside. Others, and those that do not
+    # fit, get indices beyond the end and are dropped.
     running = running_count(inside)
     target = jnp.where(inside, running - 1, config.road)
     source = jnp.zeros(config.road, jnp.int32).at[target].set(jnp.arange(len(inside)), mode="drop")
@@ -327,26 +333,27 @@ def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
 def _lights(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, state: Int[Array, " L"]
 ) -> Observation:
+    """Return the group ``lights``: those on the route first, then the others, each by distance."""
     line = bank.light_line[context.index]
     dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
-    # Ignore lights whose line is well behind ego. Sort those on the route first, then by distance.
+    # Ignore lights whose line is well behind ego.
     relevant = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_PASSED_M)
     perception, on_route = config.perception, line[LightRow.ARC] < NEVER_M
-    rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, 1e4)
-    chosen = _nearest(jnp.where(relevant, rank, jnp.inf), config.lights)
-    exists = relevant[chosen] & (jnp.arange(config.lights) < state.shape[0])
+    rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, _OFF_ROUTE_M)
+    first = _nearest(jnp.where(relevant, rank, jnp.inf), config.lights)
+    exists = relevant[first] & (jnp.arange(config.lights) < state.shape[0])
 
     def position() -> Float[Array, "K 2"]:
-        xy = view.point(line[LightRow.XY, chosen].T)
+        xy = view.point(line[LightRow.XY, first].T)
         if perception.noise_m > 0:
             errors = position_errors(perception, bank, context, LIGHT_NOISE_STREAM, state.shape[0])
-            xy = xy + errors[chosen]
+            xy = xy + errors[first]
         return xy / POSITION_M
 
     parts = {
         "position": position,
-        "state": lambda: _colour(state[chosen]),
-        "on_route": lambda: on_route[chosen, None].astype(jnp.float32),
+        "state": lambda: _colour(state[first]),
+        "on_route": lambda: on_route[first, None].astype(jnp.float32),
     }
     return _masked_group("lights", features.concatenate_features(config.features.lights, parts, ()), exists)
 
@@ -359,6 +366,7 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
 
 
 def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
+    """Return the group ``route``: points ahead on the route; all masked without a route on lanes."""
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, exists = route_ahead(bank, context.index, context.route_m, offsets)
     exists &= features.has_route(bank, context)

@@ -8,11 +8,7 @@ from typing import Any
 
 
 def name_of(function: Any, name: str = "") -> str:
-    """Return ``name``, or that of the function, or that of its class in snake_case.
-
-    Raises:
-        ValueError: The name is not an identifier, as that of a lambda.
-    """
+    """Return ``name``, or that of the function, or that of its class in snake_case."""
     name = name or getattr(function, "__name__", None) or ""
     if not name:
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(function).__name__).lower()
@@ -22,11 +18,7 @@ def name_of(function: Any, name: str = "") -> str:
 
 
 def check_unique(section: str, names: Sequence[str], taken: Sequence[str]) -> None:
-    """Check that names are distinct and not taken.
-
-    Raises:
-        ValueError: A name is taken or repeated.
-    """
+    """Check that names are distinct and not taken."""
     seen = set(taken)
     for name in names:
         if name in seen:

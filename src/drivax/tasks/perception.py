@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drivax.geometry.boxes import corners, passage
+from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, corners, passage
 from drivax.geometry.vectors import norm, rotate
 from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import LEVEL_M
@@ -27,9 +27,9 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import HISTORY, AgentContext, Frame
 
+#: Added to step numbers: keys fold in numbers from 0 on, and the history begins before step 0.
+_STEP_OFFSET = 16
 #: Numbers folded into the key of a step, by what is drawn.
-#: Added to step numbers, since keys are folded with numbers from 0 on.
-_BEFORE = 16
 _DROPOUT_STREAM, _NOISE_STREAM, _LIGHT_DROPOUT_STREAM, LIGHT_NOISE_STREAM, ROAD_NOISE_STREAM = range(5)
 
 
@@ -87,6 +87,7 @@ def perceive(
 def _add_errors(
     config: Perception, bank: ScenarioBank, context: AgentContext, frame: Frame, back: int
 ) -> Frame:
+    """Return the frame of ``back`` steps ago as ego perceived it then."""
     ego_motion, slots = context.history[HISTORY - 1 - back], jnp.arange(frame.valid.shape[0])
     others, detected, xy = slots != context.slot, frame.valid, frame.box[:, :2]
     distance = norm(xy - ego_motion[:2])
@@ -119,9 +120,9 @@ def in_view(
     Boxes in ``blocks`` occlude lines of sight through their interior, but not those that touch them. No box occludes
     itself, and a box around the eye occludes nothing. All S x S x 5 pairs are tested, about 40 operations each.
     """
-    dx, dy = eye[0] - box[:, 0], eye[1] - box[:, 1]
-    along, across = dx * box[:, 2] + dy * box[:, 3], dy * box[:, 2] - dx * box[:, 3]
-    inside = (jnp.abs(along) < box[:, 4] / 2) & (jnp.abs(across) < box[:, 5] / 2)
+    dx, dy = eye[0] - box[:, X], eye[1] - box[:, Y]
+    along, across = dx * box[:, COS] + dy * box[:, SIN], dy * box[:, COS] - dx * box[:, SIN]
+    inside = (jnp.abs(along) < box[:, LENGTH] / 2) & (jnp.abs(across) < box[:, WIDTH] / 2)
     points = jnp.concatenate([corners(box), box[:, None, :2]], axis=1)
     enters, leaves = passage(eye, points[:, :, None], box)
     others = ~jnp.eye(len(box), dtype=bool)
@@ -146,8 +147,9 @@ def position_errors(
 
 
 def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: int = 0) -> Array:
+    """Return the random key of the driven agent's perception ``back`` steps ago."""
     key = jax.random.key(config.seed)
-    for number in (bank.identity[context.index], context.step - back + _BEFORE, context.slot):
+    for number in (bank.identity[context.index], context.step - back + _STEP_OFFSET, context.slot):
         key = jax.random.fold_in(key, number)
     return key
 

@@ -30,6 +30,8 @@ _SPEEDING_MPS = 2.23
 _MIN_TTC_S = 1.0
 #: nuPlan's limits of jerk and lateral acceleration; their sum is the unpublished "max" of the published comfort.
 _JERK_MPS3, _LATERAL_MPS2 = 8.37, 4.89
+#: nuPlan's limits of braking and of acceleration.
+_BRAKING_MPS2, _ACCELERATION_MPS2 = 4.05, 2.40
 #: Cap of distances from the log, m.
 _MAX_LOG_DISTANCE_M = 10.0
 #: The goal is reached within this distance, m (semantics, ``reached_goal``).
@@ -60,6 +62,7 @@ def reward_term(*reads: str, option: str | None = None) -> Callable[[Any], Any]:
     """Register a function as the built-in term of its name that reads these facts."""
 
     def register(function: Any) -> Any:
+        """Add a function to ``TERMS`` and return it unchanged."""
         TERMS[function.__name__] = RewardTerm(function, frozenset(reads), option)
         return function
 
@@ -67,6 +70,7 @@ def reward_term(*reads: str, option: str | None = None) -> Callable[[Any], Any]:
 
 
 def _event(condition: Bool[Array, ""]) -> Scalar:
+    """Return 1.0 if a condition holds, else 0.0."""
     return condition.astype(jnp.float32)
 
 
@@ -99,7 +103,8 @@ def discomfort(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 
     Causal differences over 0.5 s, so that the reward never depends on future steps.
     """
-    along = jnp.where(now.acceleration_mps2 < 0, now.acceleration_mps2 / 4.05, now.acceleration_mps2 / 2.40)
+    acceleration = now.acceleration_mps2
+    along = jnp.where(acceleration < 0, acceleration / _BRAKING_MPS2, acceleration / _ACCELERATION_MPS2)
     ratios = jnp.stack([along, now.lateral_acceleration_mps2 / _LATERAL_MPS2, now.jerk_mps3 / _JERK_MPS3])
     return jnp.clip(jnp.max(ratios * ratios), 0.0, 1.0)
 
@@ -186,7 +191,7 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 
 
 # 1 at the step that enters a neighbouring lane of the same direction; at the step that leaves a lane that ends within
-# 100 m, or joins another (``scenario.bank.lane_passage``).
+# 100 m, or joins another (``scenario.bank.queries.lane_passage``).
 _event_term("lane_change", "lane_changed")
 _event_term("merge", "merged")
 
@@ -261,8 +266,8 @@ class RewardConfig(_Weights):
 
     def weights(self) -> dict[str, float]:
         """Return the nonzero weights by term, before ``scale``."""
-        changed = {name: weight for name in TERMS if (weight := getattr(self, name)) is not None}
-        weights = PRESETS[self.preset] | changed | {term.name: term.weight for term in self.own}
+        overrides = {name: weight for name in TERMS if (weight := getattr(self, name)) is not None}
+        weights = PRESETS[self.preset] | overrides | {term.name: term.weight for term in self.own}
         return {name: weight for name, weight in weights.items() if weight}
 
     @property

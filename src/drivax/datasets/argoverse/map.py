@@ -24,8 +24,10 @@ MAP_PATTERN = "log_map_archive_*.json"
 _AGAIN = "download the map again"
 #: A local map spans some hundred metres; a point this far from the others is damage.
 _SPREAD_M = 20_000.0
-#: Centre lines and widths are sampled at least this densely.
-_SPACING_M = 2.0
+#: Spacing of points on centre lines, at most, and the length below which a line has none.
+_SPACING_M, _SHORTEST_M = 2.0, 1e-3
+#: Ids are below this, so that those of edges and lines, which follow the largest, fit into 64 bits.
+_ID_END = 2**62
 _LANES = {"VEHICLE": RoadKind.LANE_SURFACE, "BUS": RoadKind.LANE_SURFACE, "BIKE": RoadKind.LANE_BIKE}
 #: WOMD has no white lines that are dashed on one side and solid on the other: they become double solid.
 _MARKS = {
@@ -67,6 +69,7 @@ def read_map(path: Path) -> ArgoverseMap:
 
 
 def _decode(content: Any) -> ArgoverseMap:
+    """Decode a parsed map; edges, painted lines and crossings get ids above those of the lanes."""
     groups = ("lane_segments", "drivable_areas", "pedestrian_crossings")
     if not isinstance(content, dict) or not all(isinstance(content.get(group), dict) for group in groups):
         raise DataError(f"is not an Argoverse 2 map with {', '.join(groups)}", cure=_AGAIN)
@@ -74,16 +77,18 @@ def _decode(content: Any) -> ArgoverseMap:
     lanes = [lane for segment in segments if (lane := _lane(segment)) is not None]
     lines = _lines(segments)
     rings: list[Area] = [(_points(area, "area_boundary"), ()) for area in areas]
-    walks = [np.concatenate((_points(walk, "edge1"), _points(walk, "edge2")[::-1])) for walk in crossings]
-    walks = [walk for walk in walks if len(walk) >= 3]
+    # A crossing has two edges in the same direction.
+    outlines = [np.concatenate((_points(item, "edge1"), _points(item, "edge2")[::-1])) for item in crossings]
+    outlines = [outline for outline in outlines if len(outline) >= 3]
     _check_extent(
-        [*(lane.points for lane in lanes), *(line for _, line in lines), *(r for r, _ in rings), *walks]
+        [*(lane.points for lane in lanes), *(line for _, line in lines), *(r for r, _ in rings), *outlines]
     )
-    free = 1 + max((lane.feature_id for lane in lanes), default=0)
-    edges = road_edges(rings, free)
-    shapes = [*lines, *((RoadKind.CROSSWALK, walk) for walk in walks)]
+    first_id = 1 + max((lane.feature_id for lane in lanes), default=0)
+    edges = road_edges(rings, first_id)
+    shapes = [*lines, *((RoadKind.CROSSWALK, outline) for outline in outlines)]
     rest = [
-        MapFeature(number, kind, points) for number, (kind, points) in enumerate(shapes, free + len(edges))
+        MapFeature(number, kind, points)
+        for number, (kind, points) in enumerate(shapes, first_id + len(edges))
     ]
     unknown = (content.keys() - {*groups}).union(*segments, *areas, *crossings) - _FIELDS
     lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes), unknown_fields=len(unknown))
@@ -94,7 +99,7 @@ def _lane(segment: Any) -> MapFeature | None:
     """Build a lane; None for a segment with a boundary of no length."""
     left, right = _points(segment, "left_lane_boundary"), _points(segment, "right_lane_boundary")
     lengths = [arc_lengths(line).max(initial=0.0) for line in (left, right)]
-    if min(lengths) < 1e-3:
+    if min(lengths) < _SHORTEST_M:
         return None
     # Sampled at the same fractions of their lengths, points of one row face each other.
     count = int(min(max(lengths), 2 * _SPREAD_M) / _SPACING_M) + 2
@@ -125,7 +130,7 @@ def _centre(segment: Any, middle: Float[Array, "point 3"]) -> Float[Array, "cent
         return middle
     centre = _points(segment, "centerline")
     arc = arc_lengths(centre)
-    if arc.max(initial=0.0) < 1e-3:
+    if arc.max(initial=0.0) < _SHORTEST_M:
         return middle
     centre[:, 2] = _at(middle, arc / arc[-1])[:, 2]
     return centre
@@ -140,6 +145,7 @@ def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]
             points = _points(segment, f"{side}_lane_boundary")
             if mark == "NONE" or len(points) < 2:
                 continue
+            # The key is the same for both directions in which lanes may store a shared line.
             centimetres = np.round(points * 100) + 0.0  # no negative zeros
             ends = centimetres[0].tolist(), centimetres[-1].tolist()
             key = (centimetres if ends[0] <= ends[1] else centimetres[::-1]).tobytes()
@@ -174,7 +180,7 @@ def _neighbour(record: Any, name: str) -> tuple[int, ...]:
 
 
 def _id(value: Any) -> int:
-    if not isinstance(value, int) or not 0 <= value < 2**62:
+    if not isinstance(value, int) or not 0 <= value < _ID_END:
         raise DataError(f"{str(value)[:40]!r} is not an id of a map element", cure=_AGAIN)
     return value
 
@@ -183,4 +189,5 @@ def _check_extent(lines: Sequence[Float[Array, "_ 3"]]) -> None:
     """Refuse points far away from the others: lines of that length would be cut into millions of segments."""
     points = np.concatenate([np.zeros((0, 3)), *lines])
     if len(points) and not (np.abs(points - np.median(points, axis=0)) <= _SPREAD_M).all():
-        raise DataError("a point of the map is nowhere near the others", cure=_AGAIN)
+        problem = f"a point of the map is more than {_SPREAD_M / 1000:.0f} km away from the others"
+        raise DataError(problem, cure=_AGAIN)

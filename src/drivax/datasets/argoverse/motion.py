@@ -24,7 +24,7 @@ from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag
 Array = np.ndarray[Any, Any]
 
 EGO = "AV"
-#: Values of ``object_category``.
+#: Value of ``object_category`` of tracks that the data set's benchmark scores.
 _SCORED = 2
 _STATE = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
 _COLUMNS: dict[str, Kind] = {
@@ -48,7 +48,7 @@ _TYPES: dict[str, tuple[AgentKind, tuple[float, float, float]]] = {
     "construction": (AgentKind.STATIC, (0.4, 0.4, 0.9)),
     "unknown": (AgentKind.OTHER, (0.5, 0.5, 1.0)),
 }
-_MOST_STEPS = 1000
+_MOST_STEPS, _LATEST_S = 1000, 1e12
 _SKIP = "skip this scenario, or download it again"
 
 
@@ -81,7 +81,7 @@ class ArgoverseMotion:
         )
 
     def count(self, path: Path) -> int:
-        """One: every scenario becomes one window."""
+        """Return 1, since every scenario becomes one window; 0 for another kind of file."""
         return int(tables.has_magic(path, tables.PARQUET_MAGIC))
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
@@ -122,7 +122,7 @@ def decode(path: Path) -> Recording:
         ego=ego,
         tracks=lift(tracks, local_map.features),
         features=local_map.features,
-        to_predict=tuple(row for row, word in enumerate(names.words) if word == focal),
+        to_predict=tuple(row for row, name in enumerate(names.words) if name == focal),
         of_interest=tuple(row for row, code in enumerate(category) if code == _SCORED),
         tags={"source_format": "av2-motion"} | place_tags(table.texts["city"].text(0)),
         lost=parsing.nonzero(
@@ -152,7 +152,7 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
     ego, row = names.words.index(EGO), names.of_row
     states = np.zeros((len(names.words), int(step.max()) + 1, len(_STATE)))
     valid = np.zeros(states.shape[:2], bool)
-    states[row, step], valid[row, step] = table.stacked(_STATE), True
+    states[row, step], valid[row, step] = table.stack(_STATE), True
     parsing.check_within(tables.FARTHEST_M, states[..., :3])
     parsing.check_within(tables.FASTEST_MPS, states[..., 3:])
     heading = np.where(valid, wrap(states[..., 2]), 0.0)
@@ -174,26 +174,26 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
 
 def _classes(types: Words, names: Words, ego: int) -> tuple[Array, Float64[Array, "track 3"]]:
     """Kinds and sizes of all tracks."""
-    known = [_TYPES.get(types.words[code], _TYPES["unknown"]) for code in _of_track(types.of_row, names)]
-    sizes = np.array([size for _, size in known], np.float64)
+    classes = [_TYPES.get(types.words[code], _TYPES["unknown"]) for code in _of_track(types.of_row, names)]
+    sizes = np.array([size for _, size in classes], np.float64)
     sizes[ego] = tables.EGO_SIZE
-    return np.array([kind for kind, _ in known], np.int8), sizes
+    return np.array([kind for kind, _ in classes], np.int8), sizes
 
 
-def _track_ids(words: tuple[str, ...]) -> Int[Array, " track"]:
+def _track_ids(names: tuple[str, ...]) -> Int[Array, " track"]:
     """The ids as numbers, the ego's as 0; row numbers if some id is not a number or not unique."""
-    texts = ["0" if word == EGO else word for word in words]
+    texts = ["0" if name == EGO else name for name in names]
     if all(text.isascii() and text.isdecimal() and len(text) < 10 for text in texts):
         ids = [int(text) for text in texts]
         if len(set(ids)) == len(ids):
             return np.array(ids, np.int64)
-    return np.arange(len(words), dtype=np.int64)
+    return np.arange(len(names), dtype=np.int64)
 
 
 def _timestamps(table: Table, steps: int) -> Float64[Array, " step"]:
     """Seconds of every step: the file gives the first, the last and their number."""
     start, end = (float(table.numbers[f"{name}_timestamp"][0]) * 1e-9 for name in ("start", "end"))
     intervals = int(table.numbers["num_timestamps"][0]) - 1
-    between = (end - start) / intervals if intervals > 0 else DT_S
-    parsing.check_within(1e12, np.array([start, between]))
-    return start + between * np.arange(steps)
+    step_s = (end - start) / intervals if intervals > 0 else DT_S
+    parsing.check_within(_LATEST_S, np.array([start, step_s]))
+    return start + step_s * np.arange(steps)

@@ -50,6 +50,7 @@ _KINDS = {
     **dict.fromkeys(_CYCLES, AgentKind.CYCLIST),
     **dict.fromkeys(_THINGS, AgentKind.STATIC),
 }
+
 _SKIP = "skip this log, or download it again"
 
 
@@ -160,8 +161,9 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
     pose = _poses(poses, clock)
     stamp, code = boxes.numbers["timestamp_ns"], boxes.texts["track_uuid"].of_row
     category = boxes.texts["category"]
-    is_ego = np.array([word == EGO for word in category.words])[category.of_row]
+    is_ego = np.array([name == EGO for name in category.words])[category.of_row]
     rows = np.flatnonzero(np.isin(stamp, clock) & ~is_ego)
+    # ``first``: a box of each track; ``row``: the track of each box, without the ego.
     codes, first, row = np.unique(code[rows], return_index=True, return_inverse=True)
     if (1 + len(codes)) * len(clock) > tables.MOST_STATES:
         raise DataError(f"{len(codes)} tracks of {len(clock)} frames are too many")
@@ -187,7 +189,7 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
 def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:
     """The pose of the car at every frame: quaternion (w, x, y, z) and translation in the city."""
     known, first = np.unique(poses.numbers["timestamp_ns"], return_index=True)
-    pose = poses.stacked(_POSE)[first[np.searchsorted(known, clock)]]
+    pose = poses.stack(_POSE)[first[np.searchsorted(known, clock)]]
     parsing.check_within(tables.FARTHEST_M, pose[:, 4:])
     pose[:, :4] = _unit(pose[:, :4])
     return pose
@@ -195,7 +197,7 @@ def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:
 
 def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) -> Float[Array, "box 7"]:
     """Boxes in the city's frame: x, y, z, heading, length, width, height."""
-    table = boxes.stacked((*_POSE, *_SIZE))[rows]
+    table = boxes.stack((*_POSE, *_SIZE))[rows]
     parsing.check_within(tables.FARTHEST_M, table[:, 4:7])
     parsing.check_within(tables.LARGEST_M, table[:, 7:])
     forward = rotate(pose[:, :4], rotate(_unit(table[:, :4]), _AHEAD))
@@ -206,7 +208,7 @@ def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) 
 def _ego(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "step 7"]) -> Float[Array, "step 7"]:
     """The ego's boxes like those of :func:`_boxes`."""
     # Some logs hold boxes of the car itself: the sizes are right, the centres are the rear axle again.
-    size = np.median(boxes.stacked(_SIZE)[rows], axis=0) if len(rows) else np.array(tables.EGO_SIZE)
+    size = np.median(boxes.stack(_SIZE)[rows], axis=0) if len(rows) else np.array(tables.EGO_SIZE)
     parsing.check_within(tables.LARGEST_M, size)
     offset = np.array([tables.CENTRE_AHEAD_M, 0.0, size[2] / 2 - tables.AXLE_HEIGHT_M])
     centre = rotate(pose[:, :4], offset) + pose[:, 4:]
@@ -223,6 +225,7 @@ def rotate(quaternion: Float[Array, "row 4"], vector: Float[Array, "*rows 3"]) -
 
 
 def _unit(quaternion: Float[Array, "row 4"]) -> Float[Array, "row 4"]:
+    """Normalise quaternions; refuse those that are far from unit length."""
     parsing.check_within(2.0, quaternion)
     length = np.linalg.norm(quaternion, axis=1, keepdims=True)
     if not (length > 0.5).all():

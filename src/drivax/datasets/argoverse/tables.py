@@ -51,8 +51,8 @@ class Table:
     texts: Mapping[str, Words]
     others: frozenset[str]
 
-    def stacked(self, names: Sequence[str]) -> Array:
-        """Columns of numbers side by side, float64, shape ``(rows, len(names))``."""
+    def stack(self, names: Sequence[str]) -> Array:
+        """Stack columns of numbers, float64 ``[row, name]``."""
         return np.stack([self.numbers[name] for name in names], axis=1).astype(np.float64)
 
 
@@ -118,6 +118,7 @@ def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> tuple[
 
 
 def _check(names: Sequence[str], columns: Sequence[str], rows: int) -> None:
+    """Refuse a table that lacks a column, has it twice, or has an implausible number of rows."""
     for name in columns:
         if names.count(name) != 1:
             raise DataError(f"has no column {name}", cure="this is another kind of table, or a damaged one")
@@ -125,15 +126,16 @@ def _check(names: Sequence[str], columns: Sequence[str], rows: int) -> None:
         raise DataError(f"invalid row count {rows}", cure=_AGAIN)
 
 
-def _numbers(column: Any, whole: bool, name: str) -> Array:
+def _numbers(column: Any, is_integer: bool, name: str) -> Array:
+    """Return a column of integers or, unless ``is_integer``, of any numbers."""
     import pyarrow as pa
 
-    fits = pa.types.is_integer(column.type) or (not whole and pa.types.is_floating(column.type))
+    fits = pa.types.is_integer(column.type) or (not is_integer and pa.types.is_floating(column.type))
     if not fits or column.null_count:
         raise DataError(
             f"column {name} contains {column.type} with {column.null_count} null values", cure=_AGAIN
         )
-    return column.to_numpy().astype(np.int64 if whole else np.float64)
+    return column.to_numpy().astype(np.int64 if is_integer else np.float64)
 
 
 def _words(column: Any) -> Words:

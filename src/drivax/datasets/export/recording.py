@@ -32,8 +32,8 @@ def restore(scenario: Scenario) -> Recording:
     get ids above all others.
     """
     largest = max(int(scenario.feature_id.max(initial=0)), int(scenario.lane_id.max(initial=0)))
-    fresh = itertools.count(largest + 1)
-    features = (*_features(scenario, fresh), *_stop_signs(scenario, fresh))
+    new_ids = itertools.count(largest + 1)
+    features = (*_features(scenario, new_ids), *_stop_signs(scenario, new_ids))
     masks = scenario.agent_valid, scenario.parked_valid
     moving, parked = (np.flatnonzero(mask.any(axis=0)) for mask in masks)
     marks = scenario.agent_flags[moving]
@@ -47,7 +47,7 @@ def restore(scenario: Scenario) -> Recording:
         tracks=_tracks(scenario, moving, parked),
         features=features,
         seen=_seen(scenario, moving, parked),
-        lights=_lights(scenario, fresh),
+        lights=_lights(scenario, new_ids),
         to_predict=tuple(np.flatnonzero(marks & PREDICT_BIT).tolist()),
         of_interest=tuple(np.flatnonzero(marks & INTEREST_BIT).tolist()),
         tags=scenario.tags,
@@ -58,35 +58,38 @@ def restore(scenario: Scenario) -> Recording:
 def _over_time(scenario: Scenario, moving: _Array, parked: _Array, name: str) -> Bool[_Array, "track time"]:
     """A mask of both blocks in the order of tracks."""
     steps = int(scenario.steps)
-    moves, stands = scenario.record["agent_" + name], scenario.record["parked_" + name]
-    return np.concatenate((moves[:steps, moving], stands[:steps, parked]), axis=1).T
+    agents, parked_agents = scenario.record["agent_" + name], scenario.record["parked_" + name]
+    return np.concatenate((agents[:steps, moving], parked_agents[:steps, parked]), axis=1).T
 
 
 def _tracks(scenario: Scenario, moving: _Array, parked: _Array) -> Tracks:
+    """Tracks of the agents in some slots of both blocks, in the source's frame."""
     steps = int(scenario.steps)
-    still = np.zeros((steps, len(parked), 1))
+    repeat = np.zeros((steps, len(parked), 1))
     valid = _over_time(scenario, moving, parked, "valid")
     mask = valid.T[..., None]
 
-    def timed(moves: _Array, stands: _Array) -> _Array:
-        """[track, time, number], zero where not valid."""
-        both = np.concatenate((moves[:steps, moving].reshape(steps, len(moving), -1), stands + still), axis=1)
+    def join_steps(agents: _Array, poses: _Array) -> _Array:
+        """Join time series of moving agents and poses of parked ones: [track, time, number], zero where not valid."""
+        series = agents[:steps, moving].reshape(steps, len(moving), -1)
+        both = np.concatenate((series, poses + repeat), axis=1)
         return np.swapaxes(np.where(mask, both, 0.0), 0, 1).astype(np.float64)
 
-    def block(moves: _Array, stands: _Array) -> _Array:
-        return np.concatenate((moves[moving], stands[parked]))
+    def join(agents: _Array, parked_agents: _Array) -> _Array:
+        """Join constants of both blocks."""
+        return np.concatenate((agents[moving], parked_agents[parked]))
 
-    size = block(scenario.agent_size, scenario.parked_size).astype(np.float64)
+    size = join(scenario.agent_size, scenario.parked_size).astype(np.float64)
     origin = np.where(mask, scenario.origin, 0.0).swapaxes(0, 1)
     return Tracks(
-        xy=timed(scenario.agent_xy, scenario.parked_xy[parked]) + origin[..., :2],
-        z=timed(scenario.agent_z, scenario.parked_z[parked, None])[..., 0] + origin[..., 2],
-        heading=timed(scenario.agent_heading, scenario.parked_heading[parked, None])[..., 0],
-        velocity=timed(scenario.agent_velocity, np.zeros((len(parked), 2))),
+        xy=join_steps(scenario.agent_xy, scenario.parked_xy[parked]) + origin[..., :2],
+        z=join_steps(scenario.agent_z, scenario.parked_z[parked, None])[..., 0] + origin[..., 2],
+        heading=join_steps(scenario.agent_heading, scenario.parked_heading[parked, None])[..., 0],
+        velocity=join_steps(scenario.agent_velocity, np.zeros((len(parked), 2))),
         size=np.where(valid[..., None], size[:, None], 0.0),
         valid=valid.copy(),
-        kind=block(scenario.agent_kind, scenario.parked_kind).astype(np.int8),
-        track_id=block(scenario.agent_id, scenario.parked_id).astype(np.int64),
+        kind=join(scenario.agent_kind, scenario.parked_kind).astype(np.int8),
+        track_id=join(scenario.agent_id, scenario.parked_id).astype(np.int64),
     )
 
 
@@ -117,19 +120,20 @@ def _polylines(scenario: Scenario) -> list[tuple[Float[_Array, "point 3"], int]]
     return [(np.concatenate((begin[chain[:1]], end[chain])).astype(np.float64), chain[0]) for chain in chains]
 
 
-def _features(scenario: Scenario, fresh: Iterator[int]) -> list[MapFeature]:
+def _features(scenario: Scenario, new_ids: Iterator[int]) -> list[MapFeature]:
+    """A feature per polyline; only the first one of a source's feature keeps its id and links."""
     features, numbers = [], set()
     for local, segment in _polylines(scenario):
         kind = RoadKind(int(scenario.segment_kind[segment]))
         row, lane = int(scenario.segment_feature[segment]), int(scenario.segment_lane[segment])
         number = int(scenario.lane_id[lane] if lane >= 0 else scenario.feature_id[row] if row >= 0 else -1)
-        first = number >= 0 and number not in numbers
+        is_first = number >= 0 and number not in numbers
         numbers.add(number)
         points = local + scenario.origin
         if kind in POLYGON_KINDS and np.array_equal(points[0], points[-1]):
             points = points[:-1]
-        links = _links(scenario, lane) if first and kind in LANE_KINDS and lane >= 0 else {}
-        features.append(MapFeature(number if first else next(fresh), kind, points, **links))
+        links = _links(scenario, lane) if is_first and kind in LANE_KINDS and lane >= 0 else {}
+        features.append(MapFeature(number if is_first else next(new_ids), kind, points, **links))
     return features
 
 
@@ -137,9 +141,10 @@ def _links(scenario: Scenario, lane: int) -> dict[str, Any]:
     """Fields of a lane from the lane graph, in ids of the source."""
 
     def ids(rows: _Array) -> tuple[int, ...]:
+        """Return the source's ids of lanes by index, without missing ones (-1)."""
         return tuple(int(scenario.lane_id[row]) for row in rows if row >= 0)
 
-    # Links made from geometry are not the source's; they are made again.
+    # Links that the assembly chained by geometry are not the source's; a new assembly chains them again.
     has_graph = Flag.CHAINED_GRAPH not in scenario.has
     limit, width = float(scenario.lane_limit[lane]), float(scenario.lane_width[lane])
     return {
@@ -153,7 +158,7 @@ def _links(scenario: Scenario, lane: int) -> dict[str, Any]:
     }
 
 
-def _stop_signs(scenario: Scenario, fresh: Iterator[int]) -> list[MapFeature]:
+def _stop_signs(scenario: Scenario, new_ids: Iterator[int]) -> list[MapFeature]:
     """Stop signs, at the height of the nearest segment."""
     rows = np.flatnonzero((scenario.stop_xy != 0).any(axis=1) | (scenario.stop_lane >= 0).any(axis=1))
     near = scenario.segment_a[: int(scenario.segment_blocks[3])].astype(np.float64)
@@ -163,15 +168,16 @@ def _stop_signs(scenario: Scenario, fresh: Iterator[int]) -> list[MapFeature]:
         z = near[np.hypot(*(near[:, :2] - xy).T).argmin(), 2] if len(near) else 0.0
         lanes = tuple(int(scenario.lane_id[lane]) for lane in scenario.stop_lane[row] if lane >= 0)
         point = np.append(xy, z) + scenario.origin
-        signs.append(MapFeature(next(fresh), RoadKind.STOP_SIGN, point[None], lanes=lanes))
+        signs.append(MapFeature(next(new_ids), RoadKind.STOP_SIGN, point[None], lanes=lanes))
     return signs
 
 
-def _lights(scenario: Scenario, fresh: Iterator[int]) -> tuple[Light, ...]:
+def _lights(scenario: Scenario, new_ids: Iterator[int]) -> tuple[Light, ...]:
+    """Lights that were observed, at the middle of their stop lines."""
     lights = []
     for row in np.flatnonzero((scenario.light_state >= 0).any(axis=0)):
         line, lane = scenario.light_line[row].astype(np.float64), int(scenario.light_lane[row])
         middle = np.array([*(line[:2] + line[2:]) / 2, scenario.light_z[row]]) + scenario.origin
         states = scenario.light_state[: int(scenario.steps), row].copy()
-        lights.append(Light(int(scenario.lane_id[lane]) if lane >= 0 else next(fresh), middle, states))
+        lights.append(Light(int(scenario.lane_id[lane]) if lane >= 0 else next(new_ids), middle, states))
     return tuple(lights)

@@ -35,10 +35,11 @@ _Array = np.ndarray[Any, Any]
 
 AGENTS, LIGHTS, POINTS = 128, 16, 30_000
 _SPANS = {"past": slice(0, 10), "current": slice(10, 11), "future": slice(11, STEPS)}
-#: Most tracks to predict that come before all others.
-_FIRST = 8
-#: Just under 1 m, so that rounding makes no longer gap, where readers cut polylines.
-_SPACING_M = 0.998
+#: Most tracks to predict that come before all others; rank of tracks without a current position, less their steps.
+_FIRST, _ABSENT_RANK = 8, 1e9
+#: Spacing of map points just under 1 m, so that rounding makes no longer gap, where readers cut polylines; and the
+#: factor by which it grows until the points fit.
+_SPACING_M, _WIDEN = 0.998, 1.1
 #: Largest absolute coordinate that is written; up to it float32 is exact to half a millimetre.
 _ABSOLUTE_M = 16_384.0
 #: Ends of the whole numbers that float32 and int32 hold.
@@ -102,9 +103,9 @@ def _over_time(recording: Recording) -> tuple[Tracks, Counter[str]]:
     tracks = recording.tracks
     steps, known = _steps(recording)
     index = np.clip(steps, 0, tracks.valid.shape[1] - 1)
-    timed = {name: getattr(tracks, name)[:, index] for name in ("xy", "z", "heading", "velocity", "size")}
+    series = {name: getattr(tracks, name)[:, index] for name in ("xy", "z", "heading", "velocity", "size")}
     valid = tracks.valid[:, index] & known
-    return replace(tracks, **timed, valid=valid), Counter(steps=int(tracks.valid.shape[1] - known.sum()))
+    return replace(tracks, **series, valid=valid), Counter(steps=int(tracks.valid.shape[1] - known.sum()))
 
 
 def _steps(recording: Recording) -> tuple[_Array, _Array]:
@@ -120,18 +121,20 @@ def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
     others, those with most valid steps first.
     """
     now = tracks.valid[:, CURRENT_STEP]
-    predicted = [row for row in recording.to_predict if now[row] and row != recording.ego]
-    first = sorted(predicted, key=lambda row: int(tracks.track_id[row]))[:_FIRST]
-    at = tracks.xy[:, CURRENT_STEP]
-    away = np.hypot(*(at - at[recording.ego]).T)
-    rank = np.where(now, away, 1e9 - tracks.valid.sum(axis=1))
+    to_predict = [row for row in recording.to_predict if now[row] and row != recording.ego]
+    first = sorted(to_predict, key=lambda row: int(tracks.track_id[row]))[:_FIRST]
+    xy = tracks.xy[:, CURRENT_STEP]
+    distance = np.hypot(*(xy - xy[recording.ego]).T)
+    # One sort key: distances, with the tracks to predict below all of them and absent tracks above.
+    rank = np.where(now, distance, _ABSENT_RANK - tracks.valid.sum(axis=1))
     rank[first] = -2.0 + np.arange(len(first)) / _FIRST
     rank[recording.ego] = -np.inf
     order = np.argsort(rank, kind="stable")
     return order[tracks.valid[order].any(axis=1)]
 
 
-def _padded(values: _Array, rows: int, fill: int = -1) -> _Array:
+def _pad(values: _Array, rows: int, fill: int = -1) -> _Array:
+    """Pad an array to a number of rows."""
     out = np.full((rows, *values.shape[1:]), fill, values.dtype)
     out[: len(values)] = values
     return out
@@ -147,6 +150,7 @@ def _by_span(prefix: str, table: Mapping[str, _Array], axis: int) -> dict[str, _
 
 
 def _states(tracks: Tracks, order: _Array, micros: _Array, origin: _Array) -> dict[str, _Array]:
+    """Features of agents over time; -1 where not valid."""
     valid = tracks.valid[order]
     vx, vy = np.moveaxis(tracks.velocity[order], -1, 0)
     columns = {
@@ -163,8 +167,8 @@ def _states(tracks: Tracks, order: _Array, micros: _Array, origin: _Array) -> di
         "vel_yaw": np.arctan2(vy, vx),
         "timestamp_micros": np.broadcast_to(micros, valid.shape),
     }
-    table = {name: _padded(np.where(valid, column, -1), AGENTS) for name, column in columns.items()}
-    table["valid"] = _padded(valid.astype(np.int64), AGENTS, 0)
+    table = {name: _pad(np.where(valid, column, -1), AGENTS) for name, column in columns.items()}
+    table["valid"] = _pad(valid.astype(np.int64), AGENTS, 0)
     return _by_span("state", table, axis=1)
 
 
@@ -187,7 +191,7 @@ def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Ar
         "type": kinds.astype(np.float32),
         **{name: np.isin(order, rows).astype(np.int64) for name, rows in marks.items()},
     }
-    return {f"state/{name}": _padded(column, AGENTS) for name, column in columns.items()}
+    return {f"state/{name}": _pad(column, AGENTS) for name, column in columns.items()}
 
 
 def _numbers(recording: Recording) -> dict[int, int]:
@@ -208,19 +212,19 @@ def _lights(
     for column, light in enumerate(lights):
         states[known, column] = light.states[steps[known]]
     slot = np.broadcast_to(np.arange(LIGHTS), (STEPS, LIGHTS))
-    if len(lights) > LIGHTS:
+    if len(lights) > LIGHTS:  # Observed lights first, by step: a slot may change its lane.
         slot = np.argsort(states < 0, axis=1, kind="stable")[:, :LIGHTS]
         lost["light_states"] += int((states >= 0).sum() - (np.take_along_axis(states, slot, 1) >= 0).sum())
-    seen = np.take_along_axis(states, slot, 1) >= 0
+    observed = np.take_along_axis(states, slot, 1) >= 0
     lane = np.full(states.shape[1], -1, np.int64)
     point = np.full((states.shape[1], 3), -1.0)
     lane[: len(lights)] = [numbers[light.lane_id] for light in lights]
     point[: len(lights)] = np.array([light.stop_point for light in lights]).reshape(-1, 3) - origin
     table = {
         "state": np.take_along_axis(states, slot, 1),
-        "id": np.where(seen, lane[slot], -1),
-        "valid": seen.astype(np.int64),
-        **{axis: np.where(seen, point[slot, i], -1.0) for i, axis in enumerate("xyz")},
+        "id": np.where(observed, lane[slot], -1),
+        "valid": observed.astype(np.int64),
+        **{axis: np.where(observed, point[slot, i], -1.0) for i, axis in enumerate("xyz")},
         "timestamp_micros": micros,
     }
     return _by_span("traffic_light_state", table, axis=0)
@@ -229,27 +233,27 @@ def _lights(
 def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _Array) -> dict[str, _Array]:
     """Points along every feature, at most 1 m apart; further where 30,000 would not be enough."""
     rank = {kind: number for number, kind in enumerate(_ORDER)}
-    ordered = sorted(features, key=lambda feature: rank[feature.kind])
+    features = tuple(sorted(features, key=lambda feature: rank[feature.kind]))
     spacing = _SPACING_M
-    lines = [_dense(feature, spacing) for feature in ordered]
+    lines = [_sample(feature, spacing) for feature in features]
     while sum(map(len, lines)) > POINTS:
-        spacing *= 1.1
-        lines = [_dense(feature, spacing) for feature in ordered]
+        spacing *= _WIDEN
+        lines = [_sample(feature, spacing) for feature in features]
     counts = [len(line) for line in lines]
-    limits = [-1.0 if f.limit_mps is None else f.limit_mps / MPS_PER_MPH for f in ordered]
+    limits = [-1.0 if f.limit_mps is None else f.limit_mps / MPS_PER_MPH for f in features]
     columns = {
         "xyz": np.concatenate([*lines, np.zeros((0, 3))]) - origin,
         "dir": np.concatenate([*map(_directions, lines), np.zeros((0, 3))]),
-        "id": np.repeat([numbers[f.feature_id] for f in ordered], counts).astype(np.int64)[:, None],
-        "type": np.repeat([int(f.kind) for f in ordered], counts).astype(np.int64)[:, None],
+        "id": np.repeat([numbers[f.feature_id] for f in features], counts).astype(np.int64)[:, None],
+        "type": np.repeat([int(f.kind) for f in features], counts).astype(np.int64)[:, None],
         "speed_limit": np.repeat(limits, counts).astype(np.float64),
     }
-    table = {f"roadgraph_samples/{name}": _padded(column, POINTS) for name, column in columns.items()}
+    table = {f"roadgraph_samples/{name}": _pad(column, POINTS) for name, column in columns.items()}
     valid = np.ones((sum(counts), 1), np.int64)
-    return {**table, "roadgraph_samples/valid": _padded(valid, POINTS, 0)}
+    return {**table, "roadgraph_samples/valid": _pad(valid, POINTS, 0)}
 
 
-def _dense(feature: MapFeature, spacing_m: float) -> _Array:
+def _sample(feature: MapFeature, spacing_m: float) -> _Array:
     """Points along a feature at most ``spacing_m`` apart, its own included; polygons are closed."""
     points = feature.points
     if feature.kind in POLYGON_KINDS:
@@ -268,21 +272,21 @@ def _directions(line: _Array) -> _Array:
     return step / np.where(length > 0, length, 1.0)
 
 
-def _paths(scenario: Scenario, numbers: Mapping[int, int], shift: _Array, form: Paths) -> dict[str, _Array]:
+def _paths(scenario: Scenario, numbers: Mapping[int, int], shift: _Array, paths: Paths) -> dict[str, _Array]:
     """Routes from ego's first logged position; the route to the goal first and on the route.
 
     The log route (stored row 1) is privileged and not exported, unless no lane leads to the goal: then it is row 0.
     """
-    shape = (form.count, form.points)
+    shape = (paths.count, paths.points)
     xyz, lane = np.full((*shape, 3), -1.0), np.full(shape, -1, np.int64)
-    arc, valid, on_route = np.zeros(shape), np.zeros(shape, np.int64), np.zeros((form.count, 1), np.int64)
+    arc, valid, on_route = np.zeros(shape), np.zeros(shape, np.int64), np.zeros((paths.count, 1), np.int64)
     log = scenario.agent_xy[scenario.agent_valid[:, 0], 0].astype(np.float64)
-    rows = [row for row in np.flatnonzero(scenario.route_points > 1) if row != 1][: form.count]
+    rows = [row for row in np.flatnonzero(scenario.route_points > 1) if row != 1][: paths.count]
     for number, row in enumerate(rows):
         count = int(scenario.route_points[row])
         line = np.column_stack((scenario.route_xy[row], scenario.route_z[row]))[:count].astype(np.float64)
         begin = min(int(np.hypot(*(line[:, :2] - log[0]).T).argmin()), count - 2)
-        points, index = resample(line[begin:], form.spacing_m, form.points)
+        points, index = resample(line[begin:], paths.spacing_m, paths.points)
         lanes = scenario.route_lane[row, begin:count][index]
         ids = np.where(lanes >= 0, scenario.lane_id[lanes], -1).tolist()
         size = len(points)

@@ -49,11 +49,7 @@ class Export:
     overwrite: bool = False
 
     def check(self) -> None:
-        """Check the options.
-
-        Raises:
-            UsageError: An option is invalid.
-        """
+        """Check the options."""
         for name in ("limit", "shard_size"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -145,7 +141,7 @@ def refuse_part(opened: ScenarioSet, out: Path) -> None:
 
 @dataclass(frozen=True)
 class _Work:
-    """Rows of a set to write into a folder that will get a name."""
+    """An export to write: rows of a set, the folder to write into, and the name that the folder will get."""
 
     opened: ScenarioSet
     rows: Sequence[int]
@@ -189,7 +185,7 @@ def _write_scenes(work: _Work) -> _Written:
 
 
 def _note(work: _Work, files: Sequence[str], lost: Mapping[str, int]) -> dict[str, Any]:
-    """The description: neither format keeps data set and segment, nor says which scenario is in which shard."""
+    """Content of ``export.json``: what the formats do not keep, such as data sets, segments and files of scenarios."""
     opened, names = work.opened, ("scenario_id", "dataset", "segment")
     return {
         "drivax_version": metadata.version("drivax"),
@@ -204,6 +200,7 @@ def _note(work: _Work, files: Sequence[str], lost: Mapping[str, int]) -> dict[st
 
 
 def _refuse_existing(out: Path, options: Export) -> None:
+    """Refuse a path that exists, except an empty folder, or an export if it may be overwritten."""
     empty = out.is_dir() and not any(out.iterdir())
     if empty or not (out.exists() or out.is_symlink()):
         return

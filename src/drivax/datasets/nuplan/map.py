@@ -54,9 +54,9 @@ CURE = "download the nuPlan maps again"
 MARGIN_M = 250.0
 #: A feature near the drive that reaches further than this from it is damaged.
 _FARTHEST_M = 20_000.0
-#: Plausible distances between boundaries, metres.
+#: Plausible distances between boundaries, metres, and the fractions of a lane's length at which they are measured.
 _WIDTHS_M = (1.5, 10.0)
-_WIDTH_PLACES = (0.1, 0.3, 0.5, 0.7, 0.9)
+_WIDTH_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9)
 #: Boundary types that are painted, as far as public readers of the format agree; 1 and 3 are not painted.
 _LINES: Mapping[int | None, RoadKind] = {
     0: RoadKind.LINE_BROKEN_SINGLE_WHITE,
@@ -78,9 +78,10 @@ def find_map(log: Path, name: str) -> Path:
     above it, then in the nuPlan devkit's ``NUPLAN_MAPS_ROOT``.
     """
     listing = _listing(log)
-    known = parsing.load_json(listing)
-    entry = known.get(name) if isinstance(known, dict) else None
+    maps = parsing.load_json(listing)
+    entry = maps.get(name) if isinstance(maps, dict) else None
     version = entry.get("version") if isinstance(entry, dict) else None
+    # Both become folders of a path, so neither may hold a separator.
     if not isinstance(version, str) or not all(re.fullmatch(r"[\w.-]+", word) for word in (version, name)):
         raise DataError(f"lists no map {name[:80]!r}", file=listing, cure=CURE)
     path = listing.parent / name / version / "map.gpkg"
@@ -150,6 +151,7 @@ def city_map(path: Path) -> City:
 
 @functools.lru_cache(maxsize=2)
 def _city(path: Path, mtime_ns: int, size: int) -> City:
+    """Index a map; time and size of the file only serve the cache."""
     with open_database(path) as database:
         layers = {name: layer for name in LAYERS if (layer := read_layer(database, name, LAYERS[name]))}
         if missing := [name for name in _BASE_LAYERS if name not in layers]:
@@ -177,7 +179,7 @@ def _read_epsg(database: Database) -> int:
     return int(match[1])
 
 
-def whole(value: Any) -> int | None:
+def as_integer(value: Any) -> int | None:
     """A feature id or enumeration, which files hold as integers, floats or texts; None for anything else."""
     if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 11:
         value = int(value)
@@ -195,7 +197,8 @@ def _limit(value: Any) -> float | None:
 
 
 def _lane_id(layer: str, value: Any) -> int | None:
-    fid = whole(value)
+    """Packed id of a feature whose fid a file gives; None without one."""
+    fid = as_integer(value)
     return None if fid is None else feature_id(layer, fid)
 
 
@@ -226,24 +229,24 @@ def _lanes(layers: Mapping[str, Layer]) -> dict[int, Lane]:
 def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
     """Lanes with their neighbours: the next and the last index of the same group, counted from the left."""
     lanes: dict[int, Lane] = {}
-    places: dict[tuple[int, int], int] = {}
+    lane_at: dict[tuple[int, int], int] = {}
     slots: dict[int, tuple[int, int]] = {}
     for fid, lane, group, index, left, right, limit in _table(layer, *LAYERS["lanes_polygons"]):
         number = _lane_id("lanes_polygons", fid if lane is None else lane)
         if number is None or number not in baselines or number in lanes:
             continue
-        block, slot = whole(group), whole(index)
+        block, slot = as_integer(group), as_integer(index)
         lanes[number] = Lane(
             baseline=baselines[number],
             roadblock=None if block is None else ("lane", block),
             limit_mps=_limit(limit),
-            boundaries=(whole(left), whole(right)),
+            boundaries=(as_integer(left), as_integer(right)),
         )
         if block is not None and slot is not None:
-            places.setdefault((block, slot), number)
+            lane_at.setdefault((block, slot), number)
             slots[number] = block, slot
     for number, (block, slot) in slots.items():
-        neighbours = {"left": places.get((block, slot - 1)), "right": places.get((block, slot + 1))}
+        neighbours = {"left": lane_at.get((block, slot - 1)), "right": lane_at.get((block, slot + 1))}
         lanes[number] = replace(lanes[number], **neighbours)
     return lanes
 
@@ -252,11 +255,11 @@ def _connectors(layers: Mapping[str, Layer], baselines: Mapping[int, int]) -> It
     """Connectors by packed id; the lane before one is its ``exit_lane_fid``, where one leaves that lane."""
     name = "gen_lane_connectors_scaled_width_polygons"
     sides = {
-        whole(connector): (whole(left), whole(right))
+        as_integer(connector): (as_integer(left), as_integer(right))
         for _, connector, left, right in _table(layers.get(name), *LAYERS[name])
     }
     for fid, leave, enter, group, limit in _table(layers["lane_connectors"], *LAYERS["lane_connectors"]):
-        number, block = _lane_id("lane_connectors", fid), whole(group)
+        number, block = _lane_id("lane_connectors", fid), as_integer(group)
         before, after = _lane_id("lanes_polygons", leave), _lane_id("lanes_polygons", enter)
         if number is None or number not in baselines:
             continue
@@ -264,7 +267,7 @@ def _connectors(layers: Mapping[str, Layer], baselines: Mapping[int, int]) -> It
             baseline=baselines[number],
             roadblock=None if block is None else ("connector", block),
             limit_mps=_limit(limit),
-            boundaries=sides.get(whole(fid), (None, None)),
+            boundaries=sides.get(as_integer(fid), (None, None)),
             successors=[] if after is None else [after],
             predecessors=[] if before is None else [before],
         )
@@ -302,15 +305,18 @@ def features_around(
         problem = f"no lane of the map {city.path} lies within {MARGIN_M:.0f} m of the drive"
         raise DataError(problem, cure=CURE)
     features += road_edges(areas, feature_id("road_edges", 0))
-    return tuple(features), parsing.nonzero(map_geometries=len(around.damaged), lanes=around.pointless)
+    return tuple(features), parsing.nonzero(map_geometries=len(around.damaged), lanes=around.lost_lanes)
 
 
 class _Around:
-    """Decodes the map around a drive; counts what it cannot use."""
+    """Decodes the map around ``drive``, a box (west, south, east, north) in the system of the logs.
+
+    ``damaged`` holds layer and row of unusable geometries; ``lost_lanes`` counts baselines without a direction.
+    """
 
     def __init__(self, city: City, database: Database, drive: tuple[float, ...]) -> None:
         self.city = city
-        self.pointless = 0
+        self.lost_lanes = 0
         self.damaged: set[tuple[str, int]] = set()
         self._database = database
         west, south, east, north = drive
@@ -329,7 +335,7 @@ class _Around:
     def types(self, name: str) -> dict[int, int | None]:
         """Types of the features around the drive by row, for a layer whose only column is the type."""
         (column,) = LAYERS[name]
-        return {row: whole(self.city.layers[name].columns[column][row]) for row in self.near(name)}
+        return {row: as_integer(self.city.layers[name].columns[column][row]) for row in self.near(name)}
 
     @functools.cached_property
     def baselines(self) -> tuple[list[int], Array]:
@@ -353,17 +359,17 @@ class _Around:
         bad = np.bincount(owner[far], minlength=len(shapes)) > 0
         bad |= np.bincount(owner, minlength=len(shapes)) == 0
         self.damaged.update((name, rows[i]) for i in np.flatnonzero(bad).tolist())
-        kept = np.asarray(shapes).copy()
-        kept[bad] = None
-        shapely.set_coordinates(kept, xy[~bad[owner]])
-        return kept
+        result = np.asarray(shapes).copy()
+        result[bad] = None
+        shapely.set_coordinates(result, xy[~bad[owner]])
+        return result
 
     def outlines(
         self, name: str, rows: Sequence[int], outline: Callable[[Any], Array | None]
     ) -> Iterator[tuple[int, int, Array]]:
         """Row, packed id and points of the geometries that have an outline."""
         for row, shape in zip(rows, self.shapes(name, rows), strict=True):
-            points, fid = outline(shape), whole(int(self.city.layers[name].fid[row]))
+            points, fid = outline(shape), as_integer(int(self.city.layers[name].fid[row]))
             if points is not None and fid is not None:
                 yield row, feature_id(name, fid), points
 
@@ -402,7 +408,8 @@ def _ring(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
     return points if points is not None and len(points) >= 3 else None
 
 
-def _distinct(xy: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "kept 3"] | None:
+def _distinct(xy: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "distinct 3"] | None:
+    """Points that differ from the one before, z = 0; None for fewer than two."""
     moved = np.append(True, (np.diff(xy, axis=0) != 0.0).any(axis=1))
     return np.pad(xy[moved], ((0, 0), (0, 1))) if moved.sum() >= 2 else None
 
@@ -420,7 +427,7 @@ def _lane_features(around: _Around) -> Iterator[MapFeature]:
     for number, shape, width in zip(numbers, shapes, widths, strict=True):
         points, lane = _line(shape), city.lanes[number]
         if points is None:
-            around.pointless += shape is not None
+            around.lost_lanes += shape is not None
             continue
         yield MapFeature(
             feature_id=number,
@@ -437,18 +444,19 @@ def _lane_features(around: _Around) -> Iterator[MapFeature]:
 
 
 def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float | None]:
-    """Width of each lane: the median, over five places, of the distances to both boundaries added up."""
+    """Width of each lane: the median of the sum of the distances to both boundaries, at five points along it."""
     shapely = import_extra("shapely")
-    known = around.city.boundary_rows
-    pairs = [[known.get(fid, -1) for fid in lane.boundaries] for lane in lanes]
+    row_of = around.city.boundary_rows
+    pairs = [[row_of.get(fid, -1) for fid in lane.boundaries] for lane in lanes]
     rows = np.array(pairs, np.int64).reshape(-1, 2)
     side_rows = np.unique(rows[rows >= 0])
-    nothing = np.array(None, dtype=object)
-    lines = np.append(around.shapes("boundaries", side_rows.tolist()), nothing)
+    # A missing boundary is None, the last of the lines: distances to it, and so the width, are NaN.
+    none = np.array(None, dtype=object)
+    lines = np.append(around.shapes("boundaries", side_rows.tolist()), none)
     sides = lines[np.where(rows >= 0, np.searchsorted(side_rows, rows), -1)]
-    along = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, nothing)
-    places = shapely.line_interpolate_point(along[:, None], _WIDTH_PLACES, normalized=True)
-    gaps = shapely.distance(places[:, None], sides[:, :, None])
+    along = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, none)
+    points = shapely.line_interpolate_point(along[:, None], _WIDTH_FRACTIONS, normalized=True)
+    gaps = shapely.distance(points[:, None], sides[:, :, None])
     low, high = _WIDTHS_M
     widths = np.median(gaps.sum(axis=1), axis=1)
     return [float(width) if low <= width <= high else None for width in widths]

@@ -24,8 +24,8 @@ from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, STEPS, AgentKind, LightState
 
 FORMAT = DATASET = "nuplan"
-#: Tables that tell a nuPlan log from other SQLite files.
-_TELLING = ("lidar_pc", "lidar_box", "ego_pose", "scenario_tag")
+#: Tables by which a nuPlan log is recognised among SQLite files.
+_SIGNATURE = ("lidar_pc", "lidar_box", "ego_pose", "scenario_tag")
 #: Tables and columns that are read; a file with all of these tables is a nuPlan log.
 TABLES: Mapping[str, tuple[str, ...]] = {
     "log": ("logfile", "map_version"),
@@ -58,6 +58,7 @@ _GAP_US = 120_000
 _LONGEST_PIECE = 400
 #: Largest plausible values: UTM coordinates, m/s, metres of a box, metres of ego between two steps.
 _FARTHEST_M, _FASTEST_MPS, _LONGEST_M, _LONGEST_STEP_M = 2e7, 300.0, 200.0, 20.0
+_LARGEST_YAW = 1e4
 #: Most entries of an array of tracks by steps; real scenes have up to a thousand tracks.
 _MOST_CELLS = 2_000_000
 _CURE = "skip this record, or download the file again"
@@ -84,7 +85,7 @@ class NuPlan:
         """Whether the file is SQLite and has the tables of a nuPlan log."""
         try:
             with open_database(path) as database:
-                return all(database.columns(table) for table in _TELLING)
+                return all(database.columns(table) for table in _SIGNATURE)
         except (OSError, DataError):
             return False
 
@@ -122,10 +123,10 @@ class NuPlan:
             with open_database(path) as database:
                 log = _open_log(database, path)
                 city = city_map(find_map(path, log.map_name))
-                known = agents(database)
+                by_token = agents(database)
                 for piece in pieces(log.line, self.steps):
                     try:
-                        yield _recording(log, piece, known, city)
+                        yield _recording(log, piece, by_token, city)
                     except DataError as error:
                         yield BadRecord.of(error, path, piece.name)
         except DataError as error:
@@ -176,6 +177,7 @@ class Log:
 
 
 def _open_log(database: Database, path: Path) -> Log:
+    """Check the tables of a log, and read its names and its time line."""
     for table, columns in TABLES.items():
         database.require(table, *columns)
     rows = database.rows("SELECT logfile, map_version FROM log")
@@ -190,8 +192,8 @@ def _unknown_fields(database: Database) -> int:
     """Number of tables, and of columns of the tables that are read, with unknown names."""
     columns = {
         (table, column)
-        for table, known in TABLES.items()
-        for column in database.columns(table) - _OTHERS.union(known)
+        for table, names in TABLES.items()
+        for column in database.columns(table) - _OTHERS.union(names)
     }
     return len(database.tables() - TABLES.keys() - _OTHERS) + len(columns)
 
@@ -215,31 +217,32 @@ def pieces(line: TimeLine, steps: int = STEPS) -> list[Piece]:
     """
     recordings: list[Piece] = []
     counts: dict[Any, int] = {}
-    step = _every(line.time_us)
+    step = _sweeps_per_step(line.time_us)
     ends = np.flatnonzero(np.diff(line.time_us) > _GAP_US) + 1
     for first, last in zip((0, *ends), (*ends, len(line.tokens)), strict=True):
         sweeps = np.arange(first, last, step)
         for begin, end in _scenes(line, sweeps):
-            part = slice(max(begin - CURRENT_STEP, 0), min(end + steps - CURRENT_STEP - 1, len(sweeps)))
-            if part.stop - part.start < steps and (begin > 0 or len(sweeps) >= steps):
+            span = slice(max(begin - CURRENT_STEP, 0), min(end + steps - CURRENT_STEP - 1, len(sweeps)))
+            # Drop a remainder, unless the whole stretch between two gaps is too short for a window.
+            if span.stop - span.start < steps and (begin > 0 or len(sweeps) >= steps):
                 continue
             scene = line.scenes[sweeps[begin]]
             number = counts[scene] = counts.get(scene, 0) + 1
             name = scene.hex() if isinstance(scene, bytes) and 0 < len(scene) <= 16 else "no-scene"
             name += f".{number}" if number > 1 else ""
             own = int(sweeps[begin]), int(sweeps[end - 1]) + step
-            recordings.append(Piece(name, scene, sweeps[part], own))
+            recordings.append(Piece(name, scene, sweeps[span], own))
     return recordings
 
 
-def _every(time_us: Int64[np.ndarray, " sweep"]) -> int:
-    """Number of sweeps per step of 10 Hz."""
-    usual = float(np.median(np.diff(time_us))) if len(time_us) > 1 else 1e5
-    if 40_000 <= usual <= 60_000:
+def _sweeps_per_step(time_us: Int64[np.ndarray, " sweep"]) -> int:
+    """Number of sweeps per step of 10 Hz: 2 at 20 Hz, 1 at 10 Hz, within 10 ms."""
+    median_us = float(np.median(np.diff(time_us))) if len(time_us) > 1 else 1e5
+    if 40_000 <= median_us <= 60_000:
         return 2
-    if 90_000 <= usual <= 110_000:
+    if 90_000 <= median_us <= 110_000:
         return 1
-    problem = f"lidar sweeps come every {usual / 1e3:.0f} ms, not every 50 or 100 ms"
+    problem = f"lidar sweeps come every {median_us / 1e3:.0f} ms, not every 50 or 100 ms"
     raise DataError(problem, cure="use an unaltered log")
 
 
@@ -265,7 +268,7 @@ def _numbers(rows: Sequence[Sequence[Any]], width: int, what: str) -> Float64[np
 def _check(values: Float64[np.ndarray, "*shape"], most: float, what: str) -> None:
     """Refuse numbers that are not finite or too large."""
     if not (np.abs(values) <= most).all():  # NaN compares false
-        raise DataError(f"{what} is missing or absurd", cure=_CURE)
+        raise DataError(f"{what} is missing or implausible", cure=_CURE)
 
 
 def agents(database: Database) -> _Agents:
@@ -277,11 +280,11 @@ def agents(database: Database) -> _Agents:
     return {token: (number, kind) for number, (token, kind) in enumerate(kinds.items(), start=1)}
 
 
-def tracks(log: Log, piece: Piece, known: _Agents) -> tuple[Tracks, int]:
+def tracks(log: Log, piece: Piece, by_token: _Agents) -> tuple[Tracks, int]:
     """Return the tracks of a piece, ego in row 0, and the number of boxes without a track."""
     steps = len(piece.sweeps)
-    boxes, owners, lost = _boxes(log, piece, known)
-    tokens = sorted({owner for _, owner in owners}, key=lambda token: known[token][0])
+    boxes, owners, lost = _boxes(log, piece, by_token)
+    tokens = sorted({owner for _, owner in owners}, key=lambda token: by_token[token][0])
     if (len(tokens) + 1) * steps > _MOST_CELLS:
         raise DataError(f"{len(tokens)} tracks in {steps} steps", cure=_CURE)
     rows = {token: row for row, token in enumerate(tokens, start=1)}
@@ -289,9 +292,9 @@ def tracks(log: Log, piece: Piece, known: _Agents) -> tuple[Tracks, int]:
     table, valid = np.zeros((*shape, 9)), np.zeros(shape, dtype=bool)
     table[0], valid[0] = _ego(log, piece), True
     if owners:
-        at = np.array([(rows[owner], step) for step, owner in owners]).T
-        table[at[0], at[1]], valid[at[0], at[1]] = boxes, True
-    entries = [(EGO_TRACK_ID, AgentKind.VEHICLE), *(known[token] for token in tokens)]
+        row, step = np.array([(rows[owner], step) for step, owner in owners]).T
+        table[row, step], valid[row, step] = boxes, True
+    entries = [(EGO_TRACK_ID, AgentKind.VEHICLE), *(by_token[token] for token in tokens)]
     states = Tracks(
         xy=table[..., 0:2].copy(),
         z=table[..., 2].copy(),
@@ -327,9 +330,9 @@ def _ego(log: Log, piece: Piece) -> Float64[np.ndarray, "step 9"]:
     heading = yaw_of(pose[:, 2:6])
     cos, sin = np.cos(heading), np.sin(heading)
     centre = parsing.box_centre(pose[:, 0:2], heading, REAR_AXLE_TO_CENTRE_M)
-    moving = np.stack((pose[:, 6], pose[:, 7] + REAR_AXLE_TO_CENTRE_M * pose[:, 8]), axis=-1)
+    velocity = np.stack((pose[:, 6], pose[:, 7] + REAR_AXLE_TO_CENTRE_M * pose[:, 8]), axis=-1)
     size = np.broadcast_to(EGO_SIZE_M, (len(pose), 3))
-    return np.column_stack((centre, np.zeros(len(pose)), heading, size, rotate(moving, cos, sin)))
+    return np.column_stack((centre, np.zeros(len(pose)), heading, size, rotate(velocity, cos, sin)))
 
 
 def yaw_of(quaternion: Float64[np.ndarray, "pose 4"]) -> Float64[np.ndarray, " pose"]:
@@ -346,26 +349,26 @@ def _read_observations(log: Log, piece: Piece, table: str, columns: str) -> list
     query = f"SELECT lidar_pc_token, {columns} FROM {table} WHERE lidar_pc_token IN"
     rows = log.database.rows_in(query, list(steps))
     # A damaged index leads to rows of other sweeps.
-    kept = [(steps[row[0]], *row[1:]) for row in rows if row[0] in steps]
-    return sorted(kept, key=lambda row: row[0])
+    observations = [(steps[row[0]], *row[1:]) for row in rows if row[0] in steps]
+    return sorted(observations, key=lambda row: row[0])
 
 
 def _boxes(
-    log: Log, piece: Piece, known: _Agents
+    log: Log, piece: Piece, by_token: _Agents
 ) -> tuple[Float64[np.ndarray, "box 9"], list[tuple[int, Any]], int]:
     """Boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track), and how many have no track."""
     columns = "track_token, x, y, z, yaw, length, width, height, vx, vy"
     rows = _read_observations(log, piece, "lidar_box", columns)
-    kept = [row for row in rows if row[1] in known]
-    boxes = _numbers([row[2:] for row in kept], 9, "lidar_box")
+    with_track = [row for row in rows if row[1] in by_token]
+    boxes = _numbers([row[2:] for row in with_track], 9, "lidar_box")
     # Static things have no velocity, and the size of a few is unknown.
     boxes[:, 4:9] = np.where(np.isnan(boxes[:, 4:9]), 0.0, boxes[:, 4:9])
     _check(boxes[:, 0:3], _FARTHEST_M, "the position of a box")
-    _check(boxes[:, 3], 1e4, "the yaw of a box")
+    _check(boxes[:, 3], _LARGEST_YAW, "the yaw of a box")
     _check(boxes[:, 4:7], _LONGEST_M, "the size of a box")
     _check(boxes[:, 7:9], _FASTEST_MPS, "the velocity of a box")
     boxes[:, 3] = wrap(boxes[:, 3])
-    return boxes, [row[:2] for row in kept], len(rows) - len(kept)
+    return boxes, [row[:2] for row in with_track], len(rows) - len(with_track)
 
 
 def _scenario_types(log: Log, piece: Piece) -> list[str]:
@@ -383,16 +386,17 @@ def _roadblocks(log: Log, piece: Piece) -> list[int]:
     return [int(word) for word in words if word.isascii() and word.isdigit() and len(word) < 19]
 
 
-def _recording(log: Log, piece: Piece, known: _Agents, city: City) -> Recording:
+def _recording(log: Log, piece: Piece, by_token: _Agents, city: City) -> Recording:
+    """Read the recording of a piece, with the map around it."""
     if len(piece.sweeps) <= CURRENT_STEP:
         problem = f"{len(piece.sweeps)} steps without a gap, fewer than {CURRENT_STEP + 1}"
         raise DataError(problem, cure="skip this record")
-    states, boxes = tracks(log, piece, known)
+    states, lost_boxes = tracks(log, piece, by_token)
     features, lost = features_around(city, states.xy[0])
     states, features = flatten(states, features)
-    lights, unlit = _lights(log, piece, city, features)
+    lights, lost_lights = _lights(log, piece, city, features)
     lanes = {feature.feature_id for feature in features}
-    route, unknown = corridor(city, _roadblocks(log, piece))
+    route, lost_roadblocks = corridor(city, _roadblocks(log, piece))
     types, time_us = _scenario_types(log, piece), log.line.time_us
     tags = {"source_format": FORMAT} | parsing.place_tags(log.map_name)
     return Recording(
@@ -409,9 +413,9 @@ def _recording(log: Log, piece: Piece, known: _Agents, city: City) -> Recording:
         tags=tags | ({"scenario_types": "|".join(types)} if types else {}),
         lost=parsing.nonzero(
             lost,
-            boxes_without_track=boxes,
-            lights=unlit,
-            roadblocks=unknown,
+            boxes_without_track=lost_boxes,
+            lights=lost_lights,
+            roadblocks=lost_roadblocks,
             unknown_fields=log.unknown_fields + city.unknown_layers,
         ),
     )
@@ -427,8 +431,8 @@ def _lights(
     for step, connector, status in _read_observations(
         log, piece, "traffic_light_status", "lane_connector_id, status"
     ):
-        good = isinstance(connector, int) and 0 <= connector < 2**32
-        lane = feature_id("lane_connectors", connector) if good else -1
+        is_fid = isinstance(connector, int) and 0 <= connector < 2**32
+        lane = feature_id("lane_connectors", connector) if is_fid else -1
         if lane in starts:
             lights.observe(step, lane, _LIGHT_STATES.get(status, LightState.UNKNOWN), starts[lane])
         elif lane not in city.lanes:

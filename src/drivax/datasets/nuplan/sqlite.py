@@ -42,16 +42,17 @@ class Database:
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path
         self._connection = connection
-        self._left = 0
+        self._remaining = 0
         connection.set_progress_handler(self._tick, _STEPS_AT_ONCE)
 
     def _tick(self) -> int:
-        self._left -= _STEPS_AT_ONCE
-        return int(self._left < 0)
+        """Count instructions of the query; SQLite ends it if the result is not 0."""
+        self._remaining -= _STEPS_AT_ONCE
+        return int(self._remaining < 0)
 
     def rows(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Return all rows of a query."""
-        self._left = 1_000_000 + _STEPS_PER_BYTE * self.path.stat().st_size
+        self._remaining = 1_000_000 + _STEPS_PER_BYTE * self.path.stat().st_size
         try:
             return self._connection.execute(query, values).fetchall()
         except (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError) as error:
@@ -71,9 +72,11 @@ class Database:
         return frozenset(str(name) for (name,) in names)
 
     def columns(self, table: str) -> frozenset[str]:
-        """Return the names of a table's columns; none where there is no such table (a view is none)."""
-        real = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"
-        if not self.rows(real, (table,)):
+        """Return the names of a table's columns, none for a missing table or a view."""
+        is_table = (
+            "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"
+        )
+        if not self.rows(is_table, (table,)):
             return frozenset()
         names = self.rows("SELECT name FROM pragma_table_info(?)", (table,))
         return frozenset(str(name) for (name,) in names)
@@ -140,18 +143,18 @@ def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> La
     """Read a layer without its geometries; None for one that the GeoPackage lacks."""
     present = database.columns(name)
     database.require("gpkg_geometry_columns", "table_name", "column_name", "srs_id")
-    described = database.rows(
+    entries = database.rows(
         "SELECT column_name, srs_id FROM gpkg_geometry_columns WHERE table_name = ?", (name,)
     )
-    if not present or not described:
+    if not present or not entries:
         return None
-    geometry, epsg = described[0]
+    geometry, epsg = entries[0]
     if geometry not in present or not str(geometry).isidentifier():
         raise DataError(f"layer {name} has no geometry column", file=database.path, cure=_CURE)
-    kept = [column for column in columns if column in present]
-    listed = ", ".join(["rowid", f"substr({geometry}, 1, {_HEAD_BYTES})", *(f'"{c}"' for c in kept)])
-    rows = database.rows(f"SELECT {listed} FROM {name} ORDER BY rowid")
-    values = {column: tuple(row[i + 2] for row in rows) for i, column in enumerate(kept)}
+    available = [column for column in columns if column in present]
+    selection = ", ".join(["rowid", f"substr({geometry}, 1, {_HEAD_BYTES})", *(f'"{c}"' for c in available)])
+    rows = database.rows(f"SELECT {selection} FROM {name} ORDER BY rowid")
+    values = {column: tuple(row[i + 2] for row in rows) for i, column in enumerate(available)}
     layer = Layer(
         name=name,
         geometry=geometry,
@@ -160,6 +163,7 @@ def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> La
         bounds=np.array([_envelope(row[1]) for row in rows], np.float64).reshape(-1, 4),
         columns={column: values.get(column, (None,) * len(rows)) for column in columns},
     )
+    # Headers without an envelope: the bounds are those of the geometry itself.
     unknown = np.flatnonzero(~np.isfinite(layer.bounds).all(axis=1))
     if len(unknown):
         shapes = geometries(database, layer, unknown)
@@ -171,6 +175,7 @@ def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> La
 def _envelope(head: Any) -> tuple[float, float, float, float]:
     """Bounds in the header of a geometry BLOB; NaN where it has none."""
     complete = isinstance(head, bytes) and len(head) >= _HEAD_BYTES and head[:2] == b"GP"
+    # Byte 3 holds flags: bit 0 the byte order, bits 1 to 3 the code of the envelope, bits 4 and 5 empty and extended.
     if not complete or not 1 <= head[3] >> 1 & 7 <= 4:
         return np.nan, np.nan, np.nan, np.nan
     west, east, south, north = struct.unpack_from("<4d" if head[3] & 1 else ">4d", head, 8)

@@ -69,9 +69,10 @@ SPACING_M = 0.5
 #: No lane is longer.
 _LONGEST_M = 5_000.0
 _TURNS = {"L": 1.0, "S": 0.0, "R": -1.0}
-#: Adjacent lanes: spacing of their centres, angle between them.
-_NEIGHBOUR_M, _PARALLEL_RAD = (2.2, 5.5), np.deg2rad(20.0)
-_WIDTHS_M = (2.0, 6.0)
+#: Adjacent lanes: spacing of their centres, angle between them, largest offset along them between compared points.
+_NEIGHBOUR_M, _PARALLEL_RAD, _ABREAST_M = (2.2, 5.5), np.deg2rad(20.0), 1.0
+#: Plausible widths of lanes, and largest distance from the end of a lane to its stop line.
+_WIDTHS_M, _STOP_M = (2.0, 6.0), 1.0
 
 
 @dataclass(frozen=True)
@@ -88,18 +89,19 @@ class City:
         """Features in the box around some points; lines are cut there, lanes and polygons stay whole."""
         box = Box.around(xy, margin_m)
         number = len(self.features)
-        kept: list[MapFeature] = []
+        result: list[MapFeature] = []
         for feature in self.features:
             # A stop sign is one point.
             points = np.repeat(feature.points, 2, axis=0) if len(feature.points) == 1 else feature.points
             pieces = list(box.pieces(points))
             if feature.kind not in (*EDGE_KINDS, *LINE_KINDS):
-                kept += [feature] if pieces else []
+                result += [feature] if pieces else []
                 continue
+            # The first piece keeps the id; others get ids above those of the city.
             for i, piece in enumerate(pieces):
                 number += i > 0
-                kept.append(replace(feature, feature_id=number if i else feature.feature_id, points=piece))
-        return tuple(kept)
+                result.append(replace(feature, feature_id=number if i else feature.feature_id, points=piece))
+        return tuple(result)
 
 
 @lru_cache(maxsize=4)
@@ -140,6 +142,7 @@ class _Layers:
         return City((*lanes, *features, *stops, *edges), self._lost)
 
     def _layer(self, name: str) -> Sequence[Mapping[str, Any]]:
+        """Rows of a layer, none if it is missing."""
         return self._content.get(name, ())
 
     def _points(self, tokens: Sequence[str]) -> Float[Array, "point 3"]:
@@ -153,6 +156,7 @@ class _Layers:
             self._lost[name] = self._lost.get(name, 0) + number
 
     def _areas(self, tokens: Sequence[str]) -> Iterator[Area]:
+        """Polygons by token; missing ones are counted."""
         for token in tokens:
             polygon = self._polygons.get(token)
             if polygon is None:
@@ -175,7 +179,7 @@ class _Layers:
         for i, (row, name) in enumerate(with_path):
             connects, line = name == "lane_connector", lines[row["token"]]
             link = links.get(row["token"], {})
-            after, before = ([*link.get(way, ())] for way in ("outgoing", "incoming"))
+            after, before = ([*link.get(direction, ())] for direction in ("outgoing", "incoming"))
             self._count("dangling_links", sum(token not in index for token in (*after, *before)))
             lanes.append(
                 MapFeature(
@@ -201,7 +205,7 @@ class _Layers:
         return None
 
     def _dividers(self) -> Iterator[MapFeature]:
-        """Painted lane dividers in runs of one kind, and road dividers, whose paint the map does not tell."""
+        """Painted lane dividers in runs of one kind, and road dividers, whose paint is not in the map."""
         for row in self._layer("lane_divider"):
             segments = row["lane_divider_segments"]
             for name, run in groupby(enumerate(segments), key=lambda item: str(item[1]["segment_type"])):
@@ -232,10 +236,10 @@ class _Layers:
         ends = shapely.points(np.array([lane.points[-1, :2] for lane in lanes]).reshape(-1, 2))
         for exterior in (exterior for exterior in areas if len(exterior) > 2):
             polygon = shapely.make_valid(shapely.Polygon(exterior[:, :2]))
-            near = np.flatnonzero(shapely.dwithin(ends, polygon, 1.0)).tolist()
-            ending = tuple(i for i in near if not lanes[i].interpolating)
+            near = np.flatnonzero(shapely.dwithin(ends, polygon, _STOP_M)).tolist()
+            stop_lanes = tuple(i for i in near if not lanes[i].interpolating)
             centre = np.array([[polygon.centroid.x, polygon.centroid.y, 0.0]])
-            stops.append(MapFeature(first_id + len(stops), RoadKind.STOP_SIGN, centre, lanes=ending))
+            stops.append(MapFeature(first_id + len(stops), RoadKind.STOP_SIGN, centre, lanes=stop_lanes))
         return stops
 
 
@@ -244,9 +248,6 @@ def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
 
     Each starts at ``start_pose`` (x, y, heading) and has three segments of lengths ``segment_length``, which turn left
     (L), go straight (S) or turn right (R) by ``shape``, with ``radius``.
-
-    Raises:
-        ValueError: A number is not finite, the radius is not positive, or the lane is longer than 5 km.
     """
     parts = [np.zeros((0, 2))]
     for arc in path:
@@ -296,15 +297,17 @@ def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
     result = list(lanes)
     for i in rows:
         middle = len(lanes[i].points) // 2
-        at, course = lanes[i].points[middle, :2], headings(lanes[i].points)[middle]
-        near = np.array(tree.query_ball_point(at, _NEIGHBOUR_M[1] + 0.5), dtype=np.int64)
+        xy, course = lanes[i].points[middle, :2], headings(lanes[i].points)[middle]
+        # Half a metre more than the distance sideways covers the offset along the lane.
+        near = np.array(tree.query_ball_point(xy, _NEIGHBOUR_M[1] + 0.5), dtype=np.int64)
         near = near[(owner[near] != i) & (np.abs(wrap(heading[near] - course)) < _PARALLEL_RAD)]
-        offset = points[near] - at
+        offset = points[near] - xy
         ahead = offset @ np.array([np.cos(course), np.sin(course)])
         left = offset @ np.array([-np.sin(course), np.cos(course)])
-        good = (np.abs(ahead) < 1.0) & (np.abs(left) >= _NEIGHBOUR_M[0]) & (np.abs(left) <= _NEIGHBOUR_M[1])
+        adjacent = (np.abs(left) >= _NEIGHBOUR_M[0]) & (np.abs(left) <= _NEIGHBOUR_M[1])
+        adjacent &= np.abs(ahead) < _ABREAST_M
         sides = {
-            side: tuple(int(lane) for lane in owner[near[good & (sign * left > 0)]][:1])
+            side: tuple(int(lane) for lane in owner[near[adjacent & (sign * left > 0)]][:1])
             for side, sign in (("left_neighbours", 1), ("right_neighbours", -1))
         }
         result[i] = replace(result[i], **sides)

@@ -39,16 +39,16 @@ _FIELDS = frozenset((
 ))  # fmt: skip
 #: Keyframes are 0.5 s apart; the gap of a missing one is not interpolated.
 LONGEST_GAP_S = 0.75
-#: Scenes last 20 s; a longer one is damage.
-_LONGEST_S = 120.0
+#: Steps of a usual scene (40 keyframes); a scene that lasts longer than the second number is damaged, s.
+_SCENE_STEPS, _LONGEST_S = 196, 120.0
 #: Map around the ego's log.
 MARGIN_M = 150.0
 #: The ego is a Renault Zoe: length, width, height, and how far its centre lies ahead of the rear axle (half the length
 #: less the rear overhang), from the maker's data sheet; poses are of the rear axle (nuscenes-devkit, issue 108).
 EGO_SIZE_M, CENTRE_AHEAD_M = (4.084, 1.730, 1.562), 1.385
-#: Tables are read in chunks; no row is longer than ``_LONGEST``.
+#: Tables are read in chunks; no row is longer than ``_LONGEST``, characters.
 _CHUNK, _LONGEST = 1 << 20, 1 << 24
-_BETWEEN = re.compile(r"[ \t\r\n,]*")
+_SEPARATOR = re.compile(r"[ \t\r\n,]*")
 _AGAIN = "unpack the metadata archive again"
 #: Categories by the beginning of their names; the first that fits counts.
 _KINDS = (
@@ -96,9 +96,9 @@ class NuScenes:
         return Description("nuScenes", flavour, folder.name, scenes, tuple(notes), tuple(missing))
 
     def count(self, path: Path) -> int:
-        """Scenes times the windows of 20 s."""
+        """Scenes times the windows of a usual scene; 0 if the table is unreadable."""
         try:
-            return len(scene_rows(path.parent)) * windows_of(196)
+            return len(scene_rows(path.parent)) * windows_of(_SCENE_STEPS)
         except DataError:
             return 0
 
@@ -109,16 +109,16 @@ class NuScenes:
         except DataError as error:
             yield BadRecord.of(error, path)
             return
-        for row, about in enumerate(tables.scenes):
+        for row, entry in enumerate(tables.scenes):
             try:
                 scene = tables.scene(row)
                 yield recording(scene, _maps(path) / f"{Path(scene.location).name}.json")
             except DataError as error:
-                yield BadRecord.of(error, path, about["name"])
+                yield BadRecord.of(error, path, entry["name"])
 
 
 def _maps(path: Path) -> Path:
-    """The folder of city maps: where the devkit expects it, or where the archive, a folder itself, was unpacked."""
+    """The folder of city maps: where the devkit expects it, or where the archive unpacks them."""
     root = path.parent.parent
     expansion = root / "maps" / "expansion"
     folders = (expansion, root / "maps", root / "expansion")
@@ -153,15 +153,15 @@ def recording(scene: Scene, map_file: Path) -> Recording:
 
 
 def _tracks(scene: Scene, times: Float64[Array, " time"]) -> Tracks:
-    """The ego (row 0) and every instance at some times."""
+    """The ego (row 0) and every instance at some times; the size of each is its median."""
     poses = scene.poses[:, 1:].copy()
     poses[:, :2] = box_centre(poses[:, :2], poses[:, 2], CENTRE_AHEAD_M)
     check_finite(poses, *scene.observations)
-    moved = [interpolate(scene.poses[:, 0], poses, times)]
-    moved += [interpolate(table[:, 0], table[:, 1:4], times) for table in scene.observations]
+    motions = [interpolate(scene.poses[:, 0], poses, times)]
+    motions += [interpolate(table[:, 0], table[:, 1:4], times) for table in scene.observations]
     sizes = [EGO_SIZE_M, *(np.median(table[:, 4:7], axis=0) for table in scene.observations)]
-    state = np.stack([states for states, _ in moved])
-    valid = np.stack([seen for _, seen in moved])
+    state = np.stack([states for states, _ in motions])
+    valid = np.stack([mask for _, mask in motions])
     return Tracks(
         xy=state[..., 0:2],
         z=np.zeros(valid.shape),
@@ -170,7 +170,7 @@ def _tracks(scene: Scene, times: Float64[Array, " time"]) -> Tracks:
         size=np.where(valid[..., None], np.array(sizes)[:, None], 0.0),
         valid=valid,
         kind=np.array([AgentKind.VEHICLE, *scene.kinds], np.int8),
-        track_id=np.arange(len(moved), dtype=np.int64),
+        track_id=np.arange(len(motions), dtype=np.int64),
     )
 
 
@@ -196,15 +196,16 @@ def interpolate(
     state, valid = np.zeros((len(times), 5)), np.zeros(len(times), bool)
     runs = np.split(np.arange(len(seen_s)), np.flatnonzero(np.diff(seen_s) > LONGEST_GAP_S) + 1)
     for run in (run for run in runs if len(run)):
-        at, xy = seen_s[run], pose[run, :2]
-        inside = (times >= at[0] - DT_S / 2) & (times <= at[-1] + DT_S / 2)
-        when = np.clip(times[inside], at[0], at[-1])
+        knots, xy = seen_s[run], pose[run, :2]
+        # Half a step of tolerance: the ends of a run fall between steps.
+        inside = (times >= knots[0] - DT_S / 2) & (times <= knots[-1] + DT_S / 2)
+        time = np.clip(times[inside], knots[0], knots[-1])
         if len(run) == 1:
             state[inside, :3] = pose[run[0]]
         else:
-            spline = CubicHermiteSpline(at, xy, np.gradient(xy, at, axis=0))
-            state[inside, :2], state[inside, 3:] = spline(when), spline(when, 1)
-            state[inside, 2] = np.interp(when, at, np.unwrap(pose[run, 2]))
+            spline = CubicHermiteSpline(knots, xy, np.gradient(xy, knots, axis=0))
+            state[inside, :2], state[inside, 3:] = spline(time), spline(time, 1)
+            state[inside, 2] = np.interp(time, knots, np.unwrap(pose[run, 2]))
         valid |= inside
     state[:, 2] = np.where(valid, wrap(state[:, 2]), 0.0)
     return state, valid
@@ -289,25 +290,25 @@ class Tables:
         return cls(scenes, logs, sample_scene, sample_time, poses, annotations, kinds, unknown)
 
     def scene(self, row: int) -> Scene:
-        """One scene."""
-        about = self.scenes[row]
-        location, logfile = self.logs.get(about["log_token"], ("", ""))
+        """Return the scene in a row of ``scenes``; refuse one without a log or two keyframes and poses."""
+        entry = self.scenes[row]
+        location, logfile = self.logs.get(entry["log_token"], ("", ""))
         samples = np.flatnonzero(self.sample_scene == row)
         poses = self.poses[self.poses[:, 0] == row, 1:]
         if len(samples) < 2 or len(poses) < 2 or not location:
             problem = f"{len(samples)} keyframes, {len(poses)} ego poses, log {location or 'unknown'}"
-            raise DataError(f"the scene cannot be used: {problem}", record=about["name"], cure=_AGAIN)
+            raise DataError(f"the scene cannot be used: {problem}", record=entry["name"], cure=_AGAIN)
         annotations = self.annotations[np.isin(self.annotations[:, 0], samples)]
         times = self.sample_time[annotations[:, 0].astype(np.int64)]
         table = np.column_stack((times, annotations[:, 2:]))
         instances = np.unique(annotations[:, 1]).astype(np.int64).tolist()
         return Scene(
-            name=about["name"],
+            name=entry["name"],
             location=location,
             logfile=logfile,
             keyframes_s=np.unique(self.sample_time[samples]),
-            poses=_in_time(poses),
-            observations=[_in_time(table[annotations[:, 1] == instance]) for instance in instances],
+            poses=_sort_by_time(poses),
+            observations=[_sort_by_time(table[annotations[:, 1] == instance]) for instance in instances],
             kinds=[self.kinds[instance] for instance in instances],
             unknown_fields=self.unknown_fields,
         )
@@ -320,7 +321,7 @@ def _unknown_fields(folder: Path) -> int:
     return len(fields - _FIELDS) + len(tables.difference(_TABLES, _OTHERS))
 
 
-def _in_time(table: Float64[Array, "row column"]) -> Float64[Array, "kept column"]:
+def _sort_by_time(table: Float64[Array, "row column"]) -> Float64[Array, "kept column"]:
     """Rows in the order of their first column, the first of several at one time."""
     _, first = np.unique(table[:, 0], return_index=True)
     return table[first]
@@ -385,7 +386,7 @@ def yaw(w: float, x: float, y: float, z: float) -> float:
 
 
 class _Row:
-    """A row of a table; values are checked when they are read."""
+    """A row of a table; its methods check values of a type by name."""
 
     def __init__(self, values: Mapping[str, Any], file: Path) -> None:
         self.values, self._file = values, file
@@ -414,6 +415,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _table(folder: Path, name: str) -> Iterator[_Row]:
+    """Rows of a table of a version, one by one."""
     file = folder / f"{name}.json"
     return (_Row(row, file) for row in rows(file))
 
@@ -427,25 +429,25 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
             text = file.read(_CHUNK).lstrip()
             if not text.startswith("["):
                 raise DataError("is not a table (an array of objects)", file=path, cure="download it again")
-            place = 1
+            position = 1
             while True:
-                # Only ``place`` moves: cutting the text after every row would copy it thousands of times.
-                if between := _BETWEEN.match(text, place):
-                    place = between.end()
-                if text.startswith("]", place):
+                # Only ``position`` moves: cutting the text after every row would copy it thousands of times.
+                if separator := _SEPARATOR.match(text, position):
+                    position = separator.end()
+                if text.startswith("]", position):
                     return
                 try:
-                    row, end = decoder.raw_decode(text, place)
-                except ValueError:
+                    row, end = decoder.raw_decode(text, position)
+                except ValueError:  # The row goes on in the next chunk, unless the file is damaged.
                     more = file.read(_CHUNK)
-                    if not more or len(text) - place > _LONGEST:
+                    if not more or len(text) - position > _LONGEST:
                         raise
-                    text, place = text[place:] + more, 0
+                    text, position = text[position:] + more, 0
                     continue
                 if not isinstance(row, dict):
                     raise DataError("is not an object", file=path, record=number, cure="download it again")
                 yield row
-                place, number = end, number + 1
+                position, number = end, number + 1
     except FileNotFoundError as error:
         raise DataError("is missing", file=path, cure=_AGAIN) from error
     except (ValueError, RecursionError) as error:

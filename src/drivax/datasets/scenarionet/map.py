@@ -42,7 +42,7 @@ _FASTEST_MPS = 45.0
 #: Data sets whose converters make limits up: 100 km/h on every connector, 85 mph everywhere.
 _MADE_UP_LIMITS = ("nuscenes", "lyft", "nuplan", "av2")
 #: Data sets with the drivable side on the left of road edges.
-_ORIENTED = ("womd",)
+_DRIVABLE_LEFT = ("womd",)
 #: Type names of MetaDrive (metadrive/type.py); others, such as sidewalks, are dropped and counted.
 _KINDS = {
     "LANE_UNKNOWN": RoadKind.LANE_UNDEFINED,
@@ -79,17 +79,17 @@ def outlines_on_left(lines: Sequence[Array]) -> list[Array]:
     Rings repeat their first point and do not cross, so one inside an even number of others is an exterior, else a hole.
     A line that is no ring (a clipped outline) is reversed: GEOS makes outlines that run clockwise around areas.
     """
-    ring = [len(points) >= 4 and bool((points[0, :2] == points[-1, :2]).all()) for points in lines]
-    rings = [points[:, :2] for points, closed in zip(lines, ring, strict=True) if closed]
+    are_rings = [len(points) >= 4 and bool((points[0, :2] == points[-1, :2]).all()) for points in lines]
+    rings = [points[:, :2] for points, is_ring in zip(lines, are_rings, strict=True) if is_ring]
     if _PROBES * len(rings) * sum(map(len, rings)) > _MOST_COMPARISONS:
         raise DataError(f"an outline of {len(rings)} rings", cure=SKIP)
     depth = iter([_depth(points, [other for other in rings if other is not points]) for points in rings])
-    oriented = []
-    for points, closed in zip(lines, ring, strict=True):
-        anticlockwise = closed and _area(points) > 0
-        exterior = closed and next(depth) % 2 == 0
-        oriented.append(points if closed and anticlockwise == exterior else points[::-1].copy())
-    return oriented
+    result = []
+    for points, is_ring in zip(lines, are_rings, strict=True):
+        anticlockwise = is_ring and _area(points) > 0
+        exterior = is_ring and next(depth) % 2 == 0
+        result.append(points if is_ring and anticlockwise == exterior else points[::-1].copy())
+    return result
 
 
 def _area(ring: Array) -> float:
@@ -100,9 +100,9 @@ def _area(ring: Array) -> float:
 
 def _depth(ring: Array, others: Sequence[Array]) -> int:
     """Number of other rings that contain most of a few points along a ring."""
-    at = np.linspace(0, len(ring) - 2, _PROBES).astype(np.int64)
-    place = (ring[at] + ring[at + 1]) / 2
-    return sum(int(2 * inside(place, other).sum() > _PROBES) for other in others)
+    first = np.linspace(0, len(ring) - 2, _PROBES).astype(np.int64)
+    middle = (ring[first] + ring[first + 1]) / 2
+    return sum(int(2 * inside(middle, other).sum() > _PROBES) for other in others)
 
 
 def inside(points: Array, ring: Array) -> Array:
@@ -110,6 +110,7 @@ def inside(points: Array, ring: Array) -> Array:
     a, b = ring[:-1], ring[1:]
     above = points[:, None, 1] >= a[None, :, 1]
     crosses = above != (points[:, None, 1] >= b[None, :, 1])
+    # Horizontal edges cross no horizontal ray: any divisor but zero will do.
     rise = np.where(a[:, 1] == b[:, 1], 1.0, b[:, 1] - a[:, 1])
     x = a[:, 0] + (points[:, None, 1] - a[:, 1]) / rise * (b - a)[:, 0]
     return ((crosses & (x > points[:, None, 0])).sum(axis=1) % 2).astype(bool)
@@ -132,13 +133,14 @@ def _votes_left(edge: Array, centres: Array) -> int:
 
 
 def _votes(edge: Array, points: Array) -> int:
+    """The same for a block of points."""
     a, b = edge[:-1], edge[1:]
     distance, along = point_to_segment(points[:, None], a[None], b[None])
     rows = np.arange(len(points))
     nearest = distance.argmin(axis=1)
-    place = nearest + along[rows, nearest]
+    position = nearest + along[rows, nearest]
     # A point that is nearest to an end lies before or behind the edge, not next to it.
-    adjacent = (distance[rows, nearest] <= NEIGHBOUR_M) & (place > 0) & (place < len(a))
+    adjacent = (distance[rows, nearest] <= NEIGHBOUR_M) & (position > 0) & (position < len(a))
     step, offset = (b - a)[nearest], points - a[nearest]
     side = np.sign(step[:, 0] * offset[:, 1] - step[:, 1] * offset[:, 0])
     return int(side[adjacent].sum())
@@ -146,7 +148,7 @@ def _votes(edge: Array, points: Array) -> int:
 
 @dataclass(frozen=True)
 class RoadMap:
-    """Features without dangling links, numbers of their names, whether the file lacks heights, and counts of losses."""
+    """Features without dangling links, ids by name, whether the file lacks heights (``flat``), and counts of losses."""
 
     features: tuple[MapFeature, ...]
     names: Names
@@ -169,9 +171,6 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
     """Read ``map_features``; ``around`` is a position (x, y) of ego, metres.
 
     The original data set decides which speed limits and which orientation of edges are used.
-
-    Raises:
-        DataError: The map is too large.
     """
     bodies = {name: body for key, body in table.items() if (name := as_text(key)) and isinstance(body, dict)}
     numbers = sum(extent(value) for body in bodies.values() for value in body.values())
@@ -180,8 +179,8 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
     reading = _Reading(dataset, around, Names(list(bodies), bits=62), Counter(), set())
     reading.lost["broken_features"] += len(table) - len(bodies)
     reading.lost["unknown_fields"] += len({str(key) for body in bodies.values() for key in body} - _FIELDS)
-    read = {name: f for name, body in bodies.items() if (f := _feature(name, body, reading)) is not None}
-    features = list(read.values())
+    by_name = {name: f for name, body in bodies.items() if (f := _feature(name, body, reading)) is not None}
+    features = list(by_name.values())
     total = sum(float(np.hypot(*np.diff(f.points[:, :2], axis=0).T).sum()) for f in features)
     if total > _LONGEST_M:
         raise DataError(f"a map of {total / 1000:.0f} km of lines", cure=SKIP)
@@ -190,7 +189,7 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
     if flat:
         features = [replace(f, points=_on_plane(f.points)) for f in features]
     kind = RoadKind.LINE_SOLID_SINGLE_WHITE
-    outline = np.array([name.startswith(_OUTLINE) and f.kind == kind for name, f in read.items()], bool)
+    outline = np.array([name.startswith(_OUTLINE) and f.kind == kind for name, f in by_name.items()], bool)
     return RoadMap(
         features=tuple(_with_edges(features, outline, dataset)),
         names=reading.names,
@@ -216,8 +215,8 @@ def _feature(name: str, body: Mapping[Any, Any], reading: _Reading) -> MapFeatur
     else:
         points = _on_plane(points)
     if kind not in LANE_KINDS:
-        controlled = _links(body.get("lane"), reading) if kind == RoadKind.STOP_SIGN else ()
-        return MapFeature(feature_id, kind, points, lanes=controlled)
+        lanes = _links(body.get("lane"), reading) if kind == RoadKind.STOP_SIGN else ()
+        return MapFeature(feature_id, kind, points, lanes=lanes)
     return MapFeature(
         feature_id,
         kind,
@@ -238,12 +237,12 @@ def _points(name: str, kind: RoadKind, body: Mapping[Any, Any]) -> Array | None:
 
     The outlines of crosswalks and speed bumps are called ``polyline`` in the first form of the files.
     """
-    parts = ("position",) if kind == RoadKind.STOP_SIGN else ("polyline",)
-    parts = ("polygon", *parts) if kind in POLYGON_KINDS else parts
-    part = next((part for part in parts if body.get(part) is not None), None)
-    if part is None:
+    keys = ("position",) if kind == RoadKind.STOP_SIGN else ("polyline",)
+    keys = ("polygon", *keys) if kind in POLYGON_KINDS else keys
+    key = next((key for key in keys if body.get(key) is not None), None)
+    if key is None:
         return None
-    points = floats(body[part], f"map_features {name[:40]!r}: {part}")
+    points = floats(body[key], f"map_features {name[:40]!r}: {key}")
     points = points[None] if kind == RoadKind.STOP_SIGN and points.ndim == 1 else points
     return points if points.ndim == 2 and points.shape[1] in (2, 3) and len(points) else None
 
@@ -306,7 +305,7 @@ def _with_edges(features: list[MapFeature], outline: Array, dataset: str) -> lis
     rows = np.flatnonzero(outline).tolist()
     for row, points in zip(rows, outlines_on_left([features[row].points for row in rows]), strict=True):
         features[row] = replace(features[row], kind=RoadKind.EDGE_BOUNDARY, points=points)
-    if dataset in _ORIENTED:
+    if dataset in _DRIVABLE_LEFT:
         return features
     lanes = [f.points for f in features if f.kind in LANE_KINDS]
     rows = [i for i, f in enumerate(features) if f.kind in EDGE_KINDS and not outline[i]]

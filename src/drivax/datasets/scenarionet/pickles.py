@@ -63,15 +63,17 @@ def load(data: bytes) -> Any:
 
 @dataclass(frozen=True)
 class _Global:
+    """A function or class that a pickle names: its module and name."""
+
     name: str
 
 
 @dataclass
 class _Unbuilt:
-    """An array or array type whose rest follows in a later operation, and its places in the memo."""
+    """An array or array type whose state follows in a later operation, and its indices in the memo."""
 
     finish: Callable[[Any], Any]
-    places: list[int] = field(default_factory=list)
+    indices: list[int] = field(default_factory=list)
 
 
 class _Machine:
@@ -79,9 +81,10 @@ class _Machine:
 
     def __init__(self) -> None:
         self.stack: list[Any] = []
+        #: Stacks below the marks: each mark begins a new stack.
         self._below: list[list[Any]] = []
         self._memo: dict[int, Any] = {}
-        self._called_with = 0
+        self._argument_size = 0
 
     def run(self, name: str, argument: Any) -> None:
         """Carry out one operation."""
@@ -104,7 +107,7 @@ class _Machine:
             raise DataError(problem, cure=_DISTRUST)
 
     def _take(self, count: int | None) -> list[Any]:
-        """Remove the last items from the stack; all down to the mark where there is no count."""
+        """Remove and return the last items of the stack; all above the mark if ``count`` is None."""
         if count is None:
             items, self.stack = self.stack, self._below.pop()
             return items
@@ -115,19 +118,23 @@ class _Machine:
         return items
 
     def _mark(self, argument: Any) -> None:
+        """MARK: begin a sequence of items."""
         self._below.append(self.stack)
         self.stack = []
 
     def _pop(self, argument: Any) -> None:
+        """POP: drop the last item."""
         self._take(1 if self.stack else None)  # on an empty stack POP removes the mark below it
 
     def _put(self, index: Any) -> None:
-        place = len(self._memo) if index is None else index
-        self._memo[place] = top = self.stack[-1]
+        """PUT and MEMOIZE: store the last item in the memo, at the next index if none is given."""
+        index = len(self._memo) if index is None else index
+        self._memo[index] = top = self.stack[-1]
         if isinstance(top, _Unbuilt):
-            top.places.append(place)
+            top.indices.append(index)
 
     def _name(self, argument: str | None) -> None:
+        """GLOBAL and STACK_GLOBAL: push a name, which must be that of a constructor of data."""
         module, name = self._take(2) if argument is None else argument.partition(" ")[::2]
         if not isinstance(module, str) or not isinstance(name, str):
             raise ValueError("a name that is not text")
@@ -137,13 +144,14 @@ class _Machine:
         self.stack.append(_Global(full))
 
     def _call(self, argument: Any) -> None:
+        """REDUCE: call a constructor."""
         function, arguments = self._take(2)
         make = _FUNCTIONS.get(function.name) if isinstance(function, _Global) else None
         if make is None or not isinstance(arguments, tuple):
-            raise ValueError("a call of something else than a constructor")
-        # Calls copy their arguments, and the memo can repeat the same argument.
-        self._called_with += sum(len(part) for part in arguments if isinstance(part, Sized))
-        if self._called_with > MOST_BYTES:
+            raise ValueError("a call of an object that is not a constructor")
+        # Calls copy their arguments, and the memo can repeat the same argument: bound what all calls copy.
+        self._argument_size += sum(len(part) for part in arguments if isinstance(part, Sized))
+        if self._argument_size > MOST_BYTES:
             raise ValueError("calls with more than the file contains")
         try:
             self.stack.append(make(*arguments))
@@ -151,16 +159,18 @@ class _Machine:
             raise ValueError(f"odd arguments for {function.name}") from error
 
     def _build(self, argument: Any) -> None:
+        """BUILD: finish an array or array type with its state, on the stack and in the memo."""
         (state,) = self._take(1)
         unbuilt = self.stack[-1]
         if not isinstance(unbuilt, _Unbuilt):
-            raise ValueError("a state for something that has none")
-        self.stack[-1] = built = unbuilt.finish(state)
-        for place in unbuilt.places:
-            self._memo[place] = built
+            raise ValueError("a state for an object that has none")
+        self.stack[-1] = result = unbuilt.finish(state)
+        for index in unbuilt.indices:
+            self._memo[index] = result
 
 
 def _fill(container: dict[Any, Any], items: Sequence[Any]) -> dict[Any, Any]:
+    """Add alternating keys and values to a dictionary."""
     container.update((_hashable(key), value) for key, value in zip(items[::2], items[1::2], strict=True))
     return container
 
@@ -170,7 +180,7 @@ _LITERALS = frozenset((
     "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES",
     "BINBYTES8", "BYTEARRAY8",
 ))  # fmt: skip
-#: Operations that make a value of the last items, of those above the mark without a number.
+#: Operations that make a value of the last items: of a number of them, or (None) of those above the mark.
 _MAKES: dict[str, tuple[int | None, Callable[[list[Any]], Any]]] = {
     "NONE": (0, lambda items: None), "NEWTRUE": (0, lambda items: True), "NEWFALSE": (0, lambda items: False),
     "EMPTY_LIST": (0, list), "EMPTY_TUPLE": (0, tuple), "EMPTY_DICT": (0, dict), "EMPTY_SET": (0, set),
@@ -194,7 +204,7 @@ _SKIPPED = frozenset(("PROTO", "FRAME", "STOP"))
 
 
 def _hashable(key: Any) -> Any:
-    """A key or a member of a set: a plain value, or a flat tuple of them. Hashing deep tuples ends the process."""
+    """A key or a member of a set: a plain value or a flat tuple of them, since hashing deep tuples ends the process."""
     plain = (str, int, float, bytes, type(None))
     if isinstance(key, plain) or (type(key) is tuple and all(isinstance(part, plain) for part in key)):
         return key
@@ -202,21 +212,22 @@ def _hashable(key: Any) -> Any:
 
 
 def _members(items: Any = ()) -> list[Any]:
+    """Items of a container."""
     if not isinstance(items, list | tuple | set | frozenset):
-        raise ValueError("a container of something else than items")
+        raise ValueError("a container of an object without items")
     return list(items)
 
 
 def _new_dictionary(*arguments: Any) -> dict[Any, Any]:
-    """An ordered dictionary, or a default dictionary, whose first argument makes defaults."""
+    """A plain dictionary in place of an ordered or a default one, whose factory (the first argument) is dropped."""
     pairs = [argument for argument in arguments if not isinstance(argument, _Global) and argument is not None]
     return {_hashable(key): value for items in pairs for key, value in _members(items)}
 
 
 def _encode(text: Any, encoding: Any = "latin1") -> bytes:
-    """Bytes, as protocols up to 2 hold them."""
+    """Bytes, which protocols up to 2 store as a text in Latin-1."""
     if not isinstance(text, str):
-        raise ValueError("bytes of something else")
+        raise ValueError("bytes of an object that is no text")
     return text.encode("latin1")
 
 
@@ -227,6 +238,7 @@ def _type(code: Any, align: Any = False, copy: Any = False) -> _Unbuilt:
     plain = np.dtype(code)
 
     def finish(state: Any) -> np.dtype[Any]:
+        """Apply the byte order of the state; refuse fields, shapes and metadata."""
         plain_state = isinstance(state, tuple) and state[2:5] == (None, None, None)
         if not plain_state or state[1] not in ("<", ">", "|", "="):
             raise ValueError("an array type with fields")
@@ -239,6 +251,7 @@ def _empty_array(kind: Any, shape: Any, code: Any) -> _Unbuilt:
     """An array whose shape, type and content follow with its state."""
 
     def finish(state: Any) -> Any:
+        """Build the array from its state: version, shape, type, order and content."""
         if not isinstance(state, tuple) or len(state) != 5:
             raise ValueError("an array without content")
         _, shape, dtype, fortran, content = state
@@ -248,7 +261,7 @@ def _empty_array(kind: Any, shape: Any, code: Any) -> _Unbuilt:
 
 
 def _array(content: Any, dtype: Any, shape: Any, order: Any = "C") -> Any:
-    """An array over bytes of the file, so that no shape can ask for more memory than the file has."""
+    """A list of objects, or an array over bytes of the file: no shape can ask for more memory than the file has."""
     if not isinstance(dtype, np.dtype) or not isinstance(shape, tuple) or len(shape) > MOST_AXES:
         raise ValueError("an array of odd shape or type")
     if any(type(size) is not int or not 0 <= size <= MOST_BYTES for size in shape):
@@ -296,11 +309,11 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 def _content(content: Any) -> bytes:
-    """Bytes of a bytes-like value; an integer, which would allocate that many, is refused."""
+    """Bytes of a bytes-like value or a text in Latin-1; an integer, which would allocate that many, is refused."""
     if isinstance(content, str):
         return _encode(content)
     if not isinstance(content, bytes | bytearray):
-        raise ValueError("bytes of something else")
+        raise ValueError("bytes of an object that has none")
     return bytes(content)
 
 
@@ -322,8 +335,8 @@ def as_text(value: Any) -> str | None:
 
 def as_int(value: Any) -> int | None:
     """Return an integer, also from a text; None for anything else."""
-    written = as_text(value)
-    return int(written) if written and written.isascii() and written.isdigit() and len(written) < 19 else None
+    text = as_text(value)
+    return int(text) if text and text.isascii() and text.isdigit() and len(text) < 19 else None
 
 
 def as_float(value: Any) -> float | None:
@@ -367,6 +380,7 @@ def floats(value: Any, what: str) -> Array:
 
 
 def _row(row: Any) -> Any:
+    """Return a number, or up to three numbers in a list, tuple or array; refuse anything else."""
     if isinstance(row, _NUMBER):
         return row
     if isinstance(row, np.ndarray) and row.dtype.kind in "biuf" and row.size <= 3:
@@ -385,9 +399,9 @@ class Names:
     """
 
     def __init__(self, names: Sequence[str], bits: int) -> None:
-        own = [as_int(name) for name in names]
-        kept = [number for number in own if number is not None and number < 1 << bits]
-        numbers = kept if len(kept) == len(names) and len(set(kept)) == len(kept) else range(len(names))
+        integers = [n for name in names if (n := as_int(name)) is not None and n < 1 << bits]
+        are_ids = len(integers) == len(names) and len(set(integers)) == len(integers)
+        numbers = integers if are_ids else range(len(names))
         self._numbers = dict(zip(names, numbers, strict=True))
 
     def get(self, value: Any) -> int | None:

@@ -135,6 +135,7 @@ class ScenarioNet:
 
 
 def _head(path: Path) -> bytes:
+    """The beginning of a file; empty if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(_HEAD_BYTES)
@@ -143,6 +144,7 @@ def _head(path: Path) -> bytes:
 
 
 def _load(path: Path) -> Any:
+    """Read a pickle of plausible size as data."""
     try:
         if path.stat().st_size > pickles.MOST_BYTES:
             raise DataError(
@@ -170,9 +172,6 @@ def decode(tree: Any) -> Recording:
     """Return the recording in a ScenarioNet dictionary, in the map frame of the original data, metres, float64.
 
     A shift of the origin is undone where the file tells it (:func:`_offset`); else the frame is the file's.
-
-    Raises:
-        DataError: The dictionary is damaged.
     """
     metadata = mapping(tree, "metadata")
     table = {
@@ -219,9 +218,9 @@ def _offset(metadata: Mapping[Any, Any], table: Mapping[str, Any], dataset: str)
     centre = _position(metadata, "map_center") - _position(metadata, "old_origin_in_current_coordinate")
     if not centre.any() and dataset == "nuscenes":
         states = [body["state"] for body in table.values() if body["state"].get("valid") is not None]
-        unseen = [floats(s["position"], "")[floats(s["valid"], "").reshape(-1) < 0.5, :2] for s in states]
-        places = np.unique(np.concatenate([np.zeros((0, 2)), *unseen]), axis=0)
-        centre = -places[0] if len(places) == 1 else centre
+        invalid = [floats(s["position"], "")[floats(s["valid"], "").reshape(-1) < 0.5, :2] for s in states]
+        origins = np.unique(np.concatenate([np.zeros((0, 2)), *invalid]), axis=0)
+        centre = -origins[0] if len(origins) == 1 else centre
     return np.append(centre, 0.0)
 
 
@@ -235,6 +234,7 @@ def _position(metadata: Mapping[Any, Any], name: str) -> Array:
 
 
 def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
+    """The id of the scenario, which forms of the files hold in three places."""
     for value in (tree.get("id"), metadata.get("scenario_id"), metadata.get("id")):
         if identity := as_text(value):
             return identity
@@ -242,21 +242,23 @@ def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
 
 
 def _dataset(tree: Any, metadata: Mapping[Any, Any]) -> str:
-    """The origin of the data in drivax' words."""
-    name = as_text(metadata.get("dataset")) or as_text(metadata.get("coordinate")) or ""
+    """Return drivax's name of the source data set; ``scenarionet`` if the file gives none that is usable."""
+    source = as_text(metadata.get("dataset")) or as_text(metadata.get("coordinate")) or ""
     version = as_text(tree.get("version")) or ""
     # Early files name the data set in their version only.
-    word = next((word for word in ("nuscenes", "nuplan") if version.startswith(word)), name.lower())
-    word = _DATASETS.get(word, word)
-    return word if word.isascii() and 0 < len(word) <= 16 and "\0" not in word else _NAME
+    name = next((name for name in ("nuscenes", "nuplan") if version.startswith(name)), source.lower())
+    name = _DATASETS.get(name, name)
+    # Longer names than 16 bytes cannot be stored (``scenario.recording.DATASET_BYTES``).
+    return name if name.isascii() and 0 < len(name) <= 16 and "\0" not in name else _NAME
 
 
 def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
-    ego = as_text(metadata.get("sdc_id"))
-    row = rows.get("ego" if ego is None else ego)
-    if row is not None:
+    """The row of the ego: of the track ``sdc_id``, or of the track ``ego`` if the file names none."""
+    name = as_text(metadata.get("sdc_id"))
+    name = "ego" if name is None else name
+    if (row := rows.get(name)) is not None:
         return row
-    raise DataError(f"the ego {(ego or 'is not named')[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
+    raise DataError(f"the ego {name[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
 
 
 def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Tracks, Counter[str]]:
@@ -270,32 +272,32 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Track
     steps = count_rows(states[ego].get("position"))
     if steps == 0 or steps * len(states) > _MOST_TRACK_STATES:
         raise DataError(f"{len(states)} tracks of {steps} steps", cure=SKIP)
-    stacked = {name: np.zeros((len(states), steps, columns[-1])) for name, (columns, _) in _COLUMNS.items()}
+    arrays = {name: np.zeros((len(states), steps, columns[-1])) for name, (columns, _) in _COLUMNS.items()}
     for row, (title, state) in enumerate(zip(titles, states, strict=True)):
         for name in _COLUMNS:
             values = _series(state, name, steps, title)
             if values is not None:
-                stacked[name][row, :, : values.shape[1]] = values
+                arrays[name][row, :, : values.shape[1]] = values
             elif name in ("position", "heading"):
                 raise DataError(f"{title} has no {name}", cure=SKIP)
             elif name == "valid":
-                stacked[name][row] = 1.0
-    valid = stacked["valid"][..., 0] > 0.5
+                arrays[name][row] = 1.0
+    valid = arrays["valid"][..., 0] > 0.5
     for name, (_, limit) in _COLUMNS.items():
-        stacked[name][~valid] = 0.0
-        parsing.check_within(limit, stacked[name])
-    size = np.concatenate([stacked[name] for name in ("length", "width", "height")], axis=-1)
-    size = np.where(size.any(axis=(1, 2), keepdims=True), size, stacked["size"])
-    missing = ~size[..., :2].any(axis=(1, 2), keepdims=True)
-    size[..., :2] += np.where(missing, 2.0 * stacked["radius"], 0.0)
+        arrays[name][~valid] = 0.0
+        parsing.check_within(limit, arrays[name])
+    size = np.concatenate([arrays[name] for name in ("length", "width", "height")], axis=-1)
+    size = np.where(size.any(axis=(1, 2), keepdims=True), size, arrays["size"])
+    is_round = ~size[..., :2].any(axis=(1, 2), keepdims=True)
+    size[..., :2] += np.where(is_round, 2.0 * arrays["radius"], 0.0)
     longest, widest, _ = size[ego].max(axis=0)
     if longest < widest:  # nuScenes files have a car 1.73 m long and 4.08 m wide
         size[ego] = size[ego][:, [1, 0, 2]]
     tracks = Tracks(
-        xy=stacked["position"][..., :2].copy(),
-        z=stacked["position"][..., 2].copy(),
-        heading=np.where(valid, wrap(stacked["heading"][..., 0]), 0.0),
-        velocity=stacked["velocity"][..., :2].copy(),
+        xy=arrays["position"][..., :2].copy(),
+        z=arrays["position"][..., 2].copy(),
+        heading=np.where(valid, wrap(arrays["heading"][..., 0]), 0.0),
+        velocity=arrays["velocity"][..., :2].copy(),
         size=size,
         valid=valid,
         kind=np.array(
@@ -322,7 +324,7 @@ def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array
 
 
 def velocity_is_missing(tracks: Tracks) -> bool:
-    """Whether the file has no velocities, or differences that are zero where moving tracks end, as for nuScenes."""
+    """Whether most tracks that move at their end have velocity 0 there: it is missing, or a difference (nuScenes)."""
     rows = np.arange(len(tracks.valid))
     last = tracks.valid.shape[1] - 1 - np.argmax(tracks.valid[:, ::-1], axis=1)
     before = np.maximum(last - 1, 0)
@@ -333,7 +335,7 @@ def velocity_is_missing(tracks: Tracks) -> bool:
 
 
 def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int) -> tuple[Tracks, Flag]:
-    """Tracks with box centres and their velocities, and flags for what had to be made up."""
+    """Tracks with box centres and their velocities, and flags for default sizes and differentiated velocities."""
     flags = Flag.DEFAULT_SIZES if dataset == "av2" else Flag.NONE
     if dataset == "nuscenes":  # poses of ego are of the rear axle
         xy = tracks.xy.copy()
@@ -407,17 +409,17 @@ def _lights(
         points = _stop_points(light, steps, what)
         # The stop points of nuPlan's lights are 8 m behind the line.
         stops = points[points.any(axis=1)] if dataset != "nuplan" else points[:0]
-        place = starts[lane].copy()
+        stop_point = starts[lane].copy()
         if len(stops):
-            place[: stops.shape[1]] = stops[0]
-        for step, state in enumerate(states):
-            known = _state(state)
+            stop_point[: stops.shape[1]] = stops[0]
+        for step, name in enumerate(states):
+            state = _state(name)
             # The first form of the files fills all with zeros where nothing is observed.
-            unseen = known == LightState.UNKNOWN and len(points) == steps > 1 and not points[step].any()
-            if state is None or unseen:
+            is_fill = state == LightState.UNKNOWN and len(points) == steps > 1 and not points[step].any()
+            if name is None or is_fill:
                 continue
-            lost["unknown_light_states"] += known is None
-            lights.observe(step, lane, LightState.UNKNOWN if known is None else known, place.tolist())
+            lost["unknown_light_states"] += state is None
+            lights.observe(step, lane, LightState.UNKNOWN if state is None else state, stop_point.tolist())
     return lights.collect(roads.features)[0]
 
 

@@ -26,6 +26,8 @@ from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, Flag, RoadKind
 
 #: Floats hold every whole number up to here; beyond, ids stored as floats may have been rounded.
 _EXACT = 2**24
+#: Larger median spacings of map points are those of v1.2 and later (1 m instead of 0.5 m), m.
+_COARSE_M = 0.75
 Array = np.ndarray[Any, Any]
 
 
@@ -79,9 +81,9 @@ def recording(
     """
     tracks = _tracks(table, rows)
     features, truncated = _map_features(table)
-    lights, unplaced = _lights(table, features)
+    lights, lost_lights = _lights(table, features)
     scenario_id = table.scenario_id(payload)
-    read = Recording(
+    result = Recording(
         scenario_id=scenario_id,
         dataset=dataset,
         segment=parsing.segment_of(scenario_id),
@@ -91,23 +93,23 @@ def recording(
         tracks=tracks,
         features=features,
         lights=lights,
-        to_predict=table.marked("state/tracks_to_predict", rows),
-        of_interest=table.marked("state/objects_of_interest", rows),
+        to_predict=table.find_marks("state/tracks_to_predict", rows),
+        of_interest=table.find_marks("state/objects_of_interest", rows),
         tags={"source_format": source_format},
         lost=parsing.nonzero(
             paths=_paths(table),
             one_point_features=parsing.one_point_features(features),
-            lights_without_place=unplaced,
-            unknown_fields=table.unknown(),
+            lights_without_place=lost_lights,
+            unknown_fields=table.count_unknown(),
         ),
         flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
         split_gap_m=2.0 if _is_coarse(features) else 1.0,  # twice the nominal spacing of points
     )
-    return parsing.shift(read, table.origin())
+    return parsing.shift(result, table.origin())
 
 
 def _track_ids(features: ExampleFeatures, rows: Array) -> Array:
-    """Ids of the rows: stored as floats, but WOMD's are far below 2**24."""
+    """Ids of the rows, which are stored as floats; refuse those that may have been rounded."""
     ids = features.numbers("state/id")[rows]
     if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
         raise DataError("state/id contains numbers that are not exact integers", cure=SKIP)
@@ -121,18 +123,19 @@ def _tracks(features: ExampleFeatures, rows: Array) -> Tracks:
     track_id = _track_ids(features, rows)
     valid = features.over_time("valid", rows) == 1
 
-    def measured(*names: str) -> Array:
+    def read(*names: str) -> Array:
+        """Return fields of the states on a last axis, or one field without it; 0 in invalid states."""
         values = [np.where(valid, features.over_time(name, rows).astype(np.float64), 0.0) for name in names]
         parsing.check_finite(*values)
         return values[0] if len(values) == 1 else np.stack(values, axis=-1)
 
     kinds = np.nan_to_num(features.numbers("state/type", (features.numbers("state/id").size,))[rows])
     return Tracks(
-        xy=measured("x", "y"),
-        z=measured("z"),
-        size=measured("length", "width", "height"),
-        heading=np.where(valid, wrap(measured("bbox_yaw")), 0.0),
-        velocity=measured("velocity_x", "velocity_y"),
+        xy=read("x", "y"),
+        z=read("z"),
+        size=read("length", "width", "height"),
+        heading=np.where(valid, wrap(read("bbox_yaw")), 0.0),
+        velocity=read("velocity_x", "velocity_y"),
         valid=valid,
         kind=np.array([womd.agent_kind(int(kind)) for kind in kinds], np.int8),
         track_id=track_id,
@@ -142,18 +145,18 @@ def _tracks(features: ExampleFeatures, rows: Array) -> Tracks:
 def _timestamps(features: ExampleFeatures, rows: Array, valid: Array) -> Array:
     """Seconds of every step; where no valid state has a time, 10 Hz from the nearest step that has one."""
     micros = np.where(valid, features.over_time("timestamp_micros", rows), -1).max(axis=0, initial=-1)
-    return parsing.seconds(np.where(micros >= 0, micros * 1e-6, np.nan))
+    return parsing.fill_times(np.where(micros >= 0, micros * 1e-6, np.nan))
 
 
 def _ego_row(features: ExampleFeatures, rows: Array) -> int:
-    """Return the place of the ego among the rows."""
-    ego = features.marked("state/is_sdc", rows)
+    """Return the index of the ego among the rows."""
+    ego = features.find_marks("state/is_sdc", rows)
     if len(ego) != 1:
         raise DataError(f"state/is_sdc marks {len(ego)} rows, not 1", cure=SKIP)
     return ego[0]
 
 
-def _lights(features: ExampleFeatures, mapped: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
+def _lights(features: ExampleFeatures, road_map: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
     """Return the lights by lane, and the number of lights without a position."""
     collector = parsing.Lights(sum(features.spans.values()))
     start = 0
@@ -164,13 +167,13 @@ def _lights(features: ExampleFeatures, mapped: Sequence[MapFeature]) -> tuple[tu
             lanes = features.integers(base + "id", (steps, slots))
             states, valid = (features.numbers(base + name, (steps, slots)) for name in ("state", "valid"))
             points = np.stack([features.numbers(base + axis, (steps, slots)) for axis in "xyz"], axis=-1)
-            seen = (valid == 1) & (lanes >= 0) & np.isfinite(states) & np.isfinite(points).all(axis=-1)
-            for step, slot in np.argwhere(seen).tolist():
+            observed = (valid == 1) & (lanes >= 0) & np.isfinite(states) & np.isfinite(points).all(axis=-1)
+            for step, slot in np.argwhere(observed).tolist():
                 collector.observe(
                     start + step, int(lanes[step, slot]), int(states[step, slot]), points[step, slot].tolist()
                 )
         start += steps
-    return collector.collect(mapped)
+    return collector.collect(road_map)
 
 
 def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bool]:
@@ -185,13 +188,13 @@ def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bo
     keep = np.flatnonzero(valid & np.isin(kinds, [int(kind) for kind in RoadKind]))
     parsing.check_finite(points[keep])
     limits = _limits(features, ids.size)
-    mapped = []
+    road_map = []
     for group in _groups(ids, keep):
         kind = RoadKind(int(kinds[group[0]]))
         limit = float(limits[group].max()) * parsing.MPS_PER_MPH if kind in LANE_KINDS else 0.0
         line = _open_ring(points[group]) if kind in POLYGON_KINDS else points[group]
-        mapped.append(MapFeature(int(ids[group[0]]), kind, line, limit_mps=limit if limit > 0 else None))
-    return tuple(mapped), bool(valid.all())
+        road_map.append(MapFeature(int(ids[group[0]]), kind, line, limit_mps=limit if limit > 0 else None))
+    return tuple(road_map), bool(valid.all())
 
 
 def _groups(ids: Array, keep: Array) -> list[Array]:
@@ -216,9 +219,9 @@ def _open_ring(points: Array) -> Array:
     return points[:-1] if closed else points
 
 
-def _is_coarse(mapped: Sequence[MapFeature]) -> bool:
-    """Whether the map is sampled at 1 m (from v1.2 on) rather than at 0.5 m."""
-    return (parsing.spacing_m(mapped) or 0.5) > 0.75
+def _is_coarse(road_map: Sequence[MapFeature]) -> bool:
+    """Whether the map is sampled at 1 m (from v1.2 on) rather than at 0.5 m; False without lines."""
+    return (parsing.spacing_m(road_map) or 0.0) > _COARSE_M
 
 
 def _paths(features: ExampleFeatures) -> int:

@@ -21,7 +21,7 @@ from jaxtyping import Float64
 
 from drivax.errors import DataError, import_extra
 
-#: Feature of drivax' own examples: where the origin of their coordinates lies in the source's map frame.
+#: Feature of examples that drivax wrote: the origin of their coordinates in the source's map frame.
 ORIGIN = "scenario/origin"
 _STATE = "x|y|z|bbox_yaw|length|width|height|speed|vel_yaw|velocity_x|velocity_y|valid|timestamp_micros"
 _MARK = "id|type|is_sdc|is_context|tracks_to_predict|objects_of_interest|difficulty_level"
@@ -39,7 +39,7 @@ _Field = tuple[str, int, str]
 
 
 def _fields(text: str) -> tuple[_Field, ...]:
-    """Fields written as ``name number type``, separated by commas."""
+    """Parse fields written as ``name number type``, separated by commas."""
     parts = (field.split() for field in text.split(","))
     return tuple((name, int(number), kind) for name, number, kind in parts)
 
@@ -115,12 +115,13 @@ def unknown_fields(message: Any, payload: bytes) -> set[tuple[str, int]]:
 
 
 def _undeclared(message: Any) -> Iterator[tuple[str, int]]:
+    """Yield message and number of each undeclared field of a message and of the messages inside it."""
     fields = import_extra("google.protobuf.unknown_fields").UnknownFieldSet(message)
     yield from ((message.DESCRIPTOR.name, field.field_number) for field in fields)
     for field, value in message.ListFields():
         if field.message_type is not None:
-            for part in (value,) if hasattr(value, "ListFields") else value:
-                yield from _undeclared(part)
+            for inner in (value,) if hasattr(value, "ListFields") else value:
+                yield from _undeclared(inner)
 
 
 @cache
@@ -132,6 +133,7 @@ def message_class(name: str) -> Any:
 
 @cache
 def _pool() -> Any:
+    """Return a descriptor pool with all declared messages."""
     descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2")
     file = descriptor_pb2.FileDescriptorProto(name="drivax.proto", package=_PACKAGE, syntax="proto2")
     for name, fields in _MESSAGES.items():
@@ -142,6 +144,7 @@ def _pool() -> Any:
 
 
 def _declare(message: Any, fields: tuple[_Field, ...]) -> None:
+    """Add fields to the descriptor of a message."""
     if any(kind.endswith("?") for _, _, kind in fields):
         message.oneof_decl.add(name="kind")
     for name, number, kind in fields:
@@ -162,7 +165,7 @@ _WIRE = {"double": (1, "<f8"), "float": (5, "<f4"), "bool": (0, "u1")}
 
 @dataclass(frozen=True)
 class Numbers:
-    """A message of numbers: its name, and which of its fields may be there together and are read fast."""
+    """A message of numbers: its name, and sets of its fields that occur together, which NumPy reads at once."""
 
     name: str
     forms: tuple[tuple[str, ...], ...]
@@ -185,27 +188,30 @@ def _layouts(numbers: Numbers) -> tuple[np.dtype[Any], ...]:
 
 
 def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, "message field"]:
-    """One row per message, one column per field, 0 where a field is not there."""
+    """One row per message, one column per field, 0 for a field that a message lacks.
+
+    Messages of a usual layout are read together, by size and tags; protobuf reads the others.
+    """
     out = np.zeros((len(blobs), len(numbers.fields)))
-    todo = np.ones(len(blobs), dtype=bool)
+    unread = np.ones(len(blobs), dtype=bool)
     sizes = np.fromiter(map(len, blobs), np.int64, len(blobs))
     for layout in _layouts(numbers):
-        rows = np.flatnonzero(todo & (sizes == layout.itemsize))
+        rows = np.flatnonzero(unread & (sizes == layout.itemsize))
         if not rows.size:
             continue
-        whole = rows.size == len(blobs)
-        records = np.frombuffer(b"".join(blobs if whole else [blobs[row] for row in rows.tolist()]), layout)
-        present = [(i, *field) for i, field in enumerate(numbers.fields) if field[0] in (layout.names or ())]
-        same = np.ones(len(rows), dtype=bool)
-        for _, name, number, kind in present:
-            same &= records[f"#{name}"] == number << 3 | _WIRE[kind][0]
+        is_all = rows.size == len(blobs)
+        records = np.frombuffer(b"".join(blobs if is_all else [blobs[row] for row in rows.tolist()]), layout)
+        fields = [(i, *field) for i, field in enumerate(numbers.fields) if field[0] in (layout.names or ())]
+        fits = np.ones(len(rows), dtype=bool)
+        for _, name, number, kind in fields:
+            fits &= records[f"#{name}"] == number << 3 | _WIRE[kind][0]
             if kind == "bool":
-                same &= records[name] < 2
+                fits &= records[name] < 2
         with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
-            for column, name, *_ in present:
-                out[rows[same], column] = records[name][same]
-        todo[rows[same]] = False
-    for row in np.flatnonzero(todo).tolist():
+            for column, name, *_ in fields:
+                out[rows[fits], column] = records[name][fits]
+        unread[rows[fits]] = False
+    for row in np.flatnonzero(unread).tolist():
         out[row] = read_one(blobs[row], numbers)
     return out
 
@@ -250,12 +256,12 @@ class ExampleFeatures:
 
     def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> _Array:
         """A numeric feature in a shape that its size must match."""
-        kind, listed = self._list(name)
+        kind, items = self._list(name)
         if kind not in ("float_list", "int64_list"):
             raise DataError(f"numeric feature {name} is missing", cure=SKIP)
         dtype = np.float64 if kind == "float_list" else np.int64
         with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
-            values = np.array(listed, dtype)
+            values = np.array(items, dtype)
         if shape is None:
             return values
         count = int(np.prod(shape))
@@ -270,8 +276,8 @@ class ExampleFeatures:
             raise DataError(f"feature {name} contains floats, not integers", cure=SKIP)
         return values
 
-    def marked(self, name: str, rows: _Array) -> tuple[int, ...]:
-        """Places in ``rows`` with the value 1; none if the file lacks the feature."""
+    def find_marks(self, name: str, rows: _Array) -> tuple[int, ...]:
+        """Indices in ``rows`` with the value 1; none if the file lacks the feature."""
         if not self.has(name):
             return ()
         values = self.numbers(name, (self.numbers("state/id").size,))[rows]
@@ -283,12 +289,12 @@ class ExampleFeatures:
         text = "" if value is None else b"".join(value.bytes_list.value[:1]).decode("ascii", "replace")
         return text or hashlib.sha256(payload).hexdigest()[:16]
 
-    def unknown(self) -> int:
+    def count_unknown(self) -> int:
         """Number of features with names that neither the data set nor ScenarioMax uses."""
         return sum(_KNOWN.fullmatch(str(name)) is None for name in self._values)
 
     def origin(self) -> Float64[np.ndarray, "3"]:
-        """The origin of the coordinates in the source's map frame, which only drivax' own examples name; else zeros."""
+        """The origin of the coordinates in the source's map frame; zeros unless drivax wrote the example."""
         if ORIGIN not in self._values:
             return np.zeros(3)
         try:
@@ -313,7 +319,7 @@ class ExampleFeatures:
         return steps
 
     def over_time(self, name: str, rows: _Array) -> _Array:
-        """``state/{past,current,future}/<name>`` joined, of the rows: ``[track, time]``."""
+        """``state/{past,current,future}/<name>`` of some rows over all steps, ``[track, time]``."""
         count = self.numbers("state/id").size
         spans = [(span, steps) for span, steps in self.spans.items() if steps]
         return np.concatenate(

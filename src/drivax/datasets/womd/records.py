@@ -43,22 +43,22 @@ def flavour(payload: bytes) -> str | None:
 
 
 def scenariomax_signs(features: ExampleFeatures) -> int:
-    """Count which of ScenarioMax's three signs an example shows; WOMD's examples show none.
+    """Count how many of ScenarioMax's three signs an example shows; WOMD's examples show none.
 
     The prediction difficulty is missing; tracks are numbered 0, 1, 2, ... with the ego first; all times are -1.
     """
-    renumbered = untimed = False
+    ids_are_rows = has_no_times = False
     with suppress(DataError):
         ids, valid = features.numbers("state/id"), features.numbers("state/current/valid") == 1
         rows = np.flatnonzero(valid) if valid.size == ids.size else np.zeros(0, np.int64)
         ego = np.flatnonzero(features.numbers("state/is_sdc") == 1)
-        renumbered = rows.size > 0 and bool((ids[rows] == rows).all()) and ego.tolist() == [0]
-        untimed = bool((features.numbers("state/current/timestamp_micros") < 0).all())
-    return sum((not features.has("state/difficulty_level"), renumbered, untimed))
+        ids_are_rows = rows.size > 0 and bool((ids[rows] == rows).all()) and ego.tolist() == [0]
+        has_no_times = bool((features.numbers("state/current/timestamp_micros") < 0).all())
+    return sum((not features.has("state/difficulty_level"), ids_are_rows, has_no_times))
 
 
 def _first(path: Path) -> bytes:
-    """Payload of the first readable record."""
+    """Payload of the first readable record; without any, raise the error of the first record."""
     damage = DataError("the file is empty", file=path, cure="download it again")
     for number, record in read_records(path):
         if isinstance(record, bytes):
@@ -83,9 +83,8 @@ class TfRecordReader:
         """Whether the first readable record is of this format; never raises."""
         try:
             return looks_framed(path) and flavour(_first(path)) == self.name
-        except (
-            UsageError
-        ):  # without the packages it counts as Scenario protos: reading then names the package
+        except UsageError:
+            # protobuf is not installed: claim the file as Scenario protos; reading it then reports the missing package.
             return self.name == SCENARIO_FORMAT
         except DataError:
             return False
@@ -96,8 +95,8 @@ class TfRecordReader:
         try:
             return self.decode(payload)
         except DataError as error:
-            better = self._explain(error, payload)
-            raise DataError(better.problem, file=path, cure=better.cure) from error
+            cause = self._explain(error, payload)
+            raise DataError(cause.problem, file=path, cure=cause.cure) from error
 
     def count(self, path: Path) -> int:
         """The number of records times the windows of the first."""
@@ -118,7 +117,7 @@ class TfRecordReader:
                 yield BadRecord.of(self._explain(error, record), path, number)
 
     def _explain(self, error: DataError, payload: bytes) -> DrivaxError:
-        """The error, or a better one if the payload is of another format."""
+        """The error, or one that names the format if the payload is of another one."""
         other = flavour(payload)
         if other in (None, self.name):
             return error

@@ -18,7 +18,7 @@ from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import LANE_KINDS, RoadKind
+from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, LINE_KINDS, RoadKind
 
 #: Points are 0.5 m apart; twice that is a jump where the map was clipped, not road.
 _SPLIT_GAP_M = 1.0
@@ -62,7 +62,7 @@ def decode(payload: bytes) -> Recording:
     steps = len(message.timestamps_seconds)
     _check(message, steps)
     features, lost = _features(message.map_features)
-    lights, unplaced = _lights(message.dynamic_map_states, steps, features)
+    lights, lost_lights = _lights(message.dynamic_map_states, steps, features)
     rows = {track.id: row for row, track in enumerate(message.tracks)}
     return Recording(
         scenario_id=message.scenario_id,
@@ -81,7 +81,7 @@ def decode(payload: bytes) -> Recording:
         of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
         tags={"source_format": womd.SCENARIO_FORMAT},
         lost=parsing.nonzero(
-            lost, lights_without_place=unplaced, unknown_fields=_unknown_fields(message, payload)
+            lost, lights_without_place=lost_lights, unknown_fields=_unknown_fields(message, payload)
         ),
         split_gap_m=_SPLIT_GAP_M,
     )
@@ -90,12 +90,13 @@ def decode(payload: bytes) -> Recording:
 def _unknown_fields(message: Any, payload: bytes) -> int:
     """Number of fields of unknown numbers; states, which are kept as bytes, are examined once per length."""
     states = {len(state): state for track in message.tracks for state in track.states}
-    parsed = ((parse(STATES.name, state), state) for state in states.values())
-    in_states = (unknown_fields(state, blob) for state, blob in parsed if state is not None)
+    pairs = ((parse(STATES.name, blob), blob) for blob in states.values())
+    in_states = (unknown_fields(state, blob) for state, blob in pairs if state is not None)
     return len(unknown_fields(message, payload).union(*in_states))
 
 
 def _check(message: Any, steps: int) -> None:
+    """Refuse a scenario whose counts, indices or ids contradict each other."""
     if not isinstance(message.scenario_id, str):  # protobuf gives bytes where a string is no UTF-8
         raise DataError("scenario_id is not text", cure=SKIP)
     if steps == 0 or not message.tracks:
@@ -116,6 +117,7 @@ def _check(message: Any, steps: int) -> None:
 
 def _tracks(tracks: Any, steps: int) -> Tracks:
     blobs = [state for track in tracks for state in track.states]
+    # Columns in the order of the message ObjectState.
     table = read_table(blobs, STATES).reshape(len(tracks), steps, -1)
     valid = table[..., 9] > 0.5
     table[~valid] = 0.0
@@ -143,7 +145,7 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
 
 def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
     """Return the map features, and the number of skipped ones by reason."""
-    kept: dict[int, tuple[str, Any, Sequence[bytes]]] = {}
+    bodies: dict[int, tuple[str, Any, Sequence[bytes]]] = {}
     unknown = duplicate = empty = 0
     for message in messages:
         kind = message.WhichOneof("kind")
@@ -154,15 +156,15 @@ def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
         blobs = _blobs(kind, body)
         if not blobs:
             empty += 1
-        elif message.id in kept:
+        elif message.id in bodies:
             duplicate += 1
         else:
-            kept[message.id] = kind, body, blobs
-    points = read_table([blob for *_, blobs in kept.values() for blob in blobs], POINTS)
-    ends = np.cumsum([len(blobs) for *_, blobs in kept.values()], dtype=np.int64)[:-1]
+            bodies[message.id] = kind, body, blobs
+    points = read_table([blob for *_, blobs in bodies.values() for blob in blobs], POINTS)
+    ends = np.cumsum([len(blobs) for *_, blobs in bodies.values()], dtype=np.int64)[:-1]
     features = tuple(
         _feature(feature_id, kind, body, line.copy())
-        for (feature_id, (kind, body, _)), line in zip(kept.items(), np.split(points, ends), strict=False)
+        for (feature_id, (kind, body, _)), line in zip(bodies.items(), np.split(points, ends), strict=False)
     )
     lost = parsing.nonzero(
         unknown_features=unknown,
@@ -187,9 +189,9 @@ def _feature(feature_id: int, kind: str, body: Any, points: _Points) -> MapFeatu
         return MapFeature(feature_id, RoadKind.STOP_SIGN, points, lanes=tuple(body.lane))
     if kind in _POLYGONS:
         return MapFeature(feature_id, _POLYGONS[kind], points)
-    first, last = (5, 13) if kind == "road_line" else (14, 16)
-    code = first + body.type
-    return MapFeature(feature_id, RoadKind(code if first <= code <= last else first), points)
+    # Types of lines and edges count from 0 in the order of RoadKind, which begins with the unknown kind.
+    kinds = LINE_KINDS if kind == "road_line" else EDGE_KINDS
+    return MapFeature(feature_id, kinds[body.type if 0 <= body.type < len(kinds) else 0], points)
 
 
 def _lane(feature_id: int, lane: Any, points: _Points) -> MapFeature:

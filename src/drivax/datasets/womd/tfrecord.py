@@ -36,6 +36,7 @@ def example(features: Mapping[str, bytes | _Array]) -> bytes:
     Values are bytes (a list of one), integer arrays (int64 lists) or floating-point arrays (float32 lists); arrays are
     flattened row by row.
     """
+    # Field 1 of Example are the features, field 1 of those the entries, with key 1 and value 2.
     entries = b"".join(
         _field(1, _field(1, name.encode()) + _field(2, _feature(features[name]))) for name in sorted(features)
     )
@@ -43,6 +44,7 @@ def example(features: Mapping[str, bytes | _Array]) -> bytes:
 
 
 def _feature(value: bytes | _Array) -> bytes:
+    """A serialised ``Feature``: the list of its kind, whose only field has number 1."""
     if isinstance(value, bytes):
         return _field(_BYTES, _field(1, value))
     if np.issubdtype(value.dtype, np.floating):
@@ -51,6 +53,7 @@ def _feature(value: bytes | _Array) -> bytes:
 
 
 def _field(number: int, content: bytes) -> bytes:
+    """A field with a length: tag, length, content."""
     return bytes((number << 3 | _LENGTH,)) + varints(np.array([len(content)])) + content
 
 
@@ -58,9 +61,10 @@ def varints(values: _Array) -> bytes:
     """Integers as variable-length ones: seven bits a byte, the least first; negative ones take ten bytes."""
     bits = values.reshape(-1, 1).astype(np.int64).view(np.uint64)
     groups = bits >> (np.uint64(7) * _GROUPS)
-    more = groups >= 128
-    is_written = np.concatenate((np.ones_like(more[:, :1]), more[:, :-1]), axis=1)
-    content = (groups & np.uint64(127)) | (more.astype(np.uint64) << np.uint64(7))
+    continues = groups >= 128
+    # The first byte, and every one after a byte that continues.
+    is_written = np.concatenate((np.ones_like(continues[:, :1]), continues[:, :-1]), axis=1)
+    content = (groups & np.uint64(127)) | (continues.astype(np.uint64) << np.uint64(7))
     return content.astype(np.uint8)[is_written].tobytes()
 
 
@@ -130,9 +134,10 @@ def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> byte
     length, length_crc = struct.unpack("<QI", header)
     if mask_crc(crc32c(header[:8])) != length_crc:
         raise _bad_length(header, start)
-    left = size - file.tell()
-    if length > _LONGEST_BYTES or length + _FOOTER_BYTES > left:
-        raise _Lost(f"truncated: the record needs {length + _FOOTER_BYTES} bytes, the file has {left} left")
+    remaining = size - file.tell()
+    if length > _LONGEST_BYTES or length + _FOOTER_BYTES > remaining:
+        problem = f"truncated: the record needs {length + _FOOTER_BYTES} bytes, the file has {remaining} left"
+        raise _Lost(problem)
     payload = file.read(length)
     footer = file.read(_FOOTER_BYTES)
     if len(footer) < _FOOTER_BYTES:
@@ -145,11 +150,11 @@ def count_records(path: str | Path) -> int:
     try:
         with Path(path).open("rb") as file:
             size = os.fstat(file.fileno()).st_size
-            place = count = 0
-            while place + _HEADER_BYTES + _FOOTER_BYTES <= size:
-                file.seek(place)
-                place += int.from_bytes(file.read(8), "little") + _HEADER_BYTES + _FOOTER_BYTES
-                count += place <= size
+            position = count = 0
+            while position + _HEADER_BYTES + _FOOTER_BYTES <= size:
+                file.seek(position)
+                position += int.from_bytes(file.read(8), "little") + _HEADER_BYTES + _FOOTER_BYTES
+                count += position <= size
             return count
     except OSError:
         return 0

@@ -119,26 +119,27 @@ def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
             stack_field(records, "lane_length") > 0,
         )
     )
-    moving = max(1, _rounded(int(agents.max()), capacity.agents))
-    slots = _rounded(int((agents + parked).max()), capacity.agents + capacity.parked)
-    _, edges, segments, _ = stack_field(records, "segment_blocks").T
-    half_m = np.hypot(*stack_field(records, "agent_size", 0).T[:2]).astype(np.float64) / 2
+    moving = max(1, _round_up(int(agents.max()), capacity.agents))
+    slots = _round_up(int((agents + parked).max()), capacity.agents + capacity.parked)
+    _, edge_end, lane_end, _ = stack_field(records, "segment_blocks").T
+    half_diagonal_m = np.hypot(*stack_field(records, "agent_size", 0).T[:2]).astype(np.float64) / 2
     return Sizes(
         agents=moving,
         slots=max(slots, moving),
-        lights=max(1, _rounded(int(lights.max()), capacity.lights)),
-        edges=int(edges.max()),
-        lanes=int((segments - edges).max()),
+        lights=max(1, _round_up(int(lights.max()), capacity.lights)),
+        edges=int(edge_end.max()),
+        lanes=int((lane_end - edge_end).max()),
         edge_run=_longest_run(stack_field(records, "grid_edge"), capacity.grid),
         lane_run=_longest_run(stack_field(records, "grid_lane"), capacity.grid),
-        graphs=max(1, _rounded(int(lanes.max()), capacity.lanes)),
+        graphs=max(1, _round_up(int(lanes.max()), capacity.lanes)),
         road=max(1, int(stack_field(records, "road_rows").max())),
         # Edges count up to 3 m from a corner; the 3 x 3 block is exact within a cell less half a segment.
-        long_ego=bool((half_m + 3.0 > capacity.cell_m - 2.0).any()),
+        long_ego=bool((half_diagonal_m + 3.0 > capacity.cell_m - 2.0).any()),
     )
 
 
-def _rounded(count: int, most: int) -> int:
+def _round_up(count: int, most: int) -> int:
+    """Round up to a multiple of 8, but not above ``most``."""
     return min(most, -(-count // _MULTIPLE) * _MULTIPLE)
 
 
@@ -243,8 +244,9 @@ class ScenarioBank:
     ) -> ScenarioBank:
         """Stack scenarios of one capacity.
 
-        ``trim`` cuts unused padding, or cuts to these sizes: banks of the same sizes share compiled programs, smaller
-        banks are faster. ``allow_no_future`` accepts logs with fewer than 20 steps after the current one.
+        ``trim`` cuts unused padding, or cuts to given sizes, which must hold all scenarios (:meth:`Sizes.used`): banks
+        of the same sizes share compiled programs, smaller banks are faster. ``allow_no_future`` accepts logs with fewer
+        than 20 steps after the current one.
 
         Raises:
             DrivaxError: There are no scenarios, their capacities differ, or a log is too short.
@@ -255,21 +257,21 @@ class ScenarioBank:
                 cure = "leave it out (flag!=NO_FUTURE)"
                 raise DataError(too_short(int(scenario.steps)), record=scenario.id, cure=cure)
             if scenario.capacity != logs[0].capacity:
-                own, others = (f"{c.name!r} ({c.steps} steps)" for c in (scenario.capacity, logs[0].capacity))
+                names = [f"{c.name!r} ({c.steps} steps)" for c in (scenario.capacity, logs[0].capacity)]
                 cure = "convert all sets with one --capacity and --future-s"
-                raise DataError(f"has capacity {own}, others {others}", record=scenario.id, cure=cure)
-        own = Sizes.used(logs)
-        sizes = trim if isinstance(trim, Sizes) else own if trim else Sizes.whole(logs[0].capacity)
+                raise DataError(f"has capacity {names[0]}, others {names[1]}", record=scenario.id, cure=cure)
+        least = Sizes.used(logs)
+        sizes = trim if isinstance(trim, Sizes) else least if trim else Sizes.whole(logs[0].capacity)
         arrays = _stack(logs, sizes)
         return cls(
             **{name: jax.device_put(value, may_alias=True) for name, value in arrays.items()},
             cell_m=logs[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
-            long_ego=own.long_ego or sizes.long_ego, trimmed=trim is True,
+            long_ego=least.long_ego or sizes.long_ego, trimmed=trim is True,
         )  # fmt: skip
 
 
 def too_short(steps: int) -> str:
-    """Say that a log has fewer steps than one that is evaluated or trained on."""
+    """Return the error message for a log with too few steps to evaluate or train on."""
     return f"has {steps} steps, fewer than {LEAST_STEPS} (20 after the current one)"
 
 
@@ -284,12 +286,14 @@ def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
         "map_box": (4,),
     }
     large = [_aligned((len(records), *shape), np.dtype(np.float32)) for shape in shapes.values()]
+    # The first record gives the names, shapes and types of the other arrays.
     arrays = {
         name: _aligned((len(records), *values.shape[1:]), values.dtype)
         for name, values in _stack_batch(records[:1], sizes).items()
     }
 
     def fill(rows: slice) -> None:
+        """Write a batch of scenarios into all arrays."""
         batch = records[rows]
         targets = zip(*(array[rows] for array in large), strict=True)
         for log, values, target in zip(batch, _lane_values(batch), targets, strict=True):
@@ -306,6 +310,7 @@ def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
 
 
 def _aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray[Any, Any]:
+    """Return an uninitialised array whose memory JAX takes over without a copy."""
     size = int(np.prod(shape)) * dtype.itemsize
     memory = np.empty(size + _ALIGNMENT, np.uint8)
     begin = -memory.ctypes.data % _ALIGNMENT
@@ -376,7 +381,7 @@ def _stack_agents(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
 def _log_ahead(
     xy: Float[np.ndarray, "n time 2"], valid: Bool[np.ndarray, "n time"]
 ) -> Float[np.ndarray, "n time"]:
-    """Distance that each logged ego drives from every step on, without gaps of the log."""
+    """Distance in m that each logged ego drives from every step on; gaps of the log add nothing."""
     moved = np.hypot(*np.moveaxis(np.diff(xy, axis=1), -1, 0)) * (valid[:, 1:] & valid[:, :-1])
     ahead = np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
     return np.concatenate([ahead, np.zeros_like(ahead[:, :1])], axis=1)
@@ -394,16 +399,16 @@ def _stack_parked(
     )
     mask = np.arange(parked.stop) < count[:, None]
     scenario, number = np.nonzero(mask)
-    at = scenario, first[scenario] + number
+    slot = scenario, first[scenario] + number
     poses = np.zeros((len(records), slots, 8), np.float32)
     velocity, is_observed = np.zeros((*z.shape, 2)), np.ones(z.shape)
-    poses[at] = _interleave(xy, z, np.cos(heading), np.sin(heading), velocity, is_observed)[mask]
+    poses[slot] = _interleave(xy, z, np.cos(heading), np.sin(heading), velocity, is_observed)[mask]
     boxes = np.zeros((len(records), slots, 4), np.float32)
     boxes[:, : box.shape[1]] = box
-    boxes[at] = _interleave(size, kind)[mask]
+    boxes[slot] = _interleave(size, kind)[mask]
     words = as_words(valid[:, :, parked])
     when = np.zeros((len(records), words.shape[1], slots), np.uint32)
-    when[scenario, :, at[1]] = words[scenario, :, number]
+    when[scenario, :, slot[1]] = words[scenario, :, number]
     return {"agent_box": boxes, "parked": poses, "parked_when": when}
 
 
@@ -447,7 +452,7 @@ def _stack_lights(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
 def _stop_arcs(
     records: Sequence[_Record], lane: Int[np.ndarray, "n light"], middle: Float[np.ndarray, "n light 2"]
 ) -> Float[np.ndarray, "n light"]:
-    """Arc length along the route to the goal where it is nearest to the stop lines of its lanes."""
+    """Arc length along route 0 of the stop lines of its lanes, ``NEVER_M`` for those of other lanes."""
     arcs = np.full(lane.shape, NEVER_M)
     count = stack_field(records, "route_points", 0)
     route_lane = stack_field(records, "route_lane", 0)
@@ -461,9 +466,10 @@ def _stop_arcs(
             stack_field(records, f"route_{name}", 0).astype(np.float64) for name in ("xy", "heading")
         )
         dx, dy = np.moveaxis(middle[stops][:, None] - xy[scenario], -1, 0)
-        away = np.where(np.arange(xy.shape[1]) < count[scenario, None], dx * dx + dy * dy, np.inf)
-        near = np.argmin(away, axis=1)
+        squared_m = np.where(np.arange(xy.shape[1]) < count[scenario, None], dx * dx + dy * dy, np.inf)
+        near = np.argmin(squared_m, axis=1)
         nearest, course = (np.arange(len(near)), near), heading[scenario, near]
+        # Route points are 1 m apart: the index of the nearest is its arc length.
         arcs[stops] = near + dx[nearest] * np.cos(course) + dy[nearest] * np.sin(course)
     return arcs
 
@@ -486,31 +492,32 @@ def _fill_segments(
     edges: Float[np.ndarray, "5 edge"], lanes: Float[np.ndarray, "8 lane"], box: Float[np.ndarray, "4"],
     values: Float[np.ndarray, "3 lane1"], log: _Record,
 ) -> None:  # fmt: skip
-    """Write the edges and lanes of a record in place, and the box around them."""
-    e, end = log["segment_blocks"][1:3].tolist()
-    a, b, count = log["segment_a"][:end].T, log["segment_b"][:end].T, end - e
-    ends = np.empty((5, end), np.float32)
+    """Write the edges and lanes of a record in place, and the box around them; ``values`` are :func:`_lane_values`."""
+    edge_end, lane_end = log["segment_blocks"][1:3].tolist()
+    a, b, count = log["segment_a"][:lane_end].T, log["segment_b"][:lane_end].T, lane_end - edge_end
+    ends = np.empty((5, lane_end), np.float32)
     ends[0:2], ends[2:4], ends[4] = a[:2], b[:2], (a[2] + b[2]) / 2
-    edges[:, :e], edges[:, e:] = ends[:, :e], _FAR_M
-    lanes[:5, :count], lanes[5:, :count] = ends[:, e:], values[:, log["segment_lane"][e:end]]
+    edges[:, :edge_end], edges[:, edge_end:] = ends[:, :edge_end], _FAR_M
+    lanes[:5, :count] = ends[:, edge_end:]
+    lanes[5:, :count] = values[:, log["segment_lane"][edge_end:lane_end]]
     lanes[:, count:] = _FAR_M
-    low, high = (ends[:4].min(axis=1), ends[:4].max(axis=1)) if end else np.zeros((2, 4), np.float32)
+    low, high = (ends[:4].min(axis=1), ends[:4].max(axis=1)) if lane_end else np.zeros((2, 4), np.float32)
     np.minimum(low[:2], low[2:], out=box[:2])
     np.maximum(high[:2], high[2:], out=box[2:])
 
 
 def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
-    """Half width, limit and number of each lane, as in :class:`LaneRow`, and for segments without a lane (-1)."""
+    """Half width, limit and index of each lane, as in :class:`LaneRow`; the last column is for no lane (-1)."""
     count = int(last_used(stack_field(records, "lane_id") >= 0).max())
     lanes = np.append(np.arange(count), -1)
     width = stack_field(records, "lane_width", lanes)
     half = np.where(width > 0, width, DEFAULT_LANE_WIDTH_M) / 2
-    number = lanes + 0.5 * corridor_lanes(records)[:, lanes]
-    return np.stack([half, _lane_limits(records, lanes), number], axis=1, dtype=np.float32)
+    index = lanes + 0.5 * corridor_lanes(records)[:, lanes]
+    return np.stack([half, _lane_limits(records, lanes), index], axis=1, dtype=np.float32)
 
 
 def _lane_limits(records: Sequence[_Record], lanes: Int[np.ndarray, " lane"]) -> Float[np.ndarray, "n lane"]:
-    """Limit of each lane, m/s; of connectors the highest of the lanes that they join, if known; else of the class."""
+    """Limit of each lane, m/s: for connectors the highest of the lanes that they join, if known; else of the class."""
     limit, kind, is_connector, *links = (
         stack_field(records, f"lane_{name}", lanes)
         for name in ("limit", "kind", "interpolating", "predecessor", "successor")
@@ -519,17 +526,18 @@ def _lane_limits(records: Sequence[_Record], lanes: Int[np.ndarray, " lane"]) ->
     scenario = np.arange(len(records))[:, None, None]
     joined = np.where(link >= 0, limit[scenario, link], -1.0).max(axis=2)
     limit = np.where(is_connector & (joined > 0), joined, limit)
-    for number, fallback in CLASS_LIMIT_MPS.items():
-        limit = np.where((limit <= 0) & (kind == number), fallback, limit)
+    for road_kind, class_limit in CLASS_LIMIT_MPS.items():
+        limit = np.where((limit <= 0) & (kind == road_kind), class_limit, limit)
     return limit
 
 
 def _stack_grid(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
-    edges = stack_field(records, "segment_blocks", 1).astype(np.int16)
+    # Stored lane starts index all segments; the bank holds lanes apart from edges, so subtract the number of edges.
+    edge_count = stack_field(records, "segment_blocks", 1).astype(np.int16)
     return {
         "lane_strands": lane_strands(records)[:, : sizes.graphs],
         "grid_edge": stack_field(records, "grid_edge"),
-        "grid_lane": stack_field(records, "grid_lane") - edges[:, None],
+        "grid_lane": stack_field(records, "grid_lane") - edge_count[:, None],
         "grid_side": stack_field(records, "grid_side"),
         "grid_origin": stack_field(records, "grid_origin"),
     }

@@ -38,9 +38,11 @@ def first_smallest(values: Float[Array, "..."], axis: int = -1, least: float = 0
     """Return ``argmin`` of values of at least ``least``; of nearly equal values the first.
 
     N values are nearly equal if they differ by less than 1e-6 or about ``N * 2**-23`` of their distance from ``least``.
+    Values below ``least`` count as equal to it.
     """
     count = values.shape[axis]
     bits = (count - 1).bit_length()
     place = jax.lax.broadcasted_iota(jnp.int32, values.shape, axis % values.ndim)
     key = embed_number(jnp.clip(values - least, 0.0, _FAR) + _TINY, place, bits)
+    # The bits of a NaN are any number, so keep the index inside the axis.
     return jnp.minimum(number_of(jnp.min(key, axis=axis), bits), count - 1)

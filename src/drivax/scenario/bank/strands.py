@@ -24,13 +24,13 @@ Array = np.ndarray[Any, Any]
 NOWHERE_M = 1e6
 #: Stretch of a lane at its ends that decides its course, and distance from the ends for headings, m.
 _BEND_M, _END_M = 20.0, 1.0
-#: Turn onto a lane of which that stretch is not stored, rad.
+#: Value for a turn to or from a lane of which that stretch is not stored, larger than any other, rad.
 _UNKNOWN = 100.0
 #: Lanes that meet merge if their headings differ by less 20 m before; others cross or turn in.
 _MERGING_RAD = np.deg2rad(30.0)
 #: An adjacent lane continues beyond the end of a lane if it reaches further than the first distance. Lanes may end at
 #: the crop of the map beyond the second distance from the box of the ego's log, m.
-_ON_M, _KNOWN_M = 10.0, 95.0
+_CONTINUES_M, _KNOWN_M = 10.0, 95.0
 #: Largest excess of the length of a lane over its drawing (height, rounding), m.
 _SLACK_M = 1.0
 
@@ -47,26 +47,30 @@ def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
     tables[..., StrandColumn.END] = NOWHERE_M
     if not len(lanes.scenario):
         return tables
-    row = np.arange(len(lanes.scenario))
+    lane = np.arange(len(lanes.scenario))
     successor, predecessor = lanes.links(records, "successor"), lanes.links(records, "predecessor")
-    courses, each = _Courses.of(records, lanes), np.repeat(row[:, None], 4, axis=1)
-    ahead = _straightest_link(successor, courses.turn(each, successor))
-    behind = _straightest_link(predecessor, courses.turn(predecessor, each))
-    follows = np.where((ahead >= 0) & (behind[ahead] == row), ahead, -1)
+    courses, lane_of_link = _Courses.of(records, lanes), np.repeat(lane[:, None], 4, axis=1)
+    ahead = _straightest_link(successor, courses.turn(lane_of_link, successor))
+    behind = _straightest_link(predecessor, courses.turn(predecessor, lane_of_link))
+    # Two lanes belong to one strand if each is the straightest link of the other.
+    follows = np.where((ahead >= 0) & (behind[ahead] == lane), ahead, -1)
     strand, last = _strands(follows)
-    other = np.where((ahead >= 0) & (follows < 0), behind[ahead], -1)
-    merges = (other >= 0) & (np.abs(wrap(courses.before - courses.before[other])) <= _MERGING_RAD)
+    # A lane whose successor continues another lane merges onto that strand if both come from one direction.
+    rival = np.where((ahead >= 0) & (follows < 0), behind[ahead], -1)
+    merges = (rival >= 0) & (np.abs(wrap(courses.before - courses.before[rival])) <= _MERGING_RAD)
     onto = np.where(merges, strand[ahead], -1)
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
-    stops = (successor < 0).all(axis=1) & _is_map_known(records, lanes.scenario, stop)
-    table = np.empty((len(row), 6))
+    is_dead_end = (successor < 0).all(axis=1) & _is_map_known(records, lanes.scenario, stop)
+    table = np.empty((len(lane), 6))
     for column, name in ((StrandColumn.RIGHT, "right"), (StrandColumn.LEFT, "left")):
         adjacent = lanes.links(records, name)
         further = ((stop[last[adjacent]] - stop) * course).sum(axis=1)
-        # Lanes that are not stored lie beyond the crop.
-        continues = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | ~(further <= _ON_M))
-        onto = np.where(stops & continues, strand[adjacent], onto)
+        # NaN counts as further: the end of the adjacent strand is not stored, so it lies beyond the crop.
+        is_further = ~(further <= _CONTINUES_M)
+        continues = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | is_further)
+        onto = np.where(is_dead_end & continues, strand[adjacent], onto)
         table[:, column] = lanes.index(np.where(adjacent >= 0, strand[adjacent], -1))
+    # What holds for the last lane holds for the whole strand; a ring has no last lane.
     onto = np.where(follows[last] < 0, onto[last], -1)
     table[:, StrandColumn.STRAND], table[:, StrandColumn.ONTO] = lanes.index(strand), lanes.index(onto)
     table[:, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
@@ -100,19 +104,19 @@ class _Lanes:
         return cls(mask, np.cumsum(count) - count, scenario, length[mask].astype(float))
 
     def links(self, records: Sequence[Array], name: str) -> Int[Array, "lane *link"]:
-        """Return links of lanes as places in the sequence, -1 for none."""
+        """Return links of lanes as indices in the sequence, -1 for none."""
         link = stack_field(records, f"lane_{name}")[self.mask].astype(np.int64)
         first = self.first[self.scenario].reshape(-1, *[1] * (link.ndim - 1))
         return np.where(link >= 0, link + first, -1)
 
     def index(self, lane: Int[Array, " lane"]) -> Int[Array, " lane"]:
-        """Return the indices of lanes, one per lane of the sequence, in its scenario."""
+        """Turn indices in the sequence into indices in the scenario: entry i is for lane i's scenario; -1 for none."""
         return np.where(lane >= 0, lane - self.first[self.scenario], -1)
 
 
 @dataclass(frozen=True)
 class _Courses:
-    """Courses of lanes at their ends; NaN if that stretch is not stored.
+    """Courses of lanes at their ends; NaN if the stretch is not stored.
 
     Headings (rad) at the beginning, at the end and 20 m ``before`` the end; mean curvature (1/m) over the first and the
     last 20 m; and the last point (m).
@@ -145,7 +149,7 @@ class _Courses:
 
 @dataclass(frozen=True)
 class _Segments:
-    """Segments of lanes by lane and arc length; those of lane i are ``first[i]`` to ``first[i + 1]``."""
+    """Segments in order of lane and arc length; those of lane i are ``first[i]`` to ``first[i + 1]``, exclusive."""
 
     lane: Integer[Array, " segment"]
     start: Float[Array, " segment"]
@@ -156,37 +160,39 @@ class _Segments:
     @classmethod
     def of(cls, records: Sequence[Array], lanes: _Lanes) -> _Segments:
         """Return the segments of stored lanes."""
-        parts = [slice(*record["segment_blocks"][1:3].tolist()) for record in records]
+        blocks = [slice(*record["segment_blocks"][1:3].tolist()) for record in records]
         index, start, a, b = (
             np.concatenate(
-                [record[f"segment_{name}"][part] for record, part in zip(records, parts, strict=True)]
+                [record[f"segment_{name}"][block] for record, block in zip(records, blocks, strict=True)]
             )
             for name in ("lane", "start_m", "a", "b")
         )
-        first = np.repeat(lanes.first, [part.stop - part.start for part in parts])
-        of_lanes = np.flatnonzero(index >= 0)
-        lane = (first[of_lanes] + index[of_lanes]).astype(np.min_scalar_type(len(lanes.scenario)))
-        # Floats of one sign are ordered as their bits. Whole numbers sort several times faster than np.lexsort.
-        by_start = np.abs(start[of_lanes]).view(np.uint32).astype(np.uint64) << 32 | np.arange(
-            len(of_lanes), dtype=np.uint64
+        first = np.repeat(lanes.first, [block.stop - block.start for block in blocks])
+        has_lane = np.flatnonzero(index >= 0)
+        lane = (first[has_lane] + index[has_lane]).astype(np.min_scalar_type(len(lanes.scenario)))
+        # Keys: the bits of the start, which order floats of one sign, then the index. Integers sort several times
+        # faster than np.lexsort.
+        by_start = np.abs(start[has_lane]).view(np.uint32).astype(np.uint64) << 32 | np.arange(
+            len(has_lane), dtype=np.uint64
         )
         order = (np.sort(by_start) & 0xFFFFFFFF).astype(np.int64)
         order = order[np.argsort(lane[order], kind="stable")]
-        lane, order = lane[order], of_lanes[order]
+        lane, order = lane[order], has_lane[order]
         bounds = np.searchsorted(lane, np.arange(len(lanes.scenario) + 1))
         return cls(lane, start[order].astype(float), a[order, :2], b[order, :2], bounds)
 
     def at(self, arc: Float[Array, " lane"]) -> tuple[Float[Array, " lane"], Float[Array, "lane 2"]]:
         """Heading and end of the segment at an arc length of each lane, NaN without one."""
+        # Segments of a lane are sorted by start: the number of those that start at or before ``arc`` gives the last.
         before = np.append(0, np.cumsum(self.start <= arc[self.lane]))[self.first]
         last = self.first[:-1] + np.diff(before) - 1
-        row = np.flatnonzero(np.diff(before))
-        start, a, b = (values[last[row]].astype(float) for values in (self.start, self.a, self.b))
+        lane = np.flatnonzero(np.diff(before))
+        start, a, b = (values[last[lane]].astype(float) for values in (self.start, self.a, self.b))
         span = np.hypot(*(b - a).T)
-        reaches = arc[row] - start <= span + _SLACK_M
+        reaches = arc[lane] - start <= span + _SLACK_M
         heading, end = np.full(len(arc), np.nan), np.full((len(arc), 2), np.nan)
-        heading[row[reaches]] = np.arctan2(*(b - a)[reaches].T[::-1])
-        end[row[reaches]] = b[reaches]
+        heading[lane[reaches]] = np.arctan2(*(b - a)[reaches].T[::-1])
+        end[lane[reaches]] = b[reaches]
         return heading, end
 
 
@@ -198,9 +204,9 @@ def _straightest_link(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"])
 
 def _strands(follows: Int[Array, " lane"]) -> tuple[Int[Array, " lane"], Int[Array, " lane"]]:
     """Strand of each lane and its last lane (any lane of a ring), by pointer doubling."""
-    row = np.arange(len(follows))
-    last = np.where(follows >= 0, follows, row)
-    highest = np.maximum(row, last)
+    lane = np.arange(len(follows))
+    last = np.where(follows >= 0, follows, lane)
+    highest = np.maximum(lane, last)
     for _ in range(len(follows).bit_length()):
         highest, last = np.maximum(highest, highest[last]), last[last]
     return np.where(follows[last] >= 0, highest, last), last
@@ -209,7 +215,7 @@ def _strands(follows: Int[Array, " lane"]) -> tuple[Int[Array, " lane"], Int[Arr
 def _is_map_known(
     records: Sequence[Array], scenario: Int[Array, " lane"], xy: Float[Array, "lane 2"]
 ) -> Bool[Array, " lane"]:
-    """Mask of points so near to the log of the ego that the map around them is stored."""
+    """Mask of points within 95 m of the box of the ego's log: the map around them is stored."""
     valid = stack_field(records, "agent_valid", slice(None), 0)[..., None]
     log = stack_field(records, "agent_xy", slice(None), 0)
     low = np.where(valid, log, np.inf).min(axis=1) - _KNOWN_M

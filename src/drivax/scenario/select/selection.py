@@ -31,7 +31,7 @@ OVERFLOWS = (
     "lights_without_lane", "stops", "stop_lanes", "road_rows", "events", "event_actors",
 )  # fmt: skip
 _NAMES = ("dataset", "segment", "scenario_id")
-#: Tags with words of the source; several words are joined by ``|``.
+#: Tags that take any words of the source; several words are joined by ``|``.
 _OPEN_TAGS = ("place", "location", "scenario_types", "source_format", "domain", "family", "event")
 _MAP_FEATURES = ("lane", "road_line", "road_edge", "crosswalk", "speed_bump", "stop_sign", "driveway")
 #: Counts of the source before capping, by their path in a manifest entry.
@@ -50,7 +50,7 @@ _TRUTHS = {"true": True, "false": False}
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that filters compare; ``words`` are the possible ones, empty for any."""
+    """A quantity that filters compare; ``words`` lists the possible words, empty for any."""
 
     kind: _Kind
     meaning: str
@@ -61,16 +61,18 @@ _EXCEEDS = "share of steps at which following the log exceeds the limits of"
 #: Findings of the audit (``evaluation.audit``); filters write ``audit.NAME``.
 FINDINGS: Mapping[str, Quantity] = {
     "log_collides": Quantity("truth", "the logged ego overlaps an agent that it did not overlap at first"),
-    "first_collision_step": Quantity("number", "step at which that overlap begins"),
+    "first_collision_step": Quantity(
+        "number", "step at which the first such overlap (`log_collides`) begins"
+    ),
     "log_offroad_fraction": Quantity("number", "share of the evaluated steps with a corner off the road"),
-    "first_offroad_step": Quantity("number", "first such step"),
+    "first_offroad_step": Quantity("number", "first step with a corner off the road"),
     "first_onroad_step": Quantity("number", "first step, from the current one on, that is on the road"),
     "log_left_map": Quantity("truth", "the log leaves the mapped area"),
     "log_runs_red": Quantity("truth", "the log runs a red light"),
     "distance_m": Quantity("number", "distance that the log drives after the current step"),
-    "reverse_m": Quantity("number", "distance of it that the log drives backwards"),
+    "reverse_m": Quantity("number", "distance that the log drives backwards after the current step"),
     "log_reverses": Quantity(
-        "truth", "that is more than 20 m: no manoeuvre, but headings that are wrong by pi"
+        "truth", "`reverse_m` exceeds 20 m: no manoeuvre, but headings that are wrong by pi"
     ),
     "agents_reversing": Quantity("number", "other vehicles and cyclists that drive more than 20 m backwards"),
     "route_deviation_mean_m": Quantity("number", "mean distance of the log to the route"),
@@ -120,20 +122,16 @@ class Filter:
 
     @classmethod
     def parse(cls, text: str) -> Filter:
-        """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison.
-
-        Raises:
-            UsageError: A part is invalid.
-        """
-        form = _FILTER.fullmatch(text)
-        if form is None or form[3].startswith("="):
+        """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison."""
+        match = _FILTER.fullmatch(text)
+        if match is None or match[3].startswith("="):
             raise _refusal(text, "is not a filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
-        name, sign, words = form[1], form[2], tuple(word.strip() for word in form[3].split("|"))
+        name, sign, words = match[1], match[2], tuple(word.strip() for word in match[3].split("|"))
         quantity = _find_quantity(text, name)
         if not all(words):
             raise _refusal(text, "names no value", "write NAME=VALUE or NAME=VALUE|VALUE")
         if sign in _COMPARISONS and (quantity.kind != "number" or len(words) > 1):
-            raise _refusal(text, f"cannot be compared with {sign}", "use = or !=, or a number of something")
+            raise _refusal(text, f"{name} cannot be compared by {sign}", "use = or != for words and lists")
         if name == "flag":
             words = tuple(word.upper() for word in words)
         values = tuple(_value(text, name, quantity, word) for word in words)
@@ -191,7 +189,7 @@ class Selection:
     def unknown(self, entries: Iterable[Mapping[str, Any]]) -> dict[str, int]:
         """Return the nonzero numbers of scenarios without the value of a filter, by filter."""
         known = list(entries)
-        counts = {own.text: sum(own.find(entry) is None for entry in known) for own in self.filters}
+        counts = {rule.text: sum(rule.find(entry) is None for entry in known) for rule in self.filters}
         return {text: count for text, count in counts.items() if count}
 
 
@@ -257,7 +255,7 @@ def read_names(file: Path) -> list[_Name]:
 
 
 def _rows_by_name(data: Listing, names: Sequence[str | Path]) -> set[int]:
-    """Indices of scenarios by name; an id without a data set selects it in all of them."""
+    """Indices of scenarios by name, in all data sets for an id alone; an unknown name is the path of a file, if any."""
     rows: dict[str, set[int]] = {}
     for row, entry in enumerate(data.entries):
         for text in (entry["scenario_id"], f"{entry['dataset']}\t{entry['scenario_id']}"):
@@ -273,6 +271,7 @@ def _rows_by_name(data: Listing, names: Sequence[str | Path]) -> set[int]:
 
 
 def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
+    """Return the error for one or more names that are not in the set; it lists the first three."""
     first, others = missing[0], missing[1:]
     ids = [str(entry["scenario_id"]) for entry in data.entries]
     near = difflib.get_close_matches(first.text.rpartition("\t")[2], ids, n=1)
@@ -292,23 +291,23 @@ def _nothing_left(data: Listing, selection: Selection) -> DrivaxError:
         if condition.operator == "=" and not any(condition.matches(entry) for entry in data.entries):
             tag = condition.name.removeprefix("tag.")
             words = {word for entry in data.entries for word in tag_words(entry, tag)}
-            cure = did_you_mean(str(condition.values[0]), sorted(words)) if words else "loosen it"
+            cure = did_you_mean(str(condition.values[0]), sorted(words)) if words else "drop this filter"
             return DataError(f"no scenario is selected by {condition.text!r}", file=data.path, cure=cure)
-    return DataError("no scenario is selected", file=data.path, cure="loosen the filters, or name others")
+    return DataError("no scenario is selected", file=data.path, cure="use fewer filters or other names")
 
 
 def _find_quantity(text: str, name: str) -> Quantity:
-    """Return the quantity of a name."""
+    """Return the quantity that the filter ``text`` names."""
     if name.startswith("tag.") and len(name) > len("tag."):
-        return Quantity("word", "a tag of the user's own")
+        return Quantity("word", "a user's tag")
     known = vocabulary()
     if name in known:
         return known[name]
-    # Suggest names without their group too: log_collides for audit.log_collides.
+    # Match names without their group too: log_collides suggests audit.log_collides.
     by_end = {full.rpartition(".")[2]: full for full in known} | {full: full for full in known}
     near = difflib.get_close_matches(name, by_end, n=1, cutoff=0.7)
-    cure = f"did you mean {by_end[near[0]]!r}?" if near else f"a tag of your own is asked for as tag.{name}"
-    raise _refusal(text, f"asks for {name!r}, which no scenario has", cure)
+    cure = f"did you mean {by_end[near[0]]!r}?" if near else f"write tag.{name} for a tag of your own"
+    raise _refusal(text, f"unknown quantity {name!r}", cure)
 
 
 def _value(text: str, name: str, quantity: Quantity, word: str) -> str | float | bool:

@@ -39,6 +39,7 @@ def split_of(dataset: str, segment: str, shares: Shares) -> str:
     digest = hashlib.sha256(f"{dataset}\0{segment}".encode()).digest()
     place = int.from_bytes(digest[:8], "big") / 2**64
     train, validation, test = shares
+    # An empty split gets no recording, even if the percentages add up to slightly less than 100.
     if place * 100.0 < train or validation == test == 0:
         return NAMES[0]
     return NAMES[1] if place * 100.0 < train + validation or test == 0 else NAMES[2]

@@ -35,7 +35,7 @@ TAGS: Mapping[str, tuple[str, ...]] = {
     "lane_graph": ("given", "chained", "none"),
     "routes": ("graph", "published"),
 }
-#: Shortest log that moves.
+#: Least distance that a log drives if it moves.
 MOVES_M = 5.0
 #: Least heading change of a turn and of a U-turn within ``TURN_WITHIN_M`` of driving.
 TURN_RAD, U_TURN_RAD, TURN_WITHIN_M = np.deg2rad(45.0), np.deg2rad(135.0), 40.0
@@ -74,6 +74,7 @@ class EgoPath:
         keep = space_out(xy, STEP_M)
         arc = arc_lengths(xy[keep])
         lane = routes.routes[1].lane if len(routes.routes) > 1 else np.zeros(0, dtype=np.int64)
+        # The route has a point per metre and goes on beyond the end of the log.
         return cls(arc, np.unwrap(heading[keep]), lane[: int(arc[-1]) + 1])
 
 
@@ -115,21 +116,21 @@ def type_of(path: EgoPath, graph: LaneGraph) -> str:
     if path.arc[-1] < MOVES_M:
         return "straight"
     junction = junction_lanes(graph)
-    on = path.lane[path.lane >= 0]
-    crosses = bool(junction[on].any())
-    turn = _sharpest(path)
-    if abs(turn) >= TURN_RAD and (crosses or len(on) < len(path.lane)):
+    lanes = path.lane[path.lane >= 0]
+    crosses = bool(junction[lanes].any())
+    turn = _sharpest_turn(path)
+    if abs(turn) >= TURN_RAD and (crosses or len(lanes) < len(path.lane)):
         if abs(turn) >= U_TURN_RAD:
             return "u_turn"
         return "turn_left" if turn > 0 else "turn_right"
-    if _merges(on, graph, junction):
+    if _merges(lanes, graph, junction):
         return "merge"
     if crosses:
         return "junction"
     return "straight" if np.ptp(path.heading) < STRAIGHT_RAD else "lane_follow"
 
 
-def _sharpest(path: EgoPath) -> float:
+def _sharpest_turn(path: EgoPath) -> float:
     """Largest change of heading within 40 m of driving, left positive, radians."""
     within = np.abs(path.arc[:, None] - path.arc) <= TURN_WITHIN_M
     turn = np.where(np.triu(within), path.heading - path.heading[:, None], 0.0)
@@ -144,6 +145,7 @@ def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
     begin, end = end_headings(graph.lines)
     for links, heading in ((graph.successor, end), (graph.predecessor, begin)):
         angle = wrap(heading[links][:, :, None] - heading[links][:, None])
+        # A missing link (-1) reads the heading of the last lane; pairs with it do not count.
         both = (links >= 0)[:, :, None] & (links >= 0)[:, None]
         forks = (both & (np.abs(angle) > FORK_RAD)).any(axis=2)
         result[links[forks]] = True
@@ -151,11 +153,15 @@ def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
 
 
 def _merges(lane: Int[Array, " metre"], graph: LaneGraph, junction: Bool[Array, " lane"]) -> bool:
-    """Return whether the log continues on a lane that another lane enters, neither in a junction."""
+    """Return whether the log enters a lane that another lane enters too, neither of them in a junction."""
     changes = np.flatnonzero(lane[1:] != lane[:-1])
-    entries = ((a, graph.predecessor[b]) for a, b in zip(lane[changes], lane[changes + 1], strict=True))
-    entries = ((a, into[into >= 0]) for a, into in entries)
-    return any(a in into and len(into) > 1 and not junction[into].any() for a, into in entries)
+    entries = (
+        (old, graph.predecessor[new]) for old, new in zip(lane[changes], lane[changes + 1], strict=True)
+    )
+    entries = ((old, entering[entering >= 0]) for old, entering in entries)
+    return any(
+        old in entering and len(entering) > 1 and not junction[entering].any() for old, entering in entries
+    )
 
 
 def density_of(tracks: LocalTracks, current_step: int) -> str:
@@ -192,6 +198,7 @@ def _ego_distance(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array,
 
 
 def _meets_crossing(tracks: LocalTracks) -> bool:
+    """Whether a vehicle crosses ego's heading nearby at some step (:func:`difficulty_of`)."""
     rows = np.flatnonzero(tracks.kind == AgentKind.VEHICLE)
     rows = rows[rows != tracks.ego]
     angle = np.abs(wrap(tracks.heading[rows] - tracks.heading[tracks.ego]))
@@ -201,7 +208,8 @@ def _meets_crossing(tracks: LocalTracks) -> bool:
 
 
 def _brakes(tracks: LocalTracks) -> bool:
+    """Whether the logged ego loses 2 m/s within some second."""
     speed = np.hypot(*tracks.velocity[tracks.ego].T)
-    valid, second = tracks.valid[tracks.ego], round(1.0 / DT_S)
-    both = valid[second:] & valid[:-second]
-    return bool((both & (speed[:-second] - speed[second:] >= BRAKING_MPS)).any())
+    valid, steps = tracks.valid[tracks.ego], round(1.0 / DT_S)
+    both = valid[steps:] & valid[:-steps]
+    return bool((both & (speed[:-steps] - speed[steps:] >= BRAKING_MPS)).any())

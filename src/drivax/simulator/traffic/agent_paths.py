@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.boxes import overlap
+from drivax.geometry.boxes import LENGTH, WIDTH, overlap
 from drivax.geometry.polylines import Polylines, arc_lengths, point_to_segment
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import AgentColumn, LaneRow, LightRow, SizeColumn
@@ -37,6 +37,8 @@ OVERLAPS = 2
 _KEY_M = 1.0
 #: A log that moves backwards further than this belongs to a reversing vehicle, m.
 _BACKWARDS_M = 1.5
+#: A last pose further ahead than this of the last one that shapes the path shapes it too, m.
+_ONWARD_M = 0.2
 #: Lateral acceleration in curves and braking towards them, m/s2.
 CURVE_MPS2, CURVE_BRAKING_MPS2 = 2.5, 1.5
 #: Half the stretch over which a curvature is measured: at least this many metres, and this many seconds at peak speed.
@@ -86,8 +88,8 @@ class _Logs:
     valid: Bool[np.ndarray, "V T"]
     extension: Float[np.ndarray, "V X 2"]
 
-    def part(self, chosen: Numbers) -> _Logs:
-        return _Logs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+    def part(self, agents: Numbers) -> _Logs:
+        return _Logs(*(getattr(self, name)[agents] for name in self.__dataclass_fields__))
 
 
 def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHICLE),)) -> ScenarioBank:
@@ -106,11 +108,11 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     # A bank that keeps its padding shares programs with others of its capacity.
     rows = max(2, -(-int(count.max(initial=0)) // 2) * 2) if bank.trimmed else bank.agents.shape[2]
     row = np.arange(len(logs.slot)) - np.concatenate(([0], np.cumsum(count)))[logs.scenario]
-    shape, at = (len(bank), rows), (logs.scenario, row)
 
-    def placed(values: Numbers, fill: float, dtype: Any) -> Array:
-        result = np.full((*shape, *values.shape[1:]), fill, dtype)
-        result[at] = values
+    def spread(values: Numbers, fill: float, dtype: Any) -> Array:
+        """Arrange values of all agents ``[V, ...]`` by scenario and row ``[N, R, ...]``."""
+        result = np.full((len(bank), rows, *values.shape[1:]), fill, dtype)
+        result[logs.scenario, row] = values
         return jnp.asarray(result)
 
     points, profile, spacing = _sample_paths(
@@ -119,15 +121,15 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     at_points = np.concatenate([points, profile], axis=-1)
     stop_arc, stop_light = _light_arcs(bank, logs.scenario, at_points, spacing)
     paths = AgentPaths(
-        slot=placed(logs.slot, -1, np.int16),
-        points=placed(points, 0.0, np.float32),
-        profile=placed(profile, 0.0, np.float32),
-        spacing=placed(spacing, 1.0, np.float32),
-        log_arc=jnp.swapaxes(placed(log_arc, 0.0, np.float32), 1, 2),
-        log_speed=jnp.swapaxes(placed(np.maximum(logs.speed, 0.0), 0.0, np.float32), 1, 2),
-        appears=jnp.swapaxes(placed(_next_step(logs.valid), bank.steps, np.int16), 1, 2),
-        stop_arc=placed(stop_arc, 1e6, np.float32),
-        stop_light=placed(stop_light, 0, np.int16),
+        slot=spread(logs.slot, -1, np.int16),
+        points=spread(points, 0.0, np.float32),
+        profile=spread(profile, 0.0, np.float32),
+        spacing=spread(spacing, 1.0, np.float32),
+        log_arc=jnp.swapaxes(spread(log_arc, 0.0, np.float32), 1, 2),
+        log_speed=jnp.swapaxes(spread(np.maximum(logs.speed, 0.0), 0.0, np.float32), 1, 2),
+        appears=jnp.swapaxes(spread(_next_step(logs.valid), bank.steps, np.int16), 1, 2),
+        stop_arc=spread(stop_arc, NEVER_M, np.float32),
+        stop_light=spread(stop_light, 0, np.int16),
         overlaps=jnp.asarray(_logged_overlaps(bank, logs, row, rows)),
         kinds=kinds,
     )
@@ -135,27 +137,27 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
 
 
 def _candidates(bank: ScenarioBank, kinds: tuple[int, ...]) -> _Logs:
-    """Return the logs of the agents that may react: of these kinds, moving more than 2 m, never backwards."""
+    """Return the logs of the agents that may react: of these kinds, moving more than 2 m, and not reversing."""
     agents = np.asarray(bank.agents, np.float64)
     kind = np.asarray(bank.agent_box[:, : bank.agents.shape[2], SizeColumn.KIND])
     valid = agents[..., AgentColumn.VALID] > 0
-    there = np.argwhere(np.isin(kind, kinds) & valid.any(axis=1))
-    scenario, slot = there[:, 0], there[:, 1]
+    scenario, slot = np.argwhere(np.isin(kind, kinds) & valid.any(axis=1)).T
     rows = agents[scenario, :, slot]
     heading = np.arctan2(rows[..., AgentColumn.SIN], rows[..., AgentColumn.COS])
     along = rows[..., AgentColumn.VX] * rows[..., AgentColumn.COS]
     along += rows[..., AgentColumn.VY] * rows[..., AgentColumn.SIN]
-    xy, z, seen = rows[..., AgentColumn.XY], rows[..., AgentColumn.Z], valid[scenario, :, slot]
+    xy, z, observed = rows[..., AgentColumn.XY], rows[..., AgentColumn.Z], valid[scenario, :, slot]
     extension = np.asarray(bank.extension, np.float64)[scenario, slot]
-    logs = _Logs(scenario, slot, xy, z, heading, along, seen, extension)
+    logs = _Logs(scenario, slot, xy, z, heading, along, observed, extension)
+    # Moves between key steps: a standing car's jitter does not count. The first key step has no move before it.
     key = _keys(logs.xy, logs.valid)
     last = _last_key(key)
-    xy, turned = (np.take_along_axis(x, last[..., None], 1) for x in (logs.xy, logs.heading[..., None]))
-    step = np.diff(xy, axis=1) * key[:, 1:, None] * (np.cumsum(key, axis=1)[:, 1:, None] > 1)
-    moved = np.hypot(step[..., 0], step[..., 1])
-    facing = step[..., 0] * np.cos(turned[:, :-1, 0]) + step[..., 1] * np.sin(turned[:, :-1, 0])
-    flips = np.abs(wrap(np.diff(turned[..., 0], axis=1))) > np.pi / 2
-    forward = (np.where(facing < 0, moved, 0.0).sum(1) < _BACKWARDS_M) & ~flips.any(1)
+    xy, heading = (np.take_along_axis(x, last[..., None], 1) for x in (logs.xy, logs.heading[..., None]))
+    move = np.diff(xy, axis=1) * key[:, 1:, None] * (np.cumsum(key, axis=1)[:, 1:, None] > 1)
+    moved = np.hypot(move[..., 0], move[..., 1])
+    ahead = move[..., 0] * np.cos(heading[:, :-1, 0]) + move[..., 1] * np.sin(heading[:, :-1, 0])
+    flips = np.abs(wrap(np.diff(heading[..., 0], axis=1))) > np.pi / 2
+    forward = (np.where(ahead < 0, moved, 0.0).sum(1) < _BACKWARDS_M) & ~flips.any(1)
     return logs.part((moved.sum(1) > TRAVELS_M) & forward)
 
 
@@ -186,20 +188,22 @@ def _lines(bank: ScenarioBank, logs: _Logs) -> tuple[Polylines, Float[np.ndarray
     """Return the line of every agent (x, y, z, unwrapped heading), and the arc length of its log at each step."""
     count, steps = logs.valid.shape
     key = _keys(logs.xy, logs.valid)
-    rows = np.arange(count)
+    agent = np.arange(count)
     end = steps - 1 - np.argmax(logs.valid[:, ::-1], axis=1)
-    final, final_heading = logs.xy[rows, end], logs.heading[rows, end]
-    ahead = final - logs.xy[rows, _last_key(key)[:, -1]]
+    final, final_heading = logs.xy[agent, end], logs.heading[agent, end]
+    ahead = final - logs.xy[agent, _last_key(key)[:, -1]]
     # The last pose shapes the path too, unless a standing car's jitter put it behind.
-    onward = ahead[:, 0] * np.cos(final_heading) + ahead[:, 1] * np.sin(final_heading) > 0.2
+    onward = ahead[:, 0] * np.cos(final_heading) + ahead[:, 1] * np.sin(final_heading) > _ONWARD_M
     points = max(1, min(int(EXTENSION_M / _EXTENSION_STEP_M), logs.extension.shape[1]))
-    beyond = logs.extension[:, :points]
-    line = np.concatenate([logs.xy, final[:, None], beyond], axis=1)
-    tangent = np.diff(np.concatenate([final[:, None], beyond, beyond[:, -1:]], axis=1), axis=1)
+    extension = logs.extension[:, :points]
+    line = np.concatenate([logs.xy, final[:, None], extension], axis=1)
+    # The tangent at a point of the extension is the sum of the pieces before and after it.
+    tangent = np.diff(np.concatenate([final[:, None], extension, extension[:, -1:]], axis=1), axis=1)
     tangent = tangent[:, :-1] + tangent[:, 1:]
-    turned = np.arctan2(tangent[..., 1], tangent[..., 0])
-    heading = np.concatenate([logs.heading, final_heading[:, None], turned], axis=1)
-    height = np.concatenate([logs.z, logs.z[rows, end][:, None], _heights(bank, logs, beyond, end)], axis=1)
+    heading = np.arctan2(tangent[..., 1], tangent[..., 0])
+    heading = np.concatenate([logs.heading, final_heading[:, None], heading], axis=1)
+    height = _heights(bank, logs, extension, end)
+    height = np.concatenate([logs.z, logs.z[agent, end][:, None], height], axis=1)
     shapes = np.concatenate([key, onward[:, None], np.ones((count, points), bool)], axis=1)
     flat = np.concatenate([line, height[..., None], heading[..., None]], axis=-1)[shapes]
     # Unwrapped over all agents at once: each line is continuous, whatever heading it starts with.
@@ -211,29 +215,33 @@ def _lines(bank: ScenarioBank, logs: _Logs) -> tuple[Polylines, Float[np.ndarray
 
 def _log_arcs(logs: _Logs, lines: Polylines, key: Numbers) -> Float[np.ndarray, "V T"]:
     """Return the arc length of every logged step; between two shaping points by its projection on their chord."""
-    place = lines.start[:-1, None] + np.cumsum(key, axis=1) - 1
-    place = np.maximum(place, lines.start[:-1, None])
-    begin, then = lines.points[place], lines.points[np.minimum(place + 1, len(lines.points) - 1)]
-    way = then[..., :2] - begin[..., :2]
-    length = np.maximum(np.hypot(way[..., 0], way[..., 1]), 1e-9)
-    come = ((logs.xy - begin[..., :2]) * way).sum(-1) / length
-    arc = lines.arc[place] + np.clip(np.where(key, 0.0, come), 0.0, length)
+    # The first points of a line are its key steps, so their running count is the point at or before each step.
+    point = lines.start[:-1, None] + np.cumsum(key, axis=1) - 1
+    point = np.maximum(point, lines.start[:-1, None])
+    before, after = lines.points[point], lines.points[np.minimum(point + 1, len(lines.points) - 1)]
+    chord = after[..., :2] - before[..., :2]
+    length = np.maximum(np.hypot(chord[..., 0], chord[..., 1]), 1e-9)
+    along = ((logs.xy - before[..., :2]) * chord).sum(-1) / length
+    arc = lines.arc[point] + np.clip(np.where(key, 0.0, along), 0.0, length)
     return np.maximum.accumulate(np.where(logs.valid & (key.cumsum(1) > 0), arc, 0.0), axis=1)
 
 
-def _heights(bank: ScenarioBank, logs: _Logs, beyond: Numbers, end: Numbers) -> Float[np.ndarray, "V X"]:
-    """Return heights of the box centre beyond the log, from the lanes below on the level of the point before."""
+def _heights(bank: ScenarioBank, logs: _Logs, extension: Numbers, end: Numbers) -> Float[np.ndarray, "V X"]:
+    """Return heights of the box centre beyond the log: of the nearest lane on the level of the point before.
+
+    ``end`` is the last valid step of each log; scenarios without elevation keep its height.
+    """
     flags, lanes = np.asarray(bank.flags), np.asarray(bank.lanes)
     half = np.asarray(bank.agent_box[:, :, SizeColumn.HEIGHT])[logs.scenario, logs.slot] / 2
-    height = np.repeat(logs.z[np.arange(len(end)), end][:, None], beyond.shape[1], axis=1)
-    used = np.asarray(bank.grid_lane[:, -1])
+    height = np.repeat(logs.z[np.arange(len(end)), end][:, None], extension.shape[1], axis=1)
+    segment_count = np.asarray(bank.grid_lane[:, -1])
     for scenario in np.unique(logs.scenario[(flags[logs.scenario] & int(Flag.ELEVATION)) != 0]):
-        mine = np.flatnonzero(logs.scenario == scenario)
-        segments = lanes[scenario, : LaneRow.HALF_WIDTH, : int(used[scenario])].astype(np.float64)
-        ground = height[mine, 0] - half[mine]
-        for point in range(beyond.shape[1]):
-            ground = _ground(segments, beyond[mine, point], ground)
-            height[mine, point] = ground + half[mine]
+        agents = np.flatnonzero(logs.scenario == scenario)
+        segments = lanes[scenario, : LaneRow.HALF_WIDTH, : int(segment_count[scenario])].astype(np.float64)
+        ground = height[agents, 0] - half[agents]
+        for point in range(extension.shape[1]):
+            ground = _ground(segments, extension[agents, point], ground)
+            height[agents, point] = ground + half[agents]
     return height
 
 
@@ -246,15 +254,15 @@ def _ground(segments: Numbers, xy: Numbers, ground: Numbers) -> Float[np.ndarray
     ax, ay, bx, by, z = segments[:, around]
     if not around.any():
         return ground
-    far, _ = point_to_segment(xy[:, None], np.stack([ax, ay], -1)[None], np.stack([bx, by], -1)[None])
-    far = np.where(np.abs(z - ground[:, None]) <= LEVEL_M, far, np.inf)
-    return np.where(far.min(axis=1) <= LANE_CUTOFF_M, z[far.argmin(axis=1)], ground)
+    away, _ = point_to_segment(xy[:, None], np.stack([ax, ay], -1)[None], np.stack([bx, by], -1)[None])
+    away = np.where(np.abs(z - ground[:, None]) <= LEVEL_M, away, np.inf)
+    return np.where(away.min(axis=1) <= LANE_CUTOFF_M, z[away.argmin(axis=1)], ground)
 
 
 def _sample_paths(
     lines: Polylines, peak: Numbers
 ) -> tuple[Float[np.ndarray, "V M 4"], Float[np.ndarray, "V M 2"], Float[np.ndarray, " V"]]:
-    """Return evenly spaced points of paths, their heights and speed limits, and the spacing."""
+    """Return evenly spaced poses on paths, their heights and speed limits, and the spacing; ``peak`` is in m/s."""
     row, spacing = np.arange(lines.count)[:, None], lines.length / (PATH_POINTS - 1)
     arc = spacing[:, None] * np.arange(PATH_POINTS)
     if not lines.count:
@@ -266,12 +274,13 @@ def _sample_paths(
     turn = lines.at(row, ahead)[..., 3] - lines.at(row, behind)[..., 3]
     curvature = np.abs(turn) / (ahead - behind)
     speed = np.minimum(peak[:, None], np.sqrt(CURVE_MPS2 / np.maximum(curvature, 1e-6)))
+    # Backwards, so that every point allows braking to the limits of all later ones.
     for point in range(PATH_POINTS - 2, -1, -1):
         reach = np.sqrt(speed[:, point + 1] ** 2 + 2 * CURVE_BRAKING_MPS2 * spacing)
         speed[:, point] = np.minimum(speed[:, point], reach)
     direction = [np.cos(points[..., 3:]), np.sin(points[..., 3:])]
-    placed = np.concatenate([points[..., :2], *direction], axis=-1)
-    return placed, np.stack([points[..., 2], speed], axis=-1), spacing
+    poses = np.concatenate([points[..., :2], *direction], axis=-1)
+    return poses, np.stack([points[..., 2], speed], axis=-1), spacing
 
 
 def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -> Numbers:
@@ -279,10 +288,10 @@ def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -
     overlaps = np.full((len(bank), bank.steps, rows, OVERLAPS), -1, np.int16)
     tables = [np.asarray(table) for table in (bank.agents, bank.agent_box, bank.parked, bank.parked_when)]
     for scenario in np.unique(logs.scenario):
-        mine = np.flatnonzero(logs.scenario == scenario)
+        agents = np.flatnonzero(logs.scenario == scenario)
         boxes, z, valid = _logged_boxes(*(table[scenario] for table in tables))
-        own, slots = boxes[:, logs.slot[mine]], logs.slot[mine]
-        reach = np.hypot(boxes[0, :, 4], boxes[0, :, 5]) / 2
+        own, slots = boxes[:, logs.slot[agents]], logs.slot[agents]
+        reach = np.hypot(boxes[0, :, LENGTH], boxes[0, :, WIDTH]) / 2
         dx, dy = (own[:, :, None, i] - boxes[:, None, :, i] for i in (0, 1))
         near = dx * dx + dy * dy < (reach[slots][:, None] + reach) ** 2
         near &= valid[:, None] & valid[:, slots][..., None] & (slots[:, None] != np.arange(boxes.shape[1]))
@@ -290,10 +299,11 @@ def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -
         step, agent, other = np.nonzero(near)
         meets = overlap(own[step, agent], boxes[step, other])
         step, agent, other = step[meets], agent[meets], other[meets]
-        pair = step * len(mine) + agent
-        place = np.arange(len(pair)) - np.searchsorted(pair, pair)
-        kept = place < OVERLAPS
-        overlaps[scenario, step[kept], row[mine[agent[kept]]], place[kept]] = other[kept]
+        # Overlaps are sorted by step and agent, so the distance from the first of an agent is the rank.
+        pair = step * len(agents) + agent
+        rank = np.arange(len(pair)) - np.searchsorted(pair, pair)
+        keep = rank < OVERLAPS
+        overlaps[scenario, step[keep], row[agents[agent[keep]]], rank[keep]] = other[keep]
     return overlaps
 
 
@@ -302,9 +312,9 @@ def _logged_boxes(
 ) -> tuple[Numbers, Numbers, Numbers]:
     """Return boxes, heights and validity of all slots of a scenario's frames, at every logged step."""
     step = np.arange(len(agents))
-    there = (when[step // WORD] >> (step % WORD).astype(np.uint32)[:, None]) & 1 > 0
+    is_parked = (when[step // WORD] >> (step % WORD).astype(np.uint32)[:, None]) & 1 > 0
     rows = np.pad(agents, ((0, 0), (0, len(box) - agents.shape[1]), (0, 0)))
-    rows = np.where(there[..., None], parked, rows)
+    rows = np.where(is_parked[..., None], parked, rows)
     size = np.broadcast_to(box[None, :, SizeColumn.FOOTPRINT], (len(rows), len(box), 2))
     boxes = np.concatenate([rows[..., AgentColumn.XY], rows[..., AgentColumn.HEADING], size], axis=-1)
     return boxes, rows[..., AgentColumn.Z], rows[..., AgentColumn.VALID] > 0
@@ -314,22 +324,25 @@ def _light_arcs(
     bank: ScenarioBank, scenario: Int[np.ndarray, " V"], points: Float[np.ndarray, "V M 6"],
     spacing: Float[np.ndarray, " V"],
 ) -> tuple[Float[np.ndarray, "V 4"], Int[np.ndarray, "V 4"]]:  # fmt: skip
-    """Return arc lengths of the first four stop lines that paths (points, profile) cross forwards, and their lights."""
+    """Return arc lengths of the first four stops of paths (points, profile), and the slots of their lights.
+
+    Lights that are never observed do not count.
+    """
     arcs = np.full((len(scenario), STOPS), NEVER_M)
     lights = np.zeros((len(scenario), STOPS), np.int64)
     line, state = np.asarray(bank.light_line, np.float64), np.asarray(bank.light_state)
     exits = np.arctan2(line[:, LightRow.EXIT_SIN], line[:, LightRow.EXIT_COS])
-    for row in np.unique(scenario):
-        seen = np.flatnonzero((state[row] >= 0).any(axis=0))
-        mine = np.flatnonzero(scenario == row)
-        if not len(seen):
+    for index in np.unique(scenario):
+        observed = np.flatnonzero((state[index] >= 0).any(axis=0))
+        agents = np.flatnonzero(scenario == index)
+        if not len(observed):
             continue
-        crossed = _crossings(line[row][:, seen], points[mine], spacing[mine])
-        for path, arc in zip(mine, crossed, strict=True):
-            heading = np.arctan2(points[path, :, 3], points[path, :, 2])
-            stops = _stops(arc, heading, spacing[path], exits[row, seen])
-            for number, (where, light) in enumerate(stops[:STOPS]):
-                arcs[path, number], lights[path, number] = where, seen[light]
+        crossings = _crossings(line[index][:, observed], points[agents], spacing[agents])
+        for path, arc in zip(agents, crossings, strict=True):
+            heading = np.arctan2(points[path, :, PATH_SIN], points[path, :, PATH_COS])
+            stops = _stops(arc, heading, spacing[path], exits[index, observed])
+            for number, (stop_m, light) in enumerate(stops[:STOPS]):
+                arcs[path, number], lights[path, number] = stop_m, observed[light]
     return arcs, lights
 
 

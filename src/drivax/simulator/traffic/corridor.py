@@ -61,29 +61,33 @@ class Leaders:
     # Free path to the nearest agent in the corridor, bumper to bumper, m; 10 km if free
     gap: Float[Array, " R"]
     speed: Float[Array, " R"]  # Speed of that agent along the path, m/s
-    things: Int[Array, "R C"]  # Slots of the closest agents around the corridor
-    real: Bool[Array, "R C"]  # Mask of valid ``things``
+    slots: Int[Array, "R C"]  # Slots of the closest agents around the corridor
+    valid: Bool[Array, "R C"]  # Mask of valid ``slots``
 
 
 def path_poses(
     paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"]
 ) -> tuple[Float[Array, "R 4"], Float[Array, "R 2"]]:
     """Return poses (x, y, cos, sin) at arc lengths of a scenario's paths, and their heights and speed limits."""
-    at = arc / paths.spacing[index]
-    low = jnp.clip(at.astype(jnp.int32), 0, PATH_POINTS - 2)
-    part = jnp.clip(at - low, 0.0, 1.0)[:, None]
+    position = arc / paths.spacing[index]
+    low = jnp.clip(position.astype(jnp.int32), 0, PATH_POINTS - 2)
+    part = jnp.clip(position - low, 0.0, 1.0)[:, None]
 
-    def between(table: Float[Array, "N R M F"]) -> Float[Array, "R F"]:
-        def both(row: Array, low: Array) -> Float[Array, "2 F"]:
+    def interpolate(table: Float[Array, "N R M F"]) -> Float[Array, "R F"]:
+        """Interpolate a table at the arc lengths."""
+
+        def read_ends(row: Array, low: Array) -> Float[Array, "2 F"]:
+            """Read the points before and after, which are contiguous."""
             first = (index, row, low, jnp.int32(0))
             return jax.lax.dynamic_slice(table, first, (1, 1, 2, table.shape[-1]))[0, 0]
 
-        ends = jax.vmap(both)(jnp.arange(arc.shape[0], dtype=jnp.int32), low)
+        ends = jax.vmap(read_ends)(jnp.arange(arc.shape[0], dtype=jnp.int32), low)
         return ends[:, 0] * (1 - part) + ends[:, 1] * part
 
-    here = between(paths.points)
-    unit = jax.lax.rsqrt(jnp.maximum(here[:, PATH_COS] ** 2 + here[:, PATH_SIN] ** 2, 1e-9))
-    return here * jnp.where(jnp.arange(4) >= PATH_COS, unit[:, None], 1.0), between(paths.profile)
+    pose = interpolate(paths.points)
+    # Interpolation shortens the direction, so normalise it.
+    unit = jax.lax.rsqrt(jnp.maximum(pose[:, PATH_COS] ** 2 + pose[:, PATH_SIN] ** 2, 1e-9))
+    return pose * jnp.where(jnp.arange(4) >= PATH_COS, unit[:, None], 1.0), interpolate(paths.profile)
 
 
 def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Frame) -> Leaders:
@@ -95,49 +99,50 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     look = _look(movers.speed)
     rows, arcs = _path_ahead(paths, index, movers, look)
     nodes = rows[..., :2]
-    things, real = _closest(movers, frame, nodes)
-    box, velocity = frame.box[things], frame.velocity[things]
+    slots, valid = _closest(movers, frame, nodes)
+    box, velocity = frame.box[slots], frame.velocity[slots]
     # Coordinates one by one: pairs of numbers at the end of an array do not vectorise.
     x, y = nodes[..., X, None], nodes[..., Y, None]
     keys = []
-    for number in range(PIECES):
-        ends = x[:, number], y[:, number], x[:, number + 1], y[:, number + 1]
-        keys.append(embed_number(1.0 + _from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
-    best = number_of(reduce(jnp.minimum, keys), _PIECE_BITS)
+    for piece in range(PIECES):
+        ends = x[:, piece], y[:, piece], x[:, piece + 1], y[:, piece + 1]
+        _, squared = _project_on_piece(*ends, box[..., X], box[..., Y])
+        keys.append(embed_number(1.0 + squared, piece, _PIECE_BITS))
+    nearest_piece = number_of(reduce(jnp.minimum, keys), _PIECE_BITS)
     # Written out once: XLA would compute it again for each of the columns that are read.
-    best = jnp.zeros_like(best).at[jnp.arange(len(best))].set(best)
-    x0, y0, *before, x1, y1, cos1, sin1 = jnp.moveaxis(_both_ends(rows, best), -1, 0)
-    slopes = *before, cos1, sin1
-    arc, end = (jnp.take_along_axis(arcs, best + at, axis=1) for at in (0, 1))
-    part, distance = _from_piece(x0, y0, x1, y1, box[..., X], box[..., Y])
-    long = jnp.sqrt(jnp.maximum((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6))
-    ux, uy = (x1 - x0) / long, (y1 - y0) / long
-    lateral = ux * (box[..., Y] - y0) - uy * (box[..., X] - x0) - _bulge(part, (ux, uy), slopes) * long
-    distance = jnp.where((part > 0.0) & (part < 1.0), lateral * lateral, distance)
+    nearest_piece = jnp.zeros_like(nearest_piece).at[jnp.arange(len(nearest_piece))].set(nearest_piece)
+    x0, y0, cos0, sin0, x1, y1, cos1, sin1 = jnp.moveaxis(_both_ends(rows, nearest_piece), -1, 0)
+    tangents = cos0, sin0, cos1, sin1
+    arc, end = (jnp.take_along_axis(arcs, nearest_piece + offset, axis=1) for offset in (0, 1))
+    part, squared = _project_on_piece(x0, y0, x1, y1, box[..., X], box[..., Y])
+    length = jnp.sqrt(jnp.maximum((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6))
+    ux, uy = (x1 - x0) / length, (y1 - y0) / length
+    lateral = ux * (box[..., Y] - y0) - uy * (box[..., X] - x0) - _bulge(part, (ux, uy), tangents) * length
+    squared = jnp.where((part > 0.0) & (part < 1.0), lateral * lateral, squared)
     along = arc + part * (end - arc) - movers.arc[:, None]
     cos = jnp.abs(box[..., COS] * ux + box[..., SIN] * uy)
     sin = jnp.abs(box[..., SIN] * ux - box[..., COS] * uy)
     half_length = cos * box[..., LENGTH] / 2 + sin * box[..., WIDTH] / 2
     half_width = sin * box[..., LENGTH] / 2 + cos * box[..., WIDTH] / 2
     room = movers.box[:, None, WIDTH] / 2 + SIDE_M + half_width
-    beyond = (along >= look[:, None]) | ((best == PIECES - 1) & (part >= 1.0))
-    inside = real & (distance < room * room) & (along > 0.0) & ~beyond
+    is_past = (along >= look[:, None]) | ((nearest_piece == PIECES - 1) & (part >= 1.0))
+    inside = valid & (squared < room * room) & (along > 0.0) & ~is_past
     gap = jnp.where(inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
-    nearest = first_smallest(gap, least=LEAST_GAP_M)[:, None] == jnp.arange(CLOSEST)
-    speed = jnp.sum(jnp.where(nearest, velocity[..., 0] * ux + velocity[..., 1] * uy, 0.0), axis=1)
-    return Leaders(gap=jnp.min(gap, axis=1), speed=speed, things=things, real=real)
+    is_leader = first_smallest(gap, least=LEAST_GAP_M)[:, None] == jnp.arange(CLOSEST)
+    speed = jnp.sum(jnp.where(is_leader, velocity[..., 0] * ux + velocity[..., 1] * uy, 0.0), axis=1)
+    return Leaders(gap=jnp.min(gap, axis=1), speed=speed, slots=slots, valid=valid)
 
 
 def _both_ends(rows: Float[Array, "R K 4"], first: Int[Array, "R C"]) -> Float[Array, "R C 8"]:
-    """Read the rows of two consecutive points of each path in one contiguous read."""
+    """Read the rows of two consecutive points of each path, ``first`` and the next, in one contiguous read."""
 
-    def both(path: Float[Array, "K 4"], at: Array) -> Float[Array, " 8"]:
-        return jax.lax.dynamic_slice(path, (at, jnp.int32(0)), (2, 4)).reshape(8)
+    def read(path: Float[Array, "K 4"], first: Array) -> Float[Array, " 8"]:
+        return jax.lax.dynamic_slice(path, (first, jnp.int32(0)), (2, 4)).reshape(8)
 
-    return jax.vmap(jax.vmap(both, in_axes=(None, 0)))(rows, first)
+    return jax.vmap(jax.vmap(read, in_axes=(None, 0)))(rows, first)
 
 
-def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any, Any]:
+def _project_on_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any, Any]:
     """Return the relative position on a piece nearest to a point, and their squared distance."""
     ux, uy, wx, wy = x1 - x0, y1 - y0, x - x0, y - y0
     part = jnp.clip((ux * wx + uy * wy) / jnp.maximum(ux * ux + uy * uy, 1e-6), 0.0, 1.0)
@@ -145,12 +150,12 @@ def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any
     return part, dx * dx + dy * dy
 
 
-def _bulge(part: Any, way: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
+def _bulge(part: Any, direction: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
     """Return the offset of the path to the left of a straight piece, relative to its length: cubic with both tangents.
 
-    ``part`` is the relative position on the piece, ``way`` its direction; ``tangents`` are those at start and end.
+    ``part`` is the relative position on the piece; ``tangents`` are cosine and sine at its start, then at its end.
     """
-    (ux, uy), slopes = way, []
+    (ux, uy), slopes = direction, []
     for cos, sin in (tangents[:2], tangents[2:]):
         slopes.append(jnp.clip((ux * sin - uy * cos) / jnp.maximum(ux * cos + uy * sin, 0.1), -1.0, 1.0))
     return part * (1 - part) * ((1 - part) * slopes[0] - part * slopes[1])
@@ -166,12 +171,12 @@ def _path_ahead(
 ) -> tuple[Float[Array, "R K 4"], Float[Array, "R K"]]:
     """Return rows of the path from behind the vehicle to its look-ahead distance, and their arc lengths."""
     spacing = paths.spacing[index]
-    # One point more than it takes, since the first one lies behind.
+    # PIECES - 1 pieces cover the look-ahead distance, since the first one begins behind the vehicle.
     stride = jnp.ceil(look / ((PIECES - 1) * spacing)).astype(jnp.int32)
     first = (movers.arc / spacing).astype(jnp.int32)
-    place = jnp.clip(first[:, None] + stride[:, None] * jnp.arange(PIECES + 1), 0, PATH_POINTS - 1)
-    rows = paths.points[index, jnp.arange(place.shape[0])[:, None], place]
-    return rows, place * spacing[:, None]
+    point = jnp.clip(first[:, None] + stride[:, None] * jnp.arange(PIECES + 1), 0, PATH_POINTS - 1)
+    rows = paths.points[index, jnp.arange(point.shape[0])[:, None], point]
+    return rows, point * spacing[:, None]
 
 
 def _closest(
@@ -201,7 +206,7 @@ def columns(box: Float[Array, "S 6"]) -> Float[Array, "6 S"]:
 def closest(
     near: Bool[Array, "R S"], me: Float[Array, "R 6"], box: Float[Array, "6 S"]
 ) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
-    """Return the C boxes (:func:`columns`) with the closest centres among ``near``, and the mask of valid ones."""
+    """Return the slots of the C boxes (:func:`columns`) with the closest centres among ``near``, and their mask."""
     dx, dy = box[X] - me[:, X : X + 1], box[Y] - me[:, Y : Y + 1]
     key = jnp.where(
         near, embed_number(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf
@@ -211,9 +216,9 @@ def closest(
     minima = [jnp.min(key, axis=1, keepdims=True)]
     for _ in range(CLOSEST - 1):
         minima.append(jnp.min(jnp.where(key > minima[-1], key, jnp.inf), axis=1, keepdims=True))
-    chosen = jnp.concatenate(minima, axis=1)
-    real = jnp.isfinite(chosen)
-    return jnp.where(real, number_of(chosen, _SLOT_BITS), 0), real
+    smallest = jnp.concatenate(minima, axis=1)
+    valid = jnp.isfinite(smallest)
+    return jnp.where(valid, number_of(smallest, _SLOT_BITS), 0), valid
 
 
 def reaching(
@@ -226,28 +231,28 @@ def reaching(
     The number of rectangles divides K - 1.
     """
     around = _rectangles(nodes, half, behind, beyond, rectangles)
-    deep, wide = box[LENGTH] / 2, box[WIDTH] / 2
-    reached = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
+    half_length, half_width = box[LENGTH] / 2, box[WIDTH] / 2
+    reaches = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
     for number in range(rectangles):
-        x, y, cos, sin, length, width = (part[:, number : number + 1] for part in around)
+        x, y, cos, sin, length, width = (column[:, number : number + 1] for column in around)
         turn_cos = jnp.abs(box[COS] * cos + box[SIN] * sin)
         turn_sin = jnp.abs(box[SIN] * cos - box[COS] * sin)
         ahead = jnp.abs(box[X] * cos + (box[Y] * sin - (x * cos + y * sin)))
         left = jnp.abs(box[Y] * cos - (box[X] * sin + (y * cos - x * sin)))
-        inside = ahead < length + turn_cos * deep + turn_sin * wide
-        reached |= inside & (left < width + turn_sin * deep + turn_cos * wide)
-    return reached
+        inside = ahead < length + turn_cos * half_length + turn_sin * half_width
+        reaches |= inside & (left < width + turn_sin * half_length + turn_cos * half_width)
+    return reaches
 
 
 def _rectangles(
     nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any, count: int
 ) -> tuple[Float[Array, "R Q"], ...]:
     """Return rectangles around stretches of paths: x, y, cosine, sine, half the length, half the width."""
-    long = (nodes.shape[1] - 1) // count
+    pieces = (nodes.shape[1] - 1) // count
     # All points but the last, by stretches; the end of each is (chord, 0) in its own frame.
-    x, y = (nodes[:, :-1, axis].reshape(len(nodes), count, long) for axis in (X, Y))
+    x, y = (nodes[:, :-1, axis].reshape(len(nodes), count, pieces) for axis in (X, Y))
     rest_x, rest_y = x - x[..., :1], y - y[..., :1]
-    chord_x, chord_y = nodes[:, long::long, X] - x[..., 0], nodes[:, long::long, Y] - y[..., 0]
+    chord_x, chord_y = nodes[:, pieces::pieces, X] - x[..., 0], nodes[:, pieces::pieces, Y] - y[..., 0]
     chord = jnp.sqrt(jnp.maximum(chord_x * chord_x + chord_y * chord_y, 1e-6))
     # Beyond its end a path is one point, and any direction works.
     cos, sin = jnp.where(chord > 1e-2, chord_x / chord, 1.0), jnp.where(chord > 1e-2, chord_y / chord, 0.0)
@@ -257,7 +262,7 @@ def _rectangles(
     near = ahead.min(axis=-1) - half - jnp.where(number == 0, behind, 0.0)
     far = jnp.maximum(ahead.max(axis=-1), chord) + half + jnp.where(number == count - 1, beyond, 0.0)
     right, left = left.min(axis=-1) - half, left.max(axis=-1) + half
-    on, aside = (near + far) / 2, (right + left) / 2
-    centre_x, centre_y = x[..., 0] + on * cos - aside * sin, y[..., 0] + on * sin + aside * cos
-    # Once, not for every box.
+    along, across = (near + far) / 2, (right + left) / 2
+    centre_x, centre_y = x[..., 0] + along * cos - across * sin, y[..., 0] + along * sin + across * cos
+    # Without the barrier XLA computes the rectangles again for every box.
     return jax.lax.optimization_barrier((centre_x, centre_y, cos, sin, (far - near) / 2, (left - right) / 2))

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
+from drivax.scenario.schema import DT_S
 from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 
@@ -39,18 +40,18 @@ def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Floa
     Where the log does not reach back (before its start, or before the agent appeared) the motion is extended
     backwards at the velocity of the earliest known step.
     """
-    at = step - jnp.arange(HISTORY - 1, -1, -1)
-    rows = bank.agents[index, jnp.clip(at, 0, bank.steps - 1), slot]
-    known = (rows[:, AgentColumn.VALID] > 0) & (at >= 0)
+    steps = step - jnp.arange(HISTORY - 1, -1, -1)
+    rows = bank.agents[index, jnp.clip(steps, 0, bank.steps - 1), slot]
+    known = (rows[:, AgentColumn.VALID] > 0) & (steps >= 0)
     # The earliest row of the unbroken stretch that ends now.
     unbroken = jnp.flip(jnp.cumprod(jnp.flip(known.astype(jnp.int32)))) > 0
     first = jnp.minimum(HISTORY - jnp.sum(unbroken), HISTORY - 1)
-    missing = (first - jnp.arange(HISTORY))[:, None] * 0.1
+    missing_s = (first - jnp.arange(HISTORY))[:, None] * DT_S
     heading = jnp.arctan2(rows[:, AgentColumn.SIN], rows[:, AgentColumn.COS])
     speed = jnp.maximum(jnp.sum(rows[:, AgentColumn.VELOCITY] * rows[:, AgentColumn.HEADING], axis=-1), 0.0)
-    own = jnp.stack([rows[:, AgentColumn.X], rows[:, AgentColumn.Y], heading, speed], axis=-1)
-    extended = own[first] - missing * jnp.pad(rows[first, AgentColumn.VELOCITY], (0, 2))
-    return jnp.where(unbroken[:, None], own, extended)
+    logged = jnp.stack([rows[:, AgentColumn.X], rows[:, AgentColumn.Y], heading, speed], axis=-1)
+    extension = logged[first] - missing_s * jnp.pad(rows[first, AgentColumn.VELOCITY], (0, 2))
+    return jnp.where(unbroken[:, None], logged, extension)
 
 
 def agent_rows(
@@ -69,28 +70,29 @@ def frame_of(
     """Return the frame of ``step - back`` from the traffic model's rows, driven agents and parked agents.
 
     ``driven`` stacks the contexts of all driven agents of the scenario ``[K]``; slots beyond the last are empty.
-    ``back`` is less than its length; reactive traffic remembers 9. ``slots`` selects agents; by default all.
+    ``back`` is less than ``HISTORY``; reactive traffic remembers 9 steps. ``slots`` selects agents; by default all.
     """
     motion, present = driven.history[:, HISTORY - 1 - back], jnp.ones_like(driven.z)
     rows, at = agent_rows(motion, jnp.zeros_like(present), present), jnp.clip(step - back, 0, bank.steps - 1)
     box, parked, words = bank.agent_box[index], bank.parked[index], bank.parked_when[index, at // WORD]
-    moving, number = len(agents), driven.slot
+    moving, target = len(agents), driven.slot
     if slots is None:
-        more = len(box) - moving
+        parked_only = len(box) - moving
     else:
         agents = agents.at[slots].get(mode="fill", fill_value=0.0)
-        box, parked, words, more = box[slots], parked[slots], words[slots], 0
+        box, parked, words, parked_only = box[slots], parked[slots], words[slots], 0
+        # Row of each driven agent among the selected ones; past the end, and so dropped, if it is not selected.
         match = (slots[:, None] == driven.slot) & (slots[:, None] < moving)
-        place = jnp.where(match, jnp.arange(len(slots))[:, None], 0).sum(axis=0)
-        number = jnp.where(match.any(axis=0), place, len(slots))
+        row = jnp.where(match, jnp.arange(len(slots))[:, None], 0).sum(axis=0)
+        target = jnp.where(match.any(axis=0), row, len(slots))
     # Before the recording no other agent was seen.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
-    # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
-    z = agents[:, AgentColumn.Z].at[number].set(driven.z, mode="drop")
-    agents = agents.at[number].set(rows, mode="drop")
+    # Heights apart: measuring changes only them, so XLA computes the rest of the frame once for both.
+    z = agents[:, AgentColumn.Z].at[target].set(driven.z, mode="drop")
+    agents = agents.at[target].set(rows, mode="drop")
     is_parked = ((words >> (at % WORD).astype(jnp.uint32)) & 1 > 0) & (step >= back)
-    z = jnp.where(is_parked, parked[:, AgentColumn.Z], jnp.pad(z, (0, more)))
-    agents = jnp.where(is_parked[:, None], parked, jnp.pad(agents, ((0, more), (0, 0))))
+    z = jnp.where(is_parked, parked[:, AgentColumn.Z], jnp.pad(z, (0, parked_only)))
+    agents = jnp.where(is_parked[:, None], parked, jnp.pad(agents, ((0, parked_only), (0, 0))))
     parts = [agents[:, AgentColumn.XY], agents[:, AgentColumn.HEADING], box[:, SizeColumn.FOOTPRINT]]
     return Frame(
         box=jnp.concatenate(parts, axis=-1),

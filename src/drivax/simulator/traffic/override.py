@@ -52,11 +52,7 @@ class OverrideTraffic:
         return prepare_bank(self.base, bank)
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
-        """Return the state of ``base``.
-
-        Raises:
-            UsageError: The bank has no motions.
-        """
+        """Return the state of ``base``."""
         data_of(bank, OverrideMotions, "use override.with_override")
         return self.base.start(bank, index, step)
 
@@ -69,8 +65,8 @@ class OverrideTraffic:
         rows, override = self.base.agents(bank, context, back), data_of(bank, OverrideMotions)
         step = jnp.clip(context.step - back, 0, bank.steps - 1)
         at, slot = (context.index, step), override.slot[context.index]
-        overridden = agent_rows(override.motion[at], override.z[at], override.valid[at].astype(jnp.float32))
-        return rows.at[jnp.where(slot >= 0, slot, rows.shape[0])].set(overridden, mode="drop")
+        motions = agent_rows(override.motion[at], override.z[at], override.valid[at].astype(jnp.float32))
+        return rows.at[jnp.where(slot >= 0, slot, rows.shape[0])].set(motions, mode="drop")
 
 
 def with_override(
@@ -86,17 +82,19 @@ def with_override(
     slots = jnp.asarray(slots, jnp.int32)
 
     def heights(index: Array, slot: Array, line: Float[Array, "T 4"]) -> Float[Array, " T"]:
-        at = jnp.maximum(slot, 0)
-        seen = jnp.argmax(bank.agents[index, :, at, AgentColumn.VALID] > 0)
-        half = bank.height_m(index, at) / 2
+        """Return the heights of one agent's box centre along its trajectory."""
+        slot = jnp.maximum(slot, 0)
+        first = jnp.argmax(bank.agents[index, :, slot, AgentColumn.VALID] > 0)
+        half = bank.height_m(index, slot) / 2
 
         def climb(ground: Array, pose: Array) -> tuple[Array, Array]:
+            """Return the ground at a pose, on the level of the one before, and the height of the box centre."""
             heading = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
             ground = around_lanes(bank, index, pose[:2], heading, pose[None, :2], ground).z
             return ground, ground + half
 
         line = jax.lax.stop_gradient(line)
-        return jax.lax.scan(climb, bank.agents[index, seen, at, AgentColumn.Z] - half, line)[1]
+        return jax.lax.scan(climb, bank.agents[index, first, slot, AgentColumn.Z] - half, line)[1]
 
     z = jax.vmap(jax.vmap(heights, (None, 0, 1), 1))(jnp.arange(len(bank)), slots, motion)
     return with_data(bank, OverrideMotions(slots, motion, z, valid))
@@ -114,19 +112,20 @@ def motions_of_actions(
     are as logged.
     """
     steps = bank.steps - 1 - begin
-    desired = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
+    action_index = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
 
-    def drive(index: Array, slot: Array, acts: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
-        at = jnp.maximum(slot, 0)
-        past = logged_history(bank, index, begin, at)
-        size = bank.length_m(index, at)
+    def drive(index: Array, slot: Array, actions: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
+        """Return the trajectory of one agent; before its history it stands at the oldest pose."""
+        slot = jnp.maximum(slot, 0)
+        past = logged_history(bank, index, begin, slot)
+        length_m = bank.length_m(index, slot)
 
         def advance(motion: Array, action: Array) -> tuple[Array, Array]:
-            after = move(motion, action, size)
+            after = move(motion, action, length_m)
             return after, after
 
-        driven = jax.lax.scan(advance, past[-1], acts[desired])[1]
+        future = jax.lax.scan(advance, past[-1], actions[action_index])[1]
         before = jnp.concatenate([jnp.repeat(past[:1], max(begin + 1 - len(past), 0), 0), past])[-begin - 1 :]
-        return jnp.concatenate([before, driven])
+        return jnp.concatenate([before, future])
 
     return jax.vmap(jax.vmap(drive, (None, 0, 1), 1))(jnp.arange(len(bank)), jnp.asarray(slots), actions)

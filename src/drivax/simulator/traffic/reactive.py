@@ -69,11 +69,7 @@ class IdmTraffic:
         return agent_paths.with_paths(bank, tuple(kind for kind, _ in self.drivers))
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Reactive:
-        """Return the logged traffic state at ``step``.
-
-        Raises:
-            UsageError: The bank has no paths.
-        """
+        """Return the logged traffic state at ``step``."""
         paths = data_of(bank, AgentPaths)
         index, step = jnp.asarray(index, jnp.int32), jnp.asarray(step, jnp.int32)
         slot = paths.slot[index].astype(jnp.int32)
@@ -95,24 +91,24 @@ class IdmTraffic:
         step = context.step - back
         logged = bank.agents[context.index, jnp.clip(step, 0, bank.steps - 1)]
         at = PAST - 1 - min(back, PAST - 1)
-        (here, profile), speed = path_poses(paths, context.index, now.arc[at]), now.speed[at, :, None]
-        direction, there = here[:, 2:], now.there[at, :, None].astype(jnp.float32)
-        parts = [here[:, :2], profile[:, PROFILE_Z, None], direction, direction * speed, there]
-        driven = jnp.concatenate(parts, axis=-1)
+        (pose, profile), speed = path_poses(paths, context.index, now.arc[at]), now.speed[at, :, None]
+        direction, valid = pose[:, 2:], now.there[at, :, None].astype(jnp.float32)
+        parts = [pose[:, :2], profile[:, PROFILE_Z, None], direction, direction * speed, valid]
+        rows = jnp.concatenate(parts, axis=-1)
         slot = paths.slot[context.index].astype(jnp.int32)
         reacts = (now.phase != REPLAYS) & (step > now.begin)
-        return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(driven, mode="drop")
+        return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(rows, mode="drop")
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Reactive:
         """Advance all vehicles by one step of 0.1 s from the present frame."""
         paths, now = data_of(bank, AgentPaths), context.traffic
         drives, waits = now.phase == DRIVES, now.phase == WAITS
         slot = paths.slot[context.index].astype(jnp.int32)
-        movers, most = _movers(bank, context, slot)
-        movers, ignored = _without_parted(movers, frame, waits)
+        movers, limit = _movers(bank, context, slot)
+        movers, ignored = _update_ignored(movers, frame, waits)
         ahead = leaders(paths, context.index, movers, frame)
         driver = self._parameters(bank, context.index, slot)
-        acceleration = _acceleration(bank, context, movers, most, ahead, driver)
+        acceleration = _acceleration(bank, context, movers, limit, ahead, driver)
         arc, speed = _drive_step(movers.arc, movers.speed, acceleration)
         enters = waits & _may_enter(context, movers, ahead, frame)
         arrived = arc >= paths.spacing[context.index] * (agent_paths.PATH_POINTS - 1)
@@ -124,20 +120,23 @@ class IdmTraffic:
         return Reactive(now.begin, phase.astype(jnp.int8), now.entry, arc, speed, there, ignored)
 
     def _class(self, bank: ScenarioBank, index: Any, slot: Int[Array, " R"]) -> Int[Array, " R"]:
-        """Index of the driver parameters of each vehicle; -1 for none."""
+        """Index in ``drivers`` of each vehicle's class; -1 for none."""
         kind = bank.agent_box[index, jnp.maximum(slot, 0), SizeColumn.KIND].astype(jnp.int32)
-        number = jnp.full(kind.shape, -1)
-        for place, (name, _) in enumerate(self.drivers):
-            number = jnp.where(kind == name, place, number)
-        return number
+        driver_index = jnp.full(kind.shape, -1)
+        for i, (driver_kind, _) in enumerate(self.drivers):
+            driver_index = jnp.where(kind == driver_kind, i, driver_index)
+        return driver_index
 
     def _parameters(self, bank: ScenarioBank, index: Any, slot: Int[Array, " R"]) -> IdmParameters:
-        """Return the IDM parameters of each vehicle."""
+        """IDM parameters per vehicle (scalars if there is one class).
+
+        Vehicles without a class (-1) get the last one's; they replay the log.
+        """
         if len(self.drivers) == 1:
             return self.drivers[0][1]
-        number = self._class(bank, index, slot)
+        driver_index = self._class(bank, index, slot)
         table = {
-            field.name: jnp.asarray([getattr(driver, field.name) for _, driver in self.drivers])[number]
+            field.name: jnp.asarray([getattr(driver, field.name) for _, driver in self.drivers])[driver_index]
             for field in fields(IdmParameters)
         }
         return IdmParameters(**table)
@@ -149,40 +148,41 @@ def _movers(
     """Return the vehicles at their present (or entry) poses, and the speed limits of their paths."""
     now = context.traffic
     arc, speed = now.arc[-1], now.speed[-1]
-    here, profile = path_poses(data_of(bank, AgentPaths), context.index, arc)
+    pose, profile = path_poses(data_of(bank, AgentPaths), context.index, arc)
     size = bank.agent_box[context.index, jnp.maximum(slot, 0), SizeColumn.FOOTPRINT]
-    box, z = jnp.concatenate([here, size], axis=-1), profile[:, PROFILE_Z]
+    box, z = jnp.concatenate([pose, size], axis=-1), profile[:, PROFILE_Z]
     return Movers(box, z, arc, speed, slot, now.ignored.astype(jnp.int32)), profile[:, PROFILE_SPEED]
 
 
-def _without_parted(
+def _update_ignored(
     movers: Movers, frame: Frame, waits: Bool[Array, " R"]
 ) -> tuple[Movers, Int[Array, "R 2"]]:
-    """Stop ignoring agents that a driving vehicle has separated from."""
+    """Stop ignoring agents that a driving vehicle has separated from; return the new slots, too, as stored."""
     other = jnp.maximum(movers.ignored, 0)
     level = jnp.abs(frame.z[other] - movers.z[:, None]) <= LEVEL_M
-    together = overlap(movers.box[:, None], frame.box[other]) & frame.valid[other] & level
-    kept = jnp.where((movers.ignored >= 0) & (together | waits[:, None]), movers.ignored, -1)
-    return replace(movers, ignored=kept), kept.astype(jnp.int16)
+    touches = overlap(movers.box[:, None], frame.box[other]) & frame.valid[other] & level
+    ignored = jnp.where((movers.ignored >= 0) & (touches | waits[:, None]), movers.ignored, -1)
+    return replace(movers, ignored=ignored), ignored.astype(jnp.int16)
 
 
 def _acceleration(
-    bank: ScenarioBank, context: AgentContext, movers: Movers, most: Float[Array, " R"], ahead: Leaders,
+    bank: ScenarioBank, context: AgentContext, movers: Movers, limit: Float[Array, " R"], ahead: Leaders,
     driver: IdmParameters,
 ) -> Float[Array, " R"]:  # fmt: skip
     """IDM acceleration behind the leader, and before a red light as behind a standing car on the stop line."""
     stop = _stop_gap(bank, context, movers, driver)
-    behind = idm_acceleration(movers.speed, most, ahead.gap, ahead.speed, driver)
-    before = idm_acceleration(movers.speed, most, stop, jnp.zeros_like(stop), driver)
+    behind = idm_acceleration(movers.speed, limit, ahead.gap, ahead.speed, driver)
+    before = idm_acceleration(movers.speed, limit, stop, jnp.zeros_like(stop), driver)
     return jnp.minimum(behind, before)
 
 
 def _stop_gap(
     bank: ScenarioBank, context: AgentContext, movers: Movers, driver: IdmParameters
 ) -> Float[Array, " R"]:
-    """Distance from the front bumper to the nearest stop line that requires a stop, m.
+    """Distance from the front bumper to the nearest stop line that requires a stop, m; 10 km for none.
 
-    Red stops all vehicles that still can, yellow those that can stop comfortably.
+    Red stops all vehicles that still can, yellow those that can stop comfortably. At red it is 0 for a vehicle that
+    stands with its front over the line.
     """
     paths = data_of(bank, AgentPaths)
     light = paths.stop_light[context.index].astype(jnp.int32)
@@ -193,9 +193,9 @@ def _stop_gap(
     hard = jnp.reshape(driver.max_braking_mps2, (-1, 1))
     soft = jnp.reshape(driver.comfortable_braking_mps2, (-1, 1))
     red, yellow = is_red(state), is_yellow(state)
-    over = (front <= 0.0) & (line > 0.0) & (movers.speed < _STANDS_MPS)[:, None]
-    can = (front > 0.0) & ((red & (square <= 2 * hard * front)) | (yellow & (square <= 2 * soft * front)))
-    return jnp.min(jnp.where(can | (red & over), jnp.maximum(front, 0.0), FREE_M), axis=1)
+    on_line = (front <= 0.0) & (line > 0.0) & (movers.speed < _STANDS_MPS)[:, None]
+    brakes = (front > 0.0) & ((red & (square <= 2 * hard * front)) | (yellow & (square <= 2 * soft * front)))
+    return jnp.min(jnp.where(brakes | (red & on_line), jnp.maximum(front, 0.0), FREE_M), axis=1)
 
 
 def _drive_step(
@@ -216,14 +216,14 @@ def _may_enter(context: AgentContext, movers: Movers, ahead: Leaders, frame: Fra
     Of two that wait for the same space the one due first enters first; two on time both enter, as in the log.
     """
     now = context.traffic
-    size = jnp.asarray([0.0, 0.0, 0.0, 0.0, 2 * _ENTRY_END_M, 2 * _ENTRY_SIDE_M])
-    box, velocity = frame.box[ahead.things], frame.velocity[ahead.things]
-    then = box.at[..., :2].add(velocity * DT_S)
-    taken = (overlap((movers.box + size)[:, None], then) & ahead.real).any(axis=1)
+    margin = jnp.asarray([0.0, 0.0, 0.0, 0.0, 2 * _ENTRY_END_M, 2 * _ENTRY_SIDE_M])
+    box, velocity = frame.box[ahead.slots], frame.velocity[ahead.slots]
+    next_box = box.at[..., :2].add(velocity * DT_S)
+    blocked = (overlap((movers.box + margin)[:, None], next_box) & ahead.valid).any(axis=1)
     entry = now.entry.astype(jnp.int32)
-    ready = (now.phase == WAITS) & (context.step + 1 >= entry) & ~taken
+    ready = (now.phase == WAITS) & (context.step + 1 >= entry) & ~blocked
     late = context.step + 1 > entry
-    # Minima of floats vectorise.
+    # By entry step, then by row; as floats, whose minima vectorise.
     order = (entry * entry.shape[0] + jnp.arange(entry.shape[0])).astype(jnp.float32)
     reach = jnp.sqrt(jnp.sum(movers.box[:, LENGTH : WIDTH + 1] ** 2, axis=-1)) / 2
     x, y = columns(movers.box)[:2]
@@ -247,11 +247,7 @@ TRAFFIC: dict[str, Callable[[], Traffic]] = {"log": LogTraffic, "idm": IdmTraffi
 
 
 def make_traffic(name: str) -> Traffic:
-    """Return the traffic model of a name in :data:`TRAFFIC`, or of ``package.module:name`` (a class or function).
-
-    Raises:
-        UsageError: Unknown name, or it makes no traffic model.
-    """
+    """Return the traffic model of a name in :data:`TRAFFIC`, or of ``package.module:name`` (a class or function)."""
     if name in TRAFFIC:
         return TRAFFIC[name]()
     if not is_dotted(name):
