@@ -152,7 +152,7 @@ def _notes(sample: Sequence[Description]) -> Iterator[str]:
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:
-    """Missing shards of numbered families (``NAME-00003-of-00150``), one sentence per family."""
+    """Missing shards of numbered families (``NAME-00003-of-00150``), a sentence each; more than 8 runs stay unnamed."""
     families: defaultdict[tuple[Path, str, int], set[int]] = defaultdict(set)
     for path in paths:
         if match := _SHARD.fullmatch(path.name):

@@ -91,7 +91,7 @@ class _EmptyTask:
         return PHYSICAL.first(history, length)
 
     def observe(
-        self, bank: ScenarioBank, context: AgentContext, agents: Any, frame: Frame
+        self, bank: ScenarioBank, context: AgentContext, frames: Any, frame: Frame
     ) -> Mapping[str, Any]:
         return {}
 

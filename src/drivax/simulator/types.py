@@ -255,9 +255,9 @@ class Task(Protocol):
         ...
 
     def observe(
-        self, bank: ScenarioBank, context: AgentContext, agents: Any, frame: Frame
+        self, bank: ScenarioBank, context: AgentContext, frames: Any, frame: Frame
     ) -> Mapping[str, Any]:
-        """Return the observation of a context."""
+        """Return the observation of a context; ``frames(k)`` is the frame k steps ago, ``frame`` the present one."""
         ...
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:

@@ -75,15 +75,16 @@ class Task:
         """Return the last action at the start of an episode."""
         return self.actions.first(history, length)
 
-    def observe(self, bank: ScenarioBank, context: AgentContext, agents: Frames, frame: Frame) -> Observation:
-        """Return the observation of a context; ``agents`` returns earlier frames, ``frame`` is the present one."""
+    def observe(self, bank: ScenarioBank, context: AgentContext, frames: Frames, frame: Frame) -> Observation:
+        """Return the observation of a context; ``frames`` returns earlier frames, ``frame`` is the present one."""
 
-        def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
+        def frames_with_present(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
+            """Return a frame; the present one is not computed again."""
             if back:
-                return agents(back, slots)
+                return frames(back, slots)
             return frame if slots is None else frame.at(slots)
 
-        return observe(self.observation, bank, context, frames)
+        return observe(self.observation, bank, context, frames_with_present)
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
         """Return weighted reward terms by name."""

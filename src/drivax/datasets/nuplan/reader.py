@@ -123,10 +123,10 @@ class NuPlan:
             with open_database(path) as database:
                 log = _open_log(database, path)
                 city = city_map(find_map(path, log.map_name))
-                by_token = agents(database)
+                agents_by_token = agents(database)
                 for piece in pieces(log.line, self.steps):
                     try:
-                        yield _recording(log, piece, by_token, city)
+                        yield _recording(log, piece, agents_by_token, city)
                     except DataError as error:
                         yield BadRecord.of(error, path, piece.name)
         except DataError as error:
@@ -280,11 +280,11 @@ def agents(database: Database) -> _Agents:
     return {token: (number, kind) for number, (token, kind) in enumerate(kinds.items(), start=1)}
 
 
-def tracks(log: Log, piece: Piece, by_token: _Agents) -> tuple[Tracks, int]:
+def tracks(log: Log, piece: Piece, agents_by_token: _Agents) -> tuple[Tracks, int]:
     """Return the tracks of a piece, ego in row 0, and the number of boxes without a track."""
     steps = len(piece.sweeps)
-    boxes, owners, lost = _boxes(log, piece, by_token)
-    tokens = sorted({owner for _, owner in owners}, key=lambda token: by_token[token][0])
+    boxes, owners, lost = _boxes(log, piece, agents_by_token)
+    tokens = sorted({owner for _, owner in owners}, key=lambda token: agents_by_token[token][0])
     if (len(tokens) + 1) * steps > _MOST_CELLS:
         raise DataError(f"{len(tokens)} tracks in {steps} steps", cure=_CURE)
     rows = {token: row for row, token in enumerate(tokens, start=1)}
@@ -294,7 +294,7 @@ def tracks(log: Log, piece: Piece, by_token: _Agents) -> tuple[Tracks, int]:
     if owners:
         row, step = np.array([(rows[owner], step) for step, owner in owners]).T
         table[row, step], valid[row, step] = boxes, True
-    entries = [(EGO_TRACK_ID, AgentKind.VEHICLE), *(by_token[token] for token in tokens)]
+    entries = [(EGO_TRACK_ID, AgentKind.VEHICLE), *(agents_by_token[token] for token in tokens)]
     states = Tracks(
         xy=table[..., 0:2].copy(),
         z=table[..., 2].copy(),
@@ -319,10 +319,10 @@ def _ego(log: Log, piece: Piece) -> Float64[np.ndarray, "step 9"]:
         "SELECT p.token, e.x, e.y, e.qw, e.qx, e.qy, e.qz, e.vx, e.vy, e.angular_rate_z "
         "FROM lidar_pc AS p JOIN ego_pose AS e ON e.token = p.ego_pose_token WHERE p.token IN"
     )
-    by_token = {token: pose for token, *pose in log.database.rows_in(query, tokens)}
-    if missing := [token for token in tokens if token not in by_token]:
+    pose_of = {token: pose for token, *pose in log.database.rows_in(query, tokens)}
+    if missing := [token for token in tokens if token not in pose_of]:
         raise DataError(f"{len(missing)} sweeps have no ego pose", cure=_CURE)
-    pose = _numbers([by_token[token] for token in tokens], 9, "ego_pose")
+    pose = _numbers([pose_of[token] for token in tokens], 9, "ego_pose")
     _check(pose[:, 0:2], _FARTHEST_M, "an ego position")
     _check(pose[:, 6:9], _FASTEST_MPS, "an ego velocity")
     if (np.hypot(*np.diff(pose[:, 0:2], axis=0).T) > _LONGEST_STEP_M).any():
@@ -354,12 +354,12 @@ def _read_observations(log: Log, piece: Piece, table: str, columns: str) -> list
 
 
 def _boxes(
-    log: Log, piece: Piece, by_token: _Agents
+    log: Log, piece: Piece, agents_by_token: _Agents
 ) -> tuple[Float64[np.ndarray, "box 9"], list[tuple[int, Any]], int]:
     """Boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track), and how many have no track."""
     columns = "track_token, x, y, z, yaw, length, width, height, vx, vy"
     rows = _read_observations(log, piece, "lidar_box", columns)
-    with_track = [row for row in rows if row[1] in by_token]
+    with_track = [row for row in rows if row[1] in agents_by_token]
     boxes = _numbers([row[2:] for row in with_track], 9, "lidar_box")
     # Static things have no velocity, and the size of a few is unknown.
     boxes[:, 4:9] = np.where(np.isnan(boxes[:, 4:9]), 0.0, boxes[:, 4:9])
@@ -386,12 +386,12 @@ def _roadblocks(log: Log, piece: Piece) -> list[int]:
     return [int(word) for word in words if word.isascii() and word.isdigit() and len(word) < 19]
 
 
-def _recording(log: Log, piece: Piece, by_token: _Agents, city: City) -> Recording:
+def _recording(log: Log, piece: Piece, agents_by_token: _Agents, city: City) -> Recording:
     """Read the recording of a piece, with the map around it."""
     if len(piece.sweeps) <= CURRENT_STEP:
         problem = f"{len(piece.sweeps)} steps without a gap, fewer than {CURRENT_STEP + 1}"
         raise DataError(problem, cure="skip this record")
-    states, lost_boxes = tracks(log, piece, by_token)
+    states, lost_boxes = tracks(log, piece, agents_by_token)
     features, lost = features_around(city, states.xy[0])
     states, features = flatten(states, features)
     lights, lost_lights = _lights(log, piece, city, features)

@@ -232,7 +232,7 @@ def _encode(text: Any, encoding: Any = "latin1") -> bytes:
 
 
 def _type(code: Any, align: Any = False, copy: Any = False) -> _Unbuilt:
-    """An array type; its byte order follows with its state."""
+    """An array type, with the arguments of ``numpy.dtype``; its byte order follows with its state."""
     if not isinstance(code, str) or not _TYPE_CODE.fullmatch(code):
         raise ValueError(f"arrays of type {code[:20]!r}" if isinstance(code, str) else "arrays of no type")
     plain = np.dtype(code)
