@@ -55,7 +55,9 @@ def conditions() -> Iterator[dict[str, Any]]:
 
 
 def cells(record: dict[str, Any]) -> str:
-    """Return the cells of a table row: fixed program and load, before and after."""
+    """Return the cells of a table row: fixed program and load, before and after; empty if they were not recorded."""
+    if "load" not in record:
+        return " | "
     low, high = sorted(record["machine_ms"])
     before, after = record["load"]
     return f"{low:.0f} to {high:.0f} | {before:.1f} to {after:.1f}"

@@ -1,5 +1,8 @@
 """Seeds in parts: a loop of one's own learns the same parameters as ``drivax.train``."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import jax
@@ -45,17 +48,41 @@ def own_loop(config, bank):
         (environments, _, _), rollout = jax.lax.scan(step, first, None, config.algorithm.unroll)
         state = replace(state, environments=environments)
         if not hasattr(agent, "buffer"):
-            return agent.update(bank, state, rollout)[0]
-        return agent.update(bank, replace(state, replay=agent.buffer.add(state.replay, rollout)))[0]
+            return agent.update(bank, state, rollout)
+        return agent.update(bank, replace(state, replay=agent.buffer.add(state.replay, rollout)))
 
     first = state = jax.jit(agent.init)(bank, jax.random.key(config.seed))
     for _ in range(config.iterations):
-        state = iteration(bank, state)
+        state, _logs = iteration(bank, state)
     return first, state
 
 
+def run_optimised(name):
+    """Run a test of this file in a process that compiles as users do."""
+    environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        f"{__file__}::{name}",
+    ]
+    done = subprocess.run(
+        command, env=environment | {"DRIVAX_OPTIMISED": "1"}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout
+
+
 @pytest.mark.parametrize("algorithm", [SAC, pytest.param(PPO, marks=pytest.mark.slow)], ids=["sac", "ppo"])
-def test_own_loop_equals_training(data, algorithm, tmp_path):
+def test_own_loop_equals_training(data, algorithm, tmp_path, request):
+    if not os.environ.get("DRIVAX_OPTIMISED"):
+        # Compiled without optimisation, the two programs round sums differently.
+        run_optimised(request.node.name)
+        return
     config = config_of(algorithm, 3)
     first, state = own_loop(config, ScenarioBank.from_scenarios(data))
     run = train(config, data, tmp_path / "run")

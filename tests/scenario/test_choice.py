@@ -71,7 +71,7 @@ def test_names_may_include_a_file_of_names(tmp_path, monkeypatch):
         ({"filters": ["type=turn_lef"]}, UsageError, "did you mean 'turn_left'?"),
         ({"filters": ["place=bostn"]}, DataError, "no scenario is selected by 'place=bostn'; did you mean 'boston'?"),
         ({"filters": ["type=u_turn"]}, DataError, "by 'type=u_turn'; use one of merge, straight, turn_left"),
-        ({"filters": ["type=merge", "place=boston"]}, DataError, "no scenario is selected; loosen the filters"),
+        ({"filters": ["type=merge", "place=boston"]}, DataError, "is selected; use fewer filters or other names"),
         ({"limit": 0}, UsageError, "--limit 0 leaves no scenario; use 1 or more"),
     ],
 )  # fmt: skip

@@ -309,19 +309,7 @@ class _Simulation:
         self._occupied_crossings = np.zeros(worlds.crossing[-1], bool)
         self._crossing_world = np.repeat(np.arange(len(runs)), np.diff(worlds.crossing))
         self._halting = np.zeros(self._tables.crossing.shape, bool)  # per vehicle and crossing on its path
-        self._movers = [
-            (world, user) for world, run in enumerate(runs) for user in run.staging.extras if not user.is_static
-        ]  # fmt: skip
-        self._overrides = [
-            (int(worlds.row[world]) + override.vehicle, override)
-            for world, run in enumerate(runs)
-            for override in run.staging.overrides
-        ]
-        self._plans = [
-            (int(row), run.ego, positions_along(run.traffic.roles.paths[0], run.ego.xy))
-            for row, run in zip(self._ego_rows, runs, strict=True)
-            if run.ego is not None
-        ]
+        self._gather_scripts(runs)
         self._at = np.concatenate([r.distance_m for r in roles])
         self._speed = np.concatenate([r.speed_mps for r in roles])
         for world, run in enumerate(runs):
@@ -342,6 +330,23 @@ class _Simulation:
         )
         self._steps = np.array([len(times) for times in times_s])[worlds.of]
         self._log = _Log.empty(max(map(len, times_s)), count, len(self._pedestrian_world))
+
+    def _gather_scripts(self, runs: Sequence[Run]) -> None:
+        """Gather scripted users that move, overrides, and planned egos with their positions along their paths."""
+        row = self._worlds.row
+        self._movers = [
+            (world, user) for world, run in enumerate(runs) for user in run.staging.extras if not user.is_static
+        ]  # fmt: skip
+        self._overrides = [
+            (int(row[world]) + override.vehicle, override)
+            for world, run in enumerate(runs)
+            for override in run.staging.overrides
+        ]
+        self._plans = [
+            (int(ego_row), run.ego, positions_along(run.traffic.roles.paths[0], run.ego.xy))
+            for ego_row, run in zip(self._ego_rows, runs, strict=True)
+            if run.ego is not None
+        ]
 
     def finish(self) -> list[Motion]:
         """Run all steps and collect the motions."""
