@@ -256,3 +256,9 @@ def test_curves_show_every_seed(script, learning):
     for line, (seed, points) in zip(axes.lines, curves["success"].items(), strict=True):
         assert line.get_label() == seed
         np.testing.assert_array_equal(line.get_xydata(), points)
+
+
+def test_speed_page_shows_ratios_against_the_earlier_state(script, stored):
+    ratios = script("speed.ratios")
+    table = ratios.table(stored("speed_ratios"))
+    assert f"{ratios.BEGIN}\n\n{table}\n\n{ratios.END}" in ratios.PAGE.read_text()
