@@ -120,3 +120,21 @@ time.sleep(0.2)
     quiet = program.replace("= 0.0", "= 60.0")
     done = subprocess.run([sys.executable, "-c", quiet], capture_output=True, text=True, check=True)
     assert "compiling" not in done.stderr
+
+
+@pytest.mark.parametrize("flag", ["", "--no-cache"])
+def test_commands_store_programs_without_no_cache(tmp_path: Path, flag: str) -> None:
+    program = f"""
+from drivax.cli import main
+main("bench --help {flag}".split())
+import jax, jax.numpy as jnp
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+jax.jit(lambda x: jnp.sin(x) * 2)(jnp.arange(3.0))
+"""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_COMP")}
+    # JAX itself follows its own variable.
+    environment |= {"XDG_CACHE_HOME": str(tmp_path)} | (
+        {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own")} if flag else {}
+    )
+    subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, check=True)
+    assert bool(list(tmp_path.rglob("*-cache"))) == (not flag)

@@ -5,9 +5,9 @@
 
 SET has at least 1,024 scenarios. Each tree runs in processes of its own. A repeated measurement keeps one process per
 tree alive, runs both by turns, and quotes the median of the ratios of neighbouring runs; the first run of each, which
-compiles, does not count. A command is started anew, with an empty compilation cache (``first``) or with that of an
-earlier run (``again``). Nothing else may run on the machine. Each row has the time of a fixed program and the load
-before and after it.
+compiles, does not count. A command starts in a new process, with an empty compilation cache (``first``) or with that
+of an earlier run (``again``). Nothing else may run on the machine. Each row has the time of a fixed program and the
+load before and after it.
 """
 
 from __future__ import annotations
@@ -129,15 +129,14 @@ def call():
     "generation, one core": Repeated(
         "scenarios/s",
         """
-from drivax.scenario.build.assemble import assemble
-from drivax.scenario.schema import CAPACITIES
-from drivax.synthetic.world import WorldConfig, generate_one
-index = [0]
+import tempfile
+from drivax.synthetic.generate import generate
+seed = [0]
 def call():
-    for _ in range(4):
-        assemble(generate_one(5, index[0], WorldConfig()).recording, CAPACITIES["default"])
-        index[0] += 1
-    return 4
+    with tempfile.TemporaryDirectory() as folder:
+        generate(folder + "/set", 32, seed[0])
+    seed[0] += 1
+    return 32
 """,
         "2 x (4 x)",
     ),
@@ -224,8 +223,8 @@ def repeated(measurement: Repeated, trees: Sequence[Path], data: Path, repeats: 
     ratios = [after / before for before, after in pairs]
     return {
         "unit": measurement.unit,
-        "before": round(before, 3 if before < 100 else 0),
-        "after": round(after, 3 if after < 100 else 0),
+        "before": round(before, 3) if before < 100 else round(before),
+        "after": round(after, 3) if after < 100 else round(after),
         "ratio": round(statistics.median(ratios), 2),
         "smallest": round(min(ratios), 2),
         "largest": round(max(ratios), 2),
@@ -283,9 +282,15 @@ def timed_command(
     }
 
 
+def commit_of(tree: Path) -> str:
+    """Return the short hash of the commit that is checked out in a tree."""
+    command = ["git", "-C", str(tree), "rev-parse", "--short=7", "HEAD"]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
 def measure(names: Sequence[str], trees: Sequence[Path], data: Path, repeats: int) -> dict[str, Any]:
-    """Return a row for each measurement, with the machine's speed and load."""
-    rows = {}
+    """Return a row for each measurement, with the commits, the machine's speed and the load."""
+    rows, commits = {}, dict(zip(("before", "after"), map(commit_of, trees), strict=True))
     for name in names:
         measurement = MEASUREMENTS[name]
         with conditions() as record:
@@ -293,7 +298,7 @@ def measure(names: Sequence[str], trees: Sequence[Path], data: Path, repeats: in
                 row = repeated(measurement, trees, data, repeats)
             else:
                 row = timed_command(name, measurement, trees, data, max(1, repeats // 3))
-        rows[name] = row = row | record
+        rows[name] = row = row | record | {"commits": commits}
         print(f"{name}: {json.dumps(row)}", flush=True)
     return rows
 
@@ -330,18 +335,8 @@ def main() -> None:
         if args.write:
             stored = json.loads(RESULT.read_text())["rows"] if RESULT.exists() else {}
             stored |= rows
-            commits = [
-                subprocess.run(
-                    ["git", "-C", str(tree), "rev-parse", "--short=7", "HEAD"],
-                    check=True,
-                    capture_output=True,
-                    text=True,
-                ).stdout.strip()
-                for tree in trees
-            ]
             result = {
                 "command": "python -m experiments.speed.ratios --data SET --against TREE --write",
-                "commits": {"before": commits[0], "after": commits[1]},
                 "rows": {name: stored[name] for name in MEASUREMENTS if name in stored},
                 "versions": versions(),
             }

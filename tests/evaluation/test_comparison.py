@@ -104,7 +104,7 @@ def test_too_few_scenarios_decide_nothing():
     result = compare(
         dataclasses.replace(PLAN, minimum_scenarios=61), [table("one", 0.3)], [table("two", seed=2)]
     )
-    assert result.primary.winner == "A", "the test is told all the same"
+    assert result.primary.winner == "A", "the result of the test is still reported"
     assert (result.decision.recommendation, result.decision.because) == ("not enough scenarios", "minimum")
     assert result.decision.needed >= 61
 

@@ -144,9 +144,9 @@ def test_misspelt_policy_lists_the_names(bank, capsys, tmp_path):
         "out",
     ]
     assert main(command) == 2
-    told = "no policy 'zoo:bold' in the zoo; use zoo:aggressive"
-    assert capsys.readouterr().err == f"drivax: {told}\n"
-    with pytest.raises(UsageError, match=told):
+    message = "no policy 'zoo:bold' in the zoo; use zoo:aggressive"
+    assert capsys.readouterr().err == f"drivax: {message}\n"
+    with pytest.raises(UsageError, match=message):
         find_planner("zoo:bold", bank)
 
 

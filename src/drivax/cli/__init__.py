@@ -168,6 +168,9 @@ def _run(name: str, command: Command, arguments: list[str], use_cache: bool) -> 
 
     # Before the module is imported: JAX reads the setting as it starts.
     cache = use_compilation_cache() if use_cache else None
+    if not use_cache:
+        # Also for a folder of JAX's own variable, which is read when a command imports JAX.
+        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
     module = importlib.import_module(command.module)
     if cache and "jax" in sys.modules:
         report_compilation(partial(print, file=sys.stderr, flush=True))

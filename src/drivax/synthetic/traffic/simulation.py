@@ -73,7 +73,7 @@ _SLOWEST = 6
 #: A planned ego claims junctions this many steps ahead.
 _FORESEEN = 25
 #: Runs that are simulated together.
-_TOGETHER = 8
+_TOGETHER = 6
 
 _T = TypeVar("_T")
 
