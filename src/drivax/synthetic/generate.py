@@ -282,7 +282,7 @@ def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> Iterat
 
 
 def _draw_in_worker(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:
-    """:func:`_draw_chunk`; the garbage collector ignores what was imported, which saves 3 % of the time."""
+    """:func:`_draw_chunk`; the garbage collector ignores what was imported, which saves time."""
     if not gc.get_freeze_count():
         gc.freeze()
     return list(_draw_chunk(first, last, seed, options))
