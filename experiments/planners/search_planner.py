@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, corners, overlap
-from drivax.planners.simple import pursuit
 from drivax.scenario.bank.columns import AgentColumn, RouteColumn
 from drivax.scenario.bank.queries import (
     LEVEL_M,
@@ -26,10 +25,10 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.ahead import STOP_SHORT_M, desired_speed, project, stop_line_m
-from drivax.simulator.dynamics import GRIP_MPS2
+from drivax.simulator.dynamics import GRIP_MPS2, pursuit
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.types import AgentContext, Frame, SimState, Situation
-from drivax.tasks.actions import ActionSpace, Physical
+from drivax.tasks.actions import ActionSpace, Physical, action_of
 
 #: Number and spacing (s) of prediction times; predictions along lanes use longer steps.
 HORIZON, STEP_S = 20, 0.25
@@ -407,9 +406,7 @@ class SearchPlanner:
 
         costs, controls = jax.vmap(line_costs)(jnp.asarray(_SHIFTS))
         best = controls.reshape(-1, 2)[jnp.argmin(costs)]
-        motion = context.history[-1]
-        action = self.actions.action(motion, best[0], best[1], ego_box[LENGTH])
-        return action, trend
+        return action_of(self.actions, bank, context, best[0], best[1]), trend
 
     def _drive_line(
         self, line: Array, exists: Array, offsets: Array, others: Others, ego: tuple[Array, ...]

@@ -20,8 +20,9 @@ from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import Discrete
+from drivax.tasks.actions import PHYSICAL, ROUTE, Discrete, execute
 from drivax.tasks.observations import ObservationConfig, OwnGroup
+from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 
 
@@ -191,3 +192,49 @@ def test_demonstrations_follow_the_log(bank, driving):
              if (i, s - 1) in did]  # fmt: skip
     assert len(pairs) > 20
     np.testing.assert_allclose(*map(np.array, zip(*pairs, strict=True)), atol=1e-5)
+
+
+def test_held_decision_takes_its_steps_and_stops_at_an_end(bank, driving):
+    """Two steps of one action equal two single steps; rewards add up, and an ended episode waits for its reset."""
+    task = replace(driving.task, rewards=RewardConfig(preset="pace"))
+    single = Driving(Simulator(task), LATEST, EARLIEST)
+    double = Driving(Simulator(replace(task, hold=2)), LATEST, EARLIEST)
+    start = jax.jit(single.start, static_argnums=2)(bank, jax.random.key(0), 24)
+    steps = {name: jax.jit(each.step) for name, each in (("single", single), ("double", double))}
+    action, now = jnp.tile(jnp.array([[1.0, 0.4], [-1.0, -0.4]]), (12, 1)), start
+    ended = 0
+    for number in range(40):
+        key, cache = jax.random.key(number), single.cache(bank, now.state)
+        held, result = steps["double"](bank, now, cache, action, key)
+        first, one = steps["single"](bank, now, cache, action, key)
+        second, two = steps["single"](bank, first, one.cache, action, key)
+        idle = np.asarray(now.over | first.over)
+        ended += int((np.asarray(first.over) & ~np.asarray(now.over)).sum())
+        expected = np.asarray(one.reward) + np.where(idle, 0.0, two.reward)
+        running = ~np.asarray(now.over)
+        np.testing.assert_allclose(result.reward[running], expected[running], atol=1e-5)
+        np.testing.assert_array_equal(
+            result.terminated | result.truncated, first.over | (second.over & ~idle)
+        )
+        motion = np.where(
+            idle[:, None], first.state.context.history[:, -1], second.state.context.history[:, -1]
+        )
+        np.testing.assert_allclose(held.state.context.history[:, -1], motion, atol=1e-4)
+        now = held
+    assert ended > 3
+
+
+def test_expert_of_the_route_space_is_cloned_by_its_offset(bank):
+    """What the clone requests is executed as the expert's action, which the next state remembers."""
+    route = Driving(Simulator(Task(actions=ROUTE, observation=OBSERVATION, metrics="none")), LATEST)
+    physical = replace(route, simulator=Simulator(replace(route.task, actions=PHYSICAL)))
+    key = jax.random.key(0)
+    (seen, offset, clipped), (_, action, _) = (
+        jax.jit(each.demonstrations, static_argnums=2)(bank, key, 32) for each in (route, physical)
+    )
+    index, step = (seen["moment"][:, 0, column].astype(int) for column in (0, 1))
+    contexts = jax.vmap(route._logged_context, (None, 0, 0))(bank, index, step)
+    executed = jax.vmap(lambda context, a: execute(ROUTE, bank, context, a))(contexts, offset)
+    kept = ~np.asarray(clipped)
+    assert kept.sum() > 20
+    np.testing.assert_allclose(executed[kept], action[kept], atol=1e-3)

@@ -1,5 +1,6 @@
 """Planners: what each promises, on scenes whose answer is known."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -12,11 +13,22 @@ from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.functions import NetworkPlanner
-from drivax.planners.planner import Planner
-from drivax.planners.simple import IdmPlanner, RandomActions, expert_action, logged_motion, logged_poses
+from drivax.planners.planner import Planner, hold
+from drivax.planners.simple import (
+    ConstantSpeed,
+    ConstantVelocity,
+    Expert,
+    IdmPlanner,
+    RandomActions,
+    expert_action,
+    logged_motion,
+    logged_poses,
+)
+from drivax.scenario.schema import Flag
+from drivax.simulator.ahead import follow_route
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import PHYSICAL, Trajectory
+from drivax.tasks.actions import PHYSICAL, ROUTE, Trajectory, execute
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from scenes import RED, bank_of, car, straight_road
@@ -146,3 +158,66 @@ def test_random_actions_fill_the_action_space_evenly_and_follow_the_key(simulato
     assert abs(np.corrcoef(actions.T)[0, 1]) < 0.05 and np.abs(actions).max() <= 1.0
     again = planner.act((), bank, state, situation, None, keys[7])[0]
     assert np.array_equal(np.asarray(again), actions[7])
+
+
+def test_constant_speed_follows_a_bend(simulator):
+    """0.5 m left of a straight route, at a look-ahead of 0.8 v + 3 m; the acceleration is zero."""
+    recording = straight_road([car(0, 0.5, 0, 9)])
+    action = act(ConstantSpeed(), simulator, bank_of(recording))
+    distance = 0.8 * 9 + 3
+    assert action[0] == 0.0
+    assert action[1] * 0.3 == pytest.approx(2 * -0.5 / (distance**2 + 0.25), rel=1e-3)
+
+
+def test_constant_speed_is_the_zero_of_the_route_space(simulator):
+    bank = bank_of(straight_road([car(0, 0.5, 0.1, 9)]))
+    physical, route = (act(ConstantSpeed(space), simulator, bank) for space in (PHYSICAL, ROUTE))
+    np.testing.assert_allclose(route, 0.0, atol=1e-5)
+    state = first_moment(simulator, bank)[0]
+    np.testing.assert_allclose(execute(ROUTE, bank, state.context, jnp.zeros(2)), physical, atol=1e-6)
+
+
+def test_rule_planners_execute_the_same_in_the_route_space(simulator):
+    """The offset that pursuit needs for a curvature is the inverse of the pursuit."""
+    bank = bank_of(straight_road([car(0, 0.5, 0.1, 9), car(30, 0, 0, 5)]))
+    state = first_moment(simulator, bank)[0]
+    for planner in (IdmPlanner, ConstantVelocity, lambda actions: Expert(actions, replays=False)):
+        physical, route = (act(planner(space), simulator, bank) for space in (PHYSICAL, ROUTE))
+        assert abs(route[1]) < 1
+        np.testing.assert_allclose(
+            execute(ROUTE, bank, state.context, jnp.asarray(route)), physical, atol=1e-5
+        )
+
+
+def test_route_space_steers_straight_on_beyond_the_route_and_without_one(simulator):
+    bank = bank_of(straight_road([car(0, 0, 0.1, 9)]))
+    bank = replace(bank, flags=bank.flags & ~jnp.uint32(int(Flag.ROUTE)))
+    state = first_moment(simulator, bank)[0]
+    assert float(follow_route(bank, state.context, jnp.zeros(()))) == pytest.approx(0.0, abs=1e-6)
+    left = float(follow_route(bank, state.context, jnp.ones(())))
+    assert left == pytest.approx(2 / (10.2**2 + 1), rel=1e-3)
+    bank = bank_of(straight_road([car(0, 0, 0, 9)]))
+    context = first_moment(simulator, bank)[0].context
+    end_m = float(bank.route_points[0, 0] - 1)
+    place = context.history.at[-1].set(jnp.array([end_m - float(context.route_m), 1.0, 0.0, 9.0]))
+    beyond = replace(context, history=place, route_m=jnp.asarray(end_m))
+    assert float(follow_route(bank, beyond, jnp.zeros(()))) == pytest.approx(-2 / (10.2**2 + 1), rel=1e-2)
+
+
+def test_held_planner_decides_at_every_other_step(simulator):
+    """Gaps shrink from step to step, so that IDM's decision changes at each."""
+    bank = bank_of(straight_road([car(0, 0, 0, 9), car(30, 0, 0, 5)]))
+    planner, key, taken, fresh = hold(IdmPlanner(), 2), jax.random.key(0), [], []
+    state = simulator.reset(bank, 0)
+    carry = planner.init(bank, state, key)
+    step = jax.jit(simulator.step)
+    for _ in range(4):
+        situation = simulator.situation(bank, state)
+        action, carry = planner.act(carry, bank, state, situation, {}, key)
+        taken.append(np.asarray(action))
+        fresh.append(np.asarray(IdmPlanner().act((), bank, state, situation, {}, key)[0]))
+        state = step(bank, state, action)[0]
+    np.testing.assert_array_equal(taken[::2], fresh[::2])
+    np.testing.assert_array_equal(taken[1::2], taken[::2])
+    assert (np.asarray(fresh[1::2]) != np.asarray(taken[1::2])).any()
+    assert hold(planner, 1) is planner and planner.name == "idm" and not planner.replays

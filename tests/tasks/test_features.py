@@ -107,6 +107,38 @@ def test_optional_features_of_ego_and_agents(seen):
     np.testing.assert_allclose(relative[at : at + 2], [(6 - 9) / 15, 0], atol=1e-5)
 
 
+def test_agents_relate_to_the_route_and_approach(seen):
+    """The car behind loses 6 m/s; the one that crosses reaches ego's lane at once, too late to be hit."""
+    along, left = (column(seen, "agents", f"route {part}")[:2, -1] for part in ("along", "left"))
+    np.testing.assert_allclose(along * 50, [-12, 20], atol=0.05)
+    np.testing.assert_allclose(left * 5, [3.7, 0.5], atol=0.05)
+    sine, cosine = (column(seen, "agents", f"route {part}")[:2, -1] for part in ("sin", "cos"))
+    np.testing.assert_allclose([sine, cosine], [[0, 1], [1, 0]], atol=1e-3)
+    behind, across = np.array([-12.0, 3.7]), np.array([20.0, 0.5])
+    speeds = [-behind @ [-6, 0] / np.hypot(*behind), -across @ [-9, 6] / np.hypot(*across)]
+    np.testing.assert_allclose(column(seen, "agents", "closing_speed")[:2, -1] * 15, speeds, atol=1e-3)
+    # Ego's front is at 2.4 m; the crossing car is 2 m wide and leaves ego's lane after (1 + 2.5 - 0.5) / 6 s.
+    assert (20 - 1 - 2.4) / 9 > (1 + 2.5 - 0.5) / 6
+    np.testing.assert_array_equal(column(seen, "agents", "time_to_overlap")[:2, -1], 0.0)
+    # At the second place, the car behind is not beside the route.
+    assert column(seen, "agents", "route left", place=1)[:2, -1].max() == pytest.approx(20 / 5)
+
+
+def test_time_to_overlap_of_a_leader():
+    """A gap of 15.2 m closes at 4 m/s in 3.8 s; without a route there are no route coordinates."""
+    config = replace(EVERYTHING, own=(), agents=1, steps=1)
+    recording = straight_road([car(0, 0, 0, 9), car(20, 0, 0, 5)])
+    simulator, found = Simulator(Task(observation=config)), {}
+    for name, scene in (("route", recording), ("none", replace(recording, route_lanes=()))):
+        bank = bank_of(scene)
+        observed = jax.device_get(jax.jit(lambda b: simulator.observe(b, simulator.context(b, 0, 10)))(bank))
+        names = feature_names(config.features, {n: v.shape for n, v in observed.items()})["agents"]
+        found[name] = dict(zip(names, observed["agents"][0, 0], strict=True))
+    assert found["route"]["time_to_overlap"] == pytest.approx(1 - 3.8 / 8, abs=1e-3)
+    assert found["route"]["route along"] == pytest.approx(0.4, abs=1e-3)
+    assert found["none"]["time_to_overlap"] == pytest.approx(1 - 3.8 / 8, abs=1e-3)
+
+
 def test_curvature_of_road_and_route(seen):
     mask = seen["everything"]["road_mask"][0]
     x, y = (column(seen, "road", f"position {axis}")[mask] * 50 for axis in "xy")
@@ -188,14 +220,8 @@ def test_examples(seen):
 
 def test_car_following_has_the_inputs_of_idm(seen):
     """The car that stands across the route leads, 16.6 m ahead, at no speed along it; nothing leads on the arc."""
-    wanted_gap = 2 + 1.5 * 9 + 9 * 9 / (2 * np.sqrt(1.5 * 3))
-    braking = 1.5 * (1 - (9 / 13.4) ** 4 - (wanted_gap / 16.6) ** 2)
     curve = np.sqrt(2.5 * RADIUS_M)
-    free = 1.5 * (1 - (9 / curve) ** 4)
-    expected = [
-        [16.6 / 50, 9 / 15, 0, 1, 13.4 / 15, braking / 6],
-        [90 / 50, 0, 0, 0, curve / 15, free / 6],
-    ]
+    expected = [[16.6 / 50, 9 / 15, 0, 1, 13.4 / 15], [90 / 50, 0, 0, 0, curve / 15]]
     np.testing.assert_allclose(seen["everything"]["car_following"][:2], expected, atol=0.01)
 
 

@@ -222,7 +222,7 @@ def test_unseen_lights_are_hidden_from_custom_groups():
     assert sighted["lights_mask"].any() and sighted["stop_line"][1:].tolist() == [1.0, 1.0]
     assert sighted["car_following"][3] == 1.0 and sighted["car_following"][0] < 1.0
     assert not blind["lights_mask"].any() and blind["stop_line"].tolist() == [1.0, 0.0, 0.0]
-    assert blind["car_following"][3] == 0.0 and blind["car_following"][5] > sighted["car_following"][5]
+    assert blind["car_following"][3] == 0.0 and blind["car_following"][0] > sighted["car_following"][0]
 
 
 @pytest.mark.slow

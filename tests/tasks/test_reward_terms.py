@@ -68,6 +68,8 @@ def value(term, near=True, before=BEFORE, **now):
     return float(found)
 
 
+#: Scales of ``pace``, m.
+LATE_M, EARLY_M = 8.0, 8.0
 #: Term, what is different from the quiet moment, and the value by hand.
 CASES = [
     ("collision", {}, 0.0),
@@ -126,6 +128,19 @@ CASES = [
     ("lane_change", {"lane_changed": True}, 1.0),
     ("merge", {}, 0.0),
     ("merge", {"merged": True}, 1.0),
+    # On time; at the slack ahead; one scale late; one scale early.
+    ("pace", {"late_m": -5.0, "early_m": -5.0}, 1.0),
+    ("pace", {"late_m": -11.0, "early_m": 1.0}, 1.0),
+    ("pace", {"late_m": LATE_M, "early_m": -18.0}, np.exp(-1)),
+    ("pace", {"late_m": -15.0, "early_m": 1.0 + EARLY_M}, np.exp(-1)),
+    ("completion", {"completed": 0.25}, 0.25),
+    ("completion", {}, 0.0),
+    ("route_offset", {"route_deviation_m": 0.5}, 0.25),
+    ("route_offset", {"route_deviation_m": 5.0}, 1.0),
+    ("route_offset", {"route_deviation_m": 5.0, "routed": False}, 0.0),
+    ("urgency", {"ttc_s": 0.5}, 0.75),
+    ("urgency", {"ttc_s": 2.5}, 0.0),
+    ("urgency", {"ttc_s": 0.0, "ttc_defined": False}, 0.0),
 ]
 
 
@@ -215,6 +230,10 @@ def in_numpy(before, now, near):
             "goal": routed and n["goal_distance_m"] <= 3 < b["goal_distance_m"],
             "lane_change": n["lane_changed"],
             "merge": n["merged"],
+            "pace": np.exp(-max(n["late_m"], 0) / LATE_M - max(n["early_m"] - 1, 0) / EARLY_M),
+            "completion": max(n["completed"] - b["completed"], 0),
+            "route_offset": min(n["route_deviation_m"] / 2, 1) if routed else 0,
+            "urgency": max(0, 1 - n["ttc_s"] / 2) if defined else 0,
         }
         for name, number in row.items():
             rows.setdefault(name, []).append(float(number))
@@ -225,7 +244,7 @@ def in_numpy(before, now, near):
 RANGES = {
     "speed_mps": (0, 30), "acceleration_mps2": (-6, 4), "lateral_acceleration_mps2": (-6, 6), "jerk_mps3": (-12, 12),
     "log_divergence_m": (0, 15), "goal_distance_m": (0, 6), "progress_m": (0, 3), "ttc_s": (0, 3), "gap_m": (0, 3),
-    "lag_m": (-5, 15),
+    "lag_m": (-5, 15), "late_m": (-15, 15), "early_m": (-15, 15), "completed": (0, 1), "route_deviation_m": (0, 3),
 }  # fmt: skip
 
 
@@ -308,6 +327,26 @@ def test_aggressive_preset_by_hand():
     assert total("aggressive") == pytest.approx(0.4 + fast)
     assert total("aggressive", ttc_s=0.3) == pytest.approx(0.4 + fast - 0.5 * 0.7)
     assert total("aggressive", lane_changed=True, merged=True) == pytest.approx(0.4 + fast + 0.4)
+
+
+def test_soft_factors_lower_a_softened_term_one_after_the_other():
+    """Each takes its share of what those before it leave, so that the sum is their product."""
+    hard = {"ttc_s": 1.0, "acceleration_mps2": 1.2, "speed_mps": 20.0, "route_deviation_m": 1.0}
+    terms = RewardConfig(preset="pace", scale=2.0).weigh(BEFORE, facts(**hard), around())
+    assert float(terms["pace"]) == pytest.approx(0.2)
+    assert float(terms["pace/urgency"]) == pytest.approx(-0.2 * 0.3 * 0.5)
+    assert float(terms["pace/discomfort"]) == pytest.approx(-0.2 * 0.85 * 0.2 * 0.25)
+    whole = 0.2 * (1 - 0.3 * 0.5) * (1 - 0.2 * 0.25) * (1 - 0.2) * (1 - 0.1 * 0.5)
+    assert float(sum(terms.values())) == pytest.approx(whole)
+    crash = RewardConfig(preset="pace").weigh(BEFORE, facts(collision=True), around())
+    assert float(sum(crash.values())) == pytest.approx(-3.0 + 0.1)
+
+
+def test_soft_terms_read_the_facts_of_their_factors():
+    assert {"late_m", "early_m", "ttc_s", "jerk_mps3", "limit_mps", "route_deviation_m"} < RewardConfig(
+        preset="pace"
+    ).reads
+    assert "early_m" not in RewardConfig(preset="completion").reads
 
 
 def test_facts_of_disabled_terms_are_not_measured():

@@ -149,6 +149,9 @@ class _Backend:
     def __init__(self, data: Scenarios | str | Path | int, task: Task | None, traffic: str | Traffic) -> None:
         bank, self.ids, self.scenarios = _open(data)
         self.task = task or Task()
+        if self.task.hold > 1:
+            cure = "set hold to 1 and repeat the action"
+            raise UsageError(f"the task holds decisions for {self.task.hold} steps", cure=cure)
         self.simulator = Simulator(self.task, find_traffic(traffic) if isinstance(traffic, str) else traffic)
         cpu = jax.devices("cpu")[0]
         self.bank = jax.device_put(prepare_bank(self.simulator.traffic, bank), cpu)

@@ -20,7 +20,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, DT_S, LEAST_STEPS, AgentKind, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import AgentContext, Facts, Frame, SimState, Situation, Surroundings
-from drivax.tasks.actions import PHYSICAL, PUBLISHED
+from drivax.tasks.actions import PHYSICAL, PUBLISHED, execute
 
 Findings = dict[str, float | int | bool | str | None]
 
@@ -81,10 +81,10 @@ class _EmptyTask:
     def motion(self, motion: Array, action: Array, length: Any) -> Array:
         return PHYSICAL.move(motion, action, length)
 
-    def actuate(self, motion: Array, action: Array, last: Array, length: Any) -> Array:
-        return PHYSICAL.actuate(motion, action, last, length)
+    def actuate(self, bank: ScenarioBank, context: AgentContext, action: Array) -> Array:
+        return execute(PHYSICAL, bank, context, action)
 
-    def coast(self, motion: Array, length: Any) -> Array:
+    def coast(self, bank: ScenarioBank, context: AgentContext) -> Array:
         return jnp.zeros(2)
 
     def first_action(self, history: Array, length: Any) -> Array:

@@ -185,13 +185,12 @@ def advance(
     situation = simulator.situation(bank, state)
     observation = simulator.observe(bank, state.context)
     action, carry = planner.act(carry, bank, state, situation, observation, key)
-    context, motion = state.context, state.context.history[-1]
-    length_m = bank.length_m(context.index, context.slot)
+    context = state.context
     if planner.replays:
-        action = simulator.task.actuate(motion, action, context.action, length_m)
+        action = simulator.task.actuate(bank, context, action)
         logged_pose = logged_motion(bank, context, 1)
         return simulator.replay(bank, state, logged_pose, action)[0], carry, jnp.ones((), bool)
-    is_finite, coast = jnp.isfinite(action).all(), simulator.task.coast(motion, length_m)
+    is_finite, coast = jnp.isfinite(action).all(), simulator.task.coast(bank, context)
     return simulator.step(bank, state, jnp.where(is_finite, action, coast))[0], carry, is_finite
 
 

@@ -28,7 +28,7 @@ from drivax.files import check_space, explain_full_disk, replace_folder
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.planners.functions import collect_errors
-from drivax.planners.planner import Planner
+from drivax.planners.planner import Planner, hold
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities, too_short
 from drivax.scenario.schema import CURRENT_STEP, LEAST_STEPS, STEPS, Scenario
@@ -328,7 +328,7 @@ class _Evaluation:
         metrics = metric_specs(task.metrics)
         if conflicts := sorted({*KEYS, *ADDED} & metrics.keys()):
             raise UsageError(f"the column {conflicts[0]!r} already exists", cure="rename your metric")
-        return cls(replace(simulator, task=task), planner, start_step, seed, metrics)
+        return cls(replace(simulator, task=task), hold(planner, task.hold), start_step, seed, metrics)
 
     def episodes(self, bank: ScenarioBank) -> Iterator[Episodes]:
         """Run the scenarios of a bank in order, and yield their episodes in batches."""

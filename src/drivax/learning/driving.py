@@ -22,7 +22,7 @@ from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.starts import LogStart
 from drivax.simulator.types import AgentContext, EpisodeStart, Frame, SimState
-from drivax.tasks.actions import Discrete
+from drivax.tasks.actions import Discrete, Route
 from drivax.tasks.task import Task
 
 #: Scenarios that are replayed in one batch.
@@ -119,7 +119,10 @@ class Driving:
     def step(
         self, data: ScenarioBank, now: Environments, cache: Frame, action: Float[Array, "B D"], key: Array
     ) -> tuple[Environments, Outcome]:
-        """Step every environment, or reset it to another scenario where its episode is over."""
+        """Hold a decision for ``Task.hold`` steps in every environment, or reset it where its episode is over.
+
+        An episode that ends while a decision is held does not step on. Rewards of the steps are added.
+        """
 
         def new_episode(index: Array, step: Array, key: Array) -> EpisodeStart:
             return self.simulator.new_episode(data, index, step, 0, key)
@@ -128,9 +131,26 @@ class Driving:
         step_all = jax.vmap(self.simulator.step_or_reset, (None, 0, 0, 0, 0, 0))
         fresh = map_where(now.over, new_episode, *start)
         state, result = step_all(data, now.state, action, now.over, fresh, cache)
-        over = result.terminated | result.truncated
-        totals = _totals(data, state, result.reward_terms, over, now.over)
-        outcome = Outcome(result.reward, result.terminated, result.truncated, self.cache(data, state), totals)
+        summed = (result.reward, result.reward_terms, result.terminated, result.truncated)
+
+        def step_on(carry: tuple[SimState, Any], _: None) -> tuple[tuple[SimState, Any], None]:
+            """Take another step of the decision where the episode has neither ended nor just begun."""
+            state, (reward, terms, terminated, truncated) = carry
+            idle = now.over | terminated | truncated
+            after, result = jax.vmap(self.simulator.step, (None, 0, 0))(data, state, action)
+            state = jax.tree.map(lambda new, old: _where(idle, old, new), after, state)
+            more = jax.tree.map(
+                lambda value: jnp.where(idle, 0.0, value), (result.reward, result.reward_terms)
+            )
+            reward, terms = jax.tree.map(jnp.add, (reward, terms), more)
+            ends = (terminated | (result.terminated & ~idle), truncated | (result.truncated & ~idle))
+            return (state, (reward, terms, *ends)), None
+
+        (state, summed), _ = jax.lax.scan(step_on, (state, summed), None, self.task.hold - 1)
+        reward, terms, terminated, truncated = summed
+        over = terminated | truncated
+        totals = _totals(data, state, terms, over, now.over)
+        outcome = Outcome(reward, terminated, truncated, self.cache(data, state), totals)
         return Environments(state, over, self.observe_all(data, state.context)), outcome
 
     def demonstrations(self, data: ScenarioBank, key: Array, count: int) -> ExpertActions:
@@ -178,17 +198,19 @@ class Driving:
         context, before = (
             self._log_simulator.context(bank, index, t) for t in (step, jnp.maximum(step - 1, 0))
         )
-        return replace(context, action=self._expert_action(bank, before)[0])
+        action = expert_action(bank, before, self.task.actions)
+        return replace(context, action=self.task.actuate(bank, before, action))
 
     def _expert_action(
         self, bank: ScenarioBank, context: AgentContext
     ) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
-        """Return the expert's executed action, and whether it was clipped."""
+        """Return the expert's action within bounds and actuator rates, and whether it was clipped."""
         space = self.task.actions
         action = expert_action(bank, context, space)
-        length_m = bank.length_m(context.index, context.slot)
-        executed = space.actuate(context.history[-1], action, context.action, length_m)
-        return executed, space.exceeds_bounds(action)
+        # In the space ``route`` the executed action is another one than that which a policy requests.
+        is_route = isinstance(space, Route)
+        target = jnp.clip(action, -1.0, 1.0) if is_route else self.task.actuate(bank, context, action)
+        return target, space.exceeds_bounds(action)
 
     def _rollout(self, bank: ScenarioBank, index: Int[Array, ""]) -> tuple[Array, ...]:
         """Action, reward, terminated, truncated and clipped of the expert in one scenario from the current step on."""
@@ -219,6 +241,11 @@ def _draw(
     # Unused, and not computed, with logged starts.
     keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
     return index, step, keys
+
+
+def _where(condition: Bool[Array, " B"], chosen: Array, other: Array) -> Array:
+    """Select along the first axis."""
+    return jnp.where(condition.reshape(-1, *(1,) * (chosen.ndim - 1)), chosen, other)
 
 
 def _has_expert_action(bank: ScenarioBank) -> Bool[Array, "N T"]:

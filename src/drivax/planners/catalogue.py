@@ -10,7 +10,7 @@ from drivax.errors import UsageError
 from drivax.planners.nuplan.planner import Host, NuplanPlanner, is_nuplan
 from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
-from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner, RandomActions
+from drivax.planners.simple import ConstantSpeed, ConstantVelocity, Expert, IdmPlanner, RandomActions
 from drivax.plugins import check_arguments, find_named, is_dotted
 from drivax.tasks.actions import ActionSpace
 from drivax.tasks.task import Task
@@ -19,6 +19,7 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
     "expert": Expert,
     "expert_actions": lambda: Expert(replays=False),
     "constant_velocity": ConstantVelocity,
+    "constant_speed": ConstantSpeed,
     "random": RandomActions,
     "idm": IdmPlanner,
     "pdm": PdmPlanner,

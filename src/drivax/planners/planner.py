@@ -5,11 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
+from drivax.scenario.record import record, static
 from drivax.simulator.types import Action, SimState, Situation
-from drivax.tasks.actions import ActionSpace
+from drivax.tasks.actions import ActionSpace, action_of
 
 
 @runtime_checkable
@@ -76,6 +79,43 @@ class RuleBased(Memoryless, ABC):
 
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
         """Return the action of the controls."""
-        context = situation.context
-        length_m = bank.length_m(context.index, context.slot)
-        return self.actions.action(context.history[-1], *self.controls(bank, situation), length_m)
+        return action_of(self.actions, bank, situation.context, *self.controls(bank, situation))
+
+
+@record
+class Held:
+    """A planner whose decisions are executed for several steps (``Task.hold``)."""
+
+    planner: Any
+    steps: int = static()
+
+    @property
+    def name(self) -> str:
+        """Name of the planner."""
+        return self.planner.name
+
+    @property
+    def replays(self) -> bool:
+        """Whether the planner replays the log."""
+        return self.planner.replays
+
+    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[Any, Action]:
+        """Return the planner's carry, and room for a decision."""
+        return self.planner.init(bank, state, key), jnp.zeros_like(state.context.action)
+
+    def act(
+        self, carry: tuple[Any, Action], bank: ScenarioBank, state: SimState, situation: Situation,
+        observation: Any, key: Array,
+    ) -> tuple[Action, Any]:  # fmt: skip
+        """Return the planner's action at every ``steps``-th step of an episode, in between the last one."""
+        decision = self.planner.act(carry[0], bank, state, situation, observation, key)
+        decides = (state.context.step - state.start) % self.steps == 0
+        action, inner = jax.tree.map(
+            lambda new, old: jnp.where(decides, new, old), decision, (carry[1], carry[0])
+        )
+        return action, (inner, action)
+
+
+def hold(planner: Planner, steps: int) -> Planner:
+    """Return a planner whose decisions are executed for ``steps`` steps."""
+    return planner if steps == 1 else Held(planner, steps)

@@ -14,10 +14,11 @@ from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
-from drivax.simulator.ahead import ahead
+from drivax.simulator.ahead import ahead, follow_route, lookahead_m
+from drivax.simulator.dynamics import pursuit
 from drivax.simulator.idm import IdmParameters
 from drivax.simulator.types import MOTION_SPEED, Action, AgentContext, Motion, Situation
-from drivax.tasks.actions import ActionSpace, Physical, Trajectory
+from drivax.tasks.actions import ActionSpace, Physical, Trajectory, follow_log
 
 
 def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Motion:
@@ -53,7 +54,7 @@ def expert_action(bank: ScenarioBank, context: AgentContext, actions: ActionSpac
     if isinstance(actions, Trajectory):
         return actions.plan(logged_poses(bank, context, actions.steps))
     first, second = logged_motion(bank, context, 1), logged_motion(bank, context, 2)
-    return actions.expert(context.history[-1], first, second, bank.length_m(context.index, context.slot))
+    return follow_log(actions, bank, context, first, second)
 
 
 @record
@@ -86,6 +87,18 @@ class ConstantVelocity(RuleBased):
 
 
 @record
+class ConstantSpeed(RuleBased):
+    """Keep the speed and follow the route by pure pursuit: what an untrained policy does in the space ``route``."""
+
+    actions: ActionSpace = static(default=Physical())
+    name: str = static(default="constant_speed")
+
+    def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Scalar, Scalar]:
+        """Return no acceleration, and the curvature to the route."""
+        return jnp.zeros(()), follow_route(bank, situation.context, jnp.zeros(()))
+
+
+@record
 class RandomActions(Memoryless):
     """Draw actions uniformly from the action space, independently at every step."""
 
@@ -113,20 +126,8 @@ class IdmPlanner(RuleBased):
         context, frame = situation.context, situation.surroundings.frame
         box, speed = frame.box[context.slot], context.history[-1, MOTION_SPEED]
         obstacles = ahead(bank, context, frame, self.parameters.min_gap_m)
-        lookahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
         remaining_m = bank.route_points[context.index, 0] - 1 - context.route_m
-        lookahead_m = jnp.minimum(lookahead_m, jnp.maximum(remaining_m, 0.0))
-        points, _ = route_ahead(bank, context.index, context.route_m, lookahead_m[None])
+        distance_m = jnp.minimum(lookahead_m(speed), jnp.maximum(remaining_m, 0.0))
+        points, _ = route_ahead(bank, context.index, context.route_m, distance_m[None])
         curvature = pursuit(box, points[0, RouteColumn.XY] - box[:2])
         return obstacles.acceleration(speed, self.parameters), curvature
-
-
-def pursuit(pose: Float[Array, " pose"], offset: Float[Array, " 2"]) -> Scalar:
-    """Return the curvature of the arc from a pose or box to a point at an offset, 0 for a point behind.
-
-    Pure pursuit (Coulter 1992): k = 2 y / L^2, for a point at (x, y) in the frame of the pose, at distance L.
-    """
-    forward = offset[0] * pose[2] + offset[1] * pose[3]
-    left = offset[1] * pose[2] - offset[0] * pose[3]
-    curvature = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
-    return jnp.where(forward > 1.0, curvature, 0.0)

@@ -1,21 +1,24 @@
-"""What a driver has ahead on its route: the nearest obstacle, lights that require a stop, and the desired speed."""
+"""What a driver has ahead on its route: obstacles, lights that require a stop, desired speed, and the way to steer."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, WIDTH, X
+from drivax.geometry.vectors import norm, rotate
 from drivax.scenario.bank.columns import LightRow, RouteColumn
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
+from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
+from drivax.scenario.schema import Flag
 from drivax.simulator.contact import others_on_level
+from drivax.simulator.dynamics import pursuit
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.traffic.corridor import FREE_M, LEAST_GAP_M, closest, reaching
-from drivax.simulator.types import MOTION_SPEED, AgentContext, Frame
+from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, AgentContext, Frame
 
 #: Spacing of the points ahead on the route, m; their number; and the number of rectangles around them.
 _STEP_M, _POINTS, _RECTANGLES = 2.0, 46, 9
@@ -26,6 +29,8 @@ _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
 _NEAR_M = 0.4
 #: A yellow light counts as red for a car that can stop with this deceleration, m/s2.
 _YELLOW_BRAKING_MPS2 = 3.0
+#: Look-ahead of pure pursuit: at a standstill, m; per m/s, s; its bounds, m.
+_LOOKAHEAD_M, _LOOKAHEAD_S, _LOOKAHEAD_BOUNDS_M = 3.0, 0.8, (4.0, 20.0)
 #: Distance at which to stand before a stop line, m.
 STOP_SHORT_M = 1.0
 
@@ -116,3 +121,51 @@ def project(
     relative_cos = heading[:, 0] * cos + heading[:, 1] * sin
     relative_sin = heading[:, 1] * cos - heading[:, 0] * sin
     return offsets[nearest] + forward, jnp.where(is_alongside, left, jnp.inf), relative_cos, relative_sin
+
+
+def has_route(bank: ScenarioBank, context: AgentContext) -> Bool[Array, ""]:
+    """Whether the driven agent has a route on lanes; if not, the bank holds the logged path, which is privileged."""
+    return ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
+
+
+def lookahead_m(speed: Scalar) -> Scalar:
+    """Return the look-ahead of pure pursuit at a speed, m."""
+    return jnp.clip(_LOOKAHEAD_S * speed + _LOOKAHEAD_M, *_LOOKAHEAD_BOUNDS_M)
+
+
+def follow_route(bank: ScenarioBank, context: AgentContext, offset_m: Scalar) -> Scalar:
+    """Return the curvature of pure pursuit to a line beside the route, ``offset_m`` to its left, 1/m."""
+    point, left = _route_aim(bank, context)
+    return pursuit(jnp.array([0.0, 0.0, 1.0, 0.0]), point + offset_m * left)
+
+
+def route_offset(bank: ScenarioBank, context: AgentContext, curvature: Scalar) -> Scalar:
+    """Return the offset that makes :func:`follow_route` steer a curvature, m; the nearest one if none does.
+
+    The arc of curvature k from the origin meets the line p + d n where k |p + d n|^2 = 2 (p + d n)_y.
+    """
+    point, left = _route_aim(bank, context)
+    linear = 2.0 * (curvature * jnp.sum(point * left) - left[1])
+    constant = curvature * jnp.sum(point * point) - 2.0 * point[1]
+    root = jnp.sqrt(jnp.maximum(linear * linear - 4.0 * curvature * constant, 0.0))
+    # The solution that stays finite for a straight line.
+    return 2.0 * constant / jnp.maximum(root - linear, 1e-3)
+
+
+def _route_aim(bank: ScenarioBank, context: AgentContext) -> tuple[Vector, Vector]:
+    """Return the route's point at the look-ahead and the direction to its left there, in the agent's frame.
+
+    Beyond its end the route continues straight on. An agent without a route on lanes aims straight ahead.
+    """
+    motion, zero = context.history[-1], jnp.zeros(())
+    distance_m = lookahead_m(motion[MOTION_SPEED])
+    remaining_m = bank.route_points[context.index, 0] - 1 - context.route_m
+    on_route_m = jnp.clip(remaining_m, 0.0, distance_m)
+    points, _ = route_ahead(bank, context.index, context.route_m, on_route_m[None])
+    direction = points[0, RouteColumn.HEADING] / jnp.maximum(norm(points[0, RouteColumn.HEADING]), 1e-6)
+    xy = points[0, RouteColumn.XY] + (distance_m - on_route_m) * direction - motion[:2]
+    cos, sin = jnp.cos(motion[MOTION_HEADING]), jnp.sin(motion[MOTION_HEADING])
+    point, direction = rotate(xy, cos, -sin), rotate(direction, cos, -sin)
+    routed = has_route(bank, context)
+    point = jnp.where(routed, point, jnp.stack([distance_m, zero]))
+    return point, jnp.where(routed, jnp.stack([-direction[1], direction[0]]), jnp.array([0.0, 1.0]))

@@ -7,6 +7,7 @@ Everything is differentiable, with finite gradients at standstill, where heading
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from drivax.geometry.vectors import norm, rotate, wrap
 from drivax.scenario.bank.scenario_bank import Scalar, Vector
@@ -81,3 +82,14 @@ def follow(motion: Motion, target: Motion, beyond: Motion) -> tuple[Scalar, Scal
     squared = forward * forward + left * left
     curvature = jnp.where(squared > _STILL_M**2, 2.0 * left / jnp.maximum(squared, _STILL_M**2), 0.0)
     return acceleration, curvature
+
+
+def pursuit(pose: Float[Array, " pose"], offset: Float[Array, " 2"]) -> Scalar:
+    """Return the curvature of the arc from a pose or box to a point at an offset, 0 for a point behind.
+
+    Pure pursuit (Coulter 1992): k = 2 y / L^2, for a point at (x, y) in the frame of the pose, at distance L.
+    """
+    forward = offset[0] * pose[2] + offset[1] * pose[3]
+    left = offset[1] * pose[2] - offset[0] * pose[3]
+    curvature = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
+    return jnp.where(forward > 1.0, curvature, 0.0)

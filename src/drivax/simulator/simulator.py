@@ -208,9 +208,9 @@ class Simulator:
     ) -> AgentContext:
         """Move the driven agent one step, given traffic that has already moved."""
         if motion is None:
-            now, length_m = context.history[-1], bank.length_m(context.index, context.slot)
-            action = self.task.actuate(now, action, context.action, length_m)
-            motion = self.task.motion(now, action, length_m)
+            action = self.task.actuate(bank, context, action)
+            length_m = bank.length_m(context.index, context.slot)
+            motion = self.task.motion(context.history[-1], action, length_m)
         history = jnp.concatenate([context.history[1:], motion[None]])
         return replace(context, step=context.step + 1, history=history, action=action, traffic=traffic)
 

@@ -14,8 +14,9 @@ from drivax.geometry.vectors import norm, root, wrap
 from drivax.scenario.bank import queries
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
-from drivax.scenario.schema import DT_S, Flag
+from drivax.scenario.schema import CURRENT_STEP, DT_S
 from drivax.simulator import contact
+from drivax.simulator.ahead import has_route
 from drivax.simulator.contact import STOPPED_MPS, Contact
 from drivax.simulator.lights import check_lights
 from drivax.simulator.types import (
@@ -37,6 +38,8 @@ _ON_ROUTE_M = 2.0
 _ENTRY_STEPS = 16
 #: Steps over which accelerations and yaw rates are differences.
 _RATE_STEPS = 5
+#: Steps in a second; a log that moves less than this stands, m (semantics, ``progress_ratio``).
+_SECOND, _STANDS_M = round(1.0 / DT_S), 0.5
 #: Facts that need fault classification, and those that need contacts.
 _FAULTS = frozenset({"at_fault", "collision_type", "ttc_s"})
 _CONTACTS = _FAULTS | {"collision", "ignored", "gap_m"}
@@ -67,7 +70,7 @@ def measure(
     # Not ``offroad``: a lateral hit is a fault in a scenario without a map, too.
     unlawful = lanes.leaving_lane | (offroad_m > queries.OFFROAD_TOLERANCE_M)
     codes, fault, kind, ttc = _measure_contacts(context, frame, previous, contacts, unlawful, reads)
-    routed = ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
+    routed = has_route(bank, context)
     red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
     if "red_light" in reads:
         red, lights = check_lights(bank, context, me, ground, on_route, lights)
@@ -174,6 +177,7 @@ def _requested_facts(
 ) -> dict[str, Array]:  # fmt: skip
     """Return the facts measured on request; those outside ``reads`` are zero."""
     facts: dict[str, Array] = dict.fromkeys(("gap_m", "lag_m"), jnp.zeros(()))
+    facts |= _schedule(bank, context)
     facts |= {"strand": jnp.int16(-1)} | dict.fromkeys(("lane_changed", "merged"), jnp.zeros((), bool))
     if "gap_m" in reads:
         facts["gap_m"] = contact.nearest_gap(frame, context.slot, codes == Contact.IGNORED)
@@ -190,6 +194,20 @@ def _requested_facts(
         passage = queries.lane_passage(bank, context.index, me[:2], me[2:4], ground, strand)
         facts |= {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
     return facts
+
+
+def _schedule(bank: ScenarioBank, context: AgentContext) -> dict[str, Scalar]:
+    """Return the facts that compare the way on the route with that of the log at the same time."""
+    way, last = bank.log_progress[context.index], bank.last_step[context.index]
+    step = jnp.minimum(context.step + _SECOND, last)
+    final = bank.agents[context.index, last, 0, AgentColumn.VELOCITY]
+    # After its end the log continues at its last speed.
+    later = way[step] + norm(final) * (context.step + _SECOND - step) * DT_S
+    whole, done = way[last] - way[CURRENT_STEP], context.route_m - way[CURRENT_STEP]
+    moves = whole >= _STANDS_M
+    completed = jnp.where(moves, jnp.clip(done / jnp.where(moves, whole, 1.0), 0.0, 1.0), 1.0)
+    late_m, early_m = way[context.step] - context.route_m, context.route_m - later
+    return {"late_m": late_m, "early_m": early_m, "completed": completed}
 
 
 def _drop_unread(facts: Facts, reads: frozenset[str]) -> Facts:

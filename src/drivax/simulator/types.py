@@ -82,8 +82,10 @@ class Facts:
     lanes), without which progress and ``off_route`` are undefined; ``logged``: the log has the agent at this step;
     ``ignored`` counts ignored overlaps. Facts outside ``Task.reads`` are None and not computed.
 
-    The last five are measured only on request (``ON_REQUEST``): ``gap_m`` to the nearest agent, at most 50 m; ``lag_m``
-    behind the log along the agent's heading (negative: ahead of it); the lane ``strand`` of the agent
+    The others are measured only on request (``ON_REQUEST``): ``gap_m`` to the nearest agent, at most 50 m; ``lag_m``
+    behind the log along the agent's heading (negative: ahead of it); ``late_m`` behind the log along the route, and
+    ``early_m`` ahead of where the log is a second later (both negative in between); ``completed``: share of the log's
+    way from the current step to its end, in [0, 1], 1 if that is below 0.5 m; the lane ``strand`` of the agent
     (``scenario.bank.queries.lane_passage``), and whether it changed lanes or merged in this step.
     """
 
@@ -114,13 +116,18 @@ class Facts:
     jerk_mps3: Float[Array, "*batch"]
     gap_m: Any = None
     lag_m: Any = None
+    late_m: Any = None
+    early_m: Any = None
+    completed: Any = None
     strand: Any = None
     lane_changed: Any = None
     merged: Any = None
 
 
 #: Facts measured only if requested by name.
-ON_REQUEST = frozenset({"gap_m", "lag_m", "strand", "lane_changed", "merged"})
+ON_REQUEST = frozenset(
+    {"gap_m", "lag_m", "late_m", "early_m", "completed", "strand", "lane_changed", "merged"}
+)
 #: Names of all other facts.
 FACTS = frozenset(field.name for field in fields(cast(Any, Facts))) - ON_REQUEST
 
@@ -242,11 +249,11 @@ class Task(Protocol):
         """Return the next motion of the driven agent."""
         ...
 
-    def actuate(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
-        """Return the executed action for a requested ``action``, given the ``last`` executed one."""
+    def actuate(self, bank: ScenarioBank, context: AgentContext, action: Action) -> Action:
+        """Return the executed action for a requested ``action``."""
         ...
 
-    def coast(self, motion: Motion, length: Any) -> Action:
+    def coast(self, bank: ScenarioBank, context: AgentContext) -> Action:
         """Return the action that keeps speed and heading."""
         ...
 

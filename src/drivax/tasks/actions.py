@@ -1,8 +1,9 @@
 """Action spaces: meaning and bounds of actions, the dynamics that they drive, and expert actions.
 
 :class:`Physical` (default), :class:`Published` and :class:`Discrete` drive the kinematic bicycle by acceleration and
-curvature. :class:`DeltaLocal` displaces the agent, :class:`DirectState` sets its state, :class:`Trajectory` has a
-controller follow planned poses. Except for the last two, actions are in [-1, 1] and zero means zero.
+curvature, :class:`Route` by acceleration and lateral offset from the route. :class:`DeltaLocal` displaces the agent,
+:class:`DirectState` sets its state, :class:`Trajectory` has a controller follow planned poses. Except for the last two,
+actions are in [-1, 1] and zero means zero.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.geometry.vectors import wrap
-from drivax.scenario.bank.scenario_bank import Integer, Scalar, Vector
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.schema import DT_S
 from drivax.simulator import controller
+from drivax.simulator.ahead import follow_route, route_offset
 from drivax.simulator.controller import TrackingConfig
 from drivax.simulator.dynamics import bicycle, command_between, displace, displacement, follow
-from drivax.simulator.types import History, Motion
+from drivax.simulator.types import Action, AgentContext, History, Motion
 
 #: Wheelbase as a share of the length, for steering angles (semantics, ``published``).
 _WHEELBASE = 0.6
@@ -191,6 +193,31 @@ class Discrete(Physical):
     def actuate(self, motion: Motion, action: Vector, last: Vector, length_m: Any) -> Vector:
         """Return the nearest level, limited as in :class:`Physical`."""
         return super().actuate(motion, self.of_index(self.index(action)), last, length_m)
+
+
+@dataclass(frozen=True)
+class Route(Physical):
+    """Acceleration, and lateral offset from the route on lanes, to which pure pursuit steers the bicycle.
+
+    A policy in this space plans beside a route that it is given; it does not steer. Zero keeps speed and route. Without
+    a route on lanes the offset is that from the line straight ahead. The executed action is that of :class:`Physical`.
+
+    Attributes:
+        offset_m: Offset at 1 of the second action, to the left, m.
+    """
+
+    offset_m: float = 3.5
+
+    def steer(self, bank: ScenarioBank, context: AgentContext, action: Vector) -> Vector:
+        """Return the action of :class:`Physical` that follows an action; clips the offset."""
+        offset_m = self.offset_m * jnp.clip(action[1], -1.0, 1.0)
+        curvature = follow_route(bank, context, offset_m)
+        return jnp.stack([action[0], curvature / self.steering])
+
+    def unsteer(self, bank: ScenarioBank, context: AgentContext, action: Vector) -> Vector:
+        """Return the action that is steered as an action of :class:`Physical`, not clipped."""
+        offset_m = route_offset(bank, context, action[1] * self.steering)
+        return jnp.stack([action[0], offset_m / self.offset_m])
 
 
 def _levels(count: int, density: float) -> Float[Array, " count"]:
@@ -378,9 +405,35 @@ class Trajectory:
         return jnp.zeros(self.size).at[:3].set(actuators)
 
 
-#: Types of ``task.actions``; ``kind:`` in YAML is ``physical``, ``published``, ``discrete``, ``delta_local``,
-#: ``direct_state`` or ``trajectory``.
-ActionSpace = Physical | Published | Discrete | DeltaLocal | DirectState | Trajectory
+#: Types of ``task.actions``; ``kind:`` in YAML is ``physical``, ``published``, ``discrete``, ``route``,
+#: ``delta_local``, ``direct_state`` or ``trajectory``.
+ActionSpace = Physical | Published | Discrete | Route | DeltaLocal | DirectState | Trajectory
 
-PHYSICAL, PUBLISHED, DISCRETE = Physical(), Published(), Discrete()
+PHYSICAL, PUBLISHED, DISCRETE, ROUTE = Physical(), Published(), Discrete(), Route()
 DELTA_LOCAL, DIRECT_STATE = DeltaLocal(), DirectState()
+
+
+def execute(actions: ActionSpace, bank: ScenarioBank, context: AgentContext, action: Action) -> Action:
+    """Return the executed action for a requested one, within bounds and actuator rates."""
+    if isinstance(actions, Route):
+        action = actions.steer(bank, context, action)
+    length_m = bank.length_m(context.index, context.slot)
+    return actions.actuate(context.history[-1], action, context.action, length_m)
+
+
+def action_of(
+    actions: ActionSpace, bank: ScenarioBank, context: AgentContext, acceleration: Scalar, curvature: Scalar
+) -> Action:
+    """Return the action of an acceleration (m/s2) and a curvature (1/m), not clipped."""
+    length_m = bank.length_m(context.index, context.slot)
+    action = actions.action(context.history[-1], acceleration, curvature, length_m)
+    return actions.unsteer(bank, context, action) if isinstance(actions, Route) else action
+
+
+def follow_log(
+    actions: ActionSpace, bank: ScenarioBank, context: AgentContext, target: Motion, beyond: Motion
+) -> Action:
+    """Return the action that follows motions one and two steps ahead (``actions.expert``), not clipped."""
+    length_m = bank.length_m(context.index, context.slot)
+    action = actions.expert(context.history[-1], target, beyond, length_m)
+    return actions.unsteer(bank, context, action) if isinstance(actions, Route) else action

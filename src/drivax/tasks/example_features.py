@@ -16,7 +16,7 @@ from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
-from drivax.simulator.ahead import ahead
+from drivax.simulator.ahead import ahead, has_route
 from drivax.simulator.idm import IdmParameters
 from drivax.simulator.lights import is_red
 from drivax.simulator.types import MOTION_SPEED, AgentContext
@@ -29,9 +29,8 @@ _OTHERS, _STEP_M, _POINTS = 8, 5.0, 10
 _LANE_M, _LANE_COS, _M_PER_SINE = 2.5, 0.5, 4.0
 #: Half the width of the strip ahead in which a leader drives, m; cap of time gaps, s.
 _STRIPE_M, _LONGEST_S = 1.5, 10.0
-#: Driver model, its hardest braking, m/s2, and its look-ahead, m.
-_IDM = IdmParameters()
-_HARDEST_MPS2, _FARTHEST_M = 6.0, 90.0
+#: Look-ahead of a car-following driver, m.
+_FARTHEST_M = 90.0
 #: Lower bound of the speed in time gaps, m/s.
 _SLOWEST_MPS = 1.0
 
@@ -78,7 +77,7 @@ def recommended_speed(
     offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
     _, valid = route_ahead(bank, context.index, context.route_m, offsets)
     curvature = features.route_curvature(bank, context.index, context.route_m + offsets)
-    valid &= features.has_route(bank, context)
+    valid &= has_route(bank, context)
     return features.recommended_speed(curvature)[:, None] / SPEED_MPS, valid
 
 
@@ -101,20 +100,18 @@ def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float
     return jnp.stack([jnp.minimum(time / _LONGEST_S, 1.0), leads.any().astype(jnp.float32)])
 
 
-def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 6"]:
-    """Return the inputs of a car-following driver along the route, and the IDM acceleration.
+def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 5"]:
+    """Return the inputs of a car-following driver along the route.
 
     Gap to the leader or a light to stop at (at most 90 m, in 50 m); approach speed and speed of the leader (15 m/s);
-    whether there is one; the speed that limit and curves ahead allow (15 m/s); the acceleration of the Intelligent
-    Driver Model with default parameters (6 m/s2). Without a leader both speeds are 0.
+    whether there is one; the speed that limit and curves ahead allow (15 m/s). Without a leader both speeds are 0.
     """
     speed = context.history[-1, MOTION_SPEED]
-    inputs = ahead(bank, context, frames(0), _IDM.min_gap_m)
+    inputs = ahead(bank, context, frames(0), IdmParameters().min_gap_m)
     leads = inputs.gap < _FARTHEST_M
     gap = jnp.minimum(inputs.gap, _FARTHEST_M) / POSITION_M
     speeds = jnp.stack([speed - inputs.leader, inputs.leader]) * leads / SPEED_MPS
-    acceleration = inputs.acceleration(speed, _IDM) / _HARDEST_MPS2
-    return jnp.stack([gap, *speeds, leads.astype(jnp.float32), inputs.desired / SPEED_MPS, acceleration])
+    return jnp.stack([gap, *speeds, leads.astype(jnp.float32), inputs.desired / SPEED_MPS])
 
 
 def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:

@@ -10,15 +10,16 @@ from dataclasses import dataclass, fields
 from types import MappingProxyType
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.geometry.vectors import rotate
+from drivax.geometry.boxes import COS, LENGTH, X, time_to_overlap
+from drivax.geometry.vectors import norm, rotate
 from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
-from drivax.scenario.schema import Flag
+from drivax.simulator.ahead import has_route, project
 from drivax.simulator.types import AgentContext, Frame
 
 #: Units of positions, speeds, sizes and lengths of road pieces.
@@ -27,6 +28,10 @@ POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 CURVATURE_PM = 0.1
 #: Cap of curvatures, in these units.
 _MAX_CURVATURE = 3.0
+#: Points of the route to which agents are related: behind ego, m; spacing, m; number. Largest distance beside it, m.
+_ROUTE_BEHIND_M, _ROUTE_STEP_M, _ROUTE_POINTS, _ROUTE_SIDE_M = -30.0, 2.0, 61, 20.0
+#: Horizon of times to overlap, s.
+_OVERLAP_S = 8.0
 #: Half the distance over which the curvature of the route is measured, m.
 _ARM_M = 2.0
 
@@ -42,6 +47,9 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
             "relative_velocity": ("ahead", "left"),
             **dict.fromkeys(("time", "length", "width", "height"), ("",)),
             "type": ("vehicle", "pedestrian", "cyclist", "other"),
+            # Of the present step, repeated at past ones.
+            "route": ("along", "left", "sin", "cos"),
+            **dict.fromkeys(("closing_speed", "time_to_overlap"), ("",)),
         },
         "road": {
             "position": ("x", "y"),
@@ -174,9 +182,30 @@ def scale_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.clip(curvature / CURVATURE_PM, -_MAX_CURVATURE, _MAX_CURVATURE)
 
 
-def has_route(bank: ScenarioBank, context: AgentContext) -> Bool[Array, ""]:
-    """Whether the driven agent has a route on lanes; if not, the bank holds the logged path, which is privileged."""
-    return ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
+def route_coordinates(
+    bank: ScenarioBank, context: AgentContext, box: Float[Array, "K 6"]
+) -> list[Float[Array, " K"]]:
+    """Return positions of agents along the route from ego and left of it, and sine and cosine of their heading to it.
+
+    Positions in units of 50 m and 5 m; an agent that is not beside the route is 20 m left of it. Zeros without a route.
+    """
+    offsets = _ROUTE_BEHIND_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
+    path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
+    on_route &= context.route_m + offsets >= 0.0
+    along, left, cos, sin = project(path, on_route, offsets, box[:, X:COS], box[:, COS:LENGTH])
+    columns = [along / POSITION_M, jnp.clip(left, -_ROUTE_SIDE_M, _ROUTE_SIDE_M) / SIZE_M, sin, cos]
+    return [jnp.where(has_route(bank, context), column, 0.0) for column in columns]
+
+
+def approach(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], agents: Frame) -> tuple[Array, Array]:
+    """Return the speed at which agents approach ego, and their times to overlap at constant velocity and heading.
+
+    Speed of the centres towards each other in units of 15 m/s; 1 at an overlap, 0 from 8 s on.
+    """
+    offset, velocity = agents.box[:, :2] - ego[:2], agents.velocity - ego_velocity
+    speed = -jnp.sum(offset * velocity, axis=-1) / jnp.maximum(norm(offset), 1.0)
+    times = time_to_overlap(ego, ego_velocity, agents.box, agents.velocity, _OVERLAP_S)
+    return speed / SPEED_MPS, 1.0 - times / _OVERLAP_S
 
 
 def route_curvature(

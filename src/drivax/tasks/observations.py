@@ -20,6 +20,7 @@ from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer, RouteC
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import DT_S, AgentKind, LightState
+from drivax.simulator.ahead import has_route
 from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.types import HISTORY, MOTION_HEADING, MOTION_SPEED, AgentContext
 from drivax.tasks import features
@@ -244,7 +245,12 @@ def _agents(
     def scale(unit: float, *columns: Array) -> list[Array]:
         return [column / unit for column in columns]
 
+    me, me_velocity = now.box[context.slot], now.velocity[context.slot]
+    related = now.at(nearest)
     parts = {
+        "route": lambda: features.route_coordinates(bank, context, related.box),
+        "closing_speed": lambda: [features.approach(me, me_velocity, related)[0]],
+        "time_to_overlap": lambda: [features.approach(me, me_velocity, related)[1]],
         "position": lambda: scale(POSITION_M, *view.rotate(x - view.xy[0], y - view.xy[1])),
         "heading": lambda: view.rotate(cos, sin)[::-1],
         "velocity": lambda: scale(SPEED_MPS, *view.rotate(vx, vy)),
@@ -369,7 +375,7 @@ def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext,
     """Return the group ``route``: points ahead on the route; all masked without a route on lanes."""
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, exists = route_ahead(bank, context.index, context.route_m, offsets)
-    exists &= features.has_route(bank, context)
+    exists &= has_route(bank, context)
     limit = rows[:, RouteColumn.LIMIT, None]
 
     def curvature() -> Float[Array, "K 1"]:

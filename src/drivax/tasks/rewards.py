@@ -32,6 +32,10 @@ _MIN_TTC_S = 1.0
 _JERK_MPS3, _LATERAL_MPS2 = 8.37, 4.89
 #: nuPlan's limits of braking and of acceleration.
 _BRAKING_MPS2, _ACCELERATION_MPS2 = 4.05, 2.40
+#: Scales of ``pace`` behind and ahead of the log, m; how far ahead costs nothing, m.
+_LATE_M, _EARLY_M, _EARLY_SLACK_M = 8.0, 8.0, 1.0
+#: Distance from the route at which ``route_offset`` is 1, m; time to collision at which ``urgency`` is 0, s.
+_ROUTE_OFFSET_M, _URGENT_S = 2.0, 2.0
 #: Cap of distances from the log, m.
 _MAX_LOG_DISTANCE_M = 10.0
 #: The goal is reached within this distance, m (semantics, ``reached_goal``).
@@ -42,12 +46,17 @@ _GOAL_M = 3.0
 class RewardTerm:
     """A built-in term: a function of the facts that it ``reads``.
 
-    ``option`` is the field of :class:`RewardConfig` that it takes as a fourth argument, if any.
+    Attributes:
+        function: Returns the term.
+        reads: Facts that it reads.
+        option: Field of :class:`RewardConfig` that it takes as a fourth argument, if any.
+        softened: Whether the term is multiplied by :data:`SOFT_FACTORS`.
     """
 
     function: Callable[..., Scalar]
     reads: frozenset[str]
     option: str | None = None
+    softened: bool = False
 
     def __call__(self, before: Facts, now: Facts, around: Surroundings, *option: float) -> Scalar:
         """Return the term."""
@@ -58,12 +67,12 @@ class RewardTerm:
 TERMS: dict[str, RewardTerm] = {}
 
 
-def reward_term(*reads: str, option: str | None = None) -> Callable[[Any], Any]:
+def reward_term(*reads: str, option: str | None = None, softened: bool = False) -> Callable[[Any], Any]:
     """Register a function as the built-in term of its name that reads these facts."""
 
     def register(function: Any) -> Any:
         """Add a function to ``TERMS`` and return it unchanged."""
-        TERMS[function.__name__] = RewardTerm(function, frozenset(reads), option)
+        TERMS[function.__name__] = RewardTerm(function, frozenset(reads), option, softened)
         return function
 
     return register
@@ -196,14 +205,52 @@ _event_term("lane_change", "lane_changed")
 _event_term("merge", "merged")
 
 
+@reward_term("late_m", "early_m", softened=True)
+def pace(before: Facts, now: Facts, around: Surroundings) -> Scalar:
+    """Adherence to the log's schedule along the route, in [0, 1].
+
+    1 from where the log is now to where it is a second later; 1/e 8 m behind that, and 9 m ahead of it (1 m is free). A
+    log that stands asks for standing.
+    """
+    late_m, early_m = jnp.maximum(now.late_m, 0.0), jnp.maximum(now.early_m - _EARLY_SLACK_M, 0.0)
+    return jnp.exp(-late_m / _LATE_M - early_m / _EARLY_M)
+
+
+@reward_term("completed", softened=True)
+def completion(before: Facts, now: Facts, around: Surroundings) -> Scalar:
+    """Gain of the completed share of the log's way, in [0, 1] (CaRL, arXiv 2504.17838)."""
+    return jnp.maximum(now.completed - before.completed, 0.0)
+
+
+@reward_term("routed", "route_deviation_m")
+def route_offset(before: Facts, now: Facts, around: Surroundings) -> Scalar:
+    """Distance from the route over 2 m, in [0, 1]; 0 without a route."""
+    return now.routed * jnp.clip(now.route_deviation_m / _ROUTE_OFFSET_M, 0.0, 1.0)
+
+
+@reward_term("ttc_s", "ttc_defined")
+def urgency(before: Facts, now: Facts, around: Surroundings) -> Scalar:
+    """Shortfall of the time to collision from 2 s, in [0, 1]; 0 while standing."""
+    return now.ttc_defined * jnp.clip(1.0 - now.ttc_s / _URGENT_S, 0.0, 1.0)
+
+
+#: Terms that lower a softened term, and the share of it that each takes at 1; together they leave at least 0.4.
+SOFT_FACTORS = {"urgency": 0.3, "discomfort": 0.2, "speeding": 0.2, "route_offset": 0.1}
+
 SAFETY = {"collision": -1.0, "offroad": -1.0, "red_light": -1.0}
 NAVIGATION = SAFETY | {"off_route": -0.2, "progress": 0.2}
 BEHAVIOUR = NAVIGATION | {"discomfort": -0.2, "speeding": -0.1}
 PUBLISHED = SAFETY | {"off_route": -0.2, "any_progress": 0.2, "comfort": 0.2, "any_speeding": -0.1}
 AGGRESSIVE = PUBLISHED | {"ttc_shortfall": -0.5, "speed_ratio": 0.3, "lane_change": 0.2, "merge": 0.2}
-Preset = Literal["safety", "navigation", "behaviour", "published", "aggressive"]
+FAILURES = {"collision": -3.0, "offroad": -3.0, "red_light": -3.0}
+PACE, COMPLETION = FAILURES | {"pace": 0.1}, FAILURES | {"completion": 8.0}
+Preset = Literal["safety", "navigation", "behaviour", "published", "aggressive", "pace", "completion"]
 PRESETS: dict[str, dict[str, float]] = dict(
-    zip(get_args(Preset), (SAFETY, NAVIGATION, BEHAVIOUR, PUBLISHED, AGGRESSIVE), strict=True)
+    zip(
+        get_args(Preset),
+        (SAFETY, NAVIGATION, BEHAVIOUR, PUBLISHED, AGGRESSIVE, PACE, COMPLETION),
+        strict=True,
+    )
 )
 
 
@@ -241,7 +288,9 @@ class RewardConfig(_Weights):
 
     Attributes:
         preset: ``safety``, ``navigation`` and ``behaviour`` each include the previous; ``published`` has the form and
-            weights of the published description, ``aggressive`` those of its aggressive driver.
+            weights of the published description, ``aggressive`` those of its aggressive driver. ``pace`` pays for
+            the log's schedule along the route, ``completion`` for the completed share of its way, both times
+            :data:`SOFT_FACTORS`, and fine failures.
         collision_margin_m: Gap below which ``collision`` counts (published safety margin: 0.5).
         ttc_s: Time to collision below which ``ttc`` counts (published safety margin: 0.95).
         close_m: Gap below which ``close`` counts.
@@ -277,14 +326,24 @@ class RewardConfig(_Weights):
         reads |= {term.name: FACTS.union(term.reads) for term in self.own}
         if self.collision_margin_m:
             reads["collision"] = reads["collision"] | {"gap_m"}
+        factors = frozenset[str]().union(*(TERMS[name].reads for name in SOFT_FACTORS))
+        reads |= {name: term.reads | factors for name, term in TERMS.items() if term.softened}
         return frozenset[str]().union(*(reads[name] for name in self.weights()))
 
     def weigh(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Scalar]:
-        """Return the weighted and scaled terms by name."""
+        """Return the weighted and scaled terms by name, and what each soft factor takes from a term as ``TERM/FACTOR``.
+
+        The reward is the sum of all.
+        """
         own_terms = {term.name: term.term for term in self.own}
         result = {}
         for name, weight in self.weights().items():
             term = TERMS.get(name)
             options = (getattr(self, term.option),) if term is not None and term.option is not None else ()
-            result[name] = self.scale * weight * (term or own_terms[name])(before, now, around, *options)
+            value = self.scale * weight * (term or own_terms[name])(before, now, around, *options)
+            result[name] = value
+            for factor, share in SOFT_FACTORS.items() if term is not None and term.softened else ():
+                loss = value * share * TERMS[factor](before, now, around)
+                result[f"{name}/{factor}"] = -loss
+                value = value - loss
         return result

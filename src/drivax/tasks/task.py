@@ -8,6 +8,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.errors import UsageError
 from drivax.metrics.episode import Episode, episode_add, episode_start
 from drivax.metrics.selection import MetricNames, select_metrics
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -21,7 +22,7 @@ from drivax.simulator.types import (
     Situation,
     Surroundings,
 )
-from drivax.tasks.actions import ActionSpace, Physical
+from drivax.tasks.actions import ActionSpace, Physical, action_of, execute
 from drivax.tasks.features import Frames
 from drivax.tasks.observations import Observation, ObservationConfig, observe
 from drivax.tasks.rewards import RewardConfig
@@ -35,6 +36,7 @@ class Task:
 
     Attributes:
         actions: Action space and dynamics.
+        hold: Steps for which a planner's decision is executed before it decides again.
         observation: Groups and sizes.
         rewards: Preset, weights and custom terms.
         metrics: ``none``, ``training``, ``full``, or a list of sets, metrics and dotted names of custom metrics. Others
@@ -49,9 +51,12 @@ class Task:
     ends: tuple[Failure, ...] = ("collision", "offroad", "red_light")
     to_the_end: bool = False
     metrics: MetricNames = "full"
+    hold: int = 1
 
     def __post_init__(self) -> None:
         select_metrics(self.metrics)
+        if self.hold < 1:
+            raise UsageError(f"task.hold is {self.hold}", cure="use 1 step or more")
 
     @property
     def reads(self) -> frozenset[str]:
@@ -63,13 +68,13 @@ class Task:
         """Return the next motion by the dynamics of the action space."""
         return self.actions.move(motion, action, length)
 
-    def actuate(self, motion: Motion, action: Action, last: Action, length: Any) -> Action:
+    def actuate(self, bank: ScenarioBank, context: AgentContext, action: Action) -> Action:
         """Return the executed action, within bounds and actuator rates."""
-        return self.actions.actuate(motion, action, last, length)
+        return execute(self.actions, bank, context, action)
 
-    def coast(self, motion: Motion, length: Any) -> Action:
+    def coast(self, bank: ScenarioBank, context: AgentContext) -> Action:
         """Return the action that keeps speed and heading."""
-        return self.actions.action(motion, jnp.zeros(()), jnp.zeros(()), length)
+        return action_of(self.actions, bank, context, jnp.zeros(()), jnp.zeros(()))
 
     def first_action(self, history: History, length: Any) -> Action:
         """Return the last action at the start of an episode."""

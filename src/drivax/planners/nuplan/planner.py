@@ -29,7 +29,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank, last_used
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S, AgentKind, LightState, Scenario
 from drivax.simulator.types import HISTORY, MOTION_SPEED, SimState, Situation
-from drivax.tasks.actions import ActionSpace, Trajectory
+from drivax.tasks.actions import ActionSpace, Trajectory, follow_log
 
 #: Speed below which the steering angle of a logged motion counts as zero, m/s.
 _STILL_MPS = 0.5
@@ -85,10 +85,10 @@ class NuplanPlanner:
         plan = python_actions(partial(self.host.plan, steps), identity, context.step, inputs, 3 * (steps + 1))
         if trajectory:
             return plan, carry
-        poses, motion = plan.reshape(-1, 3), context.history[-1]
+        poses = plan.reshape(-1, 3)
         speeds = jnp.linalg.norm(jnp.diff(poses[:, :2], axis=0), axis=-1) / DT_S
         first, second = (jnp.append(poses[k], speeds[k - 1]) for k in (1, 2))
-        return self.actions.expert(motion, first, second, bank.length_m(context.index, context.slot)), carry
+        return follow_log(self.actions, bank, context, first, second), carry
 
 
 @dataclass

@@ -28,7 +28,7 @@ from drivax.simulator.contact import overlaps
 from drivax.simulator.controller import ACCELERATION, STEERING, TrackingConfig, recent_actuators, steering_of
 from drivax.simulator.idm import IdmParameters
 from drivax.simulator.types import MOTION_SPEED, SimState, Situation
-from drivax.tasks.actions import ActionSpace, Physical, Trajectory
+from drivax.tasks.actions import ActionSpace, Physical, Trajectory, action_of
 
 #: IDM of the proposals.
 PUBLISHED_DRIVER = IdmParameters(1.0, 1.5, 1.5, 3.0, exponent=10.0, max_braking_mps2=3.0)
@@ -139,7 +139,7 @@ class PdmPlanner:
         acceleration = jnp.where(brakes, hard, scored.cars.acceleration[best, 1])
         steering = jnp.where(brakes, 0.0, scored.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
-        action = self.actions.action(motion, acceleration, curvature, length)
+        action = action_of(self.actions, bank, context, acceleration, curvature)
         if tracked:
             stopped = stop(tracked, motion, hard, length, brake)
             action = jnp.where(brakes, stopped, tracked.plan(scored.plans[best]))
