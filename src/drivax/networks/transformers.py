@@ -254,7 +254,7 @@ class LatentEncoder(nnx.Module):
 
 
 class MtrEncoder(nnx.Module):
-    """Attention over the times of each mover, then over movers and map; the embedding is the mean of ego's movers.
+    """Attention over the times of each mover, then over movers and map; the output is the mean over ego's tokens.
 
     Attributes (names of stored parameters):
         time: Self-attention over the times of a mover.

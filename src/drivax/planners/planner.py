@@ -75,7 +75,7 @@ class RuleBased(Memoryless, ABC):
         """Return acceleration (m/s2) and curvature (1/m)."""
 
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
-        """Return the action of the controls."""
+        """Return the action that exerts the controls in the planner's action space."""
         context = situation.context
         length_m = bank.length_m(context.index, context.slot)
         return self.actions.action(context.history[-1], *self.controls(bank, situation), length_m)

@@ -20,23 +20,26 @@ from drivax.simulator.types import MOTION_SPEED, Action, AgentContext, Motion, S
 from drivax.tasks.actions import ActionSpace, Physical, Trajectory
 
 
-def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Motion:
-    """Return the agent's logged motion ``ahead`` steps from now, or its present motion if the log is invalid then.
+def logged_motion(bank: ScenarioBank, context: AgentContext, steps: int) -> Motion:
+    """Return the agent's logged motion after ``steps`` more steps, or its present motion if the log is invalid then.
 
     After the end of the log, the motion continues at constant velocity.
     """
-    step, last = context.step + ahead, bank.last_step[context.index]
+    step, last = context.step + steps, bank.last_step[context.index]
     state = bank.agents[context.index, jnp.minimum(step, last), context.slot]
     heading, velocity = state[AgentColumn.HEADING], state[AgentColumn.VELOCITY]
     speed = jnp.maximum(jnp.sum(velocity * heading), 0.0)
-    time_after_log_s = jnp.maximum(step - last, 0) * 0.1
+    time_after_log_s = jnp.maximum(step - last, 0) * DT_S
     xy = state[AgentColumn.XY] + time_after_log_s * velocity
     motion = jnp.stack([xy[0], xy[1], jnp.arctan2(state[AgentColumn.SIN], state[AgentColumn.COS]), speed])
     return jnp.where(state[AgentColumn.VALID] > 0, motion, context.history[-1])
 
 
 def logged_poses(bank: ScenarioBank, context: AgentContext, steps: int) -> Float[Array, "steps1 3"]:
-    """Return the logged poses from now on, at constant velocity in gaps and after the log."""
+    """Return the logged poses (x, y, heading) of now and the next ``steps`` steps.
+
+    In gaps and after the log, the last valid pose continues at constant velocity.
+    """
     track = bank.agents[context.index, :, context.slot]
     last_valid = jax.lax.cummax(jnp.where(track[:, AgentColumn.VALID] > 0, jnp.arange(bank.steps), 0))
     step = context.step + jnp.arange(steps + 1)
@@ -96,6 +99,12 @@ class RandomActions(Memoryless):
         return jax.random.uniform(key, situation.context.action.shape, minval=-1.0, maxval=1.0)
 
 
+#: Lookahead of pure pursuit: this time at the present speed plus this distance, within bounds, s and m.
+_LOOKAHEAD_S, _LOOKAHEAD_M, _LOOKAHEAD_BOUNDS_M = 0.8, 3.0, (4.0, 20.0)
+#: A target less far ahead is not pursued, m.
+_MIN_PURSUIT_M = 1.0
+
+
 @record
 class IdmPlanner(RuleBased):
     """Follow the leader along the route by IDM, stop for red lights, slow down in curves, steer by pure pursuit.
@@ -113,7 +122,8 @@ class IdmPlanner(RuleBased):
         context, frame = situation.context, situation.surroundings.frame
         box, speed = frame.box[context.slot], context.history[-1, MOTION_SPEED]
         obstacles = ahead(bank, context, frame, self.parameters.min_gap_m)
-        lookahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
+        lookahead_m = jnp.clip(_LOOKAHEAD_S * speed + _LOOKAHEAD_M, *_LOOKAHEAD_BOUNDS_M)
+        # Route points are 1 m apart.
         remaining_m = bank.route_points[context.index, 0] - 1 - context.route_m
         lookahead_m = jnp.minimum(lookahead_m, jnp.maximum(remaining_m, 0.0))
         points, _ = route_ahead(bank, context.index, context.route_m, lookahead_m[None])
@@ -122,11 +132,12 @@ class IdmPlanner(RuleBased):
 
 
 def pursuit(pose: Float[Array, " pose"], offset: Float[Array, " 2"]) -> Scalar:
-    """Return the curvature of the arc from a pose or box to a point at an offset, 0 for a point behind.
+    """Return the curvature (1/m) of the arc from a pose to a point, 0 for a point less than 1 m ahead.
 
-    Pure pursuit (Coulter 1992): k = 2 y / L^2, for a point at (x, y) in the frame of the pose, at distance L.
+    Pure pursuit (Coulter 1992): k = 2 y / L^2, for a point at (x, y) in the frame of the pose, at distance L. ``pose``
+    begins with x, y, cos and sin of the heading, as a box does; ``offset`` is that of the point from the pose.
     """
     forward = offset[0] * pose[2] + offset[1] * pose[3]
     left = offset[1] * pose[2] - offset[0] * pose[3]
-    curvature = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
-    return jnp.where(forward > 1.0, curvature, 0.0)
+    curvature = 2.0 * left / jnp.maximum(forward * forward + left * left, _MIN_PURSUIT_M**2)
+    return jnp.where(forward > _MIN_PURSUIT_M, curvature, 0.0)

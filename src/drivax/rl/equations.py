@@ -127,9 +127,9 @@ def conservative_penalty(
 def penalty_weight_loss(
     log_weight: Float[Array, ""], penalty: Float[Array, "*batch"], gap: float
 ) -> Float[Array, "*batch"]:
-    """``-alpha (penalty - gap)`` with ``alpha = exp(log_weight)``: CQL's Lagrange multiplier (eq. 30).
+    """``-alpha (penalty - gap)`` with ``alpha = exp(log_weight)``: CQL's Lagrange multiplier.
 
-    The weight rises while the penalty is above the gap. No gradient reaches the critics.
+    The weight rises while the penalty is above the gap (arXiv 2006.04779, eq. 30). No gradient reaches the critics.
     """
     return -jnp.exp(log_weight) * jax.lax.stop_gradient(penalty - gap)
 
