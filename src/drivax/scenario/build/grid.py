@@ -88,7 +88,7 @@ class Grid:
             drop[members[np.argsort(far[members], kind="stable")[-excess:]]] = True
 
     def starts(self, cell: Int[Array, " entry"], offset: int) -> Int[Array, " cell_plus_1"]:
-        """CSR row starts of entries sorted by cell, ``offset`` added."""
+        """Index of the first entry of each cell, and of the end; entries are sorted by cell and begin at ``offset``."""
         counts = np.bincount(cell, minlength=self.side**2)
         return np.concatenate(([0], np.cumsum(counts))) + offset
 
@@ -97,7 +97,8 @@ class Grid:
 class GridSegments:
     """Segments in storage order (edges by cell, car lanes by cell, the rest in order of the source) with their grid.
 
-    ``blocks`` holds 0 and the ends of the edges, the lanes and the rest; the CSR starts are absolute segment indices.
+    ``blocks`` holds 0 and the ends of the edges, the lanes and the rest. ``edge_start`` and ``lane_start`` hold the
+    index of the first segment of each cell, and of the end.
     """
 
     grid: Grid
@@ -156,10 +157,10 @@ def arrange(
 def ringed_cells(
     grid: Grid, edges: Segments, closed: Bool[Array, " edge"], path: Float[Array, "step 2"], margin_m: float
 ) -> Bool[Array, " cell"]:
-    """Mask of the cells that are known to be road or not however far the next edge is, because edges are closed rings.
+    """Mask of the cells where closed rings of edges separate road from the rest, however far the next edge is.
 
-    All cells if each edge of the source is part of a closed ring (``closed``). If this holds for those in the box of
-    ``path`` widened by the margin, the cells in this box. Else none.
+    These are all cells if each edge of the source is part of a closed ring (``closed``). If this holds only for the
+    edges in the box of ``path`` widened by the margin, they are the cells in this box. Otherwise there are none.
     """
     near = inside_box(edges.middle, path, margin_m)
     if not len(near) or closed.all():
@@ -220,22 +221,23 @@ def _nearest_sides(fine: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Fl
     squared = _squared_distances(x, y, a, b)
     nearest = np.full(size * size + 1, np.inf)
     np.minimum.at(nearest, cell.ravel(), squared.ravel())
-    segment, place = np.nonzero(inside & (squared <= nearest[cell] * (1 + 1e-6) + 1e-6))
-    at = cell[segment, place]
+    # All edges that are nearest up to rounding: at a vertex there are two.
+    segment, offset = np.nonzero(inside & (squared <= nearest[cell] * (1 + 1e-6) + 1e-6))
+    near_cell = cell[segment, offset]
     u = b[segment] - a[segment]
-    w = np.stack([x[segment, place], y[segment, place]], axis=-1) - a[segment]
+    w = np.stack([x[segment, offset], y[segment, offset]], axis=-1) - a[segment]
     length = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-6)
     along = (u * w).sum(axis=1) / length**2
     left = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / length
     begins, ends = _open_ends(a, b)
     past_end = (begins[segment] & (along <= 0.0)) | (ends[segment] & (along >= 1.0))
     # At a vertex the segment whose line is further away decides.
-    most, least, cut = np.zeros(size * size), np.zeros(size * size), np.zeros(size * size, dtype=bool)
-    np.maximum.at(most, at, left)
-    np.minimum.at(least, at, left)
-    cut[at[past_end]] = True
+    most, least, unknown = np.zeros(size * size), np.zeros(size * size), np.zeros(size * size, dtype=bool)
+    np.maximum.at(most, near_cell, left)
+    np.minimum.at(least, near_cell, left)
+    unknown[near_cell[past_end]] = True
     sign, distance = np.where(most >= -least, 1, -1), np.sqrt(nearest[:-1])
-    return np.where(cut | (distance > _REACH_M), 0, sign), distance
+    return np.where(unknown | (distance > _REACH_M), 0, sign), distance
 
 
 def _squared_distances(x: Array, y: Array, a: Array, b: Array) -> Float[Array, "segment near"]:
@@ -257,6 +259,7 @@ def _squared_distances(x: Array, y: Array, a: Array, b: Array) -> Float[Array, "
 def _open_ends(a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> tuple[Array, Array]:
     """Masks of segments that begin at an open end, and that end at one."""
     ends = (np.round(end / _VERTEX_M).astype(np.int64) for end in (a, b))
+    # One integer per vertex.
     first, last = (end[:, 0] * 2**32 + end[:, 1] for end in ends)
     return ~np.isin(first, last), ~np.isin(last, first)
 
