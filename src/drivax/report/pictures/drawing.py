@@ -87,8 +87,8 @@ def surroundings(scenario: Scenario, rollouts: Sequence[Rollout]) -> Box:
 class Shape:
     """Lines or polygons ``[n, 2]`` of one style, metres.
 
-    ``line`` and ``fill`` are the colours of outline and inside, None to draw none. ``dash`` has the lengths of dashes
-    and gaps in pixels, ``level`` is the drawing order.
+    ``line`` and ``fill`` are the colours of outline and inside; without a colour it is not drawn. ``dash`` has the
+    lengths of dashes and gaps in pixels, empty for a solid line. Shapes of a higher ``level`` are drawn on top.
     """
 
     lines: Sequence[Array]
@@ -190,6 +190,7 @@ class Drawing:
             yield Shape([_outline((x, y), heading, size)], "ink", "ego", level=6)
             ahead = np.array((np.cos(heading), np.sin(heading)))
             left = np.array((-ahead[1], ahead[0]))
+            # An arrow on the roof: its tip and base ahead of the centre, and half its width, as shares of the size.
             tip, base, side = 0.38 * size[0] * ahead, 0.05 * size[0] * ahead, 0.32 * size[1] * left
             arrow = np.array((x, y)) + np.array((tip, base + side, base - side))
             yield Shape([arrow], fill="outline", level=7)
@@ -202,7 +203,7 @@ def _outline(xy: Any, heading: Any, size: Any) -> Float[Array, "5 2"]:
 
 
 def ring(xy: Array, radius: float) -> Float[Array, "25 2"]:
-    """Return a circle."""
+    """Return the points of a circle; the last is the first."""
     angle = np.linspace(0.0, 2 * np.pi, 25)
     return xy + radius * np.column_stack((np.cos(angle), np.sin(angle)))
 
