@@ -215,6 +215,21 @@ class View:
     def initialization(self) -> nuplan.PlannerInitialization:
         """Return route, goal and map."""
         scenario, count = self.scenario, int(self.scenario.route_points[0])
+        goal = np.asarray(scenario.goal_xy, np.float64)
+        heading = float(scenario.agent_heading[scenario.current_step, 0])
+        if count:
+            distance = np.linalg.norm(scenario.route_xy[0, :count] - goal, axis=1)
+            heading = float(scenario.route_heading[0, distance.argmin()])
+        x, y = (goal + self.origin).tolist()
+        return nuplan.PlannerInitialization(self._route(), nuplan.StateSE2(x, y, heading), self.map)
+
+    def _route(self) -> list[str]:
+        """Return the roadblocks of the route, extended by a successor if there is only one.
+
+        Raises:
+            PlannerError: The scenario has no route on lanes.
+        """
+        scenario, count = self.scenario, int(self.scenario.route_points[0])
         rows = dict.fromkeys(int(row) for row in scenario.route_lane[0, :count] if int(row) in self.map.lanes)
         blocks = [self.map.block_of[row] for row in rows]
         route = [name for k, name in enumerate(blocks) if k == 0 or name != blocks[k - 1]]
@@ -224,13 +239,7 @@ class View:
         if len(route) < 2:
             successors = self.map.blocks[route[0]].outgoing_edges
             route += [block.id for block in successors if block.id not in route][:1]
-        goal = np.asarray(scenario.goal_xy, np.float64)
-        heading = float(scenario.agent_heading[scenario.current_step, 0])
-        if count:
-            distance = np.linalg.norm(scenario.route_xy[0, :count] - goal, axis=1)
-            heading = float(scenario.route_heading[0, distance.argmin()])
-        x, y = (goal + self.origin).tolist()
-        return nuplan.PlannerInitialization(route, nuplan.StateSE2(x, y, heading), self.map)
+        return route
 
     def ego(
         self, step: int, history: Any, actuators: Any = None, last: nuplan.DynamicCarState | None = None

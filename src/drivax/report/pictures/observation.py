@@ -221,7 +221,7 @@ def _draw_agents(axes: Axes, groups: ObservationGroups) -> None:
     for row in np.flatnonzero(mask[:, -1]):
         kind = groups["agents", "type"][row, -1] if groups.has("agents", "type") else np.eye(4)[0]
         colour = LIGHT[_KINDS[int(np.argmax(kind))]]
-        for step in np.flatnonzero(mask[row]):
+        for step in np.flatnonzero(mask[row]).tolist():
             _outline(axes, groups, "agents", (row, step), colour, _opacity(step, steps), 4.0 + step / steps)
         if kind[1] + kind[2] > 0:  # pedestrians and cyclists get a halo
             centre = _to_paper(groups["agents", "position"][row, -1])

@@ -45,8 +45,13 @@ def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
     lanes = _Lanes.of(records)
     tables = np.full((*lanes.mask.shape, 6), -1.0, np.float32)
     tables[..., StrandColumn.END] = NOWHERE_M
-    if not len(lanes.scenario):
-        return tables
+    if len(lanes.scenario):
+        tables[lanes.mask] = _strand_rows(records, lanes)
+    return tables
+
+
+def _strand_rows(records: Sequence[Array], lanes: _Lanes) -> Float[Array, "lane 6"]:
+    """Return a row of :class:`StrandColumn` for each stored lane (at least one) of all scenarios."""
     lane = np.arange(len(lanes.scenario))
     successor, predecessor = lanes.links(records, "successor"), lanes.links(records, "predecessor")
     courses, lane_of_link = _Courses.of(records, lanes), np.repeat(lane[:, None], 4, axis=1)
@@ -62,7 +67,7 @@ def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
     onto = np.where(merges, strand[ahead], -1)
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
     is_dead_end = (successor < 0).all(axis=1) & _is_map_known(records, lanes.scenario, stop)
-    table = np.empty((len(lane), 6))
+    rows = np.empty((len(lane), 6))
     for column, name in ((StrandColumn.RIGHT, "right"), (StrandColumn.LEFT, "left")):
         adjacent = lanes.links(records, name)
         further = ((stop[last[adjacent]] - stop) * course).sum(axis=1)
@@ -70,13 +75,12 @@ def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
         is_further = ~(further <= _CONTINUES_M)
         continues = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | is_further)
         onto = np.where(is_dead_end & continues, strand[adjacent], onto)
-        table[:, column] = lanes.index(np.where(adjacent >= 0, strand[adjacent], -1))
+        rows[:, column] = lanes.index(np.where(adjacent >= 0, strand[adjacent], -1))
     # What holds for the last lane holds for the whole strand; a ring has no last lane.
     onto = np.where(follows[last] < 0, onto[last], -1)
-    table[:, StrandColumn.STRAND], table[:, StrandColumn.ONTO] = lanes.index(strand), lanes.index(onto)
-    table[:, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
-    tables[lanes.mask] = table
-    return tables
+    rows[:, StrandColumn.STRAND], rows[:, StrandColumn.ONTO] = lanes.index(strand), lanes.index(onto)
+    rows[:, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
+    return rows
 
 
 @dataclass(frozen=True)

@@ -391,13 +391,7 @@ def place_lights(
     stop = np.array([light.stop_point for light in lights], dtype=np.float64).reshape(-1, 3) - origin
     index = graph.index()
     lane = np.array([index.get(light.lane_id, -1) for light in lights], dtype=np.int64)
-    heading, exit_heading = np.full(len(lights), np.nan), np.full(len(lights), np.nan)
-    known = np.flatnonzero(lane >= 0)
-    s = _arc_at(graph, lane[known], stop[known, :2])
-    heading[known] = graph.lines.heading(lane[known], s, END_SPAN_M)
-    exit_heading[known] = graph.lines.heading(lane[known], graph.lines.length[lane[known]], END_SPAN_M)
-    for i in np.flatnonzero(lane < 0):
-        heading[i] = exit_heading[i] = _heading_near(lane_segments, stop[i])
+    heading, exit_heading = _light_headings(lane_segments, lane, stop)
     width = np.append(graph.width, -1.0)[lane]
     half = np.where(width > 0, width / 2, HALF_WIDTH_M)
     has_heading = np.flatnonzero(~np.isnan(heading))
@@ -415,6 +409,23 @@ def place_lights(
         state=np.stack(states) if states else np.zeros((0, steps), dtype=np.int8),
         overflow=overflow,
     )
+
+
+def _light_headings(
+    lane_segments: LaneSegments, lane: Int[Array, " light"], stop: Float[Array, "light 3"]
+) -> tuple[Float[Array, " light"], Float[Array, " light"]]:
+    """Headings of each light's lane at the stop point and at its end.
+
+    A light without a lane (-1) has the heading of the nearest lane segment for both, NaN without one in reach.
+    """
+    graph, heading, exit_heading = lane_segments.graph, np.full(len(lane), np.nan), np.full(len(lane), np.nan)
+    known = np.flatnonzero(lane >= 0)
+    s = _arc_at(graph, lane[known], stop[known, :2])
+    heading[known] = graph.lines.heading(lane[known], s, END_SPAN_M)
+    exit_heading[known] = graph.lines.heading(lane[known], graph.lines.length[lane[known]], END_SPAN_M)
+    for i in np.flatnonzero(lane < 0):
+        heading[i] = exit_heading[i] = _heading_near(lane_segments, stop[i])
+    return heading, exit_heading
 
 
 def _arc_at(
