@@ -140,8 +140,8 @@ def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s:
         # At rest on this axis, any divisor serves: the result is not selected.
         inverse = 1.0 / xp.where(moving, speed, xp.ones_like(speed))
         first, second = (-reach - distance) * inverse, (reach - distance) * inverse
-        inside = abs(distance) < reach
-        enter = xp.where(moving, xp.minimum(first, second), xp.where(inside, xp.zeros_like(dx), never))
+        overlaps = abs(distance) < reach
+        enter = xp.where(moving, xp.minimum(first, second), xp.where(overlaps, xp.zeros_like(dx), never))
         leave = xp.where(moving, xp.maximum(first, second), never)
         begin, end = xp.maximum(begin, enter), xp.minimum(end, leave)
     return xp.where(begin < end, begin, never)

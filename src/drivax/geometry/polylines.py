@@ -150,26 +150,26 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
     if z_weight > 0.0 and lines.points.shape[1] > 2:
         axes.append(z_weight * lines.points[:, 2])
     keep = np.zeros(len(lines.points), dtype=bool)
-    filled = np.diff(lines.start) > 0
-    keep[lines.start[:-1][filled]] = True
-    keep[lines.start[1:][filled] - 1] = True
-    inside = np.flatnonzero(~keep)  # interior points of intervals that may still have to be split
-    while len(inside):
-        kept = np.flatnonzero(keep)
-        interval = np.searchsorted(kept, inside)
-        begin, end = kept[interval - 1], kept[interval]
+    has_points = np.diff(lines.start) > 0
+    keep[lines.start[:-1][has_points]] = True
+    keep[lines.start[1:][has_points] - 1] = True
+    interior = np.flatnonzero(~keep)  # points of intervals that may still have to be split
+    while len(interior):
+        vertices = np.flatnonzero(keep)
+        interval = np.searchsorted(vertices, interior)
+        begin, end = vertices[interval - 1], vertices[interval]
         distance, _ = _distance_to_chords(
-            [x[inside] - x[begin] for x in axes], [x[end] - x[begin] for x in axes]
+            [x[interior] - x[begin] for x in axes], [x[end] - x[begin] for x in axes]
         )
         first = np.flatnonzero(np.diff(interval, prepend=-1))  # the first interior point of each interval
-        farthest = np.repeat(np.maximum.reduceat(distance, first), np.diff(first, append=len(inside)))
+        farthest = np.repeat(np.maximum.reduceat(distance, first), np.diff(first, append=len(interior)))
         active = farthest > tolerance_m
         # Several points may be equally far: split at the earliest.
         peak = np.flatnonzero(active & (distance == farthest))
         _, earliest = np.unique(interval[peak], return_index=True)
-        keep[inside[peak[earliest]]] = True
-        inside = inside[active]
-        inside = inside[~keep[inside]]
+        keep[interior[peak[earliest]]] = True
+        interior = interior[active]
+        interior = interior[~keep[interior]]
     return keep
 
 

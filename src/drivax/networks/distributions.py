@@ -236,8 +236,8 @@ class Mixture(_SquashedActions):
     @classmethod
     def from_parameters(cls, parameters: Float[Array, "*batch parameters"]) -> Mixture:
         """Split a head's output into logits and components (:meth:`SquashedGaussian.from_parameters`)."""
-        logits, rest = jnp.split(parameters, [_COMPONENTS], axis=-1)
-        return cls(logits, SquashedGaussian.from_parameters(rest.reshape(*rest.shape[:-1], _COMPONENTS, -1)))
+        logits, flat = jnp.split(parameters, [_COMPONENTS], axis=-1)
+        return cls(logits, SquashedGaussian.from_parameters(flat.reshape(*flat.shape[:-1], _COMPONENTS, -1)))
 
     def sample(self, key: Array) -> Float[Array, "*batch action"]:
         """Sample a component, then a raw action from it."""

@@ -96,7 +96,7 @@ class PlannerTraffic:
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> PlannerTrafficState:
         """Advance all agents by one step of 0.1 s from the present frame."""
-        now = context.traffic
+        traffic = context.traffic
 
         def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
             """Return the frame ``back`` steps ago, of all slots or of some."""
@@ -106,11 +106,11 @@ class PlannerTraffic:
         def drive(agent: AgentContext) -> AgentContext:
             """Return an agent's context one step later, after an action of the planner."""
             # Earlier contacts matter to metrics only, so none is kept.
-            apart = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
+            no_contact = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
             lights = remember_lights(bank, agent)
-            situation, contacts, lights = measure(bank, agent, frame, frames(1), apart, lights)
+            situation, contacts, lights = measure(bank, agent, frame, frames(1), no_contact, lights)
             episode = self.task.episode_start()
-            state = SimState(situation.context, situation.facts, contacts, lights, episode, now.begin)
+            state = SimState(situation.context, situation.facts, contacts, lights, episode, traffic.begin)
             key = jax.random.key(self.seed)
             for number in (bank.identity[agent.index], agent.step, agent.slot):
                 key = jax.random.fold_in(key, number)
@@ -123,15 +123,15 @@ class PlannerTraffic:
             history = jnp.concatenate([agent.history[1:], motion[None]])
             return replace(situation.context, step=agent.step + 1, history=history, action=action)
 
-        base = self.base.advance(bank, replace(context, traffic=now.base), frame)
-        return PlannerTrafficState(now.begin, jax.vmap(drive)(now.contexts), base)
+        base = self.base.advance(bank, replace(context, traffic=traffic.base), frame)
+        return PlannerTrafficState(traffic.begin, jax.vmap(drive)(traffic.contexts), base)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Return the rows of ``base`` with the driven vehicles at their simulated poses."""
-        now = context.traffic
-        rows = self.base.agents(bank, replace(context, traffic=now.base), back)
-        slot = jnp.where(context.step - back > now.begin, now.contexts.slot, rows.shape[0])
-        motion, z = now.contexts.history[:, HISTORY - 1 - back], now.contexts.z
+        traffic = context.traffic
+        rows = self.base.agents(bank, replace(context, traffic=traffic.base), back)
+        slot = jnp.where(context.step - back > traffic.begin, traffic.contexts.slot, rows.shape[0])
+        motion, z = traffic.contexts.history[:, HISTORY - 1 - back], traffic.contexts.z
         return rows.at[slot].set(agent_rows(motion, z, jnp.ones_like(z)), mode="drop")
 
     def _slots(self, bank: ScenarioBank, index: Any, step: Any) -> Int[Array, " K"]:

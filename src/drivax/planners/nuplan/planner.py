@@ -187,8 +187,8 @@ class Host:
     ) -> Float[np.ndarray, "n 3"]:
         """Append the present state to the episode's history, and return the poses of the planner's trajectory."""
         view = episode.view
-        last = episode.egos[-1].dynamic_car_state if step > start else None
-        episode.egos.append(view.ego(step, history, actuators, last))
+        last_state = episode.egos[-1].dynamic_car_state if step > start else None
+        episode.egos.append(view.ego(step, history, actuators, last_state))
         episode.observations.append(view.tracks(step, frame.box, frame.velocity, frame.valid, frame.kind))
         iteration = nuplan.SimulationIteration(nuplan.TimePoint.of_step(step), step - start)
         buffer = nuplan.SimulationHistoryBuffer(list(episode.egos), list(episode.observations))

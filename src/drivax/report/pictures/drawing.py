@@ -150,12 +150,12 @@ class Drawing:
         """Return the drawing of a scenario within a box (low x, low y, high x, high y)."""
         signs = scenario.stop_xy[(scenario.stop_xy != 0).any(axis=1)]
         line, state = _lights(scenario)
-        near = _within(line[:, 0], box)
+        is_near = _within(line[:, 0], box)
         route = scenario.route_xy[0, : int(scenario.route_points[0])]
         goal = np.asarray(scenario.goal_xy)[None]
         return cls(
             road_lines(scenario, box), signs[_within(signs, box)], route[_within(route, box)],
-            goal[_within(goal, box)], line[near], state[:, near],
+            goal[_within(goal, box)], line[is_near], state[:, is_near],
             _agent_boxes(scenario, box), _parked_boxes(scenario, box), _boxes(scenario, slice(0, 1)),
         )  # fmt: skip
 
@@ -223,8 +223,8 @@ def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
     rows = np.lexsort((scenario.segment_start_m[:count], scenario.segment_feature[:count]))
     a, b = scenario.segment_a[rows, :2], scenario.segment_b[rows, :2]
     if box is not None:
-        inside = _within((a + b) / 2, box)
-        rows, a, b = rows[inside], a[inside], b[inside]
+        is_inside = _within((a + b) / 2, box)
+        rows, a, b = rows[is_inside], a[is_inside], b[is_inside]
     layers: dict[str, Lines] = {name: [] for name in LAYERS}
     if not len(rows):
         return layers
@@ -262,10 +262,10 @@ def _boxes(scenario: Scenario, rows: Any, valid: Any = None) -> Boxes:
 def _agent_boxes(scenario: Scenario, box: Box) -> Boxes:
     """Return all moving agents but ego, present while they are inside the box."""
     steps = int(scenario.steps)
-    near = scenario.agent_valid[:steps] & _within(scenario.agent_xy[:steps], box)
-    near[:, 0] = False
-    rows = np.flatnonzero(near.any(axis=0))
-    return _boxes(scenario, rows, near[:, rows])
+    is_near = scenario.agent_valid[:steps] & _within(scenario.agent_xy[:steps], box)
+    is_near[:, 0] = False
+    rows = np.flatnonzero(is_near.any(axis=0))
+    return _boxes(scenario, rows, is_near[:, rows])
 
 
 def _parked_boxes(scenario: Scenario, box: Box) -> Boxes:

@@ -93,8 +93,8 @@ def _select_episodes(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGr
         return groups[: int(count)]
     if matches := [group for group in groups if group.scenario_id == which]:
         return matches
-    near = did_you_mean(which, [group.scenario_id for group in groups])
-    cure = near if near.startswith("did") else "write worst:N, all, or an id of its episodes.csv"
+    hint = did_you_mean(which, [group.scenario_id for group in groups])
+    cure = hint if hint.startswith("did") else "write worst:N, all, or an id of its episodes.csv"
     raise UsageError(f"no episode of scenario {which!r} is stored", file=runs[-1].folder, cure=cure)
 
 

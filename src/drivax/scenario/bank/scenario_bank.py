@@ -102,10 +102,10 @@ class Sizes:
     def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
         """Return the sizes that one or more scenarios of one capacity use."""
         batches = iter(scenarios)
-        each = [_batch_sizes(batch) for batch in iter(lambda: list(islice(batches, _BATCH)), [])]
-        if not each:
+        batch_sizes = [_batch_sizes(batch) for batch in iter(lambda: list(islice(batches, _BATCH)), [])]
+        if not batch_sizes:
             raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
-        return cls(*(max(getattr(sizes, field.name) for sizes in each) for field in fields(cls)))
+        return cls(*(max(getattr(sizes, field.name) for sizes in batch_sizes) for field in fields(cls)))
 
 
 def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
@@ -324,12 +324,12 @@ def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
 
     It is a four-byte BLAKE2b digest of data set, id and the number of earlier scenarios of that name: copies differ.
     """
-    seen: Counter[tuple[str, str]] = Counter()
+    counts: Counter[tuple[str, str]] = Counter()
     numbers = []
     for name in names:
-        digest = hashlib.blake2b("\0".join((*name, str(seen[name]))).encode(), digest_size=4).digest()
+        digest = hashlib.blake2b("\0".join((*name, str(counts[name]))).encode(), digest_size=4).digest()
         numbers.append(int.from_bytes(digest, "little"))
-        seen[name] += 1
+        counts[name] += 1
     return np.array(numbers, np.uint32)
 
 
@@ -472,10 +472,10 @@ def _stop_arcs(
         )
         dx, dy = np.moveaxis(middle[stops][:, None] - xy[scenario], -1, 0)
         squared_m = np.where(np.arange(xy.shape[1]) < count[scenario, None], dx * dx + dy * dy, np.inf)
-        near = np.argmin(squared_m, axis=1)
-        nearest, course = (np.arange(len(near)), near), heading[scenario, near]
+        point = np.argmin(squared_m, axis=1)
+        nearest, course = (np.arange(len(point)), point), heading[scenario, point]
         # Route points are 1 m apart: the index of the nearest is its arc length.
-        arcs[stops] = near + dx[nearest] * np.cos(course) + dy[nearest] * np.sin(course)
+        arcs[stops] = point + dx[nearest] * np.cos(course) + dy[nearest] * np.sin(course)
     return arcs
 
 

@@ -160,10 +160,10 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     routes = find_routes(lane_segments, log, intent, style, capacity.routes, capacity.route_points)
     on_route = np.unique(np.concatenate([route.lane for route in routes.routes]))
     on_route = on_route[on_route >= 0]
-    inside = inside_box(segments.middle, path, MARGIN_M)
-    inside |= np.isin(segments.feature, whole.feature[on_route])
-    grid = arrange(segments.take(inside), path, MARGIN_M, capacity)
-    keep, lost_lanes = _select_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
+    in_crop = inside_box(segments.middle, path, MARGIN_M)
+    in_crop |= np.isin(segments.feature, whole.feature[on_route])
+    grid = arrange(segments.take(in_crop), path, MARGIN_M, capacity)
+    keep, lost_lanes = _select_lanes(whole, segments.feature[in_crop], on_route, path, capacity.lanes)
     graph = select(whole, keep)
     polylines, lost_features = _select_polylines(roads, grid, path, capacity.features)
     preferred = (*recording.to_predict, *recording.of_interest)
@@ -220,9 +220,9 @@ def _drop_jumps(recording: Recording) -> Recording:
 def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
     """Intended route in dense indices, and the numbers of its lanes that the map lacks."""
     index, sources = graph.index(), (recording.route_lanes, recording.route_corridor)
-    known = [tuple(index[lane] for lane in lanes if lane in index) for lanes in sources]
-    missing = [len(lanes) - len(dense) for lanes, dense in zip(sources, known, strict=True)]
-    return Intent(*known), {"route_lanes_missing": missing[0], "route_corridor_missing": missing[1]}
+    dense = [tuple(index[lane] for lane in lanes if lane in index) for lanes in sources]
+    counts = [len(lanes) - len(indices) for lanes, indices in zip(sources, dense, strict=True)]
+    return Intent(*dense), {"route_lanes_missing": counts[0], "route_corridor_missing": counts[1]}
 
 
 def _refuse_endless(roads: RoadLines) -> None:

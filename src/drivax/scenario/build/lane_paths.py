@@ -95,10 +95,10 @@ class LaneSearch:
         if corridor:
             outside[~np.isin(np.arange(graph.count), list(corridor))] = OUTSIDE_COST_M
         starts = []
-        for lane, s, far in lane_segments.around(xyz, heading, REACH_M, TURN_RAD):
+        for lane, s, distance in lane_segments.around(xyz, heading, REACH_M, TURN_RAD):
             turn = float(np.abs(wrap(graph.lines.heading(np.array([lane]), np.array([s])) - heading))[0])
-            penalty = LATERAL_COST * far + ASKEW_COST_M * turn + float(outside[lane])
-            starts.append(LanePath((lane,), s, -s, s, penalty, changes=0, lateral=far))
+            penalty = LATERAL_COST * distance + ASKEW_COST_M * turn + float(outside[lane])
+            starts.append(LanePath((lane,), s, -s, s, penalty, changes=0, lateral=distance))
         starts.sort(key=lambda lane_path: lane_path.penalty)
         begin, end = end_headings(graph.lines)
         drivable = tuple(np.isin(graph.kind, CAR_LANE_KINDS).tolist())
@@ -316,19 +316,19 @@ def walk(
     chain, begin = [lane], [-s]
     for _ in range(4 * count):  # ends rings of very short lanes
         next_lane = graph.successor[chain[-1], 0]
-        after = np.where(next_lane >= 0, begin[-1] + graph.lines.length[chain[-1]], np.inf)
-        if not (after <= distance[-1]).any():
+        next_begin = np.where(next_lane >= 0, begin[-1] + graph.lines.length[chain[-1]], np.inf)
+        if not (next_begin <= distance[-1]).any():
             break
         chain.append(np.maximum(next_lane, 0))
-        begin.append(after)
+        begin.append(next_begin)
     hop = (distance[None, :, None] > np.stack(begin, axis=-1)[:, None, :]).sum(axis=-1) - 1
     hop = np.maximum(hop, 0)
     row = np.take_along_axis(np.stack(chain, axis=-1), hop, axis=1)
     arc = distance - np.take_along_axis(np.stack(begin, axis=-1), hop, axis=1)
-    inside = np.minimum(arc, graph.lines.length[row])
-    heading = graph.lines.heading(row, inside, END_SPAN_M)
-    overrun = (arc - inside)[..., None] * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
-    return graph.lines.at(row, inside)[..., :2] + overrun, heading
+    lane_arc = np.minimum(arc, graph.lines.length[row])
+    heading = graph.lines.heading(row, lane_arc, END_SPAN_M)
+    overrun = (arc - lane_arc)[..., None] * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
+    return graph.lines.at(row, lane_arc)[..., :2] + overrun, heading
 
 
 def precede(
@@ -368,7 +368,7 @@ def continue_straight(line: Line, behind_m: float, ahead_m: float) -> Line:
 def _end_direction(xyz: Float[Array, "point 3"]) -> Float[Array, "3"]:
     """Direction in the plane of the last two metres of a line; +x for a line without length."""
     distance = np.hypot(*(xyz[:, :2] - xyz[-1, :2]).T)
-    before = np.flatnonzero(distance >= min(END_SPAN_M, distance.max()))
-    step = xyz[-1] - xyz[before[-1]]
+    rows = np.flatnonzero(distance >= min(END_SPAN_M, distance.max()))
+    step = xyz[-1] - xyz[rows[-1]]
     size = float(np.hypot(step[0], step[1]))
     return np.array([step[0] / size, step[1] / size, 0.0]) if size > 0.0 else np.array([1.0, 0.0, 0.0])

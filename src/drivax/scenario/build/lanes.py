@@ -150,8 +150,8 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
 def _widths(lanes: Sequence[MapFeature], gap: Float[Array, " lane"]) -> Float[Array, " lane"]:
     """Width of every lane: that of the source, else the gap to a neighbour, else -1."""
     width = np.array([lane.width_m for lane in lanes], dtype=np.float64)
-    measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
-    return np.where((width > 0.0) & (width <= MOST_WIDTH_M), width, measured)
+    spacing = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
+    return np.where((width > 0.0) & (width <= MOST_WIDTH_M), width, spacing)
 
 
 def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], *names: str) -> int:
@@ -259,10 +259,12 @@ def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
 
     Links to other lanes go uncounted: they lead out of the crop.
     """
-    new = np.full(graph.count + 1, -1)
-    new[rows] = np.arange(len(rows))
+    new_index = np.full(graph.count + 1, -1)  # the last entry is that of -1
+    new_index[rows] = np.arange(len(rows))
     lines = [graph.lines.line(i) for i in rows]
-    successor, predecessor = (_compact(new[links[rows]]) for links in (graph.successor, graph.predecessor))
+    successor, predecessor = (
+        _compact(new_index[links[rows]]) for links in (graph.successor, graph.predecessor)
+    )
     per_lane = ("feature", "lane_id", "kind", "width", "limit", "interpolating", "left_shift", "right_shift")
     return replace(
         graph,
@@ -270,8 +272,8 @@ def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
         successor=successor[:, :LINKS],
         predecessor=predecessor[:, :LINKS],
         dropped_links=int((successor[:, LINKS:] >= 0).sum() + (predecessor[:, LINKS:] >= 0).sum()),
-        left=new[graph.left[rows]],
-        right=new[graph.right[rows]],
+        left=new_index[graph.left[rows]],
+        right=new_index[graph.right[rows]],
         **{name: getattr(graph, name)[rows] for name in per_lane},
     )
 
@@ -311,28 +313,28 @@ class LaneSegments:
 
         The lane is -1 without one in reach; then the other values mean nothing.
         """
-        near = self._near(xyz[:, :2], reach_m)
-        if not len(near.lane):
+        crop = self._crop(xyz[:, :2], reach_m)
+        if not len(crop.lane):
             return np.full(len(xyz), -1), np.zeros(len(xyz)), np.full(len(xyz), np.inf)
-        distance, s = near._measure(xyz, heading, turn_rad)
+        distance, s = crop._measure(xyz, heading, turn_rad)
         best = distance.argmin(axis=1)
         pick = np.arange(len(xyz)), best
-        return np.where(distance[pick] <= reach_m, near.lane[best], -1), s[pick], distance[pick]
+        return np.where(distance[pick] <= reach_m, crop.lane[best], -1), s[pick], distance[pick]
 
     def around(
         self, xyz: Float[Array, " 3"], heading: float, reach_m: float, turn_rad: float
     ) -> list[tuple[int, float, float]]:
         """Lanes within reach of a pose as (lane, arc length on it, distance), the nearest first."""
-        near = self._near(xyz[None, :2], reach_m)
-        (distance,), (s,) = near._measure(xyz[None], np.array([heading]), turn_rad)
+        crop = self._crop(xyz[None, :2], reach_m)
+        (distance,), (s,) = crop._measure(xyz[None], np.array([heading]), turn_rad)
         lanes: dict[int, tuple[int, float, float]] = {}
         for i in np.argsort(distance, kind="stable"):
-            lane = int(near.lane[i])
+            lane = int(crop.lane[i])
             if distance[i] <= reach_m:
                 lanes.setdefault(lane, (lane, float(s[i]), float(distance[i])))
         return list(lanes.values())
 
-    def _near(self, xy: Float[Array, "pose 2"], reach_m: float) -> LaneSegments:
+    def _crop(self, xy: Float[Array, "pose 2"], reach_m: float) -> LaneSegments:
         """Segments in the box of the poses, widened by the reach."""
         rows = np.zeros(0, int)
         if len(xy) and len(self.segments):
@@ -344,9 +346,9 @@ class LaneSegments:
         segments, a, b = self.segments, self.segments.a, self.segments.b
         distance, along = point_to_segment(xyz[:, None, :2], a[None, :, :2], b[None, :, :2])
         z = a[:, 2] + along * (b[:, 2] - a[:, 2])
-        excluded = np.abs(wrap(self.heading - heading[:, None])) > turn_rad
-        excluded |= np.abs(z - xyz[:, 2:3]) > LEVEL_M
-        return np.where(excluded, np.inf, distance), segments.start_m + along * segments.span_m
+        is_excluded = np.abs(wrap(self.heading - heading[:, None])) > turn_rad
+        is_excluded |= np.abs(z - xyz[:, 2:3]) > LEVEL_M
+        return np.where(is_excluded, np.inf, distance), segments.start_m + along * segments.span_m
 
 
 def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:

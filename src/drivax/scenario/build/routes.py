@@ -146,11 +146,11 @@ def find_routes(
     else:
         best, others = _search_routes(lane_segments, ego, intent, most_routes - 1, most_points)
     first = log if best is None else best
-    rest = [route for route in others if not _same(route, first)]
+    alternatives = [route for route in others if not _same(route, first)]
     progress = log_progress(first, ego)
     index = np.arange(len(first.xyz))
     goal = np.array([np.interp(progress[ego.last], index, first.xyz[:, axis]) for axis in (0, 1)])
-    return RouteSet((first, log, *rest)[:most_routes], best is not None, goal, progress)
+    return RouteSet((first, log, *alternatives)[:most_routes], best is not None, goal, progress)
 
 
 def _search_routes(
@@ -271,8 +271,8 @@ class _Drawer:
         line = trace(graph, lanes, max(begin, 0.0), -lane_path.s - length, window_m, place, change_m)
         line = continue_straight(line, max(-begin, 0.0), PAST_GOAL_M)
         arc, _ = project(line[0], ego.seen[-1:, :2])
-        missing = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
-        xyz, label = continue_straight(line, 0.0, missing)
+        missing_m = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
+        xyz, label = continue_straight(line, 0.0, missing_m)
         points, index = resample(xyz, SPACING_M, self.most)
         return Route.along(points if self.plain else join(points, history, change_m), label[index], self.most)
 
@@ -328,18 +328,18 @@ def log_route(lane_segments: LaneSegments, ego: EgoLog, most_points: int) -> Rou
 
     Positions within half a metre of the previous one are jitter; a log that stays within 2 m has only its last pose.
     """
-    seen, heading = ego.seen, ego.heading[ego.valid]
-    keep = space_out(seen[:, :2], STEP_M)
-    if np.hypot(*(seen - seen[0])[:, :2].T).max() < STANDS_M:
+    xyz, heading = ego.seen, ego.heading[ego.valid]
+    keep = space_out(xyz[:, :2], STEP_M)
+    if np.hypot(*(xyz - xyz[0])[:, :2].T).max() < STANDS_M:
         keep = keep[-1:]
-    pose, course = seen[keep[-1]], float(heading[keep[-1]])
-    line = np.concatenate((seen[keep], _ahead(lane_segments, pose, course)))
+    pose, course = xyz[keep[-1]], float(heading[keep[-1]])
+    line = np.concatenate((xyz[keep], _continuation(lane_segments, pose, course)))
     probe = np.arange(0, len(line), LABEL_EVERY)
     lane, _, _ = lane_segments.nearest(line[probe], headings(line)[probe], REACH_M, SAME_TURN_RAD)
     return Route.along(line, np.repeat(lane, LABEL_EVERY)[: len(line)], most_points)
 
 
-def _ahead(lane_segments: LaneSegments, pose: Float[Array, "3"], heading: float) -> Array:
+def _continuation(lane_segments: LaneSegments, pose: Float[Array, "3"], heading: float) -> Array:
     """Points 1 m apart ahead of a pose: along its lane, its lateral offset fading within 20 m; else straight."""
     lines = lane_segments.graph.lines
     count = int(LOG_AHEAD_M)
@@ -361,7 +361,7 @@ def log_progress(route: Route, ego: EgoLog) -> Float[Array, " time"]:
     Each position is searched no further ahead than 1.5 times the distance driven since the last valid step, plus 2 m.
     """
     rows = np.flatnonzero(ego.valid)
-    moved = np.hypot(*np.diff(ego.seen[:, :2], axis=0, prepend=ego.seen[:1, :2]).T)
-    s = project_monotone(route.xyz, ego.seen[:, :2], 1.5 * moved + 2.0)
-    before = np.searchsorted(rows, np.arange(len(ego.valid)), side="right") - 1
-    return s[np.maximum(before, 0)]
+    step_m = np.hypot(*np.diff(ego.seen[:, :2], axis=0, prepend=ego.seen[:1, :2]).T)
+    s = project_monotone(route.xyz, ego.seen[:, :2], 1.5 * step_m + 2.0)
+    last_valid = np.searchsorted(rows, np.arange(len(ego.valid)), side="right") - 1
+    return s[np.maximum(last_valid, 0)]

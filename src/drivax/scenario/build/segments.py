@@ -219,8 +219,8 @@ def road_rows(
     span = np.repeat(length / pieces, pieces)
     begin = number * span
     middle = roads.lines.at(owner, begin + span / 2)[..., :2]
-    near = np.flatnonzero(inside_box(middle, path, margin_m))
-    owner, begin, span, middle = owner[near], begin[near], span[near], middle[near]
+    rows = np.flatnonzero(inside_box(middle, path, margin_m))
+    owner, begin, span, middle = owner[rows], begin[rows], span[rows], middle[rows]
     kind = roads.kind[owner]
     group = np.where(among(kind, LANE_KINDS), 0, np.where(among(kind, EDGE_KINDS), 1, 2))
     order = rank(group, path_distance(middle, path))[:most]
@@ -250,13 +250,13 @@ def _angle(roads: RoadLines, line: Array, begin: Array, end: Array) -> Float[Arr
     return np.arctan2(chord[..., 1], chord[..., 0])
 
 
-def rank(group: Int[Array, " row"], far: Float[Array, " row"]) -> Int[Array, " row"]:
+def rank(group: Int[Array, " row"], distance: Float[Array, " row"]) -> Int[Array, " row"]:
     """Order pieces so that every prefix spreads evenly over each group, nearer rings first.
 
     Within a ring of 50 m around the log, the rows of a group (in order along the map) are taken in bit-reversed
     order (van der Corput's sequence), and the groups are interleaved in proportion to their sizes.
     """
-    ring = np.floor(far / RING_M).astype(np.int64)
+    ring = np.floor(distance / RING_M).astype(np.int64)
     label, place = ring * 3 + group, np.zeros(len(group))
     for number in np.unique(label):
         members = np.flatnonzero(label == number)

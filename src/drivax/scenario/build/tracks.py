@@ -120,13 +120,13 @@ def place(tracks: LocalTracks, preferred: Sequence[int], agents: int, parked: in
     pose = median_pose(tracks)
     away = np.hypot(*np.moveaxis(tracks.xyz[..., :2] - pose[:, None, :2], -1, 0))
     turn = np.abs(wrap(tracks.heading - pose[:, None, 3]))
-    still = ((away <= PARKED_M) & (turn <= PARKED_RAD)) | ~tracks.valid
-    seen = tracks.valid.any(axis=1)
-    parks = still.all(axis=1) & seen
+    stands = ((away <= PARKED_M) & (turn <= PARKED_RAD)) | ~tracks.valid
+    has_pose = tracks.valid.any(axis=1)
+    parks = stands.all(axis=1) & has_pose
     parks[tracks.ego] = False
     rank = _rank(tracks, np.where(tracks.valid, away, 0.0).max(axis=1), preferred)
     order = np.argsort(rank, kind="stable")
-    moving_rows, parked_rows = order[(seen & ~parks)[order]], order[parks[order]]
+    moving_rows, parked_rows = order[(has_pose & ~parks)[order]], order[parks[order]]
     overflow = +Counter(agents=len(moving_rows) - agents, parked=len(parked_rows) - parked)
     return Placement(moving_rows[:agents], parked_rows[:parked], pose, overflow)
 
@@ -143,9 +143,9 @@ def median_pose(tracks: LocalTracks) -> Float[Array, "track 4"]:
 
 def _rank(tracks: LocalTracks, reach_m: Array, preferred: Sequence[int]) -> Float[Array, " track"]:
     """Sort key of every track, smaller is more relevant; ``reach_m`` is its largest distance from its median pose."""
-    both = tracks.valid & tracks.valid[tracks.ego]
+    with_ego = tracks.valid & tracks.valid[tracks.ego]
     distance = np.hypot(*np.moveaxis((tracks.xyz - tracks.xyz[tracks.ego])[..., :2], -1, 0))
-    rank = np.where(both, distance, _UNRELATED_M).min(axis=1) - MOVER_BONUS_M * (reach_m > MOVER_M)
+    rank = np.where(with_ego, distance, _UNRELATED_M).min(axis=1) - MOVER_BONUS_M * (reach_m > MOVER_M)
     rank[list(preferred)] -= _PREFERENCE_M
     rank[tracks.ego] = -np.inf
     return rank
