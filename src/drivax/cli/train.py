@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from drivax import settings
-from drivax.cli.curate import score_with_progress
-from drivax.curation.methods import Request, check_current
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, sampling_weights
 from drivax.errors import UsageError
@@ -22,12 +20,15 @@ from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train, usable_steps
 from drivax.learning.program import widen_pool
 from drivax.scenario.store import ScenarioSet
-from drivax.studies.definition import Arm, load_study
 
 if TYPE_CHECKING:
+    from drivax.studies.definition import Arm
+
     ArmName = str
 else:
-    ArmName = tyro.extras.literal_type_from_choices(load_study("longtail").arms)
+    # Read without `load_study`, which imports all of curation.
+    _LONGTAIL = settings.parse_yaml(settings.preset("studies/longtail").read_text("utf-8"))
+    ArmName = tyro.extras.literal_type_from_choices(_LONGTAIL["arms"])
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,8 @@ def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
         return WeightedSet(
             data, sampling_weights(table, weighting, args.scale or "step", usable_steps(config, data))
         )
+    from drivax.studies.definition import load_study
+
     arm = load_study("longtail").arms[args.arm]
     _check_arm(args, arm, config)
     tables = partial(_table, args, data)
@@ -143,6 +146,9 @@ def _algorithm(config: TrainConfig) -> str:
 
 def _table(args: Train, data: ScenarioSet, method: str) -> ScoreTable:
     """Return the scores of an arm's method, read from --scores if given."""
+    from drivax.cli.curate import score_with_progress
+    from drivax.curation.methods import Request, check_current
+
     if args.scores is None:
         return score_with_progress(method, Request(data))
     table = read_scores(args.scores, data)

@@ -6,6 +6,8 @@ leading axes and take NumPy or JAX arrays.
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import and_
 from typing import Any
 
 from drivax.geometry.vectors import root
@@ -22,14 +24,14 @@ def corners(box: Any) -> Any:
 
 
 def _corner(box: Any, ahead: float, left: float) -> tuple[Any, Any]:
-    """Coordinates of one corner, in units of half length and half width."""
+    """Return x and y of the corner that is ``ahead`` half lengths ahead and ``left`` half widths to the left."""
     cos, sin = box[..., COS], box[..., SIN]
     dx, dy = ahead * (box[..., LENGTH] / 2), left * (box[..., WIDTH] / 2)
     return box[..., X] + dx * cos - dy * sin, box[..., Y] + dx * sin + dy * cos
 
 
 def _axis_terms(a: Any, b: Any) -> tuple[tuple[Any, Any, Any], ...]:
-    """The four separating axes of two boxes: (axis x, axis y, sum of the half extents along it)."""
+    """Return the four separating axes of two boxes: (axis x, axis y, sum of the half extents along it)."""
     ca, sa, cb, sb = a[..., COS], a[..., SIN], b[..., COS], b[..., SIN]
     la, wa, lb, wb = a[..., LENGTH] / 2, a[..., WIDTH] / 2, b[..., LENGTH] / 2, b[..., WIDTH] / 2
     cos, sin = abs(ca * cb + sa * sb), abs(ca * sb - sa * cb)
@@ -44,17 +46,16 @@ def _axis_terms(a: Any, b: Any) -> tuple[tuple[Any, Any, Any], ...]:
 def overlap(a: Any, b: Any) -> Any:
     """Return whether boxes share interior points (separating axis theorem; touching is no overlap)."""
     dx, dy = b[..., X] - a[..., X], b[..., Y] - a[..., Y]
-    result = None
-    for axis_x, axis_y, reach in _axis_terms(a, b):
-        overlaps = abs(dx * axis_x + dy * axis_y) < reach
-        result = overlaps if result is None else result & overlaps
-    return result
+    return reduce(
+        and_, (abs(dx * axis_x + dy * axis_y) < reach for axis_x, axis_y, reach in _axis_terms(a, b))
+    )
 
 
 def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
-    """Fractions of segments ``start`` to ``end`` (``[..., 2]``) at which they enter and leave boxes (slab test).
+    """Return the fractions of segments ``start`` to ``end`` (``[..., 2]``) at which they enter and leave boxes.
 
-    A segment passes through the box where the first fraction is smaller. Both are in [0, 1].
+    A segment passes through the box if the first fraction is smaller than the second. If it does, both are in [0, 1]
+    (slab test).
     """
     xp = box.__array_namespace__()
     cos, sin = box[..., COS], box[..., SIN]
@@ -67,6 +68,7 @@ def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
     halves = (box[..., LENGTH] / 2, box[..., WIDTH] / 2)
     for begin, stop, half in zip(local(start), local(end), halves, strict=True):
         step = stop - begin
+        # Parallel to these two sides: with a tiny step the segment is between them all along, or nowhere.
         step = xp.where(abs(step) < 1e-9, xp.full_like(step, 1e-9), step)
         first, second = (-half - begin) / step, (half - begin) / step
         low, high = xp.minimum(first, second), xp.maximum(first, second)
@@ -76,14 +78,14 @@ def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
 
 
 def gap(a: Any, b: Any) -> Any:
-    """Smallest distance between boxes, m: that at a corner, or 0 where they overlap."""
+    """Return the smallest distance between boxes, m: from one box to a corner of the other, or 0 if they overlap."""
     xp = a.__array_namespace__()
-    nearest = xp.minimum(_nearest_corner(a, b), _nearest_corner(b, a))
-    return root(xp.where(overlap(a, b), xp.zeros_like(nearest), nearest))
+    squared = xp.minimum(_squared_corner_distance(a, b), _squared_corner_distance(b, a))
+    return root(xp.where(overlap(a, b), xp.zeros_like(squared), squared))
 
 
-def _nearest_corner(box: Any, other: Any) -> Any:
-    """Squared distance from the filled ``box`` to the nearest corner of ``other``."""
+def _squared_corner_distance(box: Any, other: Any) -> Any:
+    """Return the squared distance from ``box`` to the nearest corner of ``other``, m2; 0 for a corner inside."""
     xp = box.__array_namespace__()
     nearest = None
     # Corner by corner: XLA vectorises this, but not an array of corners.
@@ -91,9 +93,9 @@ def _nearest_corner(box: Any, other: Any) -> Any:
         x, y = _corner(other, *corner)
         dx, dy = x - box[..., X], y - box[..., Y]
         ahead, left = dx * box[..., COS] + dy * box[..., SIN], dy * box[..., COS] - dx * box[..., SIN]
-        beyond = xp.maximum(abs(ahead) - box[..., LENGTH] / 2, xp.zeros_like(ahead))
+        lengthwise = xp.maximum(abs(ahead) - box[..., LENGTH] / 2, xp.zeros_like(ahead))
         sideways = xp.maximum(abs(left) - box[..., WIDTH] / 2, xp.zeros_like(left))
-        squared = beyond * beyond + sideways * sideways
+        squared = lengthwise * lengthwise + sideways * sideways
         nearest = squared if nearest is None else xp.minimum(nearest, squared)
     return nearest
 
@@ -107,24 +109,25 @@ def overlap_within(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: 
     half = horizon_s / 2
     vx, vy = ((velocity_b[..., axis] - velocity_a[..., axis]) * half for axis in (0, 1))
     dx, dy = b[..., X] - a[..., X] + vx, b[..., Y] - a[..., Y] + vy
-    across = sum(
+    extent = sum(
         abs(box[..., COS] * vy - box[..., SIN] * vx) * (box[..., LENGTH] / 2)
         + abs(box[..., SIN] * vy + box[..., COS] * vx) * (box[..., WIDTH] / 2)
         for box in (a, b)
     )
-    result = abs(dy * vx - dx * vy) <= across  # Equal at rest.
+    # Without relative motion the normal is zero and excludes nothing: both sides are 0.
+    result = abs(dy * vx - dx * vy) <= extent
     for axis_x, axis_y, reach in _axis_terms(a, b):
         result &= abs(dx * axis_x + dy * axis_y) < reach + abs(vx * axis_x + vy * axis_y)
     return result
 
 
 def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: float) -> Any:
-    """First time at which two boxes overlap at constant velocities and fixed headings, in closed form.
+    """Return the first time at which two boxes overlap at constant velocities and fixed headings, in closed form.
 
     On each separating axis the centre distance is linear in time, so the boxes overlap on that axis during one
     interval; they overlap in the plane during the intersection of the four (swept separating axis theorem). Velocities
-    ``[..., 2]`` are those of the centres, m/s. The time is 0 for boxes that overlap now, and ``horizon_s`` for those
-    that do not within the horizon.
+    ``[..., 2]`` are those of the centres, m/s. The time is 0 for boxes that overlap now, and ``horizon_s`` for boxes
+    that do not overlap within the horizon.
     """
     xp = a.__array_namespace__()
     dx, dy = b[..., X] - a[..., X], b[..., Y] - a[..., Y]
@@ -134,10 +137,11 @@ def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s:
     for axis_x, axis_y, reach in _axis_terms(a, b):
         distance, speed = dx * axis_x + dy * axis_y, vx * axis_x + vy * axis_y
         moving = abs(speed) > 1e-9
+        # At rest on this axis, any divisor serves: the result is not selected.
         inverse = 1.0 / xp.where(moving, speed, xp.ones_like(speed))
         first, second = (-reach - distance) * inverse, (reach - distance) * inverse
-        inside = abs(distance) < reach
-        enter = xp.where(moving, xp.minimum(first, second), xp.where(inside, xp.zeros_like(dx), never))
+        overlaps = abs(distance) < reach
+        enter = xp.where(moving, xp.minimum(first, second), xp.where(overlaps, xp.zeros_like(dx), never))
         leave = xp.where(moving, xp.maximum(first, second), never)
         begin, end = xp.maximum(begin, enter), xp.minimum(end, leave)
     return xp.where(begin < end, begin, never)

@@ -30,7 +30,7 @@ class Polylines:
 
     @classmethod
     def of(cls, lines: Sequence[Float[Array, "_ dim"]], dim: int = 3) -> Polylines:
-        """Concatenate polylines; ``dim`` is the width where there are none."""
+        """Concatenate polylines; ``dim`` is the number of coordinates if there are none."""
         counts = np.array([len(line) for line in lines], dtype=np.int64)
         points = np.concatenate(list(lines)) if len(lines) else np.zeros((0, dim))
         start = np.concatenate(([0], np.cumsum(counts)))
@@ -43,12 +43,12 @@ class Polylines:
 
     @cached_property
     def row(self) -> Int[Array, " point"]:
-        """Polyline of every point."""
+        """Index of the polyline of every point."""
         return np.repeat(np.arange(self.count), np.diff(self.start))
 
     @cached_property
     def length(self) -> Float[Array, " polyline"]:
-        """Length of every polyline in the plane, metres."""
+        """Length of every polyline in the plane, metres; 0 without points."""
         if self.count == 0:
             return np.zeros(0)
         return np.where(np.diff(self.start) > 0, self.arc[np.maximum(self.start[1:] - 1, 0)], 0.0)
@@ -68,9 +68,11 @@ class Polylines:
         return self.arc + self._base[self.row]
 
     def locate(self, row: Array, s: Array) -> tuple[Int[Array, "*query"], Float[Array, "*query"]]:
-        """Point index and fraction of the segment that holds arc length ``s`` of polyline ``row`` (two points or more).
+        """Find the segment at arc length ``s`` of polyline ``row``, which has two points or more.
 
-        Beyond an end the fraction of the first or last segment is outside [0, 1]: evaluation continues straight on.
+        Returns:
+            The index of its first point, and the fraction of the segment at ``s``. Beyond an end it is the first or
+            last segment, with a fraction outside [0, 1]: evaluation continues straight on.
         """
         key = np.clip(s, 0.0, self.length[row]) + self._base[row]
         index = np.searchsorted(self._key, key, side="right") - 1
@@ -87,12 +89,12 @@ class Polylines:
     def heading(self, row: Array, s: Array, span_m: float = 1.0) -> Float[Array, "*query"]:
         """Heading at arc lengths ``s``: of the chord from half a span behind to half a span ahead, radians.
 
-        The chord stays inside the polyline; one shorter than the span is measured from end to end.
+        The chord stays inside the polyline; that of a polyline shorter than the span goes from end to end.
         """
         row, s = np.broadcast_arrays(np.asarray(row), np.asarray(s, dtype=np.float64))
-        longest = self.length[row]
-        begin = np.clip(s - span_m / 2, 0.0, np.maximum(longest - span_m, 0.0))
-        chord = self.at(row, np.minimum(begin + span_m, longest)) - self.at(row, begin)
+        length = self.length[row]
+        begin = np.clip(s - span_m / 2, 0.0, np.maximum(length - span_m, 0.0))
+        chord = self.at(row, np.minimum(begin + span_m, length)) - self.at(row, begin)
         return np.arctan2(chord[..., 1], chord[..., 0])
 
 
@@ -118,15 +120,21 @@ def point_to_segment(
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Distance from points to segments, and the fraction in [0, 1] of the nearest point; broadcasts leading axes."""
     axes = range(a.shape[-1])
-    return _to_chords([point[..., i] - a[..., i] for i in axes], [b[..., i] - a[..., i] for i in axes])
+    return _distance_to_chords(
+        [point[..., i] - a[..., i] for i in axes], [b[..., i] - a[..., i] for i in axes]
+    )
 
 
-def _to_chords(offset: Sequence[Array], along: Sequence[Array]) -> tuple[Array, Array]:
-    """Distance to chords and fraction along them, from their beginnings; coordinate by coordinate, which is faster."""
-    square = sum(u * u for u in along)
-    dot = sum(w * u for w, u in zip(offset, along, strict=True))
+def _distance_to_chords(offset: Sequence[Array], chord: Sequence[Array]) -> tuple[Array, Array]:
+    """Distance from points to chords, and the fraction in [0, 1] of the nearest point.
+
+    ``offset`` is that of each point from the start of its chord. Arguments are sequences of coordinates: one array per
+    coordinate is faster than an axis of two.
+    """
+    square = sum(u * u for u in chord)
+    dot = sum(w * u for w, u in zip(offset, chord, strict=True))
     fraction = np.minimum(np.maximum(dot / np.where(square > 0.0, square, 1.0), 0.0), 1.0)
-    return np.sqrt(sum((w - fraction * u) ** 2 for w, u in zip(offset, along, strict=True))), fraction
+    return np.sqrt(sum((w - fraction * u) ** 2 for w, u in zip(offset, chord, strict=True))), fraction
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
@@ -142,28 +150,32 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
     if z_weight > 0.0 and lines.points.shape[1] > 2:
         axes.append(z_weight * lines.points[:, 2])
     keep = np.zeros(len(lines.points), dtype=bool)
-    filled = np.diff(lines.start) > 0
-    keep[lines.start[:-1][filled]] = True
-    keep[lines.start[1:][filled] - 1] = True
-    inside = np.flatnonzero(~keep)  # interior points of intervals that may still have to be split
-    while len(inside):
-        kept = np.flatnonzero(keep)
-        interval = np.searchsorted(kept, inside)
-        begin, end = kept[interval - 1], kept[interval]
-        distance, _ = _to_chords([x[inside] - x[begin] for x in axes], [x[end] - x[begin] for x in axes])
-        first = np.flatnonzero(np.diff(interval, prepend=-1))
-        farthest = np.repeat(np.maximum.reduceat(distance, first), np.diff(first, append=len(inside)))
+    has_points = np.diff(lines.start) > 0
+    keep[lines.start[:-1][has_points]] = True
+    keep[lines.start[1:][has_points] - 1] = True
+    interior = np.flatnonzero(~keep)  # points of intervals that may still have to be split
+    while len(interior):
+        vertices = np.flatnonzero(keep)
+        interval = np.searchsorted(vertices, interior)
+        begin, end = vertices[interval - 1], vertices[interval]
+        distance, _ = _distance_to_chords(
+            [x[interior] - x[begin] for x in axes], [x[end] - x[begin] for x in axes]
+        )
+        first = np.flatnonzero(np.diff(interval, prepend=-1))  # the first interior point of each interval
+        farthest = np.repeat(np.maximum.reduceat(distance, first), np.diff(first, append=len(interior)))
         active = farthest > tolerance_m
+        # Several points may be equally far: split at the earliest.
         peak = np.flatnonzero(active & (distance == farthest))
         _, earliest = np.unique(interval[peak], return_index=True)
-        keep[inside[peak[earliest]]] = True
-        inside = inside[active]
-        inside = inside[~keep[inside]]
+        keep[interior[peak[earliest]]] = True
+        interior = interior[active]
+        interior = interior[~keep[interior]]
     return keep
 
 
 def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array, " segment"]:
     """Number of equal pieces of segments so that none is longer than ``longest_m``; at least one."""
+    # The tolerance keeps rounding from adding a piece.
     return np.maximum(np.ceil(length / longest_m - 1e-9), 1).astype(np.int64)
 
 
@@ -176,6 +188,7 @@ def resample(
         The first ``most`` samples, and for each the index of the point at or before it.
     """
     arc = arc_lengths(points)
+    # The tolerances keep rounding from dropping the last sample, or from choosing the segment before a point.
     count = int(np.floor(arc[-1] / spacing_m + 1e-6)) + 1
     s = np.arange(count if most is None else min(count, most)) * spacing_m
     index = np.clip(np.searchsorted(arc, s + 1e-9, side="right") - 1, 0, len(points) - 2)
@@ -199,7 +212,7 @@ def headings(points: Float[Array, "point dim"]) -> Float[Array, " point"]:
 def project(
     points: Float[Array, "point dim"], xy: Float[Array, "query 2"]
 ) -> tuple[Float[Array, " query"], Float[Array, " query"]]:
-    """Nearest point of a polyline: its arc length and its distance, metres."""
+    """Arc length of the nearest point of a polyline, and the distance from it, metres."""
     line = points[:, :2]
     arc = arc_lengths(points)
     distance, fraction = point_to_segment(xy[:, None], line[None, :-1], line[None, 1:])
@@ -228,14 +241,15 @@ def project_monotone(
             low, high = result[k - 1], min(result[k - 1] + window_m[k], arc[-1])
         i = max(int(arc.searchsorted(low, side="right")) - 1, 0)
         j = max(int(arc.searchsorted(high, side="left")), i + 1)
+        # The segments in reach are i to j; the last point of the line begins none.
         offset = xy[k] - line[i:j][: len(span) - i]
-        if not len(offset):
+        if not len(offset):  # the position before was at the end of the line
             result[k] = low
             continue
         fraction = (offset * step[i:j]).sum(axis=1) / square[i:j]
         foot = np.minimum(np.maximum(fraction * span[i:j], low - arc[i:j]), high - arc[i:j])
         foot = np.minimum(np.maximum(foot, 0.0), span[i:j])
-        apart = offset - (foot / np.maximum(span[i:j], 1e-12))[:, None] * step[i:j]
-        nearest = (apart * apart).sum(axis=1).argmin()
+        residual = offset - (foot / np.maximum(span[i:j], 1e-12))[:, None] * step[i:j]
+        nearest = (residual * residual).sum(axis=1).argmin()
         result[k] = arc[i + nearest] + foot[nearest]
     return result

@@ -29,6 +29,10 @@ from drivax.networks.encoders import (
 from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 
+#: Gains of orthogonal output weights. The small one of policies makes the first actions follow ``first_scale`` whatever
+#: the observation is.
+_POLICY_GAIN, _VALUE_GAIN = 0.01, 1.0
+
 #: Built-in encoders by ``kind``, or a configuration of your own.
 EncoderSettings = (
     MlpConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig | EntityConfig | EncoderConfig
@@ -62,22 +66,23 @@ class NetworkConfig:
 
 
 class _Head(nnx.Module):
-    def __init__(self, config: NetworkConfig, width: int, out: int, scale: float, rngs: nnx.Rngs) -> None:
+    """Dense layers from an embedding of ``width`` to ``out`` linear outputs, whose weights start with ``gain``."""
+
+    def __init__(self, config: NetworkConfig, width: int, out: int, gain: float, rngs: nnx.Rngs) -> None:
         self.activation = config.activation
         self.hidden = dense_layers(width, config.head, rngs)
         width = config.head[-1] if config.head else width
-        self.out = nnx.Linear(width, out, kernel_init=nnx.initializers.orthogonal(scale), rngs=rngs)
+        self.out = nnx.Linear(width, out, kernel_init=nnx.initializers.orthogonal(gain), rngs=rngs)
 
     def __call__(self, x: Array, extra: Array | None = None) -> Array:
         """Apply the head to ``x``, or to ``x`` and ``extra`` concatenated; ``extra`` may have further leading axes."""
         if extra is not None and extra.shape[:-1] == x.shape[:-1]:
-            # Nothing to share: one product is faster than two.
+            # Each ``x`` has one ``extra``, so no product can be shared: one product is faster than two.
             x, extra = jnp.concatenate([x, extra], axis=-1), None
-        layers = [*self.hidden, self.out]
-        for number, layer in enumerate(layers):
-            x = layer(x) if number or extra is None else _apply_concatenated(layer, x, extra)
-            if number < len(self.hidden):
-                x = ACTIVATIONS[self.activation](x)
+        first, *others = [*self.hidden, self.out]
+        x = first(x) if extra is None else _apply_concatenated(first, x, extra)
+        for layer in others:
+            x = layer(ACTIVATIONS[self.activation](x))
         return x
 
 
@@ -98,7 +103,9 @@ class Policy(nnx.Module):
         self.kind: DistributionName = config.distribution
         self.first_scale = config.first_scale
         self.encoder = config.encoder.build(spec, rngs)
-        self.head = _Head(config, self.encoder.width, parameter_count(self.kind, self.actions), 0.01, rngs)
+        self.head = _Head(
+            config, self.encoder.width, parameter_count(self.kind, self.actions), _POLICY_GAIN, rngs
+        )
 
     def __call__(self, groups: Groups) -> Distribution:
         """Return the action distribution; before training it is centred at zero with ``first_scale``."""
@@ -117,10 +124,10 @@ class Value(nnx.Module):
         self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, encoder: Encoder | None = None
     ) -> None:
         self.encoder = encoder or config.encoder.build(spec, rngs)
-        self.head = _Head(config, self.encoder.width, 1, 1.0, rngs)
+        self.head = _Head(config, self.encoder.width, 1, _VALUE_GAIN, rngs)
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch"]:
-        """Return the expected discounted return."""
+        """Return the expected discounted return of the policy from an observation or a batch."""
         return self.from_embedding(self.encoder(groups))
 
     def from_embedding(self, embedding: Float[Array, "*batch width"]) -> Float[Array, "*batch"]:
@@ -154,7 +161,7 @@ class Critic(nnx.Module):
     ) -> None:
         self.encoder = config.encoder.build(spec, rngs)
         width = self.encoder.width + (actions or Actions()).size
-        self.head = _Head(config, width, 1, 1.0, rngs)
+        self.head = _Head(config, width, 1, _VALUE_GAIN, rngs)
 
     def __call__(self, groups: Groups, action: Float[Array, "*actions D"]) -> Float[Array, "*actions"]:
         """Return the expected discounted return of an action in [-1, 1].

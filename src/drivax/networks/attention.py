@@ -47,28 +47,33 @@ class Attention(nnx.Module):
         mask: Bool[Array, "*batch k"] | None = None,
     ) -> Float[Array, "*batch q width"]:
         """Return ``softmax(Q K^T / sqrt(width / heads)) V`` over tokens in ``mask`` (None: all); zeros without any."""
-        _, heads, size = self.query.shape
-        if queries.shape[-2] * heads < self.query.shape[0]:
+        width, heads, size = self.query.shape
+        # To project a token takes width^2 products, to compare it with projected queries width x heads per query.
+        if queries.shape[-2] * heads < width:
             return self._attend_few_queries(queries, tokens, mask)
-        query = self._times("...qd,dhc->...qhc", queries, self.query) * size**-0.5
-        key = self._times("...kd,dhc->...khc", tokens, self.key)
-        value = self._times("...kd,dhc->...khc", tokens, self.value)
-        weights = _weights(self._times("...qhc,...khc->...hqk", query, key), mask)
-        mean = self._times("...hqk,...khc->...qhc", weights, value)
-        return self._times("...qhc,hcd->...qd", mean, self.out)
+        query = self._einsum("...qd,dhc->...qhc", queries, self.query) * size**-0.5
+        key = self._einsum("...kd,dhc->...khc", tokens, self.key)
+        value = self._einsum("...kd,dhc->...khc", tokens, self.value)
+        weights = _masked_softmax(self._einsum("...qhc,...khc->...hqk", query, key), mask)
+        mean = self._einsum("...hqk,...khc->...qhc", weights, value)
+        return self._einsum("...qhc,hcd->...qd", mean, self.out)
 
     def _attend_few_queries(self, queries: Array, tokens: Array, mask: Array | None) -> Array:
-        # With few queries it is cheaper to project them than all tokens:
+        """Project queries instead of tokens."""
         # ``(W_q x) . (W_k y) = (W_k^T W_q x) . y``, and the mean of ``W_v y`` is ``W_v`` times the mean of ``y``.
-        query = self._times("...qd,dhc->...qhc", queries, self.query) * self.query.shape[2] ** -0.5
-        projected = self._times("...qhc,dhc->...qhd", query, self.key)
-        weights = _weights(self._times("...qhd,...kd->...hqk", projected, tokens), mask)
-        mean = self._times("...hqk,...kd->...qhd", weights, tokens)
-        return self._times("...qhc,hcd->...qd", self._times("...qhd,dhc->...qhc", mean, self.value), self.out)
+        query = self._einsum("...qd,dhc->...qhc", queries, self.query) * self.query.shape[2] ** -0.5
+        projections = self._einsum("...qhc,dhc->...qhd", query, self.key)
+        weights = _masked_softmax(self._einsum("...qhd,...kd->...hqk", projections, tokens), mask)
+        mean = self._einsum("...hqk,...kd->...qhd", weights, tokens)
+        return self._einsum(
+            "...qhc,hcd->...qd", self._einsum("...qhd,dhc->...qhc", mean, self.value), self.out
+        )
 
-    def _times(self, axes: str, left: Any, right: Any) -> Array:
+    def _einsum(self, subscripts: str, left: Any, right: Any) -> Array:
+        """Multiply two arrays or parameters in ``dtype``, with sums in float32."""
+
         def product(left: Array, right: Array) -> Array:
-            return jnp.einsum(axes, left, right, preferred_element_type=jnp.float32)
+            return jnp.einsum(subscripts, left, right, preferred_element_type=jnp.float32)
 
         def float32_product(left: Array, right: Array) -> Array:
             return product(left.astype(jnp.float32), right.astype(jnp.float32))
@@ -80,9 +85,10 @@ class Attention(nnx.Module):
         return jax.lax.platform_dependent(left, right, cpu=float32_product, default=product)
 
 
-def _weights(
+def _masked_softmax(
     logits: Float[Array, "*batch h q k"], mask: Bool[Array, "*batch k"] | None
 ) -> Float[Array, "*batch h q k"]:
+    """Return the softmax over valid tokens, zeros without any."""
     if mask is None:
         return jax.nn.softmax(logits)
     valid = mask[..., None, None, :]
@@ -91,7 +97,7 @@ def _weights(
 
 
 class ResidualAttention(nnx.Module):
-    """``x + attention(norm(x), tokens)`` with normalised ``tokens``; without them, self-attention."""
+    """``x + attention(norm(x), tokens)``; the caller normalises ``tokens``. Without them, self-attention."""
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
         self.norm = nnx.LayerNorm(width, rngs=rngs)
@@ -104,8 +110,8 @@ class ResidualAttention(nnx.Module):
         mask: Bool[Array, "*batch k"] | None = None,
     ) -> Float[Array, "*batch q width"]:
         """Return ``x`` plus the attention output."""
-        normed = self.norm(x)
-        return x + self.attention(normed, normed if tokens is None else tokens, mask)
+        queries = self.norm(x)
+        return x + self.attention(queries, queries if tokens is None else tokens, mask)
 
 
 class FeedForward(nnx.Module):
@@ -152,7 +158,7 @@ class GroupShape:
 
     @property
     def features(self) -> int:
-        """Width of a token."""
+        """Number of features of a token."""
         return self.shape[-1]
 
     @property
@@ -167,7 +173,7 @@ class GroupShape:
 
     @property
     def times(self) -> int:
-        """Number of tokens of a row."""
+        """Number of tokens of a row, one per time."""
         return math.prod(self.shape[:-1]) // self.rows
 
 
@@ -189,7 +195,7 @@ def group_shapes(spec: GroupSpec) -> dict[str, GroupShape]:
 
 
 def group_rows(groups: Groups, name: str, shape: GroupShape) -> TokenRows:
-    """Return the features of a group as rows of tokens; masked tokens are zero."""
+    """Return the features of a group as rows of tokens in float32; masked tokens are zero."""
     value = groups[name].astype(jnp.float32)
     axes = (*value.shape[: value.ndim - len(shape.shape)], shape.rows, shape.times)
     value = value.reshape(*axes, shape.features)

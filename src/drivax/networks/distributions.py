@@ -24,6 +24,7 @@ DistributionName = Literal["gaussian", "beta", "grid", "mixture"]
 #: Distributions whose samples have a gradient in all parameters.
 REPARAMETRISED: tuple[DistributionName, ...] = ("gaussian", "beta")
 
+#: Bounds of the standard deviation of an unsquashed Gaussian.
 _MIN_SCALE, _MAX_SCALE = 1e-3, 2.0
 #: Actions are clipped to +-0.999 (a raw action of +-3.8) before arctanh, which has poles at the bounds.
 _MAX_ACTION = 0.999
@@ -162,9 +163,8 @@ class Beta:
         return jnp.clip((action + 1.0) / 2.0, _EDGE, 1.0 - _EDGE)
 
     def mode(self) -> Float[Array, "*batch action"]:
-        """Return the peak of the density; for the uniform distribution, its centre."""
-        above = jnp.maximum(self.alpha + self.beta - 2.0, _EDGE)
-        return (self.alpha - self.beta) / above
+        """Return the peak of the density; for the uniform distribution (``alpha = beta = 1``), its centre."""
+        return (self.alpha - self.beta) / jnp.maximum(self.alpha + self.beta - 2.0, _EDGE)
 
     def mean_action(self) -> Float[Array, "*batch action"]:
         """Return ``(alpha - beta) / (alpha + beta)``."""
@@ -173,8 +173,9 @@ class Beta:
     def entropy_estimate(self, key: Array) -> Float[Array, "*batch"]:
         """Return the exact differential entropy of the action."""
         a, b = self.alpha, self.beta
-        peaks = (a - 1.0) * digamma(a) + (b - 1.0) * digamma(b) - (a + b - 2.0) * digamma(a + b)
-        return jnp.sum(betaln(a, b) - peaks + math.log(2.0), axis=-1)
+        # E[ln(x^(a - 1) (1 - x)^(b - 1))]: the mean log-density without its normaliser.
+        mean_log = (a - 1.0) * digamma(a) + (b - 1.0) * digamma(b) - (a + b - 2.0) * digamma(a + b)
+        return jnp.sum(betaln(a, b) - mean_log + math.log(2.0), axis=-1)
 
 
 @record
@@ -229,14 +230,14 @@ class Mixture(_SquashedActions):
     Samples have no gradient in the logits.
     """
 
-    logits: Float[Array, "*batch part"]
+    logits: Float[Array, "*batch component"]
     components: SquashedGaussian
 
     @classmethod
     def from_parameters(cls, parameters: Float[Array, "*batch parameters"]) -> Mixture:
-        """Make one of a head's output: logits, then each part as in :meth:`SquashedGaussian.from_parameters`."""
-        logits, rest = jnp.split(parameters, [_COMPONENTS], axis=-1)
-        return cls(logits, SquashedGaussian.from_parameters(rest.reshape(*rest.shape[:-1], _COMPONENTS, -1)))
+        """Split a head's output into logits and components (:meth:`SquashedGaussian.from_parameters`)."""
+        logits, flat = jnp.split(parameters, [_COMPONENTS], axis=-1)
+        return cls(logits, SquashedGaussian.from_parameters(flat.reshape(*flat.shape[:-1], _COMPONENTS, -1)))
 
     def sample(self, key: Array) -> Float[Array, "*batch action"]:
         """Sample a component, then a raw action from it."""
@@ -246,9 +247,10 @@ class Mixture(_SquashedActions):
 
     def log_prob(self, raw_action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
         """Return the log of the weighted sum of the components' densities."""
-        shares, sample = jax.nn.log_softmax(self.logits), raw_action[..., None, :]
-        each = jnp.broadcast_to(sample, jnp.broadcast_shapes(sample.shape, self.components.loc.shape))
-        return jax.nn.logsumexp(shares + self.components.log_prob(each), axis=-1)
+        log_weights, sample = jax.nn.log_softmax(self.logits), raw_action[..., None, :]
+        # Batch axes of samples and components must agree.
+        samples = jnp.broadcast_to(sample, jnp.broadcast_shapes(sample.shape, self.components.loc.shape))
+        return jax.nn.logsumexp(log_weights + self.components.log_prob(samples), axis=-1)
 
     def mode(self) -> Float[Array, "*batch action"]:
         """Return the squashed mean of the component with the largest weight."""
@@ -259,7 +261,7 @@ class Mixture(_SquashedActions):
         return jnp.sum(jax.nn.softmax(self.logits)[..., None] * self.components.mean_action(), axis=-2)
 
 
-def _select_component(values: Float[Array, "*batch part action"], index: Int[Array, "*batch"]) -> Array:
+def _select_component(values: Float[Array, "*batch component action"], index: Int[Array, "*batch"]) -> Array:
     return jnp.take_along_axis(values, index[..., None, None], axis=-2)[..., 0, :]
 
 
@@ -270,7 +272,7 @@ def combinations(levels: tuple[tuple[float, ...], ...]) -> Float[np.ndarray, "co
 
 
 def parameter_count(kind: DistributionName, actions: Actions) -> int:
-    """Return the number of parameters of a distribution.
+    """Return the number of parameters of a distribution, which is the number of a head's outputs.
 
     Raises:
         UsageError: The distribution is a grid, but the actions have no levels.
@@ -283,14 +285,17 @@ def parameter_count(kind: DistributionName, actions: Actions) -> int:
 def initial_parameters(
     kind: DistributionName, actions: Actions, scale: float
 ) -> Float[np.ndarray, " parameters"]:
-    """Return the parameters of a distribution centred at zero; UsageError if a Beta would have no peak.
+    """Return the parameters of a distribution centred at zero, to add to the outputs of an untrained head.
 
     ``scale`` is the standard deviation of the unsquashed Gaussian, of the Beta's action, or of the Gaussian whose
-    density weights the grid's levels; in a mixture, of each part, with means between ``-scale`` and ``scale``.
+    density weights the grid's levels; in a mixture, of each component, with means between ``-scale`` and ``scale``.
+
+    Raises:
+        UsageError: A Beta with this scale has no peak.
     """
     if kind == "grid":
         return (-0.5 * (combinations(_levels(actions)) / scale) ** 2).sum(axis=-1)
-    spread = math.log(math.expm1(scale))
+    spread = math.log(math.expm1(scale))  # The inverse of softplus.
     if kind == "gaussian":
         return np.repeat(np.array([0.0, spread], np.float32), actions.size)
     if kind == "mixture":
@@ -299,11 +304,11 @@ def initial_parameters(
         components = [np.repeat([mean, spread], actions.size) for mean in means]
         return np.concatenate([(means == 0.0).astype(float), *components]).astype(np.float32)
     # A symmetric Beta's action has the variance 1 / (2 alpha + 1).
-    above = (scale**-2 - 1.0) / 2.0 - 1.0
-    if above <= 0.0:
+    alpha_minus_1 = (scale**-2 - 1.0) / 2.0 - 1.0
+    if alpha_minus_1 <= 0.0:
         raise UsageError(f"a Beta of first_scale {scale:g} has no peak", cure="use less than 0.577")
-    # ln(e^x - 1) without overflow.
-    return np.full(2 * actions.size, above + math.log(-math.expm1(-above)), np.float32)
+    # The inverse of softplus, ln(e^x - 1), without overflow.
+    return np.full(2 * actions.size, alpha_minus_1 + math.log(-math.expm1(-alpha_minus_1)), np.float32)
 
 
 def distribution(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
@@ -25,7 +26,7 @@ Layers = Sequence[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
 
 Activation = Literal["relu", "tanh", "gelu", "silu"]
 ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "gelu": jax.nn.gelu, "silu": jax.nn.silu}
-#: Activations that commute with a maximum.
+#: Non-decreasing activations: they commute with a maximum.
 _MONOTONE = ("relu", "tanh")
 
 #: Lower bound of deviations: a nearly constant feature is not amplified.
@@ -87,24 +88,25 @@ class MlpEncoder(nnx.Module):
         self.activation: Activation = config.activation
         width, shared = 0, {}
         for name in self.names:
-            masked = f"{name}_mask" in spec
-            if masked and self.pools:
+            mask_shape = spec.get(f"{name}_mask")
+            if mask_shape is not None and self.pools:
                 # A row is what the mask's first axis counts; its times are concatenated with their masks.
-                row_width = math.prod(spec[name][1:]) + math.prod(spec[f"{name}_mask"][1:])
+                row_width = math.prod(spec[name][1:]) + math.prod(mask_shape[1:])
                 shared[name] = dense_layers(row_width, config.rows, rngs)
                 width += config.rows[-1]
             else:
-                width += math.prod(spec[name]) + (math.prod(spec[f"{name}_mask"]) if masked else 0)
+                width += math.prod(spec[name]) + (0 if mask_shape is None else math.prod(mask_shape))
         self.shared = nnx.Dict(shared)
         self.layers = dense_layers(width, config.hidden, rngs)
         self.width = config.hidden[-1]
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
-        """Encode one observation or a batch."""
+        """Return the embedding of an observation or a batch."""
         x = jnp.concatenate([self._group(name, groups) for name in self.names], axis=-1)
         return dense(self.activation, _weights(self.layers), x)
 
     def _group(self, name: str, groups: Groups) -> Float[Array, "*batch features"]:
+        """Return a group as one vector: its rows pooled, or its features and masks flattened."""
         value, mask = groups[name].astype(jnp.float32), groups.get(f"{name}_mask")
         lead = value.shape[: value.ndim - len(self.shapes[name])]
         if mask is None:
@@ -120,12 +122,10 @@ class MlpEncoder(nnx.Module):
 
 
 def dense_layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
-    """Return dense layers of these sizes, with orthogonal weights scaled for relu or tanh."""
-    layers = []
-    for size in sizes:
-        layers.append(nnx.Linear(width, size, kernel_init=nnx.initializers.orthogonal(2**0.5), rngs=rngs))
-        width = size
-    return nnx.List(layers)
+    """Return dense layers of these sizes on ``width`` inputs, with orthogonal weights of gain sqrt(2), as for relu."""
+    initializer = nnx.initializers.orthogonal(2**0.5)
+    pairs = pairwise((width, *sizes))
+    return nnx.List([nnx.Linear(*pair, kernel_init=initializer, rngs=rngs) for pair in pairs])
 
 
 def _weights(layers: Any) -> Layers:
@@ -158,7 +158,7 @@ def max_pool(
     activation: Activation, layers: Layers, rows: Float[Array, "*batch row inputs"],
     valid: Bool[Array, "*batch row"],
 ) -> Float[Array, "*batch outputs"]:  # fmt: skip
-    """Return the maximum of zero and the valid rows after the layers; tied rows share its gradient."""
+    """Return the maximum of zero and the valid rows after the layers; equal rows share its gradient."""
     if activation not in _MONOTONE:
         return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=valid[..., None])
     lead, (count, width) = rows.shape[:-2], rows.shape[-2:]
@@ -178,7 +178,10 @@ def _dense_and_max(
 def _dense_and_max_forward(
     activation: Activation, layers: Layers, rows: Array, valid: Array
 ) -> tuple[Array, Any]:
-    """Add the last bias and activate after the maximum, which is equal for a monotone activation."""
+    """Return the output and the residuals of the backward pass.
+
+    The last bias is added and the last activation applied after the maximum, with the same result since it is monotone.
+    """
     inputs: list[Array] = [rows.reshape(-1, rows.shape[-1])]
     activate, hidden_vjps = partial(jax.vjp, ACTIVATIONS[activation]), []
     for kernel, bias in layers[:-1]:
@@ -264,7 +267,7 @@ class NormalisedEncoder(nnx.Module):
 
 
 def set_statistics(network: nnx.Module, statistics: Statistics) -> None:
-    """Set the statistics of all normalised encoders of a network."""
+    """Set the statistics of all normalised encoders of a network, in place."""
     for _, node in nnx.iter_graph(network):
         if isinstance(node, NormalisedEncoder):
             for name, (mean, deviation) in statistics.items():

@@ -86,6 +86,7 @@ class EntityEncoder(nnx.Module):
         means = {part: masked_mean(*rows[part]) for part in self.order}
         if "others" in means:
             query = sum((means[part] for part in ("ego", "goal") if part in means), jnp.zeros(()))
+            # Without ego and goal the query is the scalar zero.
             query = jnp.broadcast_to(query, means["others"].shape)[..., None, :]
             means["others"] = self.norm(self.attention(query, *rows["others"])[..., 0, :])
         return jnp.concatenate([means[part] for part in self.order], axis=-1)
@@ -100,6 +101,7 @@ class EntityEncoder(nnx.Module):
 
 
 def _part_of(config: EntityConfig, name: str, shape: GroupShape) -> str:
+    """Return the part of the embedding, one of ``_PARTS``, that a group belongs to."""
     if name in config.goal:
         return "goal"
     if name in config.context:

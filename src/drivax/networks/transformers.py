@@ -28,7 +28,7 @@ from drivax.networks.encoders import Groups, GroupSpec
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of a transformer; see :class:`TransformerConfig`."""
+    """Sizes of a transformer; see :class:`TransformerConfig`. ``latents`` is the number of latent queries."""
 
     width: int
     heads: int
@@ -104,7 +104,7 @@ class LqhConfig(LatentConfig):
     """Latent queries per group, then latent queries over those of all groups.
 
     Attributes:
-        local_layers: Depth per group; ``layers`` is the depth over all groups.
+        local_layers: Depth per group, at least 1; ``layers`` is the depth over all groups.
     """
 
     kind: Literal["lqh"] = "lqh"
@@ -192,6 +192,7 @@ class _Latents(nnx.Module):
     def __call__(
         self, tokens: Float[Array, "*batch k width"], mask: Bool[Array, "*batch k"]
     ) -> Float[Array, "*batch latent width"]:
+        """Return the latents after all layers."""
         x = self.first[...]
         for number, layer in enumerate(self.layers):
             if number < len(self.looks):
@@ -210,6 +211,7 @@ class _Factorised(nnx.Module):
         self.dtype = sizes.dtype
 
     def __call__(self, rows: TokenRows) -> TokenRows:
+        """Return the normalised tokens after both layers, with the same mask."""
         x = self.time(rows.value, rows.mask)
         x = self.space(jnp.swapaxes(x, -3, -2), jnp.swapaxes(rows.mask, -2, -1))
         return TokenRows(self.norm(jnp.swapaxes(x, -3, -2)).astype(self.dtype), rows.mask)
@@ -252,7 +254,7 @@ class LatentEncoder(nnx.Module):
 
 
 class MtrEncoder(nnx.Module):
-    """Attention over the times of each mover, then over movers and map; mean of the movers without a mask (ego).
+    """Attention over the times of each mover, then over movers and map; the output is the mean over ego's tokens.
 
     Attributes (names of stored parameters):
         time: Self-attention over the times of a mover.
@@ -280,7 +282,7 @@ class MtrEncoder(nnx.Module):
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch; float32."""
         tokens = self.embedding(groups)
-        movers = {name: self._mover(name, tokens[name]) for name in self.mover_groups}
+        movers = {name: self._mover_tokens(name, tokens[name]) for name in self.mover_groups}
         x, mask = concatenate_groups(list(movers.values()))
         map_groups = [tokens[name].flat() for name in self.map_groups]
         map_tokens = concatenate_groups(map_groups) if map_groups else None
@@ -289,12 +291,13 @@ class MtrEncoder(nnx.Module):
             if map_tokens is not None:
                 x = self.around[number](x, *map_tokens)
             x = layer(x)
-        pooled = self.ego_groups or self.mover_groups
-        masks = [m if name in pooled else jnp.zeros_like(m) for name, (_, m) in movers.items()]
+        # The embedding is the mean over ego's tokens, or over all movers if no group is ego's.
+        output_groups = self.ego_groups or self.mover_groups
+        masks = [m if name in output_groups else jnp.zeros_like(m) for name, (_, m) in movers.items()]
         return masked_mean(self.norm(x), jnp.concatenate(masks, axis=-1))
 
-    def _mover(self, name: str, rows: TokenRows) -> tuple[Array, Array]:
-        """Return one token per row: the mean over its times after self-attention."""
+    def _mover_tokens(self, name: str, rows: TokenRows) -> tuple[Array, Array]:
+        """Return one token per row and its mask; a series gives the mean over its times after self-attention."""
         if not self.embedding.group_shapes[name].series:
             return rows.flat()
         return masked_mean(self.time(rows.value, rows.mask), rows.mask), rows.mask.any(axis=-1)

@@ -45,32 +45,32 @@ def default_task(planner: Planner) -> Task:
     return Task(actions=getattr(planner, "actions", Task().actions))
 
 
-def as_planner(thing: Any, name: str) -> Planner:
-    """Return a user's planner: ``thing`` itself, or the result of calling it without arguments.
+def as_planner(candidate: Any, name: str) -> Planner:
+    """Return a user's planner: ``candidate`` itself, or the result of calling it without arguments.
 
     Adapts objects and classes with nuPlan's interface (:mod:`drivax.planners.nuplan`).
 
     Raises:
-        UsageError: ``thing`` is not a planner and does not make one; the message uses ``name``.
+        UsageError: ``candidate`` is not a planner and does not make one; the message uses ``name``.
     """
-    if not isinstance(thing, type) and (is_nuplan(thing) or isinstance(thing, Planner)):
-        return _adapt(thing, name)
-    if callable(thing):
+    if not isinstance(candidate, type) and (is_nuplan(candidate) or isinstance(candidate, Planner)):
+        return _adapt(candidate, name)
+    if callable(candidate):
         try:
-            check_arguments(thing, name, ())
+            check_arguments(candidate, name, ())
         except ValueError as error:
             cure = "put @drivax.python_planner or @drivax.jax_planner above a function that drives"
-            if is_nuplan(thing):
+            if is_nuplan(candidate):
                 cure = f"name a function that makes {name} without arguments"
             raise UsageError(str(error), cure=cure) from None
-        return _adapt(thing if is_nuplan(thing) else thing(), name)
-    return _adapt(thing, name)
+        return _adapt(candidate if is_nuplan(candidate) else candidate(), name)
+    return _adapt(candidate, name)
 
 
-def _adapt(thing: Any, name: str) -> Planner:
+def _adapt(candidate: Any, name: str) -> Planner:
     """Wrap a planner with nuPlan's interface, and check any other."""
-    if is_nuplan(thing):
-        return NuplanPlanner(Host(thing, name))
-    if not isinstance(thing, Planner):
+    if is_nuplan(candidate):
+        return NuplanPlanner(Host(candidate, name))
+    if not isinstance(candidate, Planner):
         raise UsageError(f"{name!r} makes no planner", cure="see drivax.planners.planner.Planner")
-    return thing
+    return candidate

@@ -53,7 +53,7 @@ class FunctionPlanner(Memoryless):
         return str(getattr(self.function, "__name__", type(self.function).__name__))
 
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
-        """Return the function's action, or NaN if it raises an error."""
+        """Return the function's action; NaN if a Python function raises an error."""
         if not self.in_python:
             return jnp.ravel(jnp.asarray(self.function(situation, observation), jnp.float32))
         context = situation.context
@@ -94,11 +94,12 @@ def python_actions(
     """
 
     def call(identity: Any, steps: Any, arguments: Any) -> Any:
+        """Convert the arrays of a batch to NumPy, and call the function for each scenario."""
         identity, steps = np.asarray(identity), np.asarray(steps)
         return _call_batch(function, identity, steps, jax.tree.map(np.asarray, arguments), size)
 
-    result = jax.ShapeDtypeStruct((size,), jnp.float32)
-    return jax.pure_callback(call, result, identity, step, arguments, vmap_method="broadcast_all")
+    result_type = jax.ShapeDtypeStruct((size,), jnp.float32)
+    return jax.pure_callback(call, result_type, identity, step, arguments, vmap_method="broadcast_all")
 
 
 @record
@@ -129,7 +130,7 @@ class NetworkPlanner(Memoryless):
 def collect_errors() -> Iterator[dict[tuple[int, int], str]]:
     """Collect errors of Python functions by scenario identity and step of the log.
 
-    Outside of this context, errors end the program.
+    The value of an entry is the text of the error. Outside of this context, errors end the program.
     """
     _collectors.append({})
     try:
@@ -141,7 +142,7 @@ def collect_errors() -> Iterator[dict[tuple[int, int], str]]:
 def _call_batch(
     function: Callable[..., Any], identity: Any, steps: Any, arguments: tuple[Any, ...], size: int
 ) -> Any:
-    """Return the function's action for each scenario of a batch of any shape."""
+    """Return the function's action for each scenario of a batch of any shape; NaN for errors, which are collected."""
     actions = np.full((*identity.shape, size), np.nan, np.float32)
     for index in np.ndindex(identity.shape):
         try:
@@ -158,7 +159,7 @@ def _call_batch(
 
 
 def error_text(error: Exception) -> str:
-    """Format an error with its line in the user's function."""
+    """Format an error as one line, with its location in the user's code if the traceback has one."""
     if isinstance(error, PlannerError):
         return str(error)
     text = " ".join(f"{type(error).__name__}: {error}".split())

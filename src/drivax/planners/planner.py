@@ -78,7 +78,7 @@ class RuleBased(Memoryless, ABC):
         """Return acceleration (m/s2) and curvature (1/m)."""
 
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
-        """Return the action of the controls."""
+        """Return the action that exerts the controls in the planner's action space."""
         return action_of(self.actions, bank, situation.context, *self.controls(bank, situation))
 
 

@@ -41,11 +41,17 @@ class TrafficPolicy(TrafficData):
 
 @record
 class PlannerTrafficState:
-    """State of the K agents that the planner drives."""
+    """State of the K agents that the planner drives.
 
-    begin: Int[Array, "*batch"]  # First step of the episode; until then all agents moved as logged
-    contexts: AgentContext  # One context per agent; slots beyond the moving agents are empty
-    base: Any  # State of the traffic around them
+    Attributes:
+        begin: First step of the episode; until then all agents moved as logged.
+        contexts: One context per agent; a slot equal to the number of agents is empty.
+        base: State of the traffic around them.
+    """
+
+    begin: Int[Array, "*batch"]
+    contexts: AgentContext
+    base: Any
 
 
 @dataclass(frozen=True)
@@ -70,7 +76,7 @@ class PlannerTraffic:
 
     @property
     def name(self) -> str:
-        """``driven``, or ``driven+idm``."""
+        """``driven``, followed by the name of another base than the log (``driven+idm``)."""
         return "driven" if self.base.name == "log" else f"driven+{self.base.name}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
@@ -90,53 +96,59 @@ class PlannerTraffic:
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> PlannerTrafficState:
         """Advance all agents by one step of 0.1 s from the present frame."""
-        now = context.traffic
+        traffic = context.traffic
 
         def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
+            """Return the frame ``back`` steps ago, of all slots or of some."""
             rows = self.agents(bank, context, back)
             return frame_of(bank, context.index, context.step, rows, alone(context), back, slots)
 
         def drive(agent: AgentContext) -> AgentContext:
-            apart = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
+            """Return an agent's context one step later, after an action of the planner."""
+            # Earlier contacts matter to metrics only, so none is kept.
+            no_contact = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
             lights = remember_lights(bank, agent)
-            situation, contacts, lights = measure(bank, agent, frame, frames(1), apart, lights)
+            situation, contacts, lights = measure(bank, agent, frame, frames(1), no_contact, lights)
             episode = self.task.episode_start()
-            state = SimState(situation.context, situation.facts, contacts, lights, episode, now.begin)
+            state = SimState(situation.context, situation.facts, contacts, lights, episode, traffic.begin)
             key = jax.random.key(self.seed)
             for number in (bank.identity[agent.index], agent.step, agent.slot):
                 key = jax.random.fold_in(key, number)
-            seen = self.task.observe(bank, situation.context, frames, frame)
-            requested, _ = data_of(bank, TrafficPolicy).planner.act((), bank, state, situation, seen, key)
-            action = self.task.actuate(bank, agent, requested)
+            observation = self.task.observe(bank, situation.context, frames, frame)
+            planner = data_of(bank, TrafficPolicy).planner
+            action, _ = planner.act((), bank, state, situation, observation, key)
+            action = self.task.actuate(bank, agent, action)
             length_m = bank.length_m(agent.index, agent.slot)
             motion = self.task.motion(agent.history[-1], action, length_m)
             history = jnp.concatenate([agent.history[1:], motion[None]])
             return replace(situation.context, step=agent.step + 1, history=history, action=action)
 
-        base = self.base.advance(bank, replace(context, traffic=now.base), frame)
-        return PlannerTrafficState(now.begin, jax.vmap(drive)(now.contexts), base)
+        base = self.base.advance(bank, replace(context, traffic=traffic.base), frame)
+        return PlannerTrafficState(traffic.begin, jax.vmap(drive)(traffic.contexts), base)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Return the rows of ``base`` with the driven vehicles at their simulated poses."""
-        now = context.traffic
-        rows = self.base.agents(bank, replace(context, traffic=now.base), back)
-        slot = jnp.where(context.step - back > now.begin, now.contexts.slot, rows.shape[0])
-        motion, z = now.contexts.history[:, HISTORY - 1 - back], now.contexts.z
+        traffic = context.traffic
+        rows = self.base.agents(bank, replace(context, traffic=traffic.base), back)
+        slot = jnp.where(context.step - back > traffic.begin, traffic.contexts.slot, rows.shape[0])
+        motion, z = traffic.contexts.history[:, HISTORY - 1 - back], traffic.contexts.z
         return rows.at[slot].set(agent_rows(motion, z, jnp.ones_like(z)), mode="drop")
 
     def _slots(self, bank: ScenarioBank, index: Any, step: Any) -> Int[Array, " K"]:
-        """Slots of the driven vehicles, nearest to ego first, padded with empty slots."""
+        """Return the slots of the vehicles to drive, nearest to ego first, padded with the number of agents."""
         rows, count = bank.agents[index], bank.agents.shape[2]
         xy, valid = rows[..., AgentColumn.XY], rows[..., AgentColumn.VALID] > 0
-        moved = ((xy - xy[step]) ** 2).sum(axis=-1)
-        later = valid & (jnp.arange(bank.steps) > step)[:, None]
-        chosen = valid[step] & (jnp.arange(count) > 0) & (later & (moved > _TRAVELS_M**2)).any(axis=0)
-        chosen &= bank.agent_box[index, :count, SizeColumn.KIND] == int(AgentKind.VEHICLE)
-        distance = jnp.where(chosen, ((xy[step] - xy[step, 0]) ** 2).sum(axis=-1), jnp.inf)
-        order = jnp.argsort(distance)[: self.count]
+        squared_travel = ((xy - xy[step]) ** 2).sum(axis=-1)
+        is_later = valid & (jnp.arange(bank.steps) > step)[:, None]
+        travels = (is_later & (squared_travel > _TRAVELS_M**2)).any(axis=0)
+        is_vehicle = bank.agent_box[index, :count, SizeColumn.KIND] == int(AgentKind.VEHICLE)
+        # Slot 0 is ego.
+        is_eligible = valid[step] & (jnp.arange(count) > 0) & travels & is_vehicle
+        squared_distance = jnp.where(is_eligible, ((xy[step] - xy[step, 0]) ** 2).sum(axis=-1), jnp.inf)
+        order = jnp.argsort(squared_distance)[: self.count]
         order = jnp.pad(order, (0, self.count - order.shape[0]), constant_values=count)
-        far = jnp.isinf(distance.at[order].get(mode="fill", fill_value=jnp.inf))
-        return jnp.where(far, count, order).astype(jnp.int32)
+        is_empty = jnp.isinf(squared_distance.at[order].get(mode="fill", fill_value=jnp.inf))
+        return jnp.where(is_empty, count, order).astype(jnp.int32)
 
 
 def with_driver(bank: ScenarioBank, driver: Planner) -> ScenarioBank:

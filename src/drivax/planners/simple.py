@@ -21,23 +21,26 @@ from drivax.simulator.types import MOTION_SPEED, Action, AgentContext, Motion, S
 from drivax.tasks.actions import ActionSpace, Physical, Trajectory, follow_log
 
 
-def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Motion:
-    """Return the agent's logged motion ``ahead`` steps from now, or its present motion if the log is invalid then.
+def logged_motion(bank: ScenarioBank, context: AgentContext, steps: int) -> Motion:
+    """Return the agent's logged motion after ``steps`` more steps, or its present motion if the log is invalid then.
 
     After the end of the log, the motion continues at constant velocity.
     """
-    step, last = context.step + ahead, bank.last_step[context.index]
+    step, last = context.step + steps, bank.last_step[context.index]
     state = bank.agents[context.index, jnp.minimum(step, last), context.slot]
     heading, velocity = state[AgentColumn.HEADING], state[AgentColumn.VELOCITY]
     speed = jnp.maximum(jnp.sum(velocity * heading), 0.0)
-    time_after_log_s = jnp.maximum(step - last, 0) * 0.1
+    time_after_log_s = jnp.maximum(step - last, 0) * DT_S
     xy = state[AgentColumn.XY] + time_after_log_s * velocity
     motion = jnp.stack([xy[0], xy[1], jnp.arctan2(state[AgentColumn.SIN], state[AgentColumn.COS]), speed])
     return jnp.where(state[AgentColumn.VALID] > 0, motion, context.history[-1])
 
 
 def logged_poses(bank: ScenarioBank, context: AgentContext, steps: int) -> Float[Array, "steps1 3"]:
-    """Return the logged poses from now on, at constant velocity in gaps and after the log."""
+    """Return the logged poses (x, y, heading) of now and the next ``steps`` steps.
+
+    In gaps and after the log, the last valid pose continues at constant velocity.
+    """
     track = bank.agents[context.index, :, context.slot]
     last_valid = jax.lax.cummax(jnp.where(track[:, AgentColumn.VALID] > 0, jnp.arange(bank.steps), 0))
     step = context.step + jnp.arange(steps + 1)
@@ -126,6 +129,7 @@ class IdmPlanner(RuleBased):
         context, frame = situation.context, situation.surroundings.frame
         box, speed = frame.box[context.slot], context.history[-1, MOTION_SPEED]
         obstacles = ahead(bank, context, frame, self.parameters.min_gap_m)
+        # Route points are 1 m apart.
         remaining_m = bank.route_points[context.index, 0] - 1 - context.route_m
         distance_m = jnp.minimum(lookahead_m(speed), jnp.maximum(remaining_m, 0.0))
         points, _ = route_ahead(bank, context.index, context.route_m, distance_m[None])

@@ -20,6 +20,7 @@ from drivax.report.pictures.palette import Stroke, stroke
 from drivax.report.runs import Training
 from drivax.scenario.schema import DT_S
 
+#: Size of a chart, and its margins other than the left one, pixels.
 WIDTH, HEIGHT = 380, 210
 _RIGHT, _TOP, _BOTTOM = 12, 10, 34
 Points = Float[np.ndarray[Any, Any], "point 2"]
@@ -54,7 +55,7 @@ def chart(
     x_ticks = ticks(min(0.0, float(values[:, 0].min())), float(values[:, 0].max()), 5)
     low, high = float(values[:, 1].min()), float(values[:, 1].max())
     y_ticks = [0.0, 0.25, 0.5, 0.75, 1.0] if share and low >= 0 and high <= 1 else ticks(low, high, 5)
-    last = max(float(values[:, 0].max()), x_ticks[0] + 1e-9)
+    last = max(float(values[:, 0].max()), x_ticks[0] + 1e-9)  # an axis has a length
     axes = Axes(x_ticks[0], last, y_ticks[0], y_ticks[-1], left=52)
     shapes = [axes.grid_line(value, compact(value)) for value in y_ticks]
     shapes += [axes.tick_label(value) for value in x_ticks if value <= axes.x1 + 1e-9]
@@ -74,6 +75,7 @@ def _bin_points(points: Points) -> Float[np.ndarray[Any, Any], "bin 2"]:
 
 
 def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
+    """Return a chart of each quantity, with a line per run that logged it."""
     charts = []
     for name in names:
         lines = {
@@ -87,7 +89,7 @@ def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
 
 
 class Axes:
-    """Mapping from data to pixels, with a margin ``left`` for the labels of the vertical axis."""
+    """Mapping from data to pixels: axes from ``x0`` to ``x1`` and ``y0`` to ``y1``, right of a margin ``left``."""
 
     def __init__(self, x0: float, x1: float, y0: float, y1: float, left: int) -> None:
         self.x0, self.x1, self.y0, self.y1, self.left = x0, x1, y0, y1, left
@@ -101,7 +103,7 @@ class Axes:
         return HEIGHT - _BOTTOM - (value - self.y0) / (self.y1 - self.y0) * (HEIGHT - _BOTTOM - _TOP)
 
     def path(self, points: Any) -> str:
-        """Return points ``[n, 2]`` as an SVG path."""
+        """Return points ``[n, 2]`` as the ``points`` of an SVG polyline."""
         return " ".join(f"{self.x(x):.1f},{self.y(y):.1f}" for x, y in points)
 
     def grid_line(self, value: float, text: str) -> str:
@@ -128,7 +130,10 @@ class Axes:
 
 
 def ticks(low: float, high: float, maximum: int) -> list[float]:
-    """Return evenly spaced round numbers that enclose ``[low, high]``: steps of 1, 2 or 5 times a power of ten."""
+    """Return evenly spaced round numbers that enclose ``[low, high]``: steps of 1, 2 or 5 times a power of ten.
+
+    The interval is at most ``maximum`` steps long. A single value gets an interval around it.
+    """
     if high - low < 1e-12 * max(1.0, abs(low), abs(high)):
         pad = max(0.5 * abs(low), 0.5)
         low, high = low - pad, high + pad
@@ -217,7 +222,7 @@ def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenari
 def bins(values: Values, maximum: int = BINS) -> Values:
     """Return the edges of at most ``maximum`` bins of one round width that hold all values.
 
-    Each integer gets a bin centred on it if there are enough bins.
+    Each integer gets a bin centred on it if there are enough bins. A single value gets the middle one of three bins.
     """
     low, high = float(values.min()), float(values.max())
     integers = bool((values == np.round(values)).all())
@@ -225,6 +230,7 @@ def bins(values: Values, maximum: int = BINS) -> Values:
         return low + np.array([-1.5, -0.5, 0.5, 1.5])
     if integers and high - low < maximum:
         return np.arange(low - 0.5, high + 1.0)
+    # Begin at zero, unless all values are far above it.
     start = min(low, 0.0) if low < 0.5 * high else low
     edges = ticks(start, high, maximum - 1)
     width = edges[1] - edges[0]
@@ -241,17 +247,20 @@ def short(value: Any) -> str:
 
 
 def _shares(values: Values, edges: Values) -> Values:
+    """Return the share of values in each bin; zeros without values."""
     counts, _ = np.histogram(values, edges)
     return counts / max(len(values), 1)
 
 
 def _facts(values: Values) -> str:
+    """Return median, maximum and number of values as text."""
     if not len(values):
         return "n 0"
     return f"median {short(np.median(values))}, max {short(values.max())}, n {len(values):,}"
 
 
 def _bars(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
+    """Return the bins as bars."""
     return "".join(
         f'<rect x="{axes.x(a) + 0.5:.1f}" y="{axes.y(share):.1f}" width="{axes.x(b) - axes.x(a) - 1:.1f}" '
         f'height="{axes.y(0) - axes.y(share):.1f}" fill="{style.colour}">'
@@ -262,12 +271,13 @@ def _bars(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
 
 
 def _outline(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
+    """Return the bins as one line around all bars."""
     corners = np.column_stack((np.repeat(edges, 2), np.concatenate(([0.0], np.repeat(shares, 2), [0.0]))))
     return f'<polyline {style.svg} points="{axes.path(corners)}"/>'
 
 
 Array = np.ndarray[Any, Any]
-#: Curvature is undefined below this speed, where noise dominates the change of heading.
+#: Below this speed curvature is undefined: noise dominates the change of heading.
 _MIN_SPEED_MPS = 0.5
 
 
@@ -318,15 +328,15 @@ def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
         return values
     path, steps = np.asarray(ego[first:end], np.float64), slice(first + 1, end)
     heading_changes = np.asarray(wrap(np.diff(path[:, 2])))
-    along, speed = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
+    acceleration, speed = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
     samples = end - first - 1
     smooth = savgol_matrix(samples, *comfort.SMOOTH)
-    rate = savgol_matrix(samples, *comfort.YAW_RATE) @ np.cumsum(heading_changes) / DT_S
-    values["acceleration"][steps] = smooth @ along
+    yaw_rate = savgol_matrix(samples, *comfort.YAW_RATE) @ np.cumsum(heading_changes) / DT_S
+    values["acceleration"][steps] = smooth @ acceleration
     values["lateral"][steps] = smooth @ (speed * heading_changes / DT_S)
-    values["jerk"][steps] = savgol_matrix(samples, *comfort.JERK) @ smooth @ along / DT_S
-    values["yaw_rate"][steps] = rate
+    values["jerk"][steps] = savgol_matrix(samples, *comfort.JERK) @ smooth @ acceleration / DT_S
+    values["yaw_rate"][steps] = yaw_rate
     values["curvature"][steps] = np.where(
-        speed >= _MIN_SPEED_MPS, rate / np.maximum(speed, _MIN_SPEED_MPS), np.nan
+        speed >= _MIN_SPEED_MPS, yaw_rate / np.maximum(speed, _MIN_SPEED_MPS), np.nan
     )
     return values

@@ -31,7 +31,7 @@ FAILURES = (
     ("left the map", "left_map", 1.0),
     ("goal not reached", "reached_goal", 0.0),
 )
-#: Share of successes among the shown episodes if there are enough failures.
+#: Least share of successes among the shown episodes, if there are enough.
 _MIN_SUCCESS_SHARE = 0.25
 
 
@@ -39,8 +39,8 @@ _MIN_SUCCESS_SHARE = 0.25
 class EpisodeGroup:
     """The episodes of all runs in one scenario.
 
-    ``rows`` has a row of each run's table, or None if the run has no episode. ``outcome`` is the policy's: a kind of
-    failure, or ``success``.
+    ``rows`` has a row of each run's table, or None if the run has no episode. ``outcome`` is that of the policy's
+    episode (:func:`outcome`).
     """
 
     dataset: str
@@ -88,9 +88,10 @@ def sort_worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> 
 
 
 def choose(runs: Sequence[EpisodeTable], count: int) -> list[EpisodeGroup]:
-    """Choose episodes of the last run: failures of every kind in turn, worst score first, and some successes.
+    """Choose ``count`` episodes of the last run: failures of every kind in turn, worst score first, then successes.
 
-    Among equal failures, those where other planners succeed come first; among successes, those where they fail.
+    At least a quarter are successes if there are enough. Among equal failures, those where other planners succeed come
+    first; among successes, those where they fail.
     """
     kinds: dict[str, list[EpisodeGroup]] = {}
     for group in rank_scenarios(runs):
@@ -164,6 +165,7 @@ def rollouts_of(runs: Sequence[EpisodeTable], group: EpisodeGroup, scenario: Sce
 
 
 def _rollout(run: EpisodeTable, row: int, scenario: Scenario) -> Rollout:
+    """Return an episode as steps of the scenario: as logged before its start, NaN after its end."""
     trajectories = run.trajectories
     steps, start = int(scenario.steps), int(trajectories.start[row])
     ego = np.full((steps, 4), np.nan)

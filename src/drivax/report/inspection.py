@@ -18,7 +18,7 @@ from jaxtyping import Float
 from drivax.errors import DataError
 from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
 from drivax.report.charts import short
-from drivax.scenario.schema import DT_S, NAMES, Scenario
+from drivax.scenario.schema import DT_S, NAMES, AgentKind, Scenario
 from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
 from drivax.table import MISSING, Cell, Column, Table
@@ -110,7 +110,7 @@ class Inspection:
 
     @property
     def megabytes(self) -> float:
-        """Size of the whole set on disk, MB."""
+        """Size of the whole set on disk, MB, whatever scenarios are selected."""
         files = (path for path in self.scenarios.path.rglob("*") if path.is_file())
         return sum(path.stat().st_size for path in files) / 1e6
 
@@ -203,13 +203,13 @@ def read_speeds(inspection: Inspection) -> Speeds:
         speed = np.linalg.norm(scenario.agent_velocity, axis=-1)
         valid, now = scenario.agent_valid, int(scenario.current_step)
         ego.append(speed[valid[:, 0], 0])
-        others = valid[now, 1:] & (scenario.agent_kind[1:] == 1)
+        others = valid[now, 1:] & (scenario.agent_kind[1:] == AgentKind.VEHICLE)
         vehicles.append(speed[now, 1:][others])
     ego_mps, vehicles_mps = (np.concatenate(values, dtype=np.float64) for values in (ego, vehicles))
     return Speeds(ego_mps, vehicles_mps, len(ego))
 
 
-#: Maximum numbers of listed scenarios, named values of a tag, sets per table, and causes of unreadable records.
+#: Maximum numbers of listed scenarios, listed values of a tag, sets per table, and causes of unreadable records.
 MAX_LISTED, MAX_NAMED, SETS_PER_TABLE, _MAX_CAUSES = 30, 6, 4, 3
 #: A label and one text per set.
 Row = tuple[str, list[str]]
@@ -344,7 +344,7 @@ def _table(name: str, headings: Sequence[str], rows: Sequence[Row], **options: A
 
 
 def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
-    """Return the shares of scenarios by audit finding, tag value and flag."""
+    """Return the shares of scenarios by audit finding, tag value and flag; tags of many values only have a count."""
     sizes = [len(inspection) for inspection in inspections]
     rows = _percents("", true_findings(inspections))
     tags_by_set = [inspection.tags() for inspection in inspections]

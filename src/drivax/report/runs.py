@@ -35,6 +35,10 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
     """Read evaluation and training runs, with every seed of a run.
 
     A repeated name gets its folder as suffix.
+
+    Raises:
+        DataError: A folder is missing, damaged, or neither an evaluation nor a training run.
+        UsageError: No folder is given, or one twice.
     """
     folders = [seed_folder for folder in folders for seed_folder in seed_folders(folder)]
     paths = [folder.resolve() for folder in folders]
@@ -63,7 +67,12 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
 
 
 def read_evaluations(folders: Sequence[Path]) -> list[EpisodeTable]:
-    """Read run folders, at least one of them an evaluation, as :func:`read_runs` does."""
+    """Read the evaluations among run folders.
+
+    Raises:
+        DataError: As in :func:`read_runs`.
+        UsageError: As in :func:`read_runs`, or no folder is an evaluation.
+    """
     evaluations, _ = read_runs(folders)
     if not evaluations:
         raise UsageError("no run folder is an evaluation", cure="name run folders of drivax evaluate")
@@ -81,6 +90,7 @@ def _unique_name(name: str, folder: Path, names: set[str]) -> str:
 
 
 def _curves(run: RunFolder) -> dict[str, Array]:
+    """Return the finite logged values of each quantity as points (environment steps, value)."""
     points: dict[str, list[tuple[float, float]]] = {}
     for row in run.read_metrics():
         for name, value in row.items():

@@ -15,7 +15,7 @@ from drivax.report.episodes import EvaluatedSet
 from drivax.report.runs import read_evaluations
 from drivax.table import Table
 
-#: Columns of a breakdown, few enough for a page.
+#: Columns of the tables by tag, few enough for a page.
 KEY_METRICS = (
     "success", "accuracy", "collision", "at_fault_collision", "offroad", "red_light", "progress_ratio", "vmax_score",
 )  # fmt: skip
@@ -71,6 +71,7 @@ def select_metrics(runs: Sequence[EpisodeTable], extra: Sequence[str] = ()) -> l
 
 
 def _tables(runs: Sequence[EpisodeTable], data: Path | None, extra: Sequence[str]) -> list[Table]:
+    """Return all tables in the order of the files."""
     default_metrics, metrics = select_metrics(runs), select_metrics(runs, extra)
     results = [result_tables.results_table(runs, metrics)]
     if len(runs) > 1:

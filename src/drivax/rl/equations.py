@@ -21,15 +21,15 @@ def generalised_advantages(
     """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438).
 
     ``delta_t = r_t + gamma (1 - terminated_t) V(s_{t+1}) - V(s_t)`` and
-    ``A_t = delta_t + gamma lambda (1 - terminated_t) (1 - truncated_t) A_{t+1}``, zero beyond the end. A truncated
+    ``A_t = delta_t + gamma lambda (1 - terminated_t) (1 - truncated_t) A_{t+1}``, zero after the last step. A truncated
     step bootstraps ``value_tp1``, the value of its final state, and no reward of the next episode reaches it.
 
     Returns:
         Advantages, and value targets ``A_t + V(s_t)``.
     """
-    alive = 1.0 - terminated_t.astype(jnp.float32)
-    delta_t = reward_t + gamma * alive * value_tp1 - value_t
-    decay_t = gamma * lambda_ * alive * (1.0 - truncated_t.astype(jnp.float32))
+    not_terminated_t = 1.0 - terminated_t.astype(jnp.float32)
+    delta_t = reward_t + gamma * not_terminated_t * value_tp1 - value_t
+    decay_t = gamma * lambda_ * not_terminated_t * (1.0 - truncated_t.astype(jnp.float32))
 
     def step(advantage_tp1: Array, step_t: tuple[Array, Array]) -> tuple[Array, Array]:
         delta, decay = step_t
@@ -60,7 +60,7 @@ def td_target(
 
     A truncated step bootstraps the value of its final state. No gradient flows into the targets.
     """
-    # Selected, not multiplied by zero: a value that overflowed must not reach a terminated step.
+    # Select, do not multiply by zero: a value that overflowed must not reach a terminated step.
     return jax.lax.stop_gradient(reward_t + gamma * jnp.where(terminated_t, 0.0, value_tp1))
 
 
@@ -127,9 +127,9 @@ def conservative_penalty(
 def penalty_weight_loss(
     log_weight: Float[Array, ""], penalty: Float[Array, "*batch"], gap: float
 ) -> Float[Array, "*batch"]:
-    """``-alpha (penalty - gap)`` with ``alpha = exp(log_weight)``: CQL's Lagrange multiplier (its eq. 30).
+    """``-alpha (penalty - gap)`` with ``alpha = exp(log_weight)``: CQL's Lagrange multiplier.
 
-    The weight rises while the penalty is above the gap. No gradient reaches the critics.
+    The weight rises while the penalty is above the gap (arXiv 2006.04779, eq. 30). No gradient reaches the critics.
     """
     return -jnp.exp(log_weight) * jax.lax.stop_gradient(penalty - gap)
 
@@ -151,7 +151,7 @@ def advantage_weights(
 def scaled_policy_loss(loss: Float[Array, "*batch"], q: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """``loss / mean |Q|`` over the batch, independent of the scale of rewards (Fujimoto and Gu 2021, arXiv 2106.06860).
 
-    No gradient reaches the divisor.
+    No gradient reaches the divisor, which is at least 1e-6.
     """
     return loss / jnp.maximum(jax.lax.stop_gradient(jnp.mean(jnp.abs(q))), 1e-6)
 

@@ -18,6 +18,8 @@ from drivax.simulator.types import Motion
 GRIP_MPS2 = 8.0
 #: Shorter moves count as straight, m.
 _STILL_M = 0.1
+#: Least distance ahead of a point that pure pursuit steers to, m.
+_MIN_PURSUIT_M = 1.0
 #: Gain on the along-track error when following a log, 1/s.
 _ALONG_GAIN = 1.0
 
@@ -85,11 +87,12 @@ def follow(motion: Motion, target: Motion, beyond: Motion) -> tuple[Scalar, Scal
 
 
 def pursuit(pose: Float[Array, " pose"], offset: Float[Array, " 2"]) -> Scalar:
-    """Return the curvature of the arc from a pose or box to a point at an offset, 0 for a point behind.
+    """Return the curvature (1/m) of the arc from a pose to a point, 0 for a point less than 1 m ahead.
 
-    Pure pursuit (Coulter 1992): k = 2 y / L^2, for a point at (x, y) in the frame of the pose, at distance L.
+    Pure pursuit (Coulter 1992): k = 2 y / L^2, for a point at (x, y) in the frame of the pose, at distance L. ``pose``
+    begins with x, y, cos and sin of the heading, as a box does; ``offset`` is that of the point from the pose.
     """
     forward = offset[0] * pose[2] + offset[1] * pose[3]
     left = offset[1] * pose[2] - offset[0] * pose[3]
-    curvature = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
-    return jnp.where(forward > 1.0, curvature, 0.0)
+    curvature = 2.0 * left / jnp.maximum(forward * forward + left * left, _MIN_PURSUIT_M**2)
+    return jnp.where(forward > _MIN_PURSUIT_M, curvature, 0.0)

@@ -49,7 +49,7 @@ class Checkpoints:
         return sorted(int(name) for name in names if name.isdecimal())
 
     def best(self) -> int | None:
-        """Return the step with the highest score, the latest of equal ones; None without scores."""
+        """Return the step with the highest score, the latest if several are equal; None without scores."""
         scores = [(self.about(step)["score"], step) for step in self.steps()]
         candidates = [(tuple(np.atleast_1d(score)), step) for score, step in scores if score is not None]
         return max(candidates)[1] if candidates else None
@@ -60,7 +60,9 @@ class Checkpoints:
         return max(self.steps(), default=None) if best is None else best
 
     def about(self, step: int) -> dict[str, Any]:
-        """Return the step, score and leaves of a checkpoint.
+        """Return ``step``, ``score`` (None without one) and ``leaves`` of a checkpoint, the content of ``about.json``.
+
+        Leaves have their current names.
 
         Raises:
             DataError: The checkpoint is missing or damaged.
@@ -72,7 +74,7 @@ class Checkpoints:
         try:
             about = json.loads(file.read_bytes())
             for leaf in about.get("leaves", ()):
-                leaf["name"] = _present_name(leaf["name"])
+                leaf["name"] = _current_name(leaf["name"])
             return about
         except ValueError as error:
             raise DataError(f"is damaged ({error})", file=file, cure="use another checkpoint") from error
@@ -86,8 +88,8 @@ class Checkpoints:
         score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
         final = self._path(step)
         about = json.dumps({"step": step, "score": score, "leaves": leaves}, indent=1)
-        needed = len(about) + sum(array.nbytes for array in arrays.values())
-        with replace_folder(final, needed) as partial:
+        size_bytes = len(about) + sum(array.nbytes for array in arrays.values())
+        with replace_folder(final, size_bytes) as partial:
             if arrays:
                 _save_arrays(partial / _ARRAYS, arrays)
             write_text(partial / ABOUT, about)
@@ -114,21 +116,26 @@ class Checkpoints:
     def restore_parts(
         self, templates: Mapping[str, State], step: int | None = None, cure: str = _CURE
     ) -> dict[str, State]:
-        """Return several parts of a stored state by their paths, as in :meth:`restore`; errors suggest ``cure``."""
+        """Return several parts of a stored state by their paths, as :meth:`restore` does.
+
+        Raises:
+            DataError: As in :meth:`restore`; leaves that do not match suggest ``cure``.
+        """
         if step is None:
             step = max(self.steps(), default=None)
         if step is None:
             raise DataError("no checkpoint found", file=self.folder, cure="train without --resume")
-        stored, path = self.about(step)["leaves"], self._path(step)
-        requested = [
+        stored_leaves, path = self.about(step)["leaves"], self._path(step)
+        requested_leaves = [
             (part + name, leaf)
             for part, template in templates.items()
             for name, leaf in _named_leaves(template)
         ]
-        _compare(path, [leaf for leaf in stored if is_part(leaf["name"], templates)], requested, cure)
-        names = [leaf["name"] for leaf in stored]
-        arrays = dict(zip(names, _load_arrays(path, stored), strict=True))
-        values = iter([_rebuild(arrays[name], leaf) for name, leaf in requested])
+        part_leaves = [leaf for leaf in stored_leaves if is_part(leaf["name"], templates)]
+        _compare(path, part_leaves, requested_leaves, cure)
+        names = [leaf["name"] for leaf in stored_leaves]
+        arrays = dict(zip(names, _load_arrays(path, stored_leaves), strict=True))
+        values = iter([_rebuild(arrays[name], leaf) for name, leaf in requested_leaves])
         return {part: jax.tree.map(lambda _: next(values), template) for part, template in templates.items()}
 
     def _path(self, step: int) -> Path:
@@ -149,11 +156,12 @@ class Checkpoints:
 
 
 def is_part(leaf: str, parts: Iterable[str]) -> bool:
-    """Return whether a leaf (a name) belongs to one of the parts of a state (``.critics`` not to ``.critic``)."""
+    """Return whether a leaf belongs to one of the parts of a state, all by name (``.critics`` not to ``.critic``)."""
+    # A part ends where the leaf does, or before an attribute or index.
     return any(leaf.startswith(part) and (leaf + ".")[len(part)] in ".[" for part in parts)
 
 
-def _present_name(leaf: str) -> str:
+def _current_name(leaf: str) -> str:
     """Return the name of a leaf, with the current names of renamed fields."""
     return re.sub(r"\.(\w+)", lambda field: f".{_RENAMED_FIELDS.get(field[1], field[1])}", leaf)
 
@@ -199,10 +207,11 @@ def _describe(state: Any) -> tuple[dict[str, np.ndarray[Any, Any]], list[dict[st
     arrays, leaves = {}, []
     for number, (name, leaf) in enumerate(_named_leaves(state)):
         array = np.asarray(_to_numpy(leaf), order="C")
-        stored_type, crc = [str(array.dtype), list(array.shape)], zlib.crc32(array.tobytes())
+        # A key is stored as an array of other type and shape.
+        array_type, crc = [str(array.dtype), list(array.shape)], zlib.crc32(array.tobytes())
         shape = list(np.shape(leaf))
         leaves.append(
-            {"name": name, "type": _type_name(leaf), "shape": shape, "stored": stored_type, "crc": crc}
+            {"name": name, "type": _type_name(leaf), "shape": shape, "stored": array_type, "crc": crc}
         )
         if array.size:
             arrays[f"{number:05d}"] = array
@@ -214,6 +223,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _to_numpy(leaf: Any) -> np.ndarray[Any, Any]:
+    """Return a leaf as an array; that of a key holds its data."""
     array = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
     if array.dtype == object or array.dtype.kind in "US":
         raise TypeError(f"a {type(leaf).__name__} cannot be stored in a checkpoint")
@@ -224,10 +234,12 @@ def _type_name(leaf: Any) -> str:
     return type(leaf).__name__ if type(leaf) in _SCALARS else str(leaf.dtype)
 
 
-def _compare(path: Path, stored: list[dict[str, Any]], requested: list[tuple[str, Any]], cure: str) -> None:
+def _compare(
+    path: Path, stored_leaves: list[dict[str, Any]], requested_leaves: list[tuple[str, Any]], cure: str
+) -> None:
     """Check that stored and requested leaves have the same names, types and shapes."""
-    stored_types = {leaf["name"]: f"{leaf['type']}{list(leaf['shape'])}" for leaf in stored}
-    requested_types = {name: f"{_type_name(leaf)}{list(np.shape(leaf))}" for name, leaf in requested}
+    stored_types = {leaf["name"]: f"{leaf['type']}{list(leaf['shape'])}" for leaf in stored_leaves}
+    requested_types = {name: f"{_type_name(leaf)}{list(np.shape(leaf))}" for name, leaf in requested_leaves}
     for name in [*requested_types, *stored_types]:
         if name not in stored_types:
             raise DataError(f"the checkpoint has no {name}", file=path, cure=cure)
@@ -246,19 +258,22 @@ def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
 
 
 def _load_arrays(path: Path, leaves: list[dict[str, Any]]) -> list[np.ndarray[Any, Any]]:
+    """Read the arrays of all leaves, and verify their checksums."""
     import orbax.checkpoint as ocp
 
-    empty = [np.zeros(tuple(leaf["stored"][1]), jnp.dtype(leaf["stored"][0])) for leaf in leaves]
-    target = {f"{number:05d}": array for number, array in enumerate(empty) if array.size}
+    templates = [np.zeros(tuple(leaf["stored"][1]), jnp.dtype(leaf["stored"][0])) for leaf in leaves]
+    nonempty = {f"{number:05d}": array for number, array in enumerate(templates) if array.size}
     restored_arrays: dict[str, Any] = {}
-    if target:
+    if nonempty:
         try:
             with ocp.StandardCheckpointer() as checkpointer:
-                restored_arrays = checkpointer.restore((path / _ARRAYS).resolve(), target)
+                restored_arrays = checkpointer.restore((path / _ARRAYS).resolve(), nonempty)
         except Exception as error:
             problem = f"arrays cannot be read ({error})"
             raise DataError(problem, file=path, cure="use another checkpoint") from error
-    arrays = [np.asarray(restored_arrays.get(f"{number:05d}", array)) for number, array in enumerate(empty)]
+    arrays = [
+        np.asarray(restored_arrays.get(f"{number:05d}", array)) for number, array in enumerate(templates)
+    ]
     for array, leaf in zip(arrays, leaves, strict=True):
         if zlib.crc32(array.tobytes()) != leaf["crc"]:
             raise DataError(f"checksum mismatch in {leaf['name']}", file=path, cure="use another checkpoint")
@@ -266,6 +281,7 @@ def _load_arrays(path: Path, leaves: list[dict[str, Any]]) -> list[np.ndarray[An
 
 
 def _rebuild(array: np.ndarray[Any, Any], template: Any) -> Any:
+    """Return a stored array as a leaf of the template's type: number, key, or NumPy or JAX array."""
     if type(template) in _SCALARS:
         return type(template)(array)
     if _is_key(template):

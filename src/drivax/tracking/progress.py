@@ -105,7 +105,7 @@ class Progress:
 
 def duration(seconds: float) -> str:
     """Format seconds as ``4.2 s``, ``3 min 5 s`` or ``2 h 10 min``."""
-    if seconds < 59.95:
+    if seconds < 59.95:  # more would be rounded to 60.0 s
         return f"{seconds:.1f} s"
     whole_seconds = round(seconds)
     if whole_seconds < 3600:
@@ -115,4 +115,5 @@ def duration(seconds: float) -> str:
 
 
 def _format_number(value: float) -> str:
+    """Format a number with three significant digits, or all digits before the decimal point."""
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

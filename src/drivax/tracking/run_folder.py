@@ -184,7 +184,7 @@ def seed_folders(path: str | Path) -> list[Path]:
 
 
 def _kind(path: Path) -> str | None:
-    """Return the kind of the run in a folder, or None if it cannot be read."""
+    """Return the kind of the run in a folder, or None if the run cannot be read or has no kind."""
     with contextlib.suppress(DataError, OSError):
         return RunFolder.open(path).kind
     return None
@@ -228,7 +228,10 @@ def is_policy(name: str | Path) -> bool:
 
 
 def learned_from(planner: str) -> list[dict[str, Any]]:
-    """Return the training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), including pretraining."""
+    """Return the training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), including pretraining.
+
+    Other planners have none.
+    """
     folder = planner.partition("@")[0]
     path = policy_folder(folder) if is_policy(folder) else Path(folder)
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
@@ -244,7 +247,7 @@ def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
-    """Return command, versions, data and machine of this process as plain JSON values."""
+    """Return command, start, versions, commit, data and machine of this process as plain JSON values."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -44,13 +44,13 @@ class JsonLines:
 
 
 class TensorBoard:
-    """TensorBoard events through tensorboardX (extra ``track``)."""
+    """TensorBoard events through tensorboardX (extra ``track``), without those after ``resume_step``."""
 
     def __init__(self, folder: str | Path, resume_step: int | None = None) -> None:
         from tensorboardX import SummaryWriter
 
-        purge = None if resume_step is None else resume_step + 1
-        self._writer = SummaryWriter(str(folder), purge_step=purge, write_to_disk=True)
+        first_step = None if resume_step is None else resume_step + 1
+        self._writer = SummaryWriter(str(folder), purge_step=first_step, write_to_disk=True)
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Add a scalar for each value."""

@@ -49,11 +49,12 @@ def one_core_each(
 
 
 def await_interrupt() -> None:
-    """Wait briefly after the death of a worker, so that a Ctrl-C that caused it raises KeyboardInterrupt here."""
+    """Wait for 0.3 s after the death of a worker: a Ctrl-C that caused it raises KeyboardInterrupt in this time."""
     time.sleep(0.3)
 
 
 def _start(core_queue: Any) -> None:
+    """Set up a worker process: its core, if there is a queue of cores, its signals, and its end."""
     if core_queue is not None:
         # JAX starts one thread per core, so restrict the cores first.
         os.sched_setaffinity(0, {core_queue.get()})

@@ -91,12 +91,12 @@ class Polyline(DevkitObject):
 
 
 class _Edge(DevkitObject):
-    """A node of the graph with an area: a lane, a connector or a roadblock."""
+    """What the devkit calls an edge of the graph: a lane, a connector or a roadblock."""
 
     _interface = ""
 
     def devkit_names(self) -> tuple[str, ...]:
-        """Return the devkit's class, and its interface for when only that is imported."""
+        """Return the devkit's class, then its interface, in case only that is imported."""
         return type(self).__name__, self._interface
 
     def __init__(self, map_api: MapApi, name: str, connector: bool) -> None:
@@ -124,6 +124,7 @@ class NuPlanLane(_Edge):
         self.baseline_path = Polyline(name, points)
 
     def _boundary(self, side: int) -> Polyline:
+        """Return the left (``side`` 1) or right (-1) border."""
         line, offset = self.baseline_path, side * self.half_width_m
         return Polyline(f"{self.id}:{side:+d}", line.points + offset * left_normals(line.heading))
 
@@ -149,7 +150,7 @@ class NuPlanLane(_Edge):
 
     @property
     def adjacent_edges(self) -> tuple[NuPlanLane | None, NuPlanLane | None]:
-        """The neighbours of the same direction, on the left and on the right."""
+        """The neighbours of the same direction, on the left and on the right; None without one."""
         left, right = self._map.scenario.lane_left[self.row], self._map.scenario.lane_right[self.row]
         return self._map.lanes.get(int(left)), self._map.lanes.get(int(right))
 
@@ -201,10 +202,11 @@ class NuPlanLane(_Edge):
         return self.distance_m(point) <= 0.0
 
     def distance_m(self, point: Any) -> float:
-        """Return the distance of a point from the lane; 0 or less inside."""
+        """Return the distance of a point from the lane, m; 0 or less inside."""
         line, xy = self.baseline_path, _xy(point)
         arc_m, distance_m = (float(value[0]) for value in project(line.points, xy))
         if not 0.0 < arc_m < line.length:
+            # Beyond an end of the centre line, the distance is that from the straight end of the strip.
             end, outward = (0, -1) if arc_m <= 0.0 else (-1, 1)
             (x, y), heading = xy[0] - line.points[end], line.heading[end]
             beyond_m = (x * np.cos(heading) + y * np.sin(heading)) * outward
@@ -236,7 +238,7 @@ class Area:
         return self.distance_m(point) <= 0.0
 
     def distance_m(self, point: Any) -> float:
-        """Return the distance of a point from the nearest lane."""
+        """Return the distance of a point from the nearest lane, m; 0 or less inside."""
         return min(lane.distance_m(point) for lane in self.interior_edges)
 
 
@@ -345,12 +347,14 @@ class MapApi(DevkitObject):
         return object_id, distance_m
 
     def __getattr__(self, name: str) -> Any:
+        """Refuse what the devkit's maps have and this map lacks, with the nearest name."""
         if name.startswith("_") or name in ("lanes", "blocks", "block_of", "scenario"):
             raise AttributeError(name)
         methods = [method for method in dir(MapApi) if method.startswith(("get_", "is_"))]
         raise NotImplementedError(f"the map has no {name}; {did_you_mean(name, methods)}")
 
     def _objects(self, layer: Any) -> list[Any]:
+        """Return the objects of a layer of this map or the devkit, by its number."""
         try:
             member = SemanticMapLayer(int(layer))
         except ValueError:
@@ -378,5 +382,5 @@ def _unique(blocks: Iterable[NuPlanRoadBlock]) -> list[NuPlanRoadBlock]:
 
 
 def _xy(point: Any) -> Float[np.ndarray, "1 2"]:
-    """Return a point as an array."""
+    """Return any object with x and y as an array of one point."""
     return np.array([[point.x, point.y]], np.float64)

@@ -40,9 +40,9 @@ _LATE_S = 1e-3
 _PLANS = "compute_planner_trajectory"
 
 
-def is_nuplan(thing: Any) -> bool:
+def is_nuplan(candidate: Any) -> bool:
     """Return whether a class or object has nuPlan's interface of planners."""
-    return callable(getattr(thing, _PLANS, None))
+    return callable(getattr(candidate, _PLANS, None))
 
 
 @record
@@ -108,12 +108,15 @@ class Host:
     """Instances of a planner, one per episode.
 
     Args:
-        thing: Class of the planner, or an instance to copy.
+        candidate: Class of the planner, or an instance to copy.
         name: Dotted name of the planner, for messages.
+
+    Raises:
+        UsageError: The planner cannot be made, or observes something other than ``DetectionsTracks``.
     """
 
-    def __init__(self, thing: Any, name: str) -> None:
-        self._make = thing if isinstance(thing, type) else partial(copy.deepcopy, thing)
+    def __init__(self, candidate: Any, name: str) -> None:
+        self._make = candidate if isinstance(candidate, type) else partial(copy.deepcopy, candidate)
         try:
             planner = self._make()
             self.name = str(planner.name())
@@ -132,10 +135,16 @@ class Host:
     def plan(
         self, steps: int, identity: Any, start: Any, step: Any, *inputs: Any
     ) -> Float[np.ndarray, "n 3"]:
-        """Return the planned poses of the box centre from now on, in the scenario's frame."""
+        """Return the planned poses of the box centre now and in the next ``steps`` steps, in the scenario's frame.
+
+        ``inputs`` are history, actuators and frame at ``step``; ``start`` is the first step of the episode.
+
+        Raises:
+            PlannerError: The planner raises an error, now or at an earlier step, or returns no trajectory from now on.
+        """
         identity, start, step = int(identity), int(start), int(step)
         episode = self._episodes.get(identity)
-        # A short batch repeats its last scenario.
+        # A short batch repeats its last scenario, whose step must not be planned twice.
         if episode is not None and episode.step == step and _equal(episode.inputs, inputs):
             return episode.plan
         try:
@@ -154,7 +163,10 @@ class Host:
         return episode.plan
 
     def _start_episode(self, identity: int, step: int, history: Any) -> _Episode:
-        """Make and initialize an instance with the logged history; forget episodes that are further on."""
+        """Make and initialise an instance with the logged history.
+
+        Episodes of a batch advance together, so those of later steps are over and forgotten.
+        """
         if self.scenario_of is None:
             raise UsageError(
                 f"planner {self.name} needs stored scenarios", cure="evaluate a set or drivax.load"
@@ -173,9 +185,10 @@ class Host:
     def _plan(
         self, episode: _Episode, steps: int, step: int, start: int, history: Any, actuators: Any, frame: Any
     ) -> Float[np.ndarray, "n 3"]:
+        """Append the present state to the episode's history, and return the poses of the planner's trajectory."""
         view = episode.view
-        last = episode.egos[-1].dynamic_car_state if step > start else None
-        episode.egos.append(view.ego(step, history, actuators, last))
+        last_state = episode.egos[-1].dynamic_car_state if step > start else None
+        episode.egos.append(view.ego(step, history, actuators, last_state))
         episode.observations.append(view.tracks(step, frame.box, frame.velocity, frame.valid, frame.kind))
         iteration = nuplan.SimulationIteration(nuplan.TimePoint.of_step(step), step - start)
         buffer = nuplan.SimulationHistoryBuffer(list(episode.egos), list(episode.observations))
@@ -184,7 +197,7 @@ class Host:
 
 
 class View:
-    """A scenario in nuPlan's terms."""
+    """A scenario in nuPlan's terms; poses are in the source's frame."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario, self.map = scenario, MapApi(scenario)
@@ -202,6 +215,21 @@ class View:
     def initialization(self) -> nuplan.PlannerInitialization:
         """Return route, goal and map."""
         scenario, count = self.scenario, int(self.scenario.route_points[0])
+        goal = np.asarray(scenario.goal_xy, np.float64)
+        heading = float(scenario.agent_heading[scenario.current_step, 0])
+        if count:
+            distance = np.linalg.norm(scenario.route_xy[0, :count] - goal, axis=1)
+            heading = float(scenario.route_heading[0, distance.argmin()])
+        x, y = (goal + self.origin).tolist()
+        return nuplan.PlannerInitialization(self._route(), nuplan.StateSE2(x, y, heading), self.map)
+
+    def _route(self) -> list[str]:
+        """Return the roadblocks of the route, extended by a successor if there is only one.
+
+        Raises:
+            PlannerError: The scenario has no route on lanes.
+        """
+        scenario, count = self.scenario, int(self.scenario.route_points[0])
         rows = dict.fromkeys(int(row) for row in scenario.route_lane[0, :count] if int(row) in self.map.lanes)
         blocks = [self.map.block_of[row] for row in rows]
         route = [name for k, name in enumerate(blocks) if k == 0 or name != blocks[k - 1]]
@@ -211,20 +239,15 @@ class View:
         if len(route) < 2:
             successors = self.map.blocks[route[0]].outgoing_edges
             route += [block.id for block in successors if block.id not in route][:1]
-        goal = np.asarray(scenario.goal_xy, np.float64)
-        heading = float(scenario.agent_heading[scenario.current_step, 0])
-        if count:
-            distance = np.linalg.norm(scenario.route_xy[0, :count] - goal, axis=1)
-            heading = float(scenario.route_heading[0, distance.argmin()])
-        x, y = (goal + self.origin).tolist()
-        return nuplan.PlannerInitialization(route, nuplan.StateSE2(x, y, heading), self.map)
+        return route
 
     def ego(
         self, step: int, history: Any, actuators: Any = None, last: nuplan.DynamicCarState | None = None
     ) -> nuplan.EgoState:
         """Return ego at a step, computed from its motions until then.
 
-        ``actuators`` (if finite) determine acceleration and steering. With the ``last`` simulated state, speed and
+        ``history`` holds the motions up to the step. ``actuators``, what they did in the last step, determine
+        acceleration and steering; if None or not finite, the motions do. With the ``last`` simulated state, speed and
         steering determine the yaw rate, as in nuPlan's vehicle model.
         """
         now, before, earlier = (np.asarray(history[-k], np.float64) for k in (1, 2, 3))
@@ -238,6 +261,7 @@ class View:
         yaw_acceleration = (yaw_rate - last_yaw_rate) / DT_S
         steering = math.atan(yaw_rate * wheelbase / speed) if speed > _STILL_MPS else 0.0
         if actuators is not None and np.isfinite(actuators).all():
+            # The steering angle is that at the start of the last step.
             acceleration, steering, steering_rate = (float(value) for value in actuators)
             steering += steering_rate * DT_S
             if last is not None:
@@ -253,7 +277,7 @@ class View:
         return nuplan.EgoState(box, dynamic, steering, nuplan.TimePoint.of_step(step))
 
     def tracks(self, step: int, box: Any, velocity: Any, valid: Any, kind: Any) -> nuplan.DetectionsTracks:
-        """Return the other agents of a frame."""
+        """Return the agents of a frame other than ego."""
         time_us, objects = nuplan.TimePoint.of_step(step).time_us, []
         for slot in np.flatnonzero(valid).tolist():
             if slot == 0:  # ego
@@ -271,7 +295,7 @@ class View:
         return nuplan.DetectionsTracks(nuplan.TrackedObjects(objects))
 
     def logged_tracks(self, step: int) -> nuplan.DetectionsTracks:
-        """Return the other agents as logged; before the log, they keep their first velocity."""
+        """Return the agents other than ego as logged; before the log, they keep their first velocity."""
         scenario, moving, parked = self.scenario, slice(self._moving_count), slice(self._parked_count)
         log_step = max(step, 0)
         velocity = scenario.agent_velocity[log_step, moving]
@@ -336,10 +360,11 @@ def _read_states(trajectory: Any) -> list[tuple[float, float, float, float]]:
 
 
 def _axle_speed(last: Any, now: Any) -> float:
-    """Return the speed of the rear axle: the component of the centre's speed along the heading."""
+    """Return the speed of the rear axle after a step: the component of the centre's speed along the heading."""
     dx, dy = now[:2] - last[:2]
     if math.hypot(dx, dy) < _STILL_M:
         return float(now[MOTION_SPEED])
+    # The centre moves along the mean heading of the step plus the slip angle.
     slip = math.atan2(dy, dx) - last[2] - float(wrap(now[2] - last[2])) / 2
     return float(now[MOTION_SPEED]) * math.cos(slip)
 

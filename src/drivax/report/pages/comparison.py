@@ -39,11 +39,13 @@ def comparison_tables(comparison: Comparison, arms: tuple[str, str] = ("A", "B")
 
 
 def _table(
-    comparison: Comparison, arms: tuple[str, str], name: str, p: str, metrics: list[MetricComparison]
+    comparison: Comparison, arms: tuple[str, str], name: str, p_heading: str, metrics: list[MetricComparison]
 ) -> Table:
+    """Return a row per metric; ``name`` heads the metrics, ``p_heading`` their p-values."""
     columns = (
         Column(name, label=True), *map(Column, arms), Column("A − B"),
-        Column("next to zero", picture=True), Column(effect_name(comparison)), Column(p), Column("n"), Column("better"),
+        Column("next to zero", picture=True), Column(effect_name(comparison)), Column(p_heading), Column("n"),
+        Column("better"),
     )  # fmt: skip
     return Table(name, columns, tuple(map(_row, metrics)))
 
@@ -65,11 +67,11 @@ def _row(metric: MetricComparison) -> tuple[Cell, ...]:
 
 
 def _picture(metric: MetricComparison, label: MetricLabel) -> str:
-    """Return the interval of the difference around zero: A is higher on the right, B on the left."""
+    """Return the interval of the difference around zero as SVG, or "" without one; on the right, A is higher."""
     mean, low, high = metric.difference.mean, metric.difference.low, metric.difference.high
     if mean is None or low is None or high is None or low == high:
         return ""
-    limit = 1.15 * max(abs(low), abs(high))
+    limit = 1.15 * max(abs(low), abs(high))  # a margin of 15 %
     left, middle, right = (_WIDTH / 2 * (1 + value / limit) for value in (low, mean, high))
     label_text = f"A − B: {number(mean, label.unit, signed=True)}, {bounds(metric.difference, label.unit, signed=True)}"
     return (

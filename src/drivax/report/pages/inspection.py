@@ -21,7 +21,7 @@ from drivax.report.pages.page import asset, definitions, page, section
 from drivax.report.pictures.palette import stroke
 from drivax.scenario.select.selection import FINDINGS
 
-#: Maximum number of values of a shown tag; excludes ids and dates.
+#: Tags with more values, such as ids and dates, are not shown.
 _MAX_TAG_VALUES = 16
 
 

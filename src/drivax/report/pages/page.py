@@ -54,9 +54,9 @@ def section(title: str, *parts: str, note: str = "", attributes: str = "") -> st
 
 
 def data_element(value: Any, **attributes: str) -> str:
-    """Return a script element that holds JSON, with every ``<`` escaped."""
+    """Return a script element that holds JSON; every ``<`` is escaped, so that no text ends the element."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    attributes_text = "".join(f' {name}="{escape(text)}"' for name, text in attributes.items())
+    attributes_text = "".join(f' {name}="{escape(content)}"' for name, content in attributes.items())
     return f'<script type="application/json"{attributes_text}>{text}</script>'
 
 

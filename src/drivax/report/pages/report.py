@@ -35,8 +35,8 @@ from drivax.report.table_files import strata_tables, transfer_tables
 from drivax.table import bounds, number, suffix
 
 EPISODES = 12
-#: Selected episodes and their data for the player.
-Packed = Sequence[tuple[EpisodeGroup, Mapping[str, Any]]]
+#: Selected episodes, and their data for the player.
+PackedEpisodes = Sequence[tuple[EpisodeGroup, Mapping[str, Any]]]
 
 
 def write_report(
@@ -59,33 +59,41 @@ def write_report(
     if episodes < 0:
         raise UsageError(f"cannot show {episodes} episodes", cure="give 0 or more")
     evaluations, trainings = read_runs(runs)
-    packed, tags = _load_episodes(evaluations, data, episodes) if evaluations and episodes else ((), {})
-    write_text(out, _page(evaluations, trainings, packed, tags))
+    packed_episodes, tags = (
+        _load_episodes(evaluations, data, episodes) if evaluations and episodes else ((), {})
+    )
+    write_text(out, _page(evaluations, trainings, packed_episodes, tags))
     return out
 
 
-def _load_episodes(runs: Sequence[EpisodeTable], data: Path | None, count: int) -> tuple[Packed, Tags]:
+def _load_episodes(
+    runs: Sequence[EpisodeTable], data: Path | None, count: int
+) -> tuple[PackedEpisodes, Tags]:
     """Return the selected episodes with their data for the player, and the tags of all scenarios."""
     scenarios = EvaluatedSet(runs[-1], data)
-    packed = []
+    packed_episodes = []
     for group in choose(runs, count):
         scenario = scenarios.scenario(group.key)
         title = f"{group.scenario_id}: {group.outcome}"
-        packed.append((group, pack_episode(scenario, rollouts_of(runs, group, scenario), title)))
-    return packed, scenarios.tags()
+        packed_episodes.append((group, pack_episode(scenario, rollouts_of(runs, group, scenario), title)))
+    return packed_episodes, scenarios.tags()
 
 
-def _page(runs: Sequence[EpisodeTable], trainings: Sequence[Training], packed: Packed, tags: Tags) -> str:
+def _page(
+    runs: Sequence[EpisodeTable], trainings: Sequence[Training], packed_episodes: PackedEpisodes, tags: Tags
+) -> str:
     sections, data, scripts = [], [], []
     if runs:
         sections = [
             _results(runs), _differences(runs), _transfer(runs), _collisions(runs),
-            _strata(runs, tags), _distributions(runs), _episodes(runs, packed),
+            _strata(runs, tags), _distributions(runs), _episodes(runs, packed_episodes),
         ]  # fmt: skip
-        playable: dict[ScenarioKey, int] = {group.key: index for index, (group, _) in enumerate(packed)}
-        data = player_data([episode for _, episode in packed]) if packed else []
+        playable: dict[ScenarioKey, int] = {
+            group.key: index for index, (group, _) in enumerate(packed_episodes)
+        }
+        data = player_data([episode for _, episode in packed_episodes]) if packed_episodes else []
         data.append(episode_data(runs, tags, playable))
-        scripts += [*(player_scripts() if packed else ()), asset("episode_table.js")]
+        scripts += [*(player_scripts() if packed_episodes else ()), asset("episode_table.js")]
     if trainings:
         sections.append(section("Learning curves", curve_sections(trainings)))
     if runs:
@@ -209,24 +217,28 @@ def _distributions(runs: Sequence[EpisodeTable]) -> str:
     return section("Distributions", distribution_charts(runs), note=note)
 
 
-def _episodes(runs: Sequence[EpisodeTable], packed: Packed) -> str:
-    note = "▶ marks the episodes in the player below." if packed else "This page has no rollouts and no tags."
+def _episodes(runs: Sequence[EpisodeTable], packed_episodes: PackedEpisodes) -> str:
+    note = (
+        "▶ marks the episodes in the player below."
+        if packed_episodes
+        else "This page has no rollouts and no tags."
+    )
     text = (
         "<p>All episodes, worst first: by the severity of failures, then by the lowest score. Click a number in the "
         f"tables above for its episodes. {note}</p>"
     )
     episode_list = asset("episode_list.html").rstrip()
-    return section("Episodes", text, episode_list, _player(runs, packed), attributes=" id=episodes")
+    return section("Episodes", text, episode_list, _player(runs, packed_episodes), attributes=" id=episodes")
 
 
-def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
-    if not packed:
+def _player(runs: Sequence[EpisodeTable], packed_episodes: PackedEpisodes) -> str:
+    if not packed_episodes:
         return ""
     buttons = "".join(
         f"<button type=button data-episode aria-pressed=false>"
         f'<span class="{"good" if group.outcome == "success" else "bad"}">{escape(group.outcome)}</span>'
         f"<small>{escape(group.scenario_id)}</small></button>"
-        for group, _ in packed
+        for group, _ in packed_episodes
     )
     policy = escape(runs[-1].name)
     comparable_runs = [run for run in runs if comparable(run, runs[-1])]
@@ -273,7 +285,7 @@ def _provenance(runs: Sequence[EpisodeTable | Training]) -> str:
     )
 
 
-#: Maximum number of values of a selectable tag; excludes ids and places.
+#: Tags with more values, such as ids and places, cannot be selected.
 MAX_TAG_VALUES = 24
 #: Columns of the list, if a run has them; all other metrics filter and sort it.
 _SHOWN = (
@@ -307,6 +319,7 @@ def episode_data(runs: Sequence[EpisodeTable], tags: Tags, playable: Mapping[Sce
 
 
 def _metric(name: str, runs: Sequence[EpisodeTable]) -> dict[str, Any]:
+    """Return the label of a metric; ``bad`` is the value of a rate that means failure, None for other metrics."""
     label = result_tables.metric_label(name, runs)
     bad = {"high": 0, "low": 1, "-": None}[label.better] if name in RATES else None
     return {"name": name, "label": label.text, "better": label.better, "unit": label.unit, "bad": bad}
@@ -315,6 +328,7 @@ def _metric(name: str, runs: Sequence[EpisodeTable]) -> dict[str, Any]:
 def _run(
     run: EpisodeTable, runs: Sequence[EpisodeTable], names: Sequence[str], index_of: Mapping[ScenarioKey, int]
 ) -> dict[str, Any]:
+    """Return a run's episodes, worst first."""
     rows = sort_worst_first(run, [other for other in runs if other is not run])
     outcomes = [outcome(run, row) for row in rows]
     distinct = list(dict.fromkeys(outcomes))
@@ -333,6 +347,7 @@ def _run(
 
 
 def _column(values: Any, rows: Sequence[int]) -> list[float | None]:
+    """Return a metric in these rows, None where it is undefined or the run lacks it."""
     if values is None:
         return [None] * len(rows)
     return [None if np.isnan(value) else _round_significant(value) for value in np.asarray(values)[rows]]
@@ -345,6 +360,7 @@ def _round_significant(value: float) -> float:
 
 
 def _tags(scenario_tags: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
+    """Return each selectable tag: its values, and the indices of those of each scenario."""
     columns = []
     for name in dict.fromkeys(name for tags in scenario_tags for name in tags):
         values = [tags.get(name, result_tables.UNKNOWN).split("|") for tags in scenario_tags]

@@ -21,7 +21,7 @@ from drivax.report.pictures.player_data import pack_episode
 from drivax.scenario.schema import DT_S, Scenario
 from drivax.scenario.store import ScenarioSet
 
-#: Findings of the audit that count as violations, and their text in the list.
+#: Findings of the audit that are violations, and their text in the list.
 _FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red", "log_reverses": "drives backwards"}
 
 
@@ -73,7 +73,7 @@ def write_player(
 
 
 def findings(scenario: Scenario) -> str:
-    """Return the violations that the audit found in a log, as text."""
+    """Return the violations that the audit found in a log, as text; empty without any."""
     texts = [text for name, text in _FINDINGS.items() if scenario.audit.get(name)]
     if (scenario.audit.get("log_offroad_fraction") or 0.0) > 0.0:
         texts.append("off-road")

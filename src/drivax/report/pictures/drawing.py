@@ -87,8 +87,8 @@ def surroundings(scenario: Scenario, rollouts: Sequence[Rollout]) -> Box:
 class Shape:
     """Lines or polygons ``[n, 2]`` of one style, metres.
 
-    ``line`` and ``fill`` are the colours of outline and inside, None to draw none. ``dash`` has the lengths of dashes
-    and gaps in pixels, ``level`` is the drawing order.
+    ``line`` and ``fill`` are the colours of outline and inside; without a colour it is not drawn. ``dash`` has the
+    lengths of dashes and gaps in pixels, empty for a solid line. Shapes of a higher ``level`` are drawn on top.
     """
 
     lines: Sequence[Array]
@@ -150,12 +150,12 @@ class Drawing:
         """Return the drawing of a scenario within a box (low x, low y, high x, high y)."""
         signs = scenario.stop_xy[(scenario.stop_xy != 0).any(axis=1)]
         line, state = _lights(scenario)
-        near = _within(line[:, 0], box)
+        is_near = _within(line[:, 0], box)
         route = scenario.route_xy[0, : int(scenario.route_points[0])]
         goal = np.asarray(scenario.goal_xy)[None]
         return cls(
             road_lines(scenario, box), signs[_within(signs, box)], route[_within(route, box)],
-            goal[_within(goal, box)], line[near], state[:, near],
+            goal[_within(goal, box)], line[is_near], state[:, is_near],
             _agent_boxes(scenario, box), _parked_boxes(scenario, box), _boxes(scenario, slice(0, 1)),
         )  # fmt: skip
 
@@ -190,6 +190,7 @@ class Drawing:
             yield Shape([_outline((x, y), heading, size)], "ink", "ego", level=6)
             ahead = np.array((np.cos(heading), np.sin(heading)))
             left = np.array((-ahead[1], ahead[0]))
+            # An arrow on the roof: its tip and base ahead of the centre, and half its width, as shares of the size.
             tip, base, side = 0.38 * size[0] * ahead, 0.05 * size[0] * ahead, 0.32 * size[1] * left
             arrow = np.array((x, y)) + np.array((tip, base + side, base - side))
             yield Shape([arrow], fill="outline", level=7)
@@ -202,7 +203,7 @@ def _outline(xy: Any, heading: Any, size: Any) -> Float[Array, "5 2"]:
 
 
 def ring(xy: Array, radius: float) -> Float[Array, "25 2"]:
-    """Return a circle."""
+    """Return the points of a circle; the last is the first."""
     angle = np.linspace(0.0, 2 * np.pi, 25)
     return xy + radius * np.column_stack((np.cos(angle), np.sin(angle)))
 
@@ -222,8 +223,8 @@ def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
     rows = np.lexsort((scenario.segment_start_m[:count], scenario.segment_feature[:count]))
     a, b = scenario.segment_a[rows, :2], scenario.segment_b[rows, :2]
     if box is not None:
-        inside = _within((a + b) / 2, box)
-        rows, a, b = rows[inside], a[inside], b[inside]
+        is_inside = _within((a + b) / 2, box)
+        rows, a, b = rows[is_inside], a[is_inside], b[is_inside]
     layers: dict[str, Lines] = {name: [] for name in LAYERS}
     if not len(rows):
         return layers
@@ -261,10 +262,10 @@ def _boxes(scenario: Scenario, rows: Any, valid: Any = None) -> Boxes:
 def _agent_boxes(scenario: Scenario, box: Box) -> Boxes:
     """Return all moving agents but ego, present while they are inside the box."""
     steps = int(scenario.steps)
-    near = scenario.agent_valid[:steps] & _within(scenario.agent_xy[:steps], box)
-    near[:, 0] = False
-    rows = np.flatnonzero(near.any(axis=0))
-    return _boxes(scenario, rows, near[:, rows])
+    is_near = scenario.agent_valid[:steps] & _within(scenario.agent_xy[:steps], box)
+    is_near[:, 0] = False
+    rows = np.flatnonzero(is_near.any(axis=0))
+    return _boxes(scenario, rows, is_near[:, rows])
 
 
 def _parked_boxes(scenario: Scenario, box: Box) -> Boxes:

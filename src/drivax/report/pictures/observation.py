@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Values = np.ndarray[Any, Any]
+#: Colours by position in one-hot features: kinds of agents, states of lights (by name), kinds of road (and widths).
 _KINDS = ("vehicle", "pedestrian", "cyclist", "other")
 _STATES = {"unknown": "unknown", "green": "green", "yellow": "amber", "red": "red"}
 _ROADS = {"lane": ("lane", 1.6), "edge": ("edge", 2.2), "crosswalk": ("line", 5.0)}
@@ -33,6 +34,7 @@ _MAX_DISTANCE_M, _MARGIN_M = 130.0, 4.0
 _MIN_ASPECT = 0.66
 #: Radius of the dot for an agent of unknown size, m.
 _DOT_M = 0.9
+#: Units of features that are scaled.
 _SCALE = {
     "position": POSITION_M, "goal": POSITION_M, "velocity": SPEED_MPS, "length": SIZE_M, "width": SIZE_M
 }  # fmt: skip
@@ -120,6 +122,7 @@ def _to_paper(points: Values) -> Values:
 
 def _extent(groups: ObservationGroups) -> tuple[Values, Values]:
     """Return the low and high corner of a rectangle around all points, clipped to ``_MAX_DISTANCE_M``."""
+    # The picture is not smaller than this.
     points = [np.zeros((1, 2)), np.array([[20.0, 12.0], [-8.0, -12.0]])]
     for group in ("agents", "road", "lights", "route", "ego"):
         if groups.has(group, "position"):
@@ -207,15 +210,19 @@ def _draw_lights(axes: Axes, groups: ObservationGroups) -> None:
         axes.scatter(x, y, s=size, color=colour, edgecolor=edge, linewidth=width, marker="s", zorder=3)
 
 
+def _opacity(step: int, steps: int) -> float:
+    """Return the opacity of a pose: 1 at the last step, the less the earlier before it."""
+    return 1.0 if step == steps - 1 else 0.12 + 0.3 * step / steps
+
+
 def _draw_agents(axes: Axes, groups: ObservationGroups) -> None:
     mask = groups.masks["agents"]
     steps = mask.shape[1]
     for row in np.flatnonzero(mask[:, -1]):
         kind = groups["agents", "type"][row, -1] if groups.has("agents", "type") else np.eye(4)[0]
         colour = LIGHT[_KINDS[int(np.argmax(kind))]]
-        for step in np.flatnonzero(mask[row]):
-            alpha = 1.0 if step == steps - 1 else 0.12 + 0.3 * step / steps
-            _outline(axes, groups, "agents", (row, step), colour, alpha, 4.0 + step / steps)
+        for step in np.flatnonzero(mask[row]).tolist():
+            _outline(axes, groups, "agents", (row, step), colour, _opacity(step, steps), 4.0 + step / steps)
         if kind[1] + kind[2] > 0:  # pedestrians and cyclists get a halo
             centre = _to_paper(groups["agents", "position"][row, -1])
             axes.scatter(*centre, s=70, color=colour, alpha=0.45, linewidth=0, zorder=3.9)
@@ -247,7 +254,7 @@ def _outline(
 
 
 def _arrow(axes: Axes, position: Values, velocity: Values) -> None:
-    """Draw an arrow to the position in one second at this velocity."""
+    """Draw an arrow to the position in one second at this velocity, none below 0.5 m/s."""
     if np.hypot(*velocity) < 0.5:
         return
     start, end = _to_paper(position), _to_paper(position + velocity)
@@ -264,8 +271,7 @@ def _draw_ego(axes: Axes, groups: ObservationGroups) -> None:
         return
     steps = len(groups["ego", "position"])
     for step in range(steps):
-        alpha = 1.0 if step == steps - 1 else 0.12 + 0.3 * step / steps
-        _outline(axes, groups, "ego", (step,), LIGHT["ego"], alpha, 6.0 + step / steps)
+        _outline(axes, groups, "ego", (step,), LIGHT["ego"], _opacity(step, steps), 6.0 + step / steps)
     if groups.has("ego", "velocity"):
         _arrow(axes, groups["ego", "position"][-1], groups["ego", "velocity"][-1])
 

@@ -26,7 +26,8 @@ from drivax.scenario.schema import Scenario
 Array = np.ndarray[Any, Any]
 #: Marks an absent pose or value.
 ABSENT = -32768
-_RADIAN = 10_000
+#: Packed headings per radian, and largest packed value: int16 holds little more.
+_PER_RADIAN, _MOST = 10_000, 32_000
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Scale:
         low, high = np.array(box[:2]), np.array(box[2:])
         centre = (low + high) / 2
         reach = float((high - low).max()) / 2 + 10.0
-        return cls((round(float(centre[0]), 2), round(float(centre[1]), 2)), max(0.01, reach / 32_000))
+        return cls((round(float(centre[0]), 2), round(float(centre[1]), 2)), max(0.01, reach / _MOST))
 
     def points(self, xy: Array) -> Array:
         """Return points ``[..., 2]`` as int16."""
@@ -57,7 +58,7 @@ class Scale:
         result = np.full((*valid.shape, 3), ABSENT, np.int16)
         result[valid, :2] = self.points(xy[valid])
         angle = (np.asarray(heading[valid], np.float64) + np.pi) % (2 * np.pi) - np.pi
-        result[valid, 2] = np.round(angle * _RADIAN).astype(np.int16)
+        result[valid, 2] = np.round(angle * _PER_RADIAN).astype(np.int16)
         return result
 
 
@@ -98,6 +99,7 @@ def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) ->
 
 
 def _encode(array: Array) -> str:
+    """Return int16, or smaller integers as int8, in base64."""
     dtype = "<i2" if array.dtype == np.int16 else "i1"
     return base64.b64encode(np.ascontiguousarray(array, dtype=dtype).tobytes()).decode("ascii")
 
@@ -119,6 +121,7 @@ def _boxes(scale: Scale, boxes: Boxes, poses: Array) -> dict[str, Any]:
 
 
 def _parked_entries(scale: Scale, parked: Boxes) -> dict[str, Any]:
+    """Return parked agents with one pose each, and the first and last step at which they are present."""
     valid = parked.valid
     poses = scale.poses(parked.xy[0], parked.heading[0], np.ones(len(parked.size), bool))
     first, last = valid.argmax(axis=0), len(valid) - 1 - valid[::-1].argmax(axis=0)
@@ -128,7 +131,7 @@ def _parked_entries(scale: Scale, parked: Boxes) -> dict[str, Any]:
 def _rollout(rollout: Rollout, scale: Scale, steps: int) -> dict[str, Any]:
     ego = np.asarray(rollout.ego, np.float64)[:steps]
     valid = np.asarray(np.isfinite(ego).all(axis=1))
-    speed = np.clip(np.round(np.where(valid, ego[:, 3], 0.0) * 100), -32_000, 32_000)
+    speed = np.clip(np.round(np.where(valid, ego[:, 3], 0.0) * 100), -_MOST, _MOST)
     return {
         "planner": rollout.planner,
         "pose": _encode(scale.poses(ego[:, :2], ego[:, 2], valid)),
@@ -150,5 +153,5 @@ def _signals(ego: Float[Array, "step 4"], action: Float[Array, "step 2"] | None)
 
 
 def _signal(signal: Signal, values: Float[Array, " step"]) -> str:
-    rounded = np.clip(np.round(values / signal.step), -32_000, 32_000)
+    rounded = np.clip(np.round(values / signal.step), -_MOST, _MOST)
     return _encode(np.where(np.isnan(rounded), ABSENT, rounded).astype(np.int16))

@@ -77,9 +77,13 @@ def draw_on(
     axes: Axes, scenario: Scenario, step: int, centre: tuple[float, float], reach_m: float, path: Any = None,
     colours: Colours = LIGHT,
 ) -> None:  # fmt: skip
-    """Draw a square of a scenario on axes; the arguments are those of :func:`draw_scenario`."""
+    """Draw a square of a scenario on axes.
+
+    ``path`` is ``ego`` of :func:`draw_scenario`, and ``colours`` are those of a theme; other arguments are the same.
+    """
     from matplotlib.patches import Rectangle
 
+    # Shapes whose centre lies up to 5 m outside may reach into the square.
     (x, y), half_size_m = centre, reach_m + 5.0
     drawing = Drawing.of(scenario, (x - half_size_m, y - half_size_m, x + half_size_m, y + half_size_m))
     logged = path is not None

@@ -93,8 +93,8 @@ def _select_episodes(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGr
         return groups[: int(count)]
     if matches := [group for group in groups if group.scenario_id == which]:
         return matches
-    near = did_you_mean(which, [group.scenario_id for group in groups])
-    cure = near if near.startswith("did") else "write worst:N, all, or an id of its episodes.csv"
+    hint = did_you_mean(which, [group.scenario_id for group in groups])
+    cure = hint if hint.startswith("did") else "write worst:N, all, or an id of its episodes.csv"
     raise UsageError(f"no episode of scenario {which!r} is stored", file=runs[-1].folder, cure=cure)
 
 
@@ -166,6 +166,7 @@ Array = np.ndarray[Any, Any]
 Picture = UInt8[Array, "_ _ 4"]
 #: Metres across the shorter edge of a picture.
 VIEW_M = 70.0
+#: Heights of the bar at the top of a picture and of a line of the legend, pixels.
 _BAR, _LINE = 30, 22
 
 
@@ -247,6 +248,7 @@ class Canvas:
         self._draw_pixels(edges, None, 0.0, fill)
 
     def _draw_pixels(self, points: Array, line: str | None, width: float, fill: str | None) -> None:
+        """Draw a polygon in pixels from the upper left corner."""
         camera, self._camera = self._camera, self._affine().scale(1, -1).translate(0, self.height)
         self.draw(self._path(points), line, width, fill)
         self._camera = camera
@@ -301,7 +303,7 @@ def legend_strip(width: int, theme: str) -> Picture:
     """Return the legend, as wide as a picture and an even number of pixels high."""
     entries, x, y = [], 10.0, 0
     for name, words in LEGEND:
-        length = 34 + 7.0 * len(words)
+        length = 34 + 7.0 * len(words)  # symbol, gap, and about 7 pixels per letter
         if x + length > width - 10:
             x, y = 10.0, y + _LINE
         entries.append((x, y, name, words))

@@ -72,6 +72,7 @@ class Sizes:
 
     Attributes:
         agents, slots: Moving agents; slots of a frame for moving and parked agents.
+        lights: Traffic lights.
         edges, lanes, road: Segments of road edges and of car lanes, and pieces of road to observe.
         edge_run, lane_run: Longest run of a row of three grid cells.
         graphs: Lanes of the graph.
@@ -101,10 +102,10 @@ class Sizes:
     def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
         """Return the sizes that one or more scenarios of one capacity use."""
         batches = iter(scenarios)
-        each = [_batch_sizes(batch) for batch in iter(lambda: list(islice(batches, _BATCH)), [])]
-        if not each:
+        batch_sizes = [_batch_sizes(batch) for batch in iter(lambda: list(islice(batches, _BATCH)), [])]
+        if not batch_sizes:
             raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
-        return cls(*(max(getattr(sizes, field.name) for sizes in each) for field in fields(cls)))
+        return cls(*(max(getattr(sizes, field.name) for sizes in batch_sizes) for field in fields(cls)))
 
 
 def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
@@ -140,6 +141,7 @@ def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
 
 def _round_up(count: int, most: int) -> int:
     """Round up to a multiple of 8, but not above ``most``."""
+    # Floor division of the negative number rounds up.
     return min(most, -(-count // _MULTIPLE) * _MULTIPLE)
 
 
@@ -322,12 +324,12 @@ def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
 
     It is a four-byte BLAKE2b digest of data set, id and the number of earlier scenarios of that name: copies differ.
     """
-    seen: Counter[tuple[str, str]] = Counter()
+    counts: Counter[tuple[str, str]] = Counter()
     numbers = []
     for name in names:
-        digest = hashlib.blake2b("\0".join((*name, str(seen[name]))).encode(), digest_size=4).digest()
+        digest = hashlib.blake2b("\0".join((*name, str(counts[name]))).encode(), digest_size=4).digest()
         numbers.append(int.from_bytes(digest, "little"))
-        seen[name] += 1
+        counts[name] += 1
     return np.array(numbers, np.uint32)
 
 
@@ -354,7 +356,7 @@ def _stack_batch(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
 
 
 def _fill_agents(agents: Float[np.ndarray, "time agent 8"], log: _Record) -> None:
-    """Write the moving agents of a record in place. They hold most bytes of a bank."""
+    """Write the moving agents of a record in place: they hold most bytes of a bank, so no copy is made."""
     xy, z, heading, velocity, valid = (
         log[f"agent_{name}"][:, : agents.shape[1]] for name in ("xy", "z", "heading", "velocity", "valid")
     )
@@ -381,16 +383,19 @@ def _stack_agents(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
 def _log_ahead(
     xy: Float[np.ndarray, "n time 2"], valid: Bool[np.ndarray, "n time"]
 ) -> Float[np.ndarray, "n time"]:
-    """Distance in m that each logged ego drives from every step on; gaps of the log add nothing."""
-    moved = np.hypot(*np.moveaxis(np.diff(xy, axis=1), -1, 0)) * (valid[:, 1:] & valid[:, :-1])
-    ahead = np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
+    """Return the distance that each logged ego drives from every step on, m; gaps of the log add nothing."""
+    step_m = np.hypot(*np.moveaxis(np.diff(xy, axis=1), -1, 0)) * (valid[:, 1:] & valid[:, :-1])
+    ahead = np.cumsum(step_m[:, ::-1], axis=1)[:, ::-1]
     return np.concatenate([ahead, np.zeros_like(ahead[:, :1])], axis=1)
 
 
 def _stack_parked(
     records: Sequence[_Record], slots: int, first: Int[np.ndarray, " n"], box: Float[np.ndarray, "n agent 4"]
 ) -> _Arrays:
-    """Parked agents, from slot ``first`` of their scenario on, and the boxes of all agents."""
+    """Return the parked agents, from slot ``first`` of their scenario on, and the boxes of all agents.
+
+    ``box`` holds those of the moving agents.
+    """
     valid = stack_field(records, "parked_valid")
     count = last_used(valid.any(1))
     parked = slice(0, int(count.max()))
@@ -452,7 +457,7 @@ def _stack_lights(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
 def _stop_arcs(
     records: Sequence[_Record], lane: Int[np.ndarray, "n light"], middle: Float[np.ndarray, "n light 2"]
 ) -> Float[np.ndarray, "n light"]:
-    """Arc length along route 0 of the stop lines of its lanes, ``NEVER_M`` for those of other lanes."""
+    """Return the arc length along route 0 of the stop lines of its lanes, ``NEVER_M`` for those of other lanes."""
     arcs = np.full(lane.shape, NEVER_M)
     count = stack_field(records, "route_points", 0)
     route_lane = stack_field(records, "route_lane", 0)
@@ -467,10 +472,10 @@ def _stop_arcs(
         )
         dx, dy = np.moveaxis(middle[stops][:, None] - xy[scenario], -1, 0)
         squared_m = np.where(np.arange(xy.shape[1]) < count[scenario, None], dx * dx + dy * dy, np.inf)
-        near = np.argmin(squared_m, axis=1)
-        nearest, course = (np.arange(len(near)), near), heading[scenario, near]
+        point = np.argmin(squared_m, axis=1)
+        nearest, course = (np.arange(len(point)), point), heading[scenario, point]
         # Route points are 1 m apart: the index of the nearest is its arc length.
-        arcs[stops] = near + dx[nearest] * np.cos(course) + dy[nearest] * np.sin(course)
+        arcs[stops] = point + dx[nearest] * np.cos(course) + dy[nearest] * np.sin(course)
     return arcs
 
 
@@ -507,7 +512,7 @@ def _fill_segments(
 
 
 def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
-    """Half width, limit and index of each lane, as in :class:`LaneRow`; the last column is for no lane (-1)."""
+    """Return half width, limit and index of each lane, as in :class:`LaneRow`; the last column is for no lane (-1)."""
     count = int(last_used(stack_field(records, "lane_id") >= 0).max())
     lanes = np.append(np.arange(count), -1)
     width = stack_field(records, "lane_width", lanes)
@@ -517,15 +522,19 @@ def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
 
 
 def _lane_limits(records: Sequence[_Record], lanes: Int[np.ndarray, " lane"]) -> Float[np.ndarray, "n lane"]:
-    """Limit of each lane, m/s: for connectors the highest of the lanes that they join, if known; else of the class."""
+    """Return the limit of each lane, m/s, -1 unknown.
+
+    For connectors it is the highest of the lanes that they join, if known. Lanes without a limit have that of their
+    class.
+    """
     limit, kind, is_connector, *links = (
         stack_field(records, f"lane_{name}", lanes)
         for name in ("limit", "kind", "interpolating", "predecessor", "successor")
     )
     link = np.concatenate(links, axis=2)
     scenario = np.arange(len(records))[:, None, None]
-    joined = np.where(link >= 0, limit[scenario, link], -1.0).max(axis=2)
-    limit = np.where(is_connector & (joined > 0), joined, limit)
+    highest = np.where(link >= 0, limit[scenario, link], -1.0).max(axis=2)
+    limit = np.where(is_connector & (highest > 0), highest, limit)
     for road_kind, class_limit in CLASS_LIMIT_MPS.items():
         limit = np.where((limit <= 0) & (kind == road_kind), class_limit, limit)
     return limit

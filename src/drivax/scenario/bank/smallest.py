@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-#: Offset that keeps keys above the smallest normal float.
+#: Offset that keeps keys above the smallest normal float, below which processors may round to zero.
 _TINY = 1e-6
 #: Replaces infinity, which would become NaN with other low bits.
 _FAR = 1e30
@@ -42,7 +42,7 @@ def first_smallest(values: Float[Array, "..."], axis: int = -1, least: float = 0
     """
     count = values.shape[axis]
     bits = (count - 1).bit_length()
-    place = jax.lax.broadcasted_iota(jnp.int32, values.shape, axis % values.ndim)
-    key = embed_number(jnp.clip(values - least, 0.0, _FAR) + _TINY, place, bits)
+    index = jax.lax.broadcasted_iota(jnp.int32, values.shape, axis % values.ndim)
+    key = embed_number(jnp.clip(values - least, 0.0, _FAR) + _TINY, index, bits)
     # The bits of a NaN are any number, so keep the index inside the axis.
     return jnp.minimum(number_of(jnp.min(key, axis=axis), bits), count - 1)

@@ -24,7 +24,7 @@ Array = np.ndarray[Any, Any]
 NOWHERE_M = 1e6
 #: Stretch of a lane at its ends that decides its course, and distance from the ends for headings, m.
 _BEND_M, _END_M = 20.0, 1.0
-#: Value for a turn to or from a lane of which that stretch is not stored, larger than any other, rad.
+#: Turn to or from a lane whose stretch is not stored, larger than any known turn, rad.
 _UNKNOWN = 100.0
 #: Lanes that meet merge if their headings differ by less 20 m before; others cross or turn in.
 _MERGING_RAD = np.deg2rad(30.0)
@@ -45,23 +45,29 @@ def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
     lanes = _Lanes.of(records)
     tables = np.full((*lanes.mask.shape, 6), -1.0, np.float32)
     tables[..., StrandColumn.END] = NOWHERE_M
-    if not len(lanes.scenario):
-        return tables
+    if len(lanes.scenario):
+        tables[lanes.mask] = _strand_rows(records, lanes)
+    return tables
+
+
+def _strand_rows(records: Sequence[Array], lanes: _Lanes) -> Float[Array, "lane 6"]:
+    """Return a row of :class:`StrandColumn` for each stored lane (at least one) of all scenarios."""
     lane = np.arange(len(lanes.scenario))
     successor, predecessor = lanes.links(records, "successor"), lanes.links(records, "predecessor")
     courses, lane_of_link = _Courses.of(records, lanes), np.repeat(lane[:, None], 4, axis=1)
     ahead = _straightest_link(successor, courses.turn(lane_of_link, successor))
     behind = _straightest_link(predecessor, courses.turn(predecessor, lane_of_link))
-    # Two lanes belong to one strand if each is the straightest link of the other.
+    # Two lanes belong to one strand if each is the straightest link of the other. Index -1 reads the last lane; what it
+    # yields is masked.
     follows = np.where((ahead >= 0) & (behind[ahead] == lane), ahead, -1)
     strand, last = _strands(follows)
-    # A lane whose successor continues another lane merges onto that strand if both come from one direction.
+    # A lane whose successor continues another lane (its rival) merges onto that strand if both come from one direction.
     rival = np.where((ahead >= 0) & (follows < 0), behind[ahead], -1)
     merges = (rival >= 0) & (np.abs(wrap(courses.before - courses.before[rival])) <= _MERGING_RAD)
     onto = np.where(merges, strand[ahead], -1)
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
     is_dead_end = (successor < 0).all(axis=1) & _is_map_known(records, lanes.scenario, stop)
-    table = np.empty((len(lane), 6))
+    rows = np.empty((len(lane), 6))
     for column, name in ((StrandColumn.RIGHT, "right"), (StrandColumn.LEFT, "left")):
         adjacent = lanes.links(records, name)
         further = ((stop[last[adjacent]] - stop) * course).sum(axis=1)
@@ -69,13 +75,12 @@ def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
         is_further = ~(further <= _CONTINUES_M)
         continues = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | is_further)
         onto = np.where(is_dead_end & continues, strand[adjacent], onto)
-        table[:, column] = lanes.index(np.where(adjacent >= 0, strand[adjacent], -1))
+        rows[:, column] = lanes.index(np.where(adjacent >= 0, strand[adjacent], -1))
     # What holds for the last lane holds for the whole strand; a ring has no last lane.
     onto = np.where(follows[last] < 0, onto[last], -1)
-    table[:, StrandColumn.STRAND], table[:, StrandColumn.ONTO] = lanes.index(strand), lanes.index(onto)
-    table[:, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
-    tables[lanes.mask] = table
-    return tables
+    rows[:, StrandColumn.STRAND], rows[:, StrandColumn.ONTO] = lanes.index(strand), lanes.index(onto)
+    rows[:, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
+    return rows
 
 
 @dataclass(frozen=True)
@@ -118,8 +123,10 @@ class _Lanes:
 class _Courses:
     """Courses of lanes at their ends; NaN if the stretch is not stored.
 
-    Headings (rad) at the beginning, at the end and 20 m ``before`` the end; mean curvature (1/m) over the first and the
-    last 20 m; and the last point (m).
+    Attributes:
+        begin, end, before: Headings 1 m from the beginning, 1 m from the end, and 20 m from the end, rad.
+        early, late: Mean curvatures over the first and the last 20 m, 1/m.
+        stop: Last point, m.
     """
 
     begin: Float[Array, " lane"]
@@ -133,18 +140,18 @@ class _Courses:
     def of(cls, records: Sequence[Array], lanes: _Lanes) -> _Courses:
         """Return the courses of stored lanes."""
         segments, length = _Segments.of(records, lanes), lanes.length
-        look = np.minimum(_BEND_M, length)
+        stretch = np.minimum(_BEND_M, length)
         begin, _ = segments.at(np.minimum(_END_M, length))
         end, _ = segments.at(np.maximum(length - _END_M, 0.0))
-        bend, _ = segments.at(look)
-        before, _ = segments.at(length - look)
+        after, _ = segments.at(stretch)
+        before, _ = segments.at(length - stretch)
         _, stop = segments.at(length)
-        return cls(begin, end, wrap(bend - begin) / look, wrap(end - before) / look, before, stop)
+        return cls(begin, end, wrap(after - begin) / stretch, wrap(end - before) / stretch, before, stop)
 
     def turn(self, lane: Int[Array, "*n"], onto: Int[Array, "*n"]) -> Float[Array, "*n"]:
         """Turn and change of curvature from a lane onto another, rad over 20 m."""
-        kink = np.abs(wrap(self.begin[onto] - self.end[lane]))
-        return kink + _BEND_M * np.abs(self.early[onto] - self.late[lane])
+        turn = np.abs(wrap(self.begin[onto] - self.end[lane]))
+        return turn + _BEND_M * np.abs(self.early[onto] - self.late[lane])
 
 
 @dataclass(frozen=True)
@@ -197,7 +204,7 @@ class _Segments:
 
 
 def _straightest_link(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"]) -> Int[Array, " lane"]:
-    """Link of each lane with the smallest turn, the first if equal or unknown; -1 for none."""
+    """Link of each lane with the smallest turn, the first if several are equal to 0.01 rad or unknown; -1 for none."""
     turn = np.where(links >= 0, np.where(np.isnan(turn), _UNKNOWN, np.round(turn, 2)), np.inf)
     return links[np.arange(len(links)), np.argmin(turn, axis=1)]
 

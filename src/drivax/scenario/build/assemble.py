@@ -76,6 +76,7 @@ MEASURED = (
     Flag.LANE_GRAPH | Flag.DEFAULT_LIMITS | Flag.SPEED_LIMITS | Flag.CHAINED_GRAPH
     | Flag.CLOSED_EDGES | Flag.OVERFLOW | Flag.ROUTE | Flag.ELEVATION
 )  # fmt: skip
+#: Actors that a record stores per event.
 EVENT_ACTORS = 4
 #: Fields in which unused slots and unknown values are -1; they are 0 in all others.
 MISSING = (
@@ -154,15 +155,15 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     _refuse_endless(roads)
     segments = cut(roads)
     whole = lane_graph(recording.features, origin)
-    on = LaneSegments.of(segments, whole)
+    lane_segments = LaneSegments.of(segments, whole)
     intent, unknown = _intent(recording, whole)
-    routes = find_routes(on, log, intent, style, capacity.routes, capacity.route_points)
+    routes = find_routes(lane_segments, log, intent, style, capacity.routes, capacity.route_points)
     on_route = np.unique(np.concatenate([route.lane for route in routes.routes]))
     on_route = on_route[on_route >= 0]
-    inside = inside_box(segments.middle, path, MARGIN_M)
-    inside |= np.isin(segments.feature, whole.feature[on_route])
-    grid = arrange(segments.take(inside), path, MARGIN_M, capacity)
-    keep, lost_lanes = _select_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
+    in_crop = inside_box(segments.middle, path, MARGIN_M)
+    in_crop |= np.isin(segments.feature, whole.feature[on_route])
+    grid = arrange(segments.take(in_crop), path, MARGIN_M, capacity)
+    keep, lost_lanes = _select_lanes(whole, segments.feature[in_crop], on_route, path, capacity.lanes)
     graph = select(whole, keep)
     polylines, lost_features = _select_polylines(roads, grid, path, capacity.features)
     preferred = (*recording.to_predict, *recording.of_interest)
@@ -174,7 +175,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     parts = Parts(
         tracks=tracks,
         placement=placement,
-        extension=extend(tracks, placement.moving, on, capacity.extension),
+        extension=extend(tracks, placement.moving, lane_segments, capacity.extension),
         graph=graph,
         routes=_renumber(routes, keep, whole.count),
         grid=grid,
@@ -209,21 +210,23 @@ def _drop_jumps(recording: Recording) -> Recording:
     if not jumping.any():
         return recording
     velocity = tracks.velocity.copy()
-    if Flag.DIFFERENTIATED_VELOCITY in recording.flags:  # those next to a jump are of the jump
+    if Flag.DIFFERENTIATED_VELOCITY in recording.flags:
+        # Velocities next to a jump were computed from it.
         velocity[jumping] = differentiate(tracks.xy[jumping], valid[jumping], recording.timestamps_s)
     lost = {**recording.lost, "jumping_tracks": int(jumping.sum())}
     return replace(recording, tracks=replace(tracks, valid=valid, velocity=velocity), lost=lost)
 
 
 def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
-    """Intended route in dense indices, and the numbers of its missing lanes."""
+    """Intended route in dense indices, and the numbers of its lanes that the map lacks."""
     index, sources = graph.index(), (recording.route_lanes, recording.route_corridor)
-    known = [tuple(index[lane] for lane in lanes if lane in index) for lanes in sources]
-    missing = [len(lanes) - len(dense) for lanes, dense in zip(sources, known, strict=True)]
-    return Intent(*known), {"route_lanes_missing": missing[0], "route_corridor_missing": missing[1]}
+    dense = [tuple(index[lane] for lane in lanes if lane in index) for lanes in sources]
+    counts = [len(lanes) - len(indices) for lanes, indices in zip(sources, dense, strict=True)]
+    return Intent(*dense), {"route_lanes_missing": counts[0], "route_corridor_missing": counts[1]}
 
 
 def _refuse_endless(roads: RoadLines) -> None:
+    """Raise a DataError if the lines of the map are implausibly long together."""
     length = float(roads.lines.length.sum())
     if length > MAP_M:
         problem = f"the map's lines are {length / 1000:.0f} km long together, more than {MAP_M / 1000:.0f} km"
@@ -239,20 +242,21 @@ def ego_log(tracks: LocalTracks, current_step: int) -> EgoLog:
 
 def _select_lanes(
     graph: LaneGraph,
-    near: Int[Array, " segment"],
+    feature: Int[Array, " segment"],
     on_route: Int[Array, " route_lane"],
     path: Float[Array, "step 2"],
     most: int,
 ) -> tuple[Int[Array, " lane"], int]:
     """Return the lanes to store, in order of the source, and the number that did not fit.
 
-    These are the lanes with a segment in the crop; routes come first, bike lanes and distant lanes last.
+    These are the lanes of the ``feature`` of some segment in the crop. Lanes of routes come first, then those for cars,
+    then others, the nearest to ``path`` first.
     """
-    rows = np.flatnonzero(np.isin(graph.feature, near))
-    far = np.full(graph.count, np.inf)
-    np.minimum.at(far, graph.lines.row, path_distance(graph.lines.points[:, :2], path))
+    rows = np.flatnonzero(np.isin(graph.feature, feature))
+    distance = np.full(graph.count, np.inf)
+    np.minimum.at(distance, graph.lines.row, path_distance(graph.lines.points[:, :2], path))
     not_for_cars, off_route = ~among(graph.kind, CAR_LANE_KINDS), ~np.isin(np.arange(graph.count), on_route)
-    order = rows[np.lexsort((far[rows], not_for_cars[rows], off_route[rows]))]
+    order = rows[np.lexsort((distance[rows], not_for_cars[rows], off_route[rows]))]
     return np.sort(order[:most]), max(len(rows) - most, 0)
 
 
@@ -261,20 +265,22 @@ def _select_polylines(
 ) -> tuple[Int[Array, " polyline"], int]:
     """Return the nearest polylines with a stored segment, and the number that did not fit."""
     rows = np.unique(grid.segments.polyline)
-    far = np.full(roads.lines.count, np.inf)
-    np.minimum.at(far, grid.segments.polyline, path_distance(grid.segments.middle, path))
-    return np.sort(rows[np.argsort(far[rows], kind="stable")[:most]]), max(len(rows) - most, 0)
+    distance = np.full(roads.lines.count, np.inf)
+    np.minimum.at(distance, grid.segments.polyline, path_distance(grid.segments.middle, path))
+    return np.sort(rows[np.argsort(distance[rows], kind="stable")[:most]]), max(len(rows) - most, 0)
 
 
 def _renumber(routes: RouteSet, keep: Int[Array, " lane"], count: int) -> RouteSet:
-    """Return routes in the dense indices of the stored lanes."""
-    new = np.full(count + 1, -1)
-    new[keep] = np.arange(len(keep))
-    return replace(routes, routes=tuple(replace(r, lane=new[r.lane]) for r in routes.routes))
+    """Return routes in the dense indices of the stored lanes ``keep``, -1 for the others of ``count`` lanes."""
+    new_index = np.full(count + 1, -1)  # the last entry is that of -1
+    new_index[keep] = np.arange(len(keep))
+    return replace(
+        routes, routes=tuple(replace(route, lane=new_index[route.lane]) for route in routes.routes)
+    )
 
 
 def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict[str, int]) -> dict[str, int]:
-    """Nonzero numbers of items that did not fit, by name."""
+    """Positive numbers of items that did not fit, by name; ``lost`` has some of them."""
     counts = parts.placement.overflow | lost
     for part in (parts.grid, parts.lights, parts.stops, parts.rows):
         counts |= part.overflow
@@ -282,7 +288,7 @@ def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict
     counts["events"] = len(recording.events) - capacity.events
     events = recording.events[: capacity.events]
     counts["event_actors"] = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in events)
-    return dict(+Counter(counts))
+    return dict(+Counter(counts))  # drops zero and negative numbers
 
 
 def _flags(recording: Recording, parts: Parts) -> Flag:
@@ -312,7 +318,7 @@ def fill(
     record = blank(capacity)
     for name in NAMES:
         record[name] = stored_name(getattr(recording, name), record.dtype[name].itemsize)
-    # Rounded to a micrometre: the last bits of generated recordings depend on the processor.
+    # Rounded to a micrometre: the last bits of generated recordings depend on the processor. Adding 0 turns -0 into 0.
     record["origin"] = np.round(origin, 6) + 0.0
     record["dt_s"] = step_seconds(recording.timestamps_s)[0]
     record["current_step"] = recording.current_step
@@ -377,6 +383,7 @@ def _fill_agents(record: Record, parts: Parts, recording: Recording) -> None:
 
 def _fill_map(record: Record, parts: Parts, recording: Recording) -> None:
     grid, roads, polylines, lights = parts.grid, parts.roads, parts.polylines, parts.lights
+    # Features that are not stored have row -1.
     row_of = np.full(roads.lines.count + 1, -1)
     row_of[polylines] = np.arange(len(polylines))
     source_ids = np.array([feature.feature_id for feature in recording.features], dtype=np.int64)
@@ -404,19 +411,18 @@ def _fill_map(record: Record, parts: Parts, recording: Recording) -> None:
 
 def _fill_lanes(record: Record, parts: Parts) -> None:
     graph = parts.graph
-    light_of, stops_at = np.full(graph.count, -1), np.zeros(graph.count, dtype=bool)
+    light, has_stop = np.full(graph.count, -1), np.zeros(graph.count, dtype=bool)
+    # Of several lights of a lane the first, which is nearest to the log, is written last.
     for i in reversed(np.flatnonzero(parts.lights.lane >= 0)):
-        light_of[parts.lights.lane[i]] = i
-    stops_at[parts.stops.lane[parts.stops.lane >= 0]] = True
+        light[parts.lights.lane[i]] = i
+    has_stop[parts.stops.lane[parts.stops.lane >= 0]] = True
     _copy(record, "lane", graph, "kind", "width", "limit", "interpolating")
     _copy(record, "lane", graph, "successor", "predecessor", "left", "right")
-    _put(
-        record, lane_id=graph.lane_id, lane_length=graph.lines.length, lane_light=light_of, lane_stop=stops_at
-    )
+    _put(record, lane_id=graph.lane_id, lane_length=graph.lines.length, lane_light=light, lane_stop=has_stop)
 
 
 def _fill_routes(record: Record, parts: Parts) -> None:
-    limits = np.append(parts.graph.limit, -1.0)
+    limits = np.append(parts.graph.limit, -1.0)  # the last entry is that of -1, no lane
     for k, route in enumerate(parts.routes.routes):
         count = len(route.xyz)
         record["route_xy"][k, :count] = route.xyz[:, :2]

@@ -73,7 +73,7 @@ class Grid:
         table = np.pad(counts.reshape(self.side, self.side), ((0, 0), (1, 1)))
         return table[:, :-2] + table[:, 1:-1] + table[:, 2:]
 
-    def excess_entries(self, cell: Int[Array, " entry"], far: Float[Array, " entry"], cap: int) -> Array:
+    def excess_entries(self, cell: Int[Array, " entry"], distance: Float[Array, " entry"], cap: int) -> Array:
         """Return the farthest entries to drop so that no run of three cells is longer than ``cap``."""
         drop = np.zeros(len(cell), dtype=bool)
         while True:
@@ -83,12 +83,12 @@ class Grid:
             excess = runs[row, column] - cap
             if excess <= 0:
                 return np.flatnonzero(drop)
-            near = np.abs(cell % self.side - column) <= 1
-            members = np.flatnonzero(~drop & (cell // self.side == row) & near)
-            drop[members[np.argsort(far[members], kind="stable")[-excess:]]] = True
+            in_run = (cell // self.side == row) & (np.abs(cell % self.side - column) <= 1)
+            members = np.flatnonzero(~drop & in_run)
+            drop[members[np.argsort(distance[members], kind="stable")[-excess:]]] = True
 
     def starts(self, cell: Int[Array, " entry"], offset: int) -> Int[Array, " cell_plus_1"]:
-        """CSR row starts of entries sorted by cell, ``offset`` added."""
+        """Index of the first entry of each cell, and of the end; entries are sorted by cell and begin at ``offset``."""
         counts = np.bincount(cell, minlength=self.side**2)
         return np.concatenate(([0], np.cumsum(counts))) + offset
 
@@ -97,7 +97,8 @@ class Grid:
 class GridSegments:
     """Segments in storage order (edges by cell, car lanes by cell, the rest in order of the source) with their grid.
 
-    ``blocks`` holds 0 and the ends of the edges, the lanes and the rest; the CSR starts are absolute segment indices.
+    ``blocks`` holds 0 and the ends of the edges, the lanes and the rest. ``edge_start`` and ``lane_start`` hold the
+    index of the first segment of each cell, and of the end.
     """
 
     grid: Grid
@@ -121,22 +122,24 @@ def arrange(
     """
     middle = segments.middle
     grid = Grid.around(middle, path, capacity)
-    far = path_distance(middle, path)
+    distance = path_distance(middle, path)
     keep = grid.contains(middle)
     in_scope = keep | inside_box(middle, path, margin_m)
     if keep.sum() > capacity.segments:
         inside = np.flatnonzero(keep)
-        keep[inside[np.argsort(far[inside], kind="stable")[capacity.segments :]]] = False
+        keep[inside[np.argsort(distance[inside], kind="stable")[capacity.segments :]]] = False
     overflow = Counter(segments=int((in_scope & ~keep).sum()))
     block = segments.block
     for name, number in (("edge_run", EDGE_BLOCK), ("lane_run", LANE_BLOCK)):
         rows = np.flatnonzero(keep & (block == number))
-        drop = rows[grid.excess_entries(grid.cell(middle[rows]), far[rows], getattr(capacity, name))]
+        drop = rows[grid.excess_entries(grid.cell(middle[rows]), distance[rows], getattr(capacity, name))]
         keep[drop] = False
         overflow[name] = len(drop)
-    if lost := int((~keep & (block == EDGE_BLOCK) & (far < UNSAFE_M)).sum()):
-        near = f"{lost} road-edge segments within {UNSAFE_M:.0f} m of the ego's log"
-        problem = f"{near} do not fit capacity {capacity.name!r}"
+    if count := int((~keep & (block == EDGE_BLOCK) & (distance < UNSAFE_M)).sum()):
+        problem = (
+            f"{count} road-edge segments within {UNSAFE_M:.0f} m of the ego's log "
+            f"do not fit capacity {capacity.name!r}"
+        )
         raise DataError(problem, cure="convert with a larger capacity")
     rows = np.flatnonzero(keep)
     cell = grid.cell(middle[rows])
@@ -156,15 +159,15 @@ def arrange(
 def ringed_cells(
     grid: Grid, edges: Segments, closed: Bool[Array, " edge"], path: Float[Array, "step 2"], margin_m: float
 ) -> Bool[Array, " cell"]:
-    """Mask of the cells that are known to be road or not however far the next edge is, because edges are closed rings.
+    """Mask of the cells where closed rings of edges separate road from the rest, however far the next edge is.
 
-    All cells if each edge of the source is part of a closed ring (``closed``). If this holds for those in the box of
-    ``path`` widened by the margin, the cells in this box. Else none.
+    These are all cells if each edge of the source is part of a closed ring (``closed``). If this holds only for the
+    edges in the box of ``path`` widened by the margin, they are the cells in this box. Otherwise there are none.
     """
-    near = inside_box(edges.middle, path, margin_m)
-    if not len(near) or closed.all():
-        return np.full(grid.side**2, len(near) > 0)
-    return inside_box(grid.centres, path, margin_m) & (near.any() and closed[near].all())
+    in_box = inside_box(edges.middle, path, margin_m)
+    if not len(in_box) or closed.all():
+        return np.full(grid.side**2, len(in_box) > 0)
+    return inside_box(grid.centres, path, margin_m) & (in_box.any() and closed[in_box].all())
 
 
 def cell_sides(
@@ -177,21 +180,21 @@ def cell_sides(
     end of an open edge the side is unknown. Side cells with a lane centre (``lanes``) are never off the road. Cells out
     of reach of all edges get a side only if they are ``ringed`` (:func:`ringed_cells`).
     """
-    fine = Grid(grid.origin, grid.cell_m / SPLIT, grid.side * SPLIT)
+    side_grid = Grid(grid.origin, grid.cell_m / SPLIT, grid.side * SPLIT)
     if not len(edges):
         return np.zeros(grid.side**2, dtype=np.int32)
     reach = _REACH_M + grid.cell_m
     middle = (edges.a[:, :2] + edges.b[:, :2]) / 2 - grid.origin
-    near = np.all((middle >= -reach) & (middle <= grid.side * grid.cell_m + reach), axis=1)
-    side, distance = _nearest_sides(fine, edges.take(near))
-    lane_cells = fine.cell(lanes[fine.contains(lanes)])
+    in_reach = np.all((middle >= -reach) & (middle <= grid.side * grid.cell_m + reach), axis=1)
+    side, distance = _nearest_sides(side_grid, edges.take(in_reach))
+    lane_cells = side_grid.cell(lanes[side_grid.contains(lanes)])
     on_road = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
     side[on_road] = 0
     if ringed.any():
         square = _sides_within_rings(grid, edges, closed, ringed).reshape(grid.side, grid.side)
-        within = square.repeat(SPLIT, axis=0).repeat(SPLIT, axis=1).ravel()
-        side = np.where(within != 0, within, side)
-    return pack_sides(side.reshape(fine.side, fine.side))
+        ring_side = square.repeat(SPLIT, axis=0).repeat(SPLIT, axis=1).ravel()
+        side = np.where(ring_side != 0, ring_side, side)
+    return pack_sides(side.reshape(side_grid.side, side_grid.side))
 
 
 def pack_sides(side: Int[Array, "row column"]) -> Int32[Array, " cell"]:
@@ -205,13 +208,13 @@ def pack_sides(side: Int[Array, "row column"]) -> Int32[Array, " cell"]:
     return np.bitwise_or.reduce(codes << np.arange(0, 2 * SPLIT * SPLIT, 2, dtype=np.int32), axis=1)
 
 
-def _nearest_sides(fine: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Float[Array, " cell"]]:
+def _nearest_sides(side_grid: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Float[Array, " cell"]]:
     """Side of the nearest edge at every cell centre (0: out of reach, or beyond its open end), and its distance."""
-    size, width = fine.side, fine.cell_m
+    size, width = side_grid.side, side_grid.cell_m
     reach = int(np.ceil(_REACH_M / width))
     steps = np.arange(-reach, reach + 1)
     dx, dy = (part.ravel() for part in np.meshgrid(steps, steps))
-    a, b = edges.a[:, :2] - fine.origin, edges.b[:, :2] - fine.origin
+    a, b = edges.a[:, :2] - side_grid.origin, edges.b[:, :2] - side_grid.origin
     base = np.floor((a + b) / (2 * width)).astype(np.int64)
     column, row = base[:, :1] + dx, base[:, 1:] + dy
     inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
@@ -220,22 +223,23 @@ def _nearest_sides(fine: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Fl
     squared = _squared_distances(x, y, a, b)
     nearest = np.full(size * size + 1, np.inf)
     np.minimum.at(nearest, cell.ravel(), squared.ravel())
-    segment, place = np.nonzero(inside & (squared <= nearest[cell] * (1 + 1e-6) + 1e-6))
-    at = cell[segment, place]
+    # All edges that are nearest up to rounding: at a vertex there are two.
+    segment, offset = np.nonzero(inside & (squared <= nearest[cell] * (1 + 1e-6) + 1e-6))
+    near_cell = cell[segment, offset]
     u = b[segment] - a[segment]
-    w = np.stack([x[segment, place], y[segment, place]], axis=-1) - a[segment]
+    w = np.stack([x[segment, offset], y[segment, offset]], axis=-1) - a[segment]
     length = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-6)
     along = (u * w).sum(axis=1) / length**2
     left = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / length
     begins, ends = _open_ends(a, b)
     past_end = (begins[segment] & (along <= 0.0)) | (ends[segment] & (along >= 1.0))
     # At a vertex the segment whose line is further away decides.
-    most, least, cut = np.zeros(size * size), np.zeros(size * size), np.zeros(size * size, dtype=bool)
-    np.maximum.at(most, at, left)
-    np.minimum.at(least, at, left)
-    cut[at[past_end]] = True
+    most, least, unknown = np.zeros(size * size), np.zeros(size * size), np.zeros(size * size, dtype=bool)
+    np.maximum.at(most, near_cell, left)
+    np.minimum.at(least, near_cell, left)
+    unknown[near_cell[past_end]] = True
     sign, distance = np.where(most >= -least, 1, -1), np.sqrt(nearest[:-1])
-    return np.where(cut | (distance > _REACH_M), 0, sign), distance
+    return np.where(unknown | (distance > _REACH_M), 0, sign), distance
 
 
 def _squared_distances(x: Array, y: Array, a: Array, b: Array) -> Float[Array, "segment near"]:
@@ -257,6 +261,7 @@ def _squared_distances(x: Array, y: Array, a: Array, b: Array) -> Float[Array, "
 def _open_ends(a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> tuple[Array, Array]:
     """Masks of segments that begin at an open end, and that end at one."""
     ends = (np.round(end / _VERTEX_M).astype(np.int64) for end in (a, b))
+    # One integer per vertex.
     first, last = (end[:, 0] * 2**32 + end[:, 1] for end in ends)
     return ~np.isin(first, last), ~np.isin(last, first)
 
@@ -279,9 +284,9 @@ def _sides_within_rings(
         return side  # Rings contradict each other.
     drivable = winding > 0 if high > 0 else winding == 0
     corner = np.concatenate((rings.a[:, :2], rings.b[:, :2]))
-    within = (grid.centres >= corner.min(axis=0)) & (grid.centres <= corner.max(axis=0))
-    known = ringed & within.all(axis=1) & ~_near_edge(grid, edges).ravel()
-    side[known] = np.where(drivable[known], 1, -1)
+    in_box = (grid.centres >= corner.min(axis=0)) & (grid.centres <= corner.max(axis=0))
+    has_side = ringed & in_box.all(axis=1) & ~_near_edge(grid, edges).ravel()
+    side[has_side] = np.where(drivable[has_side], 1, -1)
     return side
 
 

@@ -27,6 +27,7 @@ CHAIN_GAP_M, CHAIN_HEADING_RAD = 0.5, np.deg2rad(20.0)
 SAME_WAY_RAD = np.deg2rad(45.0)
 #: Plausible widths measured from the spacing of neighbours, and the largest plausible width of a source, metres.
 WIDTHS_M, MOST_WIDTH_M = (2.2, 5.5), 50.0
+#: Larger height differences are between levels, metres.
 LEVEL_M = 3.0
 #: Headings at lane ends are measured over this chord: the last source points lie close together.
 END_SPAN_M = 2.0
@@ -39,7 +40,9 @@ _DANGLING = {
 HALF_WIDTH_M = 1.85
 #: A light without a lane takes the heading of a lane segment within this distance.
 LANE_REACH_M = 2.0
+#: Lanes that a record stores per stop sign.
 LANES_PER_STOP = 4
+#: Points of a lane to measure neighbours, places on a lane where it is measured (fractions), and lanes per chunk.
 _SAMPLES, _PROBES, _CHUNK = 33, (0.1, 0.3, 0.5, 0.7, 0.9), 512
 
 
@@ -101,7 +104,13 @@ class LaneGraph:
 
 
 def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> LaneGraph:
-    """Build the graph of all lanes of two or more points; dangling links are dropped and counted."""
+    """Build the graph of all lanes with a length; dangling links are dropped and counted.
+
+    If the source links no lanes, they are chained where their ends meet.
+
+    Raises:
+        DataError: Two lanes have one id.
+    """
     rows = [
         i for i, feature in enumerate(features)
         if feature.kind in LANE_KINDS and (np.abs(feature.points - feature.points[0])[:, :2] > 1e-3).any()
@@ -110,8 +119,8 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     ids = [lane.feature_id for lane in lanes]
     index = {lane_id: i for i, lane_id in enumerate(ids)}
     if len(index) < len(ids):
-        twice = next(i for i in ids if ids.count(i) > 1)
-        raise DataError(f"two lanes have the id {twice}", cure="give every map feature its own id")
+        duplicate = next(i for i in ids if ids.count(i) > 1)
+        raise DataError(f"two lanes have the id {duplicate}", cure="give every map feature its own id")
     lines = Polylines.of([np.asarray(lane.points, dtype=np.float64) - origin for lane in lanes])
     begin, end = end_headings(lines)
     kind = np.array([lane.kind for lane in lanes], dtype=np.int64)
@@ -141,8 +150,8 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
 def _widths(lanes: Sequence[MapFeature], gap: Float[Array, " lane"]) -> Float[Array, " lane"]:
     """Width of every lane: that of the source, else the gap to a neighbour, else -1."""
     width = np.array([lane.width_m for lane in lanes], dtype=np.float64)
-    measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
-    return np.where((width > 0.0) & (width <= MOST_WIDTH_M), width, measured)
+    spacing = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
+    return np.where((width > 0.0) & (width <= MOST_WIDTH_M), width, spacing)
 
 
 def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], *names: str) -> int:
@@ -188,6 +197,7 @@ def _link_table(
     most = np.bincount(a).max(initial=LINKS)
     table = np.full((len(out_heading), most), -1, dtype=np.int64)
     bend = np.abs(wrap(in_heading[b] - out_heading[a]))
+    # Rounded: links that are equally straight stay in order.
     order = np.lexsort((np.arange(len(a)), np.round(bend, 3), a))
     place = np.arange(len(a)) - np.searchsorted(a[order], a[order])
     table[a[order], place] = b[order]
@@ -203,7 +213,7 @@ def _samples(lines: Polylines) -> Float[Array, "lane sample 2"]:
 def _adjacent(
     lanes: Sequence[MapFeature], index: Mapping[int, int], samples: Array, length: Array, side: str
 ) -> tuple[Int[Array, " lane"], Float[Array, " lane"], Float[Array, " lane"]]:
-    """Adjacent lane in the same direction, its arc-length shift, and the gap between them.
+    """Adjacent lane in the same direction (-1 none), its arc-length shift (0), and the gap between them (NaN), metres.
 
     Of several, the lane that runs along most of this one, then the nearest. Oncoming lanes (neighbours in Argoverse 2)
     do not count.
@@ -215,18 +225,18 @@ def _adjacent(
         return best, shift, gap
     a, b = np.array(pairs).T
     interior, distance, offset = _measure_adjacent(samples, length, a, b)
-    ok = interior.any(axis=1)
-    a, b, interior, share = a[ok], b[ok], interior[ok], interior.sum(axis=1)[ok]
-    pick = (np.arange(len(a)), (share - 1) // 2)  # the (lower) median of the interior probes
-    middle = np.sort(np.where(interior, distance[ok], np.inf), axis=1)[pick]
-    middle_offset = np.sort(np.where(interior, offset[ok], np.inf), axis=1)[pick]
-    for i in np.lexsort((-middle, share)):  # the best comes last
-        best[a[i]], shift[a[i]], gap[a[i]] = b[i], middle_offset[i], middle[i]
+    adjacent = interior.any(axis=1)
+    a, b, interior, probes = a[adjacent], b[adjacent], interior[adjacent], interior.sum(axis=1)[adjacent]
+    pick = (np.arange(len(a)), (probes - 1) // 2)  # the (lower) median of the interior probes
+    median_gap = np.sort(np.where(interior, distance[adjacent], np.inf), axis=1)[pick]
+    median_shift = np.sort(np.where(interior, offset[adjacent], np.inf), axis=1)[pick]
+    for i in np.lexsort((-median_gap, probes)):  # the best comes last
+        best[a[i]], shift[a[i]], gap[a[i]] = b[i], median_shift[i], median_gap[i]
     return best, shift, gap
 
 
 def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Whether lane ``b`` is adjacent and parallel at probes along ``a``, its distance, and its arc-length shift."""
+    """Whether lane ``b`` runs along ``a`` in its direction, its distance and arc-length shift: ``[pair, probe]``."""
     fraction = np.array(_PROBES)
     at = np.round(fraction * (_SAMPLES - 1)).astype(np.int64)
     probe = samples[a][:, at]
@@ -249,10 +259,12 @@ def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
 
     Links to other lanes go uncounted: they lead out of the crop.
     """
-    new = np.full(graph.count + 1, -1)
-    new[rows] = np.arange(len(rows))
+    new_index = np.full(graph.count + 1, -1)  # the last entry is that of -1
+    new_index[rows] = np.arange(len(rows))
     lines = [graph.lines.line(i) for i in rows]
-    successor, predecessor = (_compact(new[links[rows]]) for links in (graph.successor, graph.predecessor))
+    successor, predecessor = (
+        _compact(new_index[links[rows]]) for links in (graph.successor, graph.predecessor)
+    )
     per_lane = ("feature", "lane_id", "kind", "width", "limit", "interpolating", "left_shift", "right_shift")
     return replace(
         graph,
@@ -260,8 +272,8 @@ def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
         successor=successor[:, :LINKS],
         predecessor=predecessor[:, :LINKS],
         dropped_links=int((successor[:, LINKS:] >= 0).sum() + (predecessor[:, LINKS:] >= 0).sum()),
-        left=new[graph.left[rows]],
-        right=new[graph.right[rows]],
+        left=new_index[graph.left[rows]],
+        right=new_index[graph.right[rows]],
         **{name: getattr(graph, name)[rows] for name in per_lane},
     )
 
@@ -297,29 +309,32 @@ class LaneSegments:
     def nearest(
         self, xyz: Float[Array, "pose 3"], heading: Float[Array, " pose"], reach_m: float, turn_rad: float
     ) -> tuple[Int[Array, " pose"], Float[Array, " pose"], Float[Array, " pose"]]:
-        """Nearest lane of each pose within reach, turn and level (-1 none), arc length on it, and distance from it."""
-        near = self._near(xyz[:, :2], reach_m)
-        if not len(near.lane):
+        """Nearest lane of each pose within reach, turn and level, arc length on it, and distance from it, metres.
+
+        The lane is -1 without one in reach; then the other values mean nothing.
+        """
+        crop = self._crop(xyz[:, :2], reach_m)
+        if not len(crop.lane):
             return np.full(len(xyz), -1), np.zeros(len(xyz)), np.full(len(xyz), np.inf)
-        distance, s = near._measure(xyz, heading, turn_rad)
+        distance, s = crop._measure(xyz, heading, turn_rad)
         best = distance.argmin(axis=1)
         pick = np.arange(len(xyz)), best
-        return np.where(distance[pick] <= reach_m, near.lane[best], -1), s[pick], distance[pick]
+        return np.where(distance[pick] <= reach_m, crop.lane[best], -1), s[pick], distance[pick]
 
     def around(
         self, xyz: Float[Array, " 3"], heading: float, reach_m: float, turn_rad: float
     ) -> list[tuple[int, float, float]]:
         """Lanes within reach of a pose as (lane, arc length on it, distance), the nearest first."""
-        near = self._near(xyz[None, :2], reach_m)
-        (distance,), (s,) = near._measure(xyz[None], np.array([heading]), turn_rad)
+        crop = self._crop(xyz[None, :2], reach_m)
+        (distance,), (s,) = crop._measure(xyz[None], np.array([heading]), turn_rad)
         lanes: dict[int, tuple[int, float, float]] = {}
         for i in np.argsort(distance, kind="stable"):
-            lane = int(near.lane[i])
+            lane = int(crop.lane[i])
             if distance[i] <= reach_m:
                 lanes.setdefault(lane, (lane, float(s[i]), float(distance[i])))
         return list(lanes.values())
 
-    def _near(self, xy: Float[Array, "pose 2"], reach_m: float) -> LaneSegments:
+    def _crop(self, xy: Float[Array, "pose 2"], reach_m: float) -> LaneSegments:
         """Segments in the box of the poses, widened by the reach."""
         rows = np.zeros(0, int)
         if len(xy) and len(self.segments):
@@ -328,12 +343,12 @@ class LaneSegments:
 
     def _measure(self, xyz: Array, heading: Array, turn_rad: float) -> tuple[Array, Array]:
         """Distance (infinite if turn or level exclude it) and arc length of every pose on every segment."""
-        seg = self.segments
-        distance, along = point_to_segment(xyz[:, None, :2], seg.a[None, :, :2], seg.b[None, :, :2])
-        z = seg.a[:, 2] + along * (seg.b[:, 2] - seg.a[:, 2])
-        excluded = np.abs(wrap(self.heading - heading[:, None])) > turn_rad
-        excluded |= np.abs(z - xyz[:, 2:3]) > LEVEL_M
-        return np.where(excluded, np.inf, distance), seg.start_m + along * seg.span_m
+        segments, a, b = self.segments, self.segments.a, self.segments.b
+        distance, along = point_to_segment(xyz[:, None, :2], a[None, :, :2], b[None, :, :2])
+        z = a[:, 2] + along * (b[:, 2] - a[:, 2])
+        is_excluded = np.abs(wrap(self.heading - heading[:, None])) > turn_rad
+        is_excluded |= np.abs(z - xyz[:, 2:3]) > LEVEL_M
+        return np.where(is_excluded, np.inf, distance), segments.start_m + along * segments.span_m
 
 
 def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:
@@ -363,7 +378,7 @@ class Lights:
 
 def place_lights(
     lights: Sequence[Light],
-    on: LaneSegments,
+    lane_segments: LaneSegments,
     origin: Float[Array, "3"],
     path: Float[Array, "step 2"],
     margin_m: float,
@@ -374,17 +389,11 @@ def place_lights(
     Lights near no lane have no direction and are dropped. They are counted in the box of ``path`` widened by
     ``margin_m``: elsewhere the lanes are cropped too.
     """
-    graph, steps = on.graph, len(lights[0].states) if lights else 0
+    graph, steps = lane_segments.graph, len(lights[0].states) if lights else 0
     stop = np.array([light.stop_point for light in lights], dtype=np.float64).reshape(-1, 3) - origin
     index = graph.index()
     lane = np.array([index.get(light.lane_id, -1) for light in lights], dtype=np.int64)
-    heading, exit_heading = np.full(len(lights), np.nan), np.full(len(lights), np.nan)
-    known = np.flatnonzero(lane >= 0)
-    s = _arc_at(graph, lane[known], stop[known, :2])
-    heading[known] = graph.lines.heading(lane[known], s, END_SPAN_M)
-    exit_heading[known] = graph.lines.heading(lane[known], graph.lines.length[lane[known]], END_SPAN_M)
-    for i in np.flatnonzero(lane < 0):
-        heading[i] = exit_heading[i] = _heading_near(on, stop[i])
+    heading, exit_heading = _light_headings(lane_segments, lane, stop)
     width = np.append(graph.width, -1.0)[lane]
     half = np.where(width > 0, width / 2, HALF_WIDTH_M)
     has_heading = np.flatnonzero(~np.isnan(heading))
@@ -404,6 +413,23 @@ def place_lights(
     )
 
 
+def _light_headings(
+    lane_segments: LaneSegments, lane: Int[Array, " light"], stop: Float[Array, "light 3"]
+) -> tuple[Float[Array, " light"], Float[Array, " light"]]:
+    """Headings of each light's lane at the stop point and at its end.
+
+    A light without a lane (-1) has the heading of the nearest lane segment for both, NaN without one in reach.
+    """
+    graph, heading, exit_heading = lane_segments.graph, np.full(len(lane), np.nan), np.full(len(lane), np.nan)
+    known = np.flatnonzero(lane >= 0)
+    s = _arc_at(graph, lane[known], stop[known, :2])
+    heading[known] = graph.lines.heading(lane[known], s, END_SPAN_M)
+    exit_heading[known] = graph.lines.heading(lane[known], graph.lines.length[lane[known]], END_SPAN_M)
+    for i in np.flatnonzero(lane < 0):
+        heading[i] = exit_heading[i] = _heading_near(lane_segments, stop[i])
+    return heading, exit_heading
+
+
 def _arc_at(
     graph: LaneGraph, lane: Int[Array, " light"], xy: Float[Array, "light 2"]
 ) -> Float[Array, " light"]:
@@ -417,13 +443,13 @@ def _arc_at(
     return result
 
 
-def _heading_near(on: LaneSegments, stop: Float[Array, "3"]) -> float:
+def _heading_near(lane_segments: LaneSegments, stop: Float[Array, "3"]) -> float:
     """Heading of the nearest lane segment, NaN without one in reach."""
-    if len(on.segments) == 0:
+    if len(lane_segments.segments) == 0:
         return float("nan")
-    distance, _ = point_to_segment(stop[:2], on.segments.a[:, :2], on.segments.b[:, :2])
+    distance, _ = point_to_segment(stop[:2], lane_segments.segments.a[:, :2], lane_segments.segments.b[:, :2])
     best = distance.argmin()
-    return float(on.heading[best]) if distance[best] <= LANE_REACH_M else float("nan")
+    return float(lane_segments.heading[best]) if distance[best] <= LANE_REACH_M else float("nan")
 
 
 @dataclass(frozen=True)
@@ -452,8 +478,8 @@ def place_stops(
         known = [index[number] for number in sign.lanes if number in index]
         lane[i, : min(len(known), LANES_PER_STOP)] = known[:LANES_PER_STOP]
         excess[i] = max(len(known) - LANES_PER_STOP, 0)
-    near, far = inside_box(xy, path, margin_m) | (lane[:, 0] >= 0), path_distance(xy, path)
-    rows = np.lexsort((far, ~near))[:most]
-    rows = rows[np.argsort(far[rows], kind="stable")]
-    overflow = +Counter(stops=int(near.sum()) - most, stop_lanes=int(excess[rows].sum()))
+    in_scope, distance = inside_box(xy, path, margin_m) | (lane[:, 0] >= 0), path_distance(xy, path)
+    rows = np.lexsort((distance, ~in_scope))[:most]
+    rows = rows[np.argsort(distance[rows], kind="stable")]
+    overflow = +Counter(stops=int(in_scope.sum()) - most, stop_lanes=int(excess[rows].sum()))
     return Stops(xy[rows], lane[rows], overflow)

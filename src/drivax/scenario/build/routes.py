@@ -40,22 +40,25 @@ RouteStyle = Literal["graph", "published"]
 OFFSET_M, _POSE_SPACING_M = 1.0, 1.0
 #: Largest drift of the ego across a line, metres per metre (a change of 3.5 m within 12 m).
 _MOST_SLOPE = 0.3
-#: The line goes over to the ego's poses within this distance behind the first of them.
+#: The shift of a route fades out over this distance behind the first driven pose.
 _BEHIND_M = 20.0
 #: Published candidates begin on lanes within this distance of the ego at the start of the log, m.
 PUBLISHED_REACH_M = 2.5
+#: Least length and largest number of published candidates, and largest number of paths that their search extends.
 LEAST_M, MOST_PATHS, MOST_EXPANSIONS = 250.0, 10, 5000
 #: Least heading change along a lane that is a turn.
 TURN_RAD = np.deg2rad(30.0)
+#: Weights of the published :func:`score`.
 CHANGE_WEIGHT, TURN_WEIGHT, LENGTH_WEIGHT, CURVATURE_WEIGHT = -0.3, -0.2, 0.1, -0.1
+#: Distance between the points of a route.
 SPACING_M = 1.0
 #: Candidates are this long at least, or as far as the present speed carries in ``AHEAD_S``.
 AHEAD_M, AHEAD_S = 200.0, 12.0
 #: Routes begin this far behind the driven path and go on this far past the goal, straight on where the map ends.
 BEHIND_M, PAST_GOAL_M = 20.0, 50.0
-#: Seconds until a lane change begins, and that it takes.
+#: Time until a lane change begins, and its duration.
 REACTION_S, CHANGE_S = 0.5, 3.0
-#: A route to the goal passes it within this distance.
+#: Largest distance from the goal at which a route leads to it.
 GOAL_M = 10.0
 #: Where along the stretch of two parallel lanes a route may change from one to the other.
 CHANGE_PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -129,30 +132,35 @@ class Intent:
 
 
 def find_routes(
-    on: LaneSegments, ego: EgoLog, intent: Intent, style: RouteStyle, most_routes: int, most_points: int
+    lane_segments: LaneSegments,
+    ego: EgoLog,
+    intent: Intent,
+    style: RouteStyle,
+    most_routes: int,
+    most_points: int,
 ) -> RouteSet:
     """Find all routes of a scenario; ``published`` candidates ignore the intended route."""
-    log = log_route(on, ego, most_points)
+    log = log_route(lane_segments, ego, most_points)
     if style == "published":
-        best, others = _published_routes(on, ego, most_points)
+        best, others = _published_routes(lane_segments, ego, most_points)
     else:
-        best, others = _search_routes(on, ego, intent, most_routes - 1, most_points)
+        best, others = _search_routes(lane_segments, ego, intent, most_routes - 1, most_points)
     first = log if best is None else best
-    rest = [route for route in others if not _same(route, first)]
+    alternatives = [route for route in others if not _same(route, first)]
     progress = log_progress(first, ego)
     index = np.arange(len(first.xyz))
     goal = np.array([np.interp(progress[ego.last], index, first.xyz[:, axis]) for axis in (0, 1)])
-    return RouteSet((first, log, *rest)[:most_routes], best is not None, goal, progress)
+    return RouteSet((first, log, *alternatives)[:most_routes], best is not None, goal, progress)
 
 
 def _search_routes(
-    on: LaneSegments, ego: EgoLog, intent: Intent, most_routes: int, most_points: int
+    lane_segments: LaneSegments, ego: EgoLog, intent: Intent, most_routes: int, most_points: int
 ) -> tuple[Route | None, list[Route]]:
     """Route to the goal, if any, and alternatives, by best-first search from the current step."""
     pose = ego.xyz[ego.current], float(ego.heading[ego.current])
     need = max(AHEAD_M, float(ego.speed[ego.current]) * AHEAD_S)
-    search = LaneSearch.start(on, *pose, need, intent.corridor)
-    drawer = _Drawer(on.graph, ego, most_points)
+    search = LaneSearch.start(lane_segments, *pose, need, intent.corridor)
+    drawer = _Drawer(lane_segments.graph, ego, most_points)
     others = [drawer.draw(lane_path, 0.0) for lane_path in search.alternatives(most_routes)]
     end = ego.xyz[ego.last], float(ego.heading[ego.last])
     if intent.lanes:
@@ -160,11 +168,13 @@ def _search_routes(
     return _best(ego, [*drawer.variants(search.to_goal(*end)), *others], GOAL_M), others
 
 
-def _published_routes(on: LaneSegments, ego: EgoLog, most_points: int) -> tuple[Route | None, list[Route]]:
+def _published_routes(
+    lane_segments: LaneSegments, ego: EgoLog, most_points: int
+) -> tuple[Route | None, list[Route]]:
     """Published candidate that leads to the goal, if any, and all candidates, the best score first."""
     ego = replace(ego, current=int(np.argmax(ego.valid)))
-    search = LaneSearch.start(on, ego.xyz[ego.current], float(ego.heading[ego.current]), LEAST_M)
-    drawer = _Drawer(on.graph, ego, most_points, plain=True)
+    search = LaneSearch.start(lane_segments, ego.xyz[ego.current], float(ego.heading[ego.current]), LEAST_M)
+    drawer = _Drawer(lane_segments.graph, ego, most_points, plain=True)
     others = [drawer.draw(lane_path, 0.0) for lane_path in published_paths(search)]
     return _best(ego, others, GOAL_M), others
 
@@ -186,10 +196,10 @@ def published_paths(search: LaneSearch) -> list[LanePath]:
         if search.reach(lane_path) >= search.need_m:
             complete.append(lane_path)
             continue
-        following = search.expand(lane_path)
-        if not search.goes_on(following):
+        children = search.expand(lane_path)
+        if not search.goes_on(children):
             dead_ends.append(lane_path)
-        queue.extend(following)
+        queue.extend(children)
     return sorted([*complete, *dead_ends][:MOST_PATHS], key=lambda lane_path: -score(search, lane_path))
 
 
@@ -207,15 +217,20 @@ def score(search: LaneSearch, lane_path: LanePath) -> float:
 
 
 def _same(route: Route, other: Route) -> bool:
+    """Return whether the points of two routes differ by less than 10 cm."""
     return len(route.xyz) == len(other.xyz) and bool(np.abs(route.xyz - other.xyz).max() < 0.1)
 
 
 def _best(ego: EgoLog, routes: Sequence[Route], reach_m: float) -> Route | None:
-    """Route that passes nearest to the goal region, then nearest to the log; None if no route is in reach."""
+    """Route that passes nearest to the end of the log, in whole metres, then nearest to all of the log.
+
+    None if no route passes within ``reach_m`` of its end.
+    """
     if not routes:
         return None
     path = thin_path(ego.seen[:, :2])
     distances = [project(route.xyz, path)[1] for route in routes]
+    # Rounded, so that routes which are equally good stay in order.
     keys = [(np.floor(away[-1]), round(float(away.mean()), 1), i) for i, away in enumerate(distances)]
     goal_distance, _, best = min(keys)
     return routes[best] if goal_distance < reach_m else None
@@ -243,21 +258,21 @@ class _Drawer:
         return routes
 
     def draw(self, lane_path: LanePath, place: float) -> Route:
-        """Route along a lane path and the straightest successors of its last lane."""
+        """Route along a lane path and the straightest successors of its last lane; ``place`` as in :func:`trace`."""
         graph, ego = self.graph, self.ego
         history = ego.history[:, :2]
         behind = 0.0 if self.plain else BEHIND_M + float(arc_lengths(history)[-1])
         prefix, length = precede(graph, lane_path.lanes[0], behind - lane_path.s, history)
-        begin = lane_path.s + length - behind
-        ends = float(graph.lines.length[list(lane_path.lanes)].sum()) - lane_path.s
-        lanes = (*prefix, *follow(graph, lane_path.lanes, ends, self.most * SPACING_M))
+        begin = lane_path.s + length - behind  # negative: the lanes begin too late
+        ahead_m = float(graph.lines.length[list(lane_path.lanes)].sum()) - lane_path.s
+        lanes = (*prefix, *follow(graph, lane_path.lanes, ahead_m, self.most * SPACING_M))
         speed = float(ego.speed[ego.current])
-        change_m, window_m = max(CHANGE_M, CHANGE_S * speed), (REACTION_S * speed, lane_path.until)
+        change_m, window_m = max(CHANGE_M, CHANGE_S * speed), (REACTION_S * speed, lane_path.goal_m)
         line = trace(graph, lanes, max(begin, 0.0), -lane_path.s - length, window_m, place, change_m)
         line = continue_straight(line, max(-begin, 0.0), PAST_GOAL_M)
         arc, _ = project(line[0], ego.seen[-1:, :2])
-        missing = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
-        xyz, label = continue_straight(line, 0.0, missing)
+        missing_m = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
+        xyz, label = continue_straight(line, 0.0, missing_m)
         points, index = resample(xyz, SPACING_M, self.most)
         return Route.along(points if self.plain else join(points, history, change_m), label[index], self.most)
 
@@ -271,23 +286,26 @@ def join(
     interpolated between the poses and fades out ahead of the last one by a cubic polynomial that continues in the ego's
     direction (Hermite: shift and slope at the ego, zero both ``ahead_m`` ahead). Points of ``xyz`` are about 1 m apart.
     """
-    near = int(arc_lengths(history)[-1] + 2 * _BEHIND_M) + 2
-    s, shift = _shifts(xyz[:near], history)
-    if not shift.any():
+    # The line may pass the poses again later on: project them onto its beginning only.
+    count = int(arc_lengths(history)[-1] + 2 * _BEHIND_M) + 2
+    s, pose_shift = _shifts(xyz[:count], history)
+    if not pose_shift.any():
         return xyz
     arc = arc_lengths(xyz)
-    across, back, ahead = np.interp(arc, s, shift), arc < s[0], arc > s[-1]
-    slope = np.clip(np.diff(shift) / np.diff(s), -_MOST_SLOPE, _MOST_SLOPE) if len(s) > 1 else np.zeros(1)
-    across[back] = _fade(s[0] - arc[back], shift[0], -slope[0], _BEHIND_M)
-    across[ahead] = _fade(arc[ahead] - s[-1], shift[-1], slope[-1], ahead_m)
+    shift, is_behind, is_ahead = np.interp(arc, s, pose_shift), arc < s[0], arc > s[-1]
+    slope = np.diff(pose_shift) / np.diff(s) if len(s) > 1 else np.zeros(1)
+    slope = np.clip(slope, -_MOST_SLOPE, _MOST_SLOPE)
+    shift[is_behind] = _fade(s[0] - arc[is_behind], pose_shift[0], -slope[0], _BEHIND_M)
+    shift[is_ahead] = _fade(arc[is_ahead] - s[-1], pose_shift[-1], slope[-1], ahead_m)
     result = xyz.copy()
-    result[:, :2] += across[:, None] * left_normals(headings(xyz))
+    result[:, :2] += shift[:, None] * left_normals(headings(xyz))
     return result
 
 
 def _shifts(xyz: Float[Array, "point 3"], history: Float[Array, "step 2"]) -> tuple[Array, Array]:
     """Increasing arc lengths of driven poses along a line, and the shift of the line to its left there."""
     s, _ = project(xyz, history)
+    # From the last pose back, keep those that lie at least a metre further back along the line.
     keep = [len(s) - 1]
     for i in range(len(s) - 2, -1, -1):
         if s[i] <= s[keep[-1]] - _POSE_SPACING_M:
@@ -305,33 +323,33 @@ def _fade(distance: Array, shift: float, slope: float, length: float) -> Array:
     return shift * (1.0 + t**2 * (2.0 * t - 3.0)) + slope * length * t * (1.0 - t) ** 2
 
 
-def log_route(on: LaneSegments, ego: EgoLog, most_points: int) -> Route:
+def log_route(lane_segments: LaneSegments, ego: EgoLog, most_points: int) -> Route:
     """Path of the logged ego (privileged), continued along its last lane, else straight on.
 
     Positions within half a metre of the previous one are jitter; a log that stays within 2 m has only its last pose.
     """
-    seen, heading = ego.seen, ego.heading[ego.valid]
-    keep = space_out(seen[:, :2], STEP_M)
-    if np.hypot(*(seen - seen[0])[:, :2].T).max() < STANDS_M:
+    xyz, heading = ego.seen, ego.heading[ego.valid]
+    keep = space_out(xyz[:, :2], STEP_M)
+    if np.hypot(*(xyz - xyz[0])[:, :2].T).max() < STANDS_M:
         keep = keep[-1:]
-    pose, course = seen[keep[-1]], float(heading[keep[-1]])
-    line = np.concatenate((seen[keep], _ahead(on, pose, course)))
+    pose, course = xyz[keep[-1]], float(heading[keep[-1]])
+    line = np.concatenate((xyz[keep], _continuation(lane_segments, pose, course)))
     probe = np.arange(0, len(line), LABEL_EVERY)
-    lane, _, _ = on.nearest(line[probe], headings(line)[probe], REACH_M, SAME_TURN_RAD)
+    lane, _, _ = lane_segments.nearest(line[probe], headings(line)[probe], REACH_M, SAME_TURN_RAD)
     return Route.along(line, np.repeat(lane, LABEL_EVERY)[: len(line)], most_points)
 
 
-def _ahead(on: LaneSegments, pose: Float[Array, "3"], heading: float) -> Array:
+def _continuation(lane_segments: LaneSegments, pose: Float[Array, "3"], heading: float) -> Array:
     """Points 1 m apart ahead of a pose: along its lane, its lateral offset fading within 20 m; else straight."""
-    lines = on.graph.lines
+    lines = lane_segments.graph.lines
     count = int(LOG_AHEAD_M)
     distance = np.arange(1.0, count + 1.0)
-    lane, s, _ = on.nearest(pose[None], np.array([heading]), REACH_M, SAME_TURN_RAD)
+    lane, s, _ = lane_segments.nearest(pose[None], np.array([heading]), REACH_M, SAME_TURN_RAD)
     if lane[0] < 0:
         xy = pose[:2] + distance[:, None] * np.array([np.cos(heading), np.sin(heading)])
     else:
         lateral = float((pose[:2] - lines.at(lane, s)[0, :2]) @ left_normals(lines.heading(lane, s))[0])
-        points, courses = walk(on.graph, lane, s, 1.0, count)
+        points, courses = walk(lane_segments.graph, lane, s, 1.0, count)
         fade = lateral * np.maximum(1.0 - distance / BEHIND_M, 0.0)
         xy = points[0] + fade[:, None] * left_normals(courses[0])
     return np.concatenate((xy, np.full((count, 1), pose[2])), axis=1)
@@ -343,7 +361,7 @@ def log_progress(route: Route, ego: EgoLog) -> Float[Array, " time"]:
     Each position is searched no further ahead than 1.5 times the distance driven since the last valid step, plus 2 m.
     """
     rows = np.flatnonzero(ego.valid)
-    moved = np.hypot(*np.diff(ego.seen[:, :2], axis=0, prepend=ego.seen[:1, :2]).T)
-    s = project_monotone(route.xyz, ego.seen[:, :2], 1.5 * moved + 2.0)
-    before = np.searchsorted(rows, np.arange(len(ego.valid)), side="right") - 1
-    return s[np.maximum(before, 0)]
+    step_m = np.hypot(*np.diff(ego.seen[:, :2], axis=0, prepend=ego.seen[:1, :2]).T)
+    s = project_monotone(route.xyz, ego.seen[:, :2], 1.5 * step_m + 2.0)
+    last_valid = np.searchsorted(rows, np.arange(len(ego.valid)), side="right") - 1
+    return s[np.maximum(last_valid, 0)]

@@ -21,11 +21,13 @@ Array = np.ndarray[Any, Any]
 LONGEST_M = 3.99
 #: Tolerance of simplification, and the weight of heights in it: 20 cm count as 5 cm in the plane.
 TOLERANCE_M, Z_WEIGHT = 0.05, 0.25
-#: Largest gap between the first and last point of a closed ring.
-CLOSED_M = 0.05
-#: Larger speed limits of a source are not believed.
+#: Largest gap between the first and last point of a closed ring, and its fewest points, the first twice.
+CLOSED_M, _RING_POINTS = 0.05, 4
+#: Shorter polylines are dropped.
+_LEAST_LENGTH_M = 1e-3
+#: Larger speed limits of a source are ignored.
 MOST_LIMIT_MPS = 100.0
-#: Longest piece of road, and fewest pieces of a closed ring, so that each has a direction.
+#: Longest piece of road, and fewest pieces of a closed ring: a single piece would end where it begins.
 PIECE_M, RING_PIECES = 10.0, 4
 #: Pieces rank by rings of this width around the log of the ego.
 RING_M = 50.0
@@ -97,10 +99,10 @@ def road_lines(
     if split_gap_m is not None and len(points):
         step = np.hypot(*np.diff(points[:, :2], axis=0, prepend=points[:1, :2]).T)
         breaks |= (step > split_gap_m) & ~among(kind, POLYGON_KINDS)[whole.row]
-    lines, keep = _long_enough(points, np.flatnonzero(breaks))
+    lines, keep = _drop_short(points, np.flatnonzero(breaks))
     row = whole.row[keep][lines.start[:-1]]
     first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
-    closed = (np.hypot(*(last - first)[:, :2].T) <= CLOSED_M) & (np.diff(lines.start) >= 4)
+    closed = (np.hypot(*(last - first)[:, :2].T) <= CLOSED_M) & (np.diff(lines.start) >= _RING_POINTS)
     lines.points[lines.start[1:][closed] - 1] = first[closed]
     return RoadLines(lines, np.array(rows, dtype=np.int64)[row], kind[row], closed, whole.arc[keep])
 
@@ -113,12 +115,12 @@ def _outline(feature: MapFeature) -> Array:
     return points
 
 
-def _long_enough(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " point"]]:
-    """Polylines that begin at these points, and the mask of their points; those without length are dropped."""
+def _drop_short(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " point"]]:
+    """Polylines that begin at the indices ``begin``, without those of no length, and the mask of their points."""
     start = np.append(begin, len(points))
     counts = np.diff(start)
     arc = arc_lengths(points, start)
-    long = (counts >= 2) & (arc[start[1:] - 1] > 1e-3) if len(points) else counts >= 2
+    long = (counts >= 2) & (arc[start[1:] - 1] > _LEAST_LENGTH_M) if len(points) else counts >= 2
     keep = np.repeat(long, counts)
     return Polylines(points[keep], np.concatenate(([0], np.cumsum(counts[long]))), arc[keep]), keep
 
@@ -147,7 +149,7 @@ def cut(roads: RoadLines) -> Segments:
 
 
 def path_distance(xy: Float[Array, "point 2"], path: Float[Array, "step 2"]) -> Float[Array, " point"]:
-    """Distance of points from the nearest point of ``path``, metres."""
+    """Distance of points from the nearest point of ``path``, metres; infinite for an empty path."""
     best = np.full(len(xy), np.inf)
     for x, y in path:
         np.minimum(best, np.hypot(xy[:, 0] - x, xy[:, 1] - y), out=best)
@@ -217,16 +219,18 @@ def road_rows(
     span = np.repeat(length / pieces, pieces)
     begin = number * span
     middle = roads.lines.at(owner, begin + span / 2)[..., :2]
-    near = np.flatnonzero(inside_box(middle, path, margin_m))
-    owner, begin, span, middle = owner[near], begin[near], span[near], middle[near]
+    rows = np.flatnonzero(inside_box(middle, path, margin_m))
+    owner, begin, span, middle = owner[rows], begin[rows], span[rows], middle[rows]
     kind = roads.kind[owner]
     group = np.where(among(kind, LANE_KINDS), 0, np.where(among(kind, EDGE_KINDS), 1, 2))
     order = rank(group, path_distance(middle, path))[:most]
     overflow = +Counter(road_rows=len(owner) - len(order))
     owner, begin, span, middle, kind = owner[order], begin[order], span[order], middle[order], kind[order]
     angle = _angle(roads, owner, begin, begin + span)
-    first, last = _angle(roads, owner, begin, begin + span / 3), begin + span * 2 / 3
-    turn = wrap(_angle(roads, owner, last, begin + span) - first)
+    # Curvature is the turn from the first third to the last, over the distance of their middles.
+    first = _angle(roads, owner, begin, begin + span / 3)
+    last = _angle(roads, owner, begin + span * 2 / 3, begin + span)
+    turn = wrap(last - first)
     limits = np.array([plausible_limit(feature) for feature in features], dtype=np.float64)
     return RoadRows(
         xy=middle,
@@ -234,7 +238,7 @@ def road_rows(
         length=span,
         kind=kind,
         limit=limits[roads.feature[owner]] if len(owner) else np.zeros(0),
-        # Rounded: the last bits of angles depend on the processor.
+        # Rounded: the last bits of angles depend on the processor. Adding 0 makes -0 positive.
         curvature=np.round(turn / (span * 2 / 3), 6) + 0.0,
         overflow=overflow,
     )
@@ -246,13 +250,13 @@ def _angle(roads: RoadLines, line: Array, begin: Array, end: Array) -> Float[Arr
     return np.arctan2(chord[..., 1], chord[..., 0])
 
 
-def rank(group: Int[Array, " row"], far: Float[Array, " row"]) -> Int[Array, " row"]:
+def rank(group: Int[Array, " row"], distance: Float[Array, " row"]) -> Int[Array, " row"]:
     """Order pieces so that every prefix spreads evenly over each group, nearer rings first.
 
     Within a ring of 50 m around the log, the rows of a group (in order along the map) are taken in bit-reversed
     order (van der Corput's sequence), and the groups are interleaved in proportion to their sizes.
     """
-    ring = np.floor(far / RING_M).astype(np.int64)
+    ring = np.floor(distance / RING_M).astype(np.int64)
     label, place = ring * 3 + group, np.zeros(len(group))
     for number in np.unique(label):
         members = np.flatnonzero(label == number)

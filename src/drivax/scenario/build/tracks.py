@@ -19,7 +19,9 @@ from drivax.scenario.schema import AgentKind, among
 
 Array = np.ndarray[Any, Any]
 
+#: A parked agent stays within these distances of its median pose.
 PARKED_M, PARKED_RAD = 0.3, 0.1
+#: Distance between the points of an extension.
 EXTENSION_STEP_M = 4.0
 #: Over this distance an extension fades from the agent's lateral offset to the centre of its lane.
 FADE_M = 20.0
@@ -33,7 +35,10 @@ DEFAULT_SIZES = {
     AgentKind.CYCLIST: (1.8, 0.6, 1.7), AgentKind.OTHER: (1.0, 1.0, 1.0), AgentKind.STATIC: (0.5, 0.5, 1.0),
 }  # fmt: skip
 DEFAULT_EGO_SIZE = (4.9, 2.0, 1.5)
-MOST_SIZE_M = 100.0  # larger measurements are ignored
+#: Larger measurements of a size are ignored.
+MOST_SIZE_M = 100.0
+#: Sort keys, larger than all distances: of tracks that are never valid with the ego, and the lead of preferred ones.
+_UNRELATED_M, _PREFERENCE_M = 1e6, 1e7
 
 
 @dataclass(frozen=True)
@@ -70,18 +75,18 @@ def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTr
 
 
 def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], Bool[Array, " track"]]:
-    """Median box size of every track, and the mask of those with a default size."""
-    plain = np.nan_to_num(tracks.size)
-    measured = tracks.valid[..., None] & (plain > 0.0) & (plain <= MOST_SIZE_M)
-    size = masked_median(np.swapaxes(tracks.size, 1, 2), np.swapaxes(measured, 1, 2))
+    """Median box size of every track, and the mask of those with a default length, width or height."""
+    sizes = np.nan_to_num(tracks.size)
+    is_plausible = tracks.valid[..., None] & (sizes > 0.0) & (sizes <= MOST_SIZE_M)
+    size = masked_median(np.swapaxes(tracks.size, 1, 2), np.swapaxes(is_plausible, 1, 2))
     default = np.array([DEFAULT_SIZES[AgentKind(kind)] for kind in tracks.kind]).reshape(-1, 3)
     default[ego] = DEFAULT_EGO_SIZE
-    missing = ~np.any(measured, axis=1)
-    return np.where(missing, default, size), missing.any(axis=1)
+    is_unknown = ~np.any(is_plausible, axis=1)
+    return np.where(is_unknown, default, size), is_unknown.any(axis=1)
 
 
 def masked_median(values: Float[Array, "*row time"], valid: Bool[Array, "*row time"]) -> Float[Array, "*row"]:
-    """Median over the valid entries of the last axis; 0 without one."""
+    """Median over the valid entries of the last axis; 0 without any."""
     sorted_values = np.sort(np.where(valid, values, np.inf), axis=-1)
     count = valid.sum(axis=-1)
     middle = np.stack(
@@ -115,13 +120,13 @@ def place(tracks: LocalTracks, preferred: Sequence[int], agents: int, parked: in
     pose = median_pose(tracks)
     away = np.hypot(*np.moveaxis(tracks.xyz[..., :2] - pose[:, None, :2], -1, 0))
     turn = np.abs(wrap(tracks.heading - pose[:, None, 3]))
-    still = ((away <= PARKED_M) & (turn <= PARKED_RAD)) | ~tracks.valid
-    seen = tracks.valid.any(axis=1)
-    parks = still.all(axis=1) & seen
+    stands = ((away <= PARKED_M) & (turn <= PARKED_RAD)) | ~tracks.valid
+    has_pose = tracks.valid.any(axis=1)
+    parks = stands.all(axis=1) & has_pose
     parks[tracks.ego] = False
     rank = _rank(tracks, np.where(tracks.valid, away, 0.0).max(axis=1), preferred)
     order = np.argsort(rank, kind="stable")
-    moving_rows, parked_rows = order[(seen & ~parks)[order]], order[parks[order]]
+    moving_rows, parked_rows = order[(has_pose & ~parks)[order]], order[parks[order]]
     overflow = +Counter(agents=len(moving_rows) - agents, parked=len(parked_rows) - parked)
     return Placement(moving_rows[:agents], parked_rows[:parked], pose, overflow)
 
@@ -138,16 +143,16 @@ def median_pose(tracks: LocalTracks) -> Float[Array, "track 4"]:
 
 def _rank(tracks: LocalTracks, reach_m: Array, preferred: Sequence[int]) -> Float[Array, " track"]:
     """Sort key of every track, smaller is more relevant; ``reach_m`` is its largest distance from its median pose."""
-    both = tracks.valid & tracks.valid[tracks.ego]
+    with_ego = tracks.valid & tracks.valid[tracks.ego]
     distance = np.hypot(*np.moveaxis((tracks.xyz - tracks.xyz[tracks.ego])[..., :2], -1, 0))
-    rank = np.where(both, distance, 1e6).min(axis=1) - MOVER_BONUS_M * (reach_m > MOVER_M)
-    rank[list(preferred)] -= 1e7
+    rank = np.where(with_ego, distance, _UNRELATED_M).min(axis=1) - MOVER_BONUS_M * (reach_m > MOVER_M)
+    rank[list(preferred)] -= _PREFERENCE_M
     rank[tracks.ego] = -np.inf
     return rank
 
 
 def extend(
-    tracks: LocalTracks, rows: Int[Array, " slot"], on: LaneSegments, count: int
+    tracks: LocalTracks, rows: Int[Array, " slot"], lane_segments: LaneSegments, count: int
 ) -> Float[Array, "slot count 2"]:
     """Extend tracks by ``count`` points 4 m apart beyond their last valid pose: along their lane, else straight on.
 
@@ -159,15 +164,15 @@ def extend(
     distance = EXTENSION_STEP_M * np.arange(1, count + 1)
     direction = np.stack((np.cos(heading), np.sin(heading)), axis=-1)
     points = xyz[:, None, :2] + distance[:, None] * direction[:, None]
-    lane, s, _ = on.nearest(xyz, heading, reach_m=3.0, turn_rad=np.deg2rad(45.0))
+    lane, s, _ = lane_segments.nearest(xyz, heading, reach_m=3.0, turn_rad=np.deg2rad(45.0))
     drives = among(tracks.kind[rows], (AgentKind.VEHICLE, AgentKind.CYCLIST))
     follows = np.flatnonzero((lane >= 0) & drives)
     if len(follows) == 0:
         return points
-    lines, lane, s = on.graph.lines, lane[follows], s[follows]
+    lines, lane, s = lane_segments.graph.lines, lane[follows], s[follows]
     offset = xyz[follows, :2] - lines.at(lane, s)[..., :2]
     lateral = np.einsum("ai,ai->a", offset, left_normals(lines.heading(lane, s)))
-    ahead, lane_heading = walk(on.graph, lane, s, EXTENSION_STEP_M, count)
+    lane_points, lane_heading = walk(lane_segments.graph, lane, s, EXTENSION_STEP_M, count)
     fade = np.maximum(1.0 - distance / FADE_M, 0.0)
-    points[follows] = ahead + (lateral[:, None] * fade)[..., None] * left_normals(lane_heading)
+    points[follows] = lane_points + (lateral[:, None] * fade)[..., None] * left_normals(lane_heading)
     return points
