@@ -177,7 +177,8 @@ class PdmPlanner:
         rows = lines.at(proposals.way).reshape(*plans.shape[:2], -1)
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
-        every = config.scoring.ground_every
+        # The controller swings out in bends and touches curbs between look-ups.
+        every = 1 if self._plans else config.scoring.ground_every
         contacts = jax.vmap(Contacts.along, in_axes=(0, None, None))(cars.motion, size, others)
         needs_lanes = jax.vmap(partial(Contacts.needs_lanes, steps=config.steps + 1))(contacts)
         ground = ground_along(bank, context.index, cars.motion, size, z, on_route, needs_lanes, every)

@@ -37,7 +37,8 @@ class ScoringConfig:
         standing_mps: Speed below which time to collision is not evaluated.
         astray_m: Continuous distances off the route's direction up to which the gate is 1, and up to which it is 0.5.
         least_progress_m: If the best proposal makes less progress, all allowed proposals count as making the most.
-        ground_every: Steps between look-ups of lanes and edges; the publication looks them up at every step.
+        ground_every: Steps between look-ups of lanes and edges; in the action space ``trajectory`` every step, as
+            published.
     """
 
     progress: float = 5.0
