@@ -14,7 +14,8 @@ from drivax.errors import UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking, is_emergency, stop
-from drivax.planners.pdm.forecast import Forecast
+from drivax.planners.pdm.forecast import Forecast, boxes_of
+from drivax.planners.pdm.ground import ground_at
 from drivax.planners.pdm.planner import PUBLISHED_DRIVER, PdmConfig, PdmPlanner
 from drivax.planners.pdm.proposals import LINE_BEND, LINE_PLACE, Lines, unroll_idm
 from drivax.planners.pdm.scoring import ScoringConfig
@@ -244,6 +245,25 @@ def test_proposals_are_unrolled_as_the_simulator_executes_their_plans():
     # The chosen plan is handed over.
     best = int(np.argmax(scored.score))
     np.testing.assert_allclose(action.reshape(-1, 3)[:41], scored.plans[best], atol=1e-6)
+
+
+def test_tracked_proposals_are_looked_up_at_every_pose():
+    """In the action space ``trajectory``: heading for the edge of the road, tracked back onto the lane."""
+    space = Trajectory(initial_steering="logged")
+    simulator, planner = Simulator(replace(TASK, actions=space)), PdmPlanner(space)
+
+    def gate_and_look_ups(bank):
+        state, key, index = simulator.reset(bank, 0, 10, 0), jax.random.key(0), jnp.asarray(0)
+        situation = simulator.situation(bank, state)
+        scored = planner.score_proposals(planner.init(bank, state, key), bank, situation)
+        boxes = boxes_of(scored.cars.motion, jnp.array([4.8, 2.0]))
+        look = lambda box: ground_at(bank, index, box, jnp.zeros(()), jnp.asarray(True))  # noqa: E731
+        return scored.metrics.road, jax.vmap(jax.vmap(look))(boxes).off
+
+    road, off = quick(gate_and_look_ups, bank_of(straight_road([car(0, 0, -0.2, 9)])))
+    assert (1.0 - road).tolist() == off.any(axis=1).tolist()
+    # Some corners are off the road for less than half a second, between multiples of it.
+    assert (off.any(axis=1) & ~off[:, ::5].any(axis=1)).any() and not off.any(axis=1).all()
 
 
 def test_agents_that_touched_ego_are_ignored():

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from drivax.planners.pdm.forecast import Forecast, fault_times, overlapping
+from drivax.planners.pdm import ground
+from drivax.planners.pdm.forecast import Contacts, Forecast, boxes_of, overlapping
+from drivax.planners.pdm.ground import Ground, ground_along, ground_at
 from drivax.planners.pdm.scoring import (
-    Ground,
     ProposalMetrics,
     ScoringConfig,
     _direction,
     evaluate_proposal,
-    ground_along,
-    ground_at,
     is_comfortable,
     scores,
 )
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import Frame
+from drivax.synthetic.world import generate_recording
 from quick import quick
 from scenes import bank_of, car, straight_road
 
@@ -47,9 +52,10 @@ def others(*rows):
 @pytest.fixture(scope="module")
 def evaluate():
     def one(motion, others, several):
-        ground = Ground(several, jnp.zeros(41, bool), jnp.zeros(41, bool))
+        position = Ground(several, jnp.zeros(41, bool), jnp.zeros(41, bool))
         still = jnp.zeros(41), jnp.zeros(())
-        return evaluate_proposal(motion, *still, SIZE, others, ground, motion[-1, 0], CONFIG)
+        contacts = Contacts.along(motion, SIZE, others)
+        return evaluate_proposal(motion, *still, SIZE, others, contacts, position, motion[-1, 0], CONFIG)
 
     run = jax.jit(one)
     return lambda motion, others, several=False: jax.device_get(
@@ -178,9 +184,45 @@ def test_ground_is_looked_up_ahead_of_each_step():
     drift = np.stack([10 * T, -0.5 * T, 0 * T, np.full(41, 10.0)], 1)
     motion = jnp.asarray(np.stack([np.asarray(straight(10.0)), drift]), jnp.float32)
     z, there = jnp.zeros((2, 41)), jnp.ones((2, 41), bool)
-    found = quick(lambda b, m: ground_along(b, jnp.asarray(0), m, SIZE, z, there, 5), bank, motion)
+    found = quick(lambda b, m: ground_along(b, jnp.asarray(0), m, SIZE, z, there, there, 5), bank, motion)
     # 1.15 m aside is the limit, after 2.3 s; the look-up at 2.5 s stands for 2.1 s to 2.5 s.
     assert not found.off[0].any() and found.off[1].tolist() == [False] * 21 + [True] * 20
+
+
+@pytest.mark.parametrize(("most", "every"), [((96, 40), 5), ((96, 40), 1), ((20, 40), 5), ((96, 6), 5)])
+def test_ground_along_equals_a_query_of_the_grid_per_pose(monkeypatch, most, every):
+    """On curves that leave lanes, road and route of generated worlds, also with more segments than fit."""
+    monkeypatch.setattr(ground, "PATH_SEGMENTS", most[0])
+    monkeypatch.setattr(ground, "GROUP_SEGMENTS", most[1])
+    worlds = [assemble(generate_recording(0, index)) for index in range(6)]
+    bank = ScenarioBank.from_scenarios(worlds)
+    rng = np.random.default_rng(0)
+    curvature, speed = rng.normal(0.0, 0.02, (6, 5, 1)), rng.uniform(0.0, 15.0, (6, 5, 1))
+    start = np.array([[*world.agent_xy[10, 0], world.agent_heading[10, 0]] for world in worlds])[:, None]
+    turned = start[..., 2:] + curvature * speed * T
+    steps = speed[..., None] * DT * np.stack([np.cos(turned), np.sin(turned)], -1)
+    xy = start[..., None, :2] + np.cumsum(steps, axis=2) - steps[:, :, :1]
+    motion = np.concatenate([xy, turned[..., None], np.broadcast_to(speed[..., None], (6, 5, 41, 1))], -1)
+    z = np.broadcast_to(bank.agents[:, 10, 0, AgentColumn.Z][:, None, None] - 0.75, (6, 5, 41))
+    on_route, needs_lanes = rng.random((6, 5, 41)) < 0.9, rng.random((6, 5, 41)) < 0.1
+    poses = (np.asarray(motion, np.float32), z, on_route)
+
+    def along(index, motion, z, on_route, needs_lanes):
+        return ground_along(bank, index, motion, SIZE, z, on_route, needs_lanes, every)
+
+    def query(index, motion, z, on_route):
+        return jax.vmap(jax.vmap(partial(ground_at, bank, index)))(boxes_of(motion, SIZE), z, on_route)
+
+    index = jnp.arange(6)
+    seen = jax.device_get(jax.jit(jax.vmap(along))(index, *poses, needs_lanes))
+    exact = jax.device_get(jax.jit(jax.vmap(query))(index, *poses))
+    # Each step shares the look-up at the end of its interval.
+    at = np.ceil(np.arange(41) / every).astype(int) * every
+    np.testing.assert_array_equal(seen.off, exact.off[..., at])
+    np.testing.assert_array_equal(seen.astray, exact.astray[..., at])
+    np.testing.assert_array_equal(seen.several[needs_lanes], exact.several[..., at][needs_lanes])
+    for flags in (exact.off, exact.astray, exact.several[needs_lanes]):
+        assert 0.1 < flags.mean() < 0.9
 
 
 def test_forecast_keeps_agents_that_come_near():
@@ -260,7 +302,7 @@ def test_fault_is_decided_at_the_first_contact_only():
     both = others((-12, 0, 0, 10, AgentKind.VEHICLE), (15, 0, 0, 0, AgentKind.VEHICLE))
 
     def times(motion, others):
-        return fault_times(motion, SIZE, others, overlapping(motion, SIZE, others), jnp.ones(41, bool))
+        return Contacts.along(motion, SIZE, others).fault_times(jnp.ones(41, bool))
 
     found = quick(times, straight(4.0), both)
     # 15 - 4.8 = 10.2 m at 4 m/s: 2.55 s.

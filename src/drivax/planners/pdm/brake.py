@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import LENGTH, WIDTH
-from drivax.planners.pdm.forecast import Forecast, fault_times, overlapping
+from drivax.planners.pdm.forecast import Contacts, Forecast
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
@@ -124,8 +124,7 @@ class EmergencyBrake:
         others = Forecast.of(around.frame, context.slot, touched, drive[::5, :2], _OTHERS, _RADIUS_M)
         size = me[LENGTH : WIDTH + 1]
         unlawful = jnp.broadcast_to(around.lanes.leaving_lane, drive.shape[:1])
-        touching = overlapping(drive, size, others)
-        fault_s = jnp.min(fault_times(drive, size, others, touching, unlawful))
+        fault_s = jnp.min(Contacts.along(drive, size, others).fault_times(unlawful))
         speed = motion[MOTION_SPEED]
         unclipped = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
         brake = stop(self.actions, motion, unclipped, me[LENGTH], self.config)

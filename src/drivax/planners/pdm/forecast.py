@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -73,29 +75,47 @@ def overlapping(
     return overlap_within(me, velocity, then, others.velocity, horizon_s) & others.valid
 
 
-def fault_times(
-    motion: Float[Array, "T 4"], size: Vector, others: Forecast, touching: Bool[Array, "T K"],
-    unlawful: Bool[Array, " T"],
-) -> Float[Array, " K"]:  # fmt: skip
-    """Return the time of the first at-fault collision with each agent, s; infinite for none.
+@record
+class Contacts:
+    """First contact of ego's motion with each agent, and whose fault it is."""
 
-    ``simulator.contact.classify_contacts`` decides the fault at the first overlap (``touching``: :func:`overlapping`);
-    ``unlawful`` masks the steps at which ego is in several lanes or off the road.
-    """
-    steps = jnp.arange(motion.shape[0])
-    first = jnp.min(jnp.where(touching, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
-    hit = jnp.isfinite(first)
-    step = jnp.where(hit, first, 0.0).astype(jnp.int32)
-    me = boxes_of(motion[step], size)
-    moved = others.box.at[:, :2].add(others.velocity * (step * DT_S)[:, None])
-    speeds = norm(others.velocity)
+    touches: Bool[Array, "*batch K"]
+    step: Int[Array, "*batch K"]  # Of the motion; 0 without a contact
+    lawful_fault: Bool[Array, "*batch K"]  # Ego's fault if it is in a single lane and on the road
+    unlawful_fault: Bool[Array, "*batch K"]  # Ego's fault otherwise
 
-    def at_fault(both: Array, kind: Array, speed: Array, other: Array, several: Array) -> Array:
-        two, slot = jnp.zeros(2), jnp.zeros((), jnp.int32)
-        kinds, lights = jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
-        frame = Frame(both, jnp.zeros((2, 2)), two, two == 0.0, kinds, lights)
-        return classify_contacts(frame, slot, jnp.arange(2) == 1, speed, two + other, several)[0][1]
+    @classmethod
+    def along(cls, motion: Float[Array, "T 4"], size: Vector, others: Forecast) -> Contacts:
+        """Find the first overlap with each agent; ``simulator.contact.classify_contacts`` decides its fault."""
+        steps = jnp.arange(motion.shape[0])
+        touching = overlapping(motion, size, others)
+        first = jnp.min(jnp.where(touching, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
+        touches = jnp.isfinite(first)
+        step = jnp.where(touches, first, 0.0).astype(jnp.int32)
+        me = boxes_of(motion[step], size)
+        moved = others.box.at[:, :2].add(others.velocity * (step * DT_S)[:, None])
 
-    pairs = jnp.stack([me, moved], axis=1)
-    fault = jax.vmap(at_fault)(pairs, others.kind, motion[step, MOTION_SPEED], speeds, unlawful[step])
-    return jnp.where(hit & fault, first * DT_S, jnp.inf)
+        def at_fault(unlawful: bool, both: Array, kind: Array, speed: Array, other: Array) -> Array:
+            zeros, slot = jnp.zeros(2), jnp.zeros((), jnp.int32)
+            kinds, lights = jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
+            frame = Frame(both, jnp.zeros((2, 2)), zeros, zeros == 0.0, kinds, lights)
+            fresh = jnp.arange(2) == 1
+            return classify_contacts(frame, slot, fresh, speed, zeros + other, jnp.asarray(unlawful))[0][1]
+
+        pairs = jnp.stack([me, moved], axis=1)
+        contacts = pairs, others.kind, motion[step, MOTION_SPEED], norm(others.velocity)
+        faults = (jax.vmap(partial(at_fault, unlawful))(*contacts) for unlawful in (False, True))
+        return cls(touches, step, *faults)
+
+    def needs_lanes(self, steps: int) -> Bool[Array, " T"]:
+        """Mask of the steps at which a fault depends on lanes and road."""
+        depends = self.touches & (self.lawful_fault != self.unlawful_fault)
+        return ((self.step == jnp.arange(steps)[:, None]) & depends).any(axis=1)
+
+    def fault_times(self, unlawful: Bool[Array, " T"]) -> Float[Array, " K"]:
+        """Return the time of the contact with each agent if it is at fault, s, else infinity.
+
+        ``unlawful`` masks the steps at which ego is in several lanes or off the road.
+        """
+        fault = jnp.where(unlawful[self.step], self.unlawful_fault, self.lawful_fault)
+        return jnp.where(self.touches & fault, self.step * DT_S, jnp.inf)

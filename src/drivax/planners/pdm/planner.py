@@ -7,6 +7,7 @@ Planning" (CoRL 2023), and its published implementation; ``docs/guide/planners.m
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,7 +18,8 @@ from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH
 from drivax.planners.pdm import scoring
 from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency, stop
-from drivax.planners.pdm.forecast import Forecast
+from drivax.planners.pdm.forecast import Contacts, Forecast
+from drivax.planners.pdm.ground import ground_along
 from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unroll_idm
 from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig
 from drivax.planners.pdm.tracking import Car, Reference, track
@@ -175,13 +177,16 @@ class PdmPlanner:
         rows = lines.at(proposals.way).reshape(*plans.shape[:2], -1)
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
-        every = config.scoring.ground_every
-        ground = scoring.ground_along(bank, context.index, cars.motion, size, z, on_route, every)
+        # The controller swings out in bends and touches curbs between look-ups.
+        every = 1 if self._plans else config.scoring.ground_every
+        contacts = jax.vmap(Contacts.along, in_axes=(0, None, None))(cars.motion, size, others)
+        needs_lanes = jax.vmap(partial(Contacts.needs_lanes, steps=config.steps + 1))(contacts)
+        ground = ground_along(bank, context.index, cars.motion, size, z, on_route, needs_lanes, every)
         ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
         yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
 
-        metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, 0, None, None, None, 0, 0, None))(
-            cars.motion, cars.acceleration, yaw_rate, size, others, ground, ends, config.scoring
+        metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, 0, None, None, None, 0, 0, 0, None))(
+            cars.motion, cars.acceleration, yaw_rate, size, others, contacts, ground, ends, config.scoring
         )
         return ScoredProposals(plans, cars, metrics, scoring.scores(metrics, config.scoring))
 

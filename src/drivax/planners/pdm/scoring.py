@@ -6,20 +6,19 @@ Source: Dauner et al. 2023 and its published implementation, which follows nuPla
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drivax.geometry.boxes import LENGTH, corners
+from drivax.geometry.boxes import LENGTH
 from drivax.geometry.vectors import norm, wrap
 from drivax.metrics import comfort
-from drivax.planners.pdm.forecast import Forecast, boxes_of, fault_times, overlapping
-from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, is_mapped, offroad_distance
-from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
+from drivax.planners.pdm.forecast import Contacts, Forecast, boxes_of, overlapping
+from drivax.planners.pdm.ground import Ground
+from drivax.scenario.bank.scenario_bank import Scalar, Vector
 from drivax.scenario.record import record
-from drivax.scenario.schema import DT_S, AgentKind, Flag
+from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.contact import REAR_AXLE
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED
 
@@ -38,7 +37,8 @@ class ScoringConfig:
         standing_mps: Speed below which time to collision is not evaluated.
         astray_m: Continuous distances off the route's direction up to which the gate is 1, and up to which it is 0.5.
         least_progress_m: If the best proposal makes less progress, all allowed proposals count as making the most.
-        ground_every: Steps between look-ups of lanes and edges; the publication looks them up at every step.
+        ground_every: Steps between look-ups of lanes and edges; in the action space ``trajectory`` every step, as
+            published.
     """
 
     progress: float = 5.0
@@ -50,16 +50,6 @@ class ScoringConfig:
     astray_m: tuple[float, float] = (2.0, 6.0)
     least_progress_m: float = 0.1
     ground_every: int = 5
-
-
-@record
-class Ground:
-    """Position relative to lanes and road at each step of a motion."""
-
-    several: Bool[Array, "*T"]  # In more than one lane
-    off: Bool[Array, "*T"]  # Some corner is off the road
-    # The centre is outside the lanes in the route's direction (nuPlan's oncoming traffic)
-    astray: Bool[Array, "*T"]
 
 
 @record
@@ -77,49 +67,15 @@ class ProposalMetrics:
     fault_s: Float[Array, "*batch"]  # Time of the first at-fault collision, infinite for none
 
 
-def ground_at(
-    bank: ScenarioBank, index: Integer, box: Float[Array, " 6"], z: Scalar, on_route: Bool[Array, ""]
-) -> Ground:
-    """Return the position of ego's box at a hypothetical pose, on ground of height ``z``, relative to lanes and road.
-
-    Beyond the end of the route (not ``on_route``) only wrong-way driving is astray.
-    """
-    points = corners(box)
-    lanes = around_lanes(bank, index, box[:2], box[2:4], points, z)
-    beyond = offroad_distance(bank, index, box[:2], points, lanes.points_near, z).max()
-    routed = ((bank.flags[index] & jnp.uint32(int(Flag.ROUTE))) != 0) & on_route
-    astray = jnp.where(routed, ~lanes.on_corridor, lanes.wrong_way)
-    return Ground(lanes.leaving_lane, (beyond > OFFROAD_TOLERANCE_M) & is_mapped(bank, index), astray)
-
-
-def ground_along(
-    bank: ScenarioBank, index: Integer, motion: Float[Array, "N T 4"], size: Vector,
-    z: Float[Array, "N T"], on_route: Bool[Array, "N T"], every: int,
-) -> Ground:  # fmt: skip
-    """Return :func:`ground_at` along N motions from one pose.
-
-    Looked up at every ``every``-th step (a divisor of T - 1); the steps between use the next look-up.
-    """
-    box, few = boxes_of(motion, size), slice(every, None, every)
-    look = partial(ground_at, bank, index)
-    now = look(box[0, 0], z[0, 0], on_route[0, 0])
-    # One motion after the other: what is read for all of them exceeds the caches.
-    later = jax.lax.map(lambda poses: jax.vmap(look)(*poses), (box[:, few], z[:, few], on_route[:, few]))
-
-    def spread(first: Array, rest: Array) -> Array:
-        first = jnp.broadcast_to(first, (rest.shape[0], 1))
-        return jnp.concatenate([first, jnp.repeat(rest, every, axis=1)], axis=1)
-
-    return jax.tree.map(spread, now, later)
-
-
 def evaluate_proposal(
     motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar, size: Vector,
-    others: Forecast, ground: Ground, progress_m: Scalar, config: ScoringConfig,
+    others: Forecast, contacts: Contacts, ground: Ground, progress_m: Scalar, config: ScoringConfig,
 ) -> ProposalMetrics:  # fmt: skip
-    """Evaluate one proposal: ego's motion and acceleration at each step, with its ``yaw_rate`` now (rad/s)."""
-    unlawful = ground.several | ground.off
-    faults = fault_times(motion, size, others, overlapping(motion, size, others), unlawful)
+    """Evaluate one proposal: ego's motion and acceleration at each step, with its ``yaw_rate`` now (rad/s).
+
+    ``contacts`` and ``ground`` are those along the motion.
+    """
+    faults = contacts.fault_times(ground.several | ground.off)
     soon = overlapping(motion, size, others, config.ttc_s)
     alive = (others.kind == AgentKind.VEHICLE) | (others.kind == AgentKind.PEDESTRIAN)
     alive |= others.kind == AgentKind.CYCLIST

@@ -54,8 +54,15 @@ def left_of_edges(
     whose line is further away decides. Points must lie within 5 m of ``centre``, whose cells are read.
     """
     rows, inside = edges_around(bank, index, centre)
+    return left_of_segments(rows, inside & is_level(rows[EdgeRow.Z], z), points)
+
+
+def left_of_segments(
+    rows: Float[Array, "5 K"], counts: Bool[Array, " K"], points: Float[Array, "P 2"]
+) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:
+    """Return the values of :func:`left_of_edges` for the edges ``rows`` of the mask ``counts``."""
     squared, side = to_segments(rows, points)
-    squared = jnp.where(inside & _level(rows[EdgeRow.Z], z), squared, _FAR)
+    squared = jnp.where(counts, squared, _FAR)
     nearest = squared.min(axis=1)
     tied = squared <= (nearest + 1e-4 + 1e-4 * nearest)[:, None]
     left = jnp.max(jnp.where(tied, side, -_FAR), axis=1)
@@ -113,7 +120,8 @@ def to_segments(
     return dx * dx + dy * dy, (ux * wy - uy * wx) * jax.lax.rsqrt(squared)
 
 
-def _level(height: Float[Array, " K"], z: Scalar) -> Bool[Array, " K"]:
+def is_level(height: Float[Array, " K"], z: Scalar) -> Bool[Array, " K"]:
+    """Whether segments are on the level of a height."""
     return jnp.abs(height - z) <= LEVEL_M
 
 
@@ -163,7 +171,7 @@ def around_lanes(
     nearest within 30 degrees, else the nearest within 90 degrees.
     """
     rows, inside = lanes_around(bank, index, centre)
-    inside = inside & _level(rows[LaneRow.Z], z)
+    inside = inside & is_level(rows[LaneRow.Z], z)
     box = jnp.concatenate([centre[None], points])
     squared, side = to_segments(rows, box)
     squared = jnp.where(inside, squared, _FAR)
@@ -218,7 +226,7 @@ def lane_distance(bank: ScenarioBank, index: Integer, xy: Vector, z: Scalar) -> 
     """Distance to the nearest lane centre in any direction, m; infinite beyond the cut-off."""
     rows, inside = lanes_around(bank, index, xy)
     squared = to_segments(rows, xy[None])[0][0]
-    nearest = jnp.where(inside & _level(rows[LaneRow.Z], z), squared, _FAR).min()
+    nearest = jnp.where(inside & is_level(rows[LaneRow.Z], z), squared, _FAR).min()
     return jnp.where(nearest <= LANE_CUTOFF_M**2, root(nearest), jnp.inf)
 
 
@@ -261,7 +269,7 @@ def _corner_lanes(
     """Whether a lane is near a corner of a long box, and whether the corner is outside all lanes."""
     rows, inside = lanes_around(bank, index, point)
     squared = to_segments(rows, point[None])[0]
-    squared = jnp.where(inside & _level(rows[LaneRow.Z], z), squared, _FAR)
+    squared = jnp.where(inside & is_level(rows[LaneRow.Z], z), squared, _FAR)
     holds = _holds(squared, _runs_along(rows, heading), rows[LaneRow.HALF_WIDTH])
     return squared.min() <= LANE_CUTOFF_M**2, ~holds.any()
 
@@ -280,9 +288,21 @@ def offroad_distance(
         left, known = (part[:, 0] for part in look(points))
     else:
         left, known = left_of_edges(bank, index, centre, points, z)
+    distance, is_known = offroad_by_edges(bank, index, points, left, known)
+    return jnp.where(is_known, distance, jnp.where(points_near_lane, -EDGE_CUTOFF_M, EDGE_CUTOFF_M))
+
+
+def offroad_by_edges(
+    bank: ScenarioBank, index: Integer, points: Float[Array, "P 2"], left: Float[Array, " P"],
+    known: Bool[Array, " P"],
+) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:  # fmt: skip
+    """Return :func:`offroad_distance` by edges and stored sides, and the mask of points where these decide.
+
+    ``left`` and ``known`` are the values of :func:`left_of_edges`.
+    """
     stored = _stored_side(bank, index, points)
-    off = jnp.where(stored != 0, stored == NOT_DRIVABLE, ~points_near_lane)
-    return jnp.where(known, -left, jnp.where(off, EDGE_CUTOFF_M, -EDGE_CUTOFF_M))
+    sides = jnp.where(stored == NOT_DRIVABLE, EDGE_CUTOFF_M, -EDGE_CUTOFF_M)
+    return jnp.where(known, -left, sides), known | (stored != 0)
 
 
 def _stored_side(bank: ScenarioBank, index: Integer, points: Float[Array, "P 2"]) -> Int[Array, " P"]:
@@ -399,7 +419,7 @@ def lane_course(
     length = jnp.sqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
     cos = (ux * heading[0] + uy * heading[1]) / length
     sin = (ux * heading[1] - uy * heading[0]) / length
-    fits = inside & _level(rows[LaneRow.Z], z) & (cos > 0.5) & (squared[0] <= _FOLLOWED_M**2)
+    fits = inside & is_level(rows[LaneRow.Z], z) & (cos > 0.5) & (squared[0] <= _FOLLOWED_M**2)
     best = first_smallest(jnp.where(fits, squared[0] + (4.0 * sin) ** 2, _FAR))
     direction = jnp.stack([ux[best], uy[best]]) / length[best]
     return direction, side[0, best], fits[best]
@@ -428,7 +448,7 @@ def lane_passage(
     """
     rows, inside = lanes_around(bank, index, xy)
     to_line, side = to_segments(rows, xy[None])
-    counts = inside & _runs_along(rows, heading) & _level(rows[LaneRow.Z], z)
+    counts = inside & _runs_along(rows, heading) & is_level(rows[LaneRow.Z], z)
     lane = jnp.where(counts, rows[LaneRow.LANE], -1.0).astype(jnp.int32)
     squared, side = jnp.where(counts, to_line[0], _FAR), side[0]
     codes = bank.lane_strands[index]
