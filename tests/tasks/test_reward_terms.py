@@ -69,7 +69,7 @@ def value(term, near=True, before=BEFORE, **now):
 
 
 #: Scales of ``pace``, m.
-LATE_M, EARLY_M = 8.0, 8.0
+LATE_M, EARLY_M = 4.0, 8.0
 #: Term, what is different from the quiet moment, and the value by hand.
 CASES = [
     ("collision", {}, 0.0),
@@ -131,11 +131,11 @@ CASES = [
     # On time; at the slack ahead; one scale late; one scale early.
     ("pace", {"late_m": -5.0, "early_m": -5.0}, 1.0),
     ("pace", {"late_m": -11.0, "early_m": 1.0}, 1.0),
-    ("pace", {"late_m": LATE_M, "early_m": -18.0}, np.exp(-1)),
+    ("pace", {"late_m": LATE_M, "early_m": -18.0}, 0.5),
     ("pace", {"late_m": -15.0, "early_m": 1.0 + EARLY_M}, np.exp(-1)),
     ("completion", {"completed": 0.25}, 0.25),
     ("completion", {}, 0.0),
-    ("route_offset", {"route_deviation_m": 0.5}, 0.25),
+    ("route_offset", {"route_deviation_m": 0.25}, 0.25),
     ("route_offset", {"route_deviation_m": 5.0}, 1.0),
     ("route_offset", {"route_deviation_m": 5.0, "routed": False}, 0.0),
     ("urgency", {"ttc_s": 0.5}, 0.75),
@@ -230,9 +230,9 @@ def in_numpy(before, now, near):
             "goal": routed and n["goal_distance_m"] <= 3 < b["goal_distance_m"],
             "lane_change": n["lane_changed"],
             "merge": n["merged"],
-            "pace": np.exp(-max(n["late_m"], 0) / LATE_M - max(n["early_m"] - 1, 0) / EARLY_M),
+            "pace": np.exp(-max(n["early_m"] - 1, 0) / EARLY_M) / (1 + max(n["late_m"], 0) / LATE_M),
             "completion": max(n["completed"] - b["completed"], 0),
-            "route_offset": min(n["route_deviation_m"] / 2, 1) if routed else 0,
+            "route_offset": min(n["route_deviation_m"], 1) if routed else 0,
             "urgency": max(0, 1 - n["ttc_s"] / 2) if defined else 0,
         }
         for name, number in row.items():
@@ -331,12 +331,12 @@ def test_aggressive_preset_by_hand():
 
 def test_soft_factors_lower_a_softened_term_one_after_the_other():
     """Each takes its share of what those before it leave, so that the sum is their product."""
-    hard = {"ttc_s": 1.0, "acceleration_mps2": 1.2, "speed_mps": 20.0, "route_deviation_m": 1.0}
+    hard = {"ttc_s": 1.0, "acceleration_mps2": 1.2, "speed_mps": 20.0, "route_deviation_m": 0.5}
     terms = RewardConfig(preset="pace", scale=2.0).weigh(BEFORE, facts(**hard), around())
     assert float(terms["pace"]) == pytest.approx(0.2)
     assert float(terms["pace/urgency"]) == pytest.approx(-0.2 * 0.3 * 0.5)
     assert float(terms["pace/discomfort"]) == pytest.approx(-0.2 * 0.85 * 0.2 * 0.25)
-    whole = 0.2 * (1 - 0.3 * 0.5) * (1 - 0.2 * 0.25) * (1 - 0.2) * (1 - 0.1 * 0.5)
+    whole = 0.2 * (1 - 0.3 * 0.5) * (1 - 0.2 * 0.25) * (1 - 0.2) * (1 - 0.2 * 0.5)
     assert float(sum(terms.values())) == pytest.approx(whole)
     crash = RewardConfig(preset="pace").weigh(BEFORE, facts(collision=True), around())
     assert float(sum(crash.values())) == pytest.approx(-3.0 + 0.1)

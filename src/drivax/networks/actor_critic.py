@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
@@ -12,6 +13,7 @@ from drivax.networks.distributions import (
     Actions,
     Distribution,
     DistributionName,
+    SquashedGaussian,
     distribution,
     initial_parameters,
     parameter_count,
@@ -47,8 +49,10 @@ class NetworkConfig:
         encoder: The encoder; policy, value and each critic have their own.
         head: Hidden layers between embedding and output.
         activation: Activation after each hidden layer of a head; outputs are linear.
-        first_scale: Standard deviation of an untrained policy: before squashing (gaussian, mixture), of the action
-            (beta), or of the Gaussian whose density weights the levels (grid).
+        first_scale: Standard deviation of an untrained policy, for all actions or for each: before squashing (gaussian,
+            mixture), of the action (beta), or of the Gaussian whose density weights the levels (grid).
+        least_scale: Lower bound of the standard deviation of a Gaussian, as a share of ``first_scale``, so that
+            exploration does not vanish.
         distribution: Action distribution; ``grid`` is for ``discrete`` actions.
         shared_encoder: Whether policy and value share one encoder.
     """
@@ -56,13 +60,16 @@ class NetworkConfig:
     encoder: EncoderSettings = field(default_factory=MlpConfig)
     head: tuple[int, ...] = (64,)
     activation: Activation = "tanh"
-    first_scale: float = 0.3
+    first_scale: float | tuple[float, ...] = 0.3
+    least_scale: float = 0.0
     distribution: DistributionName = "gaussian"
     shared_encoder: bool = False
 
     def __post_init__(self) -> None:
-        if self.first_scale <= 0.0:
-            raise ValueError(f"first_scale is {self.first_scale:g}; use more than 0")
+        if np.min(self.first_scale) <= 0.0:
+            raise ValueError(f"first_scale is {self.first_scale}; use more than 0")
+        if not 0.0 <= self.least_scale <= 1.0:
+            raise ValueError(f"least_scale is {self.least_scale}; use 0 to 1")
 
 
 class _Head(nnx.Module):
@@ -101,7 +108,7 @@ class Policy(nnx.Module):
     ) -> None:
         self.actions = actions or Actions()
         self.kind: DistributionName = config.distribution
-        self.first_scale = config.first_scale
+        self.first_scale, self.least_scale = config.first_scale, config.least_scale
         self.encoder = config.encoder.build(spec, rngs)
         self.head = _Head(
             config, self.encoder.width, parameter_count(self.kind, self.actions), _POLICY_GAIN, rngs
@@ -114,7 +121,11 @@ class Policy(nnx.Module):
     def from_embedding(self, embedding: Float[Array, "*batch width"]) -> Distribution:
         """Return the action distribution of an embedding."""
         initial = initial_parameters(self.kind, self.actions, self.first_scale)
-        return distribution(self.kind, self.head(embedding) + initial, self.actions)
+        result = distribution(self.kind, self.head(embedding) + initial, self.actions)
+        if not (self.least_scale and isinstance(result, SquashedGaussian)):
+            return result
+        least = self.least_scale * np.asarray(self.first_scale, np.float32)
+        return replace(result, scale=jnp.maximum(result.scale, least))
 
 
 class Value(nnx.Module):

@@ -283,32 +283,38 @@ def parameter_count(kind: DistributionName, actions: Actions) -> int:
 
 
 def initial_parameters(
-    kind: DistributionName, actions: Actions, scale: float
+    kind: DistributionName, actions: Actions, scale: float | tuple[float, ...]
 ) -> Float[np.ndarray, " parameters"]:
     """Return the parameters of a distribution centred at zero, to add to the outputs of an untrained head.
 
-    ``scale`` is the standard deviation of the unsquashed Gaussian, of the Beta's action, or of the Gaussian whose
-    density weights the grid's levels; in a mixture, of each component, with means between ``-scale`` and ``scale``.
+    ``scale`` is, per action or for all, the standard deviation of the unsquashed Gaussian, of the Beta's action, or of
+    the Gaussian whose density weights the grid's levels; in a mixture, of each component, with means between ``-scale``
+    and ``scale``.
 
     Raises:
-        UsageError: A Beta with this scale has no peak.
+        UsageError: A Beta with this scale has no peak, or there are scales of another number of actions.
     """
+    scales = np.atleast_1d(np.asarray(scale, np.float64))
+    if len(scales) not in (1, actions.size):
+        problem = f"first_scale has {len(scales)} numbers for {actions.size} actions"
+        raise UsageError(problem, cure="give one, or one per action")
+    scales = np.broadcast_to(scales, actions.size)
     if kind == "grid":
-        return (-0.5 * (combinations(_levels(actions)) / scale) ** 2).sum(axis=-1)
-    spread = math.log(math.expm1(scale))  # The inverse of softplus.
+        return (-0.5 * (combinations(_levels(actions)) / scales) ** 2).sum(axis=-1)
+    spread = np.log(np.expm1(scales))  # The inverse of softplus.
     if kind == "gaussian":
-        return np.repeat(np.array([0.0, spread], np.float32), actions.size)
+        return np.concatenate([np.zeros(actions.size), spread]).astype(np.float32)
     if kind == "mixture":
         # Equal components would stay equal; the one around zero starts with the largest weight.
-        means = np.linspace(-scale, scale, _COMPONENTS)
-        components = [np.repeat([mean, spread], actions.size) for mean in means]
+        means = np.linspace(-1.0, 1.0, _COMPONENTS)
+        components = [np.concatenate([mean * scales, spread]) for mean in means]
         return np.concatenate([(means == 0.0).astype(float), *components]).astype(np.float32)
     # A symmetric Beta's action has the variance 1 / (2 alpha + 1).
-    alpha_minus_1 = (scale**-2 - 1.0) / 2.0 - 1.0
-    if alpha_minus_1 <= 0.0:
-        raise UsageError(f"a Beta of first_scale {scale:g} has no peak", cure="use less than 0.577")
+    alpha_minus_1 = (scales**-2 - 1.0) / 2.0 - 1.0
+    if (alpha_minus_1 <= 0.0).any():
+        raise UsageError(f"a Beta of first_scale {scales.max():g} has no peak", cure="use less than 0.577")
     # The inverse of softplus, ln(e^x - 1), without overflow.
-    return np.full(2 * actions.size, alpha_minus_1 + math.log(-math.expm1(-alpha_minus_1)), np.float32)
+    return np.tile(alpha_minus_1 + np.log(-np.expm1(-alpha_minus_1)), 2).astype(np.float32)
 
 
 def distribution(

@@ -33,9 +33,9 @@ _JERK_MPS3, _LATERAL_MPS2 = 8.37, 4.89
 #: nuPlan's limits of braking and of acceleration.
 _BRAKING_MPS2, _ACCELERATION_MPS2 = 4.05, 2.40
 #: Scales of ``pace`` behind and ahead of the log, m; how far ahead costs nothing, m.
-_LATE_M, _EARLY_M, _EARLY_SLACK_M = 8.0, 8.0, 1.0
+_LATE_M, _EARLY_M, _EARLY_SLACK_M = 4.0, 8.0, 1.0
 #: Distance from the route at which ``route_offset`` is 1, m; time to collision at which ``urgency`` is 0, s.
-_ROUTE_OFFSET_M, _URGENT_S = 2.0, 2.0
+_ROUTE_OFFSET_M, _URGENT_S = 1.0, 2.0
 #: Cap of distances from the log, m.
 _MAX_LOG_DISTANCE_M = 10.0
 #: The goal is reached within this distance, m (semantics, ``reached_goal``).
@@ -209,11 +209,11 @@ _event_term("merge", "merged")
 def pace(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Adherence to the log's schedule along the route, in [0, 1].
 
-    1 from where the log is now to where it is a second later; 1/e 8 m behind that, and 9 m ahead of it (1 m is free). A
-    log that stands asks for standing.
+    1 from where the log is now to where it is a second later. Behind that 1 / (1 + late / 4 m), which pays to catch up
+    from any distance; ahead exp(-early / 8 m), with 1 m free. A log that stands asks for standing.
     """
     late_m, early_m = jnp.maximum(now.late_m, 0.0), jnp.maximum(now.early_m - _EARLY_SLACK_M, 0.0)
-    return jnp.exp(-late_m / _LATE_M - early_m / _EARLY_M)
+    return jnp.exp(-early_m / _EARLY_M) / (1.0 + late_m / _LATE_M)
 
 
 @reward_term("completed", softened=True)
@@ -224,7 +224,7 @@ def completion(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 
 @reward_term("routed", "route_deviation_m")
 def route_offset(before: Facts, now: Facts, around: Surroundings) -> Scalar:
-    """Distance from the route over 2 m, in [0, 1]; 0 without a route."""
+    """Distance from the route over 1 m, in [0, 1]; 0 without a route."""
     return now.routed * jnp.clip(now.route_deviation_m / _ROUTE_OFFSET_M, 0.0, 1.0)
 
 
@@ -234,8 +234,8 @@ def urgency(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     return now.ttc_defined * jnp.clip(1.0 - now.ttc_s / _URGENT_S, 0.0, 1.0)
 
 
-#: Terms that lower a softened term, and the share of it that each takes at 1; together they leave at least 0.4.
-SOFT_FACTORS = {"urgency": 0.3, "discomfort": 0.2, "speeding": 0.2, "route_offset": 0.1}
+#: Terms that lower a softened term, and the share of it that each takes at 1; together they leave at least 0.36.
+SOFT_FACTORS = {"urgency": 0.3, "discomfort": 0.2, "speeding": 0.2, "route_offset": 0.2}
 
 SAFETY = {"collision": -1.0, "offroad": -1.0, "red_light": -1.0}
 NAVIGATION = SAFETY | {"off_route": -0.2, "progress": 0.2}
