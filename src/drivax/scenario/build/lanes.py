@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,11 @@ class LaneGraph:
     chained: bool
     lost: Mapping[str, int]
     dropped_links: int = 0
+
+    @cached_property
+    def stretches(self) -> dict[tuple[int, float, float], Any]:
+        """Cache of :func:`drivax.scenario.build.lane_paths.trace`, by lane, begin and end."""
+        return {}
 
     @property
     def count(self) -> int:
@@ -301,7 +307,7 @@ class LaneSegments:
         near = self._near(xyz[:, :2], reach_m)
         if not len(near.lane):
             return np.full(len(xyz), -1), np.zeros(len(xyz)), np.full(len(xyz), np.inf)
-        distance, s = near._measure(xyz, heading, turn_rad)
+        distance, s = near._measure(xyz, heading, reach_m, turn_rad)
         best = distance.argmin(axis=1)
         pick = np.arange(len(xyz)), best
         return np.where(distance[pick] <= reach_m, near.lane[best], -1), s[pick], distance[pick]
@@ -311,7 +317,7 @@ class LaneSegments:
     ) -> list[tuple[int, float, float]]:
         """Lanes within reach of a pose as (lane, arc length on it, distance), the nearest first."""
         near = self._near(xyz[None, :2], reach_m)
-        (distance,), (s,) = near._measure(xyz[None], np.array([heading]), turn_rad)
+        (distance,), (s,) = near._measure(xyz[None], np.array([heading]), reach_m, turn_rad)
         lanes: dict[int, tuple[int, float, float]] = {}
         for i in np.argsort(distance, kind="stable"):
             lane = int(near.lane[i])
@@ -326,14 +332,21 @@ class LaneSegments:
             rows = np.flatnonzero(inside_box(self.segments.a[:, :2], xy, reach_m + LONGEST_M))
         return LaneSegments(self.graph, self.segments.take(rows), self.lane[rows], self.heading[rows])
 
-    def _measure(self, xyz: Array, heading: Array, turn_rad: float) -> tuple[Array, Array]:
-        """Distance (infinite if turn or level exclude it) and arc length of every pose on every segment."""
-        seg = self.segments
-        distance, along = point_to_segment(xyz[:, None, :2], seg.a[None, :, :2], seg.b[None, :, :2])
-        z = seg.a[:, 2] + along * (seg.b[:, 2] - seg.a[:, 2])
-        excluded = np.abs(wrap(self.heading - heading[:, None])) > turn_rad
-        excluded |= np.abs(z - xyz[:, 2:3]) > LEVEL_M
-        return np.where(excluded, np.inf, distance), seg.start_m + along * seg.span_m
+    def _measure(self, xyz: Array, heading: Array, reach_m: float, turn_rad: float) -> tuple[Array, Array]:
+        """Distance (infinite if reach, turn or level exclude it) and arc length of every pose on every segment."""
+        seg, most = self.segments, reach_m + LONGEST_M
+        distance, s = np.full((len(xyz), len(seg)), np.inf), np.zeros((len(xyz), len(seg)))
+        near = np.abs(xyz[:, :1] - seg.a[:, 0]) <= most
+        near &= np.abs(xyz[:, 1:2] - seg.a[:, 1]) <= most
+        pose, row = near.nonzero()
+        a, b = seg.a[row], seg.b[row]
+        away, along = point_to_segment(xyz[pose, :2], a[:, :2], b[:, :2])
+        z = a[:, 2] + along * (b[:, 2] - a[:, 2])
+        excluded = np.abs(wrap(self.heading[row] - heading[pose])) > turn_rad
+        excluded |= np.abs(z - xyz[pose, 2]) > LEVEL_M
+        distance[pose, row] = np.where(excluded, np.inf, away)
+        s[pose, row] = seg.start_m[row] + along * seg.span_m[row]
+        return distance, s
 
 
 def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:

@@ -19,7 +19,7 @@ from drivax.scenario.schema import RoadKind
 from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.network import RoadNetwork, per_roads
 from drivax.synthetic.traffic.obstacles import Boxes
-from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, Worlds, pick
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, Worlds
 from drivax.synthetic.traffic.roles import Drivers
 
 #: MOBIL: threshold and safe braking, m/s2; the latter grows to the second value as the own lane runs out.
@@ -192,7 +192,7 @@ class LaneChanges:
     def __init__(self, worlds: Worlds, drivers: Drivers, standing: Sequence[Boxes]) -> None:
         self.chains, self._drivers, self._worlds = LaneChains.join(worlds), drivers, worlds
         self._half = drivers.size_m[:, 0] / 2
-        self._half_of_column = pick(self._half, worlds.rows, 0.0)
+        self._half_of_column = self._half.take(worlds.rows)
         blocked = [
             (self.chains.chain[first + lane], self.chains.offset_m[first + lane] + position)
             for first, network, boxes in zip(worlds.lane[:-1], worlds.networks, standing, strict=True)

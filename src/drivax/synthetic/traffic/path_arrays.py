@@ -49,9 +49,9 @@ def group_indices(group: Int64[np.ndarray, " item"], groups: int) -> Int64[np.nd
     return table
 
 
-def pick(values: np.ndarray, indices: np.ndarray, missing: float) -> np.ndarray:
-    """Values at indices, and a value for missing ones (-1)."""
-    return np.append(values, np.array([missing], values.dtype)).take(indices)
+def pad_last(values: np.ndarray, missing: float) -> np.ndarray:
+    """Append a value to the last axis, so that index -1 (missing) picks it."""
+    return np.concatenate((values, np.full((*values.shape[:-1], 1), missing, values.dtype)), axis=-1)
 
 
 def pad_steps(series: Sequence[np.ndarray]) -> list[np.ndarray]:
