@@ -354,7 +354,8 @@ def _blocked_lanes(network: RoadNetwork, boxes: Boxes) -> list[tuple[int, float]
     result, chain = [], lane_chains(network).chain
     for index in np.flatnonzero(chain >= 0).tolist() if len(boxes) else ():
         curve = network.lanes[index].curve
-        gap = np.sum((boxes.xy[:, None] - curve.xy[::2]) ** 2, axis=-1)
+        dx, dy = (np.subtract.outer(boxes.xy[:, k], curve.xy[::2, k]) for k in (0, 1))
+        gap = dx * dx + dy * dy
         for box in np.flatnonzero(gap.min(axis=1) < (0.95 + boxes.size_m[:, 1] / 2) ** 2):
             result.append((index, float(curve.arc_m[::2][np.argmin(gap[box])])))
     return result
