@@ -432,7 +432,7 @@ def plausible(recording: Recording, rows: slice = slice(None)) -> Bool[np.ndarra
 
 
 def _longest_chain(xy: Float[Array, "time 2"], at: Int[Array, " step"]) -> Int[Array, " kept"]:
-    """Steps of a track, of those given, that are kept."""
+    """Return the steps of a track that form its longest piece without jumps, and those that connect to it."""
     pieces = np.split(at, np.flatnonzero(~_connects(xy[at], at)) + 1)
     longest = int(np.argmax([len(piece) for piece in pieces]))
     chain = pieces[longest]

@@ -255,8 +255,8 @@ def _nearest_pairs(
         squared = _squared_distances(x, y, a[block], b[block])
         nearer = squared < nearest.take(cell)
         np.minimum.at(nearest, cell[nearer], squared[nearer])
-        found = np.nonzero(squared <= _almost(nearest.take(cell)))
-        pairs.append((found[0] + first, cell[found], squared[found]))
+        near = np.nonzero(squared <= _almost(nearest.take(cell)))
+        pairs.append((near[0] + first, cell[near], squared[near]))
     segment, cell, squared = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     keep = squared <= _almost(nearest[cell])
     return segment[keep], cell[keep], nearest

@@ -185,7 +185,7 @@ def nearest_obstacles(
     if not len(viewer):
         return gap, speed
     pose, place_m, apart2 = _nearest(tables, at_m, viewer, users.xy[user])
-    # Beyond the last sample of the path there is no obstacle.
+    # Obstacles beyond the last sample of the path, or next to the vehicle, do not count.
     k = (apart2 < 64.0).nonzero()[0]
     viewer, user, pose, place_m = viewer[k], user[k], pose[k], place_m[k]
     position, left, relative_heading = _relative(users, user, pose[:, :2], pose[:, 2])
@@ -198,7 +198,6 @@ def nearest_obstacles(
     size = vehicles.size_m[viewer]
     half = size[:, 1] / 2 + np.where(vehicle, _VEHICLES_M, _MARGIN_M)
     inside = (np.minimum(left, left_soon) - width < half) & (np.maximum(left, left_soon) + width > -half)
-    # Nor next to the vehicle.
     inside &= position > at_m[viewer] + 0.3 * size[:, 0]
     k = inside.nonzero()[0]
     if not len(k):

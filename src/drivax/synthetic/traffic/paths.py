@@ -205,7 +205,7 @@ def mean_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]
     window = max(1, round(_CURVATURE_WINDOW_M / step_m))
     before, heading = window // 2, curve.heading
     padded = np.empty(len(heading) + window - 1)
-    # Central differences, as np.gradient takes them, which spends more time on checks than on these.
+    # Central differences, the same as those of np.gradient, whose checks take longer.
     rate = padded[before : before + len(heading)]
     np.divide(heading[2:] - heading[:-2], 2.0 * step_m, out=rate[1:-1])
     padded[: before + 1] = (heading[1] - heading[0]) / step_m
