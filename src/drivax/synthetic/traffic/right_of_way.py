@@ -95,7 +95,7 @@ def conflict_zones(
             near = dx * dx + dy * dy < CLEARANCE_M**2
             for i, j, hit in ((a, b, near.any(axis=1)), (b, a, near.any(axis=0))):
                 if hit.any():
-                    step = network.lanes[i].length_m / (len(hit) - 1)
+                    step = network.lanes[i].length_m / (hit.size - 1)
                     places = np.flatnonzero(hit)
                     begin[i, j], end[i, j] = places[0] * step, places[-1] * step
     return begin, end
