@@ -1,5 +1,7 @@
 """Policies, values and critics; the MLP encoder's masks."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -177,9 +179,24 @@ def test_encoders_in_yaml():
             r"^encoder\.fusion: 'soon' is not one of early, late, hier",
         ),
         ("distribution: normal", r"^distribution: 'normal' is not one of gaussian, beta, grid"),
-        ("first_scale: 0", r"^first_scale is 0; use more than 0"),
+        ("first_scale: 0", r"^first_scale is 0(\.0)?; use more than 0"),
     ],
 )
 def test_mistaken_networks_are_named(text, message):
     with pytest.raises(UsageError, match=message):
         load(text)
+
+
+def test_policy_explores_by_action_and_never_less_than_a_share():
+    """Heads that ask for tiny standard deviations get a tenth of the first ones."""
+    spec = {"ego": (3,)}
+    config = NetworkConfig(encoder=MlpConfig(hidden=(8,)), first_scale=(0.3, 0.02), least_scale=0.1)
+    policy = Policy(config, spec, nnx.Rngs(0))
+    fresh = policy({"ego": jnp.zeros(3)})
+    np.testing.assert_allclose(fresh.scale, [0.3, 0.02], rtol=0.02)
+    policy.head.out.bias[...] = jnp.full(4, -20.0)
+    np.testing.assert_allclose(policy({"ego": jnp.zeros(3)}).scale, [0.03, 0.002], rtol=1e-5)
+    with pytest.raises(
+        UsageError, match="first_scale has 3 numbers for 2 actions; give one, or one per action"
+    ):
+        Policy(replace(config, first_scale=(0.1, 0.1, 0.1)), spec, nnx.Rngs(0))({"ego": jnp.zeros(3)})

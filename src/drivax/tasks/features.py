@@ -28,7 +28,7 @@ POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 CURVATURE_PM = 0.1
 #: Cap of curvatures, in these units.
 _MAX_CURVATURE = 3.0
-#: Points of the route to which agents are related: behind ego, m; spacing, m; number. Largest distance beside it, m.
+#: Points of the route to which agents are related: behind ego, m; spacing, m; number. Largest distance to a side, m.
 _ROUTE_BEHIND_M, _ROUTE_STEP_M, _ROUTE_POINTS, _ROUTE_SIDE_M = -30.0, 2.0, 61, 20.0
 #: Horizon of times to overlap, s.
 _OVERLAP_S = 8.0
@@ -187,7 +187,7 @@ def route_coordinates(
 ) -> list[Float[Array, " K"]]:
     """Return positions of agents along the route from ego and left of it, and sine and cosine of their heading to it.
 
-    Positions in units of 50 m and 5 m; an agent that is not beside the route is 20 m left of it. Zeros without a route.
+    Positions in units of 50 m and 5 m; an agent that is not alongside the route is 20 m left of it. Zeros without a route.
     """
     offsets = _ROUTE_BEHIND_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
     path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
