@@ -200,3 +200,16 @@ def test_policy_explores_by_action_and_never_less_than_a_share():
         UsageError, match="first_scale has 3 numbers for 2 actions; give one, or one per action"
     ):
         Policy(replace(config, first_scale=(0.1, 0.1, 0.1)), spec, nnx.Rngs(0))({"ego": jnp.zeros(3)})
+
+
+def test_flat_groups_keep_the_order_of_their_rows():
+    """A pooled group is the same in any order of its rows, a flat one is not."""
+    spec = {"agents": (4, 3), "agents_mask": (4,), "route": (4, 3), "route_mask": (4,)}
+    encoder = MlpConfig(rows=(8,), flat=("route",), hidden=(16,)).build(spec, nnx.Rngs(0))
+    rows = jax.random.normal(jax.random.key(0), (4, 3))
+    groups = dict.fromkeys(("agents", "route"), rows) | dict.fromkeys(
+        ("agents_mask", "route_mask"), jnp.ones(4, bool)
+    )
+    whole = encoder(groups)
+    np.testing.assert_allclose(encoder(groups | {"agents": rows[::-1]}), whole, atol=1e-6)
+    assert np.abs(encoder(groups | {"route": rows[::-1]}) - whole).max() > 0.01
