@@ -41,7 +41,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path):
 def test_planner_is_evaluated_among_policy_driven_vehicles(tmp_path):
     generate(tmp_path / "set", 2, 3, Generation(workers=0))
     data = ScenarioSet.open(tmp_path / "set")
-    run = train(settings.load(TrainConfig, TINY), data, tmp_path / "bold")
+    run = train(settings.load(TrainConfig, TINY), data, tmp_path / "bold", validation=None)
     with_logged, with_idm = (policy_traffic(run.path, count=2, base=base) for base in (None, IdmTraffic()))
     assert (with_logged.name, with_idm.name) == ("driven_by_bold", "driven_by_bold+idm")
     assert hash(with_logged) == hash(policy_traffic(run.path, count=2))

@@ -39,7 +39,7 @@ class Train:
 
     CONFIG is a YAML file or the name of a preset; override its settings with --section.key VALUE.
 
-    Example: drivax train demo --data sets/train --validation sets/test --out runs/ppo --algorithm.learning_rate 1e-3
+    Example: drivax train demo --data sets/train --out runs/ppo --algorithm.learning_rate 1e-3
 
     Example: drivax train offline/cql --data sets/train --arm heuristic --out runs/cql-heuristic
 
