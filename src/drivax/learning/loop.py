@@ -91,9 +91,7 @@ def train(
             config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
     if seeds < 1:
         raise UsageError(f"{seeds} seeds", cure="use 1 or more")
-    scenarios = _Scenarios.of(data, weights, split or validation)
-    if config.patience and scenarios.validation is None:
-        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+    scenarios = _Scenarios.of(config, data, weights, split or validation)
     environment, bank = _environment(config, scenarios.training)
     learner = config.algorithm.build(environment, bank, config.iterations)
     held_out = None if scenarios.validation is None else Validation.of(scenarios.validation)
@@ -135,18 +133,24 @@ class _Scenarios:
 
     @classmethod
     def of(
-        cls, data: ScenarioSet, weights: np.ndarray | None, validation: ScenarioSet | HoldOut | None
-    ) -> Self:
-        """Divide the set if it holds out recordings; refuse a validation set of another length."""
-        if not isinstance(validation, HoldOut):
-            if validation is not None:
-                check_lengths(data, validation)
+        cls, config: TrainConfig, data: ScenarioSet, weights: np.ndarray | None,
+        validation: ScenarioSet | HoldOut | None,
+    ) -> Self:  # fmt: skip
+        """Divide the set if it holds out recordings.
+
+        Raises:
+            UsageError: The validation set has another length, patience has none, or weights do not fit.
+        """
+        if isinstance(validation, HoldOut) and validation.recordings:
+            if weights is not None:
+                weights = check_weights(weights, (len(data), data.capacity.steps))[validation.training]
+            return cls(data.take(validation.training), weights, data.take(validation.validation))
+        if isinstance(validation, ScenarioSet):
+            check_lengths(data, validation)
             return cls(data, weights, validation)
-        if not validation.recordings:
-            return cls(data, weights, None)
-        if weights is not None:
-            weights = check_weights(weights, (len(data), data.capacity.steps))[validation.training]
-        return cls(data.take(validation.training), weights, data.take(validation.validation))
+        if config.patience:
+            raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+        return cls(data, weights, None)
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
