@@ -12,6 +12,7 @@ from drivax.errors import DataError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import policy_traffic
+from drivax.planners.planner_traffic import TrafficPolicy
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.agent_paths import AgentPaths
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
