@@ -146,7 +146,7 @@ def long_training(
     """Train PPO, and evaluate it on held-out scenarios in log traffic."""
     overrides = ["--total_steps", str(steps), "--algorithm.environments", str(environments)]
     begin = time.perf_counter()
-    run = train(settings.load(TrainConfig, "ppo", overrides), scenarios, out)
+    run = train(settings.load(TrainConfig, "ppo", overrides), scenarios, out, validation=None)
     seconds = time.perf_counter() - begin
     summary = api.evaluate(run.path, api.load(held_out.path)).summary()
     return {"steps": steps, "seconds": round(seconds), "held_out": summary["metrics"]["success"]}
