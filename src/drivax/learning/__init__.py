@@ -1,6 +1,7 @@
 """Training of policies: algorithms, their environment, the training loop, and trained policies.
 
-``replay`` stores the transitions of a run; ``experience`` samples minibatches of logged steps for offline learning.
+``replay`` stores the transitions of a run; ``experience`` samples minibatches of logged steps for offline learning; PPO
+shuffles its own rollouts (``algorithms.ppo``).
 """
 
 import lazy_loader

@@ -106,8 +106,8 @@ def read_records(path: str | Path) -> Iterator[tuple[int, bytes | DataError]]:
         number = 0
         while file.tell() < size:
             try:
-                record = _read_one(file, size, crc32c)
-            except _Lost as error:
+                record = _read_record(file, size, crc32c)
+            except _FramingError as error:
                 yield number, DataError(error.problem, file=path, record=number, cure=error.cure)
                 return
             if record is None:
@@ -118,30 +118,37 @@ def read_records(path: str | Path) -> Iterator[tuple[int, bytes | DataError]]:
             number += 1
 
 
-class _Lost(DataError):
+class _FramingError(DataError):
     """An error after which the next record cannot be located."""
 
     def __init__(self, problem: str, cure: str = _FETCH) -> None:
         super().__init__(problem, cure=cure)
 
 
-def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> bytes | None:
-    """Read the payload of the next record; None for a wrong checksum."""
+def _read_record(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> bytes | None:
+    """Read the payload of the next record; None if its checksum is wrong.
+
+    Raises:
+        _FramingError: The next record cannot be located: a length is damaged, or the file ends early.
+    """
     start = file.tell()
     header = file.read(_HEADER_BYTES)
     if len(header) < _HEADER_BYTES:
-        raise _Lost(f"truncated: {len(header)} bytes where a record's header of {_HEADER_BYTES} should be")
+        problem = f"truncated: a record's header has {_HEADER_BYTES} bytes, the file has {len(header)} left"
+        raise _FramingError(problem)
     length, length_crc = struct.unpack("<QI", header)
     if mask_crc(crc32c(header[:8])) != length_crc:
         raise _bad_length(header, start)
     remaining = size - file.tell()
-    if length > _LONGEST_BYTES or length + _FOOTER_BYTES > remaining:
+    if length + _FOOTER_BYTES > remaining:
         problem = f"truncated: the record needs {length + _FOOTER_BYTES} bytes, the file has {remaining} left"
-        raise _Lost(problem)
+        raise _FramingError(problem)
+    if length > _LONGEST_BYTES:
+        raise _FramingError(f"the record has {length} bytes, a protocol buffer at most {_LONGEST_BYTES}")
     payload = file.read(length)
     footer = file.read(_FOOTER_BYTES)
     if len(footer) < _FOOTER_BYTES:
-        raise _Lost("the file became shorter while it was read")
+        raise _FramingError("the file became shorter while it was read")
     return payload if mask_crc(crc32c(payload)) == struct.unpack("<I", footer)[0] else None
 
 
@@ -181,15 +188,17 @@ def _crc32c_slowly(data: bytes) -> int:
     return crc ^ 0xFFFFFFFF
 
 
-def _bad_length(header: bytes, start: int) -> _Lost:
+def _bad_length(header: bytes, start: int) -> _FramingError:
     """The error for a length whose checksum differs; ``start`` is where the record begins."""
     if start > 0:
-        return _Lost("the length is damaged (checksum mismatch), so the rest of the file cannot be read")
+        return _FramingError(
+            "the length is damaged (checksum mismatch), so the rest of the file cannot be read"
+        )
     if header[:2] == b"\x1f\x8b":
-        return _Lost("the file is gzip-compressed", "decompress it first (gunzip)")
+        return _FramingError("the file is gzip-compressed", "decompress it first (gunzip)")
     if header[0] == 0x78 and int.from_bytes(header[:2], "big") % 31 == 0:
-        return _Lost("the file is zlib-compressed", "decompress it first (zlib)")
-    return _Lost(
+        return _FramingError("the file is zlib-compressed", "decompress it first (zlib)")
+    return _FramingError(
         "not a TFRecord file, or damaged (checksum mismatch in the first record's length)",
         f"give an uncompressed TFRecord; if it should be one, {_FETCH}",
     )

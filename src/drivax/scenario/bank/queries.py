@@ -233,10 +233,11 @@ def lane_distance(bank: ScenarioBank, index: Integer, xy: Vector, z: Scalar) -> 
 def vertex_distances(
     bank: ScenarioBank, index: Integer, xy: Vector, spacing_m: float
 ) -> tuple[Scalar, Scalar]:
-    """Distance to the nearest vertex of a road edge and of a lane centre, on any level, m.
+    """Distances to the nearest vertex of a road edge and of a lane centre, on any level, m.
 
-    The measure of tools that keep maps as points: segments get a vertex every ``spacing_m`` from their beginning, and
-    one at their end. Exact within the cut-offs; beyond them it may be too large.
+    Reproduces tools that store maps as points, for the curation method ``published``: each segment has a vertex every
+    ``spacing_m`` from its beginning, and one at its end. Distances are exact within the cut-offs; beyond them they may
+    be too large.
     """
     edges, lanes = edges_around(bank, index, xy), lanes_around(bank, index, xy)
     return _nearest_vertex(*edges, xy, spacing_m), _nearest_vertex(*lanes, xy, spacing_m)

@@ -25,6 +25,12 @@ _FURTHEST_M, _STEEPEST = 4.3, 2.2
 _ADJACENT_M = 60.0
 #: Distance kept to the road's edge, m, and speed at which obstacles are passed, m/s.
 _EDGE_M, _PASS_MPS = 0.2, 6.0
+#: Gap to the first obstacle at the end of the way out, and to the last one at the beginning of the way back, m.
+_GAP_BEFORE_M, _GAP_BEHIND_M = 0.3, 0.5
+#: Least length of the way out and back: as a multiple of the steepest one, and as a travel time, s.
+_EASE_OUT, _EASE_BACK, _OUT_S, _BACK_S = 2.0, 1.6, 2.4, 2.0
+#: Length of the path that remains after a detour, m.
+_END_MARGIN_M = 5.0
 #: Share of a lane change after which a vehicle has left the old lane.
 _LEFT_SHARE = 0.75
 #: Lateral offset from which on a vehicle occupies the adjacent lane, m.
@@ -239,16 +245,16 @@ class Detours:
         left = float(seen.left_m[group].max()) + half_width + _ROOM_M
         right = float(seen.right_m[group].min()) - half_width - _ROOM_M
         for lateral in sorted([left, right], key=abs):
-            plan = _plan(request, first, last, lateral)
-            if plan is not None and self._is_free(request, plan, lateral, seen, moving):
-                return around(request.path, plan, lateral, request.adjacent), plan[3]
+            positions = _detour_positions(request, first, last, lateral)
+            if positions is not None and self._is_free(request, positions, lateral, seen, moving):
+                return around(request.path, positions, lateral, request.adjacent), positions[3]
         return None
 
     def _is_free(
-        self, request: DetourRequest, plan: _Positions, lateral: float, seen: Extents, moving: Boxes
+        self, request: DetourRequest, positions: _Positions, lateral: float, seen: Extents, moving: Boxes
     ) -> bool:
         """Whether the detour is free of road edges, standing obstacles and oncoming or overtaking users."""
-        begin, out, back, end = plan
+        begin, out, back, end = positions
         half = request.size_m[1] / 2
         low, high = lateral - half - _EDGE_M, lateral + half + _EDGE_M
         adjacent = (seen.near_m < back) & (seen.far_m > out) & (seen.right_m < high) & (seen.left_m > low)
@@ -274,15 +280,20 @@ class Detours:
         return not bool(np.any(meets & (ahead | behind)))
 
 
-def _plan(request: DetourRequest, first: float, last: float, lateral: float) -> _Positions | None:
-    """Positions of a detour around the stretch from first to last; None if it is too wide, steep or late."""
-    half = request.size_m[0] / 2
-    out = first - half - 0.3
-    begin = max(request.at_m, out - max(_STEEPEST * 2 * abs(lateral), 2.4 * request.speed))
-    back = last + half + 0.5
-    end = back + max(_STEEPEST * 1.6 * abs(lateral), 2.0 * min(request.speed, _PASS_MPS))
-    steep, late = out - begin < _STEEPEST * abs(lateral), end > request.path.length_m - 5.0
-    return None if abs(lateral) > _FURTHEST_M or steep or late else (begin, out, back, end)
+def _detour_positions(
+    request: DetourRequest, first_m: float, last_m: float, lateral_m: float
+) -> _Positions | None:
+    """Return the positions of a detour around obstacles from ``first_m`` to ``last_m`` of the path.
+
+    None if the offset ``lateral_m`` is too large, the rest of the way out is too steep, or the path ends too soon.
+    """
+    half_length, offset_m = request.size_m[0] / 2, abs(lateral_m)
+    out = first_m - half_length - _GAP_BEFORE_M
+    begin = max(request.at_m, out - max(_STEEPEST * _EASE_OUT * offset_m, _OUT_S * request.speed))
+    back = last_m + half_length + _GAP_BEHIND_M
+    end = back + max(_STEEPEST * _EASE_BACK * offset_m, _BACK_S * min(request.speed, _PASS_MPS))
+    is_steep, is_short = out - begin < _STEEPEST * offset_m, end > request.path.length_m - _END_MARGIN_M
+    return None if offset_m > _FURTHEST_M or is_steep or is_short else (begin, out, back, end)
 
 
 def _dense(ring: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "dense 2"]:

@@ -75,7 +75,7 @@ def parked_cars(
     has_double_parked, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
     for index in rng.permutation(len(network.bays)).tolist() if has_double_parked else ():
         bay, size = network.bays[index], _size(rng, network.bays[index].length_m)
-        if _can_pass(network, bay, size[1], gap_m):
+        if _can_double_park(network, bay, size[1], gap_m):
             pose = _double_parked_pose(network, bay, size[1], gap_m)
             return (*result, Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
     return tuple(result)
@@ -98,7 +98,8 @@ def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: f
     return centre.aside(side * ((lane.width_m - width_m) / 2 - gap_m))
 
 
-def _can_pass(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
+def _can_double_park(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
+    """Whether a car may be double-parked next to a bay: away from the ends of a lane, and where others can pass it."""
     lane = network.lanes[bay.lane]
     if lane.connector or not _MIN_FROM_ENDS_M < bay.along_m < lane.length_m - _MIN_FROM_ENDS_M:
         return False
