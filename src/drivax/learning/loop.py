@@ -89,7 +89,9 @@ def train(
     environment, bank = _environment(config, data)
     learner = config.algorithm.build(environment, bank, config.iterations)
     held_out = None if validation is None else Validation.of(validation)
-    held_out_data = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
+    held_out_data = None
+    if held_out is not None and isinstance(learner, HeldOutMetrics):
+        held_out_data = training_data(config.algorithm, environment, held_out.bank)
     numbers = range(config.seed, config.seed + (len(folders) or seeds))
     experience = training_data(config.algorithm, environment, bank, weights)
     program = Program(Seeds(learner, tuple(numbers)), experience, config.devices)
