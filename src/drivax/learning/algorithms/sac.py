@@ -60,7 +60,7 @@ class SacConfig:
         updates_per_step: Updates per step of all environments.
         batch: Steps per update.
         steps: Steps of the n-step returns; their actions are not corrected for later changes of the policy.
-        demonstrations: Share of each batch that the log's expert drove (Ball et al. 2023, arXiv 2302.02948).
+        demonstrations: Share of each batch with the log's expert (Ball et al. 2023, arXiv 2302.02948).
         warm_up: Steps before the first update.
         explore: Actions before the first update: ``uniform``, or sampled from the ``policy``.
         policy_rate, critic_rate, temperature_rate: Learning rates of Adam.
