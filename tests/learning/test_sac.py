@@ -1,6 +1,7 @@
 """SAC's losses: against NumPy on the networks' own outputs, and which parameters each of them reaches."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,9 @@ import pytest
 from drivax.errors import UsageError
 from drivax.learning.algorithm import training_data
 from drivax.learning.algorithms import optimisers
+from drivax.learning.algorithms.behaviour_cloning import Cloning
 from drivax.learning.algorithms.sac import SacConfig, SacParameters
+from drivax.learning.algorithms.warm_start import BcSacConfig, WarmStart
 from drivax.learning.replay import ReplayConfig, Transitions
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
@@ -170,6 +173,28 @@ def test_demonstrations_are_a_share_of_each_batch(logged):
         training_data(CONFIG, *logged, np.ones((5, 6)))
 
 
+def largest_change(one, other):
+    differences = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)).max(), one, other)
+    return max(jax.tree.leaves(differences))
+
+
+def test_clone_learns_from_demonstrations_after_settling(logged):
+    """One iteration each of cloning, of fitting critics, and of SAC."""
+    environment, table = logged
+    sac = replace(CONFIG, demonstrations=0.5, explore="policy")
+    start = WarmStart(iterations=1, settle=1, cloning=Cloning(batch=8, updates=2))
+    config = BcSacConfig(warm_start=start, sac=sac)
+    learner, data = config.build(environment, table, 3), training_data(config, environment, table)
+    states = [jax.jit(learner.init)(data, jax.random.key(0))]
+    iterate = jax.jit(learner.iterate)
+    for _ in range(3):
+        states.append(iterate(data, states[-1])[0])
+    policy = [largest_change(a.parameters, b.parameters) for a, b in pairwise(states)]
+    critic = [largest_change(a.learner.critic, b.learner.critic) for a, b in pairwise(states)]
+    assert policy[0] > 1e-4 and policy[1] == 0.0 and policy[2] > 1e-4
+    assert critic[0] == 0.0 and critic[1] > 1e-4 and critic[2] > 1e-4
+
+
 def test_settling_fits_critics_to_a_fixed_policy(logged):
     _, _, state, fixed, _ = iterated(CONFIG, logged, jnp.asarray(True))
     _, _, _, free, _ = iterated(CONFIG, logged, jnp.asarray(False))
@@ -178,10 +203,6 @@ def test_settling_fits_critics_to_a_fixed_policy(logged):
     def policy_of(state):
         inner = state.optimiser.inner_states
         return state.parameters, state.log_temperature, inner["policy"], inner["temperature"]
-
-    def largest_change(one, other):
-        differences = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)).max(), one, other)
-        return max(jax.tree.leaves(differences))
 
     assert largest_change(policy_of(fixed), policy_of(state)) == 0.0
     assert largest_change(fixed.critic, state.critic) > 1e-4
