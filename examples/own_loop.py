@@ -1,4 +1,4 @@
-"""Train SAC with your own training loop; the parameters equal those of ``drivax.train``."""
+"""Train SAC with your own training loop; the parameters equal those of ``drivax.train(..., validation=None)``."""
 
 import tempfile
 from dataclasses import replace

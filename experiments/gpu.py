@@ -28,6 +28,7 @@ import jax
 
 from drivax import api, settings
 from drivax.evaluation.audit import audit
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.runner import evaluate
 from drivax.files import write_json
 from drivax.learning.config import TrainConfig
@@ -128,16 +129,16 @@ def training(bank: ScenarioBank, preset: Sequence[str], environments: int | None
 
 def evaluation(scenarios: ScenarioSet, planner: str, traffic: str) -> dict[str, Any]:
     """Return seconds per 1,000 scenarios: the first time with compilation, and again."""
-    driver, seconds = make_planner(planner, None), []
-    for _ in range(2):
+    driver = make_planner(planner, None)
+
+    def run() -> tuple[float, EpisodeTable]:
         begin = time.perf_counter()
         table = evaluate(driver, scenarios, traffic=api.as_traffic(traffic))
-        seconds.append((time.perf_counter() - begin) * 1000 / len(scenarios))
-    return {
-        "first_s": round(seconds[0], 1),
-        "again_s": round(seconds[1], 1),
-        "success": round(float(table.metrics["success"].mean()), 4),
-    }
+        return round((time.perf_counter() - begin) * 1000 / len(scenarios), 1), table
+
+    (first, table), (again, _) = run(), run()
+    success = round(float(table.metrics["success"].mean()), 4)
+    return {"first_s": first, "again_s": again, "success": success}
 
 
 def long_training(
@@ -146,7 +147,7 @@ def long_training(
     """Train PPO, and evaluate it on held-out scenarios in log traffic."""
     overrides = ["--total_steps", str(steps), "--algorithm.environments", str(environments)]
     begin = time.perf_counter()
-    run = train(settings.load(TrainConfig, "ppo", overrides), scenarios, out)
+    run = train(settings.load(TrainConfig, "ppo", overrides), scenarios, out, validation=None)
     seconds = time.perf_counter() - begin
     summary = api.evaluate(run.path, api.load(held_out.path)).summary()
     return {"steps": steps, "seconds": round(seconds), "held_out": summary["metrics"]["success"]}

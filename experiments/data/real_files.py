@@ -36,7 +36,8 @@ RESULT = RESULTS / "real_files.json"
 PAGE = DOCS / "results" / "real-files.md"
 BEGIN, END = "<!-- real_files.py: begin -->", "<!-- real_files.py: end -->"
 PLANNERS = (
-    "expert", "expert_actions", "pdm", "idm", "search", "zoo:aggressive", "constant_velocity", "random",
+    "expert", "expert_actions", "pdm", "idm", "search", "zoo:aggressive", "constant_speed", "constant_velocity",
+    "random",
 )  # fmt: skip
 #: Planners outside of the package.
 MODULES = {"search": "search_planner:SearchPlanner"}

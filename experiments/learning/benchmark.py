@@ -46,7 +46,7 @@ PAGE = DOCS / "results" / "benchmark.md"
 TRAFFIC = ("log", "idm")
 #: Random actions in the box of the published action space, shown in a separate table.
 BOX = "random in the published box"
-PLANNERS = ("expert", "pdm", "idm", "constant_velocity", "random", BOX)
+PLANNERS = ("expert", "pdm", "idm", "constant_speed", "constant_velocity", "random", BOX)
 #: Columns of the page, with their short names.
 COLUMNS = {
     "accuracy": "accuracy", "collision": "collision", "at_fault_collision": "at fault", "offroad": "off-road",

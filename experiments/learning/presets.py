@@ -48,7 +48,7 @@ RESULT = RESULTS / "learning.json"
 SPEEDS = RESULT.with_name("training.json")
 #: File with training time and curves, next to the policies.
 TRAINING = "training.json"
-REFERENCES = ("expert", "idm", "constant_velocity")
+REFERENCES = ("expert", "idm", "constant_speed", "constant_velocity")
 
 
 def train_preset(args: argparse.Namespace, overrides: list[str]) -> None:

@@ -10,6 +10,7 @@ import pytest
 from drivax.cli import main
 from drivax.curation import methods
 from drivax.errors import UsageError
+from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.progress import Progress
 from drivax.tracking.sinks import read_rows
@@ -122,3 +123,26 @@ def test_weights_change_the_draws(place):
         effective.append(next(read_rows(place / name / "metrics.jsonl"))["sampler/critic_effective"])
     # Squares of ranks: an effective share of (2k + 1) / (k + 1)^2 with k = 2.
     assert effective[1] / effective[0] == pytest.approx(5 / 9, rel=0.05)
+
+
+def test_validation_option(place, monkeypatch):
+    calls = []
+
+    def note(*_, validation, **__):
+        calls.append(validation)
+        return types.SimpleNamespace(path="a-run")
+
+    monkeypatch.setattr("drivax.cli.train.train", note)
+    for flags in ((), ("--validation", "none"), ("--validation", str(place / "set-4"))):
+        assert trained(place, "set-3", "none", *flags) == 0
+    assert calls[:2] == ["held_out", None]
+    assert calls[2].hash == ScenarioSet.open(place / "set-4").hash
+
+
+def test_single_recording_trains_without_validation(place, capsys):
+    """Both scenarios of the set are windows of one recording."""
+    assert trained(place, "set-3", "single") == 0
+    assert (
+        "no validation: all scenarios are of one recording; pass --validation SET" in capsys.readouterr().err
+    )
+    assert json.loads((place / "single" / "run.json").read_text())["validation"] is None

@@ -85,7 +85,7 @@ def test_own_loop_equals_training(data, algorithm, tmp_path, request):
         return
     config = config_of(algorithm, 3)
     first, state = own_loop(config, ScenarioBank.from_scenarios(data))
-    run = train(config, data, tmp_path / "run")
+    run = train(config, data, tmp_path / "run", validation=None)
     trained = Checkpoints(run.checkpoints).restore(jax.eval_shape(lambda: state))
     jax.tree.map(np.testing.assert_array_equal, state.parameters, trained.parameters)
     moved = [

@@ -57,7 +57,7 @@ def test_preempted_run_resumes_bit_for_bit(data, kind, tmp_path, monkeypatch):
     config = config_of(kind)
     each = config.algorithm.steps_per_iteration
     config = replace(config, total_steps=6 * each)
-    whole = train(config, data, tmp_path / "whole")
+    whole = train(config, data, tmp_path / "whole", validation=None)
     write = MetricLog.write
 
     def write_and_interrupt(log, step, values):
@@ -71,7 +71,7 @@ def test_preempted_run_resumes_bit_for_bit(data, kind, tmp_path, monkeypatch):
         with pytest.raises(
             Preempted, match=f"after {3 * each:,} steps; continue it with --resume"
         ) as stopped:
-            train(config, data, tmp_path / "cut")
+            train(config, data, tmp_path / "cut", validation=None)
     assert stopped.value.status == 143 and signal.getsignal(signal.SIGTERM) is former
     resumed = train(config, data, tmp_path / "cut", resume=True)
     rows = [list(read_rows(run.metrics)) for run in (whole, resumed)]
@@ -121,7 +121,7 @@ def test_impossible_settings_are_refused():
 
 @pytest.mark.slow
 def test_run_folder_records_data_and_metrics(data, tmp_path):
-    run = train(replace(config_of("ppo"), total_steps=2 * 8 * 16), data, tmp_path / "run")
+    run = train(replace(config_of("ppo"), total_steps=2 * 8 * 16), data, tmp_path / "run", validation=None)
     info = json.loads((tmp_path / "run" / "run.json").read_text())
     assert info["kind"] == "training" and info["data"][0]["hash"] == data.hash
     rows = list(read_rows(run.metrics))
@@ -134,7 +134,7 @@ def test_run_folder_records_data_and_metrics(data, tmp_path):
 def test_ppo_learns_to_follow_the_route(data, tmp_path):
     """12 m/s earn the whole term, and a car that only coasts gets most of it: of what it lacks, half is gained."""
     longer = replace(config_of("ppo", environments=64), total_steps=200_000)
-    rows = list(read_rows(train(longer, data, tmp_path / "run").metrics))
+    rows = list(read_rows(train(longer, data, tmp_path / "run", validation=None).metrics))
     whole = longer.task.rewards.weights()["progress"]
     lacks = [whole - np.mean([row["reward/progress"] for row in part]) for part in (rows[:10], rows[-10:])]
     assert 0.0 < lacks[1] < 0.5 * lacks[0], lacks

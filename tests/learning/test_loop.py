@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from drivax import settings
+from drivax.api import evaluate, load
 from drivax.cli import main
 from drivax.errors import DrivaxError, UsageError
+from drivax.learning import loop
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train
@@ -18,6 +20,7 @@ from drivax.learning.policies import load_policy
 from drivax.learning.training_log import patience_exceeded, rank
 from drivax.report.runs import read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.select import splits
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.checkpoints import Checkpoints
@@ -52,12 +55,12 @@ def numbers(state: ToyState):
 
 def test_seeds_are_runs_of_their_own(data, config, tmp_path):
     lines = []
-    folder = train(config, data, tmp_path / "three", seeds=3, log=lines.append)
+    folder = train(config, data, tmp_path / "three", seeds=3, log=lines.append, validation=None)
     inside = seed_folders(folder.path)
     assert [path.name for path in inside] == ["seed-4", "seed-5", "seed-6"]
     assert len(lines) == 1 and lines[0].startswith("memory: ") and "scenarios" in lines[0]
     for seed, path in zip((4, 5, 6), inside, strict=True):
-        alone = train(replace(config, seed=seed), data, tmp_path / f"alone-{seed}").path
+        alone = train(replace(config, seed=seed), data, tmp_path / f"alone-{seed}", validation=None).path
         assert settings.load(TrainConfig, path / "config.yaml") == replace(config, seed=seed)
         assert [row["step"] for row in read_rows(path / "metrics.jsonl")] == [10, 20, 30, 40, 50, 60]
         for one, other in zip(
@@ -76,8 +79,8 @@ def test_seeds_are_runs_of_their_own(data, config, tmp_path):
 
 
 def test_seeds_resume_from_their_newest_common_checkpoint(data, config, tmp_path):
-    whole = train(config, data, tmp_path / "whole", seeds=2)
-    cut = train(config, data, tmp_path / "cut", seeds=2)
+    whole = train(config, data, tmp_path / "whole", seeds=2, validation=None)
+    cut = train(config, data, tmp_path / "cut", seeds=2, validation=None)
     # As if the machine had gone while checkpoints were written: one agent is a checkpoint behind.
     shutil.rmtree(cut.path / "seed-5" / "checkpoints" / "step-000000060")
     resumed = train(config, data, tmp_path / "cut", resume=True)
@@ -92,11 +95,11 @@ def test_seeds_resume_from_their_newest_common_checkpoint(data, config, tmp_path
 @pytest.mark.slow
 def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
     """The toy adds random numbers of its key to its parameters, so what it began with is what a fresh one lacks."""
-    former = train(config, data, tmp_path / "former").path
-    plain = train(replace(config, total_steps=10), data, tmp_path / "plain", seeds=2).path
+    former = train(config, data, tmp_path / "former", validation=None).path
+    plain = train(replace(config, total_steps=10), data, tmp_path / "plain", seeds=2, validation=None).path
     lines = []
     onward = replace(config, total_steps=10, begin_from=f"{former}@40")
-    run = train(onward, data, tmp_path / "run", seeds=2, log=lines.append)
+    run = train(onward, data, tmp_path / "run", seeds=2, log=lines.append, validation=None)
     assert lines[1:] == [f"starts from parameters of {former}@40"]
     began = Checkpoints(former / "checkpoints").restore(jax.eval_shape(Toy(ToyConfig()).init, None, KEY), 40)
     pairs = list(zip(seed_folders(run.path), seed_folders(plain), strict=True))
@@ -127,7 +130,7 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
         (replace(onward, begin_from="zoo:aggressive"), "is an exported policy, which cannot be fine-tuned"),
     ):
         with pytest.raises(DrivaxError, match=words):
-            train(wrong, data, tmp_path / "never")
+            train(wrong, data, tmp_path / "never", validation=None)
     assert not (tmp_path / "never").exists()
     # Where it came from is not asked for any more once there is a checkpoint.
     shutil.rmtree(former)
@@ -152,7 +155,7 @@ def test_training_stops_when_patience_is_exceeded(data, config, tmp_path):
     train(patient, data, tmp_path / "run", validation=data, resume=True)
     assert [row["step"] for row in read_rows(run.path / "seed-4" / "metrics.jsonl")] == [10, 20, 30]
     with pytest.raises(UsageError, match="pass --validation"):
-        train(patient, data, tmp_path / "other")
+        train(patient, data, tmp_path / "other", validation=None)
 
 
 def test_patience():
@@ -179,9 +182,9 @@ def test_ranks():
 
 
 def test_a_run_is_never_overwritten_or_resumed_on_other_data(data, config, tmp_path):
-    train(config, data, tmp_path / "run")
+    train(config, data, tmp_path / "run", validation=None)
     with pytest.raises(UsageError, match="--overwrite"):
-        train(config, data, tmp_path / "run")
+        train(config, data, tmp_path / "run", validation=None)
     generate(tmp_path / "other", 1, 12, Generation(workers=0))
     other = ScenarioSet.open(tmp_path / "other")
     with pytest.raises(UsageError, match="other scenarios"):
@@ -189,7 +192,7 @@ def test_a_run_is_never_overwritten_or_resumed_on_other_data(data, config, tmp_p
     with pytest.raises(UsageError, match="same --validation"):
         train(config, data, tmp_path / "run", resume=True, validation=other)
     with pytest.raises(UsageError, match="2 devices, but there are 1"):
-        train(replace(config, devices=2), data, tmp_path / "never")
+        train(replace(config, devices=2), data, tmp_path / "never", validation=None)
     assert not (tmp_path / "never").exists()
 
 
@@ -212,8 +215,70 @@ def test_command_trains_several_seeds(data, tmp_path, capsys):
 def test_weights_need_an_offline_algorithm(data, config, tmp_path):
     weighted = WeightedSet(data, np.ones((3, 91)))
     with pytest.raises(UsageError, match="ToyConfig does not learn from logged steps"):
-        train(config, weighted, tmp_path / "run")
+        train(config, weighted, tmp_path / "run", validation=None)
     assert not (tmp_path / "run").exists()
-    train(config, data, tmp_path / "run")
+    train(config, data, tmp_path / "run", validation=None)
     with pytest.raises(UsageError, match="was trained with other weights"):
         train(config, weighted, tmp_path / "run", resume=True)
+
+
+def test_training_holds_out_recordings_by_default(data, config, tmp_path, monkeypatch):
+    """Of three scenarios the third is a recording of its own; the toy drives it at constant velocity."""
+    lines = []
+    short = replace(config, total_steps=20)
+    run = train(short, data, tmp_path / "run", log=lines.append)
+    assert lines[0].startswith("trains on 2 scenarios, validates on 1 of 1 held-out recordings;")
+    recording = [data.entries[2][name] for name in ("dataset", "segment")]
+    assert run.info["validation"] == {"recordings": [recording], "scenarios": 1}
+    first, last = read_rows(run.metrics)
+    assert not any(name.startswith("validation/") for name in first)
+    alone = evaluate("constant_velocity", load(data[2:]), task=config.task).metrics
+    for name in ("vmax_score", "accuracy", "progress_ratio"):
+        assert last[f"validation/{name}"] == pytest.approx(alone[name][0], abs=1e-6)
+    seeds = train(replace(short, seed=7), data, tmp_path / "seeds", seeds=2)
+    for path in (seeds.path, *seed_folders(seeds.path)):
+        assert json.loads((path / "run.json").read_text())["validation"] == run.info["validation"]
+    # Resuming reads the split; nothing else does.
+    monkeypatch.setattr(splits, "_choose", lambda _: pytest.fail("chosen again"))
+    shutil.rmtree(run.checkpoints / "step-000000020")
+    resumed = train(short, data, run.path, resume=True)
+    assert resumed.read_metrics()[1]["validation/accuracy"] == last["validation/accuracy"]
+    for other in (None, data):
+        with pytest.raises(
+            UsageError, match="was validated on other scenarios; resume with the same --valid"
+        ):
+            train(short, data, run.path, resume=True, validation=other)
+
+
+def test_run_without_validation_resumes_without(data, config, tmp_path):
+    run = train(config, data, tmp_path / "run", validation=None)
+    shutil.rmtree(run.checkpoints / "step-000000060")
+    lines = []
+    resumed = train(config, data, run.path, resume=True, log=lines.append)
+    assert run.info["validation"] is None and len(lines) == 1 and lines[0].startswith("memory: ")
+    assert not any("validation/" in name for row in resumed.read_metrics() for name in row)
+
+
+def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, monkeypatch):
+    class Stop(Exception):
+        pass
+
+    calls = []
+
+    def note(algorithm, environment, bank, weights=None):
+        calls.append((bank, weights))
+        if len(calls) == 2:
+            raise Stop
+
+    monkeypatch.setattr(loop, "training_data", note)
+    weights = np.arange(3 * 91, dtype=float).reshape(3, 91)
+    with pytest.raises(Stop):
+        train(config, WeightedSet(data, weights), tmp_path / "run")
+    (held_out, no_weights), (bank, training_weights) = calls
+    assert no_weights is None
+    np.testing.assert_array_equal(training_weights, weights[:2])
+    for left, right in ((bank, data[:2]), (held_out, data[2:])):
+        jax.tree.map(np.testing.assert_array_equal, left, ScenarioBank.from_scenarios(right))
+    with pytest.raises(UsageError, match=r"weights of shape \(2, 91\) for 3 scenarios"):
+        train(config, WeightedSet(data, weights[:2]), tmp_path / "run")
+    assert not (tmp_path / "run").exists()

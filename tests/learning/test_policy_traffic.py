@@ -12,6 +12,7 @@ from drivax.errors import DataError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import policy_traffic
+from drivax.planners.planner_traffic import TrafficPolicy
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.agent_paths import AgentPaths
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
@@ -41,7 +42,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path):
 def test_planner_is_evaluated_among_policy_driven_vehicles(tmp_path):
     generate(tmp_path / "set", 2, 3, Generation(workers=0))
     data = ScenarioSet.open(tmp_path / "set")
-    run = train(settings.load(TrainConfig, TINY), data, tmp_path / "bold")
+    run = train(settings.load(TrainConfig, TINY), data, tmp_path / "bold", validation=None)
     with_logged, with_idm = (policy_traffic(run.path, count=2, base=base) for base in (None, IdmTraffic()))
     assert (with_logged.name, with_idm.name) == ("driven_by_bold", "driven_by_bold+idm")
     assert hash(with_logged) == hash(policy_traffic(run.path, count=2))

@@ -79,7 +79,7 @@ def test_exported_policy_has_provenance_without_paths(run, bank, tmp_path):
 @pytest.mark.slow
 def test_exported_policies_have_no_steps_or_checkpoints(run, bank, tmp_path):
     packed = export_policy(run.path, tmp_path / "packed", bank)
-    with pytest.raises(UsageError, match="packed and without steps; leave out @4"):
+    with pytest.raises(UsageError, match="is an exported policy without steps; leave out @4"):
         find_planner(f"{packed.path}@4", bank)
     with pytest.raises(UsageError, match="already exists"):
         export_policy(run.path, packed.path, bank)

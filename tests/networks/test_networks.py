@@ -1,5 +1,7 @@
 """Policies, values and critics; the MLP encoder's masks."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -206,9 +208,37 @@ def test_encoders_in_yaml():
             r"^encoder\.fusion: 'soon' is not one of early, late, hier",
         ),
         ("distribution: normal", r"^distribution: 'normal' is not one of gaussian, beta, grid"),
-        ("first_scale: 0", r"^first_scale is 0; use more than 0"),
+        ("first_scale: 0", r"^first_scale is 0(\.0)?; use more than 0"),
     ],
 )
 def test_mistaken_networks_are_named(text, message):
     with pytest.raises(UsageError, match=message):
         load(text)
+
+
+def test_policy_explores_by_action_and_never_less_than_a_share():
+    """Heads that ask for tiny standard deviations get a tenth of the first ones."""
+    spec = {"ego": (3,)}
+    config = NetworkConfig(encoder=MlpConfig(hidden=(8,)), first_scale=(0.3, 0.02), least_scale=0.1)
+    policy = Policy(config, spec, nnx.Rngs(0))
+    fresh = policy({"ego": jnp.zeros(3)})
+    np.testing.assert_allclose(fresh.scale, [0.3, 0.02], rtol=0.02)
+    policy.head.out.bias[...] = jnp.full(4, -20.0)
+    np.testing.assert_allclose(policy({"ego": jnp.zeros(3)}).scale, [0.03, 0.002], rtol=1e-5)
+    with pytest.raises(
+        UsageError, match="first_scale has 3 numbers for 2 actions; give one, or one per action"
+    ):
+        Policy(replace(config, first_scale=(0.1, 0.1, 0.1)), spec, nnx.Rngs(0))({"ego": jnp.zeros(3)})
+
+
+def test_flat_groups_keep_the_order_of_their_rows():
+    """A pooled group is the same in any order of its rows, a flat one is not."""
+    spec = {"agents": (4, 3), "agents_mask": (4,), "route": (4, 3), "route_mask": (4,)}
+    encoder = MlpConfig(rows=(8,), flat=("route",), hidden=(16,)).build(spec, nnx.Rngs(0))
+    rows = jax.random.normal(jax.random.key(0), (4, 3))
+    groups = dict.fromkeys(("agents", "route"), rows) | dict.fromkeys(
+        ("agents_mask", "route_mask"), jnp.ones(4, bool)
+    )
+    whole = encoder(groups)
+    np.testing.assert_allclose(encoder(groups | {"agents": rows[::-1]}), whole, atol=1e-6)
+    assert np.abs(encoder(groups | {"route": rows[::-1]}) - whole).max() > 0.01

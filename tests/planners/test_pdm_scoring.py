@@ -21,6 +21,7 @@ from drivax.planners.pdm.scoring import (
     is_comfortable,
     scores,
 )
+from drivax.planners.pdm.tracking import Car
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
@@ -53,9 +54,11 @@ def others(*rows):
 def evaluate():
     def one(motion, others, several):
         position = Ground(several, jnp.zeros(41, bool), jnp.zeros(41, bool))
-        still = jnp.zeros(41), jnp.zeros(())
+        still = Car(motion, jnp.zeros(41), jnp.zeros(41))
         contacts = Contacts.along(motion, SIZE, others)
-        return evaluate_proposal(motion, *still, SIZE, others, contacts, position, motion[-1, 0], CONFIG)
+        return evaluate_proposal(
+            still, jnp.zeros(()), SIZE, others, contacts, position, motion[-1, 0], CONFIG
+        )
 
     run = jax.jit(one)
     return lambda motion, others, several=False: jax.device_get(

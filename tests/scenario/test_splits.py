@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivax.errors import UsageError
-from drivax.scenario.select.splits import NAMES, parse_shares, split_of, write_splits
+from drivax.scenario.select.splits import NAMES, hold_out, parse_shares, split_of, write_splits
 
 
 def entries(recordings: int, windows: int = 3) -> list[dict[str, str]]:
@@ -97,3 +97,54 @@ def test_empty_splits_are_empty_files(tmp_path):
         "train.txt",
         "validation.txt",
     ]
+
+
+def test_a_tenth_is_held_out_in_the_order_of_the_digests():
+    """40 recordings of 3 windows: 12 scenarios are the share, so the first 4 recordings by SHA-256."""
+    rows = entries(40)
+    first = sorted(
+        {row["segment"] for row in rows},
+        key=lambda segment: hashlib.sha256(f"womd\0{segment}".encode()).digest(),
+    )[:4]
+    split = hold_out(rows)
+    assert split.recordings == sorted(["womd", segment] for segment in first)
+    assert split.validation == [i for i, row in enumerate(rows) if row["segment"] in first]
+    assert split.training == [i for i, row in enumerate(rows) if row["segment"] not in first]
+    assert split.text().startswith("trains on 108 scenarios, validates on 12 of 4 held-out recordings;")
+    assert split.note() == {"recordings": split.recordings, "scenarios": 12}
+    assert hold_out(rows, split.recordings) == split, "recordings of run.json give the same split"
+    same = hold_out(rows[::-1])
+    assert same.recordings == split.recordings, "the order of scenarios does not matter"
+
+
+@given(st.lists(st.integers(1, 400), min_size=2, max_size=12), st.integers(0, 99))
+def test_no_recording_is_divided_and_both_sides_have_some(sizes, name):
+    rows = [
+        {"dataset": "d", "segment": f"{name}-{number}"}
+        for number, size in enumerate(sizes)
+        for _ in range(size)
+    ]
+    split = hold_out(rows)
+    trained, validated = (
+        {rows[index]["segment"] for index in indices} for indices in (split.training, split.validation)
+    )
+    assert trained and validated and not trained & validated
+    assert trained | validated == {row["segment"] for row in rows}
+    assert len(split.validation) <= 256
+    held_out = len(rows) - len(split.training)
+    assert held_out <= max(0.1 * len(rows), min(sizes))
+
+
+def test_long_recording_is_validated_on_evenly_spaced_windows():
+    rows = [{"dataset": "d", "segment": name} for name in "ab" for _ in range(600)]
+    split = hold_out(rows)
+    first = split.validation[0]
+    assert first in (0, 600) and split.validation == list(range(first, first + 600, 3))
+    assert len(split.training) == 600 and first not in split.training
+
+
+def test_single_recording_is_trained_on():
+    split = hold_out(entries(1))
+    assert (split.recordings, split.training, split.validation) == ([], [0, 1, 2], [])
+    assert split.note() is None
+    assert split.text().startswith("no validation: all scenarios are of one recording; pass --validation SET")

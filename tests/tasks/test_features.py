@@ -124,6 +124,13 @@ def test_agents_relate_to_the_route_and_approach(seen):
     assert column(seen, "agents", "route left", place=1)[:2, -1].max() == pytest.approx(20 / 5)
 
 
+def test_ego_on_its_route(seen):
+    """On the straight; 1 m left of the arc; and across the road."""
+    left, sine = (seen["everything"]["ego_static"][:, -2 + column] for column in (0, 1))
+    np.testing.assert_allclose(left, [0, 1, 0], atol=0.02)
+    np.testing.assert_allclose(sine, [0, 0, 1], atol=0.02)
+
+
 def test_time_to_overlap_of_a_leader():
     """A gap of 15.2 m closes at 4 m/s in 3.8 s; without a route there are no route coordinates."""
     config = replace(EVERYTHING, own=(), agents=1, steps=1)

@@ -39,7 +39,7 @@ class Train:
 
     CONFIG is a YAML file or the name of a preset; override its settings with --section.key VALUE.
 
-    Example: drivax train demo --data sets/train --validation sets/test --out runs/ppo --algorithm.learning_rate 1e-3
+    Example: drivax train demo --data sets/train --out runs/ppo --algorithm.learning_rate 1e-3
 
     Example: drivax train offline/cql --data sets/train --arm heuristic --out runs/cql-heuristic
 
@@ -52,8 +52,9 @@ class Train:
     """Scenario set to train on."""
     out: Path
     """Run folder to write."""
-    validation: Path | None = None
-    """Scenario set for the choice of the best checkpoint."""
+    validation: Annotated[str, tyro.conf.arg(metavar="SET|none")] = "held_out"
+    """Scenario set for the choice of the best checkpoint. By default DATA holds out whole recordings, about a tenth of
+    its scenarios (at most 256); `none` trains on all of them."""
     scores: Path | None = None
     """Scores of DATA by drivax curate: bc and offline algorithms draw logged steps by their weights."""
     scale: Literal["step", "scenario"] | None = None
@@ -82,12 +83,11 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
     config = settings.load(TrainConfig, args.config, list(overrides))
     if args.begin_from is not None:
         config = replace(config, begin_from=args.begin_from)
-    validation = None if args.validation is None else ScenarioSet.open(args.validation)
     folder = train(
         config,
         _data(args, config),
         args.out,
-        validation=validation,
+        validation=_validation(args.validation),
         resume=args.resume,
         overwrite=args.overwrite,
         seeds=args.seeds,
@@ -95,6 +95,13 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
     )
     print(f"wrote {folder.path}")
     return 0
+
+
+def _validation(name: str) -> ScenarioSet | Literal["held_out"] | None:
+    """Return the validation of a name: ``held_out``, none, or a scenario set."""
+    if name == "held_out":
+        return name
+    return None if name == "none" else ScenarioSet.open(name)
 
 
 def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:

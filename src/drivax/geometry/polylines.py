@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -74,26 +74,27 @@ class Polylines:
             The index of its first point, and the fraction of the segment at ``s``. Beyond an end it is the first or
             last segment, with a fraction outside [0, 1]: evaluation continues straight on.
         """
-        key = np.clip(s, 0.0, self.length[row]) + self._base[row]
-        index = np.searchsorted(self._key, key, side="right") - 1
-        index = np.clip(index, self.start[row], self.start[row + 1] - 2)
+        # Minimum and maximum are several times as fast as clip on few elements.
+        key = np.minimum(np.maximum(s, 0.0), self.length[row]) + self._base[row]
+        index = self._key.searchsorted(key, side="right") - 1
+        index = np.minimum(np.maximum(index, self.start[row]), self.start[row + 1] - 2)
         span = self.arc[index + 1] - self.arc[index]
         return index, (s - self.arc[index]) / np.where(span > 0.0, span, 1.0)
 
     def at(self, row: Array, s: Array) -> Float[Array, "*query dim"]:
         """Points at arc lengths ``s`` of polylines ``row`` (straight on beyond the ends)."""
-        row, s = np.broadcast_arrays(np.asarray(row), np.asarray(s, dtype=np.float64))
-        index, fraction = self.locate(row, s)
-        return self.points[index] + fraction[..., None] * (self.points[index + 1] - self.points[index])
+        index, fraction = self.locate(np.asarray(row), np.asarray(s, dtype=np.float64))
+        begin = self.points[index]
+        return begin + fraction[..., None] * (self.points[index + 1] - begin)
 
     def heading(self, row: Array, s: Array, span_m: float = 1.0) -> Float[Array, "*query"]:
         """Heading at arc lengths ``s``: of the chord from half a span behind to half a span ahead, radians.
 
         The chord stays inside the polyline; that of a polyline shorter than the span goes from end to end.
         """
-        row, s = np.broadcast_arrays(np.asarray(row), np.asarray(s, dtype=np.float64))
+        row, s = np.asarray(row), np.asarray(s, dtype=np.float64)
         length = self.length[row]
-        begin = np.clip(s - span_m / 2, 0.0, np.maximum(length - span_m, 0.0))
+        begin = np.minimum(np.maximum(s - span_m / 2, 0.0), np.maximum(length - span_m, 0.0))
         chord = self.at(row, np.minimum(begin + span_m, length)) - self.at(row, begin)
         return np.arctan2(chord[..., 1], chord[..., 0])
 
@@ -107,8 +108,8 @@ def arc_lengths(
     """
     if len(points) == 0:
         return np.zeros(0)
-    step = np.hypot(*np.diff(points[:, :2], axis=0).T)
-    total = np.concatenate(([0.0], np.cumsum(step)))
+    step = points[1:, :2] - points[:-1, :2]
+    total = np.concatenate(([0.0], np.hypot(step[:, 0], step[:, 1]).cumsum()))
     if start is None:
         return total
     counts = np.diff(start)
@@ -131,10 +132,15 @@ def _distance_to_chords(offset: Sequence[Array], chord: Sequence[Array]) -> tupl
     ``offset`` is that of each point from the start of its chord. Arguments are sequences of coordinates: one array per
     coordinate is faster than an axis of two.
     """
-    square = sum(u * u for u in chord)
-    dot = sum(w * u for w, u in zip(offset, chord, strict=True))
-    fraction = np.minimum(np.maximum(dot / np.where(square > 0.0, square, 1.0), 0.0), 1.0)
-    return np.sqrt(sum((w - fraction * u) ** 2 for w, u in zip(offset, chord, strict=True))), fraction
+    square = _dot(chord, chord)
+    fraction = _dot(offset, chord) / np.where(square > 0.0, square, 1.0)
+    fraction = np.minimum(np.maximum(fraction, 0.0), 1.0)
+    residual = [w - fraction * u for w, u in zip(offset, chord, strict=True)]
+    return np.sqrt(_dot(residual, residual)), fraction
+
+
+def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    return reduce(np.add, map(np.multiply, a, b))
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
@@ -147,7 +153,7 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
     ``z_weight`` is the weight of the third coordinate in the distance; 0 ignores it.
     """
     axes = [np.ascontiguousarray(lines.points[:, i]) for i in (0, 1)]
-    if z_weight > 0.0 and lines.points.shape[1] > 2:
+    if z_weight > 0.0 and lines.points[:, 2:].any():
         axes.append(z_weight * lines.points[:, 2])
     keep = np.zeros(len(lines.points), dtype=bool)
     has_points = np.diff(lines.start) > 0
@@ -155,22 +161,25 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
     keep[lines.start[1:][has_points] - 1] = True
     interior = np.flatnonzero(~keep)  # points of intervals that may still have to be split
     while len(interior):
-        vertices = np.flatnonzero(keep)
-        interval = np.searchsorted(vertices, interior)
+        vertices, interval = np.flatnonzero(keep), keep.cumsum()[interior]
         begin, end = vertices[interval - 1], vertices[interval]
         distance, _ = _distance_to_chords(
             [x[interior] - x[begin] for x in axes], [x[end] - x[begin] for x in axes]
         )
-        first = np.flatnonzero(np.diff(interval, prepend=-1))  # the first interior point of each interval
+        first = _changes(interval)  # the first interior point of each interval
         farthest = np.repeat(np.maximum.reduceat(distance, first), np.diff(first, append=len(interior)))
         active = farthest > tolerance_m
         # Several points may be equally far: split at the earliest.
         peak = np.flatnonzero(active & (distance == farthest))
-        _, earliest = np.unique(interval[peak], return_index=True)
-        keep[interior[peak[earliest]]] = True
+        keep[interior[peak[_changes(interval[peak])]]] = True
         interior = interior[active]
         interior = interior[~keep[interior]]
     return keep
+
+
+def _changes(values: Int[Array, " n"]) -> Int[Array, " change"]:
+    """Indices at which a sequence begins or changes."""
+    return np.concatenate((values[:1] == values[:1], values[1:] != values[:-1])).nonzero()[0]
 
 
 def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array, " segment"]:
@@ -191,10 +200,12 @@ def resample(
     # The tolerances keep rounding from dropping the last sample, or from choosing the segment before a point.
     count = int(np.floor(arc[-1] / spacing_m + 1e-6)) + 1
     s = np.arange(count if most is None else min(count, most)) * spacing_m
-    index = np.clip(np.searchsorted(arc, s + 1e-9, side="right") - 1, 0, len(points) - 2)
-    span = arc[index + 1] - arc[index]
-    fraction = np.clip((s - arc[index]) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
-    return points[index] + fraction[:, None] * (points[index + 1] - points[index]), index
+    index = arc.searchsorted(s + 1e-9, side="right") - 1
+    index = np.minimum(np.maximum(index, 0), len(points) - 2)
+    begin, start = points[index], arc[index]
+    span = arc[index + 1] - start
+    fraction = np.minimum(np.maximum((s - start) / np.where(span > 0.0, span, 1.0), 0.0), 1.0)
+    return begin + fraction[:, None] * (points[index + 1] - begin), index
 
 
 def left_normals(heading: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
@@ -231,25 +242,28 @@ def project_monotone(
     ``s[k]`` is the arc length in ``[s[k-1], s[k-1] + window[k]]`` whose point is nearest to ``xy[k]``; the first
     position is searched in ``[0, first_window_m]``, and ``window[0]`` is not used. The polyline needs two points.
     """
-    line, arc = points[:, :2], arc_lengths(points)
-    step, span = np.diff(line, axis=0), np.diff(arc)
-    square = np.maximum((step * step).sum(axis=1), 1e-12)
+    arc = arc_lengths(points)
+    (x, y), (step_x, step_y), span = points[:-1, :2].T, (points[1:, :2] - points[:-1, :2]).T, np.diff(arc)
+    square = np.maximum(step_x * step_x + step_y * step_y, 1e-12)
+    divisor = np.maximum(span, 1e-12)
     result = np.zeros(len(xy))
     low, high = 0.0, min(first_window_m, arc[-1])
     for k in range(len(xy)):
         if k > 0:
             low, high = result[k - 1], min(result[k - 1] + window_m[k], arc[-1])
         i = max(int(arc.searchsorted(low, side="right")) - 1, 0)
-        j = max(int(arc.searchsorted(high, side="left")), i + 1)
-        # The segments in reach are i to j; the last point of the line begins none.
-        offset = xy[k] - line[i:j][: len(span) - i]
-        if not len(offset):  # the position before was at the end of the line
+        # The segments in reach; the last point of the line begins none.
+        part = slice(i, max(int(arc.searchsorted(high, side="left")), i + 1))
+        along_x, along_y, length, begin = step_x[part], step_y[part], span[part], arc[:-1][part]
+        if not len(length):  # the position before was at the end of the line
             result[k] = low
             continue
-        fraction = (offset * step[i:j]).sum(axis=1) / square[i:j]
-        foot = np.minimum(np.maximum(fraction * span[i:j], low - arc[i:j]), high - arc[i:j])
-        foot = np.minimum(np.maximum(foot, 0.0), span[i:j])
-        residual = offset - (foot / np.maximum(span[i:j], 1e-12))[:, None] * step[i:j]
-        nearest = (residual * residual).sum(axis=1).argmin()
+        offset_x, offset_y = xy[k, 0] - x[part], xy[k, 1] - y[part]
+        fraction = (offset_x * along_x + offset_y * along_y) / square[part]
+        foot = np.minimum(np.maximum(fraction * length, low - begin), high - begin)
+        foot = np.minimum(np.maximum(foot, 0.0), length)
+        fraction = foot / divisor[part]
+        residual_x, residual_y = offset_x - fraction * along_x, offset_y - fraction * along_y
+        nearest = (residual_x * residual_x + residual_y * residual_y).argmin()
         result[k] = arc[i + nearest] + foot[nearest]
     return result

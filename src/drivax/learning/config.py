@@ -49,7 +49,7 @@ class TrainConfig:
         earliest_start, latest_start: Training episodes begin at a random step of the log between the two.
         begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are taken
             over, the rest of the state is fresh. All other settings may differ as long as the networks fit.
-        evaluate_every: Iterations between validations (with ``--validation``); 0: only at the end.
+        evaluate_every: Iterations between validations; 0: only at the end.
         checkpoint_every: Iterations between checkpoints; the last iteration always has one.
         keep: Number of newest checkpoints to keep in addition to the best.
         checkpoint_rule: How validation ranks checkpoints; see :data:`~drivax.learning.training_log.Rule`.

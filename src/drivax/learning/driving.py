@@ -134,7 +134,7 @@ class Driving:
         summed = (result.reward, result.reward_terms, result.terminated, result.truncated)
 
         def step_on(carry: tuple[SimState, Any], _: None) -> tuple[tuple[SimState, Any], None]:
-            """Take another step of the decision where the episode has neither ended nor just started."""
+            """Take another step of the decision of every episode that neither ended nor started."""
             state, (reward, terms, terminated, truncated) = carry
             idle = now.over | terminated | truncated
             after, result = jax.vmap(self.simulator.step, (None, 0, 0))(data, state, action)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Self
 
 import jax
 import numpy as np
@@ -18,11 +18,13 @@ from drivax.files import explain_full_disk
 from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
-from drivax.learning.experience import WeightedSet
+from drivax.learning.experience import WeightedSet, check_weights
 from drivax.learning.policies import POLICY_FILE, find_traffic, open_policy
 from drivax.learning.program import Program, Seeds
 from drivax.learning.training_log import Preempted, StopSignal, TrainingLog, Validation, validate
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.schema import Scenario
+from drivax.scenario.select.splits import HoldOut, hold_out
 from drivax.scenario.store import ScenarioSet, check_lengths
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.checkpoints import Checkpoints, is_part
@@ -53,8 +55,8 @@ def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
 
 def train(
     config: TrainConfig, data: ScenarioSet | WeightedSet, out: str | Path, *,
-    validation: ScenarioSet | None = None, resume: bool = False, overwrite: bool = False, seeds: int = 1,
-    log: Callable[[str], None] = lambda line: None,
+    validation: ScenarioSet | Literal["held_out"] | None = "held_out", resume: bool = False,
+    overwrite: bool = False, seeds: int = 1, log: Callable[[str], None] = lambda line: None,
 ) -> RunFolder:  # fmt: skip
     """Train a policy and write the run folder: configuration, metrics, checkpoints of the full state.
 
@@ -62,11 +64,12 @@ def train(
         config: Settings of the training.
         data: Scenarios to train on, all held on the device; offline algorithms draw steps of a weighted set by weight.
         out: Run folder.
-        validation: Scenarios that rank checkpoints.
+        validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings with about a tenth
+            of its scenarios (at most 256). None trains on all scenarios without validation.
         resume: Continue the run in ``out`` from its newest checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-0``, ...
-        log: Called with lines about memory, pretrained networks, and early stopping.
+        log: Called with lines about held-out scenarios, memory, pretrained networks, and early stopping.
 
     Raises:
         UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
@@ -74,8 +77,11 @@ def train(
         Preempted: SIGTERM stopped it, after a checkpoint.
     """
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
-    out, notes = Path(out), hashes(validation, weights)
-    folders: list[RunFolder] = []
+    out, folders = Path(out), list[RunFolder]()
+    split = None
+    if isinstance(validation, str):
+        split, validation = _hold_out(data, out, resume), None
+    notes = hashes(validation, weights) | ({} if split is None else {"validation": split.note()})
     if resume:
         config, folders = _resumed_folders(data, notes, out, seeds)
     else:
@@ -85,18 +91,20 @@ def train(
             config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
     if seeds < 1:
         raise UsageError(f"{seeds} seeds", cure="use 1 or more")
-    _check_validation(config, data, validation)
-    environment, bank = _environment(config, data)
+    scenarios = _Scenarios.of(config, data, weights, split or validation)
+    environment, bank = _environment(config, scenarios.training)
     learner = config.algorithm.build(environment, bank, config.iterations)
-    held_out = None if validation is None else Validation.of(validation)
+    held_out = None if scenarios.validation is None else Validation.of(scenarios.validation)
     held_out_data = None
     if held_out is not None and isinstance(learner, HeldOutMetrics):
         held_out_data = training_data(config.algorithm, environment, held_out.bank)
     numbers = range(config.seed, config.seed + (len(folders) or seeds))
-    experience = training_data(config.algorithm, environment, bank, weights)
+    experience = training_data(config.algorithm, environment, bank, scenarios.weights)
     program = Program(Seeds(learner, tuple(numbers)), experience, config.devices)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.check()
+    if split is not None:
+        log(split.text())
     log(memory.text())
     # Before any folder is created, because they may not fit.
     networks = None if resume else pretrained_networks(config.begin_from, program, log)
@@ -109,12 +117,42 @@ def train(
     return RunFolder.open(out)
 
 
-def _check_validation(config: TrainConfig, data: ScenarioSet, validation: ScenarioSet | None) -> None:
-    """Refuse a validation set of another length, and patience without one."""
-    if validation is not None:
-        check_lengths(data, validation)
-    elif config.patience:
-        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+def _hold_out(data: ScenarioSet, out: Path, resume: bool) -> HoldOut | None:
+    """Return the recordings that a new run holds out, or those that the run to resume held out, if any."""
+    if not resume:
+        return hold_out(data.entries)
+    recorded = RunFolder.open(out).info.get("validation")
+    return hold_out(data.entries, recorded["recordings"]) if isinstance(recorded, dict) else None
+
+
+@dataclass(frozen=True)
+class _Scenarios:
+    """Scenarios to train on, with their weights, and scenarios that rank checkpoints."""
+
+    training: Sequence[Scenario]
+    weights: np.ndarray | None
+    validation: Sequence[Scenario] | None
+
+    @classmethod
+    def of(
+        cls, config: TrainConfig, data: ScenarioSet, weights: np.ndarray | None,
+        validation: ScenarioSet | HoldOut | None,
+    ) -> Self:  # fmt: skip
+        """Divide the set if it holds out recordings.
+
+        Raises:
+            UsageError: The validation set has another length, patience has none, or weights do not fit.
+        """
+        if isinstance(validation, HoldOut) and validation.recordings:
+            if weights is not None:
+                weights = check_weights(weights, (len(data), data.capacity.steps))[validation.training]
+            return cls(data.take(validation.training), weights, data.take(validation.validation))
+        if isinstance(validation, ScenarioSet):
+            check_lengths(data, validation)
+            return cls(data, weights, validation)
+        if config.patience:
+            raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+        return cls(data, weights, None)
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
@@ -153,7 +191,7 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
     return row
 
 
-def _environment(config: TrainConfig, data: ScenarioSet) -> tuple[Driving, ScenarioBank]:
+def _environment(config: TrainConfig, data: Iterable[Scenario]) -> tuple[Driving, ScenarioBank]:
     """Return the environment of a training, and its bank."""
     environment = config.environment(find_traffic(config.traffic))
     return environment, prepare_bank(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
@@ -183,7 +221,7 @@ def _resumed_folders(
     folder = RunFolder.open(out)
     previous = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
     previous |= {name: folder.info.get(name) for name in ("validation", "weights")}
-    for name, value in {**notes, "data": [data.hash]}.items():
+    for name, value in {"data": [data.hash], **notes}.items():
         if previous[name] != value:
             problem, option = _RESUMED_WITH_OTHER[name]
             raise UsageError(problem, file=out, cure=f"resume with the same {option}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import signal
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any, Literal, Self
@@ -17,7 +17,7 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.store import ScenarioSet
+from drivax.scenario.schema import Scenario
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
@@ -43,8 +43,8 @@ class Validation:
     names: Sequence[Mapping[str, str]]
 
     @classmethod
-    def of(cls, data: ScenarioSet) -> Validation:
-        """Load a scenario set."""
+    def of(cls, data: Iterable[Scenario]) -> Validation:
+        """Load scenarios."""
         scenarios = list(data)
         return cls(ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios))
 

@@ -64,12 +64,14 @@ class MlpConfig:
 
     Attributes:
         rows: Layers shared by the rows of each masked group, before a maximum over rows; empty: rows are flattened.
+        flat: Masked groups whose rows are flattened in any case, because their order counts, as that of route points.
         hidden: Width of each following layer; the last is the size of the embedding.
         activation: Activation after each layer.
     """
 
     kind: Literal["mlp"] = "mlp"
     rows: tuple[int, ...] = ()
+    flat: tuple[str, ...] = ()
     hidden: tuple[int, ...] = (256, 256)
     activation: Activation = "relu"
 
@@ -82,14 +84,16 @@ class MlpEncoder(nnx.Module):
     """Flatten or pool each group, then apply dense layers."""
 
     def __init__(self, config: MlpConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
-        self.pools = bool(config.rows)
         self.names = group_names(spec)
+        self.pooled = tuple(
+            name for name in self.names if config.rows and f"{name}_mask" in spec and name not in config.flat
+        )
         self.shapes = {name: tuple(spec[name]) for name in self.names}
         self.activation: Activation = config.activation
         width, shared = 0, {}
         for name in self.names:
             mask_shape = spec.get(f"{name}_mask")
-            if mask_shape is not None and self.pools:
+            if name in self.pooled and mask_shape is not None:
                 # A row is what the mask's first axis counts; its times are concatenated with their masks.
                 row_width = math.prod(spec[name][1:]) + math.prod(mask_shape[1:])
                 shared[name] = dense_layers(row_width, config.rows, rngs)
@@ -112,10 +116,11 @@ class MlpEncoder(nnx.Module):
         if mask is None:
             return value.reshape(*lead, -1)
         value = jnp.where(mask[..., None], value, 0.0)
-        axes = (*lead, self.shapes[name][0], -1) if self.pools else (*lead, -1)
+        pools = name in self.pooled
+        axes = (*lead, self.shapes[name][0], -1) if pools else (*lead, -1)
         mask = mask.reshape(axes)
         row = jnp.concatenate([value.reshape(axes), mask.astype(jnp.float32)], axis=-1)
-        if not self.pools:
+        if not pools:
             return row
         # A row is valid if any of its times is; without valid rows the embedding is zero.
         return max_pool(self.activation, _weights(self.shared[name]), row, mask.any(axis=-1))

@@ -9,7 +9,7 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int8, Int64
+from jaxtyping import Bool, Float, Float64, Int, Int8, Int64
 
 from drivax.errors import DataError, UsageError
 from drivax.geometry.vectors import wrap
@@ -402,8 +402,8 @@ def _ego_position(recording: Recording) -> Float[Array, "3"]:
 
 def _check_extent(recording: Recording) -> Finding:
     """Refuse implausible values of ego and lights, which exhaust memory or float32; other tracks lose such steps."""
-    ego = _ego_position(recording)
-    lost = np.flatnonzero(recording.tracks.valid[recording.ego] & ~plausible(recording, recording.ego))
+    ego, row = _ego_position(recording), recording.ego
+    lost = np.flatnonzero(recording.tracks.valid[row] & ~plausible(recording, slice(row, row + 1))[0])
     if len(lost):
         return f"the ego jumps or is faster than {SPEED_MPS:.0f} m/s at step {lost[0]}", _UNITS
     stops = [np.asarray(light.stop_point) for light in recording.lights if np.shape(light.stop_point) == (3,)]
@@ -412,32 +412,43 @@ def _check_extent(recording: Recording) -> Finding:
     return None
 
 
-def plausible(recording: Recording, track: int) -> Bool[np.ndarray, " time"]:
-    """Valid steps of a track without those beyond ``EXTENT_M`` and ``SPEED_MPS``, and without jumps.
+def plausible(recording: Recording, rows: slice = slice(None)) -> Bool[np.ndarray, "track time"]:
+    """Valid steps of tracks without those beyond ``EXTENT_M`` and ``SPEED_MPS``, and without jumps.
 
     A track jumps between two observations that it could not connect at ``SPEED_MPS``. Of the pieces between jumps the
     longest is kept, and before and after it those that connect.
     """
-    tracks = recording.tracks
-    xy, ego = tracks.xy[track], _ego_position(recording)
-    away = np.abs(np.column_stack((xy, tracks.z[track])) - ego).max(axis=1)
-    slow = np.abs(tracks.velocity[track]).max(axis=1) <= SPEED_MPS
-    at = np.flatnonzero(tracks.valid[track] & (away <= EXTENT_M) & slow)
-    pieces = np.split(at, np.flatnonzero(~_connects(xy, at[:-1], at[1:])) + 1)
-    longest = int(np.argmax([len(piece) for piece in pieces]))
-    chain = pieces[longest]
-    for piece in pieces[longest + 1 :]:
-        chain = np.append(chain, piece) if _connects(xy, chain[-1], piece[0]) else chain
-    for piece in reversed(pieces[:longest]):
-        chain = np.append(piece, chain) if _connects(xy, piece[-1], chain[0]) else chain
-    result = np.zeros(len(xy), dtype=bool)
-    result[chain] = True
+    tracks, ego = recording.tracks, _ego_position(recording)
+    xy, z, velocity = tracks.xy[rows], tracks.z[rows], tracks.velocity[rows]
+    result = tracks.valid[rows] & (np.abs(xy - ego[:2]).max(axis=-1) <= EXTENT_M)
+    result &= (np.abs(z - ego[2]) <= EXTENT_M) & (np.abs(velocity).max(axis=-1) <= SPEED_MPS)
+    track, step = np.nonzero(result)
+    jumps = ~_connects(xy[track, step], step) & (track[1:] == track[:-1])
+    for row in np.unique(track[1:][jumps]).tolist():
+        chain = _longest_chain(xy[row], step[track == row])
+        result[row] = False
+        result[row, chain] = True
     return result
 
 
-def _connects(xy: Float[Array, "time 2"], earlier: Any, later: Any) -> Any:
-    """Whether a track could drive from its earlier to its later positions."""
-    return np.hypot(*(xy[later] - xy[earlier]).T) <= SPEED_MPS * DT_S * (later - earlier)
+def _longest_chain(xy: Float[Array, "time 2"], at: Int[Array, " step"]) -> Int[Array, " kept"]:
+    """Return the steps of a track that form its longest piece without jumps, and those that connect to it."""
+    pieces = np.split(at, np.flatnonzero(~_connects(xy[at], at)) + 1)
+    longest = int(np.argmax([len(piece) for piece in pieces]))
+    chain = pieces[longest]
+    for piece in pieces[longest + 1 :]:
+        ends = np.array([chain[-1], piece[0]])
+        chain = np.append(chain, piece) if _connects(xy[ends], ends)[0] else chain
+    for piece in reversed(pieces[:longest]):
+        ends = np.array([piece[-1], chain[0]])
+        chain = np.append(piece, chain) if _connects(xy[ends], ends)[0] else chain
+    return chain
+
+
+def _connects(xy: Float[Array, "k 2"], step: Int[Array, " k"]) -> Bool[np.ndarray, " pair"]:
+    """Whether a track could drive between successive observations."""
+    moved = xy[1:] - xy[:-1]
+    return np.hypot(moved[:, 0], moved[:, 1]) <= SPEED_MPS * DT_S * (step[1:] - step[:-1])
 
 
 def _check_map(recording: Recording) -> Finding:

@@ -134,7 +134,7 @@ def lookahead_m(speed: Scalar) -> Scalar:
 
 
 def follow_route(bank: ScenarioBank, context: AgentContext, offset_m: Scalar) -> Scalar:
-    """Return the curvature of pure pursuit to a line beside the route, ``offset_m`` to its left, 1/m."""
+    """Return the curvature of pure pursuit to the route shifted left by ``offset_m``, 1/m."""
     point, left = _route_aim(bank, context)
     return pursuit(jnp.array([0.0, 0.0, 1.0, 0.0]), point + offset_m * left)
 

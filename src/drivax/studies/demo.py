@@ -29,7 +29,7 @@ from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import describe_run
 
 #: Planners to compare the trained policy with.
-REFERENCES = ("expert", "constant_velocity", "idm")
+REFERENCES = ("expert", "constant_velocity", "constant_speed", "idm")
 #: Metrics of the paired comparison.
 _METRICS = ("success", "vmax_score")
 #: Seeds of the training and the held-out set.
@@ -136,7 +136,8 @@ def run_demo(
     held_out = _generate_set(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
     stages.start("training", "training PPO")
     training_config = settings.load(TrainConfig, config.preset, list(config.overrides))
-    run = train(training_config, training, out / "training" / "policy", overwrite=True).path
+    # On all scenarios: the held-out set is the test.
+    run = train(training_config, training, out / "training" / "policy", validation=None, overwrite=True).path
     stages.start("evaluation", "evaluating on the held-out scenarios")
     runs, results = [], {}
     planners: dict[str, tuple[Planner, Task]] = {name: (make_planner(name), Task()) for name in REFERENCES}

@@ -199,7 +199,7 @@ class Discrete(Physical):
 class Route(Physical):
     """Acceleration, and lateral offset from the route on lanes, to which pure pursuit steers the bicycle.
 
-    A policy in this space plans beside a route that it is given; it does not steer. Zero keeps speed and route. Without
+    A policy in this space plans along a route that it is given; it does not steer. Zero keeps speed and route. Without
     a route on lanes the offset is that from the line straight ahead. The executed action is that of :class:`Physical`.
 
     Attributes:

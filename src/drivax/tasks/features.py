@@ -16,7 +16,7 @@ from drivax.errors import UsageError, did_you_mean
 from drivax.geometry.boxes import COS, LENGTH, X, time_to_overlap
 from drivax.geometry.vectors import norm, rotate
 from drivax.scenario.bank.columns import RouteColumn
-from drivax.scenario.bank.queries import route_ahead
+from drivax.scenario.bank.queries import project_on_route, route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.ahead import has_route, project
@@ -28,7 +28,7 @@ POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 CURVATURE_PM = 0.1
 #: Cap of curvatures, in these units.
 _MAX_CURVATURE = 3.0
-#: Points of the route to which agents are related: behind ego, m; spacing, m; number. Largest distance beside it, m.
+#: Points of the route to which agents are related: behind ego, m; spacing, m; number. Largest distance to a side, m.
 _ROUTE_BEHIND_M, _ROUTE_STEP_M, _ROUTE_POINTS, _ROUTE_SIDE_M = -30.0, 2.0, 61, 20.0
 #: Horizon of times to overlap, s.
 _OVERLAP_S = 8.0
@@ -41,7 +41,13 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
         "ego": {**_PLACE, "time": ("",)},
         # The last action has as many columns as the action space has dimensions.
-        "ego_static": {"length": ("",), "width": ("",), "height": ("",), "last_action": ()},
+        "ego_static": {
+            "length": ("",),
+            "width": ("",),
+            "height": ("",),
+            "last_action": (),
+            "route": ("left", "sin"),
+        },
         "agents": {
             **_PLACE,
             "relative_velocity": ("ahead", "left"),
@@ -187,7 +193,7 @@ def route_coordinates(
 ) -> list[Float[Array, " K"]]:
     """Return positions of agents along the route from ego and left of it, and sine and cosine of their heading to it.
 
-    Positions in units of 50 m and 5 m; an agent that is not beside the route is 20 m left of it. Zeros without a route.
+    Positions in units of 50 m and 5 m; 20 m left if the agent is not alongside the route. Zeros without a route.
     """
     offsets = _ROUTE_BEHIND_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
     path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
@@ -195,6 +201,14 @@ def route_coordinates(
     along, left, cos, sin = project(path, on_route, offsets, box[:, X:COS], box[:, COS:LENGTH])
     columns = [along / POSITION_M, jnp.clip(left, -_ROUTE_SIDE_M, _ROUTE_SIDE_M) / SIZE_M, sin, cos]
     return [jnp.where(has_route(bank, context), column, 0.0) for column in columns]
+
+
+def ego_on_route(bank: ScenarioBank, context: AgentContext, view: View) -> Float[Array, " 2"]:
+    """Return ego's offset to the left of its route (m, at most 5) and the sine of its heading to it; 0 without one."""
+    hit = project_on_route(bank, context.index, view.xy, context.route_m)
+    sine = view.sin * hit.heading[0] - view.cos * hit.heading[1]
+    offset = jnp.clip(hit.lateral_m, -SIZE_M, SIZE_M)
+    return jnp.where(has_route(bank, context), jnp.stack([offset, sine]), 0.0)
 
 
 def approach(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], agents: Frame) -> tuple[Array, Array]:

@@ -210,6 +210,7 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, v
         "width": lambda: size[1:2],
         "height": lambda: size[2:],
         "last_action": lambda: context.action,
+        "route": lambda: features.ego_on_route(bank, context, view),
     }
     groups = (("ego", config.features.ego, moving), ("ego_static", config.features.ego_static, static))
     return {name: features.concatenate_features(names, parts, ()) for name, names, parts in groups if names}

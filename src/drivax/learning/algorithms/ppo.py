@@ -44,6 +44,8 @@ class PpoConfig:
         gamma, lambda_: Discount, and decay of generalised advantages.
         clip: Clipping range of the probability ratio around 1.
         value_coefficient, entropy_coefficient: Weights in the loss.
+        target_kl: The other updates of an iteration are skipped once the divergence from the policy that sampled the
+            rollout exceeds this in a minibatch; None: never.
         gradient_norm: Maximum global norm of gradients (None: no clipping), separately for policy and value unless they
             share an encoder.
     """
@@ -61,6 +63,7 @@ class PpoConfig:
     clip: float = 0.2
     value_coefficient: float = 0.5
     entropy_coefficient: float = 0.01
+    target_kl: float | None = None
     gradient_norm: float | None = 0.5
 
     def __post_init__(self) -> None:
@@ -187,7 +190,7 @@ class Ppo:
         _, update_key, key = jax.random.split(state.key, 3)
         batch = self._batch(rollout, self.network(state.parameters).value(state.environments.observation))
 
-        def epoch(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
+        def epoch(carry: tuple[Any, ...], key: Array) -> tuple[tuple[Any, ...], dict[str, Array]]:
             order_key, noise_key = jax.random.split(key)
             order = jax.random.permutation(order_key, config.steps_per_iteration)
             chunk = chunk_size(config.steps_per_iteration // config.minibatches)
@@ -197,15 +200,23 @@ class Ppo:
             keys = jax.random.split(noise_key, config.minibatches)
             return jax.lax.scan(update, carry, (shuffled, keys))
 
-        def update(carry: tuple[Any, Any], inputs: tuple[Any, Array]) -> tuple[Any, dict[str, Array]]:
-            (parameters, optimiser), (minibatch, key) = carry, inputs
+        def update(carry: tuple[Any, ...], inputs: tuple[Any, Array]) -> tuple[Any, dict[str, Array]]:
+            (parameters, optimiser, stops), (minibatch, key) = carry, inputs
             logs, gradient = self._gradient(parameters, minibatch, key, auxiliary_loss)
             logs["gradient_norm"] = optax.tree.norm(gradient)
-            change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
-            return (optax.apply_updates(parameters, change), optimiser), logs
+            change, updated = self.optimiser.update(gradient, optimiser, parameters)
+            updated = (optax.apply_updates(parameters, change), updated)
+            if config.target_kl is not None:
+                stops |= logs["kl"] > config.target_kl
+                updated = jax.tree.map(partial(jnp.where, stops), (parameters, optimiser), updated)
+                logs["skipped_share"] = stops.astype(jnp.float32)
+            return (*updated, stops), logs
 
-        carry, keys = (state.parameters, state.optimiser), jax.random.split(update_key, config.epochs)
-        (parameters, optimiser), logs = jax.lax.scan(epoch, carry, keys)
+        carry, keys = (
+            (state.parameters, state.optimiser, jnp.zeros((), bool)),
+            jax.random.split(update_key, config.epochs),
+        )
+        (parameters, optimiser, _), logs = jax.lax.scan(epoch, carry, keys)
         losses = {f"loss/{name}": value.mean() for name, value in logs.items()}
         return PpoState(parameters, optimiser, state.environments, key, state.iteration + 1), losses
 

@@ -185,8 +185,8 @@ class PdmPlanner:
         ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
         yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
 
-        metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, 0, None, None, None, 0, 0, 0, None))(
-            cars.motion, cars.acceleration, yaw_rate, size, others, contacts, ground, ends, config.scoring
+        metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, None, None, None, 0, 0, 0, None))(
+            cars, yaw_rate, size, others, contacts, ground, ends, config.scoring
         )
         return ScoredProposals(plans, cars, metrics, scoring.scores(metrics, config.scoring))
 

@@ -16,6 +16,7 @@ from drivax.geometry.vectors import norm, wrap
 from drivax.metrics import comfort
 from drivax.planners.pdm.forecast import Contacts, Forecast, boxes_of, overlapping
 from drivax.planners.pdm.ground import Ground
+from drivax.planners.pdm.tracking import Car
 from drivax.scenario.bank.scenario_bank import Scalar, Vector
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind
@@ -68,13 +69,14 @@ class ProposalMetrics:
 
 
 def evaluate_proposal(
-    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar, size: Vector,
-    others: Forecast, contacts: Contacts, ground: Ground, progress_m: Scalar, config: ScoringConfig,
+    car: Car, yaw_rate: Scalar, size: Vector, others: Forecast, contacts: Contacts, ground: Ground,
+    progress_m: Scalar, config: ScoringConfig,
 ) -> ProposalMetrics:  # fmt: skip
-    """Evaluate one proposal: ego's motion and acceleration at each step, with its ``yaw_rate`` now (rad/s).
+    """Evaluate one proposal: the simulated car at each step, with ego's ``yaw_rate`` now (rad/s).
 
-    ``contacts`` and ``ground`` are those along the motion.
+    ``contacts`` and ``ground`` are those along its motion.
     """
+    motion = car.motion
     faults = contacts.fault_times(ground.several | ground.off)
     soon = overlapping(motion, size, others, config.ttc_s)
     alive = (others.kind == AgentKind.VEHICLE) | (others.kind == AgentKind.PEDESTRIAN)
@@ -86,7 +88,7 @@ def evaluate_proposal(
         direction=_direction(motion, ground.astray, config),
         progress_m=progress_m,
         ttc=1.0 - _foreseen(motion, size, others, soon, config).astype(jnp.float32),
-        comfort=is_comfortable(motion, acceleration, yaw_rate).astype(jnp.float32),
+        comfort=is_comfortable(motion, car.acceleration, yaw_rate).astype(jnp.float32),
         fault_s=jnp.min(faults),
     )
 

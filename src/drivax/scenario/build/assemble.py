@@ -205,7 +205,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
 def _drop_jumps(recording: Recording) -> Recording:
     """Drop steps of tracks that are not plausible, and count the tracks that lose some."""
     tracks = recording.tracks
-    valid = np.stack([plausible(recording, track) for track in range(len(tracks.kind))])
+    valid = plausible(recording)
     jumping = (valid != tracks.valid).any(axis=1)
     if not jumping.any():
         return recording

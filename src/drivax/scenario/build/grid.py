@@ -18,6 +18,8 @@ CUTOFF_M = 3.0
 #: Side cells along a grid cell. Half the diagonal of a side cell is below the cut-off, so no edge lies between its
 #: centre and those of its points that are beyond the cut-off.
 SPLIT = 3
+#: Edges whose surroundings are searched at once.
+_BLOCK = 64
 #: Codes of a packed side cell; 0 is unknown.
 DRIVABLE, NOT_DRIVABLE = 1, 2
 #: Edges decide the side of cells up to the first distance; end points within the second are one vertex, m.
@@ -186,7 +188,9 @@ def cell_sides(
     reach = _REACH_M + grid.cell_m
     middle = (edges.a[:, :2] + edges.b[:, :2]) / 2 - grid.origin
     in_reach = np.all((middle >= -reach) & (middle <= grid.side * grid.cell_m + reach), axis=1)
-    side, distance = _nearest_sides(side_grid, edges.take(in_reach))
+    side, distance = np.zeros(side_grid.side**2, int), np.full(side_grid.side**2, np.inf)
+    if in_reach.any():
+        side, distance = _nearest_sides(side_grid, edges.take(in_reach))
     lane_cells = side_grid.cell(lanes[side_grid.contains(lanes)])
     on_road = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
     side[on_road] = 0
@@ -210,52 +214,89 @@ def pack_sides(side: Int[Array, "row column"]) -> Int32[Array, " cell"]:
 
 def _nearest_sides(side_grid: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Float[Array, " cell"]]:
     """Side of the nearest edge at every cell centre (0: out of reach, or beyond its open end), and its distance."""
-    size, width = side_grid.side, side_grid.cell_m
-    reach = int(np.ceil(_REACH_M / width))
-    steps = np.arange(-reach, reach + 1)
-    dx, dy = (part.ravel() for part in np.meshgrid(steps, steps))
+    width, reach = side_grid.cell_m, int(np.ceil(_REACH_M / side_grid.cell_m))
     a, b = edges.a[:, :2] - side_grid.origin, edges.b[:, :2] - side_grid.origin
     base = np.floor((a + b) / (2 * width)).astype(np.int64)
-    column, row = base[:, :1] + dx, base[:, 1:] + dy
-    inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
-    cell = np.where(inside, row * size + column, size * size)  # cells outside the grid share the last index
-    x, y = (column + 0.5) * width, (row + 0.5) * width
-    squared = _squared_distances(x, y, a, b)
-    nearest = np.full(size * size + 1, np.inf)
-    np.minimum.at(nearest, cell.ravel(), squared.ravel())
-    # All edges that are nearest up to rounding: at a vertex there are two.
-    segment, offset = np.nonzero(inside & (squared <= nearest[cell] * (1 + 1e-6) + 1e-6))
-    near_cell = cell[segment, offset]
+    low, (columns, rows) = base.min(axis=0) - reach, (np.ptp(base, axis=0) + 2 * reach + 1).tolist()
+    segment, near_cell, nearest = _nearest_pairs(a, b, base, low, (rows, columns), width)
     u = b[segment] - a[segment]
-    w = np.stack([x[segment, offset], y[segment, offset]], axis=-1) - a[segment]
+    w = (np.stack((near_cell % columns, near_cell // columns), axis=-1) + low + 0.5) * width - a[segment]
     length = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-6)
     along = (u * w).sum(axis=1) / length**2
     left = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / length
     begins, ends = _open_ends(a, b)
     past_end = (begins[segment] & (along <= 0.0)) | (ends[segment] & (along >= 1.0))
     # At a vertex the segment whose line is further away decides.
-    most, least, unknown = np.zeros(size * size), np.zeros(size * size), np.zeros(size * size, dtype=bool)
+    (most, least), unknown = np.zeros((2, len(nearest))), np.zeros(len(nearest), dtype=bool)
     np.maximum.at(most, near_cell, left)
     np.minimum.at(least, near_cell, left)
     unknown[near_cell[past_end]] = True
-    sign, distance = np.where(most >= -least, 1, -1), np.sqrt(nearest[:-1])
-    return np.where(unknown | (distance > _REACH_M), 0, sign), distance
+    sign, distance = np.where(most >= -least, 1, -1), np.sqrt(nearest)
+    sides = np.where(unknown | (distance > _REACH_M), 0, sign)
+    shape, square = (rows, columns), (side_grid.side, side_grid.side)
+    return _crop(sides, shape, low, np.zeros(square, int)), _crop(
+        distance, shape, low, np.full(square, np.inf)
+    )
 
 
-def _squared_distances(x: Array, y: Array, a: Array, b: Array) -> Float[Array, "segment near"]:
-    """Squared distances from each segment ``[segment, 2]`` to points ``[segment, near]``."""
+def _nearest_pairs(
+    a: Float[Array, "segment 2"], b: Float[Array, "segment 2"], base: Int[Array, "segment 2"],
+    low: Int[Array, "2"], shape: tuple[int, int], width: float,
+) -> tuple[Int[Array, " pair"], Int[Array, " pair"], Float[Array, " cell"]]:  # fmt: skip
+    """Pairs of a segment and a cell to whose centre no other segment is nearer, and the squared distance of each cell.
+
+    ``base`` is the column and row of each segment's midpoint, ``low`` the first column and row.
+    """
+    steps = np.arange(-int(np.ceil(_REACH_M / width)), int(np.ceil(_REACH_M / width)) + 1)
+    index = (base - low) @ np.array([1, shape[1]])
+    nearest, pairs = np.full(shape[0] * shape[1], np.inf), []
+    # Blocks keep the tables in the processor's cache.
+    for first in range(0, len(a), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        cell = index[block, None, None] + (shape[1] * steps[:, None] + steps)
+        x, y = (((base[block, axis, None] + steps) + 0.5) * width for axis in (0, 1))
+        squared = _squared_distances(x, y, a[block], b[block])
+        nearer = squared < nearest.take(cell)
+        np.minimum.at(nearest, cell[nearer], squared[nearer])
+        near = np.nonzero(squared <= _almost(nearest.take(cell)))
+        pairs.append((near[0] + first, cell[near], squared[near]))
+    segment, cell, squared = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+    # All segments that are nearest up to rounding: at a vertex there are two.
+    keep = squared <= _almost(nearest[cell])
+    return segment[keep], cell[keep], nearest
+
+
+def _almost(squared: Array) -> Array:
+    """Squared distances up to which segments are equally near."""
+    return squared * (1 + 1e-6) + 1e-6
+
+
+def _crop(values: Array, shape: tuple[int, int], low: Int[Array, "2"], square: Array) -> Array:
+    """Put the cells of a rectangle, whose first column and row are ``low``, into a square, flat."""
+    (x, y), (first_x, first_y) = np.maximum(low, 0), np.maximum(-low, 0)
+    target = square[y:, x:]
+    source = values.reshape(shape)[first_y : first_y + len(target), first_x : first_x + target.shape[1]]
+    target[: len(source), : source.shape[1]] = source
+    return square.ravel()
+
+
+def _squared_distances(
+    x: Float[Array, "segment column"], y: Float[Array, "segment row"], a: Float[Array, "segment 2"],
+    b: Float[Array, "segment 2"],
+) -> Float[Array, "segment row column"]:  # fmt: skip
+    """Squared distances from each segment to a grid of points."""
     u = b - a
-    squared = np.maximum((u * u).sum(axis=1), 1e-12)[:, None]
-    x, y = x - a[:, :1], y - a[:, 1:]
-    along = x * (u[:, :1] / squared)
-    along += y * (u[:, 1:] / squared)
+    share = u / np.maximum((u * u).sum(axis=1), 1e-12)[:, None]
+    x, y = (x - a[:, :1])[:, None], (y - a[:, 1:])[..., None]
+    along = x * share[:, 0, None, None] + y * share[:, 1, None, None]
     np.minimum(np.maximum(along, 0.0, out=along), 1.0, out=along)
-    x -= along * u[:, :1]
-    y -= along * u[:, 1:]
-    x *= x
-    y *= y
-    x += y
-    return x
+    squared = x - along * u[:, 0, None, None]
+    squared *= squared
+    along *= u[:, 1, None, None]
+    np.subtract(y, along, out=along)
+    along *= along
+    squared += along
+    return squared
 
 
 def _open_ends(a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> tuple[Array, Array]:

@@ -262,6 +262,12 @@ def trace(
 
 def _stretch(graph: LaneGraph, lane: int, begin: float, end: float) -> Line:
     """Points of a lane between two arc lengths, ends included."""
+    if (lane, begin, end) not in graph.stretches:
+        graph.stretches[lane, begin, end] = _cut_out(graph, lane, begin, end)
+    return graph.stretches[lane, begin, end]
+
+
+def _cut_out(graph: LaneGraph, lane: int, begin: float, end: float) -> Line:
     arc = graph.lines.arc[graph.lines.start[lane] : graph.lines.start[lane + 1]]
     ends = graph.lines.at(np.array([lane, lane]), np.array([begin, end]))
     inner = graph.lines.line(lane)[(arc > begin + 0.01) & (arc < end - 0.01)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,11 @@ class LaneGraph:
     chained: bool
     lost: Mapping[str, int]
     dropped_links: int = 0
+
+    @cached_property
+    def stretches(self) -> dict[tuple[int, float, float], Any]:
+        """Cache of :func:`drivax.scenario.build.lane_paths.trace`, by lane, begin and end."""
+        return {}
 
     @property
     def count(self) -> int:
@@ -316,7 +322,7 @@ class LaneSegments:
         crop = self._crop(xyz[:, :2], reach_m)
         if not len(crop.lane):
             return np.full(len(xyz), -1), np.zeros(len(xyz)), np.full(len(xyz), np.inf)
-        distance, s = crop._measure(xyz, heading, turn_rad)
+        distance, s = crop._measure(xyz, heading, reach_m, turn_rad)
         best = distance.argmin(axis=1)
         pick = np.arange(len(xyz)), best
         return np.where(distance[pick] <= reach_m, crop.lane[best], -1), s[pick], distance[pick]
@@ -326,7 +332,7 @@ class LaneSegments:
     ) -> list[tuple[int, float, float]]:
         """Lanes within reach of a pose as (lane, arc length on it, distance), the nearest first."""
         crop = self._crop(xyz[None, :2], reach_m)
-        (distance,), (s,) = crop._measure(xyz[None], np.array([heading]), turn_rad)
+        (distance,), (s,) = crop._measure(xyz[None], np.array([heading]), reach_m, turn_rad)
         lanes: dict[int, tuple[int, float, float]] = {}
         for i in np.argsort(distance, kind="stable"):
             lane = int(crop.lane[i])
@@ -341,14 +347,22 @@ class LaneSegments:
             rows = np.flatnonzero(inside_box(self.segments.a[:, :2], xy, reach_m + LONGEST_M))
         return LaneSegments(self.graph, self.segments.take(rows), self.lane[rows], self.heading[rows])
 
-    def _measure(self, xyz: Array, heading: Array, turn_rad: float) -> tuple[Array, Array]:
-        """Distance (infinite if turn or level exclude it) and arc length of every pose on every segment."""
-        segments, a, b = self.segments, self.segments.a, self.segments.b
-        distance, along = point_to_segment(xyz[:, None, :2], a[None, :, :2], b[None, :, :2])
+    def _measure(self, xyz: Array, heading: Array, reach_m: float, turn_rad: float) -> tuple[Array, Array]:
+        """Distance (infinite if reach, turn or level exclude it) and arc length of every pose on every segment."""
+        segments, most = self.segments, reach_m + LONGEST_M
+        shape = (len(xyz), len(segments))
+        distance, s = np.full(shape, np.inf), np.zeros(shape)
+        in_reach = np.abs(xyz[:, :1] - segments.a[:, 0]) <= most
+        in_reach &= np.abs(xyz[:, 1:2] - segments.a[:, 1]) <= most
+        pose, row = in_reach.nonzero()
+        a, b = segments.a[row], segments.b[row]
+        separation, along = point_to_segment(xyz[pose, :2], a[:, :2], b[:, :2])
         z = a[:, 2] + along * (b[:, 2] - a[:, 2])
-        is_excluded = np.abs(wrap(self.heading - heading[:, None])) > turn_rad
-        is_excluded |= np.abs(z - xyz[:, 2:3]) > LEVEL_M
-        return np.where(is_excluded, np.inf, distance), segments.start_m + along * segments.span_m
+        is_excluded = np.abs(wrap(self.heading[row] - heading[pose])) > turn_rad
+        is_excluded |= np.abs(z - xyz[pose, 2]) > LEVEL_M
+        distance[pose, row] = np.where(is_excluded, np.inf, separation)
+        s[pose, row] = segments.start_m[row] + along * segments.span_m[row]
+        return distance, s
 
 
 def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:

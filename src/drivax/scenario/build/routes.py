@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -93,17 +94,17 @@ class EgoLog:
     valid: Bool[Array, " time"]
     current: int
 
-    @property
+    @cached_property
     def last(self) -> int:
         """The last valid step."""
         return int(np.flatnonzero(self.valid)[-1])
 
-    @property
+    @cached_property
     def seen(self) -> Float[Array, "step 3"]:
         """Valid positions in order."""
         return self.xyz[self.valid]
 
-    @property
+    @cached_property
     def history(self) -> Float[Array, "step 3"]:
         """Valid positions up to the current step."""
         return self.xyz[: self.current + 1][self.valid[: self.current + 1]]

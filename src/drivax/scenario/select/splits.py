@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,8 @@ NAMES = ("train", "validation", "test")
 #: Percentages of recordings for each of :data:`NAMES`.
 Shares = tuple[float, float, float]
 FOLDER = "splits"
+#: Share of a training set to validate on, and the maximum number of scenarios, which bounds the time.
+HELD_OUT_SHARE, MOST_HELD_OUT = 0.1, 256
 
 
 def parse_shares(text: str) -> Shares:
@@ -35,14 +39,72 @@ def parse_shares(text: str) -> Shares:
 
 
 def split_of(dataset: str, segment: str, shares: Shares) -> str:
-    """Return the split of a recording, by its SHA-256 as a number in [0, 1)."""
-    digest = hashlib.sha256(f"{dataset}\0{segment}".encode()).digest()
-    place = int.from_bytes(digest[:8], "big") / 2**64
+    """Return the split of a recording, by its :func:`_place`."""
+    place = _place(dataset, segment)
     train, validation, test = shares
     # An empty split gets no recording, even if the percentages add up to slightly less than 100.
     if place * 100.0 < train or validation == test == 0:
         return NAMES[0]
     return NAMES[1] if place * 100.0 < train + validation or test == 0 else NAMES[2]
+
+
+def _place(dataset: str, segment: str) -> float:
+    """Return the SHA-256 of a recording as a number in [0, 1)."""
+    digest = hashlib.sha256(f"{dataset}\0{segment}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") / 2**64
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    """Recordings of a training set that are held out for validation.
+
+    Attributes:
+        recordings: Their data sets and segments; empty if the set is a single recording.
+        training: Indices of all other scenarios.
+        validation: Indices of at most :data:`MOST_HELD_OUT` scenarios of the recordings, evenly spaced.
+    """
+
+    recordings: list[list[str]]
+    training: list[int]
+    validation: list[int]
+
+    def note(self) -> dict[str, Any] | None:
+        """Return the entry of ``run.json``."""
+        return {"recordings": self.recordings, "scenarios": len(self.validation)} if self.recordings else None
+
+    def text(self) -> str:
+        """Return a line for the log."""
+        if not self.recordings:
+            return "no validation: all scenarios are of one recording; pass --validation SET to validate"
+        return (
+            f"trains on {len(self.training)} scenarios, validates on {len(self.validation)} "
+            f"of {len(self.recordings)} held-out recordings; --validation none trains on all"
+        )
+
+
+def hold_out(
+    entries: Sequence[Mapping[str, Any]], recordings: Sequence[Sequence[str]] | None = None
+) -> HoldOut:
+    """Hold out these recordings, or by default a share of the set (:data:`HELD_OUT_SHARE`)."""
+    keys = [(entry["dataset"], entry["segment"]) for entry in entries]
+    chosen = _choose(Counter(keys)) if recordings is None else {(name, log) for name, log in recordings}
+    scenarios = [number for number, key in enumerate(keys) if key in chosen]
+    training = [number for number, key in enumerate(keys) if key not in chosen]
+    stride = max(-(-len(scenarios) // MOST_HELD_OUT), 1)
+    return HoldOut(sorted(map(list, chosen)), training, scenarios[::stride])
+
+
+def _choose(sizes: Mapping[tuple[str, str], int]) -> set[tuple[str, str]]:
+    """Return recordings in the order of their place while they fit into the share; else the smallest one."""
+    if len(sizes) < 2:
+        return set()
+    order = sorted(sizes, key=lambda recording: _place(*recording))
+    free, chosen = min(HELD_OUT_SHARE * sum(sizes.values()), MOST_HELD_OUT), set()
+    for recording in order:
+        if sizes[recording] <= free:
+            free -= sizes[recording]
+            chosen.add(recording)
+    return chosen or {min(order, key=lambda recording: sizes[recording])}
 
 
 def write_splits(folder: Path, entries: Iterable[Mapping[str, Any]], shares: Shares) -> dict[str, int]:

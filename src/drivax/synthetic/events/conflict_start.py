@@ -70,13 +70,8 @@ def critical_steps(
         gap, leader = _leader(others, extent, step, position, size_m)
         line = _stop_line_m(network, path, colour[step], position + size_m[0] / 2) + 2.0 - _STOP_SHORT_M
         target_mps = fastest[np.minimum((position / path.step_m).astype(int), len(fastest) - 1)]
-        a = idm_acceleration(
-            np.stack([speed, speed]),
-            np.stack([target_mps, target_mps]),
-            np.stack([gap, line]),
-            np.stack([leader, np.zeros_like(leader)]),
-            _DRIVER,
-        ).min(axis=0)
+        gaps, leads = np.array((gap, line)), np.array((leader, np.zeros_like(leader)))
+        a = idm_acceleration(speed, target_mps, gaps, leads, _DRIVER).min(axis=0)
         after = np.maximum(speed + a * _STRIDE * DT_S, 0.0)
         position, speed, step = position + (speed + after) / 2 * _STRIDE * DT_S, after, step + 1
         extent = others.extent.take(step, axis=2)
@@ -147,8 +142,10 @@ def _hits(
     maybe = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
     behind |= maybe & ((near + far) / 2 <= at - half)
     user, start = np.nonzero(maybe & ~behind)
+    result = np.zeros(len(at), bool)
+    if not len(user):
+        return result
     index = np.minimum((at[start] / path.step_m).astype(int), len(path.curve.xy) - 1)
     ego = boxes(path.curve.xy[index], path.curve.heading[index], size_m)
-    result = np.zeros(len(at), bool)
     result[start[overlap(ego, others.box[user, now[start]])]] = True
     return result

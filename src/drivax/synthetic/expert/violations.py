@@ -61,9 +61,11 @@ class Violation:
 
 def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
     """Return all users' boxes in the layout of :mod:`drivax.geometry.boxes`."""
-    size = np.broadcast_to(motion.size_m[:, None, :2], (*motion.heading.shape, 2))
-    heading = motion.heading[..., None]
-    return np.concatenate([motion.xy, np.cos(heading), np.sin(heading), size], axis=-1)
+    result = np.empty((*motion.heading.shape, 6))
+    result[..., :2], result[..., 4:] = motion.xy, motion.size_m[:, None, :2]
+    np.cos(motion.heading, out=result[..., 2])
+    np.sin(motion.heading, out=result[..., 3])
+    return result
 
 
 def find_violation(
@@ -117,13 +119,14 @@ def first_overlap_step(
     box[0, :, 4:] += 2 * EGO_SKIN_M
     reach = np.hypot(box[:, 0, 4], box[:, 0, 5]) / 2
     # Broad phase: bounding rectangles of the trajectories.
-    xy = np.where(valid[..., None], box[..., :2], np.nan)
-    with np.errstate(all="ignore"):
-        low = np.where(valid[..., None], xy, np.inf).min(axis=1) - reach[:, None]
-        high = np.where(valid[..., None], xy, -np.inf).max(axis=1) + reach[:, None]
-    meet = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=-1)
-    first, second = np.nonzero(np.triu(tested & meet, 1))
-    gap = np.sum((box[first, :, :2] - box[second, :, :2]) ** 2, axis=-1)
+    meet = np.triu(tested, 1)
+    for values in (box[..., 0], box[..., 1]):
+        low = np.where(valid, values, np.inf).min(axis=1) - reach
+        high = np.where(valid, values, -np.inf).max(axis=1) + reach
+        meet &= (low[:, None] <= high) & (high[:, None] >= low)
+    first, second = np.nonzero(meet)
+    dx, dy = (box[first, :, axis] - box[second, :, axis] for axis in (0, 1))
+    gap = dx * dx + dy * dy
     near = (gap < ((reach[first] + reach[second]) ** 2)[:, None]) & valid[first] & valid[second]
     pair, time = np.nonzero(near)
     hit = overlap(box[first[pair], time], box[second[pair], time])

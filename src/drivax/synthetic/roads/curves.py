@@ -112,7 +112,10 @@ class Curve:
 
 def normals(heading: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n 2"]:
     """Unit vectors to the left of headings."""
-    return np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+    result = np.empty((*np.shape(heading), 2))
+    np.negative(np.sin(heading), out=result[..., 0])
+    np.cos(heading, out=result[..., 1])
+    return result
 
 
 def interpolate(
@@ -121,7 +124,10 @@ def interpolate(
     xy: Float64[np.ndarray, "point 2"],
 ) -> Float64[np.ndarray, "n 2"]:
     """Positions at distances along a polyline whose points lie at ``arc_m``."""
-    return np.stack([np.interp(along_m, arc_m, xy[:, k]) for k in (0, 1)], axis=-1)
+    result = np.empty((len(along_m), 2))
+    for k in (0, 1):
+        result[:, k] = np.interp(along_m, arc_m, xy[:, k])
+    return result
 
 
 def smooth_step(share: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:

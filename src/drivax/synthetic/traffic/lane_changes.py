@@ -19,7 +19,7 @@ from drivax.scenario.schema import RoadKind
 from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.network import RoadNetwork, per_roads
 from drivax.synthetic.traffic.obstacles import Boxes
-from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, Worlds, pick
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, Worlds
 from drivax.synthetic.traffic.roles import Drivers
 
 #: MOBIL: threshold and safe braking, m/s2; the latter grows to the second value as the own lane runs out.
@@ -192,7 +192,7 @@ class LaneChanges:
     def __init__(self, worlds: Worlds, drivers: Drivers, standing: Sequence[Boxes]) -> None:
         self.chains, self._drivers, self._worlds = LaneChains.join(worlds), drivers, worlds
         self._half = drivers.size_m[:, 0] / 2
-        self._half_of_column = pick(self._half, worlds.rows, 0.0)
+        self._half_of_column = self._half.take(worlds.rows)
         blocked = [
             (self.chains.chain[first + lane], self.chains.offset_m[first + lane] + position)
             for first, network, boxes in zip(worlds.lane[:-1], worlds.networks, standing, strict=True)
@@ -354,7 +354,8 @@ def _blocked_lanes(network: RoadNetwork, boxes: Boxes) -> list[tuple[int, float]
     result, chain = [], lane_chains(network).chain
     for index in np.flatnonzero(chain >= 0).tolist() if len(boxes) else ():
         curve = network.lanes[index].curve
-        gap = np.sum((boxes.xy[:, None] - curve.xy[::2]) ** 2, axis=-1)
+        dx, dy = (np.subtract.outer(boxes.xy[:, k], curve.xy[::2, k]) for k in (0, 1))
+        gap = dx * dx + dy * dy
         for box in np.flatnonzero(gap.min(axis=1) < (0.95 + boxes.size_m[:, 1] / 2) ** 2):
             result.append((index, float(curve.arc_m[::2][np.argmin(gap[box])])))
     return result

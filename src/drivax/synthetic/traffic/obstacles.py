@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, Worlds, pick
+from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, Worlds, pad_last
 from drivax.synthetic.traffic.paths import Path
 
 #: Lateral margin of the corridor, m; less for vehicles, which keep to their lanes.
@@ -185,6 +185,9 @@ def nearest_obstacles(
     if not len(viewer):
         return gap, speed
     pose, place_m, apart2 = _nearest(tables, at_m, viewer, users.xy[user])
+    # Obstacles beyond the last sample of the path, or next to the vehicle, do not count.
+    k = (apart2 < 64.0).nonzero()[0]
+    viewer, user, pose, place_m = viewer[k], user[k], pose[k], place_m[k]
     position, left, relative_heading = _relative(users, user, pose[:, :2], pose[:, 2])
     position = position + place_m
     length, width = _reach(users.size_m[user], relative_heading)
@@ -195,8 +198,7 @@ def nearest_obstacles(
     size = vehicles.size_m[viewer]
     half = size[:, 1] / 2 + np.where(vehicle, _VEHICLES_M, _MARGIN_M)
     inside = (np.minimum(left, left_soon) - width < half) & (np.maximum(left, left_soon) + width > -half)
-    # Beyond the last sample of the path, or next to the vehicle: no obstacle.
-    inside &= (position > at_m[viewer] + 0.3 * size[:, 0]) & (apart2 < 64.0)
+    inside &= position > at_m[viewer] + 0.3 * size[:, 0]
     k = inside.nonzero()[0]
     if not len(k):
         return gap, speed
@@ -221,12 +223,11 @@ def _nearby_pairs(
     """Pairs of a vehicle and a user of its world (vehicles first) in a wedge ahead of it."""
     count = worlds.rows.shape[1]
     columns = np.concatenate((worlds.rows, np.where(by_world < 0, -1, by_world + len(vehicles))), axis=1)
-    xy = users.xy.copy()
-    xy[: len(vehicles)][~active] = np.nan
-    dx, dy = (
-        pick(xy[:, axis], columns, np.nan).take(worlds.of, axis=0) - vehicles.xy[:, axis, None]
-        for axis in (0, 1)
-    )
+    xy = pad_last(users.xy.T, np.nan)
+    xy[:, : len(vehicles)][:, ~active] = np.nan
+    dx, dy = xy.take(columns, axis=1).take(worlds.of, axis=1)
+    dx -= vehicles.xy[:, 0, None]
+    dy -= vehicles.xy[:, 1, None]
     cos, sin = (component[:, None] for component in vehicles.direction)
     ahead = dx * cos
     ahead += dy * sin

@@ -37,8 +37,11 @@ def speed_profile(
 
 def driver_profile(path: Path, drivers: Drivers, row: int) -> Float64[np.ndarray, " p"]:
     """Speed profile of one of the drivers."""
-    names = ("speed_factor", "lateral_mps2", "slowing_mps2", "top_speed_mps")
-    return speed_profile(path, *(float(getattr(drivers, name)[row]) for name in names))
+    d = drivers
+    driver = tuple(float(x[row]) for x in (d.speed_factor, d.lateral_mps2, d.slowing_mps2, d.top_speed_mps))
+    if driver not in path.profiles:
+        path.profiles[driver] = speed_profile(path, *driver)
+    return path.profiles[driver]
 
 
 def group_indices(group: Int64[np.ndarray, " item"], groups: int) -> Int64[np.ndarray, "group most"]:
@@ -49,9 +52,9 @@ def group_indices(group: Int64[np.ndarray, " item"], groups: int) -> Int64[np.nd
     return table
 
 
-def pick(values: np.ndarray, indices: np.ndarray, missing: float) -> np.ndarray:
-    """Values at indices, and a value for missing ones (-1)."""
-    return np.append(values, np.array([missing], values.dtype)).take(indices)
+def pad_last(values: np.ndarray, missing: float) -> np.ndarray:
+    """Append a value to the last axis, so that index -1 (missing) picks it."""
+    return np.concatenate((values, np.full((*values.shape[:-1], 1), missing, values.dtype)), axis=-1)
 
 
 def pad_steps(series: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.synthetic.roads.curves import STEP_M, Curve, join_curves, resample, smooth_step
-from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate, join_curves, resample, smooth_step
+from drivax.synthetic.roads.network import RoadNetwork, per_roads
 
 #: Largest number of lanes that a vehicle occupies: its own, and those that share space with it.
 SLOTS = 3
@@ -68,6 +68,11 @@ class Path:
     def length_m(self) -> float:
         """Length, m."""
         return self.step_m * (len(self.curve.xy) - 1)
+
+    @cached_property
+    def profiles(self) -> dict[tuple[float, ...], Float64[np.ndarray, " point"]]:
+        """Cache of speed profiles by properties of the driver."""
+        return {}
 
 
 @dataclass(frozen=True)
@@ -165,10 +170,8 @@ def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[L
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
     spans = [span.stretch(stretch) for span in spans]
     position = step * np.arange(len(curve.xy))
-    lane = np.full((len(position), SLOTS), -1)
-    lane_m = np.zeros((len(position), SLOTS))
-    occupied = np.zeros(len(position), int)
-    limit = np.full(len(position), math.inf)
+    lane, lane_m = np.full((len(position), SLOTS), -1), np.zeros((len(position), SLOTS))
+    occupied, limit = np.zeros(len(position), int), np.full(len(position), math.inf)
     begin = np.array([span.begin_m for span in spans])
     size = np.array([span.scale * network.lanes[span.lane].length_m for span in spans])
     bounds = np.searchsorted(position, np.concatenate((begin - 1e-6, begin + size - 1e-6))).tolist()
@@ -178,14 +181,15 @@ def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[L
         samples = slice(first, last)
         np.minimum(limit[samples], network.lanes[span.lane].limit_mps, out=limit[samples])
         current, slots = position[samples], occupied[samples]
-        inside = (current >= span.from_m) & (current <= span.until_m)
         along = np.maximum(current - span.begin_m, 0.0) / span.scale
-        for shared_lane, until_m in _lanes_sharing_space(network, span.lane):
-            samples_on_lane = (inside & (along < until_m) & (slots < SLOTS)).nonzero()[0]
-            slot = slots[samples_on_lane]
-            lane[samples][samples_on_lane, slot] = shared_lane
-            lane_m[samples][samples_on_lane, slot] = along[samples_on_lane]
-            slots[samples_on_lane] += 1
+        if span.from_m > -math.inf or span.until_m < math.inf:
+            along[(current < span.from_m) | (current > span.until_m)] = math.inf
+        for shared_lane, until_m in _lanes_sharing_space(network)[span.lane]:
+            on_lane = ((along < until_m) & (slots < SLOTS)).nonzero()[0]
+            place = (first + on_lane) * SLOTS + slots[on_lane]
+            lane.put(place, shared_lane)
+            lane_m.put(place, along[on_lane])
+            slots[on_lane] += 1
     return Path(curve, step, mean_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 
 
@@ -193,27 +197,32 @@ def interpolate_curve(
     curve: Curve, arc_m: Float64[np.ndarray, " point"], at_m: Float64[np.ndarray, " n"]
 ) -> Curve:
     """Interpolate a curve, whose samples lie at ``arc_m``, linearly at positions."""
-    xy = np.stack([np.interp(at_m, arc_m, curve.xy[:, k]) for k in (0, 1)], axis=-1)
-    return Curve(xy, np.interp(at_m, arc_m, curve.heading))
+    return Curve(interpolate(at_m, arc_m, curve.xy), np.interp(at_m, arc_m, curve.heading))
 
 
 def mean_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]:
     """Curvature of an equally sampled curve, 1/m, averaged over 3 m."""
     window = max(1, round(_CURVATURE_WINDOW_M / step_m))
-    rate = np.gradient(curve.heading, step_m)
-    before, after = window // 2, window - 1 - window // 2
-    padded = np.concatenate([np.full(before, rate[0]), rate, np.full(after, rate[-1])])
+    before, heading = window // 2, curve.heading
+    padded = np.empty(len(heading) + window - 1)
+    # Central differences, the same as those of np.gradient, whose checks take longer.
+    rate = padded[before : before + len(heading)]
+    np.divide(heading[2:] - heading[:-2], 2.0 * step_m, out=rate[1:-1])
+    padded[: before + 1] = (heading[1] - heading[0]) / step_m
+    padded[before + len(heading) - 1 :] = (heading[-1] - heading[-2]) / step_m
     return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
 
 
-def _lanes_sharing_space(network: RoadNetwork, lane: int) -> list[tuple[int, float]]:
-    """A lane, lanes that branch off the same lane, and positions up to which a vehicle on the lane occupies them, m."""
-    result = [(lane, math.inf)]
-    for before in network.lanes[lane].predecessors:
-        for other in network.lanes[before].successors:
-            if other != lane:
-                # Half a vehicle's length longer: its rear leaves after its centre.
-                result.append((other, network.shared_m[lane, other] + 2.5))
+@per_roads
+def _lanes_sharing_space(network: RoadNetwork) -> list[list[tuple[int, float]]]:
+    """Each lane and those that branch off the same lane, and positions up to which a vehicle on it occupies them, m."""
+    result = [[(lane, math.inf)] for lane in range(len(network.lanes))]
+    for lane, shared in enumerate(result):
+        for before in network.lanes[lane].predecessors:
+            for other in network.lanes[before].successors:
+                if other != lane:
+                    # Half a vehicle's length longer: its rear leaves after its centre.
+                    shared.append((other, network.shared_m[lane, other] + 2.5))
     return result
 
 

@@ -16,7 +16,7 @@ from drivax.synthetic.roads.curves import STEP_M, Curve, resample
 from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork, per_roads
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes
-from drivax.synthetic.traffic.path_arrays import PerVehicle, VehicleMask, Worlds, pad_steps, pick
+from drivax.synthetic.traffic.path_arrays import PerVehicle, VehicleMask, Worlds, pad_last, pad_steps
 from drivax.synthetic.traffic.roles import Pedestrian
 
 #: Distances from the kerb, m, at which pedestrians wait, occupy the crossing, and start to look for a gap.
@@ -186,8 +186,8 @@ class Pedestrians:
         x, y, angle = pose.T
         half = vehicles.size_m / 2 + _CLEARANCE_M
         half[~active] = -1.0
-        boxes = (*vehicles.xy.T, *vehicles.direction, *half.T)
-        near = [pick(values, self._worlds.rows, -1.0).take(self.world, axis=0) for values in boxes]
+        columns = np.stack([*vehicles.xy.T, *vehicles.direction, *half.T])
+        near = pad_last(columns, -1.0).take(self._worlds.rows, axis=1).take(self.world, axis=1)
         blocked = _is_in_box(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), near)
         if np.count_nonzero(blocked):
             blocked &= ~_is_in_box(x, y, near)
@@ -214,17 +214,16 @@ class Pedestrians:
 
     def _release_in(self, world: int, waiting: _Indices, crossing_s: _Values, vehicles: Boxes) -> None:
         """Release pedestrians of one world before its active vehicles."""
-        conflicts = self._conflicts[world]
+        conflicts, crossing = self._conflicts[world], self._crossing[waiting]
+        local, place = np.unique(crossing - self._worlds.crossing[world], return_inverse=True)
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
-        any_s, hard_s = _arrivals(conflicts, boxes, vehicles.speed)
-        crossing = self._crossing[waiting]
-        yielding, local = self._yielding[crossing], crossing - self._worlds.crossing[world]
+        any_s, hard_s = (s[place] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
         gap = np.where(
-            yielding, hard_s[local] > crossing_s + _MARGIN_S, any_s[local] > crossing_s + _GAP_MARGIN_S
+            self._yielding[crossing], hard_s > crossing_s + _MARGIN_S, any_s > crossing_s + _GAP_MARGIN_S
         ).nonzero()[0]
         # A standing queue blocks the crossing.
         if len(gap):
-            blocked = overlap(conflicts.strip[local[gap], None], boxes[None]).any(axis=1)
+            blocked = overlap(conflicts.strip[local[place[gap]], None], boxes[None]).any(axis=1)
             self._released[waiting[gap]] = ~blocked
 
     def _advance(self) -> None:
@@ -263,29 +262,32 @@ def _remaining_red_s(
 
 
 def _arrivals(
-    conflicts: _CrossingConflicts, boxes: Float64[np.ndarray, "v 6"], speed: PerVehicle
-) -> tuple[Float64[np.ndarray, " crossing"], Float64[np.ndarray, " crossing"]]:
-    """Time until the next vehicle arrives at each crossing, s, among all and among those that cannot yield."""
-    any_s, hard_s = np.full((2, len(conflicts.marked)), math.inf)
+    conflicts: _CrossingConflicts, crossings: _Indices, boxes: Float64[np.ndarray, "v 6"], speed: PerVehicle
+) -> tuple[_Values, _Values]:
+    """Time until the next vehicle arrives at each of some crossings, s: any vehicle, and one that cannot yield."""
+    any_s, hard_s = np.full((2, len(crossings)), math.inf)
     if not len(boxes):
         return any_s, hard_s
-    offset = conflicts.xy[:, None] - boxes[None, :, :2]
+    at = np.isin(conflicts.crossing, crossings).nonzero()[0]
+    offset = conflicts.xy[at, None] - boxes[None, :, :2]
     cos, sin = boxes[:, 2], boxes[:, 3]
     ahead = offset[..., 0] * cos + offset[..., 1] * sin
     lateral = np.abs(offset[..., 1] * cos - offset[..., 0] * sin)
-    same_direction = np.cos(conflicts.heading)[:, None] * cos + np.sin(conflicts.heading)[:, None] * sin
+    heading = conflicts.heading[at, None]
+    same_direction = np.cos(heading) * cos + np.sin(heading) * sin
     same_direction = same_direction > math.cos(_MAX_HEADING_DIFFERENCE)
     approaching = (ahead > -1.0) & (lateral < 2.0 + math.tan(_MAX_BEARING) * np.maximum(ahead, 0.0))
     approaching &= same_direction & (speed > _STANDING_MPS)
     distance = np.maximum(np.hypot(ahead, lateral) - boxes[:, 4] / 2, 0.0)
     time = np.where(approaching, distance / np.maximum(speed, _STANDING_MPS), math.inf)
     braking = speed**2 / (2 * np.maximum(distance - _STOP_SHORT_M, 0.05))
-    np.minimum.at(any_s, conflicts.crossing, time.min(axis=1))
-    np.minimum.at(hard_s, conflicts.crossing, np.where(braking > _YIELDING_MPS2, time, math.inf).min(axis=1))
+    of_crossing = np.searchsorted(crossings, conflicts.crossing[at])
+    np.minimum.at(any_s, of_crossing, time.min(axis=1))
+    np.minimum.at(hard_s, of_crossing, np.where(braking > _YIELDING_MPS2, time, math.inf).min(axis=1))
     return any_s, hard_s
 
 
-def _is_in_box(x: _Values, y: _Values, boxes: Sequence[Float64[np.ndarray, "w v"]]) -> _Mask:
+def _is_in_box(x: _Values, y: _Values, boxes: Float64[np.ndarray, "6 w v"]) -> _Mask:
     """Mask of points in one of their boxes: x, y, cosine and sine of the heading, half the length and the width."""
     box_x, box_y, cos, sin, half_length, half_width = boxes
     dx, dy = x[:, None] - box_x, y[:, None] - box_y

@@ -91,10 +91,11 @@ def conflict_zones(
                 continue
             if np.any(box[a][0] > box[b][1] + CLEARANCE_M) or np.any(box[b][0] > box[a][1] + CLEARANCE_M):
                 continue
-            near = np.sum((xy_a[:, None] - other) ** 2, axis=-1) < CLEARANCE_M**2
+            dx, dy = (np.subtract.outer(xy_a[:, k], other[:, k]) for k in (0, 1))
+            near = dx * dx + dy * dy < CLEARANCE_M**2
             for i, j, hit in ((a, b, near.any(axis=1)), (b, a, near.any(axis=0))):
                 if hit.any():
-                    step = network.lanes[i].length_m / (len(hit) - 1)
+                    step = network.lanes[i].length_m / (hit.size - 1)
                     places = np.flatnonzero(hit)
                     begin[i, j], end[i, j] = places[0] * step, places[-1] * step
     return begin, end

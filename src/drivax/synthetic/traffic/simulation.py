@@ -42,7 +42,6 @@ from drivax.synthetic.traffic.path_arrays import (
     Worlds,
     group_indices,
     pad_steps,
-    pick,
 )
 from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, next_lanes
 from drivax.synthetic.traffic.pedestrians import Pedestrians
@@ -170,19 +169,20 @@ class Leaders:
             return self._nearest
         vehicle, lane = slots // SLOTS, lane.ravel().take(slots)
         k = group_indices(world[vehicle], len(self._worlds))
-        index = np.where(k < 0, self._worlds.lane[:-1, None], lane[k]).take(world, axis=0)
+        lanes = np.where(k < 0, self._worlds.lane[:-1, None], lane[k])
+        index = lanes.take(world, axis=0)
         index += tables.column[:, None]
         position = tables.scale.take(index)
-        position *= pick(along.ravel().take(slots), k, 0.0).take(world, axis=0)
+        position *= along.ravel().take(slots)[k].take(world, axis=0)
         # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
         position += tables.present_begin(at_m).take(index)
-        vehicle_ahead = pick(vehicle, k, 0)
+        vehicle_ahead = vehicle[k]
         seen = (position > own) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
         if self._any_cyclist:
             # Where the lane is wide enough, cyclists are overtaken within it.
-            passes_m = np.where(self._cyclist[vehicle], self._passes_m[lane], -np.inf)
-            seen &= pick(passes_m, k, -np.inf).take(world, axis=0) < self._half_width_m[:, None]
-        position -= pick(self._half_m[vehicle], k, -np.inf).take(world, axis=0)
+            passes_m = np.where(self._cyclist[vehicle_ahead], self._passes_m[lanes], -np.inf)
+            seen &= passes_m.take(world, axis=0) < self._half_width_m[:, None]
+        position -= np.where(k < 0, -np.inf, self._half_m[vehicle_ahead]).take(world, axis=0)
         gap = np.where(seen, position, np.inf)
         gap -= own
         gap -= self._half_m[:, None]
@@ -485,8 +485,9 @@ class _Simulation:
         crossing, away = self._tables.crossing, self._tables.crossing_m - front[:, None]
         to_stop = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
         halt = self._occupied_crossings[crossing] & (crossing >= 0) & (away > -0.5)
-        extra = crossing.shape[1] - self._halting.shape[1]
-        halting = np.pad(self._halting, ((0, 0), (0, extra)))
+        halting = self._halting
+        if crossing.shape[1] > halting.shape[1]:
+            halting = np.pad(halting, ((0, 0), (0, crossing.shape[1] - halting.shape[1])))
         halt &= to_stop < np.where(halting, _HARDEST_MPS2, _YIELD_MPS2)
         # A world without an occupied crossing keeps its state.
         occupied_in = self._worlds.with_any(self._crossing_world[self._occupied_crossings])
