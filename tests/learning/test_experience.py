@@ -66,7 +66,7 @@ def test_transitions_equal_a_simulated_expert(bank, experience):
     expert = jax.device_get(experience.expert)
     index, step = np.nonzero(expert.usable)
     places = jnp.asarray(index), jnp.asarray(step)
-    found = jax.device_get(jax.jit(lambda e, p: transitions(DRIVING, e, p))(experience, places))
+    found = jax.device_get(jax.jit(lambda e, p: transitions(DRIVING, e, p, 0.9))(experience, places))
     seen, action, reward, terminated, following, truncated = jax.tree.map(
         lambda leaf: leaf[index, step - 10], online
     )
@@ -85,6 +85,32 @@ def test_transitions_equal_a_simulated_expert(bank, experience):
     np.testing.assert_array_equal(found.terminated, terminated)
     np.testing.assert_array_equal(expert.truncated[index, step], truncated)
     assert np.abs(reward).max() > 0
+
+
+@pytest.mark.parametrize("hold", [1, 2])
+def test_returns_of_logged_decisions_against_plain_loops(bank, experience, hold):
+    """Of three decisions, cut short by the failure in the first scenario and by the end of each log."""
+    expert = jax.device_get(experience.expert)
+    index, first = np.nonzero(expert.usable)
+    held = replace(experience, expert=replace(experience.expert, hold=hold))
+    find = jax.jit(lambda e, at: (transitions(DRIVING, e, at, 0.9, 3), DRIVING.observe_recorded(bank, at)))
+    found, _ = jax.device_get(find(held, (jnp.asarray(index), jnp.asarray(first))))
+    last, cut = [], 0
+    for number, (scenario, start) in enumerate(zip(index, first, strict=True)):
+        step, reward, failed = start, 0.0, False
+        while step < start + 3 * hold and expert.usable[scenario, step]:
+            reward += 0.9 ** ((step - start) // hold) * expert.reward[scenario, step]
+            failed |= bool(expert.terminated[scenario, step])
+            step += 1
+        assert found.reward[number] == pytest.approx(reward, rel=1e-4, abs=1e-5)
+        assert found.terminated[number] == failed
+        assert found.discount[number] == pytest.approx(0.9 ** np.ceil((step - start) / hold), rel=1e-5)
+        last.append(step)
+        cut += step < start + 3 * hold
+    assert found.terminated.any() and 0 < cut < len(index)
+    _, following = jax.device_get(find(held, (jnp.asarray(index), jnp.asarray(last))))
+    for name, value in following.items():
+        np.testing.assert_allclose(found.next_observation[name], value, atol=1e-5, err_msg=name)
 
 
 def test_steps_after_an_end_or_without_expert_are_unusable(experience):

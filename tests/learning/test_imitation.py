@@ -1,6 +1,7 @@
 """Cloning against NumPy, and imitation in addition to learning by reward."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +111,23 @@ def test_imitation_weight_decays():
     with pytest.raises(UsageError, match="raise total_steps"):
         WarmStart(iterations=5).online_iterations(5)
     assert WarmStart(iterations=5).online_iterations(8) == 3
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_settling_fits_ppo_values_to_a_fixed_policy(shown, shared):
+    network = replace(TINY, shared_encoder=shared)
+    start, ppo = WarmStart(iterations=1, cloning=CLONING, settle=1), replace(PPO, network=network)
+    learner = BcPpoConfig(warm_start=start, ppo=ppo).build(Pendulum(), shown, 3)
+    states, iterate = [jax.jit(learner.init)(shown, jax.random.key(0))], jax.jit(learner.iterate)
+    for _ in range(3):
+        states.append(iterate(shown, states[-1])[0])
+
+    def changes(name):
+        parts = [jax.tree.leaves(state.parameters[name]) for state in states[1:]]
+        return [max(float(abs(a - b).max()) for a, b in zip(*pair, strict=True)) for pair in pairwise(parts)]
+
+    (settling, learning), values = changes("policy"), changes("value")
+    assert settling == 0.0 and learning > 1e-5 and min(values) > 1e-5
 
 
 @pytest.mark.slow

@@ -47,6 +47,7 @@ def part():
         reward=jax.random.normal(keys[2], (COUNT,)),
         terminated=jax.random.bernoulli(keys[3], 0.3, (COUNT,)),
         next_observation={"pendulum": jax.random.normal(keys[4], (COUNT, 3))},
+        discount=jnp.full(COUNT, 0.9),
     )
 
 

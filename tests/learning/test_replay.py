@@ -85,8 +85,8 @@ def fill(config, steps, unroll):
     return buffer, kept, held
 
 
-def sampled(buffer, kept, count, seed=1):
-    return buffer.sample((), kept, buffer.draw(kept, jax.random.key(seed), (count,)))
+def sampled(buffer, kept, count, seed=1, n=1):
+    return buffer.sample((), kept, buffer.draw(kept, jax.random.key(seed), (count,)), 0.9, n)
 
 
 @pytest.mark.parametrize("store", ["state", "observation"])
@@ -107,6 +107,32 @@ def test_samples_are_collected_steps(store, capacity, steps):
     np.testing.assert_allclose(batch.reward, 10.0 * before[:, 1] + after[:, 2])
     np.testing.assert_allclose(batch.action[:, 0], before[:, 2] / 10.0, rtol=1e-6)
     assert batch.observation["place_mask"].dtype == bool
+
+
+@pytest.mark.parametrize("store", ["state", "observation"])
+@pytest.mark.parametrize("steps", [12, 20, 24, 84])
+def test_n_step_returns_against_plain_loops(store, steps):
+    """Of three steps: whole, cut short by either end of an episode, and by the newest row."""
+    buffer, kept, held = fill(ReplayConfig(60, store), steps, 4)
+    batch = sampled(buffer, kept, 2000, n=3)
+    before, after = (
+        np.asarray(part["place"]).astype(int) for part in (batch.observation, batch.next_observation)
+    )
+    assert {tuple(state) for state in before.tolist()} == held
+    lengths = set()
+    for number, (who, episode, first) in enumerate(before.tolist()):
+        last, reward, length = first, 0.0, 1 + (who + 2 * episode) % 5
+        while last < first + 3 and (who, episode, last) in held:
+            reward += 0.9 ** (last - first) * (10.0 * episode + last + 1)
+            last += 1
+        ended = last == length
+        lengths.add((last - first, ended, episode % 2))
+        assert after[number].tolist() == [who, episode, last]
+        assert float(batch.reward[number]) == pytest.approx(reward, rel=1e-6)
+        assert float(batch.discount[number]) == pytest.approx(0.9 ** (last - first), rel=1e-6)
+        assert bool(batch.terminated[number]) == (ended and episode % 2 == 0)
+    # Whole windows, and those that a termination or a truncation cuts short.
+    assert {(3, False, 0), (1, True, 0), (1, True, 1), (2, True, 1)} <= lengths
 
 
 def test_steps_are_sampled_uniformly():
@@ -147,7 +173,7 @@ def test_states_and_observations_give_the_same_batch():
             store = "state" if part.observation is None else "observation"
             buffer = ReplayBuffer(ReplayConfig(64, store), environment)
             kept = buffer.add(buffer.init(environments), part)
-            yield buffer.sample(bank, kept, buffer.draw(kept, jax.random.key(2), (64,)))
+            yield buffer.sample(bank, kept, buffer.draw(kept, jax.random.key(2), (64,)), 0.9)
 
     exact, stored = jax.jit(lambda bank: tuple(batches(bank)))(worlds.worlds())
     assert bool(exact.terminated.any()) or float(jnp.abs(exact.reward).max()) > 0

@@ -1,17 +1,24 @@
 """SAC's losses: against NumPy on the networks' own outputs, and which parameters each of them reaches."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from drivax.errors import UsageError
+from drivax.learning.algorithm import training_data
 from drivax.learning.algorithms import optimisers
+from drivax.learning.algorithms.behaviour_cloning import Cloning
 from drivax.learning.algorithms.sac import SacConfig, SacParameters
+from drivax.learning.algorithms.warm_start import BcSacConfig, WarmStart
 from drivax.learning.replay import ReplayConfig, Transitions
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from pendulum import Pendulum
+from recorded import Logged, Table
 
 NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,))
 CONFIG = SacConfig(network=NETWORK, replay=ReplayConfig(64), environments=4, unroll=4, batch=16, warm_up=0)
@@ -32,6 +39,7 @@ def sac():
         reward=jax.random.normal(keys[2], (16,)),
         terminated=jax.random.bernoulli(keys[3], 0.3, (16,)),
         next_observation={"pendulum": jax.random.normal(keys[4], (16, 3))},
+        discount=jax.random.uniform(keys[4], (16,)),
     )
     trained = SacParameters(state.parameters, state.critic, jnp.log(0.2))
     return learner, trained, target, batch
@@ -59,7 +67,7 @@ def test_losses_against_numpy(sac):
     found = {name: np.asarray(value, np.float64) for name, value in outputs(trained).items()}
     assert not np.allclose(found["q"][0], found["q"][1]), "the critics are two networks"
     value = np.minimum(*found["target"]) - 0.2 * found["then"]
-    td_target = np.asarray(batch.reward) + 0.99 * np.where(batch.terminated, 0.0, value)
+    td_target = np.asarray(batch.reward) + np.asarray(batch.discount) * np.where(batch.terminated, 0.0, value)
     expected = {
         "critic": 0.5 * ((found["q"] - td_target) ** 2).mean(),
         "policy": (0.2 * found["now"] - np.minimum(*found["policy_q"])).mean(),
@@ -124,7 +132,87 @@ def test_gradient_in_chunks_is_that_of_the_whole_batch(sac, chunk, monkeypatch):
     )
 
 
+@pytest.fixture(scope="module")
+def logged():
+    """Experience of which every number says that the log has it, to train with from the pendulum."""
+    steps = jnp.ones((5, 6), bool).at[:, -1].set(False)
+    table = Table(
+        seen=jnp.full((5, 6, 3), 9.0), action=jnp.full((5, 6, 1), 0.25), reward=jnp.full((5, 6), 50.0),
+        terminated=jnp.zeros((5, 6), bool), truncated=jnp.zeros((5, 6), bool), usable=steps,
+    )  # fmt: skip
+    return Logged(), table
+
+
+def iterated(config, logged, settling):
+    """States before and after an iteration, with a learner."""
+    environment, table = logged
+    learner = config.build(environment, table, 1)
+    data = training_data(config, environment, table)
+    state = jax.jit(learner.init)(data, jax.random.key(0))
+    after, logs = jax.jit(learner.iterate)(data, state, None, settling)
+    return learner, data, state, after, logs
+
+
+def test_demonstrations_are_a_share_of_each_batch(logged):
+    config = replace(CONFIG, demonstrations=0.25, steps=2)
+    learner, data, _, after, logs = iterated(config, logged, None)
+    index = learner._draw(data, after.replay, jax.random.key(0), 3)
+    batch = learner._sample(data, after.replay, jax.tree.map(lambda leaf: leaf[0], index))
+    is_logged = np.asarray(batch.action[:, 0]) == 0.25
+    assert is_logged.sum() == 4 and len(is_logged) == 16
+    np.testing.assert_array_equal(np.asarray(batch.observation["pendulum"])[is_logged], 9.0)
+    # Two steps where the log has them; rewards of the pendulum are negative.
+    assert set(np.asarray(batch.reward)[is_logged].round(3)) <= {
+        50.0,
+        np.float32(50.0 + 0.99 * 50.0).round(3),
+    }
+    assert (np.asarray(batch.reward)[~is_logged] < 0.0).all()
+    assert float(logs["loss/mean_q"]) != 0.0
+    assert training_data(CONFIG, *logged) is logged[1], "without demonstrations nothing is prepared"
+    with pytest.raises(UsageError, match="SacConfig does not learn from logged steps"):
+        training_data(CONFIG, *logged, np.ones((5, 6)))
+
+
+def largest_change(one, other):
+    differences = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)).max(), one, other)
+    return max(jax.tree.leaves(differences))
+
+
+def test_clone_learns_from_demonstrations_after_settling(logged):
+    """One iteration each of cloning, of fitting critics, and of SAC."""
+    environment, table = logged
+    sac = replace(CONFIG, demonstrations=0.5, explore="policy")
+    start = WarmStart(iterations=1, settle=1, cloning=Cloning(batch=8, updates=2))
+    config = BcSacConfig(warm_start=start, sac=sac)
+    learner, data = config.build(environment, table, 3), training_data(config, environment, table)
+    states = [jax.jit(learner.init)(data, jax.random.key(0))]
+    iterate = jax.jit(learner.iterate)
+    for _ in range(3):
+        states.append(iterate(data, states[-1])[0])
+    policy = [largest_change(a.parameters, b.parameters) for a, b in pairwise(states)]
+    critic = [largest_change(a.learner.critic, b.learner.critic) for a, b in pairwise(states)]
+    assert policy[0] > 1e-4 and policy[1] == 0.0 and policy[2] > 1e-4
+    assert critic[0] == 0.0 and critic[1] > 1e-4 and critic[2] > 1e-4
+
+
+def test_settling_fits_critics_to_a_fixed_policy(logged):
+    _, _, state, fixed, _ = iterated(CONFIG, logged, jnp.asarray(True))
+    _, _, _, free, _ = iterated(CONFIG, logged, jnp.asarray(False))
+    _, _, _, plain, _ = iterated(CONFIG, logged, None)
+
+    def policy_of(state):
+        inner = state.optimiser.inner_states
+        return state.parameters, state.log_temperature, inner["policy"], inner["temperature"]
+
+    assert largest_change(policy_of(fixed), policy_of(state)) == 0.0
+    assert largest_change(fixed.critic, state.critic) > 1e-4
+    assert largest_change(free.parameters, state.parameters) > 1e-4
+    assert largest_change(policy_of(free), policy_of(plain)) < 1e-6
+
+
 def test_impossible_settings_are_refused():
+    with pytest.raises(UsageError, match="demonstrations is 1"):
+        SacConfig(network=NETWORK, demonstrations=1)
     with pytest.raises(UsageError, match="no step with a successor"):
         SacConfig(network=NETWORK, environments=4, unroll=1, warm_up=4)
     with pytest.raises(UsageError, match=r"raise replay\.capacity"):

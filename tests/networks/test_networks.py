@@ -140,6 +140,35 @@ def test_twin_critics_share_nothing_and_can_be_negative():
     assert (np.abs(by_action).max(-1) > 0).all()
 
 
+def test_normalised_critics_against_numpy():
+    one = observation(np.random.default_rng(5))
+    config = NetworkConfig(SMALL.encoder, (4,), critic_norm=True)
+    graph, parameters = drawn(lambda: TwinCritic(config, shapes(one), nnx.Rngs(0), Actions(2)))
+    action = jnp.array([[0.3, -0.2], [300.0, -200.0]])
+
+    def run(parameters, groups, action):
+        critics = nnx.merge(graph, parameters)
+        embedding = jnp.stack([critic.encoder(groups) for critic in critics.critics])
+        return critics(groups, action), embedding, nnx.state([critic.head for critic in critics.critics])
+
+    values, embedding, heads = quick(run, parameters, one, action)
+    for number in (0, 1):
+        head = heads[number]
+        inputs = np.concatenate([np.broadcast_to(embedding[number], (2, 8)), action], axis=1)
+        hidden = inputs @ head["hidden"][0]["kernel"] + head["hidden"][0]["bias"]
+        mean, variance = hidden.mean(-1, keepdims=True), hidden.var(-1, keepdims=True)
+        normalised = (hidden - mean) / np.sqrt(variance + 1e-6)
+        activated = np.tanh(normalised * head["norms"][0]["scale"] + head["norms"][0]["bias"])
+        expected = activated @ head["out"]["kernel"] + head["out"]["bias"]
+        np.testing.assert_allclose(values[number], expected[:, 0], rtol=1e-4, atol=1e-5)
+    # The policy's head has none.
+    plain, with_norm = (
+        drawn(lambda config=config: Policy(config, shapes(one), nnx.Rngs(0), Actions(2)))[1]
+        for config in (SMALL, config)
+    )
+    assert size(plain) == size(with_norm)
+
+
 def load(text):
     return settings.load(NetworkConfig, settings.parse_yaml(text))
 

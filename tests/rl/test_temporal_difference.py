@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.rl.equations import polyak, soft_policy_loss, soft_value, td_target, temperature_loss
+from drivax.rl.equations import (
+    n_step_returns,
+    polyak,
+    soft_policy_loss,
+    soft_value,
+    td_target,
+    temperature_loss,
+)
 
 
 def slope(of, at, step=1e-3):
@@ -27,6 +34,21 @@ def test_terminated_targets_ignore_values_and_have_no_gradient():
     np.testing.assert_allclose(target, [1.0, 1.9])
     gradient = jax.grad(lambda value: td_target(jnp.ones(2), value, terminated, 0.9).sum())(jnp.ones(2))
     np.testing.assert_array_equal(gradient, 0.0)
+
+
+def test_n_step_returns_by_hand():
+    """Three episodes: whole, failed in the second step, cut short after one; a decision takes one step or two."""
+    reward = jnp.array([[1.0, 1.0, 1.0], [2.0, 2.0, jnp.nan], [4.0, jnp.nan, 7.0]])
+    terminated = jnp.array([[False, False, False], [False, True, True], [False, True, True]])
+    follows = jnp.array([[True, True, True], [True, True, False], [True, False, True]])
+    found = n_step_returns(reward, terminated, follows, 0.5)
+    np.testing.assert_allclose(found.reward, [1 + 1 + 1, 1 + 1, 1])
+    np.testing.assert_allclose(found.discount, [0.125, 0.25, 0.5])
+    np.testing.assert_array_equal(found.steps, [3, 2, 1])
+    np.testing.assert_array_equal(found.terminated, [False, True, False])
+    held = n_step_returns(reward, terminated, follows, 0.5, hold=2)
+    np.testing.assert_allclose(held.reward, [1 + 2 + 2, 1 + 2, 1])
+    np.testing.assert_allclose(held.discount, [0.25, 0.5, 0.5])
 
 
 def test_td_targets_of_one_episode_add_up_to_its_return():

@@ -100,7 +100,10 @@ class OfflineAlgorithm(Protocol):
     """Settings of an algorithm that learns from logged steps, which are prepared once before training."""
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
-        """Return the ``data`` of :meth:`Learner.iterate`: the environment's data, with steps drawn by weight."""
+        """Return the ``data`` of :meth:`Learner.iterate`: the environment's data, with steps drawn by weight.
+
+        None if these settings use no logged steps.
+        """
         ...
 
 
@@ -121,8 +124,10 @@ def training_data(
     ``weights`` are ``[N, T]`` of every logged step, at least 0 (None: uniform); UsageError unless the algorithm is
     offline.
     """
-    if isinstance(config, OfflineAlgorithm):
-        return config.experience(environment, data, weights)
+    offline = isinstance(config, OfflineAlgorithm)
+    experience = config.experience(environment, data, weights) if offline else None
+    if experience is not None:
+        return experience
     if weights is not None:
         problem = f"{type(config).__name__} does not learn from logged steps, so weights have no effect"
         raise UsageError(problem, cure="leave out the weights, or use bc, cql, iql or td3_bc")

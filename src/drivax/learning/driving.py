@@ -186,7 +186,8 @@ class Driving:
         )
         ends = terminated | truncated
         over = jnp.cumsum(ends, axis=1) > ends
-        return ExpertSteps(action, reward, terminated, truncated, _has_expert_action(data) & ~over, clipped)
+        usable = _has_expert_action(data) & ~over
+        return ExpertSteps(action, reward, terminated, truncated, usable, clipped, self.task.hold)
 
     @property
     def _log_simulator(self) -> Simulator:

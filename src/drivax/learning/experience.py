@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 from drivax.errors import DataError, UsageError
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
+from drivax.rl.equations import n_step_returns
 from drivax.scenario.record import record, static
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.intervals import effective_size
@@ -100,7 +101,7 @@ class ExpertSteps:
     """Actions of an expert, within the bounds, at T steps of N scenarios, and their outcome.
 
     Steps that are not ``usable`` are undefined. An action that was ``clipped`` to the bounds does not lead to the next
-    state.
+    state. ``hold`` is the number of steps per decision (``Task.hold``).
     """
 
     action: Float[Array, "N T D"]
@@ -109,6 +110,7 @@ class ExpertSteps:
     truncated: Bool[Array, "N T"]
     usable: Bool[Array, "N T"]
     clipped: Bool[Array, "N T"]
+    hold: int = static(default=1)
 
 
 @runtime_checkable
@@ -190,6 +192,11 @@ class ExperienceConfig:
         return Experience(data, expert, usable, uniform, uniform, weighted)
 
 
+def environment_data(data: Any) -> Any:
+    """Return the environment's data, with or without experience."""
+    return data.data if isinstance(data, Experience) else data
+
+
 @partial(jax.jit, static_argnums=0)
 def _expert_steps(environment: LoggedEnvironment, data: Any) -> ExpertSteps:
     return environment.expert_steps(data)
@@ -202,15 +209,26 @@ def expert_actions(environment: LoggedEnvironment, experience: Experience, index
     return observation, expert.action[index], expert.clipped[index]
 
 
-def transitions(environment: LoggedEnvironment, experience: Experience, index: StepIndex) -> Transitions:
-    """Return logged steps, observed before and after."""
+def transitions(
+    environment: LoggedEnvironment, experience: Experience, index: StepIndex, gamma: float, steps: int = 1
+) -> Transitions:
+    """Return returns of up to ``steps`` logged decisions, observed before and after.
+
+    A decision that is held has the expert's action at its first step.
+    """
     (scenario, step), expert = index, experience.expert
     observation, action, _ = expert_actions(environment, experience, index)
+    later = step + jnp.arange(steps * expert.hold).reshape(-1, *[1] * step.ndim)
+    # The last step of the log is never usable, so it ends the window.
+    window = scenario, jnp.minimum(later, expert.usable.shape[1] - 1)
+    returns = n_step_returns(
+        expert.reward[window], expert.terminated[window], expert.usable[window], gamma, expert.hold
+    )
     return Transitions(
         observation=observation,
         action=action,
-        reward=expert.reward[index],
-        terminated=expert.terminated[index],
-        # A usable step is never the last step of the log.
-        next_observation=environment.observe_recorded(experience.data, (scenario, step + 1)),
+        reward=returns.reward,
+        terminated=returns.terminated,
+        next_observation=environment.observe_recorded(experience.data, (scenario, step + returns.steps)),
+        discount=returns.discount,
     )

@@ -95,7 +95,7 @@ def train(
     environment, bank = _environment(config, scenarios.training)
     learner = config.algorithm.build(environment, bank, config.iterations)
     held_out = None if scenarios.validation is None else Validation.of(scenarios.validation)
-    held_out_data = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
+    held_out_data = _held_out_data(config, environment, learner, held_out)
     numbers = range(config.seed, config.seed + (len(folders) or seeds))
     experience = training_data(config.algorithm, environment, bank, scenarios.weights)
     program = Program(Seeds(learner, tuple(numbers)), experience, config.devices)
@@ -187,6 +187,15 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
         if count > 0:
             row[name] = value / count
     return row
+
+
+def _held_out_data(
+    config: TrainConfig, environment: Driving, learner: Any, held_out: Validation | None
+) -> Any:
+    """Return the data of a learner's held-out metrics; None without any."""
+    if held_out is None or not isinstance(learner, HeldOutMetrics):
+        return None
+    return training_data(config.algorithm, environment, held_out.bank)
 
 
 def _environment(config: TrainConfig, data: Iterable[Scenario]) -> tuple[Driving, ScenarioBank]:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment, Environments, Rollout, Store
+from drivax.rl.equations import n_step_returns
 from drivax.scenario.record import record, static
 
 
@@ -77,13 +78,21 @@ ReplayIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
 
 @record
 class Transitions:
-    """A batch of steps; ``next_observation`` is what each led to, final states included."""
+    """A batch of steps, or of n-step returns.
+
+    Attributes:
+        reward: Discounted sum of the rewards of up to n steps of one episode.
+        terminated: Whether the episode ended by a failure in them.
+        next_observation: What they led to, final states included.
+        discount: ``gamma`` to the power of their number.
+    """
 
     observation: dict[str, Array]
     action: Float[Array, "*batch D"]
     reward: Float[Array, "*batch"]
     terminated: Bool[Array, "*batch"]
     next_observation: dict[str, Array]
+    discount: Float[Array, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -144,9 +153,21 @@ class ReplayBuffer:
         position = jnp.searchsorted(running, number, side="right").astype(jnp.int32)
         return position // environments, position % environments
 
-    def sample(self, data: Any, replay: Replay, index: ReplayIndex) -> Transitions:
-        """Return the steps at an index of :meth:`draw`, observed before and after."""
+    def sample(
+        self, data: Any, replay: Replay, index: ReplayIndex, gamma: float, steps: int = 1
+    ) -> Transitions:
+        """Return the n-step returns from an index of :meth:`draw`, observed before and after.
+
+        They have fewer than ``steps`` where the episode ends or the next state was not written yet.
+        """
         row, column = index
+        rows = replay.reward.shape[0]
+        window = (row + jnp.arange(steps).reshape(-1, *[1] * row.ndim)) % rows
+        # A row that resets an environment, or the newest, ends the window.
+        follows = replay.alive[window, column] & (window != (replay.next_row - 1) % rows)
+        returns = n_step_returns(
+            replay.reward[window, column], replay.terminated[window, column], follows, gamma
+        )
 
         def observe(row: Array) -> dict[str, Array]:
             kept = jax.tree.map(lambda leaf: leaf[row, column], replay.stored)
@@ -157,9 +178,10 @@ class ReplayBuffer:
         return Transitions(
             observation=observe(row),
             action=replay.action[row, column],
-            reward=replay.reward[row, column],
-            terminated=replay.terminated[row, column],
-            next_observation=observe((row + 1) % replay.reward.shape[0]),
+            reward=returns.reward,
+            terminated=returns.terminated,
+            next_observation=observe((row + returns.steps) % rows),
+            discount=returns.discount,
         )
 
 

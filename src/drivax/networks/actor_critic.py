@@ -55,6 +55,8 @@ class NetworkConfig:
             exploration does not vanish.
         distribution: Action distribution; ``grid`` is for ``discrete`` actions.
         shared_encoder: Whether policy and value share one encoder.
+        critic_norm: Layer normalisation before each activation of the critics' heads. It bounds the values of unseen
+            actions (Ball et al. 2023, arXiv 2302.02948).
     """
 
     encoder: EncoderSettings = field(default_factory=MlpConfig)
@@ -64,6 +66,7 @@ class NetworkConfig:
     least_scale: float = 0.0
     distribution: DistributionName = "gaussian"
     shared_encoder: bool = False
+    critic_norm: bool = False
 
     def __post_init__(self) -> None:
         if np.min(self.first_scale) <= 0.0:
@@ -73,13 +76,19 @@ class NetworkConfig:
 
 
 class _Head(nnx.Module):
-    """Dense layers from an embedding of ``width`` to ``out`` linear outputs, whose weights start with ``gain``."""
+    """Dense layers from an embedding of ``width`` to ``out`` linear outputs, whose weights start with ``gain``.
 
-    def __init__(self, config: NetworkConfig, width: int, out: int, gain: float, rngs: nnx.Rngs) -> None:
+    ``norm`` adds layer normalisation before each activation.
+    """
+
+    def __init__(
+        self, config: NetworkConfig, width: int, out: int, gain: float, rngs: nnx.Rngs, norm: bool = False
+    ) -> None:
         self.activation = config.activation
         self.hidden = dense_layers(width, config.head, rngs)
         width = config.head[-1] if config.head else width
         self.out = nnx.Linear(width, out, kernel_init=nnx.initializers.orthogonal(gain), rngs=rngs)
+        self.norms = nnx.List([nnx.LayerNorm(size, rngs=rngs) for size in config.head]) if norm else None
 
     def __call__(self, x: Array, extra: Array | None = None) -> Array:
         """Apply the head to ``x``, or to ``x`` and ``extra`` concatenated; ``extra`` may have further leading axes."""
@@ -88,7 +97,8 @@ class _Head(nnx.Module):
             x, extra = jnp.concatenate([x, extra], axis=-1), None
         first, *others = [*self.hidden, self.out]
         x = first(x) if extra is None else _apply_concatenated(first, x, extra)
-        for layer in others:
+        for number, layer in enumerate(others):
+            x = x if self.norms is None else self.norms[number](x)
             x = layer(ACTIVATIONS[self.activation](x))
         return x
 
@@ -172,7 +182,7 @@ class Critic(nnx.Module):
     ) -> None:
         self.encoder = config.encoder.build(spec, rngs)
         width = self.encoder.width + (actions or Actions()).size
-        self.head = _Head(config, width, 1, _VALUE_GAIN, rngs)
+        self.head = _Head(config, width, 1, _VALUE_GAIN, rngs, config.critic_norm)
 
     def __call__(self, groups: Groups, action: Float[Array, "*actions D"]) -> Float[Array, "*actions"]:
         """Return the expected discounted return of an action in [-1, 1].

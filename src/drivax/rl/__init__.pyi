@@ -4,6 +4,7 @@ from .equations import conservative_penalty as conservative_penalty
 from .equations import expectile_loss as expectile_loss
 from .equations import generalised_advantages as generalised_advantages
 from .equations import log_mass as log_mass
+from .equations import n_step_returns as n_step_returns
 from .equations import penalty_weight_loss as penalty_weight_loss
 from .equations import polyak as polyak
 from .equations import scaled_policy_loss as scaled_policy_loss

@@ -6,11 +6,12 @@ callers average them.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 
 def generalised_advantages(
@@ -52,13 +53,45 @@ def clipped_surrogate_loss(
     return -jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
 
 
+class NStepReturns(NamedTuple):
+    """Discounted sums of rewards, whether a failure ended the episode, numbers of steps, and ``gamma^n``."""
+
+    reward: Float[Array, "*batch"]
+    terminated: Bool[Array, "*batch"]
+    steps: Int[Array, "*batch"]
+    discount: Float[Array, "*batch"]
+
+
+def n_step_returns(
+    reward_t: Float[Array, "time *batch"], terminated_t: Bool[Array, "time *batch"],
+    follows_t: Bool[Array, "time *batch"], gamma: float, hold: int = 1,
+) -> NStepReturns:  # fmt: skip
+    """``sum_k gamma^k r_{t+k}`` over the leading steps of which all ``follows_t`` hold (Sutton 1988).
+
+    ``hold`` steps of time make one decision; their rewards share a discount. Nothing corrects for the later actions,
+    which another policy may have chosen.
+    """
+    taken_t = jnp.cumprod(follows_t, axis=0, dtype=jnp.int32)
+    decision = np.arange(len(reward_t)) // hold
+    power = jnp.asarray(gamma ** np.arange(decision[-1] + 2), jnp.float32)
+    weight = power[decision].reshape(-1, *[1] * (reward_t.ndim - 1))
+    steps = taken_t.sum(axis=0)
+    return NStepReturns(
+        jnp.sum(jnp.where(taken_t > 0, weight * reward_t, 0.0), axis=0),
+        (terminated_t & (taken_t > 0)).any(axis=0),
+        steps,
+        power[(steps + hold - 1) // hold],
+    )
+
+
 def td_target(
     reward_t: Float[Array, "*batch"], value_tp1: Float[Array, "*batch"], terminated_t: Bool[Array, "*batch"],
-    gamma: float,
+    gamma: float | Float[Array, "*batch"],
 ) -> Float[Array, "*batch"]:  # fmt: skip
-    """One-step target ``r_t + gamma (1 - terminated_t) V(s_{t+1})`` (Sutton 1988).
+    """Return the target ``r_t + gamma (1 - terminated_t) V(s_{t+1})`` (Sutton 1988).
 
-    A truncated step bootstraps the value of its final state. No gradient flows into the targets.
+    A truncated step bootstraps the value of its final state. No gradient flows into the targets. With n-step returns,
+    ``gamma`` is that of n steps.
     """
     # Select, do not multiply by zero: a value that overflowed must not reach a terminated step.
     return jax.lax.stop_gradient(reward_t + gamma * jnp.where(terminated_t, 0.0, value_tp1))

@@ -113,7 +113,7 @@ class Cql(Offline[CqlConfig]):
         # As in the reference implementation the target has no entropy, though the policy's loss has.
         next_q = self.q_values(target["critic"], batch.next_observation, next_action)
         next_value = jnp.max(jnp.min(next_q, axis=0), axis=0)
-        td = td_target(batch.reward, next_value, batch.terminated, self.config.gamma)
+        td = td_target(batch.reward, next_value, batch.terminated, batch.discount)
         policy = self.distribution(parameters, batch.observation)
         action, log_density = self._penalty_actions(policy, next_policy, batch.action, sample_key)
         # In one call, so that each observation is encoded and differentiated once.

@@ -139,7 +139,7 @@ class OffPolicy(Generic[Config]):
         self, trained: Trained, batch: Transitions, next_value: Float[Array, " B"]
     ) -> tuple[Float[Array, ""], Float[Array, "2 B"]]:
         """Return the squared TD error, given the values of the next states, and the Q values of the batch."""
-        target = td_target(batch.reward, next_value, batch.terminated, self.config.gamma)
+        target = td_target(batch.reward, next_value, batch.terminated, batch.discount)
         q = self.q_values(trained["critic"], batch.observation, batch.action)
         return squared_error(q, target), q
 

@@ -95,10 +95,11 @@ class FittedQ:
 
         def update(carry: tuple[Any, Any, Any], key: Array) -> tuple[tuple[Any, Any, Any], None]:
             parameters, target_parameters, state = carry
-            batch = transitions(self.environment, data, sample_steps(data.critic, key, (config.batch,)))
+            index = sample_steps(data.critic, key, (config.batch,))
+            batch = transitions(self.environment, data, index, self.gamma)
             next_action = act(batch.next_observation)
             next_value = q_values(target_parameters, batch.next_observation, next_action)
-            target = td_target(batch.reward, next_value, batch.terminated, self.gamma)
+            target = td_target(batch.reward, next_value, batch.terminated, batch.discount)
 
             def loss(parameters: Any) -> Array:
                 return squared_error(q_values(parameters, batch.observation, batch.action), target)
@@ -271,9 +272,8 @@ class Offline(OffPolicy[Config]):
         """Draw the steps for policy evaluation and those for policy improvement."""
         environment, count = require_log(self.environment), (self.config.batch,)
         critic_key, policy_key = jax.random.split(key)
-        batch = shard_axis(
-            transitions(environment, data, sample_steps(data.critic, critic_key, count)), axis=0
-        )
+        index = sample_steps(data.critic, critic_key, count)
+        batch = shard_axis(transitions(environment, data, index, self.config.gamma), axis=0)
         if data.policy is None:
             return batch, (batch.observation, batch.action)
         drawn = expert_actions(environment, data, sample_steps(data.policy, policy_key, count))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import nnx
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.optimisers import chunk_size, clipped_adam, sum_gradients
@@ -140,14 +140,13 @@ class Ppo:
         graph, weights = nnx.split(self.network(parameters).policy)
         return NetworkPlanner(weights, graph, name, samples)
 
-    def with_policy(self, parameters: Any, of: Any) -> Any:
-        """Return parameters with the policy ``of`` others, a shared encoder included."""
-        return nnx.State({**parameters.raw_mapping, "policy": of.raw_mapping["policy"]})
-
     def iterate(
-        self, data: Any, state: PpoState, auxiliary_loss: AuxiliaryLoss | None = None
-    ) -> tuple[PpoState, dict[str, Array]]:
+        self, data: Any, state: PpoState, auxiliary_loss: AuxiliaryLoss | None = None,
+        settling: Bool[Array, ""] | None = None,
+    ) -> tuple[PpoState, dict[str, Array]]:  # fmt: skip
         """Collect a rollout, then update. Pure; jit it with the state donated.
+
+        While ``settling`` the policy is fixed, a shared encoder included.
 
         Returns:
             The next state, and sums (``rollout/*``, see ``environment.collect``) and means (``loss/*``) to log.
@@ -157,8 +156,13 @@ class Ppo:
             self.environment, data, state.environments, actor, key, self.config.unroll
         )
         state = replace(state, environments=environments)
-        state, losses = self.update(data, state, rollout, auxiliary_loss)
-        return state, {f"rollout/{name}": value for name, value in totals.items()} | losses
+        after, losses = self.update(data, state, rollout, auxiliary_loss)
+        if settling is not None:
+            policy = {"policy": state.parameters.raw_mapping["policy"]}
+            fixed = nnx.State({**after.parameters.raw_mapping, **policy})
+            parameters = jax.tree.map(partial(jnp.where, settling), fixed, after.parameters)
+            after = replace(after, parameters=parameters)
+        return after, {f"rollout/{name}": value for name, value in totals.items()} | losses
 
     def rollout_key(self, state: PpoState) -> Array:
         """Return the random key of the next rollout."""

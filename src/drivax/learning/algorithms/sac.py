@@ -10,9 +10,10 @@ from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import nnx
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
@@ -28,11 +29,23 @@ from drivax.learning.environment import (
     collect,
     transition,
 )
+from drivax.learning.experience import (
+    Experience,
+    ExperienceConfig,
+    StepIndex,
+    environment_data,
+    require_log,
+    sample_steps,
+    transitions,
+)
 from drivax.learning.replay import Replay, ReplayBuffer, ReplayConfig, ReplayIndex, Transitions
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import REPARAMETRISED
 from drivax.rl.equations import soft_value
 from drivax.scenario.record import record
+
+#: Steps of the replay buffer, and logged steps or None.
+_BatchIndex = tuple[ReplayIndex, StepIndex | None]
 
 
 @dataclass(frozen=True)
@@ -46,6 +59,8 @@ class SacConfig:
         unroll: Steps per environment and iteration.
         updates_per_step: Updates per step of all environments.
         batch: Steps per update.
+        steps: Steps of the n-step returns; their actions are not corrected for later changes of the policy.
+        demonstrations: Share of each batch with the log's expert (Ball et al. 2023, arXiv 2302.02948).
         warm_up: Steps before the first update.
         explore: Actions before the first update: ``uniform``, or sampled from the ``policy``.
         policy_rate, critic_rate, temperature_rate: Learning rates of Adam.
@@ -63,6 +78,8 @@ class SacConfig:
     unroll: int = 16
     updates_per_step: int = 2
     batch: int = 256
+    steps: int = 1
+    demonstrations: float = 0.0
     warm_up: int = 5_000
     explore: Literal["uniform", "policy"] = "uniform"
     policy_rate: float = 3e-4
@@ -75,8 +92,10 @@ class SacConfig:
     gradient_norm: float | None = 10.0
 
     def __post_init__(self) -> None:
-        if min(self.environments, self.unroll, self.updates_per_step, self.batch) < 1:
-            raise ValueError("environments, unroll, updates_per_step and batch are at least 1")
+        if min(self.environments, self.unroll, self.updates_per_step, self.batch, self.steps) < 1:
+            raise ValueError("environments, unroll, updates_per_step, batch and steps are at least 1")
+        if not 0.0 <= self.demonstrations < 1.0:
+            raise UsageError(f"demonstrations is {self.demonstrations}", cure="use 0 to less than 1")
         rows = self.replay.rows(self.environments)
         if self.unroll > rows:
             problem = f"unroll of {self.unroll} steps does not fit a replay buffer of {rows} rows"
@@ -92,6 +111,12 @@ class SacConfig:
     def steps_per_iteration(self) -> int:
         """Environment steps of one iteration."""
         return self.environments * self.unroll
+
+    def experience(
+        self, environment: Environment, data: Any, weights: np.ndarray | None
+    ) -> Experience | None:
+        """Return the logged steps that ``demonstrations`` are drawn from, if any are."""
+        return ExperienceConfig().of(environment, data, weights) if self.demonstrations else None
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Sac:
         """Return SAC in an environment."""
@@ -147,7 +172,8 @@ class Sac(OffPolicy[SacConfig]):
         networks = self.networks(network_key)
         policy, critic = (nnx.state(networks[name], nnx.Param) for name in ("policy", "critic"))
         log_temperature = jnp.asarray(math.log(self.config.temperature), jnp.float32)
-        environments = self.environment.start(data, environment_key, self.config.environments)
+        bank = environment_data(data)
+        environments = self.environment.start(bank, environment_key, self.config.environments)
         trained: Any = SacParameters(policy, critic, log_temperature)
         return SacState(
             parameters=policy,
@@ -161,14 +187,13 @@ class Sac(OffPolicy[SacConfig]):
             iteration=jnp.zeros((), jnp.int32),
         )
 
-    def with_policy(self, parameters: Any, of: Any) -> Any:
-        """Return ``of``, because parameters are the policy's."""
-        return of
-
     def iterate(
-        self, data: Any, state: SacState, auxiliary_loss: AuxiliaryLoss | None = None
-    ) -> tuple[SacState, dict[str, Array]]:
+        self, data: Any, state: SacState, auxiliary_loss: AuxiliaryLoss | None = None,
+        settling: Bool[Array, ""] | None = None,
+    ) -> tuple[SacState, dict[str, Array]]:  # fmt: skip
         """Collect a rollout, then update. Pure; jit it with the state donated.
+
+        While ``settling`` only the critics learn.
 
         Returns:
             The next state, and sums to log: ``rollout/*`` of the collector, ``loss/*`` with ``loss/*/n``.
@@ -176,10 +201,10 @@ class Sac(OffPolicy[SacConfig]):
         actor, key = partial(self.sample_action, state), self.rollout_key(state)
         unroll, keep = self.config.unroll, self.config.replay.store
         environments, rollout, totals = collect(
-            self.environment, data, state.environments, actor, key, unroll, keep
+            self.environment, environment_data(data), state.environments, actor, key, unroll, keep
         )
         state = replace(state, environments=environments, replay=self.buffer.add(state.replay, rollout))
-        state, losses = self.update(data, state, auxiliary_loss)
+        state, losses = self.update(data, state, auxiliary_loss, settling)
         return state, {f"rollout/{name}": value for name, value in totals.items()} | losses
 
     def rollout_key(self, state: SacState) -> Array:
@@ -202,11 +227,13 @@ class Sac(OffPolicy[SacConfig]):
         return transition(self.environment, now, sampled, outcome, self.config.replay.store)
 
     def update(
-        self, data: Any, state: SacState, auxiliary_loss: AuxiliaryLoss | None = None
-    ) -> tuple[SacState, dict[str, Array]]:
+        self, data: Any, state: SacState, auxiliary_loss: AuxiliaryLoss | None = None,
+        settling: Bool[Array, ""] | None = None,
+    ) -> tuple[SacState, dict[str, Array]]:  # fmt: skip
         """Take the updates of one iteration on batches from the buffer; none before ``warm_up`` steps.
 
-        The state has the rollout of this iteration in ``replay``.
+        The state has the rollout of this iteration in ``replay``. With ``demonstrations``, ``data`` is the experience
+        of :func:`~drivax.learning.algorithm.training_data`.
         """
         config = self.config
         _, draw_key, update_key, key = jax.random.split(state.key, 4)
@@ -216,15 +243,14 @@ class Sac(OffPolicy[SacConfig]):
 
         @jax.jit  # so that the shapes of its logs do not trace it a second time
         def learn() -> tuple[Carry, dict[str, Array]]:
-            shape = (config.unroll * config.updates_per_step, config.batch)
-            index = self.buffer.draw(state.replay, draw_key, shape)
+            def update(carry: Carry, drawn: tuple[_BatchIndex, Array]) -> tuple[Carry, dict[str, Array]]:
+                batch = self._sample(data, state.replay, drawn[0])
+                after, logs = self.update_networks(carry, batch, drawn[1], auxiliary_loss)
+                return after if settling is None else _keep_policy(settling, carry, after), logs
 
-            def update(carry: Carry, drawn: tuple[ReplayIndex, Array]) -> tuple[Carry, dict[str, Array]]:
-                batch = self.buffer.sample(data, state.replay, drawn[0])
-                return self.update_networks(carry, batch, drawn[1], auxiliary_loss)
-
-            keys = jax.random.split(update_key, len(index[0]))
-            carry, logs = jax.lax.scan(update, first, (index, keys))
+            updates = config.unroll * config.updates_per_step
+            index = self._draw(data, state.replay, draw_key, updates)
+            carry, logs = jax.lax.scan(update, first, (index, jax.random.split(update_key, updates)))
             return carry, _sums(logs)
 
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(learn)[1])
@@ -235,6 +261,23 @@ class Sac(OffPolicy[SacConfig]):
             state.environments, key, state.iteration + 1,
         )  # fmt: skip
         return after, losses
+
+    def _draw(self, data: Any, replay: Replay, key: Array, updates: int) -> _BatchIndex:
+        """Draw steps of the buffer and, with ``demonstrations``, of the log for all updates."""
+        logged = round(self.config.demonstrations * self.config.batch)
+        index = self.buffer.draw(replay, key, (updates, self.config.batch - logged))
+        if not logged:
+            return index, None
+        return index, sample_steps(data.critic, jax.random.fold_in(key, 1), (updates, logged))
+
+    def _sample(self, data: Any, replay: Replay, index: _BatchIndex) -> Transitions:
+        """Return the batch at an index of :meth:`_draw`."""
+        gamma, steps = self.config.gamma, self.config.steps
+        batch = self.buffer.sample(environment_data(data), replay, index[0], gamma, steps)
+        if index[1] is None:
+            return batch
+        logged = transitions(require_log(self.environment), data, index[1], gamma, steps)
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), batch, logged)
 
     def gradient(
         self, trained: SacParameters, target: dict[str, Any], *batch: Any
@@ -275,6 +318,19 @@ class Sac(OffPolicy[SacConfig]):
         policy_loss = jnp.mean(actor.loss)
         logs = actor.logs | {"critic": critic_loss, "policy": policy_loss, "mean_q": jnp.mean(q)}
         return critic_loss + policy_loss + actor.temperature_loss, logs
+
+
+def _keep_policy(settling: Bool[Array, ""], before: Carry, after: Carry) -> Carry:
+    """Return an update that, while settling, changes neither policy, temperature nor their optimisers."""
+    (old, _, old_optimiser), (new, target, optimiser) = before, after
+    keep = partial(jax.tree.map, partial(jnp.where, settling))
+    fixed = {
+        name: keep(old_optimiser.inner_states[name], optimiser.inner_states[name])
+        for name in ("policy", "temperature")
+    }
+    policy, log_temperature = keep((old.policy, old.log_temperature), (new.policy, new.log_temperature))
+    optimiser = optimiser._replace(inner_states={**optimiser.inner_states, **fixed})
+    return SacParameters(policy, new.critic, log_temperature), target, optimiser
 
 
 def _sums(logs: dict[str, Array]) -> dict[str, Array]:

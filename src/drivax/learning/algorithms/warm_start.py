@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from drivax.errors import UsageError
@@ -16,6 +17,7 @@ from drivax.learning.algorithms.behaviour_cloning import Cloning, check_loss, re
 from drivax.learning.algorithms.ppo import Ppo, PpoConfig
 from drivax.learning.algorithms.sac import Sac, SacConfig
 from drivax.learning.environment import Environment, any_across_learners
+from drivax.learning.experience import Experience
 from drivax.planners.planner import Planner
 from drivax.scenario.record import record
 
@@ -27,7 +29,7 @@ class WarmStart:
     Attributes:
         iterations: Iterations of behaviour cloning; each counts as many steps as one that collects rollouts.
         cloning: Settings of behaviour cloning.
-        settle: Iterations after pretraining in which only values are learned.
+        settle: Iterations after pretraining in which only values or critics are learned, SAC's warm-up included.
         weight: Weight of the imitation loss during reinforcement learning; 0: none.
         half_life: Iterations in which that weight halves; 0: constant.
     """
@@ -81,6 +83,12 @@ class BcSacConfig:
     def steps_per_iteration(self) -> int:
         """Environment steps of one iteration."""
         return self.sac.steps_per_iteration
+
+    def experience(
+        self, environment: Environment, data: Any, weights: np.ndarray | None
+    ) -> Experience | None:
+        """Return the logged steps to learn from if SAC uses ``demonstrations``."""
+        return self.sac.experience(environment, data, weights)
 
     def build(self, environment: Environment, data: Any, iterations: int) -> WarmStartLearner:
         """Return behaviour cloning, then SAC, in an environment."""
@@ -165,13 +173,9 @@ class WarmStartLearner:
             loss, logs = self._imitation(data, parameters, key)
             return weight * loss, logs
 
-        learner = replace(state.learner, parameters=state.parameters)
-        after, logs = self.online.iterate(data, learner, auxiliary_loss if self.config.weight else None)
-        if self.config.settle:
-            fixed = self.online.with_policy(after.parameters, state.parameters)
-            settling = state.learner.iteration < self.config.settle
-            parameters = jax.tree.map(partial(jnp.where, settling), fixed, after.parameters)
-            after = replace(after, parameters=parameters)
+        learner, config = replace(state.learner, parameters=state.parameters), self.config
+        settling = state.learner.iteration < config.settle if config.settle else None
+        after, logs = self.online.iterate(data, learner, auxiliary_loss if config.weight else None, settling)
         return self._state(after, state.optimiser, state.iteration + 1), _with_counts(logs)
 
     def _imitation(self, data: Any, parameters: Any, key: Array) -> tuple[Array, dict[str, Array]]:
