@@ -173,6 +173,7 @@ def test_ranks():
         "validation/comfortable": None, "loss/value": 3.0,
     }  # fmt: skip
     assert rank("score", row) == (0.7,)
+    assert rank("success", row | {"validation/success": 0.6}) == (0.6, 0.7)
     assert rank("lexicographic", row) == (0.75, 0.9, -1.0)
     assert rank("score", {"validation/vmax_score_partial": 0.2}) == (0.2,)
     assert rank("score", {"loss/value": 3.0}) is None

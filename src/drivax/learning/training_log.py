@@ -24,9 +24,10 @@ from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.sinks import MetricLog
 
-#: How checkpoints are ranked. ``score``: the V-Max score. ``lexicographic``: fewest failures, then progress, then
-#: comfort. ``fitted_q``: the return that fitted-Q evaluation expects on held-out steps; needs ``fitted_q.updates``.
-Rule = Literal["score", "lexicographic", "fitted_q"]
+#: How checkpoints are ranked. ``score``: the V-Max score. ``success``: successes, then the V-Max score.
+#: ``lexicographic``: fewest failures, then progress, then comfort. ``fitted_q``: the return that fitted-Q evaluation
+#: expects on held-out steps; needs ``fitted_q.updates``.
+Rule = Literal["score", "success", "lexicographic", "fitted_q"]
 
 _SCORES = ("vmax_score", "vmax_score_partial")
 _METRICS = (
@@ -77,8 +78,9 @@ def rank(rule: Rule, row: Mapping[str, Any]) -> tuple[float, ...] | None:
         return None
     if rule == "fitted_q":
         return (_or_last(values["fitted_q"], -math.inf),)
-    if rule == "score":
-        return (float(next(values[name] for name in _SCORES if name in values)),)
+    if rule in ("score", "success"):
+        score = float(next(values[name] for name in _SCORES if name in values))
+        return (score,) if rule == "score" else (_or_last(values.get("success")), score)
     return tuple(_or_last(values.get(name)) for name in _ORDER)
 
 
