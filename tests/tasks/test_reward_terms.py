@@ -69,7 +69,7 @@ def value(term, near=True, before=BEFORE, **now):
 
 
 #: Scales of ``pace``, m.
-LATE_M, EARLY_M = 4.0, 8.0
+LATE_M, EARLY_M = 2.0, 8.0
 #: Term, what is different from the quiet moment, and the value by hand.
 CASES = [
     ("collision", {}, 0.0),

@@ -33,7 +33,7 @@ _JERK_MPS3, _LATERAL_MPS2 = 8.37, 4.89
 #: nuPlan's limits of braking and of acceleration.
 _BRAKING_MPS2, _ACCELERATION_MPS2 = 4.05, 2.40
 #: Scales of ``pace`` behind and ahead of the log, m; how far ahead costs nothing, m.
-_LATE_M, _EARLY_M, _EARLY_SLACK_M = 4.0, 8.0, 1.0
+_LATE_M, _EARLY_M, _EARLY_SLACK_M = 2.0, 8.0, 1.0
 #: Distance from the route at which ``route_offset`` is 1, m; time to collision at which ``urgency`` is 0, s.
 _ROUTE_OFFSET_M, _URGENT_S = 1.0, 2.0
 #: Cap of distances from the log, m.
@@ -209,7 +209,7 @@ _event_term("merge", "merged")
 def pace(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Adherence to the log's schedule along the route, in [0, 1].
 
-    1 from where the log is now to where it is a second later. Behind that 1 / (1 + late / 4 m), which pays to catch up
+    1 from where the log is now to where it is a second later. Behind that 1 / (1 + late / 2 m), which pays to catch up
     from any distance; ahead exp(-early / 8 m), with 1 m free. A log that stands asks for standing.
     """
     late_m, early_m = jnp.maximum(now.late_m, 0.0), jnp.maximum(now.early_m - _EARLY_SLACK_M, 0.0)
