@@ -207,6 +207,11 @@ def test_errors_are_one_line(env):
         env.step(STILL)
 
 
+def test_held_decisions_are_refused(data):
+    with pytest.raises(UsageError, match="holds decisions for 2 steps; set hold to 1 and repeat the action"):
+        gym.DrivingEnv(data, Task(hold=2))
+
+
 def test_missing_gymnasium_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     spec = importlib.util.spec_from_file_location("gym_again", gym.__file__)

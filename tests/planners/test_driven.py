@@ -16,6 +16,7 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.log import alone
+from drivax.tasks.actions import ROUTE
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from scenes import bank_of, car, straight_road
@@ -75,6 +76,8 @@ def test_the_nearest_moving_vehicles_are_driven(bank):
 
 
 def test_planners_unfit_for_traffic_are_refused(bank):
+    with pytest.raises(UsageError, match="route cannot drive others, who have no route; use a policy of another"):
+        PlannerTraffic(Task(actions=ROUTE))
     with pytest.raises(UsageError, match="cannot drive others"):
         with_driver(bank, Expert())
     with pytest.raises(UsageError, match="the bank has no TrafficPolicy; use planners"):

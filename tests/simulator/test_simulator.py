@@ -1,5 +1,7 @@
 """The simulator as a whole: log replay, resets, groups, invariance, sizes."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,9 +11,13 @@ from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
+from drivax.simulator.contact import Contact
+from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.situation import measure
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.observations import PRESETS
+from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, RED, bank_of, car, moved, straight_road
 
@@ -244,3 +250,44 @@ def test_jit_changes_nothing():
     with jax.disable_jit():
         plain, _ = simulator.step(bank, state, action)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-4), plain, compiled)
+
+
+def test_schedule_compares_with_the_log_now_and_a_second_later():
+    """A log at 9 m/s: where it is, 3 m ahead, 3 m behind; after its last step it continues at its last speed."""
+    simulator = Simulator(Task(observation=GLIMPSE, rewards=RewardConfig(preset="pace", completion=1.0)))
+    bank = bank_of(straight_road([car(0, 0, 0, 9)]))
+    cases = [(10, 0.0, 0.0, -9.0), (10, 3.0, -3.0, -6.0), (40, -3.0, 3.0, -12.0), (90, 1.0, -1.0, -8.0)]
+
+    @jax.jit
+    @jax.vmap
+    def schedule(step, ahead_m):
+        context = simulator.context(bank, 0, step)
+        context = replace(context, history=context.history.at[:, 0].add(ahead_m))
+        now = simulator.now(bank, context)
+        apart, lights = (
+            jnp.full(now.valid.shape, int(Contact.APART), jnp.int8),
+            remember_lights(bank, context),
+        )
+        return measure(bank, context, now, now, apart, lights, simulator.task.reads)[0].facts
+
+    steps, ahead_m, late_m, early_m = np.array(cases, np.float32).T
+    facts = schedule(steps.astype(np.int32), ahead_m)
+    # The way on the route never decreases: behind the log it stays at the log's place.
+    np.testing.assert_allclose(facts.late_m, np.minimum(late_m, 0.0), atol=1e-3)
+    np.testing.assert_allclose(facts.early_m, np.where(late_m > 0, -9.0, early_m), atol=1e-3)
+    done = np.clip((9 * (steps - 10) / 10 + np.maximum(ahead_m, 0)) / 72, 0, 1)
+    np.testing.assert_allclose(facts.completed, done, atol=1e-4)
+
+
+def test_schedule_of_a_standing_log():
+    """Nothing is to be gained by driving: a metre ahead is a metre early, and all is completed."""
+    simulator = Simulator(Task(observation=GLIMPSE, rewards=RewardConfig(preset="pace", completion=1.0)))
+    state = jax.jit(simulator.reset)(bank := bank_of(straight_road([car(0, 0, 0, 0)])), 0)
+    assert float(state.facts.late_m) == 0.0 and float(state.facts.early_m) == 0.0
+    assert float(state.facts.completed) == 1.0
+    moved = replace(state, context=replace(state.context, route_m=state.context.route_m + 3.0))
+    after, transition = jax.jit(simulator.step)(bank, moved, jnp.zeros(2))
+    assert float(after.facts.early_m) == pytest.approx(3.0, abs=1e-3)
+    terms = transition.reward_terms
+    assert float(terms["pace"]) == pytest.approx(0.1 * np.exp(-2 / 8), rel=1e-3)
+    assert float(terms["completion"]) == 0.0

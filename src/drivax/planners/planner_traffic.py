@@ -22,6 +22,7 @@ from drivax.simulator.situation import measure
 from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_bank, with_data
 from drivax.simulator.traffic.log import LogTraffic, agent_rows, alone, frame_of
 from drivax.simulator.types import HISTORY, AgentContext, Frame, SimState, Traffic
+from drivax.tasks.actions import Route
 from drivax.tasks.task import Task
 
 #: Vehicles that travel less than this in the rest of the log are not driven, m.
@@ -73,6 +74,11 @@ class PlannerTraffic:
     count: int = 4
     base: Traffic = field(default_factory=LogTraffic)
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.task.actions, Route):
+            cure = "use a policy of another action space, such as physical"
+            raise UsageError("a policy of the action space route cannot drive others, who have no route", cure=cure)
 
     @property
     def name(self) -> str:
