@@ -4,8 +4,8 @@ python -m experiments.learning.benchmark drive --data BENCHMARK [--planner NAME 
 python -m experiments.learning.benchmark judge     (means with intervals of the episodes, and the page)
 python -m experiments.learning.benchmark table     (write the stored result to the page)
 
-`drive` stores the episodes of each planner and traffic in one file. Learned planners are read from
-experiments/state/policies, where `presets.py train` stores them, with several seeds each.
+`drive` stores the episodes of each planner and traffic in one file. Learned planners are those of the zoo (one seed)
+and those in experiments/state/policies, where `presets.py train` stores several seeds of each.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from drivax.tracking.run_folder import versions
 from experiments.learning.tables import interval, table
 from experiments.repository import DOCS, RESULTS, STATE, fetch
 
-#: Weights of all seeds of the learned planners, and episodes of all planners; fetched from history if missing.
+#: Weights of all seeds of the learned planners, and episodes of all planners.
 POLICIES, EPISODES = STATE / "policies", STATE / "benchmark"
 #: Episodes of the same planners and scenarios with the definitions before decisions 0011 and 0012.
 FORMER_EPISODES = STATE / "benchmark-former"
@@ -46,15 +46,17 @@ PAGE = DOCS / "results" / "benchmark.md"
 TRAFFIC = ("log", "idm")
 #: Random actions in the box of the published action space, shown in a separate table.
 BOX = "random in the published box"
-PLANNERS = ("expert", "pdm", "idm", "constant_speed", "constant_velocity", "random", BOX)
+ZOO = ("zoo:ppo", "zoo:ppo_physical")
+PLANNERS = ("expert", *ZOO, "pdm", "idm", "constant_speed", "constant_velocity", "random", BOX)
 #: Columns of the page, with their short names.
 COLUMNS = {
-    "accuracy": "accuracy", "collision": "collision", "at_fault_collision": "at fault", "offroad": "off-road",
-    "red_light": "red light", "progress": "progress (m)", "ttc_ok": "ttc", "comfortable": "comfort",
-    "vmax_score": "vmax score",
+    "success": "success", "accuracy": "accuracy", "collision": "collision", "at_fault_collision": "at fault",
+    "offroad": "off-road", "red_light": "red light", "progress": "progress (m)", "ttc_ok": "ttc",
+    "comfortable": "comfort", "vmax_score": "vmax score",
 }  # fmt: skip
 #: Planners to compare every learned planner with, and the metrics of the comparison.
-REFERENCES, DIFFERENCE_METRICS = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
+REFERENCES = ("constant_speed", "idm", "pdm")
+DIFFERENCE_METRICS = ("success", "accuracy", "at_fault_collision", "vmax_score")
 #: Metrics that decisions 0011 and 0012 changed.
 CHANGED_METRICS = {
     "at_fault_collision": "at fault", "offroad": "off-road", "comfortable": "comfort",
@@ -240,7 +242,12 @@ def compute_results() -> dict[str, Any]:
                     for metric in DIFFERENCE_METRICS
                 }
                 for other in REFERENCES
-                for name in ("expert", *(name for name in ("pdm",) if name != other), *learned_planners())
+                for name in (
+                    "expert",
+                    *(name for name in ("pdm",) if name != other),
+                    *ZOO,
+                    *learned_planners(),
+                )
                 if {(name, kind), (other, kind)} <= all_episodes.keys()
             }
             for kind in TRAFFIC
@@ -403,7 +410,6 @@ def main() -> None:
     commands.add_parser("table")
     args = parser.parse_args()
     if args.command != "table":
-        fetch("benchmarks/policies", POLICIES)
         fetch("benchmarks/results/benchmark", FORMER_EPISODES)
     if args.command == "drive":
         evaluate_planners(args)

@@ -249,7 +249,7 @@ def test_machine(capsys):
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 100
-    for words in ("python", "jax", "cpu", "cores", "memory", "GB free here", "womd (Waymo"):
+    for words in ("python", "jax", "cpu", "zoo:aggressive", "cores", "memory", "GB free here", "womd (Waymo"):
         assert words in out
 
 

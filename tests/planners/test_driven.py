@@ -76,7 +76,9 @@ def test_the_nearest_moving_vehicles_are_driven(bank):
 
 
 def test_planners_unfit_for_traffic_are_refused(bank):
-    with pytest.raises(UsageError, match="route cannot drive others, who have no route; use a policy of another"):
+    with pytest.raises(
+        UsageError, match="route cannot drive others, who have no route; use a policy of another"
+    ):
         PlannerTraffic(Task(actions=ROUTE))
     with pytest.raises(UsageError, match="cannot drive others"):
         with_driver(bank, Expert())

@@ -21,6 +21,7 @@ from rich.text import Text
 
 from drivax.datasets.doctor import Diagnosis, Part, count_text, diagnose
 from drivax.files import format_bytes, free_bytes
+from drivax.tracking.run_folder import zoo
 
 _COLUMNS = 100
 #: Modules and purpose of every extra.
@@ -73,6 +74,7 @@ def machine() -> Iterator[tuple[str, str]]:
         missing = [module for module in modules if not _is_installed(module)]
         state = "installed" if not missing else f"{', '.join(missing)} missing: pip install 'drivax[{extra}]'"
         yield f"{extra} ({purpose})", state
+    yield "policies", ", ".join(zoo())
     yield "cores", str(os.cpu_count())
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     yield "memory", format_bytes(memory)

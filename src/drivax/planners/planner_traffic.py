@@ -78,7 +78,9 @@ class PlannerTraffic:
     def __post_init__(self) -> None:
         if isinstance(self.task.actions, Route):
             cure = "use a policy of another action space, such as physical"
-            raise UsageError("a policy of the action space route cannot drive others, who have no route", cure=cure)
+            raise UsageError(
+                "a policy of the action space route cannot drive others, who have no route", cure=cure
+            )
 
     @property
     def name(self) -> str:
