@@ -257,7 +257,10 @@ def test_tracked_proposals_are_looked_up_at_every_pose():
         situation = simulator.situation(bank, state)
         scored = planner.score_proposals(planner.init(bank, state, key), bank, situation)
         boxes = boxes_of(scored.cars.motion, jnp.array([4.8, 2.0]))
-        look = lambda box: ground_at(bank, index, box, jnp.zeros(()), jnp.asarray(True))  # noqa: E731
+
+        def look(box):
+            return ground_at(bank, index, box, jnp.zeros(()), jnp.asarray(True))
+
         return scored.metrics.road, jax.vmap(jax.vmap(look))(boxes).off
 
     road, off = quick(gate_and_look_ups, bank_of(straight_road([car(0, 0, -0.2, 9)])))

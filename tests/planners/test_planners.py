@@ -160,7 +160,7 @@ def test_random_actions_fill_the_action_space_evenly_and_follow_the_key(simulato
     assert np.array_equal(np.asarray(again), actions[7])
 
 
-def test_constant_speed_follows_a_bend(simulator):
+def test_constant_speed_returns_to_the_route(simulator):
     """0.5 m left of a straight route, at a look-ahead of 0.8 v + 3 m; the acceleration is zero."""
     recording = straight_road([car(0, 0.5, 0, 9)])
     action = act(ConstantSpeed(), simulator, bank_of(recording))

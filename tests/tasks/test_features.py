@@ -120,7 +120,7 @@ def test_agents_relate_to_the_route_and_approach(seen):
     # Ego's front is at 2.4 m; the crossing car is 2 m wide and leaves ego's lane after (1 + 2.5 - 0.5) / 6 s.
     assert (20 - 1 - 2.4) / 9 > (1 + 2.5 - 0.5) / 6
     np.testing.assert_array_equal(column(seen, "agents", "time_to_overlap")[:2, -1], 0.0)
-    # At the second place, the car behind is not beside the route.
+    # At the second place, the car behind is not alongside the route.
     assert column(seen, "agents", "route left", place=1)[:2, -1].max() == pytest.approx(20 / 5)
 
 

@@ -138,7 +138,8 @@ class Driving:
             state, (reward, terms, terminated, truncated) = carry
             idle = now.over | terminated | truncated
             after, result = jax.vmap(self.simulator.step, (None, 0, 0))(data, state, action)
-            state = jax.tree.map(lambda new, old: _where(idle, old, new), after, state)
+            keep = jax.vmap(lambda idle, old, new: jax.tree.map(partial(jnp.where, idle), old, new))
+            state = keep(idle, state, after)
             more = jax.tree.map(
                 lambda value: jnp.where(idle, 0.0, value), (result.reward, result.reward_terms)
             )
@@ -146,7 +147,9 @@ class Driving:
             ends = (terminated | (result.terminated & ~idle), truncated | (result.truncated & ~idle))
             return (state, (reward, terms, *ends)), None
 
-        (state, summed), _ = jax.lax.scan(step_on, (state, summed), None, self.task.hold - 1)
+        # Even a scan over nothing is traced and compiled.
+        if self.task.hold > 1:
+            (state, summed), _ = jax.lax.scan(step_on, (state, summed), None, self.task.hold - 1)
         reward, terms, terminated, truncated = summed
         over = terminated | truncated
         totals = _totals(data, state, terms, over, now.over)
@@ -242,11 +245,6 @@ def _draw(
     # Unused, and not computed, with logged starts.
     keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
     return index, step, keys
-
-
-def _where(condition: Bool[Array, " B"], chosen: Array, other: Array) -> Array:
-    """Select along the first axis."""
-    return jnp.where(condition.reshape(-1, *(1,) * (chosen.ndim - 1)), chosen, other)
 
 
 def _has_expert_action(bank: ScenarioBank) -> Bool[Array, "N T"]:

@@ -139,7 +139,7 @@ def follow_route(bank: ScenarioBank, context: AgentContext, offset_m: Scalar) ->
     return pursuit(jnp.array([0.0, 0.0, 1.0, 0.0]), point + offset_m * left)
 
 
-def route_offset(bank: ScenarioBank, context: AgentContext, curvature: Scalar) -> Scalar:
+def offset_to_steer(bank: ScenarioBank, context: AgentContext, curvature: Scalar) -> Scalar:
     """Return the offset that makes :func:`follow_route` steer a curvature, m; the nearest one if none does.
 
     The arc of curvature k from the origin meets the line p + d n where k |p + d n|^2 = 2 (p + d n)_y.

@@ -40,6 +40,8 @@ _ENTRY_STEPS = 16
 _RATE_STEPS = 5
 #: Steps in a second; a log that moves less than this stands, m (semantics, ``progress_ratio``).
 _SECOND, _STANDS_M = round(1.0 / DT_S), 0.5
+#: Facts that compare with the log's schedule.
+_SCHEDULE = frozenset({"late_m", "early_m", "completed"})
 #: Facts that need fault classification, and those that need contacts.
 _FAULTS = frozenset({"at_fault", "collision_type", "ttc_s"})
 _CONTACTS = _FAULTS | {"collision", "ignored", "gap_m"}
@@ -177,7 +179,9 @@ def _requested_facts(
 ) -> dict[str, Array]:  # fmt: skip
     """Return the facts measured on request; those outside ``reads`` are zero."""
     facts: dict[str, Array] = dict.fromkeys(("gap_m", "lag_m"), jnp.zeros(()))
-    facts |= _schedule(bank, context)
+    facts |= dict.fromkeys(_SCHEDULE, jnp.zeros(()))
+    if reads & _SCHEDULE:
+        facts |= _schedule(bank, context)
     facts |= {"strand": jnp.int16(-1)} | dict.fromkeys(("lane_changed", "merged"), jnp.zeros((), bool))
     if "gap_m" in reads:
         facts["gap_m"] = contact.nearest_gap(frame, context.slot, codes == Contact.IGNORED)

@@ -21,7 +21,7 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.schema import DT_S
 from drivax.simulator import controller
-from drivax.simulator.ahead import follow_route, route_offset
+from drivax.simulator.ahead import follow_route, offset_to_steer
 from drivax.simulator.controller import TrackingConfig
 from drivax.simulator.dynamics import bicycle, command_between, displace, displacement, follow
 from drivax.simulator.types import Action, AgentContext, History, Motion
@@ -216,7 +216,7 @@ class Route(Physical):
 
     def unsteer(self, bank: ScenarioBank, context: AgentContext, action: Vector) -> Vector:
         """Return the action that is steered as an action of :class:`Physical`, not clipped."""
-        offset_m = route_offset(bank, context, action[1] * self.steering)
+        offset_m = offset_to_steer(bank, context, action[1] * self.steering)
         return jnp.stack([action[0], offset_m / self.offset_m])
 
 
@@ -427,7 +427,7 @@ def action_of(
     """Return the action of an acceleration (m/s2) and a curvature (1/m), not clipped."""
     length_m = bank.length_m(context.index, context.slot)
     action = actions.action(context.history[-1], acceleration, curvature, length_m)
-    return actions.unsteer(bank, context, action) if isinstance(actions, Route) else action
+    return _request(actions, bank, context, action)
 
 
 def follow_log(
@@ -436,4 +436,9 @@ def follow_log(
     """Return the action that follows motions one and two steps ahead (``actions.expert``), not clipped."""
     length_m = bank.length_m(context.index, context.slot)
     action = actions.expert(context.history[-1], target, beyond, length_m)
+    return _request(actions, bank, context, action)
+
+
+def _request(actions: ActionSpace, bank: ScenarioBank, context: AgentContext, action: Action) -> Action:
+    """Return what to request so that an action is executed: in the space ``route`` an offset."""
     return actions.unsteer(bank, context, action) if isinstance(actions, Route) else action

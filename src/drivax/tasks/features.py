@@ -211,15 +211,15 @@ def ego_on_route(bank: ScenarioBank, context: AgentContext, view: View) -> Float
     return jnp.where(has_route(bank, context), jnp.stack([offset, sine]), 0.0)
 
 
-def approach(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], agents: Frame) -> tuple[Array, Array]:
-    """Return the speed at which agents approach ego, and their times to overlap at constant velocity and heading.
-
-    Speed of the centres towards each other in units of 15 m/s; 1 at an overlap, 0 from 8 s on.
-    """
+def closing_speed(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], agents: Frame) -> Array:
+    """Return the speed at which the centres of agents and ego approach, in units of 15 m/s."""
     offset, velocity = agents.box[:, :2] - ego[:2], agents.velocity - ego_velocity
-    speed = -jnp.sum(offset * velocity, axis=-1) / jnp.maximum(norm(offset), 1.0)
-    times = time_to_overlap(ego, ego_velocity, agents.box, agents.velocity, _OVERLAP_S)
-    return speed / SPEED_MPS, 1.0 - times / _OVERLAP_S
+    return -jnp.sum(offset * velocity, axis=-1) / jnp.maximum(norm(offset), 1.0) / SPEED_MPS
+
+
+def overlap_soon(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], agents: Frame) -> Array:
+    """Return 1 - t / 8 s for the time t until agents overlap ego at constant velocity and heading; 0 from 8 s on."""
+    return 1.0 - time_to_overlap(ego, ego_velocity, agents.box, agents.velocity, _OVERLAP_S) / _OVERLAP_S
 
 
 def route_curvature(

@@ -250,8 +250,8 @@ def _agents(
     related = now.at(nearest)
     parts = {
         "route": lambda: features.route_coordinates(bank, context, related.box),
-        "closing_speed": lambda: [features.approach(me, me_velocity, related)[0]],
-        "time_to_overlap": lambda: [features.approach(me, me_velocity, related)[1]],
+        "closing_speed": lambda: [features.closing_speed(me, me_velocity, related)],
+        "time_to_overlap": lambda: [features.overlap_soon(me, me_velocity, related)],
         "position": lambda: scale(POSITION_M, *view.rotate(x - view.xy[0], y - view.xy[1])),
         "heading": lambda: view.rotate(cos, sin)[::-1],
         "velocity": lambda: scale(SPEED_MPS, *view.rotate(vx, vy)),
