@@ -340,13 +340,10 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
         ("planner", "traffic", *CHANGED_METRICS.values()),
         [
             (
-                f"`{name}`",
-                f"`{kind}`",
-                *(format_change(result["changes"][f"{name}, {kind}"][m]) for m in CHANGED_METRICS),
+                *(f"`{part}`" for part in key.split(", ")),
+                *(format_change(changes[m]) for m in CHANGED_METRICS),
             )
-            for name in order
-            for kind in TRAFFIC
-            if f"{name}, {kind}" in result["changes"]
+            for key, changes in result["changes"].items()
         ],
     )
     names = [name for name in order if name in result["strata"][0]["planners"]]
@@ -415,7 +412,10 @@ def main() -> None:
         evaluate_planners(args)
         return
     if args.command == "judge":
-        RESULT.write_text(json.dumps(compute_results(), indent=1) + "\n")
+        result = compute_results()
+        # Earlier policies observe what no longer exists, so their rows cannot be computed again.
+        result["changes"] = json.loads(RESULT.read_text())["changes"] | result["changes"]
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
     PAGE.write_text(fill_page(PAGE.read_text(), json.loads(RESULT.read_text())))
 
 
