@@ -48,6 +48,8 @@ class PpoConfig:
             rollout exceeds this in a minibatch; None: never.
         gradient_norm: Maximum global norm of gradients (None: no clipping), separately for policy and value unless they
             share an encoder.
+        average: Decay per iteration of an exponential moving average of the parameters, which is validated and
+            exported in place of the newest ones; 0: no average.
     """
 
     kind: Literal["ppo"] = "ppo"
@@ -65,8 +67,11 @@ class PpoConfig:
     entropy_coefficient: float = 0.01
     target_kl: float | None = None
     gradient_norm: float | None = 0.5
+    average: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.average < 1.0:
+            raise ValueError(f"average is {self.average}; choose at least 0 and less than 1")
         if self.environments < 1 or self.unroll < 1 or self.minibatches < 1:
             raise ValueError("environments, unroll and minibatches are at least 1")
         steps, minibatches = self.steps_per_iteration, self.minibatches
@@ -87,11 +92,15 @@ class PpoConfig:
 
 @record
 class PpoState:
-    """State of a run: networks, optimiser, environments, key and step."""
+    """State of a run: networks, optimiser, environments, key and step.
+
+    ``parameters`` are those of the planner: the average, if there is one, of those that are ``trained`` (else None).
+    """
 
     networks: ClassVar[tuple[str, ...]] = ("parameters",)
 
     parameters: Any
+    trained: Any
     optimiser: Any
     environments: Environments
     key: Array
@@ -125,7 +134,15 @@ class Ppo:
         parameters = nnx.state(self._network(network_key), nnx.Param)
         environments = self.environment.start(data, environment_key, self.config.environments)
         optimiser = self.optimiser.init(parameters)
-        return PpoState(parameters, optimiser, environments, key, jnp.zeros((), jnp.int32))
+        trained = parameters if self.config.average else None
+        return PpoState(parameters, trained, optimiser, environments, key, jnp.zeros((), jnp.int32))
+
+    def trained(self, state: PpoState) -> Any:
+        """Return the parameters that are trained, at first those of the planner, which a pretraining may have set."""
+        if state.trained is None:
+            return state.parameters
+        begins = state.iteration == 0
+        return jax.tree.map(partial(jnp.where, begins), state.parameters, state.trained)
 
     def network(self, parameters: Any) -> ActorCritic:
         """Return the network with these parameters."""
@@ -156,12 +173,7 @@ class Ppo:
             self.environment, data, state.environments, actor, key, self.config.unroll
         )
         state = replace(state, environments=environments)
-        after, losses = self.update(data, state, rollout, auxiliary_loss)
-        if settling is not None:
-            policy = {"policy": state.parameters.raw_mapping["policy"]}
-            fixed = nnx.State({**after.parameters.raw_mapping, **policy})
-            parameters = jax.tree.map(partial(jnp.where, settling), fixed, after.parameters)
-            after = replace(after, parameters=parameters)
+        after, losses = self.update(data, state, rollout, auxiliary_loss, settling)
         return after, {f"rollout/{name}": value for name, value in totals.items()} | losses
 
     def rollout_key(self, state: PpoState) -> Array:
@@ -170,7 +182,7 @@ class Ppo:
 
     def sample_action(self, state: PpoState, observation: Any, key: Array) -> SampledAction:
         """Sample the policy, with log-probabilities and values as extras."""
-        policy, value = self.network(state.parameters).policy_and_value(observation)
+        policy, value = self.network(self.trained(state)).policy_and_value(observation)
         raw_action = policy.sample(key)
         extra = {"log_prob": policy.log_prob(raw_action), "value": value}
         return SampledAction(raw_action, policy.action(raw_action), extra)
@@ -180,15 +192,16 @@ class Ppo:
         return transition(self.environment, now, sampled, outcome)
 
     def update(
-        self, data: Any, state: PpoState, rollout: Rollout, auxiliary_loss: AuxiliaryLoss | None = None
-    ) -> tuple[PpoState, dict[str, Array]]:
+        self, data: Any, state: PpoState, rollout: Rollout, auxiliary_loss: AuxiliaryLoss | None = None,
+        settling: Bool[Array, ""] | None = None,
+    ) -> tuple[PpoState, dict[str, Array]]:  # fmt: skip
         """Take the updates of one iteration on a rollout of ``unroll`` steps; ``data`` is unused.
 
         The state is the one that the rollout was sampled with, with the environments after it.
         """
-        config = self.config
+        config, first = self.config, self.trained(state)
         _, update_key, key = jax.random.split(state.key, 3)
-        batch = self._batch(rollout, self.network(state.parameters).value(state.environments.observation))
+        batch = self._batch(rollout, self.network(first).value(state.environments.observation))
 
         def epoch(carry: tuple[Any, ...], key: Array) -> tuple[tuple[Any, ...], dict[str, Array]]:
             order_key, noise_key = jax.random.split(key)
@@ -213,12 +226,21 @@ class Ppo:
             return (*updated, stops), logs
 
         carry, keys = (
-            (state.parameters, state.optimiser, jnp.zeros((), bool)),
+            (first, state.optimiser, jnp.zeros((), bool)),
             jax.random.split(update_key, config.epochs),
         )
         (parameters, optimiser, _), logs = jax.lax.scan(epoch, carry, keys)
+        if settling is not None:
+            fixed = nnx.State({**parameters.raw_mapping, "policy": first.raw_mapping["policy"]})
+            parameters = jax.tree.map(partial(jnp.where, settling), fixed, parameters)
         losses = {f"loss/{name}": value.mean() for name, value in logs.items()}
-        return PpoState(parameters, optimiser, state.environments, key, state.iteration + 1), losses
+        after = replace(state, optimiser=optimiser, key=key, iteration=state.iteration + 1)
+        if state.trained is None:
+            return replace(after, parameters=parameters), losses
+        # The mean of all, until the first ones are forgotten.
+        rate = jnp.maximum(1.0 - config.average, 1.0 / after.iteration)
+        average = optax.incremental_update(parameters, state.parameters, rate)
+        return replace(after, parameters=average, trained=parameters), losses
 
     def _batch(self, rollout: Rollout, last: Array) -> dict[str, Any]:
         """Return the flattened rollout with advantages, given the values of the last observations."""
