@@ -166,7 +166,7 @@ def draw_curves(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]
             axes.plot(
                 steps, values, marker=".", linewidth=1.4, color=SERIES[number % len(SERIES)], label=seed
             )
-        axes.set(xlabel="steps", ylabel=f"validation {metric}", xlim=(0, None))
+        axes.set(xlabel="steps", ylabel=f"validation {metric}", xlim=(0, last))
         axes.secondary_xaxis("top", functions=(lambda x: x * minutes, lambda x: x / minutes)).set(
             xlabel="minutes on one core"
         )
