@@ -181,7 +181,8 @@ def interval(result: Mapping[str, Any], signed: bool = False, digits: int = 3) -
     """Format a mean with its interval."""
     numbers = [result[name] for name in ("mean", "low", "high")]
     if numbers[0] is None:
-        return "-"
+        # Without events only the lower bound of an exposure per event is known.
+        return "-" if numbers[1] is None else f"above {numbers[1]:.{digits}f}"
     mean, *ends = (f"{number:{'+' if signed else ''}.{digits}f}" for number in numbers if number is not None)
     return f"{mean} [{', '.join(ends)}]" if ends else mean
 
