@@ -55,9 +55,31 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 
     ``min_gap_m`` is the gap that the driver keeps at standstill; it stops 1 m before a stop line.
     """
-    ego = frame.box[context.slot]
     offsets = jnp.arange(_POINTS) * _STEP_M
     path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
+    leader_m, leader_mps = _leader(context, frame, path, on_route, offsets)
+    # The driver stands min_gap_m behind a leader, but only STOP_SHORT_M before a line.
+    stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
+    gap = jnp.minimum(leader_m, stop)
+    leader = jnp.where(stop < leader_m, 0.0, leader_mps)
+    # Without a second point the route ends within 2 m.
+    desired = jnp.where(on_route[1], desired_speed(path, on_route, offsets), 0.0)
+    return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
+
+
+def leader_gap(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
+    """Return the gap to the nearest obstacle within 90 m on the route, m; infinite without one or without a route."""
+    offsets = jnp.arange(_POINTS) * _STEP_M
+    path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
+    gap, _ = _leader(context, frame, path, on_route, offsets)
+    return jnp.where(has_route(bank, context), gap, jnp.inf)
+
+
+def _leader(
+    context: AgentContext, frame: Frame, path: Array, on_route: Array, offsets: Array
+) -> tuple[Scalar, Scalar]:
+    """Return the gap to the nearest obstacle on a path (m; infinite for none) and its speed along it."""
+    ego = frame.box[context.slot]
     # Only the closest agents near the route are measured against all of its points.
     nodes = jnp.where(on_route[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
@@ -72,13 +94,7 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     gaps = jnp.where(blocks, along - half_length - ego[LENGTH] / 2, jnp.inf)
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
-    # The driver stands min_gap_m behind a leader, but only STOP_SHORT_M before a line.
-    stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
-    gap = jnp.minimum(gaps[nearest], stop)
-    leader = jnp.where(stop < gaps[nearest], 0.0, speed[nearest])
-    # Without a second point the route ends within 2 m.
-    desired = jnp.where(on_route[1], desired_speed(path, on_route, offsets), 0.0)
-    return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
+    return gaps[nearest], speed[nearest]
 
 
 def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
