@@ -55,9 +55,7 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 
     ``min_gap_m`` is the gap that the driver keeps at standstill; it stops 1 m before a stop line.
     """
-    offsets = jnp.arange(_POINTS) * _STEP_M
-    path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
-    leader_m, leader_mps = _leader(context, frame, path, on_route, offsets)
+    leader_m, leader_mps, (path, on_route, offsets) = _leader(bank, context, frame)
     # The driver stands min_gap_m behind a leader, but only STOP_SHORT_M before a line.
     stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
     gap = jnp.minimum(leader_m, stop)
@@ -69,17 +67,19 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 
 def leader_gap(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
     """Return the gap to the nearest obstacle within 90 m on the route, m; infinite without one or without a route."""
-    offsets = jnp.arange(_POINTS) * _STEP_M
-    path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
-    gap, _ = _leader(context, frame, path, on_route, offsets)
-    return jnp.where(has_route(bank, context), gap, jnp.inf)
+    return jnp.where(has_route(bank, context), _leader(bank, context, frame)[0], jnp.inf)
 
 
 def _leader(
-    context: AgentContext, frame: Frame, path: Array, on_route: Array, offsets: Array
-) -> tuple[Scalar, Scalar]:
-    """Return the gap to the nearest obstacle on a path (m; infinite for none) and its speed along it."""
+    bank: ScenarioBank, context: AgentContext, frame: Frame
+) -> tuple[Scalar, Scalar, tuple[Array, Array, Array]]:
+    """Return the gap to the nearest obstacle on the route (m; infinite for none), its speed along it, and the route.
+
+    The route is a triple: points ahead, whether each is on the route, and their distances along it, m.
+    """
     ego = frame.box[context.slot]
+    offsets = jnp.arange(_POINTS) * _STEP_M
+    path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
     # Only the closest agents near the route are measured against all of its points.
     nodes = jnp.where(on_route[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
@@ -94,7 +94,7 @@ def _leader(
     gaps = jnp.where(blocks, along - half_length - ego[LENGTH] / 2, jnp.inf)
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
-    return gaps[nearest], speed[nearest]
+    return gaps[nearest], speed[nearest], (path, on_route, offsets)
 
 
 def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
