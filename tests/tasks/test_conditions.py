@@ -239,6 +239,7 @@ WRONG = [
     ({"name": "collision", "low": 2, "high": 0.5}, "0 <= low < high"),
     ({"name": "collision", "low": 2, "high": 3}, "value 1.0 is not in 2.0 to 3.0"),
     ({"name": "collision", "high": 3}, "low"),
+    ({"name": "collision_margin_m", "low": 0, "high": 1}, "collision_margin_m: not in the reward"),
 ]
 
 
@@ -253,7 +254,7 @@ def test_conditions_are_unique():
     with pytest.raises(UsageError, match="occurs twice"):
         check_conditions((COLLISION, COLLISION), REWARDS)
     group = OwnGroup(lambda bank, context, frames: jnp.zeros(1), name="conditions")
-    with pytest.raises(UsageError, match="'conditions' is taken"):
+    with pytest.raises(ValueError, match="'conditions' is taken"):
         replace(TASK, observation=replace(GLIMPSE, own=(group,)))
     with pytest.raises(UsageError, match=r"value 0\.5 is not in"):
         fix_conditions(CONDITIONS, {"desired_speed": 0.5})

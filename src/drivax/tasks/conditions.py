@@ -17,6 +17,8 @@ from drivax.tasks.rewards import OPTIONS, TERMS, RewardConfig
 
 #: Separates the draws of conditions from those of starts, which split the same key.
 _STREAM = 0x636F6E64
+#: Bounds of options that conditions replace; the margin of collisions also decides which facts are measured.
+_OPTIONS = {name: bound for name, bound in OPTIONS.items() if name != "collision_margin_m"}
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,8 @@ class Condition:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.low < self.high < math.inf:
-            raise UsageError(
-                f"condition {self.name} from {self.low} to {self.high}", cure="use 0 <= low < high"
-            )
+            problem = f"condition {self.name} from {self.low} to {self.high}"
+            raise UsageError(problem, cure="use 0 <= low < high")
         if not self.low <= self.value <= self.high:
             problem = f"condition {self.name}: value {self.value} is not in {self.low} to {self.high}"
             raise UsageError(problem, cure="set a value in the range")
@@ -61,18 +62,13 @@ def check_conditions(conditions: Conditions, rewards: RewardConfig) -> None:
     """
     weights, names = rewards.weights(), [condition.name for condition in conditions]
     active = [term.option for name, term in TERMS.items() if name in weights]
-    options = {name: bound for name, bound in OPTIONS.items() if name in active}
-    for condition in conditions:
-        name = condition.name
+    options = {name: bound for name, bound in _OPTIONS.items() if name in active}
+    for name, high in ((condition.name, condition.high) for condition in conditions):
         if name not in options and name not in weights:
-            cure = did_you_mean(name, [*weights, *options])
-            raise UsageError(
-                f"condition {name}: not in the reward", cure=f"{cure}, or add the term to rewards"
-            )
-        if condition.high > options.get(name, math.inf):
-            raise UsageError(
-                f"condition {name}: high is {condition.high}", cure=f"use at most {options[name]:g}"
-            )
+            cure = f"{did_you_mean(name, [*weights, *options])}, or add the term to rewards"
+            raise UsageError(f"condition {name}: not in the reward", cure=cure)
+        if high > options.get(name, math.inf):
+            raise UsageError(f"condition {name}: high is {high}", cure=f"use at most {options[name]:g}")
         if names.count(name) > 1:
             raise UsageError(f"condition {name} occurs twice", cure="name it once")
 
@@ -84,7 +80,7 @@ def draw_conditions(conditions: Conditions, slot: Any, key: Any) -> tuple[()] | 
     values = jnp.array([condition.value for condition in conditions], jnp.float32)
     if key is None:
         return values
-    low, high = (jnp.array([getattr(c, name) for c in conditions], jnp.float32) for name in ("low", "high"))
+    low, high = _ranges(conditions)
     key = jax.random.fold_in(jax.random.fold_in(key, _STREAM), slot)
     draws = jax.random.uniform(key, values.shape, minval=low, maxval=high)
     return jnp.where(jnp.array([condition.fixed for condition in conditions]), values, draws)
@@ -92,8 +88,13 @@ def draw_conditions(conditions: Conditions, slot: Any, key: Any) -> tuple[()] | 
 
 def scale_conditions(conditions: Conditions, values: Float[Array, " C"]) -> Float[Array, " C"]:
     """Scale numbers to [-1, 1] by their ranges."""
-    low, high = (jnp.array([getattr(c, name) for c in conditions], jnp.float32) for name in ("low", "high"))
+    low, high = _ranges(conditions)
     return (2.0 * values - low - high) / (high - low)
+
+
+def _ranges(conditions: Conditions) -> Float[Array, "2 C"]:
+    """Return the lower and upper ends of the ranges."""
+    return jnp.array([(c.low, c.high) for c in conditions], jnp.float32).T
 
 
 def by_name(conditions: Conditions, values: Any) -> dict[str, Scalar]:

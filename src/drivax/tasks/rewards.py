@@ -330,7 +330,7 @@ class RewardConfig(_Weights):
     own: tuple[OwnTerm, ...] = ()
 
     def __post_init__(self) -> None:
-        check_unique("rewards.own", [term.name for term in self.own], tuple(TERMS))
+        check_unique("rewards.own", [term.name for term in self.own], (*TERMS, *OPTIONS))
         for name, bound in OPTIONS.items():
             if not 0.0 <= getattr(self, name) <= bound:
                 raise ValueError(f"{name} is {getattr(self, name)}; choose 0 to {bound:g}")

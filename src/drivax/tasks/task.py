@@ -32,6 +32,7 @@ from drivax.tasks.conditions import (
 )
 from drivax.tasks.features import Frames
 from drivax.tasks.observations import Observation, ObservationConfig, observe
+from drivax.tasks.own import check_unique
 from drivax.tasks.rewards import RewardConfig
 
 Failure = Literal["collision", "offroad", "red_light"]
@@ -68,8 +69,8 @@ class Task:
         if self.hold < 1:
             raise UsageError(f"task.hold is {self.hold}", cure="use 1 step or more")
         check_conditions(self.conditions, self.rewards)
-        if self.conditions and any(group.name == "conditions" for group in self.observation.own):
-            raise UsageError("observation.own: name 'conditions' is taken", cure="pass another with name=")
+        if self.conditions:
+            check_unique("observation.own", [group.name for group in self.observation.own], ("conditions",))
 
     @property
     def reads(self) -> frozenset[str]:
