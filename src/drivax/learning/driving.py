@@ -233,7 +233,7 @@ class Driving:
 def _draw(
     bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int | None = None
 ) -> tuple[Int[Array, " B"], Int[Array, " B"], Array]:
-    """Draw scenarios, steps up to the third last at which the ego is valid (else step 10), and keys of episodes."""
+    """Draw scenarios, steps up to the third last at which the ego is valid (else step 10), and keys for starts."""
     index_key, step_key = jax.random.split(key)
     index = jax.random.randint(index_key, (count,), 0, len(bank))
     last = bank.last_step[index] - 2
@@ -242,7 +242,7 @@ def _draw(
     # The ego is always valid at the current step.
     is_valid = (bank.agents[index, step, 0, AgentColumn.VALID] > 0) & (step <= last)
     step = jnp.where(is_valid, step, CURRENT_STEP)
-    # Unused, and not computed, with logged starts and without conditions.
+    # Unused, and not computed, with logged starts.
     keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
     return index, step, keys
 
