@@ -14,7 +14,7 @@ from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig
-from drivax.learning.driving import Driving
+from drivax.learning.driving import Driving, Egos
 from drivax.learning.training_log import Rule
 from drivax.plugins import is_dotted
 from drivax.scenario.schema import CURRENT_STEP
@@ -46,6 +46,8 @@ class TrainConfig:
         algorithm: Learning algorithm and its settings.
         traffic: How other agents move in training and validation; see :func:`~drivax.learning.policies.find_traffic`.
         start: How training episodes begin; validation episodes begin as logged, at step 10.
+        egos: Who drives in training: the recorded ego, or any vehicle of the set with a route and a goal (``moving``,
+            of a set made with ``--egos``). Validation episodes are those of the recorded ego.
         earliest_start, latest_start: Training episodes begin at a random step of the log between the two.
         begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are taken
             over, the rest of the state is fresh. All other settings may differ as long as the networks fit.
@@ -63,6 +65,7 @@ class TrainConfig:
     algorithm: Algorithm = field(default_factory=PpoConfig)
     traffic: str = "log"
     start: LogStart | NoisyStart = field(default_factory=LogStart)
+    egos: Egos = "recorded"
     earliest_start: int = CURRENT_STEP
     latest_start: int = CURRENT_STEP
     begin_from: str | None = None
@@ -94,7 +97,8 @@ class TrainConfig:
 
     def environment(self, traffic: Traffic) -> Driving:
         """Return the environment of training with :attr:`traffic` (``policies.find_traffic``)."""
-        return Driving(Simulator(self.task, traffic, self.start), self.latest_start, self.earliest_start)
+        simulator = Simulator(self.task, traffic, self.start)
+        return Driving(simulator, self.latest_start, self.earliest_start, self.egos)
 
     @property
     def iterations(self) -> int:

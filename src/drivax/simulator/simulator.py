@@ -76,8 +76,9 @@ class Simulator:
         history, route_m = LogStart().begin(bank, index, step, slot)
         action = self.task.first_action(history, bank.length_m(index, slot))
         z, traffic = bank.agents[index, step, slot, AgentColumn.Z], self.traffic.start(bank, index, step)
+        route = bank.row_of(index, slot) if bank.most_egos > 1 else None
         conditions = self.task.draw_conditions(slot, key)
-        context = AgentContext(index, step, slot, history, action, route_m, z, traffic, conditions)
+        context = AgentContext(index, step, slot, history, action, route_m, z, traffic, route, conditions)
         if isinstance(self.start, LogStart):
             return context
         # Other starts avoid the agents around, whose rows the traffic model gives for the logged context.
@@ -229,7 +230,7 @@ class Simulator:
         )
         terminated, truncated = self.task.check_end(bank, situation.context, situation.facts)
         terms = self.task.reward(before.facts, situation.facts, situation.surroundings, moved.conditions)
-        final = terminated | truncated | (moved.step >= bank.last_step[moved.index])
+        final = terminated | truncated | (moved.step >= bank.last_step[moved.row])
         episode = self.task.episode_add(before.episode, situation, before.start, final)
         after = SimState(situation.context, situation.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))
