@@ -11,8 +11,10 @@ import pytest
 
 from drivax.errors import UsageError
 from drivax.learning import TrainConfig, make_agent
+from drivax.learning.algorithms.behaviour_cloning import Cloning
 from drivax.learning.algorithms.constraints import Constraints
 from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.warm_start import BcPpoConfig, WarmStart
 from drivax.learning.environment import Environments, Outcome, Rollout, collect
 from drivax.learning.loop import mean_logs
 from drivax.learning.program import Program, Seeds
@@ -22,6 +24,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.settings import dump, load, parse_yaml
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
+from drivax.testing import check_algorithm
 from drivax.tracking.checkpoints import Checkpoints
 
 
@@ -237,6 +240,13 @@ def test_terms_of_driving_sum_to_the_reward(data):
     state, logs = jax.jit(agent.iterate)(bank, jax.jit(agent.init)(bank, jax.random.key(0)))
     assert set(state.multipliers) == {"collision", "offroad"}
     assert {"loss/multiplier/collision", "loss/cost/offroad"} <= set(mean_logs(logs))
+
+
+@pytest.mark.slow
+def test_constraints_after_cloning_pass_the_checks_of_algorithms():
+    warm_start = WarmStart(iterations=1, cloning=Cloning(batch=8, updates=2), settle=1, weight=0.5)
+    ppo = replace(PPO, environments=4, unroll=4, constraints={"collision": 0.1})
+    check_algorithm(BcPpoConfig(warm_start=warm_start, ppo=ppo))
 
 
 def test_mistakes_are_named():
