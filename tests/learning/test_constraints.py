@@ -202,10 +202,9 @@ def test_each_seed_has_its_own_multiplier():
 
 def test_terms_of_driving_sum_to_the_reward(data):
     """With held decisions, too; a penalty over its weight is the failure."""
-    task = Task(
-        rewards=RewardConfig(preset="pace", scale=0.5, at_fault_collision=-2.0), metrics="none", hold=2
-    )
-    algorithm = replace(PPO, environments=8, unroll=8, constraints={"collision": 0.1, "offroad": 0.2})
+    rewards = RewardConfig(preset="pace", scale=0.5, at_fault_collision=-2.0)
+    task = Task(rewards=rewards, metrics=("collision", "offroad"), hold=2)
+    algorithm = replace(PPO, environments=8, unroll=40, constraints={"collision": 0.1, "offroad": 0.2})
     config = TrainConfig(task=task, algorithm=algorithm, latest_start=40)
     bank = ScenarioBank.from_scenarios(data)
     agent = make_agent(config, bank)
@@ -217,11 +216,8 @@ def test_terms_of_driving_sum_to_the_reward(data):
         action = jax.random.uniform(key, (8, 2), minval=-1.0)
         return action, action, {}
 
-    names = [
-        *config.task.rewards.weights(),
-        *(f"pace/{name}" for name in ("urgency", "discomfort", "speeding")),
-    ]
-    names += ["pace/route_offset"]
+    factors = ("urgency", "discomfort", "speeding", "route_offset")
+    names = [*rewards.weights(), *(f"pace/{name}" for name in factors)]
 
     def experience(bank):
         environments = environment.start(bank, jax.random.key(0), 8)
@@ -239,7 +235,12 @@ def test_terms_of_driving_sum_to_the_reward(data):
 
     state, logs = jax.jit(agent.iterate)(bank, jax.jit(agent.init)(bank, jax.random.key(0)))
     assert set(state.multipliers) == {"collision", "offroad"}
-    assert {"loss/multiplier/collision", "loss/cost/offroad"} <= set(mean_logs(logs))
+    row = mean_logs(logs)
+    assert row["rollout/episodes"] > 8 and row["loss/multiplier/collision"] == 1.5
+    # Costs per episode are the shares of episodes that the metrics count.
+    for name in ("collision", "offroad"):
+        assert row[f"loss/cost/{name}"] == pytest.approx(row[f"rollout/{name}"])
+    assert row["loss/cost/offroad"] > 0.0
 
 
 @pytest.mark.slow
