@@ -16,7 +16,7 @@ VULNERABLE_KINDS = (2, 3)
 #: Metrics that depend on lines along the road.
 LINES = (
     "lane_straddle", "wrong_way", "wrong_way_worst", "speeding_mean", "speeding_max", "off_route",
-    "route_deviation_mean", "route_deviation_max", "progress", "progress_ratio",
+    "route_deviation_mean", "route_deviation_max", "progress", "progress_ratio", "log_lead",
 )  # fmt: skip
 
 
@@ -350,6 +350,9 @@ class Judge:
         gained, whole = max(self.motion[START:, 0].max(), 0.0), log[END, 0]
         ttc = {t: self.ttc(t, blameless[t]) for t in steps if self.motion[t, 3] >= 0.05 and t % 8 == 3}
         moving = [times[t - START - 1] for t in steps if self.motion[t, 3] >= 0.05]
+        furthest = np.maximum.accumulate(self.motion[START:, 0].clip(0.0))[1:]
+        log_furthest = np.maximum.accumulate(log[START:, 0].clip(0.0))[1:]
+        lead = DT * (furthest - log_furthest).sum() / whole if whole >= 0.5 else None
         goal = np.hypot(*(self.motion[END, :2] - log[END]))
         ratio = 1.0 if whole < 0.5 else np.clip(gained / whole, 0, 1)
         result = {
@@ -361,8 +364,8 @@ class Judge:
             "speeding_mean": np.mean(over) if over else None, "speeding_max": max(over) if over else None,
             "off_route": any(places[t][6] for t in steps), "route_deviation_mean": ways.mean(),
             "route_deviation_max": ways.max(), "ade": apart.mean(), "fde": apart[-1], "distance": moved.sum(),
-            "progress": gained, "progress_ratio": ratio, "goal_distance": goal, "comfort": comfort, "max_jerk": jerk,
-            "max_lateral_acceleration": lateral, "comfortable": comfort == 1.0,
+            "progress": gained, "progress_ratio": ratio, "log_lead": lead, "goal_distance": goal, "comfort": comfort,
+            "max_jerk": jerk, "max_lateral_acceleration": lateral, "comfortable": comfort == 1.0,
             "min_ttc": min(moving, default=None), "average_ttc": np.mean(moving) if moving else None,
             "ttc_ok": all(value >= 0.95 for value in moving),
         }  # fmt: skip

@@ -139,7 +139,7 @@ LAWFUL = {
 }  # fmt: skip
 AHEAD = {
     "progress": 80, "progress_ratio": 1, "making_progress": 1, "route_deviation_mean": 0, "route_deviation_max": 0,
-    "off_route": 0, "ade": 0, "fde": 0, "goal_distance": 0, "reached_goal": 1, "distance": 80,
+    "off_route": 0, "ade": 0, "fde": 0, "goal_distance": 0, "reached_goal": 1, "distance": 80, "log_lead": 0,
 }  # fmt: skip
 WON = {
     "accuracy": 1, "accuracy_at_fault": 1, "success": 1, "success_moving": 1, "vmax_score": 1, "nuplan_score": 1,
@@ -151,7 +151,7 @@ LOST = {"vmax_score": 0, "nuplan_score": 0}
 NO_ROUTE = {
     "progress": None, "progress_ratio": None, "making_progress": None, "route_deviation_mean": None,
     "route_deviation_max": None, "off_route": None, "goal_distance": None, "reached_goal": None, "success": None,
-    "success_moving": None, "vmax_score": None, "nuplan_score": None,
+    "success_moving": None, "vmax_score": None, "nuplan_score": None, "log_lead": None,
 }  # fmt: skip
 
 
@@ -510,14 +510,15 @@ def _journeys():
     yield "alone", Scene(straight_road([EGO]), None, PERFECT)
     yield "standing, as logged", Scene(
         straight_road([car()]), None,
-        PERFECT | {"min_ttc": None, "average_ttc": None, "progress": 0, "distance": 0, "success_moving": None},
+        PERFECT | {"min_ttc": None, "average_ttc": None, "progress": 0, "distance": 0, "success_moving": None,
+                   "log_lead": None},
     )  # fmt: skip
     yield "standing where the log drives", Scene(
         straight_road([EGO]), at_rest,
         SAFE | LOST
         | {"min_ttc": None, "average_ttc": None, "ttc_ok": 1, "progress": 0, "progress_ratio": 0, "making_progress": 0,
            "goal_distance": 80, "reached_goal": 0, "distance": 0, "ade": 40.5, "fde": 80, "accuracy": 1, "success": 0,
-           "success_moving": 0},
+           "success_moving": 0, "log_lead": -4.05},
     )  # fmt: skip
 
     def slower(share):
@@ -536,7 +537,8 @@ def _journeys():
             SAFE | FREE
             | {"progress": 80 * share, "progress_ratio": share, "making_progress": moving, "reached_goal": far,
                "goal_distance": 80 * (1 - share), "distance": 80 * share, "ade": 40.5 * (1 - share),
-               "fde": 80 * (1 - share), "success": far, "success_moving": far, "accuracy": 1,
+               "fde": 80 * (1 - share), "log_lead": -4.05 * (1 - share), "accuracy": 1,
+               "success": far, "success_moving": far,
                "nuplan_score": moving * (11 + 5 * share) / 16, "vmax_score": moving * (14 + 5 * share) / 19},
         )  # fmt: skip
     # Beyond the goal the ratio stays at 1.
@@ -545,9 +547,16 @@ def _journeys():
         Scene(
             straight_road([EGO]),
             slower(1.1),
-            {"progress": 88, "progress_ratio": 1, "goal_distance": 8, "reached_goal": 1},
+            {"progress": 88, "progress_ratio": 1, "goal_distance": 8, "reached_goal": 1, "log_lead": 0.405},
         ),
     )
+    # The log drives 39.5 m in 4 s and waits; at half its speed ego passes the metre p about p / 10 seconds later.
+    early = driven(np.where(T < 4.0 - 1e-6, 10.0, 0.0))
+    behind = 39.5 / 80 * 80 * 81 / 2 - (39 * 40 / 2 + 41 * 39.5)
+    yield "a log that waits", Scene(
+        straight_road([early]), lambda log: np.stack([39.5 / 8 * T, 0 * T, 0 * T, 0 * T + 39.5 / 8], -1),
+        {"progress": 39.5, "progress_ratio": 1, "reached_goal": 1, "log_lead": 0.1 * behind / 39.5},
+    )  # fmt: skip
     short = straight_road([driven(np.where(T <= 0.4, 10.0, np.clip(10 - 10 * (T - 0.4), 0, None)))])
     yield "a log that stops", Scene(short, None, {"progress_ratio": 1, "reached_goal": 1, "goal_distance": 0})
     yield (

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import pytest
 from hypothesis import given
@@ -273,6 +273,86 @@ def test_presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert settings.load(Training, "studies/slow").steps == 4
     with pytest.raises(UsageError, match=r"no preset or file 'fsat'; did you mean 'fast'\?"):
         settings.load(Training, "fsat")
+
+
+BASE = """
+steps: 3
+optimizer: {kind: sgd, lr: 1, momentum: 0.5}
+network: {hidden: [1, 2], optimizer: {lr: 4, clip: 5}}
+stages: [adam, sgd]
+weights: {a: 1, b: 2}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "changes"),
+    [
+        ("", {}),
+        ("steps: 4\nname: x", {"steps": 4, "name": "x"}),
+        ("weights: {b: 3, c: 4}", {"weights": {"a": 1.0, "b": 3.0, "c": 4.0}}),
+        ("network: {hidden: [3]}", {"network": Network(hidden=(3,), optimizer=Adam(lr=4.0, clip=5.0))}),
+        (
+            "network: {optimizer: {lr: 6}}",
+            {"network": Network(hidden=(1, 2), optimizer=Adam(lr=6.0, clip=5.0))},
+        ),
+        ("stages: []", {"stages": ()}),
+        ("optimizer: {lr: 2}", {"optimizer": Sgd(lr=2.0, momentum=0.5)}),
+        ("optimizer: {kind: sgd, lr: 2}", {"optimizer": Sgd(lr=2.0, momentum=0.5)}),
+        ("optimizer: {kind: adam, clip: 1}", {"optimizer": Adam(clip=1.0)}),
+        ("optimizer: adam", {"optimizer": Adam()}),
+        ("network: null", {"network": Network()}),
+    ],
+)
+def test_extended_files_are_merged_by_key(tmp_path: Path, text: str, changes: dict[str, Any]):
+    (tmp_path / "base.yaml").write_text(BASE)
+    (tmp_path / "runs").mkdir()
+    own = tmp_path / "runs" / "own.yaml"
+    own.write_text(f"extends: ../base.yaml\n{text}")
+    base = settings.load(Training, tmp_path / "base.yaml")
+    assert base.optimizer == Sgd(lr=1.0, momentum=0.5)
+    extended = settings.load(Training, own)
+    assert extended == replace(base, **changes)
+    assert "extends" not in settings.dump(extended)
+    assert settings.load(Training, own, ["--steps", "9"]) == replace(base, **{**changes, "steps": 9})
+
+
+def test_another_preset_of_a_section_starts_again(tmp_path: Path):
+    base, own = tmp_path / "base.yaml", tmp_path / "own.yaml"
+    base.write_text("rooms: {width: 4, adam: {lr: 2}}")
+    own.write_text("extends: base.yaml\nrooms: {preset: large, depth: 1}")
+    assert settings.load(House, own).rooms == Sized(width=99, depth=1, adam=Adam(lr=0.5, clip=1.0))
+    base.write_text("rooms: {preset: large, width: 4}")
+    own.write_text("extends: base.yaml\nrooms: {preset: large, depth: 1}")
+    assert settings.load(House, own).rooms == Sized(width=4, depth=1, adam=Adam(lr=0.5, clip=1.0))
+
+
+def test_files_extend_presets_and_presets_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(settings, "_configs", lambda: tmp_path)
+    (tmp_path / "offline").mkdir()
+    (tmp_path / "slow.yaml").write_text("steps: 3\nname: slow")
+    (tmp_path / "offline" / "slow.yaml").write_text("extends: slow\nname: offline")
+    own = tmp_path / "own.yaml"
+    own.write_text("extends: offline/slow\nseed: 1")
+    assert settings.load(Training, own) == Training(steps=3, name="offline", seed=1)
+    own.write_text("extends: solw")
+    with pytest.raises(
+        UsageError, match=r"own\.yaml: extends 'solw', which is not found; did you mean 'slow'\?$"
+    ):
+        settings.load(Training, own)
+    own.write_text("extends: none.yaml")
+    with pytest.raises(
+        UsageError, match=r"own\.yaml: extends 'none\.yaml', which is not found; name a file rel"
+    ):
+        settings.load(Training, own)
+    (tmp_path / "slow.yaml").write_text("extends: own.yaml")
+    own.write_text("extends: slow")
+    with pytest.raises(
+        UsageError, match=r"slow\.yaml: extends itself: own\.yaml -> slow\.yaml -> own\.yaml; remove"
+    ):
+        settings.load(Training, own)
+    (tmp_path / "slow.yaml").write_text("steps: 3\nsteps: 4")
+    with pytest.raises(UsageError, match=r"slow\.yaml: line 2: the key 'steps' appears twice"):
+        settings.load(Training, own)
 
 
 def test_presets_are_those_of_the_checkout(repository: Path):

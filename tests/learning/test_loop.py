@@ -12,7 +12,7 @@ from drivax import settings
 from drivax.api import evaluate, load
 from drivax.cli import main
 from drivax.errors import DrivaxError, UsageError
-from drivax.learning import loop
+from drivax.learning import loop, training_log
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train
@@ -213,6 +213,17 @@ def test_command_trains_several_seeds(data, tmp_path, capsys):
     assert "0 seeds; use 1 or more" in capsys.readouterr().err
 
 
+def test_unsuccessful_scenarios_are_split_by_reason():
+    """Of five scenarios with a goal, two succeed; one is late, one fails, one fails at fault. The last has no goal."""
+    values = {
+        "success": np.array([1.0, 1.0, 0.0, 0.0, 0.0, np.nan]),
+        "accuracy": np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
+        "accuracy_at_fault": np.array([1.0, 1.0, 1.0, 1.0, 0.0, 0.0]),
+    }
+    shares = pytest.approx({"late": 0.2, "not_at_fault": 0.2, "at_fault": 0.2})
+    assert training_log._split_unsuccessful(values) == shares
+
+
 def test_weights_need_an_offline_algorithm(data, config, tmp_path):
     weighted = WeightedSet(data, np.ones((3, 91)))
     with pytest.raises(UsageError, match="ToyConfig does not learn from logged steps"):
@@ -236,6 +247,8 @@ def test_training_holds_out_recordings_by_default(data, config, tmp_path, monkey
     alone = evaluate("constant_velocity", load(data[2:]), task=config.task).metrics
     for name in ("vmax_score", "accuracy", "progress_ratio"):
         assert last[f"validation/{name}"] == pytest.approx(alone[name][0], abs=1e-6)
+    shares = [last[f"validation/{name}"] for name in ("success", "late", "at_fault", "not_at_fault")]
+    assert sum(shares) == pytest.approx(1.0) and min(shares) >= 0.0
     seeds = train(replace(short, seed=7), data, tmp_path / "seeds", seeds=2)
     for path in (seeds.path, *seed_folders(seeds.path)):
         assert json.loads((path / "run.json").read_text())["validation"] == run.info["validation"]

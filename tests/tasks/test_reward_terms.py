@@ -75,6 +75,8 @@ LATE_M, EARLY_M = 2.0, 8.0
 CASES = [
     ("collision", {}, 0.0),
     ("collision", {"collision": True}, 1.0),
+    ("at_fault_collision", {"collision": True}, 0.0),
+    ("at_fault_collision", {"collision": True, "at_fault": True}, 1.0),
     ("offroad", {}, 0.0),
     ("offroad", {"offroad": True}, 1.0),
     ("red_light", {}, 0.0),
@@ -218,6 +220,7 @@ def in_numpy(before, now, near):
         felt = (abs(n["jerk_mps3"]) + abs(n["lateral_acceleration_mps2"])) / 13.26
         row = {
             "collision": n["collision"],
+            "at_fault_collision": n["at_fault"],
             "offroad": n["offroad"],
             "red_light": n["red_light"],
             "off_route": n["off_route"],

@@ -83,6 +83,11 @@ class Driving:
         with jax.ensure_compile_time_eval():
             return tuple(tuple(float(level) for level in levels) for levels in actions.levels())
 
+    @property
+    def penalties(self) -> dict[str, float]:
+        """Minus the weights of the reward's terms that are never positive."""
+        return self.task.rewards.penalties
+
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
         """Shapes of one observation by group."""
         # Starts change no shape; the logged start is the fastest to trace.
@@ -155,7 +160,7 @@ class Driving:
         reward, terms, terminated, truncated = summed
         over = terminated | truncated
         totals = _totals(data, state, terms, over, now.over)
-        outcome = Outcome(reward, terminated, truncated, self.cache(data, state), totals)
+        outcome = Outcome(reward, terminated, truncated, self.cache(data, state), totals, terms)
         return Environments(state, over, self.observe_all(data, state.context)), outcome
 
     def demonstrations(self, data: ScenarioBank, key: Array, count: int) -> ExpertActions:

@@ -6,7 +6,8 @@ scenario bank) is an argument of every function, and all functions but :meth:`En
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import field
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -40,6 +41,7 @@ class Outcome:
         cache: :meth:`Environment.cache` of the new state.
         totals: Sums to log over environments that were not over: ``"<name>"`` with its count ``"<name>/n"``, or
             ``"reward/<name>"`` over steps.
+        terms: Terms of the reward by name, with their weights; none unless the environment has ``penalties``.
     """
 
     reward: Float[Array, " B"]
@@ -47,11 +49,16 @@ class Outcome:
     truncated: Bool[Array, " B"]
     cache: Any
     totals: dict[str, Array]
+    terms: dict[str, Float[Array, " B"]] = field(default_factory=dict)
 
 
 @runtime_checkable
 class Environment(Protocol):
-    """An environment that algorithms train in."""
+    """An environment that algorithms train in.
+
+    One whose reward algorithms may constrain has a mapping ``penalties``: the terms of its outcomes that are never
+    positive, with minus their weights.
+    """
 
     @property
     def action_size(self) -> int:
@@ -102,7 +109,8 @@ class Rollout:
     """Experience ``[time, batch]``. ``alive`` is false for steps that only reset an environment; mask them out.
 
     The successor of row t is in row t + 1, final states included; that of the last row is the environments' current
-    state. Either ``observation`` or ``state`` (for the replay buffer) is kept, the other is None.
+    state. Either ``observation`` or ``state`` (for the replay buffer) is kept, the other is None. ``terms`` are the
+    reward terms that the learner reads.
     """
 
     observation: dict[str, Array] | None
@@ -113,6 +121,7 @@ class Rollout:
     terminated: Bool[Array, "*time batch"]
     truncated: Bool[Array, "*time batch"]
     alive: Bool[Array, "*time batch"]
+    terms: dict[str, Float[Array, "*time batch"]] = field(default_factory=dict)
 
 
 class SampledAction(NamedTuple):
@@ -132,9 +141,12 @@ Store = Literal["state", "observation"]
 
 def transition(
     environment: Environment, now: Environments, sampled: Sampled, outcome: Outcome,
-    keep: Store = "observation",
+    keep: Store = "observation", terms: Iterable[str] = (),
 ) -> Rollout:  # fmt: skip
-    """Return one row of a rollout, given the environments before the step, the sampled actions, and the outcome."""
+    """Return one row of a rollout, given the environments before the step, the sampled actions, and the outcome.
+
+    ``terms`` names the reward terms to keep.
+    """
     raw_action, _, extra = sampled
     return Rollout(
         observation=now.observation if keep == "observation" else None,
@@ -145,12 +157,13 @@ def transition(
         terminated=outcome.terminated,
         truncated=outcome.truncated,
         alive=~now.over,
+        terms={name: jnp.where(now.over, 0.0, outcome.terms[name]) for name in terms},
     )
 
 
 def collect(
     environment: Environment, data: Any, environments: Environments, actor: Actor, key: Array, steps: int,
-    keep: Store = "observation",
+    keep: Store = "observation", terms: Iterable[str] = (),
 ) -> tuple[Environments, Rollout, dict[str, Array]]:  # fmt: skip
     """Unroll ``steps`` steps in every environment.
 
@@ -164,7 +177,7 @@ def collect(
         key, act_key, step_key = jax.random.split(key, 3)
         sampled = actor(now.observation, act_key)
         after, outcome = environment.step(data, now, cache, sampled[1], step_key)
-        row = transition(environment, now, sampled, outcome, keep)
+        row = transition(environment, now, sampled, outcome, keep, terms)
         counts = {"episodes": after.over.sum(), "steps": row.alive.sum()}
         totals = outcome.totals | {name: count.astype(jnp.float32) for name, count in counts.items()}
         return (after, outcome.cache, key), (row, totals)

@@ -53,7 +53,8 @@ class Validation:
 def validate(planner: Planner, validation: Validation, task: Task, traffic: Traffic) -> dict[str, float]:
     """Evaluate a planner in closed loop on held-out scenarios; DrivaxError if actions are not finite.
 
-    Returns ``validation/<metric>``: means over the scenarios that define it.
+    Returns ``validation/<metric>``: means over the scenarios that define it. With ``success``, the shares ``late`` (the
+    goal is not reached), ``at_fault`` and ``not_at_fault`` (a failure) sum to 1 over the scenarios that define it.
     """
     results = evaluate(planner, validation.bank, validation.names, task=task, traffic=traffic)
     if results.crashes:
@@ -62,9 +63,19 @@ def validate(planner: Planner, validation: Validation, task: Task, traffic: Traf
     values = {name: x for name, x in results.metrics.items() if np.isfinite(x).any()}
     # Prefer full scores, and never mix them with partial ones.
     score = next(name for name in _SCORES if name in values)
-    return {
-        f"validation/{name}": float(np.nanmean(values[name])) for name in (score, *_METRICS) if name in values
-    }
+    means = {name: float(np.nanmean(values[name])) for name in (score, *_METRICS) if name in values}
+    if "success" in means:
+        means |= _split_unsuccessful(values)
+    return {f"validation/{name}": mean for name, mean in means.items()}
+
+
+def _split_unsuccessful(values: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return the shares of scenarios without success by reason."""
+    names = ("success", "accuracy", "accuracy_at_fault")
+    defined = np.isfinite(values["success"])
+    success, accuracy, lawful = (float(values[name][defined].mean()) for name in names)
+    # Each implies the next.
+    return {"late": accuracy - success, "at_fault": 1.0 - lawful, "not_at_fault": lawful - accuracy}
 
 
 def rank(rule: Rule, row: Mapping[str, Any]) -> tuple[float, ...] | None:

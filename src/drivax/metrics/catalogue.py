@@ -14,7 +14,7 @@ from drivax.metrics.steps import STEP_VALUES, StepValue, Value
 from drivax.scenario.bank.queries import is_mapped
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
-from drivax.scenario.schema import Flag
+from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import TTC_HORIZON_S
 
 #: How the step values of an episode are reduced: ``worst_second`` is the largest sum over ten consecutive steps.
@@ -137,6 +137,16 @@ def _progress_ratio(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     gain = inputs["progress"]
     ratio = jnp.where(log_gain < 0.5, 1.0, jnp.clip(gain.value / jnp.maximum(log_gain, 0.5), 0.0, 1.0))
     return Value(ratio, gain.defined)
+
+
+def _log_lead(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    """Return the area between the progress of ego and of the log over time, per metre that the log gains."""
+    log_progress = end.bank.log_progress[end.row]
+    step = jnp.arange(log_progress.shape[0]) - end.start
+    log_sum = jnp.sum(jnp.where((step > 0) & (step <= end.steps), log_progress, 0.0))
+    gain = log_progress[end.start + end.steps] - log_progress[end.start]
+    area = (value.value * end.steps - log_sum) * DT_S
+    return Value(area / jnp.maximum(gain, 0.5), value.defined & (gain >= 0.5))
 
 
 def _reached_goal(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
@@ -317,6 +327,9 @@ METRICS: dict[str, Metric] = {
         "ignored", "max", "-", "-", "agents ignored because they overlapped at the start"),
     "steps": _derived_metric(_steps, (), "-", "steps driven", summarised=False),
     "last_step": _derived_metric(_last_step, (), "-", "last step of the log", summarised=False),
+    "log_lead": _step_metric(
+        "progress", "mean", "s", "-", "mean time ahead of the log, over the metres that it drives",
+        label="mean lead on the log", needs=_ROUTE, compute=_log_lead),
 }
 # fmt: on
 #: Metrics without a mean.

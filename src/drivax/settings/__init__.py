@@ -2,9 +2,10 @@
 
 A configuration record holds scalars, strings, literals, paths, tuples, other records, and unions of records, which
 carry a ``kind`` key in YAML (:func:`kind_of`). Missing keys keep the defaults of the enclosing record. In a record with
-presets (a class method ``preset(name)``), the key ``preset`` names the preset to start from. An unknown key or a value
-of the wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. A class
-variable ``renamed`` maps former keys to present ones.
+presets (a class method ``preset(name)``), the key ``preset`` names the preset to start from. A file may extend a preset
+(``extends: ppo``) or a file relative to it (``extends: base.yaml``): its settings are merged over those of the other.
+An unknown key or a value of the wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest
+valid name. A class variable ``renamed`` maps former keys to present ones.
 """
 
 from __future__ import annotations
@@ -31,15 +32,14 @@ def load(cls: type[Record], source: str | Path | Mapping[str, Any], overrides: S
             count as underscores. A new ``kind`` discards the settings of the previous one.
 
     Raises:
-        UsageError: File or preset not found, invalid YAML, unknown key, or a value of the wrong type.
+        UsageError: File or preset not found, invalid YAML, a cycle, unknown key, or a value of the wrong type.
     """
-    file = None if isinstance(source, Mapping) else _find_file(source)
-    values = parse_yaml(_read(file), file) if file else source
-    if values is None:
-        values = {}
-    if not isinstance(values, Mapping):
-        raise UsageError("not a mapping of settings", file=file, cure="write 'name: value' lines")
-    values = _override(_copy(values), overrides)
+    if isinstance(source, Mapping):
+        file, values = None, _copy(source)
+    else:
+        file = _find_file(source)
+        values = _read_settings(file)
+    values = _override(values, overrides)
     try:
         return structure(values, cls)
     except ValueError as error:
@@ -86,6 +86,45 @@ def _find_file(source: str | Path) -> Path:
         cure = f"name a file or a preset ({', '.join(presets())})"
         raise UsageError("file not found", file=path, cure=cure)
     return preset(source)
+
+
+def _read_settings(file: Path, extensions: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return the settings of a file, merged over those of the file that it ``extends``.
+
+    ``extensions`` are the files that extend this one, from the first one that was read.
+    """
+    values = parse_yaml(_read(file), file)
+    values = {} if values is None else values
+    if not isinstance(values, dict):
+        raise UsageError("not a mapping of settings", file=file, cure="write 'name: value' lines")
+    if "extends" not in values:
+        return values
+    base, extensions = _find_base(file, values.pop("extends")), (*extensions, file.resolve())
+    if base.resolve() in extensions:
+        cycle = " -> ".join(path.name for path in (*extensions, base))
+        raise UsageError(f"extends itself: {cycle}", file=file, cure="remove an extends line")
+    return _merge(_read_settings(base, extensions), values)
+
+
+def _find_base(file: Path, name: Any) -> Path:
+    """Return the preset, or the file relative to ``file``, that ``file`` extends."""
+    name = str(name)
+    is_file = Path(name).suffix in (".yaml", ".yml")
+    if is_file and (file.parent / name).is_file():
+        return file.parent / name
+    if not is_file and name in presets():
+        return preset(name)
+    cure = "name a file relative to this one" if is_file else did_you_mean(name, presets())
+    raise UsageError(f"extends {name!r}, which is not found", file=file, cure=cure)
+
+
+def _merge(base: Any, values: Any) -> Any:
+    """Return settings merged over others by key; a section that names another kind or preset replaces the other."""
+    if not isinstance(base, dict) or not isinstance(values, dict):
+        return values
+    if any(name in values and values[name] != base.get(name) for name in ("kind", "preset")):
+        return values
+    return base | {name: _merge(base.get(name), value) for name, value in values.items()}
 
 
 def _read(file: Path) -> str:

@@ -255,6 +255,9 @@ def time_gap_shortfall(before: Facts, now: Facts, around: Surroundings, time_gap
     return now.ttc_defined * shortfall
 
 
+# 1 at the step at which a collision begins that is the agent's fault.
+_event_term("at_fault_collision", "at_fault")
+
 #: Terms that lower a softened term, and the share of it that each takes at 1; together they leave at least 0.36.
 SOFT_FACTORS = {"urgency": 0.3, "discomfort": 0.2, "speeding": 0.2, "route_offset": 0.2}
 
@@ -342,6 +345,11 @@ class RewardConfig(_Weights):
         overrides = {name: weight for name in TERMS if (weight := getattr(self, name)) is not None}
         weights = PRESETS[self.preset] | overrides | {term.name: term.weight for term in self.own}
         return {name: weight for name, weight in weights.items() if weight}
+
+    @property
+    def penalties(self) -> dict[str, float]:
+        """Size of the weights below 0 by term, with ``scale``."""
+        return {name: -self.scale * weight for name, weight in self.weights().items() if weight < 0.0}
 
     @property
     def reads(self) -> frozenset[str]:

@@ -13,6 +13,7 @@ from flax import nnx
 from jaxtyping import Array, Bool
 
 from drivax.learning.algorithm import AuxiliaryLoss
+from drivax.learning.algorithms.constraints import Constraints
 from drivax.learning.algorithms.optimisers import chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
     Environment,
@@ -50,6 +51,9 @@ class PpoConfig:
             share an encoder.
         average: Decay per iteration of an exponential moving average of the parameters, which is validated and
             exported in place of the newest ones; 0: no average.
+        constraints: Largest mean sum per episode of reward penalties by name, without their weights: of a failure that
+            ends the episode, the share of episodes. Lagrange multipliers, learned from the weights on, replace these.
+        multiplier_rate: Step size of the multipliers per iteration.
     """
 
     kind: Literal["ppo"] = "ppo"
@@ -68,8 +72,12 @@ class PpoConfig:
     target_kl: float | None = None
     gradient_norm: float | None = 0.5
     average: float = 0.0
+    constraints: dict[str, float] = field(default_factory=dict)
+    multiplier_rate: float = 0.1
 
     def __post_init__(self) -> None:
+        if min((self.multiplier_rate, *self.constraints.values())) < 0.0:
+            raise ValueError("limits of constraints and multiplier_rate are at least 0")
         if not 0.0 <= self.average < 1.0:
             raise ValueError(f"average is {self.average}; choose at least 0 and less than 1")
         if self.environments < 1 or self.unroll < 1 or self.minibatches < 1:
@@ -92,7 +100,7 @@ class PpoConfig:
 
 @record
 class PpoState:
-    """State of a run: networks, optimiser, environments, key and step.
+    """State of a run: networks, optimiser, environments, key, step, and multipliers of constraints.
 
     ``parameters`` are those of the planner: the average, if there is one, of those that are ``trained`` (else None).
     """
@@ -105,6 +113,7 @@ class PpoState:
     environments: Environments
     key: Array
     iteration: Array
+    multipliers: dict[str, Array] = field(default_factory=dict)
 
 
 class Ppo:
@@ -113,6 +122,7 @@ class Ppo:
     def __init__(self, config: PpoConfig, environment: Environment, data: Any, iterations: int) -> None:
         self.config, self.environment = config, environment
         self.spec = environment.shapes(data)
+        self.constraints = Constraints.of(config.constraints, config.multiplier_rate, environment)
         self.optimiser = clipped_adam(
             config.learning_rate,
             config.gradient_norm,
@@ -135,7 +145,8 @@ class Ppo:
         environments = self.environment.start(data, environment_key, self.config.environments)
         optimiser = self.optimiser.init(parameters)
         trained = parameters if self.config.average else None
-        return PpoState(parameters, trained, optimiser, environments, key, jnp.zeros((), jnp.int32))
+        iteration, multipliers = jnp.zeros((), jnp.int32), self.constraints.init()
+        return PpoState(parameters, trained, optimiser, environments, key, iteration, multipliers)
 
     def trained(self, state: PpoState) -> Any:
         """Return the parameters that are trained, at first those of the planner, which a pretraining may have set."""
@@ -170,8 +181,9 @@ class Ppo:
         """
         actor, key = partial(self.sample_action, state), self.rollout_key(state)
         environments, rollout, totals = collect(
-            self.environment, data, state.environments, actor, key, self.config.unroll
-        )
+            self.environment, data, state.environments, actor, key, self.config.unroll,
+            terms=self.config.constraints,
+        )  # fmt: skip
         state = replace(state, environments=environments)
         after, losses = self.update(data, state, rollout, auxiliary_loss, settling)
         return after, {f"rollout/{name}": value for name, value in totals.items()} | losses
@@ -189,7 +201,7 @@ class Ppo:
 
     def transition(self, now: Environments, sampled: SampledAction, outcome: Outcome) -> Rollout:
         """Return one row of a rollout, with its observation."""
-        return transition(self.environment, now, sampled, outcome)
+        return transition(self.environment, now, sampled, outcome, terms=self.config.constraints)
 
     def update(
         self, data: Any, state: PpoState, rollout: Rollout, auxiliary_loss: AuxiliaryLoss | None = None,
@@ -201,6 +213,8 @@ class Ppo:
         """
         config, first = self.config, self.trained(state)
         _, update_key, key = jax.random.split(state.key, 3)
+        reward, multipliers, constraint_logs = self.constraints.update(state.multipliers, rollout)
+        rollout = replace(rollout, reward=reward)
         batch = self._batch(rollout, self.network(first).value(state.environments.observation))
 
         def epoch(carry: tuple[Any, ...], key: Array) -> tuple[tuple[Any, ...], dict[str, Array]]:
@@ -233,8 +247,9 @@ class Ppo:
         if settling is not None:
             fixed = nnx.State({**parameters.raw_mapping, "policy": first.raw_mapping["policy"]})
             parameters = jax.tree.map(partial(jnp.where, settling), fixed, parameters)
-        losses = {f"loss/{name}": value.mean() for name, value in logs.items()}
+        losses = {f"loss/{name}": value.mean() for name, value in (logs | constraint_logs).items()}
         after = replace(state, optimiser=optimiser, key=key, iteration=state.iteration + 1)
+        after = replace(after, multipliers=multipliers)
         if state.trained is None:
             return replace(after, parameters=parameters), losses
         # The mean of all, until the first ones are forgotten.
