@@ -251,8 +251,13 @@ def test_learning_tables(script, learning):
 
 def test_curves_show_every_seed(script, learning):
     curves = learning["curves"]["ppo"]
-    (axes,) = script("learning.tables").draw_curves("ppo", curves).axes
+    figure = script("learning.tables").draw_curves("ppo", curves, seconds=60.0)
+    (axes,) = figure.axes
     assert axes.get_ylabel() == "validation success"
+    figure.canvas.draw()
+    (minutes,) = axes.child_axes
+    # 200 steps take a minute.
+    np.testing.assert_allclose(minutes.get_xlim(), np.divide(axes.get_xlim(), 200.0))
     for line, (seed, points) in zip(axes.lines, curves["success"].items(), strict=True):
         assert line.get_label() == seed
         np.testing.assert_array_equal(line.get_xydata(), points)

@@ -34,9 +34,9 @@ class Learned(NamedTuple):
     parameters: Any
 
 
-def write_run(path: Path, bank: ScenarioBank) -> RunFolder:
+def write_run(path: Path, bank: ScenarioBank, **task: Any) -> RunFolder:
     """Two checkpoints of drawn weights, at steps 4 and 8, of which the older scored better."""
-    config = settings.load(TrainConfig, TINY)
+    config = settings.load(TrainConfig, TINY | {"task": TINY["task"] | task})
     folder = RunFolder.create(path, config, kind="training", validation="c0de")
     about = {"path": "/some/where/train", "hash": "f00d", "scenarios": 3}
     folder = folder.note(data=[about], command="drivax train tiny")

@@ -29,16 +29,13 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import windows
 from drivax.scenario.schema import STEPS, Scenario
-from drivax.tracking.run_folder import versions
+from drivax.tracking.run_folder import versions, zoo
 from experiments.repository import DOCS, RESULTS
 
 RESULT = RESULTS / "real_files.json"
 PAGE = DOCS / "results" / "real-files.md"
 BEGIN, END = "<!-- real_files.py: begin -->", "<!-- real_files.py: end -->"
-PLANNERS = (
-    "expert", "expert_actions", "pdm", "idm", "search", "zoo:aggressive", "constant_speed", "constant_velocity",
-    "random",
-)  # fmt: skip
+RULES = ("expert", "expert_actions", "pdm", "idm", "search", "constant_speed", "constant_velocity", "random")
 #: Planners outside of the package.
 MODULES = {"search": "search_planner:SearchPlanner"}
 TRAFFIC = ("log", "idm")
@@ -64,7 +61,7 @@ def measure(data: Path) -> dict[str, Any]:
         for file, scenario in zip(files, scenarios, strict=True)
     ]
     results: dict[str, Any] = {kind: {} for kind in TRAFFIC}
-    for planner in PLANNERS:
+    for planner in (*RULES, *zoo()):
         driver, task = find_planner(MODULES.get(planner, planner), bank, False)
         for kind in TRAFFIC:
             table = evaluate(driver, bank, names, task=task, traffic=find_traffic(kind))

@@ -29,7 +29,7 @@ from drivax.planners.planner import Planner
 from drivax.planners.simple import RandomActions
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.stats.intervals import Interval, bootstrap_mean, paired_bootstrap
+from drivax.stats.intervals import Interval, bootstrap_mean, paired_bootstrap, per_event
 from drivax.stats.seeds import difference_interval, seeds_interval
 from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
@@ -66,6 +66,8 @@ CHANGED_METRICS = {
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
 #: Metrics of random actions until the first failure, where published episodes end.
 FAILURE_METRICS = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
+#: Kilometres driven until the first failure, per episode with an at-fault collision.
+KM_PER_FAULT = "km_per_fault"
 
 Metrics = dict[str, np.ndarray[Any, Any]]
 
@@ -182,6 +184,12 @@ def mean_interval(episodes: Episodes, metric: str, against: Episodes | None = No
     return difference_interval(values, other_values, segments)[0]
 
 
+def km_per_fault(episodes: Episodes) -> Interval:
+    """Return the kilometres until the first failure per at-fault collision, of all seeds together."""
+    faults = int(np.nansum(episodes.values["at_fault_collision"]))
+    return per_event(faults, float(np.nansum(episodes.values["metres_until_failure"])) / 1000.0)
+
+
 def mean_change(episodes: Episodes, metric: str, reference: Episodes) -> Interval:
     """Return the mean paired difference of the same planner between two kinds of traffic."""
     differences = episodes.values[metric].astype(np.float64) - reference.values[metric]
@@ -220,7 +228,7 @@ def compute_results() -> dict[str, Any]:
         metrics = (*COLUMNS, *FAILURE_METRICS) if name in (BOX, "expert") else COLUMNS
         planners.setdefault(name, {"seeds": episodes.about["seeds"]})[kind] = {
             metric: mean_interval(episodes, metric).as_dict() for metric in metrics
-        }
+        } | {KM_PER_FAULT: km_per_fault(episodes).as_dict()}
     return {
         "command": "python -m experiments.learning.benchmark judge",
         "test": {"hash": tests.pop(), "scenarios": len(next(iter(all_episodes.values())).segments)},
@@ -302,12 +310,16 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
         (name for name in planners if name != BOX and "log" in planners[name]),
         key=lambda name: -planners[name]["log"]["vmax_score"]["mean"],
     )
-    headings = ("planner", "seeds", *COLUMNS.values())
+    headings = ("planner", "seeds", *COLUMNS.values(), "km per fault")
     tables = {
         kind: table(
             headings,
             [
-                (f"`{name}`", str(planners[name]["seeds"]), *format_cells(planners[name][kind], COLUMNS))
+                (
+                    f"`{name}`",
+                    str(planners[name]["seeds"]),
+                    *format_cells(planners[name][kind], (*COLUMNS, KM_PER_FAULT)),
+                )
                 for name in order
                 if kind in planners[name]
             ],
@@ -370,7 +382,7 @@ def format_cells(
         interval(
             intervals[metric],
             signed=signed,
-            digits=1 if "progress" in metric or metric in FAILURE_METRICS else 3,
+            digits=1 if "progress" in metric or metric in (*FAILURE_METRICS, KM_PER_FAULT) else 3,
         )
         for metric in metrics
     ]

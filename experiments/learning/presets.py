@@ -54,7 +54,7 @@ REFERENCES = ("expert", "idm", "constant_speed", "constant_velocity")
 def train_preset(args: argparse.Namespace, overrides: list[str]) -> None:
     """Train the seeds of one preset in parallel, each on one core.
 
-    Store their policies in experiments/state/policies, with the longest training time and the curves. With --first, add
+    Store their policies in experiments/state/policies, with the time that each took and the curves. With --first, add
     them to the policies of earlier seeds.
     """
     config = settings.load(TrainConfig, args.preset, overrides)
@@ -65,11 +65,12 @@ def train_preset(args: argparse.Namespace, overrides: list[str]) -> None:
     RunFolder.create(out, config, [data], overwrite=True, **notes)
     seeds = range(config.seed + args.first, config.seed + args.first + args.seeds)
     agents = [replace(config, seed=seed) for seed in seeds]
-    durations = [seconds for _, seconds in one_core_each(partial(_train_seed, args.data, out), agents)]
-    record: dict[str, Any] = {"seconds": max(durations), "curves": learning_curves(out)}
+    trained = one_core_each(partial(_train_seed, args.data, out), agents)
+    seconds = {f"seed-{agent.seed}": duration for agent, duration in trained}
+    record: dict[str, Any] = {"seconds": seconds, "curves": learning_curves(out)}
     if args.first:
         earlier = json.loads((policies / TRAINING).read_text())
-        record["seconds"] = max(record["seconds"], earlier["seconds"])
+        record["seconds"] = earlier["seconds"] | seconds
         record["curves"] = {
             metric: earlier["curves"][metric] | lines for metric, lines in record["curves"].items()
         }
@@ -113,7 +114,8 @@ def compute_results() -> dict[str, Any]:
         "command": "python -m experiments.learning.presets judge",
         "test": {"scenarios": len(next(iter(episodes.values())).segments), "hash": tests.pop()},
         "training": {
-            name: {key: training[key] for key in ("seconds", "seeds")} for name, training in trainings.items()
+            name: {"seconds": max(training["seconds"].values()), "seeds": training["seeds"]}
+            for name, training in trainings.items()
         },
         "planners": {
             name: {metric: _mean(planner_episodes, metric) for metric in COLUMNS}
@@ -155,7 +157,8 @@ def write_tables() -> None:
     """Write the stored results to the pages, and draw the learning curves."""
     learning, training = (json.loads(path.read_text()) for path in (RESULT, SPEEDS))
     for name, curves in learning.get("curves", {}).items():
-        save_picture(draw_curves(name, curves), curve_file(name))
+        seconds = learning["training"][name]["seconds"]
+        save_picture(draw_curves(name, curves, seconds), curve_file(name))
     for page in pages():
         page.write_text(fill_page(page, learning, training))
 

@@ -147,14 +147,17 @@ def curve_file(name: str) -> Path:
     return FOLDER / f"curve-{name}.png"
 
 
-def draw_curves(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> Figure:
-    """Draw learning curves of one preset: a panel per quantity, a line per seed.
+def draw_curves(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]], seconds: float) -> Figure:
+    """Draw learning curves of one preset against steps and minutes: a panel per quantity, a line per seed.
 
     Args:
         name: The preset.
         curves: Quantity -> seed -> points (step, value).
+        seconds: Duration of the slowest seed, s.
     """
-    figure = Figure(figsize=(8.4, 2.9), dpi=100, facecolor="white", layout="constrained")
+    last = max(points[-1][0] for lines in curves.values() for points in lines.values())
+    minutes = seconds / 60.0 / last
+    figure = Figure(figsize=(8.4, 3.3), dpi=100, facecolor="white", layout="constrained")
     figure.suptitle(name, fontsize=11, color=LIGHT["ink"])
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (metric, lines) in zip(panels, curves.items(), strict=True):
@@ -163,7 +166,10 @@ def draw_curves(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]
             axes.plot(
                 steps, values, marker=".", linewidth=1.4, color=SERIES[number % len(SERIES)], label=seed
             )
-        axes.set(xlabel="steps", ylabel=f"validation {metric}", xlim=(0, None))
+        axes.set(xlabel="steps", ylabel=f"validation {metric}", xlim=(0, last))
+        axes.secondary_xaxis("top", functions=(lambda x: x * minutes, lambda x: x / minutes)).set(
+            xlabel="minutes on one core"
+        )
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: compact(value)))
         axes.grid(color=LIGHT["crosswalk"])
         axes.spines[["top", "right"]].set_visible(False)
@@ -175,7 +181,8 @@ def interval(result: Mapping[str, Any], signed: bool = False, digits: int = 3) -
     """Format a mean with its interval."""
     numbers = [result[name] for name in ("mean", "low", "high")]
     if numbers[0] is None:
-        return "-"
+        # Without events only the lower bound of an exposure per event is known.
+        return "-" if numbers[1] is None else f"above {numbers[1]:.{digits}f}"
     mean, *ends = (f"{number:{'+' if signed else ''}.{digits}f}" for number in numbers if number is not None)
     return f"{mean} [{', '.join(ends)}]" if ends else mean
 

@@ -24,6 +24,7 @@ from .scenario.schema import Scenario as Scenario
 from .scenario.store import ScenarioSet as ScenarioSet
 from .scenario.store import ScenarioWriter as ScenarioWriter
 from .simulator.simulator import Simulator as Simulator
+from .tasks.conditions import Condition as Condition
 from .tasks.observations import ObservationConfig as ObservationConfig
 from .tasks.observations import OwnGroup as OwnGroup
 from .tasks.rewards import OwnTerm as OwnTerm

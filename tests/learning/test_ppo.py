@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from drivax.learning.algorithms.behaviour_cloning import Cloning
 from drivax.learning.algorithms.optimisers import chunk_size, clip_per_network, clipped_adam
@@ -233,3 +234,26 @@ def test_updates_are_skipped_beyond_the_target_divergence():
     ):
         np.testing.assert_array_equal(left, right)
     assert int(states["near"].optimiser[1][0].count) == 1 and int(states["far"].optimiser[1][0].count) == 4
+
+
+def test_average_of_parameters():
+    """By hand: the mean of the first iterations, then a moving average; training itself is not affected."""
+    environment, decay = Pendulum(), 0.75
+    plain, averaged = (replace(CONFIG, average=value).build(environment, (), 6) for value in (0.0, decay))
+    first = state = plain.init((), jax.random.key(0))
+    averaging = averaged.init((), jax.random.key(0))
+    assert state.trained is None and averaging.trained is not None
+    history = []
+    for _ in range(6):
+        state, _ = plain.iterate((), state)
+        averaging, _ = averaged.iterate((), averaging)
+        history.append(ravel_pytree(averaging.trained)[0])
+        np.testing.assert_allclose(history[-1], ravel_pytree(state.parameters)[0], rtol=1e-3, atol=1e-5)
+        expected = np.mean(history[:4], axis=0)
+        for later in history[4:]:
+            expected = decay * expected + (1.0 - decay) * later
+        np.testing.assert_allclose(ravel_pytree(averaging.parameters)[0], expected, rtol=2e-5, atol=1e-6)
+    # A pretraining sets the parameters alone: training goes on from them.
+    pretrained = replace(averaging, parameters=state.parameters, iteration=first.iteration)
+    trained = averaged.trained(pretrained)
+    jax.tree.map(np.testing.assert_array_equal, trained, state.parameters)

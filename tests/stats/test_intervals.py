@@ -15,6 +15,7 @@ from drivax.stats.intervals import (
     interquartile_bootstrap,
     interquartile_mean,
     paired_bootstrap,
+    per_event,
     rate,
     split_bootstrap,
     wilson,
@@ -36,6 +37,24 @@ def test_wilson_by_hand():
     one_sigma = math.erf(1 / math.sqrt(2))
     result = wilson(1.5, 3, one_sigma)
     assert (result.low, result.high) == pytest.approx((0.25, 0.75), abs=1e-12)
+
+
+@pytest.mark.parametrize("events", [0, 1, 7, 250])
+def test_bounds_per_event_are_where_poisson_tails_are_2_5_percent(events):
+    result = per_event(events, 70.0)
+    assert scipy.stats.poisson.cdf(events, 70.0 / result.low) == pytest.approx(0.025, rel=1e-6)
+    if events == 0:
+        assert result.mean is None and result.high is None
+        # The rule of three, with its exact number: -ln 0.025.
+        assert result.low == pytest.approx(70.0 / -math.log(0.025))
+    else:
+        assert result.mean == 70.0 / events and result.n == events
+        assert scipy.stats.poisson.sf(events - 1, 70.0 / result.high) == pytest.approx(0.025, rel=1e-6)
+
+
+def test_no_exposure_is_refused():
+    with pytest.raises(UsageError, match="exposure"):
+        per_event(0, 0.0)
 
 
 def test_effective_sizes():

@@ -15,6 +15,7 @@ from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.scenario.bank.queries import LaneHits, RouteHit
 from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Frame, Surroundings
+from drivax.tasks.conditions import Condition
 from drivax.tasks.rewards import (
     AGGRESSIVE,
     PRESETS,
@@ -143,6 +144,13 @@ CASES = [
     ("urgency", {"ttc_s": 0.5}, 0.75),
     ("urgency", {"ttc_s": 2.5}, 0.0),
     ("urgency", {"ttc_s": 0.0, "ttc_defined": False}, 0.0),
+    ("excess_speed", {}, 0.0),
+    ("excess_speed", {"speed_mps": 16.75}, 0.25),
+    ("excess_speed", {"speed_mps": 40.0}, 1.0),
+    ("excess_speed", {"speed_mps": 40.0, "limit_mps": -1.0}, 0.0),
+    ("time_gap_shortfall", {"time_gap_s": 1.6}, 0.0),
+    ("time_gap_shortfall", {"time_gap_s": 0.6}, 0.6),
+    ("time_gap_shortfall", {"time_gap_s": 0.0, "ttc_defined": False}, 0.0),
 ]
 
 
@@ -237,6 +245,8 @@ def in_numpy(before, now, near):
             "completion": max(n["completed"] - b["completed"], 0),
             "route_offset": min(n["route_deviation_m"], 1) if routed else 0,
             "urgency": max(0, 1 - n["ttc_s"] / 2) if defined else 0,
+            "excess_speed": min(max(n["speed_mps"] / n["limit_mps"] - 1, 0), 1) if known else 0,
+            "time_gap_shortfall": max(0, 1 - n["time_gap_s"] / 1.5) if defined else 0,
         }
         for name, number in row.items():
             rows.setdefault(name, []).append(float(number))
@@ -248,6 +258,7 @@ RANGES = {
     "speed_mps": (0, 30), "acceleration_mps2": (-6, 4), "lateral_acceleration_mps2": (-6, 6), "jerk_mps3": (-12, 12),
     "log_divergence_m": (0, 15), "goal_distance_m": (0, 6), "progress_m": (0, 3), "ttc_s": (0, 3), "gap_m": (0, 3),
     "lag_m": (-5, 15), "late_m": (-15, 15), "early_m": (-15, 15), "completed": (0, 1), "route_deviation_m": (0, 3),
+    "time_gap_s": (0, 3),
 }  # fmt: skip
 
 
@@ -374,6 +385,46 @@ def test_own_terms_get_facts_on_request():
     assert float(config.weigh(BEFORE, facts(gap_m=1.0), around())["alongside"]) == pytest.approx(-0.1)
     with pytest.raises(ValueError, match="reads unknown fact 'gap'"):
         OwnTerm(alongside, -0.1, reads=("gap",))
+
+
+def conditioned(rewards, conditions, **now):
+    """Weighted terms of a task with conditions of these numbers."""
+    task = Task(rewards=rewards, conditions=tuple(Condition(name, 0.0, 2.0) for name in conditions))
+    terms = task.reward(BEFORE, facts(**now), around(), jnp.array(list(conditions.values()), jnp.float32))
+    return {name: float(term) for name, term in terms.items()}
+
+
+def test_conditioned_rewards_by_hand():
+    """10 m/s under a limit of 13.4 m/s: 0.0463 of it above 0.7 x 13.4 m/s. A gap of 1 s is half of 2 s."""
+    rewards = RewardConfig(preset="safety", excess_speed=-0.5, time_gap_shortfall=-0.2)
+    now = {"collision": True, "time_gap_s": 1.0}
+    terms = conditioned(rewards, {"collision": 1.5, "desired_speed": 0.7, "time_gap_s": 2.0}, **now)
+    assert terms["collision"] == -1.5 and terms["offroad"] == 0.0
+    assert terms["excess_speed"] == pytest.approx(-0.5 * (10 / 13.4 - 0.7))
+    assert terms["time_gap_shortfall"] == pytest.approx(-0.2 * 0.5)
+    calm = conditioned(rewards, {"collision": 0.5, "desired_speed": 0.8, "time_gap_s": 0.9}, **now)
+    assert calm == {
+        "collision": -0.5,
+        "offroad": 0,
+        "red_light": 0,
+        "excess_speed": 0,
+        "time_gap_shortfall": 0,
+    }
+    # A gap of 0 s asks for none.
+    touching = conditioned(rewards, {"time_gap_s": 0.0}, time_gap_s=0.0)
+    assert touching["time_gap_shortfall"] == 0.0
+
+
+def test_factor_of_a_softened_term_multiplies_what_its_factors_take():
+    """A time to collision of 1 s takes 0.15 of ``pace``."""
+    terms = conditioned(RewardConfig(preset="pace", scale=2.0), {"pace": 1.5}, ttc_s=1.0)
+    assert terms["pace"] == pytest.approx(2.0 * 0.1 * 1.5)
+    assert terms["pace/urgency"] == pytest.approx(-2.0 * 0.1 * 1.5 * 0.15)
+
+
+def test_own_terms_have_factors():
+    rewards = RewardConfig(preset="safety", own=(OwnTerm(lambda *_: jnp.ones(()), 0.3, name="alive"),))
+    assert conditioned(rewards, {"alive": 0.25})["alive"] == pytest.approx(0.075)
 
 
 def test_configurations():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +23,7 @@ from drivax.evaluation.runner import (
 from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.store import ScenarioSet
+from drivax.tasks.conditions import fix_conditions, parse_values
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import zoo
 
@@ -55,6 +56,10 @@ class Evaluate(EvaluationConfig):  # noqa: D101
     filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     scenarios: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID|FILE")] = ()
     task: tyro.conf.Suppress[tyro.conf.Fixed[Task]] = field(default_factory=Task)
+    condition: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=NUMBER")
+    ] = ()
+    """Change a condition of a policy that was trained with conditions; repeat it to change several."""
     overwrite: bool = False
     """Replace OUT if it is a run folder."""
 
@@ -71,6 +76,7 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     data = ScenarioSet.open(args.data)
     first = load(args.data, 1, filters=args.filter, scenarios=args.scenarios)
     planner, task = find_planner(args.planner, first.bank, args.sample, requested_task)
+    task = replace(task, conditions=fix_conditions(task.conditions, parse_values(args.condition)))
     config = record_of(EvaluationConfig, args, task=task, metrics=metrics)
     results = run_evaluation(
         config, planner, data, args.out, traffic=traffic, sizes=first.sizes, overwrite=args.overwrite

@@ -90,12 +90,17 @@ class _EmptyTask:
     def first_action(self, history: Array, length: Any) -> Array:
         return PHYSICAL.first(history, length)
 
+    def draw_conditions(self, slot: Any, key: Any) -> tuple[()]:
+        return ()
+
     def observe(
         self, bank: ScenarioBank, context: AgentContext, frames: Any, frame: Frame
     ) -> Mapping[str, Any]:
         return {}
 
-    def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Array]:
+    def reward(
+        self, before: Facts, now: Facts, around: Surroundings, conditions: Any = ()
+    ) -> dict[str, Array]:
         return {}
 
     def check_end(self, bank: ScenarioBank, context: AgentContext, facts: Facts) -> tuple[Array, Array]:

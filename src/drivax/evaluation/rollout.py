@@ -24,6 +24,7 @@ from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import SimState, Traffic
+from drivax.tasks.conditions import fix_conditions
 from drivax.tasks.task import Task
 
 #: Folded into an episode's key to draw its start.
@@ -84,9 +85,10 @@ def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Arra
 
 
 def evaluation_task(task: Task) -> Task:
-    """Return the task for evaluation: all metrics, and episodes that last to the end of the log."""
+    """Return the task for evaluation: all metrics, no draws, and episodes that last to the end of the log."""
     own = task.metrics if isinstance(task.metrics, tuple) else ()
-    return replace(task, to_the_end=True, metrics=("full", *own))
+    conditions = fix_conditions(task.conditions)
+    return replace(task, to_the_end=True, metrics=("full", *own), conditions=conditions)
 
 
 def check_actions(planner: Planner, task: Task) -> None:

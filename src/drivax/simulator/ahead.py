@@ -55,6 +55,28 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 
     ``min_gap_m`` is the gap that the driver keeps at standstill; it stops 1 m before a stop line.
     """
+    leader_m, leader_mps, (path, on_route, offsets) = _leader(bank, context, frame)
+    # The driver stands min_gap_m behind a leader, but only STOP_SHORT_M before a line.
+    stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
+    gap = jnp.minimum(leader_m, stop)
+    leader = jnp.where(stop < leader_m, 0.0, leader_mps)
+    # Without a second point the route ends within 2 m.
+    desired = jnp.where(on_route[1], desired_speed(path, on_route, offsets), 0.0)
+    return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
+
+
+def leader_gap(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
+    """Return the gap to the nearest obstacle within 90 m on the route, m; infinite without one or without a route."""
+    return jnp.where(has_route(bank, context), _leader(bank, context, frame)[0], jnp.inf)
+
+
+def _leader(
+    bank: ScenarioBank, context: AgentContext, frame: Frame
+) -> tuple[Scalar, Scalar, tuple[Array, Array, Array]]:
+    """Return the gap to the nearest obstacle on the route (m; infinite for none), its speed along it, and the route.
+
+    The route is a triple: points ahead, whether each is on the route, and their distances along it, m.
+    """
     ego = frame.box[context.slot]
     offsets = jnp.arange(_POINTS) * _STEP_M
     path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
@@ -72,13 +94,7 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     gaps = jnp.where(blocks, along - half_length - ego[LENGTH] / 2, jnp.inf)
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
-    # The driver stands min_gap_m behind a leader, but only STOP_SHORT_M before a line.
-    stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
-    gap = jnp.minimum(gaps[nearest], stop)
-    leader = jnp.where(stop < gaps[nearest], 0.0, speed[nearest])
-    # Without a second point the route ends within 2 m.
-    desired = jnp.where(on_route[1], desired_speed(path, on_route, offsets), 0.0)
-    return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
+    return gaps[nearest], speed[nearest], (path, on_route, offsets)
 
 
 def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:

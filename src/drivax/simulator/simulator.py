@@ -53,7 +53,7 @@ class Simulator:
     def reset(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
     ) -> SimState:
-        """Return the state of agent ``slot`` at ``step`` of scenario ``index``; ``key`` draws a noisy start."""
+        """Return the state of agent ``slot`` at ``step`` of scenario ``index``; ``key`` draws start and conditions."""
         context = self.context(bank, index, step, slot, key)
         return self._initial_state(bank, context, alone(context))
 
@@ -71,12 +71,13 @@ class Simulator:
     def context(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
     ) -> AgentContext:
-        """Return the context at a step: logged, or drawn by ``start``."""
+        """Return the context at a step: logged, or drawn by ``start``; ``key`` also draws the task's conditions."""
         index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
         history, route_m = LogStart().begin(bank, index, step, slot)
         action = self.task.first_action(history, bank.length_m(index, slot))
         z, traffic = bank.agents[index, step, slot, AgentColumn.Z], self.traffic.start(bank, index, step)
-        context = AgentContext(index, step, slot, history, action, route_m, z, traffic)
+        conditions = self.task.draw_conditions(slot, key)
+        context = AgentContext(index, step, slot, history, action, route_m, z, traffic, conditions)
         if isinstance(self.start, LogStart):
             return context
         # Other starts avoid the agents around, whose rows the traffic model gives for the logged context.
@@ -227,7 +228,7 @@ class Simulator:
             bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
         )
         terminated, truncated = self.task.check_end(bank, situation.context, situation.facts)
-        terms = self.task.reward(before.facts, situation.facts, situation.surroundings)
+        terms = self.task.reward(before.facts, situation.facts, situation.surroundings, moved.conditions)
         final = terminated | truncated | (moved.step >= bank.last_step[moved.index])
         episode = self.task.episode_add(before.episode, situation, before.start, final)
         after = SimState(situation.context, situation.facts, contacts, lights, episode, before.start)

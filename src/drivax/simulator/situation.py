@@ -16,7 +16,7 @@ from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, DT_S
 from drivax.simulator import contact
-from drivax.simulator.ahead import has_route
+from drivax.simulator.ahead import has_route, leader_gap
 from drivax.simulator.contact import STOPPED_MPS, Contact
 from drivax.simulator.lights import check_lights
 from drivax.simulator.types import (
@@ -42,6 +42,8 @@ _RATE_STEPS = 5
 _SECOND, _STANDS_M = round(1.0 / DT_S), 0.5
 #: Facts that compare with the log's schedule.
 _SCHEDULE = frozenset({"late_m", "early_m", "completed"})
+#: Cap of time gaps, s.
+LONGEST_GAP_S = 10.0
 #: Facts that need fault classification, and those that need contacts.
 _FAULTS = frozenset({"at_fault", "collision_type", "ttc_s"})
 _CONTACTS = _FAULTS | {"collision", "ignored", "gap_m"}
@@ -178,13 +180,16 @@ def _requested_facts(
     strand: Any,
 ) -> dict[str, Array]:  # fmt: skip
     """Return the facts measured on request; those outside ``reads`` are zero."""
-    facts: dict[str, Array] = dict.fromkeys(("gap_m", "lag_m"), jnp.zeros(()))
+    facts: dict[str, Array] = dict.fromkeys(("gap_m", "lag_m", "time_gap_s"), jnp.zeros(()))
     facts |= dict.fromkeys(_SCHEDULE, jnp.zeros(()))
     if reads & _SCHEDULE:
         facts |= _schedule(bank, context)
     facts |= {"strand": jnp.int16(-1)} | dict.fromkeys(("lane_changed", "merged"), jnp.zeros((), bool))
     if "gap_m" in reads:
         facts["gap_m"] = contact.nearest_gap(frame, context.slot, codes == Contact.IGNORED)
+    if "time_gap_s" in reads:
+        speed = jnp.maximum(context.history[-1, MOTION_SPEED], STOPPED_MPS)
+        facts["time_gap_s"] = jnp.clip(leader_gap(bank, context, frame) / speed, 0.0, LONGEST_GAP_S)
     if "lag_m" in reads:
         me, logged = frame.box[context.slot], bank.agents[context.index, context.step, context.slot]
         facts["lag_m"] = jnp.sum((logged[AgentColumn.XY] - me[:2]) * me[2:4])

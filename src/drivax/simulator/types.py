@@ -36,6 +36,7 @@ class AgentContext:
         route_m: Arc length along the route to the goal, m; never decreases.
         z: Height of the box centre, m; follows the nearest lane.
         traffic: State of the traffic model; an empty tuple for log replay.
+        conditions: Numbers ``[*batch, C]`` of ``Task.conditions``; an empty tuple without any.
     """
 
     index: Int[Array, "*batch"]
@@ -46,6 +47,7 @@ class AgentContext:
     route_m: Float[Array, "*batch"]
     z: Float[Array, "*batch"]
     traffic: Any
+    conditions: Any = ()
 
 
 @record
@@ -85,7 +87,8 @@ class Facts:
     The others are measured only on request (``ON_REQUEST``): ``gap_m`` to the nearest agent, at most 50 m; ``lag_m``
     behind the log along the agent's heading (negative: ahead of it); ``late_m`` behind the log along the route, and
     ``early_m`` ahead of where the log is a second later (both negative in between); ``completed``: share of the log's
-    way from the current step to its end, in [0, 1], 1 if that is below 0.5 m; the lane ``strand`` of the agent
+    way from the current step to its end, in [0, 1], 1 if that is below 0.5 m; ``time_gap_s`` to the nearest obstacle
+    ahead on the route (bumper to bumper, over the agent's speed), at most 10 s; the lane ``strand`` of the agent
     (``scenario.bank.queries.lane_passage``), and whether it changed lanes or merged in this step.
     """
 
@@ -119,6 +122,7 @@ class Facts:
     late_m: Any = None
     early_m: Any = None
     completed: Any = None
+    time_gap_s: Any = None
     strand: Any = None
     lane_changed: Any = None
     merged: Any = None
@@ -126,7 +130,7 @@ class Facts:
 
 #: Facts measured only if requested by name.
 ON_REQUEST = frozenset(
-    {"gap_m", "lag_m", "late_m", "early_m", "completed", "strand", "lane_changed", "merged"}
+    {"gap_m", "lag_m", "late_m", "early_m", "completed", "time_gap_s", "strand", "lane_changed", "merged"}
 )
 #: Names of all other facts.
 FACTS = frozenset(field.name for field in fields(cast(Any, Facts))) - ON_REQUEST
@@ -261,14 +265,20 @@ class Task(Protocol):
         """Return the previous action at the start of an episode; its size is that of every action."""
         ...
 
+    def draw_conditions(self, slot: Any, key: Any) -> Any:
+        """Return the conditions of an agent's episode, drawn by ``key`` if there is one."""
+        ...
+
     def observe(
         self, bank: ScenarioBank, context: AgentContext, frames: Any, frame: Frame
     ) -> Mapping[str, Any]:
         """Return the observation of a context; ``frames(k)`` is the frame k steps ago, ``frame`` the present one."""
         ...
 
-    def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
-        """Return the weighted reward terms by name."""
+    def reward(
+        self, before: Facts, now: Facts, around: Surroundings, conditions: Any = ()
+    ) -> dict[str, Float[Array, ""]]:
+        """Return the weighted reward terms by name; ``conditions`` are those of the context."""
         ...
 
     def check_end(

@@ -10,6 +10,7 @@ from .intervals import effective_size as effective_size
 from .intervals import interquartile_bootstrap as interquartile_bootstrap
 from .intervals import interquartile_mean as interquartile_mean
 from .intervals import paired_bootstrap as paired_bootstrap
+from .intervals import per_event as per_event
 from .intervals import rate as rate
 from .intervals import wilson as wilson
 from .ranking import rank_correlation as rank_correlation

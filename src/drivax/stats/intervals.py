@@ -99,6 +99,21 @@ def rate(values: Any, clusters: Any = None, confidence: float = 0.95) -> Interva
     return Interval(p, interval.low, interval.high, n)
 
 
+def per_event(events: int, exposure: float, confidence: float = 0.95) -> Interval:
+    """Return the exposure per event, such as kilometres per collision, with the exact interval of a Poisson process.
+
+    The rate lies between the quantiles of gamma distributions of ``events`` and ``events + 1`` (Garwood, Biometrika
+    28, 1936). Without events only the lower bound is known.
+    """
+    if events < 0 or not exposure > 0.0:
+        raise UsageError(f"{events} events in {exposure} of exposure", cure="use positive exposure")
+    tail = (1.0 - confidence) / 2.0
+    low = exposure / float(special.gammaincinv(events + 1, 1.0 - tail))
+    if events == 0:
+        return Interval(None, low, None, 0)
+    return Interval(exposure / events, low, exposure / float(special.gammaincinv(events, tail)), events)
+
+
 def bootstrap_mean(
     values: Any, clusters: Any = None, confidence: float = 0.95, resamples: int = RESAMPLES,
     *, strata: Any = None, seed: int,

@@ -5,6 +5,7 @@ from .actions import Discrete as Discrete
 from .actions import Physical as Physical
 from .actions import Published as Published
 from .actions import Trajectory as Trajectory
+from .conditions import Condition as Condition
 from .features import Features as Features
 from .features import View as View
 from .observations import ObservationConfig as ObservationConfig

@@ -7,7 +7,7 @@ lanes, no route) is 0.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, make_dataclass
 from typing import Any, Literal, get_args
 
@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool
 from drivax.scenario.bank.scenario_bank import Scalar
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import FARTHEST_GAP_M, TTC_HORIZON_S
+from drivax.simulator.situation import LONGEST_GAP_S
 from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Surroundings
 from drivax.tasks.own import check_unique, name_of
 
@@ -40,6 +41,11 @@ _ROUTE_OFFSET_M, _URGENT_S = 1.0, 2.0
 _MAX_LOG_DISTANCE_M = 10.0
 #: The goal is reached within this distance, m (semantics, ``reached_goal``).
 _GOAL_M = 3.0
+#: Options of terms, and the largest value of each.
+OPTIONS = {
+    "collision_margin_m": FARTHEST_GAP_M, "ttc_s": TTC_HORIZON_S, "close_m": FARTHEST_GAP_M, "desired_speed": 2.0,
+    "time_gap_s": LONGEST_GAP_S,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ class RewardTerm:
     option: str | None = None
     softened: bool = False
 
-    def __call__(self, before: Facts, now: Facts, around: Surroundings, *option: float) -> Scalar:
+    def __call__(self, before: Facts, now: Facts, around: Surroundings, *option: Any) -> Scalar:
         """Return the term."""
         return self.function(before, now, around, *option)
 
@@ -234,6 +240,21 @@ def urgency(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     return now.ttc_defined * jnp.clip(1.0 - now.ttc_s / _URGENT_S, 0.0, 1.0)
 
 
+@reward_term("limit_mps", "speed_mps", option="desired_speed")
+def excess_speed(before: Facts, now: Facts, around: Surroundings, desired_speed: Any = 1.0) -> Scalar:
+    """Speed above ``desired_speed`` x the limit over the limit, in [0, 1]; 0 where no limit is known."""
+    known = now.limit_mps > 0
+    ratio = now.speed_mps / jnp.where(known, now.limit_mps, 1.0)
+    return known * jnp.clip(ratio - desired_speed, 0.0, 1.0)
+
+
+@reward_term("time_gap_s", "ttc_defined", option="time_gap_s")
+def time_gap_shortfall(before: Facts, now: Facts, around: Surroundings, time_gap_s: Any = 1.5) -> Scalar:
+    """Shortfall of the time gap to the obstacle ahead on the route from ``time_gap_s``, in [0, 1]; 0 while standing."""
+    shortfall = jnp.maximum(time_gap_s - now.time_gap_s, 0.0) / jnp.maximum(time_gap_s, 1e-3)
+    return now.ttc_defined * shortfall
+
+
 # 1 at the step at which a collision begins that is the agent's fault.
 _event_term("at_fault_collision", "at_fault")
 
@@ -297,6 +318,8 @@ class RewardConfig(_Weights):
         collision_margin_m: Gap below which ``collision`` counts (published safety margin: 0.5).
         ttc_s: Time to collision below which ``ttc`` counts (published safety margin: 0.95).
         close_m: Gap below which ``close`` counts.
+        desired_speed: Factor of the limit above which ``excess_speed`` counts.
+        time_gap_s: Time gap below which ``time_gap_shortfall`` counts.
         scale: Factor of all weighted terms.
         own: The user's terms.
     """
@@ -304,13 +327,14 @@ class RewardConfig(_Weights):
     collision_margin_m: float = 0.0
     ttc_s: float = 1.5
     close_m: float = 1.0
+    desired_speed: float = 1.0
+    time_gap_s: float = 1.5
     scale: float = 1.0
     own: tuple[OwnTerm, ...] = ()
 
     def __post_init__(self) -> None:
-        check_unique("rewards.own", [term.name for term in self.own], tuple(TERMS))
-        bounds = {"collision_margin_m": FARTHEST_GAP_M, "ttc_s": TTC_HORIZON_S, "close_m": FARTHEST_GAP_M}
-        for name, bound in bounds.items():
+        check_unique("rewards.own", [term.name for term in self.own], (*TERMS, *OPTIONS))
+        for name, bound in OPTIONS.items():
             if not 0.0 <= getattr(self, name) <= bound:
                 raise ValueError(f"{name} is {getattr(self, name)}; choose 0 to {bound:g}")
         if not 0.0 < self.scale < math.inf:
@@ -338,17 +362,22 @@ class RewardConfig(_Weights):
         reads |= {name: term.reads | factors for name, term in TERMS.items() if term.softened}
         return frozenset[str]().union(*(reads[name] for name in self.weights()))
 
-    def weigh(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Scalar]:
+    def weigh(
+        self, before: Facts, now: Facts, around: Surroundings, conditions: Mapping[str, Scalar] | None = None
+    ) -> dict[str, Scalar]:
         """Return the weighted and scaled terms by name, and what each soft factor takes from a term as ``TERM/FACTOR``.
 
-        The reward is the sum of all.
+        The reward is the sum of all. ``conditions`` are factors of terms and replacements of options, by name.
         """
+        conditions = conditions or {}
         own_terms = {term.name: term.term for term in self.own}
         result = {}
         for name, weight in self.weights().items():
             term = TERMS.get(name)
-            options = (getattr(self, term.option),) if term is not None and term.option is not None else ()
+            option = None if term is None else term.option
+            options = () if option is None else (conditions.get(option, getattr(self, option)),)
             value = self.scale * weight * (term or own_terms[name])(before, now, around, *options)
+            value = conditions[name] * value if name in conditions else value
             result[name] = value
             for factor, share in SOFT_FACTORS.items() if term is not None and term.softened else ():
                 loss = value * share * TERMS[factor](before, now, around)

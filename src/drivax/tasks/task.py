@@ -23,8 +23,16 @@ from drivax.simulator.types import (
     Surroundings,
 )
 from drivax.tasks.actions import ActionSpace, Physical, action_of, execute
+from drivax.tasks.conditions import (
+    Conditions,
+    by_name,
+    check_conditions,
+    draw_conditions,
+    scale_conditions,
+)
 from drivax.tasks.features import Frames
 from drivax.tasks.observations import Observation, ObservationConfig, observe
+from drivax.tasks.own import check_unique
 from drivax.tasks.rewards import RewardConfig
 
 Failure = Literal["collision", "offroad", "red_light"]
@@ -42,6 +50,8 @@ class Task:
         metrics: ``none``, ``training``, ``full``, or a list of sets, metrics and dotted names of custom metrics. Others
             are neither measured nor carried.
         ends: Failures that terminate an episode.
+        conditions: Numbers of the reward that training draws for each agent and episode, observed as group
+            ``conditions``; weights and options of the reward that it does not name are the same in all episodes.
         to_the_end: Whether episodes continue to the end of the log after a failure, as in evaluation.
     """
 
@@ -52,11 +62,15 @@ class Task:
     to_the_end: bool = False
     metrics: MetricNames = "full"
     hold: int = 1
+    conditions: Conditions = ()
 
     def __post_init__(self) -> None:
         select_metrics(self.metrics)
         if self.hold < 1:
             raise UsageError(f"task.hold is {self.hold}", cure="use 1 step or more")
+        check_conditions(self.conditions, self.rewards)
+        if self.conditions:
+            check_unique("observation.own", [group.name for group in self.observation.own], ("conditions",))
 
     @property
     def reads(self) -> frozenset[str]:
@@ -80,6 +94,10 @@ class Task:
         """Return the last action at the start of an episode."""
         return self.actions.first(history, length)
 
+    def draw_conditions(self, slot: Any, key: Any) -> tuple[()] | Float[Array, " C"]:
+        """Return the conditions of an agent's episode; without a key those of evaluation."""
+        return draw_conditions(self.conditions, slot, key)
+
     def observe(self, bank: ScenarioBank, context: AgentContext, frames: Frames, frame: Frame) -> Observation:
         """Return the observation of a context; ``frames`` returns earlier frames, ``frame`` is the present one."""
 
@@ -89,11 +107,16 @@ class Task:
                 return frames(back, slots)
             return frame if slots is None else frame.at(slots)
 
-        return observe(self.observation, bank, context, frames_with_present)
+        observation = observe(self.observation, bank, context, frames_with_present)
+        if self.conditions:
+            observation["conditions"] = scale_conditions(self.conditions, context.conditions)
+        return observation
 
-    def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
-        """Return weighted reward terms by name."""
-        return self.rewards.weigh(before, now, around)
+    def reward(
+        self, before: Facts, now: Facts, around: Surroundings, conditions: Any = ()
+    ) -> dict[str, Float[Array, ""]]:
+        """Return weighted reward terms by name; ``conditions`` are those of the context."""
+        return self.rewards.weigh(before, now, around, by_name(self.conditions, conditions))
 
     def check_end(
         self, bank: ScenarioBank, context: AgentContext, facts: Facts

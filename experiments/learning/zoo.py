@@ -1,0 +1,70 @@
+"""Put the policy of a trained seed into the zoo, with what it cost and how it drives on the validation split.
+
+python -m experiments.learning.zoo NAME PRESET --seed SEED --data BENCHMARK
+
+`presets.py train PRESET` has trained it and stored it in experiments/state/policies.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.runner import evaluate
+from drivax.learning.policies import export_policy, load_policy
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from experiments.learning.benchmark import POLICIES
+from experiments.learning.presets import TRAINING
+from experiments.repository import ROOT
+
+ZOO = ROOT / "src" / "drivax" / "zoo"
+METRICS = (
+    "success", "accuracy", "at_fault_collision", "collision", "offroad", "red_light", "vmax_score",
+    "progress_ratio", "comfortable", "ttc_ok", "lane_keeping",
+)  # fmt: skip
+COMMAND = "drivax train {} --seed {} --data BENCHMARK/train --validation BENCHMARK/validation --out RUN"
+
+
+def measure(seed: Path, validation: ScenarioSet) -> dict[str, Any]:
+    """Return the means of a policy's metrics on the validation split in log replay traffic."""
+    scenarios = list(validation)
+    bank = ScenarioBank.from_scenarios(scenarios)
+    planner, task = load_policy(seed, bank)
+    metrics = evaluate(planner, bank, scenario_names(scenarios), task=task).metrics
+    return {name: round(float(np.nanmean(metrics[name])), 4) for name in METRICS}
+
+
+def main() -> None:
+    """Export and measure one policy."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("name")
+    parser.add_argument("preset")
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--data", type=Path, required=True)
+    args = parser.parse_args()
+    seed, validation = (
+        POLICIES / args.preset / f"seed-{args.seed}",
+        ScenarioSet.open(args.data / "validation"),
+    )
+    seconds = json.loads((seed.parent / TRAINING).read_text())["seconds"][seed.name]
+    measured = {
+        "validation": {"scenarios": len(validation), "hash": validation.hash},
+        "training_core_s": seconds,
+        "ego": measure(seed, validation),
+    }
+    notes = {"command": COMMAND.format(args.preset, args.seed), "measured": measured}
+    bank = ScenarioBank.from_scenarios([validation[0]])
+    export_policy(seed, ZOO / args.name, bank, notes, overwrite=True)
+    print(json.dumps(measured["ego"]))
+
+
+if __name__ == "__main__":
+    main()

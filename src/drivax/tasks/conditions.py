@@ -1,0 +1,133 @@
+"""Conditions: numbers of the reward that differ between agents and episodes, and that the policy observes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from drivax.errors import UsageError, did_you_mean
+from drivax.scenario.bank.scenario_bank import Scalar
+from drivax.tasks.rewards import OPTIONS, TERMS, RewardConfig
+
+#: Separates the draws of conditions from those of starts, which split the same key.
+_STREAM = 0x636F6E64
+#: Bounds of options that conditions replace; the margin of collisions also decides which facts are measured.
+_OPTIONS = {name: bound for name, bound in OPTIONS.items() if name != "collision_margin_m"}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A factor of a reward term's weight, or an option of the reward, drawn for each agent and episode of training.
+
+    Draws are uniform. Evaluation, validation, logged steps and the Gymnasium adapter use ``value``.
+
+    Attributes:
+        name: A term of the reward, built-in or the user's; or an option: ``desired_speed``, ``time_gap_s``, ``ttc_s``
+            or ``close_m``.
+        low, high: Range of the draws.
+        value: The number in evaluation.
+        fixed: Whether training uses ``value`` too.
+    """
+
+    name: str
+    low: float
+    high: float
+    value: float = 1.0
+    fixed: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.low < self.high < math.inf:
+            problem = f"condition {self.name} from {self.low} to {self.high}"
+            raise UsageError(problem, cure="use 0 <= low < high")
+        if not self.low <= self.value <= self.high:
+            problem = f"condition {self.name}: value {self.value} is not in {self.low} to {self.high}"
+            raise UsageError(problem, cure="set a value in the range")
+
+
+#: Conditions of a task; columns of the observation group ``conditions`` are in this order.
+Conditions = tuple[Condition, ...]
+
+
+def check_conditions(conditions: Conditions, rewards: RewardConfig) -> None:
+    """Check that each condition changes the reward, once.
+
+    Raises:
+        UsageError: A condition has no effect, is beyond the bound of its option, or occurs twice.
+    """
+    weights, names = rewards.weights(), [condition.name for condition in conditions]
+    active = [term.option for name, term in TERMS.items() if name in weights]
+    options = {name: bound for name, bound in _OPTIONS.items() if name in active}
+    for name, high in ((condition.name, condition.high) for condition in conditions):
+        if name not in options and name not in weights:
+            cure = f"{did_you_mean(name, [*weights, *options])}, or add the term to rewards"
+            raise UsageError(f"condition {name}: not in the reward", cure=cure)
+        if high > options.get(name, math.inf):
+            raise UsageError(f"condition {name}: high is {high}", cure=f"use at most {options[name]:g}")
+        if names.count(name) > 1:
+            raise UsageError(f"condition {name} occurs twice", cure="name it once")
+
+
+def draw_conditions(conditions: Conditions, slot: Any, key: Any) -> tuple[()] | Float[Array, " C"]:
+    """Draw the numbers of an agent's episode; without a key they are those of evaluation."""
+    if not conditions:
+        return ()
+    values = jnp.array([condition.value for condition in conditions], jnp.float32)
+    if key is None:
+        return values
+    low, high = _ranges(conditions)
+    key = jax.random.fold_in(jax.random.fold_in(key, _STREAM), slot)
+    draws = jax.random.uniform(key, values.shape, minval=low, maxval=high)
+    return jnp.where(jnp.array([condition.fixed for condition in conditions]), values, draws)
+
+
+def scale_conditions(conditions: Conditions, values: Float[Array, " C"]) -> Float[Array, " C"]:
+    """Scale numbers to [-1, 1] by their ranges."""
+    low, high = _ranges(conditions)
+    return (2.0 * values - low - high) / (high - low)
+
+
+def _ranges(conditions: Conditions) -> Float[Array, "2 C"]:
+    """Return the lower and upper ends of the ranges."""
+    return jnp.array([(c.low, c.high) for c in conditions], jnp.float32).T
+
+
+def by_name(conditions: Conditions, values: Any) -> dict[str, Scalar]:
+    """Return the numbers by name."""
+    return {condition.name: values[column] for column, condition in enumerate(conditions)}
+
+
+def fix_conditions(conditions: Conditions, values: Mapping[str, float] | None = None) -> Conditions:
+    """Return the conditions without draws, with some numbers changed.
+
+    Raises:
+        UsageError: A number is out of range, or has no condition.
+    """
+    values = values or {}
+    names = [condition.name for condition in conditions]
+    for name in values:
+        if name not in names:
+            cure = did_you_mean(name, names) if names else "the policy was trained without conditions"
+            raise UsageError(f"there is no condition {name!r}", cure=cure)
+    return tuple(replace(c, value=values.get(c.name, c.value), fixed=True) for c in conditions)
+
+
+def parse_values(assignments: Sequence[str]) -> dict[str, float]:
+    """Parse ``NAME=NUMBER`` arguments.
+
+    Raises:
+        UsageError: An argument has another form.
+    """
+    values = {}
+    for assignment in assignments:
+        name, _, number = assignment.partition("=")
+        try:
+            values[name] = float(number)
+        except ValueError as error:
+            raise UsageError(f"condition {assignment!r} has no number", cure="write NAME=NUMBER") from error
+    return values
