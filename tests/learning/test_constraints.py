@@ -22,6 +22,8 @@ from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.settings import dump, load, parse_yaml
+from drivax.simulator.traffic.log import LogTraffic
+from drivax.tasks.conditions import Condition
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 from drivax.testing import check_algorithm
@@ -253,11 +255,17 @@ def test_constraints_after_cloning_pass_the_checks_of_algorithms():
 def test_mistakes_are_named():
     with pytest.raises(UsageError, match=r"no penalty 'failures'; did you mean 'failure'\?"):
         replace(PPO, constraints={"failures": 0.1}).build(Bandit(), (), 1)
-    with pytest.raises(UsageError, match="no penalty 'lag'; give that reward term a weight below 0"):
+    with pytest.raises(UsageError, match="no penalty 'lag'; give that term a weight below 0, and no cond"):
         replace(PPO, constraints={"lag": 0.1}).build(Bandit(), (), 1)
     for wrong in ({"constraints": {"failure": -0.1}}, {"multiplier_rate": -1.0}):
         with pytest.raises(ValueError, match="at least 0"):
             replace(PPO, **wrong)
+
+
+def test_a_weight_of_a_condition_is_no_penalty():
+    """It differs between episodes, so that a term over its weight is no cost."""
+    task = Task(rewards=RewardConfig(preset="pace"), conditions=(Condition("collision", 0.5, 2.0),))
+    assert set(TrainConfig(task=task).environment(LogTraffic()).penalties) == {"offroad", "red_light"}
 
 
 def test_configuration():

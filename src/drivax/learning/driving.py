@@ -85,8 +85,9 @@ class Driving:
 
     @property
     def penalties(self) -> dict[str, float]:
-        """Minus the weights of the reward's terms that are never positive."""
-        return self.task.rewards.penalties
+        """Minus the weights of the reward's terms that are never positive, and equal in all episodes."""
+        conditions = {condition.name for condition in self.task.conditions}
+        return {name: x for name, x in self.task.rewards.penalties.items() if name not in conditions}
 
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
         """Shapes of one observation by group."""

@@ -38,7 +38,9 @@ class Constraints:
         weights = getattr(environment, "penalties", {})
         for name in limits:
             if name not in weights:
-                cure = did_you_mean(name, weights, otherwise="give that reward term a weight below 0")
+                cure = did_you_mean(
+                    name, weights, otherwise="give that term a weight below 0, and no condition"
+                )
                 raise UsageError(f"constraints: the reward has no penalty {name!r}", cure=cure)
         return cls(limits, {name: weights[name] for name in limits}, rate)
 
