@@ -19,7 +19,10 @@ from drivax.scenario.record import record
 
 @record
 class Environments:
-    """State and observation of a batch of environments; where an episode is ``over``, the next step resets it."""
+    """State and observation of a batch of environments.
+
+    Where an episode is ``over``, the next step resets it, or waits (self-play): it is no step to learn from.
+    """
 
     #: The axis that counts environments, which several devices divide.
     environment_axis: ClassVar[int] = 0
@@ -90,7 +93,7 @@ class Environment(Protocol):
     def step(
         self, data: Any, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
     ) -> tuple[Environments, Outcome]:
-        """Step every environment, or reset it where its episode is over.
+        """Step every environment, or reset it (or wait) where its episode is over.
 
         A reset takes a step of its own, so every state that the policy sees, final states included, is observed once.
         """
@@ -99,7 +102,7 @@ class Environment(Protocol):
 
 @record
 class Rollout:
-    """Experience ``[time, batch]``. ``alive`` is false for steps that only reset an environment; mask them out.
+    """Experience ``[time, batch]``. ``alive`` is false where an episode was over before the step; mask it out.
 
     The successor of row t is in row t + 1, final states included; that of the last row is the environments' current
     state. Either ``observation`` or ``state`` (for the replay buffer) is kept, the other is None.
@@ -165,7 +168,7 @@ def collect(
         sampled = actor(now.observation, act_key)
         after, outcome = environment.step(data, now, cache, sampled[1], step_key)
         row = transition(environment, now, sampled, outcome, keep)
-        counts = {"episodes": after.over.sum(), "steps": row.alive.sum()}
+        counts = {"episodes": (after.over & row.alive).sum(), "steps": row.alive.sum()}
         totals = outcome.totals | {name: count.astype(jnp.float32) for name, count in counts.items()}
         return (after, outcome.cache, key), (row, totals)
 
