@@ -1,0 +1,126 @@
+"""Self-play: the policy in training drives several vehicles of a scenario, which see each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NoReturn
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.errors import UsageError
+from drivax.learning.driving import Driving, _draw, keep
+from drivax.learning.environment import Environments
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.simulator import Simulator, Step, is_driven, map_where
+from drivax.simulator.types import AgentContext, EpisodeStart, SimState
+
+
+@dataclass(frozen=True)
+class SelfPlayConfig:
+    """Settings of the traffic ``self``.
+
+    Attributes:
+        vehicles: Largest number of vehicles of a scenario that the policy drives, ego included.
+    """
+
+    vehicles: int = 4
+
+    def __post_init__(self) -> None:
+        if self.vehicles < 2:
+            raise UsageError(f"self_play.vehicles is {self.vehicles}", cure="use 2 or more")
+
+
+@dataclass(frozen=True)
+class SelfPlay(Driving):
+    """Driving in groups of environments, each a vehicle of the same scenario: the ego and further egos.
+
+    Groups are contiguous. A group starts at a random step, as logged. The episode of each vehicle ends by itself; the
+    vehicle then drives on without reward until all episodes of the group are over, and the group starts again in
+    another scenario. Environments without a vehicle, where a scenario has too few, are always over.
+    """
+
+    config: SelfPlayConfig = SelfPlayConfig()
+
+    def cache(self, data: ScenarioBank, state: SimState) -> Any:
+        """Return nothing: a step computes a single frame per group."""
+        return ()
+
+    def stored(self, state: SimState) -> NoReturn:
+        """Refuse replay buffers of states: an observation needs those of the whole group."""
+        refuse_stored_states("self")
+
+    def observe_all(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
+        """Observe the contexts of whole groups."""
+
+        def observe(group: AgentContext) -> dict[str, Array]:
+            return jax.vmap(lambda context: dict(self.simulator.observe(data, context, group)))(group)
+
+        return _flatten(jax.vmap(observe)(self._groups(stored)))
+
+    def _reset(self, data: ScenarioBank, key: Array, count: int) -> tuple[SimState, Bool[Array, " B"]]:
+        size = self.config.vehicles
+        if count % size:
+            cure = f"use a multiple of {size} (self_play.vehicles)"
+            raise UsageError(f"{count} environments of self-play", cure=cure)
+        index, step, keys = _draw(data, key, count // size, self.earliest_start)
+        slots = jax.vmap(partial(self._slots, data))(index, step, keys)
+        state = jax.vmap(self.simulator.reset_together, (None, 0, 0, 0))(data, index, slots, step)
+        state = _flatten(state)
+        return state, ~is_driven(data, state)
+
+    def _step_or_reset(
+        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
+    ) -> Step:
+        def new_episodes(index: Array, step: Array, key: Array) -> EpisodeStart:
+            slots = self._slots(data, index, step, key)
+            return jax.vmap(lambda slot: self.simulator.new_episode(data, index, step, slot))(slots)
+
+        states, actions, over = self._groups((now.state, action, now.over))
+        start = _draw(data, key, len(over), self.earliest_start, self.latest_start)
+        fresh = map_where(over.all(axis=1), new_episodes, *start)
+        step_all = jax.vmap(self.simulator.step_together, (None, 0, 0, 0, 0))
+        return _flatten(step_all(data, states, actions, over, fresh))
+
+    def _step_on(
+        self, data: ScenarioBank, state: SimState, action: Float[Array, "B D"], idle: Bool[Array, " B"]
+    ) -> Step:
+        states, actions, over = self._groups((state, action, idle))
+        after, result = jax.vmap(self.simulator.step_together, (None, 0, 0, 0))(data, states, actions, over)
+        return _flatten((keep(over.all(axis=1), states, after), result))
+
+    def _over(
+        self, data: ScenarioBank, state: SimState, over: Bool[Array, " B"], ends: Bool[Array, " B"]
+    ) -> Bool[Array, " B"]:
+        resets = jnp.repeat(self._groups(over).all(axis=1), self.config.vehicles)
+        return jnp.where(resets, ~is_driven(data, state), over | ends)
+
+    def _slots(self, bank: ScenarioBank, index: Array, step: Array, key: Array) -> Int[Array, " K"]:
+        """Return the slots of ego and of random further egos that the log has at a step; the rest is padding."""
+        moving = bank.agents.shape[2]
+        candidates = jnp.arange(1, moving)
+        present = bank.agents[index, step, 1:, AgentColumn.VALID] > 0
+        rank = jnp.where(present, jax.random.uniform(key, candidates.shape), jnp.inf)
+        order = jnp.argsort(rank)[: self.config.vehicles - 1]
+        slots = jnp.where(present, candidates, moving)[order]
+        padding = (1, self.config.vehicles - 1 - len(order))
+        return jnp.pad(slots, padding, constant_values=(0, moving)).astype(jnp.int32)
+
+    def _groups(self, tree: Any) -> Any:
+        """Return a batch of environments as groups."""
+        size = self.config.vehicles
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), tree)
+
+
+def _flatten(groups: Any) -> Any:
+    """Return groups as a batch of environments."""
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), groups)
+
+
+def refuse_stored_states(traffic: str) -> NoReturn:
+    """Raise UsageError: a replay buffer cannot store the states of this traffic."""
+    problem = f"a replay buffer cannot store the states of traffic {traffic}"
+    raise UsageError(problem, cure="set replay.store to observation")
