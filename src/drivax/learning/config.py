@@ -118,7 +118,7 @@ class TrainConfig:
 
     @property
     def validation_traffic(self) -> str:
-        """Traffic of validation: the log if training has it, else the largest share that is no self-play, else the log."""
+        """Traffic of validation: the log, or the largest share other than ``self`` of a training without it."""
         others = {name: share for name, share in self.shares.items() if name != SELF}
         return "log" if "log" in others else max(others, key=lambda name: others[name], default="log")
 

@@ -126,7 +126,7 @@ class Driving:
         return jax.vmap(self.simulator.now, (None, 0))(data, state.context)
 
     def step(
-        self, data: ScenarioBank, now: Environments, cache: Frame, action: Float[Array, "B D"], key: Array
+        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
     ) -> tuple[Environments, Outcome]:
         """Hold a decision for ``Task.hold`` steps in every environment, or reset it where its episode is over.
 

@@ -62,8 +62,8 @@ class Mixture:
             data = block.prepare(data)
             kept = [id(record) for record in getattr(data, "traffic", ())]
             if not all(id(record) in kept for record in before):
-                problem = f"traffic {name} cannot share the bank with a model of its kind"
-                raise UsageError(problem, cure="mix at most one trained policy, and one set of parameters of idm")
+                cure = "mix at most one trained policy, and one kind of reactive vehicles"
+                raise UsageError(f"traffic {name} replaces data of another traffic", cure=cure)
         return data
 
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
@@ -73,10 +73,8 @@ class Mixture:
     def start(self, data: ScenarioBank, key: Array, count: int) -> Environments:
         """Reset the environments of every block to random steps of their logs."""
         keys = jax.random.split(key, len(self.blocks))
-        sizes = self.sizes(count)
-        return _concatenate(
-            [block.start(data, *start) for (_, block), *start in zip(self.blocks, keys, sizes, strict=True)]
-        )
+        blocks = zip(self.blocks, keys, self.sizes(count), strict=True)
+        return _concatenate([block.start(data, key, size) for (_, block), key, size in blocks])
 
     def stored(self, state: Any) -> NoReturn:
         """Refuse replay buffers of states: those of the blocks differ."""

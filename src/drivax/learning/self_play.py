@@ -15,7 +15,7 @@ from drivax.learning.driving import Driving, _draw, keep
 from drivax.learning.environment import Environments
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.simulator import Simulator, Step, is_driven, map_where
+from drivax.simulator.simulator import Step, is_driven, map_where
 from drivax.simulator.types import AgentContext, EpisodeStart, SimState
 
 
@@ -49,7 +49,7 @@ class SelfPlay(Driving):
         """Return nothing: a step computes a single frame per group."""
         return ()
 
-    def stored(self, state: SimState) -> NoReturn:
+    def stored(self, state: Any) -> NoReturn:
         """Refuse replay buffers of states: an observation needs those of the whole group."""
         refuse_stored_states("self")
 
@@ -112,12 +112,12 @@ class SelfPlay(Driving):
     def _groups(self, tree: Any) -> Any:
         """Return a batch of environments as groups."""
         size = self.config.vehicles
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), tree)
+        return jax.tree.map(lambda leaf: leaf.reshape(len(leaf) // size, size, *leaf.shape[1:]), tree)
 
 
 def _flatten(groups: Any) -> Any:
     """Return groups as a batch of environments."""
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), groups)
+    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), groups)
 
 
 def refuse_stored_states(traffic: str) -> NoReturn:

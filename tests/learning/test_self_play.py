@@ -1,0 +1,167 @@
+"""Self-play: groups of vehicles that one policy drives, against a plain loop of ``step_together``."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.errors import UsageError
+from drivax.learning.environment import Environment, collect
+from drivax.learning.self_play import SelfPlay, SelfPlayConfig
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from scenes import bank_of, car, straight_road
+
+OBSERVATION = ObservationConfig(agents=24, steps=1, road=0, lights=1, route=2)
+SIMULATOR = Simulator(Task(observation=OBSERVATION, metrics=("steps", "collision")))
+EARLIEST, LATEST, VEHICLES, COUNT, STEPS = 4, 30, 3, 12, 130
+
+
+@pytest.fixture(scope="module")
+def bank(data):
+    return ScenarioBank.from_scenarios(data)
+
+
+@pytest.fixture(scope="module")
+def environment():
+    return SelfPlay(SIMULATOR, LATEST, EARLIEST, SelfPlayConfig(VEHICLES))
+
+
+def swerve(key):
+    """Actions of all environments: most of them leave the road sooner or later."""
+    return jnp.tanh(jnp.asarray([0.3, 0.15]) * jax.random.normal(key, (COUNT, 2)))
+
+
+@pytest.fixture(scope="module")
+def experience(bank, environment):
+    """States before every step and after the last, actions, and results of every step."""
+
+    @jax.jit
+    def run(bank):
+        now = environment.start(bank, jax.random.key(0), COUNT)
+
+        def step(now, key):
+            action = swerve(key)
+            after, outcome = environment.step(bank, now, (), action, key)
+            return after, (now, action, outcome)
+
+        return jax.lax.scan(step, now, jax.random.split(jax.random.key(1), STEPS))
+
+    _, rows = jax.device_get(run(bank))
+    return rows
+
+
+def grouped(leaf):
+    """[time, group, vehicle, ...]"""
+    return leaf.reshape(STEPS, COUNT // VEHICLES, VEHICLES, *leaf.shape[2:])
+
+
+def test_self_play_is_an_environment(bank, environment):
+    assert isinstance(environment, Environment) and environment.action_size == 2
+    with pytest.raises(UsageError, match=r"10 environments of self-play; use a multiple of 3"):
+        environment.start(bank, jax.random.key(0), 10)
+    with pytest.raises(UsageError, match=r"vehicles is 1; use 2 or more"):
+        SelfPlayConfig(1)
+    with pytest.raises(UsageError, match=r"cannot store the states of traffic self; set replay.store"):
+        environment.stored(())
+
+
+def test_groups_reset_once_when_all_episodes_are_over(bank, experience):
+    now, _, outcome = experience
+    over, ends = grouped(now.over), grouped(outcome.terminated | outcome.truncated)
+    index, step = grouped(now.state.context.index), grouped(now.state.context.step)
+    slot = grouped(now.state.context.slot)
+    moving = bank.agents.shape[2]
+    # A group is in one scenario, at one step; ego is its first vehicle, and no vehicle is there twice.
+    assert (index == index[..., :1]).all() and (step == step[..., :1]).all() and (slot[..., 0] == 0).all()
+    assert all(
+        len({s for s in row if s < moving}) == (row < moving).sum() for row in slot.reshape(-1, VEHICLES)
+    )
+    resets = over.all(axis=2)[:-1]
+    assert resets.sum() >= 4 and len(np.unique(index)) == 3
+    np.testing.assert_array_equal(step[1:, :, 0] == step[:-1, :, 0] + 1, ~resets)
+    begun = step[1:, :, 0][resets]
+    assert (begun >= EARLIEST).all() and (begun <= LATEST).all()
+    # An episode that ended stays over until its group starts again; only padding is over from the start.
+    expected = np.where(resets[..., None], slot[1:] >= moving, over[:-1] | ends[:-1])
+    np.testing.assert_array_equal(over[1:], expected)
+    assert not (ends & over).any() and not (grouped(outcome.reward) * over).any()
+    # Some drive on after their end.
+    assert (over[:-1] & ~resets[..., None] & (slot[:-1] < moving)).sum() > 50
+
+
+def test_groups_step_as_a_plain_loop_of_step_together(bank, environment, experience):
+    now, action, outcome = experience
+    over, slots = grouped(now.over), grouped(now.state.context.slot)
+    index, step = grouped(now.state.context.index), grouped(now.state.context.step)
+    begins = [(0, group) for group in range(COUNT // VEHICLES)]
+    begins += [(time + 1, group) for time, group in np.argwhere(over.all(axis=2)[:-1])]
+    reset, one = jax.jit(SIMULATOR.reset_together), jax.jit(SIMULATOR.step_together)
+    observe = jax.jit(SIMULATOR.observe_together)
+    history, reward = grouped(now.state.context.history), grouped(outcome.reward)
+    seen = {name: grouped(value) for name, value in now.observation.items()}
+    for first, group in begins:
+        states = reset(bank, index[first, group, 0], slots[first, group], step[first, group, 0])
+        dead = slots[first, group] >= bank.agents.shape[2]
+        for time in range(first, STEPS):
+            np.testing.assert_allclose(states.context.history, history[time, group], atol=1e-3)
+            observation = observe(bank, states)
+            for name, value in seen.items():
+                np.testing.assert_allclose(observation[name], value[time, group], atol=1e-3, err_msg=name)
+            np.testing.assert_array_equal(dead, over[time, group])
+            if dead.all():
+                break
+            states, result = one(bank, states, grouped(action)[time, group], dead)
+            np.testing.assert_allclose(result.reward, reward[time, group], atol=1e-3)
+            dead = dead | np.asarray(result.terminated | result.truncated)
+
+
+def test_vehicles_of_a_group_see_each_other_where_they_drive(bank, experience):
+    """Positions in the observation against a rotation by hand, of vehicles that left their log."""
+    now, _, _ = experience
+    rows, mask = grouped(now.observation["agents"]), grouped(now.observation["agents_mask"])
+    history, slot = grouped(now.state.context.history), grouped(now.state.context.slot)
+    step, index = (grouped(getattr(now.state.context, name)) for name in ("step", "index"))
+    moving, compared, off_log = bank.agents.shape[2], 0, 0.0
+    for time in range(0, STEPS, 5):
+        for group in range(COUNT // VEHICLES):
+            x, y, heading = history[time, group, :, -1, :3].T
+            for me, other in ((0, 1), (1, 0), (1, 2), (2, 1)):
+                if max(slot[time, group, [me, other]]) >= moving:
+                    continue
+                dx, dy = x[other] - x[me], y[other] - y[me]
+                cos, sin = np.cos(heading[me]), np.sin(heading[me])
+                relative = np.array([cos * dx + sin * dy, cos * dy - sin * dx])
+                if np.abs(relative).max() > 40.0:
+                    continue
+                positions = rows[time, group, me][..., -1, :2][mask[time, group, me][..., -1] > 0] * 50.0
+                assert np.abs(positions - relative).max(axis=-1).min() < 0.05
+                logged = bank.agents[
+                    index[time, group, 0], step[time, group, 0], slot[time, group, other], :2
+                ]
+                off_log = max(off_log, float(np.hypot(*(np.array([x[other], y[other]]) - logged))))
+                compared += 1
+    assert compared > 50 and off_log > 5.0
+
+
+def test_padding_is_never_alive():
+    """Two cars in groups of four: half of the rows are dead, and nothing in them is infinite or missing."""
+    bank = bank_of(straight_road([car(0, 0, 0, 10), car(40, 0, 0, 10)]))
+    simulator = Simulator(Task(observation=OBSERVATION, metrics=("steps",)))
+    environment = SelfPlay(simulator)
+
+    def actor(observation, key):
+        return jnp.zeros((8, 2)), jnp.zeros((8, 2)), {}
+
+    environments = jax.jit(environment.start, static_argnums=2)(bank, jax.random.key(0), 8)
+    run = jax.jit(partial(collect, environment, actor=actor, key=jax.random.key(1), steps=90))
+    _, rollout, totals = run(bank, environments)
+    alive = np.asarray(rollout.alive).reshape(90, 2, 4)
+    assert not alive[:, :, 2:].any() and alive[:, :, :2].sum() == totals["steps"] > 200
+    # Each car to the end of the log, once: the reset is no step, and padding ends no episode.
+    assert totals["episodes"] == totals["steps/n"] == 4
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rollout.observation))
