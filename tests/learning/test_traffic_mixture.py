@@ -64,7 +64,7 @@ def test_a_block_without_environments_is_refused():
         UsageError, match=r"traffic idm has a share of 0.1 of 4 environments: none; raise alg"
     ):
         mixture.sizes(4)
-    with pytest.raises(UsageError, match="traffic log has a share of 0.2 of 4"):
+    with pytest.raises(UsageError, match=r"traffic log has a share of 0\.2 of 4"):
         training_environment(CONFIG).sizes(4)
 
 
