@@ -9,7 +9,7 @@ import pytest
 
 from drivax.scenario.bank.strands import NOWHERE_M, corridor_lanes, lane_strands
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.schema import CAPACITIES
+from drivax.scenario.schema import CAPACITIES, stack_field
 from drivax.synthetic.world import generate_recording
 
 from .recordings import arc, driving, edge, lane, line, make_recording, make_tracks
@@ -137,7 +137,9 @@ def test_a_scenario_without_lanes_has_an_empty_table():
 
 def test_corridor_reaches_all_neighbours_of_the_route():
     scenarios = [assemble(generate_recording(8, i)) for i in range(6)]
-    corridors = corridor_lanes([scenario.record for scenario in scenarios])
+    records = [scenario.record for scenario in scenarios]
+    route = (stack_field(records, f"route_{name}", 0) for name in ("lane", "points"))
+    corridors = corridor_lanes(records, *route)
     for scenario, corridor in zip(scenarios, corridors, strict=True):
         member, queue = set(), set(scenario.route_lane[0, : scenario.route_points[0]].tolist())
         while queue := {lane for lane in queue if lane >= 0} - member:

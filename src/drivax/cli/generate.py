@@ -63,6 +63,8 @@ class Generate:  # noqa: D101
     """Padded sizes; sets that are used together need the same."""
     future_s: float = 8.0
     """Seconds of a scenario after its current step, 8 to 60; 15 in nuPlan's challenges."""
+    egos: int = 1
+    """Vehicles per scenario with a route and a goal, 1 to 8, which training with `egos: moving` drives."""
     split: str | None = None
     """Write lists for train/validation/test to OUT/splits, by map: percentages, as 80/10/10."""
     overwrite: bool = False
@@ -81,6 +83,7 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
         workers=args.workers if args.workers is not None else os.cpu_count() or 1,
         capacity=args.capacity,
         future_s=args.future_s,
+        egos=args.egos,
         overwrite=args.overwrite,
         world=world,
     )

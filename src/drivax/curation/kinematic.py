@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.curation.logged import LOG_ROUTE, LoggedScenario
+from drivax.curation.logged import LoggedScenario
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, wrap
@@ -77,7 +77,7 @@ class KinematicConfig:
         return {
             "urgency": _urgencies(self, log),
             "braking": jnp.clip(_required_braking_of_log(bank, log) / self.full_braking_mps2, 0.0, 1.0),
-            "volatility": _volatility(self, log, bank.last_step[log.index]),
+            "volatility": _volatility(self, log, bank.last_step[log.context.row[0]]),
             "off_road": _edge_nearness(self, bank, log),
             "lane_deviation": _deviation(self, bank, log),
             "density": crowding(log, self.crowd),
@@ -116,9 +116,7 @@ def required_braking(
 
     def project_at(offset_m: float) -> Any:
         centre_m = along_m + offset_m
-        return jax.vmap(
-            lambda point: queries.project_on_route(bank, index, point, centre_m, route=LOG_ROUTE)
-        )(xy)
+        return jax.vmap(lambda point: queries.project_on_route(bank, index, point, centre_m, logged=True))(xy)
 
     # Outside its window a projection is an end point, so use the nearer projection.
     near, far = map(project_at, _WINDOWS_M)

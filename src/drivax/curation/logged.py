@@ -22,8 +22,6 @@ from drivax.simulator.contact import overlaps
 from drivax.simulator.traffic.log import alone, frame_of
 from drivax.simulator.types import HISTORY, AgentContext, Frame
 
-#: Index into ``bank.routes`` of the logged route.
-LOG_ROUTE = 1
 #: Scenarios per batch.
 BATCH = 64
 #: Called with (scenarios done, scenarios).
@@ -87,7 +85,8 @@ def read_log(bank: ScenarioBank, index: Int[Array, ""]) -> LoggedScenario:
 def _context(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> AgentContext:
     history = jnp.zeros((HISTORY, 4)) if motion is None else jnp.broadcast_to(motion, (HISTORY, 4))
     z, zero = bank.agents[index, step, 0, AgentColumn.Z], jnp.zeros(())
-    return AgentContext(index, step, jnp.int32(0), history, jnp.zeros(2), zero, z, ())
+    row = bank.row_of(index, 0) if bank.most_egos > 1 else None
+    return AgentContext(index, step, jnp.int32(0), history, jnp.zeros(2), zero, z, (), row)
 
 
 def _ignored_agents(overlapping: Bool[Array, "T S"], valid: Bool[Array, "T S"]) -> Bool[Array, "T S"]:
@@ -104,7 +103,7 @@ def _along_route(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, "T 
     def step(along: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
         # Search only as far as the car can have moved, as the simulator does.
         point, distance = inputs
-        projection = project_on_route(bank, index, point, along, 1.5 * distance + 2.0, route=LOG_ROUTE)
+        projection = project_on_route(bank, index, point, along, 1.5 * distance + 2.0, logged=True)
         along = jnp.maximum(along, projection.along_m)
         return along, along
 

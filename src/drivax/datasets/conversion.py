@@ -54,6 +54,8 @@ class Conversion:
         routes: How to find routes: our generator, or the published breadth-first search.
         future_s: Seconds of a scenario after its current step, 8 in WOMD, 15 in nuPlan's challenges; longer
             recordings become windows, shorter ones end earlier.
+        egos: Vehicles per scenario with a route and a goal, 1 to 8: the recorded ego and moving vehicles near it, which
+            training with `egos: moving` drives.
         stride: Steps between the starts of two windows of a longer recording.
         split: Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10.
         workers: Processes that read; 1 reads in the main process.
@@ -68,6 +70,7 @@ class Conversion:
     filters: tuple[str, ...] = ()
     routes: RouteStyle = "graph"
     future_s: float = 8.0
+    egos: int = 1
     stride: int = STRIDE
     split: str | None = None
     workers: int = 1
@@ -92,7 +95,7 @@ class Conversion:
     @property
     def sizes(self) -> Capacity:
         """Padded sizes of a scenario of this length."""
-        return CAPACITIES[self.capacity].lasting(self.future_s)
+        return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
 
     @property
     def shares(self) -> Shares | None:
@@ -105,8 +108,8 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
 
     Args:
         path: The file.
-        options: ``format``, ``capacity``, ``future_s``, ``routes``, ``stride`` and, without filters, ``limit`` are
-            used.
+        options: ``format``, ``capacity``, ``future_s``, ``egos``, ``routes``, ``stride`` and, without filters,
+            ``limit`` are used.
     """
     try:
         reader = detect(path) if options.format == AUTO else find_reader(options.format)
@@ -252,7 +255,18 @@ def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, A
     digest = hashlib.sha256()
     for entry in data.inputs:
         digest.update(f"{data.relative(entry.path)}\t{entry.path.stat().st_size}\t{entry.format}\n".encode())
-    names = ("format", "capacity", "future_s", "limit", "filters", "routes", "stride", "split", "shard_size")
+    names = (
+        "format",
+        "capacity",
+        "future_s",
+        "egos",
+        "limit",
+        "filters",
+        "routes",
+        "stride",
+        "split",
+        "shard_size",
+    )
     return {
         "drivax": metadata.version("drivax"),
         "schema": SCHEMA_VERSION,

@@ -140,7 +140,7 @@ def observation_statistics(
     observations = {name: np.asarray(leaf) for name, leaf in samples.observation.items()}
     hit, collides = np.asarray(samples.hit), np.asarray(samples.collides)
     context = samples.state.context
-    in_log = np.asarray(context.step < bank.last_step[context.index])
+    in_log = np.asarray(context.step < bank.last_step[context.row])
     columns, groups, permuted = {}, {}, 0
     if permute:
         candidates = np.flatnonzero(in_log)
@@ -235,7 +235,7 @@ def _episode(
 
     def step(loop_state: Any, key: Array) -> tuple[Any, None]:
         state, carry, hit = loop_state
-        is_over = state.context.step >= bank.last_step[index]
+        is_over = state.context.step >= bank.last_step[state.context.row]
         next_state, carry, _ = advance(simulator, planner, bank, state, carry, key)
         state = jax.tree.map(partial(jnp.where, is_over), state, next_state)
         return (state, carry, hit | state.facts.collision), None

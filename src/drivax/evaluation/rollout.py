@@ -133,7 +133,7 @@ def _step(
 ) -> tuple[_Loop, _StepOutput]:
     """Advance one episode; after the last step of its log, its state stays."""
     state, context = loop.state, loop.state.context
-    is_over = context.step >= bank.last_step[context.index]
+    is_over = context.step >= bank.last_step[context.row]
     after, carry, is_finite = advance(simulator, planner, bank, state, loop.carry, key)
     state = jax.tree.map(partial(jnp.where, is_over), state, after)
     all_finite = loop.all_finite & (is_finite | is_over)

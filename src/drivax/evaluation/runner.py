@@ -267,7 +267,7 @@ def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
         problem = f"{len(names)} scenario names for a bank of {len(bank)}"
         raise UsageError(problem, cure="name every scenario of the bank")
     present = np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0
-    _check_starts(names, np.asarray(bank.last_step) + 1, present, start_step)
+    _check_starts(names, np.asarray(bank.last_step[:: bank.most_egos]) + 1, present, start_step)
     return names
 
 

@@ -77,12 +77,13 @@ class Metric(Column):
 
 @record
 class EpisodeEnd:
-    """End of an episode: its scenario, start step, and number of steps."""
+    """End of an episode: its scenario, start step, number of steps, and row of its route in the bank."""
 
     bank: ScenarioBank
     index: Int[Array, ""]
     start: Int[Array, ""]
     steps: Int[Array, ""]
+    row: Int[Array, ""]
 
 
 #: Values of a metric's inputs by name.
@@ -122,17 +123,17 @@ def _steps(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
 
 
 def _last_step(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    return Value(end.bank.last_step[end.index].astype(jnp.float32), jnp.ones((), bool))
+    return Value(end.bank.last_step[end.row].astype(jnp.float32), jnp.ones((), bool))
 
 
 def _progress(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    start = end.bank.log_progress[end.index, end.start]
+    start = end.bank.log_progress[end.row, end.start]
     return Value(jnp.where(end.steps > 0, value.value - start, 0.0), value.defined)
 
 
 def _progress_ratio(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    log_progress = end.bank.log_progress[end.index]
-    log_gain = log_progress[end.bank.last_step[end.index]] - log_progress[end.start]
+    log_progress = end.bank.log_progress[end.row]
+    log_gain = log_progress[end.bank.last_step[end.row]] - log_progress[end.start]
     gain = inputs["progress"]
     ratio = jnp.where(log_gain < 0.5, 1.0, jnp.clip(gain.value / jnp.maximum(log_gain, 0.5), 0.0, 1.0))
     return Value(ratio, gain.defined)
@@ -168,7 +169,7 @@ def _success(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
 
 
 def _success_moving(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    moves = end.bank.log_ahead[end.index, end.start] > 5.0
+    moves = end.bank.log_ahead[end.row, end.start] > 5.0
     return Value(inputs["success"].value, inputs["success"].defined & moves)
 
 

@@ -17,6 +17,7 @@ from drivax.metrics.steps import STEP_VALUES, Moment, StepValue, Value
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import Flag
+from drivax.simulator.ahead import has_route
 from drivax.simulator.types import SimState, Situation
 
 _NEVER = 32767
@@ -148,7 +149,7 @@ def _stack(scalars: Sequence[Array], kind: type) -> Array:
 def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
     """Return the selected metrics of the episode that ended in ``state``; undefined metrics have the value 0."""
     context, episode = state.context, state.episode
-    end = EpisodeEnd(bank, context.index, state.start, context.step - state.start)
+    end = EpisodeEnd(bank, context.index, state.start, context.step - state.start, context.row)
     result: dict[str, Value] = {}
     for name, metric in episode.selection.metrics:
         value = _accumulated_value(episode, metric)
@@ -160,10 +161,10 @@ def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
 
 
 def _has(bank: ScenarioBank, state: SimState, needs: Flag) -> Bool[Array, ""]:
-    """Return whether the scenario has the flags that a metric needs; only ego has a route."""
-    required = jnp.uint32(int(needs))
+    """Return whether the scenario has the flags that a metric needs, and the agent the route."""
+    required = jnp.uint32(int(needs & ~Flag.ROUTE))
     has_flags = (bank.flags[state.context.index] & required) == required
-    return has_flags & ((Flag.ROUTE not in needs) | (state.context.slot == 0))
+    return has_flags & ((Flag.ROUTE not in needs) | has_route(bank, state.context))
 
 
 def _accumulated_value(episode: Episode, metric: Metric) -> Value:

@@ -26,7 +26,7 @@ def logged_motion(bank: ScenarioBank, context: AgentContext, steps: int) -> Moti
 
     After the end of the log, the motion continues at constant velocity.
     """
-    step, last = context.step + steps, bank.last_step[context.index]
+    step, last = context.step + steps, bank.last_step[context.row]
     state = bank.agents[context.index, jnp.minimum(step, last), context.slot]
     heading, velocity = state[AgentColumn.HEADING], state[AgentColumn.VELOCITY]
     speed = jnp.maximum(jnp.sum(velocity * heading), 0.0)
@@ -130,8 +130,8 @@ class IdmPlanner(RuleBased):
         box, speed = frame.box[context.slot], context.history[-1, MOTION_SPEED]
         obstacles = ahead(bank, context, frame, self.parameters.min_gap_m)
         # Route points are 1 m apart.
-        remaining_m = bank.route_points[context.index, 0] - 1 - context.route_m
+        remaining_m = bank.route_points[context.row] - 1 - context.route_m
         distance_m = jnp.minimum(lookahead_m(speed), jnp.maximum(remaining_m, 0.0))
-        points, _ = route_ahead(bank, context.index, context.route_m, distance_m[None])
+        points, _ = route_ahead(bank, context.row, context.route_m, distance_m[None])
         curvature = pursuit(box, points[0, RouteColumn.XY] - box[:2])
         return obstacles.acceleration(speed, self.parameters), curvature

@@ -27,6 +27,8 @@ CURRENT_STEP = 10
 DT_S = 0.1
 #: Fewest steps of a log that is evaluated or trained on: 20 follow the current one (semantics, Time).
 LEAST_STEPS = CURRENT_STEP + 1 + 20
+#: Most egos of a scenario: a bank holds a bit per ego and lane (``scenario.bank.columns.LaneRow``).
+MOST_EGOS = 8
 
 
 class AgentKind(enum.IntEnum):
@@ -125,7 +127,10 @@ class Flag(enum.IntFlag):
 
 @dataclass(frozen=True)
 class Capacity:
-    """Padded sizes of a stored scenario; items that do not fit are counted in ``overflow``."""
+    """Padded sizes of a stored scenario; items that do not fit are counted in ``overflow``.
+
+    ``egos`` counts the vehicles with a route and a goal, the recorded ego included.
+    """
 
     name: str = "default"
     agents: int = 80
@@ -146,6 +151,7 @@ class Capacity:
     #: Longest contiguous run of grid-sorted segments that a query reads per row of three cells.
     edge_run: int = 96
     lane_run: int = 160
+    egos: int = 1
 
     def lasting(self, future_s: float) -> Capacity:
         """Return the capacity of scenarios with this many seconds after the current step, 2 to 60.
@@ -164,6 +170,16 @@ class Capacity:
         name = f"{self.name}-{(steps - CURRENT_STEP - 1) * DT_S:g}s"
         return replace(self, name=name, steps=steps, route_points=points)
 
+    def with_egos(self, egos: int) -> Capacity:
+        """Return the capacity of scenarios with routes for up to 1 to 8 egos.
+
+        Raises:
+            UsageError: ``egos`` is out of range.
+        """
+        if not 1 <= egos <= MOST_EGOS:
+            raise UsageError(f"egos is {egos}", cure=f"use 1 to {MOST_EGOS}")
+        return replace(self, name=f"{self.name}-{egos}egos", egos=egos) if egos > 1 else self
+
 
 CAPACITIES = {
     "default": Capacity(),
@@ -180,7 +196,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
     t, a, p, s, m, n = c.steps, c.agents, c.parked, c.segments, c.features, c.lanes
     k, r, o, lt, st = c.routes, c.route_points, c.road_rows, c.lights, c.stops
     cells = c.grid * c.grid
-    return {
+    fields: dict[str, tuple[str, tuple[int, ...]]] = {
         # Longer names are shortened (stored_name); the manifest has them in full.
         "scenario_id": ("S64", ()), "dataset": ("S16", ()), "segment": ("S64", ()), "origin": ("f8", (3,)),
         "dt_s": ("f4", ()), "current_step": ("i2", ()), "steps": ("i2", ()), "flags": ("u4", ()),
@@ -226,6 +242,19 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
         # Labels of the built-in world.
         "event_kind": ("i1", (c.events,)), "event_start": ("i2", (c.events,)),
         "event_end": ("i2", (c.events,)), "event_actor": ("i4", (c.events, 4)),
+    }  # fmt: skip
+    return fields | _ego_fields(c.egos - 1, t, r) if c.egos > 1 else fields
+
+
+def _ego_fields(egos: int, steps: int, points: int) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Return the fields of the egos after the recorded one: slot, last step, and route to the goal as for ego."""
+    return {
+        "ego_slot": ("i2", (egos,)), "ego_last_step": ("i2", (egos,)),
+        "ego_on_lanes": ("?", (egos,)),  # otherwise the route is the logged path (privileged)
+        "ego_route_xy": ("f4", (egos, points, 2)), "ego_route_z": ("f4", (egos, points)),
+        "ego_route_heading": ("f4", (egos, points)), "ego_route_lane": ("i2", (egos, points)),
+        "ego_route_limit": ("f4", (egos, points)), "ego_route_points": ("i2", (egos,)),
+        "ego_goal_xy": ("f4", (egos, 2)), "ego_log_progress": ("f4", (egos, steps)),
     }  # fmt: skip
 
 

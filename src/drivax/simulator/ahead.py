@@ -12,7 +12,6 @@ from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
-from drivax.scenario.schema import Flag
 from drivax.simulator.contact import others_on_level
 from drivax.simulator.dynamics import pursuit
 from drivax.simulator.idm import IdmParameters, idm_acceleration
@@ -57,7 +56,7 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     """
     ego = frame.box[context.slot]
     offsets = jnp.arange(_POINTS) * _STEP_M
-    path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
+    path, on_route = route_ahead(bank, context.row, context.route_m, offsets)
     # Only the closest agents near the route are measured against all of its points.
     nodes = jnp.where(on_route[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
@@ -84,7 +83,8 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
     """Return the distance from the front bumper to the nearest stop line that requires a stop, m; infinite for none."""
     line, state = bank.light_line[context.index], frame.lights
-    front = line[LightRow.ARC] - context.route_m - frame.box[context.slot, LENGTH] / 2
+    arc = line[LightRow.ARC + bank.ego_number(context.row)]
+    front = arc - context.route_m - frame.box[context.slot, LENGTH] / 2
     speed = context.history[-1, MOTION_SPEED]
     can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
     stops = (is_red(state) | (is_yellow(state) & can_stop)) & (front > 0.0) & (front < _POINTS * _STEP_M)
@@ -125,7 +125,7 @@ def project(
 
 def has_route(bank: ScenarioBank, context: AgentContext) -> Bool[Array, ""]:
     """Whether the driven agent has a route on lanes; if not, the bank holds the logged path, which is privileged."""
-    return ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
+    return bank.on_lanes[context.row] & (context.slot == bank.ego_slot(context.row))
 
 
 def lookahead_m(speed: Scalar) -> Scalar:
@@ -159,9 +159,9 @@ def _route_aim(bank: ScenarioBank, context: AgentContext) -> tuple[Vector, Vecto
     """
     motion, zero = context.history[-1], jnp.zeros(())
     distance_m = lookahead_m(motion[MOTION_SPEED])
-    remaining_m = bank.route_points[context.index, 0] - 1 - context.route_m
+    remaining_m = bank.route_points[context.row] - 1 - context.route_m
     on_route_m = jnp.clip(remaining_m, 0.0, distance_m)
-    points, _ = route_ahead(bank, context.index, context.route_m, on_route_m[None])
+    points, _ = route_ahead(bank, context.row, context.route_m, on_route_m[None])
     direction = points[0, RouteColumn.HEADING] / jnp.maximum(norm(points[0, RouteColumn.HEADING]), 1e-6)
     xy = points[0, RouteColumn.XY] + (distance_m - on_route_m) * direction - motion[:2]
     cos, sin = jnp.cos(motion[MOTION_HEADING]), jnp.sin(motion[MOTION_HEADING])

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN
-from drivax.scenario.bank.columns import LightRow
+from drivax.scenario.bank.columns import NEVER_M, LightRow
 from drivax.scenario.bank.queries import light_crossing
-from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import LightState
 from drivax.simulator.types import MOTION_SPEED, AgentContext, LightMemory
 
@@ -58,7 +58,7 @@ def check_lights(
     """
     front_before, front = _fronts(context, me[LENGTH])[-2:]
     crossed, before_m = light_crossing(bank, context.index, front_before, front, ground)
-    last = bank.last_step[context.index]
+    last = bank.last_step[context.row]
     state = bank.light_state[context.index, jnp.clip(context.step, 0, last)]
     state_before = bank.light_state[context.index, jnp.clip(context.step - 1, 0, last)]
     red = is_red(state) & is_red(state_before)
@@ -66,7 +66,8 @@ def check_lights(
     arrow = (state == LightState.ARROW_STOP) | (state_before == LightState.ARROW_STOP)
     line = bank.light_line[context.index]
     red &= ~((line[LightRow.RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
-    violation = (crossed & red & (line[LightRow.ARC] < NEVER_M)).any() & on_route
+    arc = line[LightRow.ARC + bank.ego_number(context.row)]
+    violation = (crossed & red & (arc < NEVER_M)).any() & on_route
 
     # Steps since a line was crossed off the route: positive if at red, else negative.
     begins = crossed & ~on_route

@@ -76,7 +76,8 @@ class Simulator:
         history, route_m = LogStart().begin(bank, index, step, slot)
         action = self.task.first_action(history, bank.length_m(index, slot))
         z, traffic = bank.agents[index, step, slot, AgentColumn.Z], self.traffic.start(bank, index, step)
-        context = AgentContext(index, step, slot, history, action, route_m, z, traffic)
+        route = bank.row_of(index, slot) if bank.most_egos > 1 else None
+        context = AgentContext(index, step, slot, history, action, route_m, z, traffic, route)
         if isinstance(self.start, LogStart):
             return context
         # Other starts avoid the agents around, whose rows the traffic model gives for the logged context.
@@ -236,7 +237,7 @@ class Simulator:
         )
         terminated, truncated = self.task.check_end(bank, situation.context, situation.facts)
         terms = self.task.reward(before.facts, situation.facts, situation.surroundings)
-        final = terminated | truncated | (moved.step >= bank.last_step[moved.index])
+        final = terminated | truncated | (moved.step >= bank.last_step[moved.row])
         episode = self.task.episode_add(before.episode, situation, before.start, final)
         after = SimState(situation.context, situation.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))

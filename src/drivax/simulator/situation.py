@@ -100,7 +100,7 @@ def measure(
         route_deviation_m=route.distance_m,
         off_route=~lanes.on_corridor & routed,
         log_divergence_m=norm(now[:2] - logged[AgentColumn.XY]),
-        goal_distance_m=norm(now[:2] - bank.goal[context.index]),
+        goal_distance_m=norm(now[:2] - bank.goal[context.row]),
         lateral_acceleration_mps2=lateral,
         acceleration_mps2=acceleration,
         jerk_mps3=jerk,
@@ -123,12 +123,12 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     """Return all agents, the lanes around the driven agent, and its position on its route."""
     me = frame.box[context.slot]
     ground = _ground(bank, context, frame)
-    # The route is that of ego.
-    lanes = queries.around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground, context.slot == 0)
+    routed, pose = context.slot == bank.ego_slot(context.row), (me[:2], me[2:4], corners(me))
+    lanes = queries.around_lanes(bank, context.index, *pose, ground, routed, context.row)
     # Room for the step itself and for the way along a bend, which is longer on the route.
     ahead_m = 1.5 * _step_length(context) + 2.0
     return Surroundings(
-        frame, lanes, queries.project_on_route(bank, context.index, me[:2], context.route_m, ahead_m)
+        frame, lanes, queries.project_on_route(bank, context.row, me[:2], context.route_m, ahead_m)
     )
 
 
@@ -202,9 +202,9 @@ def _requested_facts(
 
 def _schedule(bank: ScenarioBank, context: AgentContext) -> dict[str, Scalar]:
     """Return the facts that compare the way on the route with that of the log at the same time."""
-    way, last = bank.log_progress[context.index], bank.last_step[context.index]
+    way, last = bank.log_progress[context.row], bank.last_step[context.row]
     step = jnp.minimum(context.step + _SECOND, last)
-    final = bank.agents[context.index, last, 0, AgentColumn.VELOCITY]
+    final = bank.agents[context.index, last, bank.ego_slot(context.row), AgentColumn.VELOCITY]
     # After its end the log continues at its last speed.
     later = way[step] + norm(final) * (context.step + _SECOND - step) * DT_S
     whole, done = way[last] - way[CURRENT_STEP], context.route_m - way[CURRENT_STEP]

@@ -58,7 +58,7 @@ class LogStart:
         self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Any = None, key: Any = None
     ) -> tuple[History, Scalar]:  # fmt: skip
         """Return the logged motion."""
-        return logged_history(bank, index, step, slot), bank.log_progress[index, step]
+        return logged_history(bank, index, step, slot), bank.log_progress[bank.row_of(index, slot), step]
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,9 @@ class NoisyStart:
         histories, good = jax.vmap(draw_history)(jax.random.split(key, self.tries))
         logged, logged_m = LogStart().begin(bank, index, step, slot)
         history = jnp.where(good.any(), histories[jnp.argmax(good)], logged)
-        near_m = bank.log_progress[index, step - count]
-        along_m = project_on_route(bank, index, history[-1, :2], near_m).along_m
+        row = bank.row_of(index, slot)
+        near_m = bank.log_progress[row, step - count]
+        along_m = project_on_route(bank, row, history[-1, :2], near_m).along_m
         return history, jnp.where(good.any(), jnp.maximum(along_m, near_m), logged_m)
 
     def draw(self, key: Array, speed: Scalar) -> tuple[Scalar, Scalar]:

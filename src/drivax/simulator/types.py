@@ -36,6 +36,8 @@ class AgentContext:
         route_m: Arc length along the route to the goal, m; never decreases.
         z: Height of the box centre, m; follows the nearest lane.
         traffic: State of the traffic model; an empty tuple for log replay.
+        route: Row of the agent's route in the bank (:meth:`ScenarioBank.row_of`); None in banks with one ego per
+            scenario, where it is ``index``.
     """
 
     index: Int[Array, "*batch"]
@@ -46,6 +48,12 @@ class AgentContext:
     route_m: Float[Array, "*batch"]
     z: Float[Array, "*batch"]
     traffic: Any
+    route: Any = None
+
+    @property
+    def row(self) -> Int[Array, "*batch"]:
+        """Row of the route, goal, logged progress and last step of the agent in the bank."""
+        return self.index if self.route is None else self.route
 
 
 @record

@@ -330,9 +330,7 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
         return around_lanes(bank, state.context.index, ego[:2], ego[2:4], corners(ego), ground(bank, state))
 
     def route(bank: ScenarioBank, state: SimState) -> Any:
-        return project_on_route(
-            bank, state.context.index, state.context.history[-1, :2], state.context.route_m
-        )
+        return project_on_route(bank, state.context.row, state.context.history[-1, :2], state.context.route_m)
 
     def ttc(bank: ScenarioBank, state: SimState) -> Any:
         return time_to_collision(frame(bank, state), state.context.slot, state.contacts == Contact.IGNORED)

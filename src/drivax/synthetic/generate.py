@@ -81,6 +81,7 @@ class Generation:
             bits: only workers write the same bytes everywhere.
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
         future_s: Seconds of a scenario after its current step, 8 to 60; events are staged in the first 8.
+        egos: Vehicles per scenario with a route and a goal, 1 to 8 (``scenario.build.egos``).
         overwrite: Replace an existing scenario set.
         world: Settings of the world.
     """
@@ -88,6 +89,7 @@ class Generation:
     workers: int = 0
     capacity: str = "default"
     future_s: float = 8.0
+    egos: int = 1
     overwrite: bool = False
     world: WorldConfig = field(default_factory=WorldConfig)
 
@@ -111,7 +113,7 @@ class Generation:
     @property
     def sizes(self) -> Capacity:
         """Padded sizes of a scenario of this length."""
-        return CAPACITIES[self.capacity].lasting(self.future_s)
+        return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, WIDTH
 from drivax.geometry.vectors import norm
-from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer
+from drivax.scenario.bank.columns import NEVER_M, LightRow, RoadColumn, RoadLayer
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.simulator.ahead import ahead, has_route
 from drivax.simulator.idm import IdmParameters
@@ -75,8 +75,8 @@ def recommended_speed(
 ) -> tuple[Float[Array, "K 1"], Bool[Array, " K"]]:
     """Return the recommended speed at ten route points 5 m apart, ``clip(30 - 25 |k|, 5, 30)`` m/s, in 15 m/s."""
     offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
-    _, valid = route_ahead(bank, context.index, context.route_m, offsets)
-    curvature = features.route_curvature(bank, context.index, context.route_m + offsets)
+    _, valid = route_ahead(bank, context.row, context.route_m, offsets)
+    curvature = features.route_curvature(bank, context.row, context.route_m + offsets)
     valid &= has_route(bank, context)
     return features.recommended_speed(curvature)[:, None] / SPEED_MPS, valid
 
@@ -119,10 +119,11 @@ def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Floa
 
     Lines beyond 50 m or behind the bumper do not count; the distance is then 1.
     """
-    line_m = bank.light_line[context.index, LightRow.ARC] - context.route_m
+    arc = bank.light_line[context.index, LightRow.ARC + bank.ego_number(context.row)]
+    line_m = arc - context.route_m
     gap = line_m - bank.length_m(context.index, context.slot) / 2
     state = frames(0).lights
-    on_route = bank.light_line[context.index, LightRow.ARC] < NEVER_M
+    on_route = arc < NEVER_M
     counts = on_route & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
     nearest = jnp.argmin(jnp.where(counts, gap, jnp.inf))
     distance = jnp.where(counts.any(), gap[nearest] / POSITION_M, 1.0)

@@ -196,7 +196,7 @@ def route_coordinates(
     Positions in units of 50 m and 5 m; 20 m left if the agent is not alongside the route. Zeros without a route.
     """
     offsets = _ROUTE_BEHIND_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
-    path, on_route = route_ahead(bank, context.index, context.route_m, offsets)
+    path, on_route = route_ahead(bank, context.row, context.route_m, offsets)
     on_route &= context.route_m + offsets >= 0.0
     along, left, cos, sin = project(path, on_route, offsets, box[:, X:COS], box[:, COS:LENGTH])
     columns = [along / POSITION_M, jnp.clip(left, -_ROUTE_SIDE_M, _ROUTE_SIDE_M) / SIZE_M, sin, cos]
@@ -205,7 +205,7 @@ def route_coordinates(
 
 def ego_on_route(bank: ScenarioBank, context: AgentContext, view: View) -> Float[Array, " 2"]:
     """Return ego's offset to the left of its route (m, at most 5) and the sine of its heading to it; 0 without one."""
-    hit = project_on_route(bank, context.index, view.xy, context.route_m)
+    hit = project_on_route(bank, context.row, view.xy, context.route_m)
     sine = view.sin * hit.heading[0] - view.cos * hit.heading[1]
     offset = jnp.clip(hit.lateral_m, -SIZE_M, SIZE_M)
     return jnp.where(has_route(bank, context), jnp.stack([offset, sine]), 0.0)
@@ -223,17 +223,17 @@ def overlap_soon(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], agen
 
 
 def route_curvature(
-    bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, " K"]
+    bank: ScenarioBank, row: Int[Array, ""], along_m: Float[Array, " K"]
 ) -> Float[Array, " K"]:
-    """Return the curvature of the route to the goal, 1/m, left positive, averaged over 4 m around each position.
+    """Return the curvature of the route of a row, 1/m, left positive, averaged over 4 m around each position.
 
     The window is shorter at the ends of the route.
     """
-    last = (bank.route_points[index, 0] - 1).astype(jnp.float32)
+    last = (bank.route_points[row] - 1).astype(jnp.float32)
     start_m, end_m = jnp.clip(along_m - _ARM_M, 0.0, last), jnp.clip(along_m + _ARM_M, 0.0, last)
     zero = jnp.zeros(())
-    start, _ = route_ahead(bank, index, zero, start_m)
-    end, _ = route_ahead(bank, index, zero, end_m)
+    start, _ = route_ahead(bank, row, zero, start_m)
+    end, _ = route_ahead(bank, row, zero, end_m)
     (c0, s0), (c1, s1) = ((rows[:, RouteColumn.COS], rows[:, RouteColumn.SIN]) for rows in (start, end))
     distance = end_m - start_m
     # Without a route, rows are zero and have no angle.

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer, RouteColumn, SizeColumn
+from drivax.scenario.bank.columns import NEVER_M, LightRow, RoadColumn, RoadLayer, RouteColumn, SizeColumn
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S, AgentKind, LightState
 from drivax.simulator.ahead import has_route
 from drivax.simulator.lights import is_red, is_yellow
@@ -345,7 +345,8 @@ def _lights(
     dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
     # Ignore lights whose line is well behind ego.
     relevant = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_PASSED_M)
-    perception, on_route = config.perception, line[LightRow.ARC] < NEVER_M
+    perception = config.perception
+    on_route = line[LightRow.ARC + bank.ego_number(context.row)] < NEVER_M
     rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, _OFF_ROUTE_M)
     first = _nearest(jnp.where(relevant, rank, jnp.inf), config.lights)
     exists = relevant[first] & (jnp.arange(config.lights) < state.shape[0])
@@ -375,14 +376,14 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
 def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     """Return the group ``route``: points ahead on the route; all masked without a route on lanes."""
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
-    rows, exists = route_ahead(bank, context.index, context.route_m, offsets)
+    rows, exists = route_ahead(bank, context.row, context.route_m, offsets)
     exists &= has_route(bank, context)
     limit = rows[:, RouteColumn.LIMIT, None]
 
     def curvature() -> Float[Array, "K 1"]:
-        return features.route_curvature(bank, context.index, context.route_m + offsets)[:, None]
+        return features.route_curvature(bank, context.row, context.route_m + offsets)[:, None]
 
-    goal = bank.goal[context.index]
+    goal = bank.goal[context.row]
     parts = {
         "position": lambda: view.point(rows[:, RouteColumn.XY]) / POSITION_M,
         "heading": lambda: view.vector(rows[:, RouteColumn.HEADING])[:, ::-1],

@@ -99,7 +99,7 @@ class Task:
         self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Return terminated (by a failure) and truncated (at the end of log or map)."""
-        log_ends, terminated = context.step >= bank.last_step[context.index], jnp.zeros((), bool)
+        log_ends, terminated = context.step >= bank.last_step[context.row], jnp.zeros((), bool)
         if self.to_the_end:
             return terminated, log_ends
         for name in self.ends:

@@ -171,7 +171,7 @@ def _check_computed(what: str, metric: Metric) -> None:
     bank = worlds.worlds()
 
     def value(row: Any, number: Any, defined: Any) -> Any:
-        end = EpisodeEnd(bank, row, jnp.asarray(10), jnp.asarray(80))
+        end = EpisodeEnd(bank, row, jnp.asarray(10), jnp.asarray(80), row)
         step_value = Value(number, defined)
         return compute(end, step_value, dict.fromkeys(metric.inputs, step_value))
 

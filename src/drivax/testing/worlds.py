@@ -240,7 +240,7 @@ def change_future(bank: ScenarioBank, step: int) -> ScenarioBank:
         light_state=jnp.where(is_future[None, :, None], (bank.light_state + 1) % 9, bank.light_state),
         log_progress=jnp.where(is_future[None], bank.log_progress + 99.0, bank.log_progress),
         log_ahead=jnp.full_like(bank.log_ahead, 99.0),
-        routes=bank.routes.at[:, 1].add(50.0),
+        log_routes=bank.log_routes + 50.0,
         extension=bank.extension + 13.0,
     )
 

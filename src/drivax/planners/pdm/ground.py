@@ -21,6 +21,7 @@ from drivax.scenario.bank.queries import (
     LANE_MARGIN_M,
     OFFROAD_TOLERANCE_M,
     around_lanes,
+    in_corridor,
     is_level,
     is_mapped,
     left_of_segments,
@@ -30,7 +31,6 @@ from drivax.scenario.bank.queries import (
 )
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.record import record
-from drivax.scenario.schema import Flag
 from drivax.simulator.simulator import map_where
 
 #: Most edges, and most lanes of the corridor, near the path and near a group of poses; with more, the grid is queried.
@@ -49,22 +49,27 @@ class Ground:
 
 
 def ground_at(
-    bank: ScenarioBank, index: Integer, box: Float[Array, " 6"], z: Scalar, on_route: Bool[Array, ""]
+    bank: ScenarioBank,
+    at: tuple[Integer, Integer],
+    box: Float[Array, " 6"],
+    z: Scalar,
+    on_route: Bool[Array, ""],
 ) -> Ground:
     """Return the position of ego's box at a hypothetical pose, on ground of height ``z``, relative to lanes and road.
 
-    Beyond the end of the route (not ``on_route``) only wrong-way driving is astray.
+    ``at`` holds the scenario and the row of the route. Beyond the end of the route (not ``on_route``) only wrong-way
+    driving is astray.
     """
-    points = corners(box)
-    lanes = around_lanes(bank, index, box[:2], box[2:4], points, z)
+    (index, row), points = at, corners(box)
+    lanes = around_lanes(bank, index, box[:2], box[2:4], points, z, row=row)
     distance = offroad_distance(bank, index, box[:2], points, lanes.points_near, z).max()
-    astray = jnp.where(_has_route(bank, index) & on_route, ~lanes.on_corridor, lanes.wrong_way)
+    astray = jnp.where(bank.on_lanes[row] & on_route, ~lanes.on_corridor, lanes.wrong_way)
     return Ground(lanes.leaving_lane, (distance > OFFROAD_TOLERANCE_M) & is_mapped(bank, index), astray)
 
 
 def ground_along(
-    bank: ScenarioBank, index: Integer, motion: Float[Array, "N T 4"], size: Vector, z: Float[Array, "N T"],
-    on_route: Bool[Array, "N T"], needs_lanes: Bool[Array, "N T"], every: int,
+    bank: ScenarioBank, at: tuple[Integer, Integer], motion: Float[Array, "N T 4"], size: Vector,
+    z: Float[Array, "N T"], on_route: Bool[Array, "N T"], needs_lanes: Bool[Array, "N T"], every: int,
 ) -> Ground:  # fmt: skip
     """Return :func:`ground_at` along N motions from one pose; ``several`` only where ``needs_lanes``, else false.
 
@@ -75,9 +80,9 @@ def ground_along(
     box, z, on_route = box.reshape(-1, 6), z.reshape(-1), on_route.reshape(-1)
     between = needs_lanes[:, 1:].reshape(count, -1, every).any(axis=2)
     needs_lanes = jnp.concatenate([needs_lanes[:, :1], between], axis=1).reshape(-1)
-    ground, is_exact = _look_up_sorted(bank, index, box, z, count)
-    queried = ~is_exact | ~(_has_route(bank, index) & on_route) | needs_lanes
-    exact = map_where(queried, partial(ground_at, bank, index), box, z, on_route)
+    ground, is_exact = _look_up_sorted(bank, at, box, z, count)
+    queried = ~is_exact | ~(bank.on_lanes[at[1]] & on_route) | needs_lanes
+    exact = map_where(queried, partial(ground_at, bank, at), box, z, on_route)
 
     def each_step(value: Array, exact: Array) -> Array:
         value = jnp.where(queried, exact, value).reshape(count, -1)
@@ -86,12 +91,12 @@ def ground_along(
     return jax.tree.map(each_step, ground, exact)
 
 
-def _has_route(bank: ScenarioBank, index: Integer) -> Bool[Array, ""]:
-    return (bank.flags[index] & jnp.uint32(int(Flag.ROUTE))) != 0
-
-
 def _look_up_sorted(
-    bank: ScenarioBank, index: Integer, box: Float[Array, "P 6"], z: Float[Array, " P"], group: int
+    bank: ScenarioBank,
+    at: tuple[Integer, Integer],
+    box: Float[Array, "P 6"],
+    z: Float[Array, " P"],
+    group: int,
 ) -> tuple[Ground, Bool[Array, " P"]]:
     """Look up poses on a route without ``several``, and the mask of those for which that is exact.
 
@@ -99,10 +104,11 @@ def _look_up_sorted(
     """
     _, order = jax.lax.top_k(-norm(box[:, :2] - box[0, :2]), len(box))
     path = box[order, :2]
+    index, row = at
     lanes = bank.lanes[index]
-    in_corridor = lanes[LaneRow.LANE] > jnp.floor(lanes[LaneRow.LANE])
-    lanes = jnp.where(in_corridor, lanes, _FAR_M)
-    lanes_m = jnp.max(jnp.where(in_corridor, lanes[LaneRow.HALF_WIDTH], 0.0)) + LANE_MARGIN_M
+    corridor = in_corridor(bank, lanes, row)
+    lanes = jnp.where(corridor, lanes, _FAR_M)
+    lanes_m = jnp.max(jnp.where(corridor, lanes[LaneRow.HALF_WIDTH], 0.0)) + LANE_MARGIN_M
     edges_m = norm(box[0, 4:]) / 2 + EDGE_CUTOFF_M
     edges_near = SortedSegments.near_path(bank.edges[index], path, edges_m)
     lanes_near = SortedSegments.near_path(lanes, path, lanes_m)

@@ -153,7 +153,7 @@ class PdmPlanner:
         frame, motion = around.frame, context.history[-1]
         me, speed = frame.box[context.slot], motion[MOTION_SPEED]
         size = me[LENGTH : WIDTH + 1]
-        lines = Lines.along_route(bank, context.index, around.route.along_m, config.offsets_m, me)
+        lines = Lines.along_route(bank, context.row, around.route.along_m, config.offsets_m, me)
         way = lines.points[0, ::_SPARSE, :2]
         others = Forecast.of(frame, context.slot, carry.touched, way, config.agents, config.radius_m)
         # Each stage is written out: XLA would compute it again in every operation that uses it.
@@ -181,7 +181,8 @@ class PdmPlanner:
         every = 1 if self._plans else config.scoring.ground_every
         contacts = jax.vmap(Contacts.along, in_axes=(0, None, None))(cars.motion, size, others)
         needs_lanes = jax.vmap(partial(Contacts.needs_lanes, steps=config.steps + 1))(contacts)
-        ground = ground_along(bank, context.index, cars.motion, size, z, on_route, needs_lanes, every)
+        at = context.index, context.row
+        ground = ground_along(bank, at, cars.motion, size, z, on_route, needs_lanes, every)
         ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
         yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
 

@@ -46,7 +46,7 @@ class Lines:
 
     @classmethod
     def along_route(
-        cls, bank: ScenarioBank, index: Integer, along_m: Scalar,
+        cls, bank: ScenarioBank, row: Integer, along_m: Scalar,
         offsets_m: tuple[float, ...], me: Float[Array, " 6"],
     ) -> Lines:  # fmt: skip
         """Build lines at lateral offsets from the route, straight ahead of ego's box where there is no route.
@@ -54,19 +54,19 @@ class Lines:
         ``along_m`` is ego's arc length along its route; offsets are positive to the left. Parallel lines share their
         normals, so all of them start abreast of ego.
         """
-        left_m = bank.route_points[index, 0] - 1.0 - along_m
-        there = bank.route_points[index, 0] > 1
+        left_m = bank.route_points[row] - 1.0 - along_m
+        there = bank.route_points[row] > 1
         left_m = jnp.where(there, left_m, -1.0)
 
         def rows(ways: Float[Array, " M"]) -> Float[Array, "M 7"]:
             inside = jnp.clip(ways, 0.0, jnp.maximum(left_m, 0.0))
-            row, _ = route_ahead(bank, index, along_m, inside)
+            points, _ = route_ahead(bank, row, along_m, inside)
             straight = jnp.zeros(7).at[RouteColumn.XY].set(me[:2])
-            row = jnp.where(there, row, straight.at[RouteColumn.HEADING].set(me[COS : SIN + 1]))
-            heading = row[:, RouteColumn.HEADING]
+            points = jnp.where(there, points, straight.at[RouteColumn.HEADING].set(me[COS : SIN + 1]))
+            heading = points[:, RouteColumn.HEADING]
             heading = heading / jnp.maximum(norm(heading), 1e-6)[:, None]
-            xy = row[:, RouteColumn.XY] + (ways - inside)[:, None] * heading
-            return row.at[:, RouteColumn.XY].set(xy).at[:, RouteColumn.HEADING].set(heading)
+            xy = points[:, RouteColumn.XY] + (ways - inside)[:, None] * heading
+            return points.at[:, RouteColumn.XY].set(xy).at[:, RouteColumn.HEADING].set(heading)
 
         ways = jnp.arange(POINTS, dtype=jnp.float32)
         base = rows(ways)

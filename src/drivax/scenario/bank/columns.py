@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+#: Arc length of stop lines that are not on the route.
+NEVER_M = 1e6
+
 
 class AgentColumn:
     """Columns of ``ScenarioBank.agents`` and ``parked``: pose, velocity in m/s, and whether the agent is observed."""
@@ -39,7 +42,7 @@ class LaneRow:
     """Rows of ``ScenarioBank.lanes``: those of :class:`EdgeRow`, half width, limit in m/s (-1 unknown), and lane index.
 
     The limit of a connector is the highest of the lanes that it joins. The index is raised by a half on lanes of the
-    corridor: the lanes of the route and their same-direction neighbours.
+    corridor: the lanes of the route and their same-direction neighbours; by 2^-(k+1) for the route of the k-th ego.
     """
 
     X_A, Y_A, X_B, Y_B, Z, HALF_WIDTH, LIMIT, LANE = range(8)
@@ -49,7 +52,8 @@ class LightRow:
     """Rows of ``ScenarioBank.light_line``.
 
     Centre of the stop line, direction of its lane, half its length, height, direction at the end of that lane, whether
-    that end turns right by more than 45 degrees, and arc length along route 0 (``NEVER_M`` on other lanes).
+    that end turns right by more than 45 degrees, and arc length along the route of the recorded ego (``NEVER_M`` on
+    other lanes); rows for the routes of further egos follow.
     """
 
     X, Y, COS, SIN, HALF, Z, EXIT_COS, EXIT_SIN, RIGHT, ARC = range(10)

@@ -162,10 +162,11 @@ class LaneHits:
 
 def around_lanes(
     bank: ScenarioBank, index: Integer, centre: Vector, heading: Vector,
-    points: Float[Array, "P 2"], z: Scalar, routed: bool | Bool[Array, ""] = True,
+    points: Float[Array, "P 2"], z: Scalar, routed: bool | Bool[Array, ""] = True, row: int | Integer = 0,
 ) -> LaneHits:  # fmt: skip
     """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height.
 
+    The corridor is that of the route ``row``, by default that of the recorded ego.
     Of the lanes that hold the centre and lead at most 30 degrees away from the heading, the box drives that with the
     highest limit, lanes of the route's corridor before others if it is ``routed``. Without such lanes it drives the
     nearest within 30 degrees, else the nearest within 90 degrees.
@@ -183,7 +184,7 @@ def around_lanes(
     alongside = own - side[0] * side[0] <= _JOINT_M**2
     parallel = alongside & (aligned_cos > _FITS)
     fits = parallel & (own <= half * half)
-    corridor = rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])
+    corridor = in_corridor(bank, rows, row)
     # By limit, on the route first; without lanes that hold the centre the nearest, parallel ones first.
     rank = jnp.where(corridor & routed, 0.0, 0.2) + 1e-3 * (100.0 - rows[LaneRow.LIMIT])
     others = jnp.where(parallel & (own <= LANE_CUTOFF_M**2), 1.0 + own, 100.0 + own)
@@ -220,6 +221,16 @@ def around_lanes(
         limit=jnp.where(has_lane, driven[LaneRow.LIMIT], -1.0),
         z=jnp.where(near, nearest[LaneRow.Z], z),
     )
+
+
+def in_corridor(bank: ScenarioBank, lanes: Float[Array, "8 K"], row: int | Integer) -> Bool[Array, " K"]:
+    """Mask of lanes (:class:`LaneRow`) in the corridor of a route."""
+    code = lanes[LaneRow.LANE]
+    if bank.most_egos == 1:
+        return code > jnp.floor(code)
+    # Exact, by a power of two: shifts the bit of the ego to the first after the point.
+    code = code * (1 << bank.ego_number(row))
+    return code - jnp.floor(code) >= 0.5
 
 
 def lane_distance(bank: ScenarioBank, index: Integer, xy: Vector, z: Scalar) -> Scalar:
@@ -344,22 +355,22 @@ class RouteHit:
 
 
 def project_on_route(
-    bank: ScenarioBank, index: Integer, xy: Vector, near_m: Scalar,
-    ahead_m: float | Scalar = 33.0, route: int = 0,
+    bank: ScenarioBank, row: Integer, xy: Vector, near_m: Scalar,
+    ahead_m: float | Scalar = 33.0, logged: bool = False,
 ) -> RouteHit:  # fmt: skip
-    """Project a point on a route from 6 m behind to ``ahead_m`` ahead of its last known arc length ``near_m``.
+    """Project a point on the route of a row, from 6 m behind to ``ahead_m`` ahead of its last known arc length.
 
-    ``ahead_m`` keeps a car off the other leg of a hairpin. Route 0 leads to the goal, 1 is the log's own.
+    ``near_m`` is that arc length; ``ahead_m`` keeps a car off the other leg of a hairpin. With ``logged`` the point is
+    projected on the logged path of the recorded ego of scenario ``row``.
     """
-    count = bank.routes.shape[2]
+    routes, points = (bank.log_routes, bank.log_route_points) if logged else (bank.routes, bank.route_points)
+    count = routes.shape[1]
     first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
     size = min(_WINDOW, count)
-    window = jax.lax.dynamic_slice(
-        bank.routes, (index, jnp.int32(route), first, jnp.int32(0)), (1, 1, size, RouteColumn.LIMIT)
-    )[0, 0]
+    window = jax.lax.dynamic_slice(routes, (row, first, jnp.int32(0)), (1, size, RouteColumn.LIMIT))[0]
     a, b = window[:-1], window[1:]
     place = first + jnp.arange(size - 1)
-    real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
+    real = (place + 1 < points[row]) & (place <= near_m + ahead_m)
     ends = [end[:, column] for end in (a, b) for column in (RouteColumn.X, RouteColumn.Y)]
     squared, side = to_segments(ends, xy[None])
     k = first_smallest(jnp.where(real, squared[0], _FAR))
@@ -371,15 +382,15 @@ def project_on_route(
 
 
 def route_ahead(
-    bank: ScenarioBank, index: Integer, along_m: Scalar, offsets_m: Float[Array, " K"], route: int = 0
+    bank: ScenarioBank, row: Integer, along_m: Scalar, offsets_m: Float[Array, " K"]
 ) -> tuple[Float[Array, "K 7"], Bool[Array, " K"]]:
     """Points of a route (:class:`RouteColumn`) at arc lengths ``along_m + offsets_m``, and the mask of valid ones."""
     at = jnp.maximum(along_m + offsets_m, 0.0)
-    last = bank.route_points[index, route] - 1
-    low = jnp.clip(at.astype(jnp.int32), 0, bank.routes.shape[2] - 2)
+    last = bank.route_points[row] - 1
+    low = jnp.clip(at.astype(jnp.int32), 0, bank.routes.shape[1] - 2)
     # Limits and lanes are not interpolated.
     part = (at - low)[:, None] * (jnp.arange(bank.routes.shape[-1]) < RouteColumn.LIMIT)
-    rows = bank.routes[index, route, low] * (1 - part) + bank.routes[index, route, low + 1] * part
+    rows = bank.routes[row, low] * (1 - part) + bank.routes[row, low + 1] * part
     return rows, (along_m + offsets_m <= last.astype(jnp.float32)) & (last > 0)
 
 

@@ -16,12 +16,13 @@ from itertools import islice
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt, UInt32
 
 from drivax.errors import DataError, DrivaxError
-from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import AgentColumn, RoadLayer, SizeColumn
+from drivax.scenario.bank.route_arrays import interleave, most_egos, of_ego, stack_lights, stack_routes
 from drivax.scenario.bank.strands import corridor_lanes, lane_strands
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import (
@@ -45,8 +46,6 @@ _MULTIPLE = 8
 DEFAULT_LANE_WIDTH_M = 3.7
 #: Limits of a lane's class where the source gives none, m/s (semantics, ``speeding``).
 CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE): 13.4}
-#: Arc length of stop lines that are not on the route.
-NEVER_M = 1e6
 #: Steps in a word of ``parked_when``.
 WORD = 32
 #: Coordinates of unused segments, m.
@@ -61,6 +60,9 @@ _ALIGNMENT = 64
 _LAYERS = np.full(max(RoadKind) + 2, RoadLayer.NONE, np.float32)
 for _layer, _kinds in enumerate((LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)):
     _LAYERS[list(_kinds)] = _layer
+
+#: Arrays of a bank with a row per ego.
+PER_EGO = ("routes", "route_points", "on_lanes", "goal", "log_progress", "log_ahead", "last_step")
 
 _Record = Shaped[np.ndarray, ""]
 _Arrays = dict[str, np.ndarray[Any, Any]]
@@ -153,12 +155,14 @@ def _longest_run(start: Int[np.ndarray, "n cells1"], grid: int) -> int:
 
 @record
 class ScenarioBank:
-    """Scenarios on the device: N scenarios, T steps, A moving agents, S slots of a frame.
+    """Scenarios on the device: N scenarios, T steps, A moving agents, S slots of a frame, K egos per scenario.
 
     The slots of parked agents follow those of the moving agents of the same scenario, so that a frame has as many slots
-    as the largest scenario needs.
+    as the largest scenario needs. What belongs to the route of an ego has M = N * K rows: row ``index * K + k`` for the
+    k-th ego of scenario ``index``, of which the first is the recorded one. Without further egos the row is the index.
 
     Attributes:
+        egos: Slots of the egos, 0 first, -1 for none.
         agents: Moving agents, :class:`AgentColumn`; slot 0 is ego.
         agent_box: Size and kind of all agents, :class:`SizeColumn`.
         parked: Parked agents in their slots, :class:`AgentColumn`.
@@ -170,12 +174,14 @@ class ScenarioBank:
         grid_edge, grid_lane: Start of the run of each cell in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.pack_sides``).
         map_box: Smallest and largest x, y of edges and lanes.
-        routes: Points 1 m apart, :class:`RouteColumn`; route 0 leads to the goal, route 1 is the log's own.
-        log_progress, log_ahead: Arc length of the logged ego along route 0; distance that it still drives, m.
+        routes, route_points: Points 1 m apart of the routes to the goals, :class:`RouteColumn`, and their numbers.
+        on_lanes: Whether the route lies on lanes; otherwise it is the logged path, which is privileged.
+        log_routes, log_route_points: The same for the logged paths of the recorded egos.
+        log_progress, log_ahead: Arc length of the logged ego along its route; distance that it still drives, m.
         road: Pieces of road to observe, in order of rank, :class:`RoadColumn`.
         road_at, road_curvature: x, y and layer of the same pieces; their curvature, left positive, 1/m.
         flags: ``scenario.schema.Flag`` bits.
-        last_step: Last step of each log; beyond it, up to T, there is only padding.
+        last_step: Last step of the log of each ego; for the recorded one that of the scenario, followed by padding.
         identity: Seeds of the random numbers of a scenario (:func:`identities`).
         extension: Points 4 m apart beyond the last logged pose of moving agents, along their lane: x, y.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
@@ -187,7 +193,7 @@ class ScenarioBank:
     agent_box: Float[Array, "N S 4"]
     parked: Float[Array, "N S 8"]
     parked_when: UInt[Array, "N W S"]
-    light_line: Float[Array, "N 10 L"]
+    light_line: Float[Array, "N F L"]
     light_state: Int[Array, "N T L"]
     edges: Float[Array, "N 5 E"]
     lanes: Float[Array, "N 8 C"]
@@ -197,16 +203,20 @@ class ScenarioBank:
     grid_side: Int[Array, "N cells"]
     grid_origin: Float[Array, "N 2"]
     map_box: Float[Array, "N 4"]
-    routes: Float[Array, "N 2 R 7"]
-    route_points: Int[Array, "N 2"]
-    goal: Float[Array, "N 2"]
-    log_progress: Float[Array, "N T"]
-    log_ahead: Float[Array, "N T"]
+    egos: Int[Array, "N K"]
+    routes: Float[Array, "M R 7"]
+    route_points: Int[Array, " M"]
+    on_lanes: Bool[Array, " M"]
+    log_routes: Float[Array, "N R 7"]
+    log_route_points: Int[Array, " N"]
+    goal: Float[Array, "M 2"]
+    log_progress: Float[Array, "M T"]
+    log_ahead: Float[Array, "M T"]
     road: Float[Array, "N O 7"]
     road_at: Float[Array, "N 3 O"]
     road_curvature: Float[Array, "N O"]
     flags: UInt[Array, " N"]
-    last_step: Int[Array, " N"]
+    last_step: Int[Array, " M"]
     identity: UInt[Array, " N"]
     extension: Float[Array, "N A X 2"]
     cell_m: float = static()
@@ -236,9 +246,33 @@ class ScenarioBank:
         """Height of an agent, m."""
         return self.agent_box[index, slot, SizeColumn.HEIGHT]
 
+    @property
+    def most_egos(self) -> int:
+        """Number of egos K that each scenario has rows for."""
+        return self.egos.shape[1]
+
+    def row_of(self, index: Integer, slot: int | Integer) -> Integer:
+        """Row of the route of an agent; that of the recorded ego for agents without a route."""
+        if self.most_egos == 1:
+            return index
+        return index * self.most_egos + jnp.argmax(self.egos[index] == slot).astype(jnp.int32)
+
+    def ego_number(self, row: Integer) -> int | Integer:
+        """Number of an ego in its scenario, 0 for the recorded one."""
+        return 0 if self.most_egos == 1 else row % self.most_egos
+
+    def ego_slot(self, row: Integer) -> int | Integer:
+        """Slot of the ego of a row, -1 for a row without one."""
+        return 0 if self.most_egos == 1 else self.egos.reshape(-1)[row]
+
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
         """Select scenarios."""
-        return jax.tree.map(lambda leaf: leaf[rows], self)
+        of_egos = (rows[:, None] * self.most_egos + jnp.arange(self.most_egos)).reshape(-1)
+
+        def select(path: tuple[Any, ...], leaf: Array) -> Array:
+            return leaf[of_egos if path[0].name in PER_EGO else rows]
+
+        return jax.tree_util.tree_map_with_path(select, self)
 
     @classmethod
     def from_scenarios(
@@ -307,6 +341,8 @@ def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
 
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(fill, (slice(first, first + _BATCH) for first in range(0, len(records), _BATCH))))
+    for name in PER_EGO:
+        arrays[name] = arrays[name].reshape(-1, *arrays[name].shape[2:])
     names = [(scenario.text("dataset"), scenario.id) for scenario in scenarios]
     return arrays | dict(zip(shapes, large, strict=True)) | {"identity": identities(names)}
 
@@ -338,20 +374,8 @@ def last_used(mask: Any) -> Int[np.ndarray, " n"]:
     return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
 
 
-def _interleave(*columns: np.ndarray[Any, Any]) -> Float[np.ndarray, "*n column"]:
-    """Interleave columns in float32; those with one dimension more than the last hold several."""
-    rank = columns[-1].ndim
-    flat: list[np.ndarray[Any, Any]] = []
-    for values in columns:
-        flat += [values] if values.ndim == rank else [values[..., i] for i in range(values.shape[-1])]
-    result = np.empty((*columns[-1].shape, len(flat)), np.float32)
-    for i, values in enumerate(flat):
-        result[..., i] = values
-    return result
-
-
 def _stack_batch(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
-    arrays = _stack_agents(records, sizes) | _stack_routes(records) | _stack_lights(records, sizes)
+    arrays = _stack_agents(records, sizes) | stack_routes(records) | stack_lights(records, sizes.lights)
     return arrays | _stack_road(records, sizes) | _stack_grid(records, sizes)
 
 
@@ -370,23 +394,12 @@ def _fill_agents(agents: Float[np.ndarray, "time agent 8"], log: _Record) -> Non
 def _stack_agents(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
     agents = slice(0, sizes.agents)
     size, kind = (stack_field(records, f"agent_{name}", agents) for name in ("size", "kind"))
-    xy, valid = stack_field(records, "agent_xy", slice(None), 0), stack_field(records, "agent_valid")
+    valid = stack_field(records, "agent_valid")
     return {
         "extension": stack_field(records, "agent_extension", agents),
         "flags": stack_field(records, "flags"),
-        "last_step": stack_field(records, "steps").astype(np.int32) - 1,
-        "log_ahead": _log_ahead(xy, valid[:, :, 0]),
-        **_stack_parked(records, sizes.slots, last_used(valid.any(1)), _interleave(size, kind)),
+        **_stack_parked(records, sizes.slots, last_used(valid.any(1)), interleave(size, kind)),
     }
-
-
-def _log_ahead(
-    xy: Float[np.ndarray, "n time 2"], valid: Bool[np.ndarray, "n time"]
-) -> Float[np.ndarray, "n time"]:
-    """Return the distance that each logged ego drives from every step on, m; gaps of the log add nothing."""
-    step_m = np.hypot(*np.moveaxis(np.diff(xy, axis=1), -1, 0)) * (valid[:, 1:] & valid[:, :-1])
-    ahead = np.cumsum(step_m[:, ::-1], axis=1)[:, ::-1]
-    return np.concatenate([ahead, np.zeros_like(ahead[:, :1])], axis=1)
 
 
 def _stack_parked(
@@ -407,10 +420,10 @@ def _stack_parked(
     slot = scenario, first[scenario] + number
     poses = np.zeros((len(records), slots, 8), np.float32)
     velocity, is_observed = np.zeros((*z.shape, 2)), np.ones(z.shape)
-    poses[slot] = _interleave(xy, z, np.cos(heading), np.sin(heading), velocity, is_observed)[mask]
+    poses[slot] = interleave(xy, z, np.cos(heading), np.sin(heading), velocity, is_observed)[mask]
     boxes = np.zeros((len(records), slots, 4), np.float32)
     boxes[:, : box.shape[1]] = box
-    boxes[slot] = _interleave(size, kind)[mask]
+    boxes[slot] = interleave(size, kind)[mask]
     words = as_words(valid[:, :, parked])
     when = np.zeros((len(records), words.shape[1], slots), np.uint32)
     when[scenario, :, slot[1]] = words[scenario, :, number]
@@ -425,60 +438,6 @@ def as_words(when: Bool[np.ndarray, "N T S"]) -> UInt[np.ndarray, "N W S"]:
     return np.bitwise_or.reduce(parts << np.arange(0, WORD, 8, dtype=np.uint32)[:, None], axis=2)
 
 
-def _stack_routes(records: Sequence[_Record]) -> _Arrays:
-    names = ("xy", "z", "heading", "limit", "lane")
-    xy, z, heading, limit, lane = (stack_field(records, f"route_{name}", slice(0, 2)) for name in names)
-    return {
-        "routes": _interleave(xy, z, np.cos(heading), np.sin(heading), limit, lane),
-        "route_points": stack_field(records, "route_points", slice(0, 2)).astype(np.int32),
-        "goal": stack_field(records, "goal_xy"),
-        "log_progress": stack_field(records, "log_progress"),
-    }
-
-
-def _stack_lights(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
-    lights = slice(0, sizes.lights)
-    line = stack_field(records, "light_line", lights).astype(np.float64)
-    z, heading, exits, lane = (
-        stack_field(records, f"light_{name}", lights) for name in ("z", "heading", "exit_heading", "lane")
-    )
-    middle, along = (line[..., :2] + line[..., 2:]) / 2, line[..., 2:] - line[..., :2]
-    half = np.hypot(*np.moveaxis(along, -1, 0)) / 2
-    right = wrap(exits.astype(np.float64) - heading) < -np.pi / 4
-    x, y = np.moveaxis(middle, -1, 0)
-    arc = _stop_arcs(records, lane, middle)
-    rows = [x, y, np.cos(heading), np.sin(heading), half, z, np.cos(exits), np.sin(exits), right, arc]
-    return {
-        "light_line": np.stack(rows, axis=1, dtype=np.float32),
-        "light_state": stack_field(records, "light_state", slice(None), lights),
-    }
-
-
-def _stop_arcs(
-    records: Sequence[_Record], lane: Int[np.ndarray, "n light"], middle: Float[np.ndarray, "n light 2"]
-) -> Float[np.ndarray, "n light"]:
-    """Return the arc length along route 0 of the stop lines of its lanes, ``NEVER_M`` for those of other lanes."""
-    arcs = np.full(lane.shape, NEVER_M)
-    count = stack_field(records, "route_points", 0)
-    route_lane = stack_field(records, "route_lane", 0)
-    on_route = np.zeros((len(records), 2 + max(int(lane.max()), int(route_lane.max()))), bool)
-    on_route[np.arange(len(records))[:, None], route_lane] = True
-    on_route[:, -1] = False  # that of -1, no lane
-    on_route &= count[:, None] > 0
-    scenario, light = stops = np.nonzero(on_route[np.arange(len(records))[:, None], lane])
-    if len(light):
-        xy, heading = (
-            stack_field(records, f"route_{name}", 0).astype(np.float64) for name in ("xy", "heading")
-        )
-        dx, dy = np.moveaxis(middle[stops][:, None] - xy[scenario], -1, 0)
-        squared_m = np.where(np.arange(xy.shape[1]) < count[scenario, None], dx * dx + dy * dy, np.inf)
-        point = np.argmin(squared_m, axis=1)
-        nearest, course = (np.arange(len(point)), point), heading[scenario, point]
-        # Route points are 1 m apart: the index of the nearest is its arc length.
-        arcs[stops] = point + dx[nearest] * np.cos(course) + dy[nearest] * np.sin(course)
-    return arcs
-
-
 def _stack_road(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
     names = ("xy", "direction", "length", "kind", "limit", "curvature")
     xy, direction, length, kind, limit, curvature = (
@@ -487,7 +446,7 @@ def _stack_road(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
     is_piece = np.arange(kind.shape[1]) < stack_field(records, "road_rows")[:, None]
     layer = np.where(is_piece, _LAYERS[np.minimum(kind, len(_LAYERS) - 1)], np.float32(RoadLayer.NONE))
     return {
-        "road": _interleave(xy, direction, length, layer, limit),
+        "road": interleave(xy, direction, length, layer, limit),
         "road_at": np.stack([xy[..., 0], xy[..., 1], layer], axis=1),
         "road_curvature": curvature,
     }
@@ -517,7 +476,10 @@ def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
     lanes = np.append(np.arange(count), -1)
     width = stack_field(records, "lane_width", lanes)
     half = np.where(width > 0, width, DEFAULT_LANE_WIDTH_M) / 2
-    index = lanes + 0.5 * corridor_lanes(records)[:, lanes]
+    index = lanes.astype(np.float64)
+    for ego in range(most_egos(records)):
+        route = (of_ego(records, f"route_{name}", ego, 0) for name in ("lane", "points"))
+        index = index + 0.5 ** (ego + 1) * corridor_lanes(records, *route)[:, lanes]
     return np.stack([half, _lane_limits(records, lanes), index], axis=1, dtype=np.float32)
 
 

@@ -230,12 +230,15 @@ def _is_map_known(
     return np.all((xy >= low[scenario]) & (xy <= high[scenario]), axis=1)
 
 
-def corridor_lanes(records: Sequence[Array]) -> Bool[np.ndarray, "n lane"]:
-    """Mask of lanes of the route and of their same-direction neighbours (at any distance sideways)."""
+def corridor_lanes(
+    records: Sequence[Array], route: Int[np.ndarray, "n point"], count: Int[np.ndarray, " n"]
+) -> Bool[np.ndarray, "n lane"]:
+    """Mask of lanes of a route and of their same-direction neighbours (at any distance sideways).
+
+    ``route`` holds the lane of each of ``count`` points of the route, -1 for none.
+    """
     neighbours = [stack_field(records, f"lane_{side}") for side in ("left", "right")]
-    route = stack_field(records, "route_lane", 0)
-    on_route = (route >= 0) & (np.arange(route.shape[1]) < stack_field(records, "route_points", 0)[:, None])
-    scenario, point = np.nonzero(on_route)
+    scenario, point = np.nonzero((route >= 0) & (np.arange(route.shape[1]) < count[:, None]))
     lane = route[scenario, point]
     member = np.zeros(neighbours[0].shape, bool)
     while len(lane):

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from drivax.errors import DataError
+from drivax.scenario.build.egos import FurtherEgo, further_egos
 from drivax.scenario.build.grid import EDGE_BLOCK, LANE_BLOCK, GridSegments, arrange, cell_sides, ringed_cells
 from drivax.scenario.build.lanes import (
     LaneGraph,
@@ -22,7 +23,7 @@ from drivax.scenario.build.lanes import (
     place_stops,
     select,
 )
-from drivax.scenario.build.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
+from drivax.scenario.build.routes import EgoLog, Intent, Route, RouteSet, RouteStyle, find_routes
 from drivax.scenario.build.segments import (
     RoadLines,
     RoadRows,
@@ -83,7 +84,8 @@ MISSING = (
     "agent_id", "parked_id", "light_lane", "light_state", "stop_lane", "segment_kind", "segment_feature",
     "segment_lane", "feature_id", "feature_kind", "lane_id", "lane_kind", "lane_width", "lane_limit",
     "lane_successor", "lane_predecessor", "lane_left", "lane_right", "lane_light", "route_lane", "route_limit",
-    "road_kind", "road_limit", "event_kind", "event_start", "event_end", "event_actor",
+    "road_kind", "road_limit", "event_kind", "event_start", "event_end", "event_actor", "ego_slot", "ego_route_lane",
+    "ego_route_limit",
 )  # fmt: skip
 #: Lanes whose class has a limit (``scenario.bank.scenario_bank.CLASS_LIMIT_MPS``).
 _LIMITED_KINDS = (RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE)
@@ -102,6 +104,7 @@ class Parts:
     extension: Float[Array, "slot point 2"]
     graph: LaneGraph
     routes: RouteSet
+    egos: list[FurtherEgo]
     grid: GridSegments
     sides: Int[Array, " cell"]
     ringed: bool
@@ -157,8 +160,17 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     whole = lane_graph(recording.features, origin)
     lane_segments = LaneSegments.of(segments, whole)
     intent, unknown = _intent(recording, whole)
-    routes = find_routes(lane_segments, log, intent, style, capacity.routes, capacity.route_points)
-    on_route = np.unique(np.concatenate([route.lane for route in routes.routes]))
+    sizes = capacity.routes, capacity.route_points
+    routes = find_routes(lane_segments, log, intent, style, *sizes)
+    preferred = (*recording.to_predict, *recording.of_interest)
+    placement = place(tracks, preferred, capacity.agents, capacity.parked)
+    egos = [
+        FurtherEgo(slot, last, find_routes(lane_segments, ego_log(own, now, last), Intent(), style, *sizes))
+        for slot, last in further_egos(tracks, placement.moving, now, path, capacity.egos - 1)
+        for own in [replace(tracks, ego=int(placement.moving[slot]))]
+    ]
+    stored = [*routes.routes, *(ego.routes.routes[0] for ego in egos)]
+    on_route = np.unique(np.concatenate([route.lane for route in stored]))
     on_route = on_route[on_route >= 0]
     in_crop = inside_box(segments.middle, path, MARGIN_M)
     in_crop |= np.isin(segments.feature, whole.feature[on_route])
@@ -166,8 +178,6 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     keep, lost_lanes = _select_lanes(whole, segments.feature[in_crop], on_route, path, capacity.lanes)
     graph = select(whole, keep)
     polylines, lost_features = _select_polylines(roads, grid, path, capacity.features)
-    preferred = (*recording.to_predict, *recording.of_interest)
-    placement = place(tracks, preferred, capacity.agents, capacity.parked)
     edges, lanes = (segments.take(segments.block == block) for block in (EDGE_BLOCK, LANE_BLOCK))
     closed = roads.closed[edges.polyline]
     ringed = ringed_cells(grid.grid, edges, closed, path, MARGIN_M)
@@ -178,6 +188,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
         extension=extend(tracks, placement.moving, lane_segments, capacity.extension),
         graph=graph,
         routes=_renumber(routes, keep, whole.count),
+        egos=[replace(ego, routes=_renumber(ego.routes, keep, whole.count)) for ego in egos],
         grid=grid,
         sides=cell_sides(grid.grid, edges, lanes.middle, closed, ringed),
         ringed=bool(ringed.any()),
@@ -233,11 +244,13 @@ def _refuse_endless(roads: RoadLines) -> None:
         raise DataError(problem, cure="crop the map in the reader, or repair the points that jump")
 
 
-def ego_log(tracks: LocalTracks, current_step: int) -> EgoLog:
-    """Return the log of the ego."""
+def ego_log(tracks: LocalTracks, current_step: int, last: int | None = None) -> EgoLog:
+    """Return the log of the ego, up to step ``last``."""
     row = tracks.ego
-    speed = np.hypot(*tracks.velocity[row].T)
-    return EgoLog(tracks.xyz[row], tracks.heading[row], speed, tracks.valid[row], current_step)
+    speed, valid = np.hypot(*tracks.velocity[row].T), tracks.valid[row]
+    if last is not None:
+        valid = valid & (np.arange(len(valid)) <= last)
+    return EgoLog(tracks.xyz[row], tracks.heading[row], speed, valid, current_step)
 
 
 def _select_lanes(
@@ -339,7 +352,7 @@ def fill(
 def blank(capacity: Capacity) -> Record:
     """Return a record without valid entries: zeros, and -1 for missing indices and values."""
     record = np.zeros((), record_dtype(capacity))
-    for name in MISSING:
+    for name in set(MISSING) & set(record.dtype.names or ()):
         record[name] = -1
     return record
 
@@ -422,14 +435,21 @@ def _fill_lanes(record: Record, parts: Parts) -> None:
 
 
 def _fill_routes(record: Record, parts: Parts) -> None:
-    limits = np.append(parts.graph.limit, -1.0)  # the last entry is that of -1, no lane
     for k, route in enumerate(parts.routes.routes):
-        count = len(route.xyz)
-        record["route_xy"][k, :count] = route.xyz[:, :2]
-        record["route_z"][k, :count] = route.xyz[:, 2]
-        record["route_heading"][k, :count] = route.heading
-        record["route_lane"][k, :count] = route.lane
-        record["route_limit"][k, :count] = limits[route.lane]
-        record["route_points"][k] = count
+        _put_route(record, "route", k, route, parts.graph)
     record["goal_xy"] = parts.routes.goal
     _put(record, log_progress=parts.routes.progress)
+    for k, ego in enumerate(parts.egos):
+        _put_route(record, "ego_route", k, ego.routes.routes[0], parts.graph)
+        record["ego_slot"][k], record["ego_last_step"][k] = ego.slot, ego.last
+        record["ego_on_lanes"][k], record["ego_goal_xy"][k] = ego.routes.on_lanes, ego.routes.goal
+        record["ego_log_progress"][k, : len(ego.routes.progress)] = ego.routes.progress
+
+
+def _put_route(record: Record, prefix: str, row: int, route: Route, graph: LaneGraph) -> None:
+    """Write a route into row ``row`` of the fields ``prefix_name``."""
+    limits, count = np.append(graph.limit, -1.0), len(route.xyz)  # the last limit is that of -1, no lane
+    values = {"xy": route.xyz[:, :2], "z": route.xyz[:, 2], "heading": route.heading, "lane": route.lane}
+    for name, value in (values | {"limit": limits[route.lane]}).items():
+        record[f"{prefix}_{name}"][row, :count] = value
+    record[f"{prefix}_points"][row] = count

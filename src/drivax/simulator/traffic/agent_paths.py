@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
 from drivax.geometry.polylines import Polylines, arc_lengths, point_to_segment
 from drivax.geometry.vectors import wrap
-from drivax.scenario.bank.columns import AgentColumn, LaneRow, LightRow, SizeColumn
+from drivax.scenario.bank.columns import NEVER_M, AgentColumn, LaneRow, LightRow, SizeColumn
 from drivax.scenario.bank.queries import LANE_CUTOFF_M, LEVEL_M
-from drivax.scenario.bank.scenario_bank import NEVER_M, WORD, ScenarioBank
+from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import AgentKind, Flag
 from drivax.simulator.traffic.bank_data import TrafficData, find_data, with_data

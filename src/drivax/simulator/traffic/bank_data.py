@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Self, TypeVar
+from typing import Self, TypeVar, cast
 
 import jax
 from jaxtyping import Array, Int
@@ -33,8 +33,8 @@ class PreparedBank(ScenarioBank):
 
     def part(self, rows: Int[Array, " n"]) -> PreparedBank:
         """Return some of the scenarios as a bank."""
-        logs = jax.tree.map(lambda leaf: leaf[rows], replace(self, traffic=()))
-        return replace(logs, traffic=tuple(data.part(rows) for data in self.traffic))
+        logs = ScenarioBank.part(replace(self, traffic=()), rows)
+        return replace(cast(PreparedBank, logs), traffic=tuple(data.part(rows) for data in self.traffic))
 
 
 def prepare_bank(traffic: Traffic, bank: ScenarioBank) -> ScenarioBank:
