@@ -37,8 +37,8 @@ CONFIG = TrainConfig(
 
 
 @pytest.fixture(scope="module")
-def bank(data):
-    return training_environment(CONFIG).prepare(ScenarioBank.from_scenarios(data))
+def bank(data_of_egos):
+    return training_environment(CONFIG).prepare(ScenarioBank.from_scenarios(data_of_egos))
 
 
 @pytest.mark.parametrize(

@@ -268,7 +268,7 @@ def _draw(
     """Draw scenarios, steps up to the third last at which the ego is valid (else step 10), and keys for starts."""
     index_key, step_key = jax.random.split(key)
     index = jax.random.randint(index_key, (count,), 0, len(bank))
-    last = bank.last_step[index] - 2
+    last = bank.last_step[index * bank.most_egos] - 2
     last = last if latest is None else jnp.minimum(last, latest)
     step = jax.random.randint(step_key, (count,), earliest, jnp.maximum(last, earliest) + 1)
     # The ego is always valid at the current step.

@@ -66,6 +66,9 @@ class SelfPlay(Driving):
         if count % size:
             cure = f"use a multiple of {size} (self_play.vehicles)"
             raise UsageError(f"{count} environments of self-play", cure=cure)
+        if size > data.most_egos:
+            problem = f"self_play.vehicles is {size}, but the scenarios have {data.most_egos} with a route"
+            raise UsageError(problem, cure="generate or convert them with --egos 8, or lower it")
         index, step, keys = _draw(data, key, count // size, self.earliest_start)
         slots = jax.vmap(partial(self._slots, data))(index, step, keys)
         state = jax.vmap(self.simulator.reset_together, (None, 0, 0, 0))(data, index, slots, step)
@@ -99,15 +102,14 @@ class SelfPlay(Driving):
         return jnp.where(resets, ~is_driven(data, state), over | ends)
 
     def _slots(self, bank: ScenarioBank, index: Array, step: Array, key: Array) -> Int[Array, " K"]:
-        """Return the slots of ego and of random further egos that the log has at a step; the rest is padding."""
-        moving = bank.agents.shape[2]
-        candidates = jnp.arange(1, moving)
-        present = bank.agents[index, step, 1:, AgentColumn.VALID] > 0
-        rank = jnp.where(present, jax.random.uniform(key, candidates.shape), jnp.inf)
-        order = jnp.argsort(rank)[: self.config.vehicles - 1]
-        slots = jnp.where(present, candidates, moving)[order]
-        padding = (1, self.config.vehicles - 1 - len(order))
-        return jnp.pad(slots, padding, constant_values=(0, moving)).astype(jnp.int32)
+        """Return the slots of ego and of random further egos whose log has at least two more steps; then padding."""
+        moving, further = bank.agents.shape[2], bank.egos[index, 1:]
+        rows = index * bank.most_egos + jnp.arange(1, bank.most_egos)
+        present = bank.agents[index, step, further, AgentColumn.VALID] > 0
+        present &= (further >= 0) & (step <= bank.last_step[rows] - 2)
+        rank = jnp.where(present, jax.random.uniform(key, further.shape), jnp.inf)
+        slots = jnp.where(present, further, moving)[jnp.argsort(rank)[: self.config.vehicles - 1]]
+        return jnp.pad(slots, (1, 0)).astype(jnp.int32)
 
     def _groups(self, tree: Any) -> Any:
         """Return a batch of environments as groups."""
