@@ -77,9 +77,9 @@ def test_the_nearest_moving_vehicles_are_driven(bank):
 
 def test_planners_unfit_for_traffic_are_refused(bank):
     with pytest.raises(
-        UsageError, match="route cannot drive others, who have no route; use a policy of another"
+        UsageError, match="route cannot drive others without routes; convert or generate the set"
     ):
-        PlannerTraffic(Task(actions=ROUTE))
+        PlannerTraffic(Task(actions=ROUTE)).start(bank, 0, 10)
     with pytest.raises(UsageError, match="cannot drive others"):
         with_driver(bank, Expert())
     with pytest.raises(UsageError, match="the bank has no TrafficPolicy; use planners"):

@@ -60,8 +60,9 @@ class PlannerTraffic:
     """Traffic whose vehicles nearest to ego are driven by the planner of :func:`with_driver`, others by ``base``.
 
     It drives vehicles that the log has when the episode starts and that travel more than 2 m in the rest of it. They
-    see all agents, follow the task's dynamics to the end of the episode, and have no route: train such a policy to
-    follow lanes.
+    see all agents and follow the task's dynamics to the end of the episode. Further egos of the set have a route,
+    others have none: train a policy for those to follow lanes. In the action space ``route`` only egos with a route on
+    lanes are driven.
 
     Attributes:
         task: Observation and action space of the planner.
@@ -74,13 +75,6 @@ class PlannerTraffic:
     count: int = 4
     base: Traffic = field(default_factory=LogTraffic)
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        if isinstance(self.task.actions, Route):
-            cure = "use a policy of another action space, such as physical"
-            raise UsageError(
-                "a policy of the action space route cannot drive others, who have no route", cure=cure
-            )
 
     @property
     def name(self) -> str:
@@ -95,8 +89,13 @@ class PlannerTraffic:
         """Return the logged traffic state at ``step``.
 
         Raises:
-            UsageError: The bank has no driver.
+            UsageError: The bank has no driver, or only the recorded ego has the route that its action space needs.
         """
+        if isinstance(self.task.actions, Route) and bank.most_egos == 1:
+            cure = "convert or generate the set with --egos 8, or use a policy of another action space"
+            raise UsageError(
+                "a policy of the action space route cannot drive others without routes", cure=cure
+            )
         data_of(bank, TrafficPolicy, "use planners.planner_traffic.with_driver")
         simulator, slots = Simulator(self.task), self._slots(bank, index, step)
         contexts = jax.vmap(lambda slot: simulator.context(bank, index, step, slot))(slots)
@@ -152,6 +151,9 @@ class PlannerTraffic:
         is_vehicle = bank.agent_box[index, :count, SizeColumn.KIND] == int(AgentKind.VEHICLE)
         # Slot 0 is ego.
         is_eligible = valid[step] & (jnp.arange(count) > 0) & travels & is_vehicle
+        if isinstance(self.task.actions, Route):
+            on_lanes = bank.on_lanes.reshape(bank.egos.shape)[index]
+            is_eligible &= jnp.isin(jnp.arange(count), jnp.where(on_lanes, bank.egos[index], -1))
         squared_distance = jnp.where(is_eligible, ((xy[step] - xy[step, 0]) ** 2).sum(axis=-1), jnp.inf)
         order = jnp.argsort(squared_distance)[: self.count]
         order = jnp.pad(order, (0, self.count - order.shape[0]), constant_values=count)

@@ -162,14 +162,13 @@ class LaneHits:
 
 def around_lanes(
     bank: ScenarioBank, index: Integer, centre: Vector, heading: Vector,
-    points: Float[Array, "P 2"], z: Scalar, routed: bool | Bool[Array, ""] = True, row: int | Integer = 0,
+    points: Float[Array, "P 2"], z: Scalar, routed: bool | Bool[Array, ""] = True, row: Any = 0,
 ) -> LaneHits:  # fmt: skip
     """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height.
 
-    The corridor is that of the route ``row``, by default that of the recorded ego.
     Of the lanes that hold the centre and lead at most 30 degrees away from the heading, the box drives that with the
-    highest limit, lanes of the route's corridor before others if it is ``routed``. Without such lanes it drives the
-    nearest within 30 degrees, else the nearest within 90 degrees.
+    highest limit, lanes of the corridor of the route ``row`` before others if it is ``routed``. Without such lanes it
+    drives the nearest within 30 degrees, else the nearest within 90 degrees.
     """
     rows, inside = lanes_around(bank, index, centre)
     inside = inside & is_level(rows[LaneRow.Z], z)
@@ -223,7 +222,7 @@ def around_lanes(
     )
 
 
-def in_corridor(bank: ScenarioBank, lanes: Float[Array, "8 K"], row: int | Integer) -> Bool[Array, " K"]:
+def in_corridor(bank: ScenarioBank, lanes: Float[Array, "8 K"], row: Any) -> Bool[Array, " K"]:
     """Mask of lanes (:class:`LaneRow`) in the corridor of a route."""
     code = lanes[LaneRow.LANE]
     if bank.most_egos == 1:

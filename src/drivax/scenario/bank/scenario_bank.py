@@ -251,17 +251,17 @@ class ScenarioBank:
         """Number of egos K that each scenario has rows for."""
         return self.egos.shape[1]
 
-    def row_of(self, index: Integer, slot: int | Integer) -> Integer:
+    def row_of(self, index: Any, slot: int | Integer) -> Any:
         """Row of the route of an agent; that of the recorded ego for agents without a route."""
         if self.most_egos == 1:
             return index
         return index * self.most_egos + jnp.argmax(self.egos[index] == slot).astype(jnp.int32)
 
-    def ego_number(self, row: Integer) -> int | Integer:
+    def ego_number(self, row: int | Integer) -> int | Integer:
         """Number of an ego in its scenario, 0 for the recorded one."""
         return 0 if self.most_egos == 1 else row % self.most_egos
 
-    def ego_slot(self, row: Integer) -> int | Integer:
+    def ego_slot(self, row: int | Integer) -> int | Integer:
         """Slot of the ego of a row, -1 for a row without one."""
         return 0 if self.most_egos == 1 else self.egos.reshape(-1)[row]
 

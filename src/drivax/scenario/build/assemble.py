@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -160,18 +162,12 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     whole = lane_graph(recording.features, origin)
     lane_segments = LaneSegments.of(segments, whole)
     intent, unknown = _intent(recording, whole)
-    sizes = capacity.routes, capacity.route_points
-    routes = find_routes(lane_segments, log, intent, style, *sizes)
     preferred = (*recording.to_predict, *recording.of_interest)
     placement = place(tracks, preferred, capacity.agents, capacity.parked)
-    egos = [
-        FurtherEgo(slot, last, find_routes(lane_segments, ego_log(own, now, last), Intent(), style, *sizes))
-        for slot, last in further_egos(tracks, placement.moving, now, path, capacity.egos - 1)
-        for own in [replace(tracks, ego=int(placement.moving[slot]))]
-    ]
-    stored = [*routes.routes, *(ego.routes.routes[0] for ego in egos)]
-    on_route = np.unique(np.concatenate([route.lane for route in stored]))
-    on_route = on_route[on_route >= 0]
+    sizes = {"most_routes": capacity.routes, "most_points": capacity.route_points}
+    find = partial(find_routes, lane_segments, style=style, **sizes)
+    routes, egos = find(log, intent), _further_egos(tracks, placement.moving, log, capacity.egos - 1, find)
+    on_route = _lanes_of([*routes.routes, *(ego.routes.routes[0] for ego in egos)])
     in_crop = inside_box(segments.middle, path, MARGIN_M)
     in_crop |= np.isin(segments.feature, whole.feature[on_route])
     grid = arrange(segments.take(in_crop), path, MARGIN_M, capacity)
@@ -213,6 +209,23 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     )
 
 
+def _further_egos(
+    tracks: LocalTracks, moving: Int[Array, " slot"], log: EgoLog, most: int,
+    find: Callable[[EgoLog, Intent], RouteSet],
+) -> list[FurtherEgo]:  # fmt: skip
+    """Return up to ``most`` egos next to the recorded one, with routes from ``find``, without an intended route."""
+    return [
+        FurtherEgo(slot, last, find(ego_log(tracks, log.current, int(moving[slot]), last), Intent()))
+        for slot, last in further_egos(tracks, moving, log, most)
+    ]
+
+
+def _lanes_of(routes: Sequence[Route]) -> Int[Array, " route_lane"]:
+    """Dense indices of the lanes of routes."""
+    lanes = np.unique(np.concatenate([route.lane for route in routes]))
+    return lanes[lanes >= 0]
+
+
 def _drop_jumps(recording: Recording) -> Recording:
     """Drop steps of tracks that are not plausible, and count the tracks that lose some."""
     tracks = recording.tracks
@@ -244,12 +257,13 @@ def _refuse_endless(roads: RoadLines) -> None:
         raise DataError(problem, cure="crop the map in the reader, or repair the points that jump")
 
 
-def ego_log(tracks: LocalTracks, current_step: int, last: int | None = None) -> EgoLog:
-    """Return the log of the ego, up to step ``last``."""
-    row = tracks.ego
-    speed, valid = np.hypot(*tracks.velocity[row].T), tracks.valid[row]
-    if last is not None:
-        valid = valid & (np.arange(len(valid)) <= last)
+def ego_log(
+    tracks: LocalTracks, current_step: int, row: int | None = None, last: int | None = None
+) -> EgoLog:
+    """Return the log of the ego, or of another track, up to step ``last``."""
+    row = tracks.ego if row is None else row
+    speed, valid = np.hypot(*tracks.velocity[row].T), tracks.valid[row].copy()
+    valid[len(valid) if last is None else last + 1 :] = False
     return EgoLog(tracks.xyz[row], tracks.heading[row], speed, valid, current_step)
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
-from drivax.scenario.build.routes import STANDS_M, RouteSet
+from drivax.scenario.build.routes import STANDS_M, EgoLog, RouteSet
 from drivax.scenario.build.tracks import LocalTracks
 from drivax.scenario.schema import CURRENT_STEP, LEAST_STEPS, AgentKind
 
@@ -29,13 +29,14 @@ class FurtherEgo:
 
 
 def further_egos(
-    tracks: LocalTracks, moving: Int[Array, " slot"], now: int, path: Float[Array, "step 2"], most: int
+    tracks: LocalTracks, moving: Int[Array, " slot"], log: EgoLog, most: int
 ) -> list[tuple[int, int]]:
     """Return slot and last step of up to ``most`` vehicles, the nearest to the recorded ego first.
 
-    They are valid at the current step ``now`` and for 2 s or more after it without a gap, and travel more than 2 m in
-    that time. ``moving`` holds the track of every slot, ``path`` the recorded ego's log.
+    They are valid at the current step and for 2 s or more after it without a gap, and travel more than 2 m in that
+    time. ``moving`` holds the track of every slot, ``log`` is that of the recorded ego.
     """
+    now, path = log.current, log.seen[:, :2]
     xy, valid = tracks.xyz[moving, now:, :2], tracks.valid[moving, now:]
     low, high = path.min(axis=0) - KNOWN_M, path.max(axis=0) + KNOWN_M
     unbroken = np.logical_and.accumulate(valid & ((xy >= low) & (xy <= high)).all(axis=2), axis=1)
@@ -44,6 +45,6 @@ def further_egos(
     eligible = (steps >= LEAST_STEPS - CURRENT_STEP) & (travel > STANDS_M)
     eligible &= (tracks.kind[moving] == AgentKind.VEHICLE) & (moving != tracks.ego)
     slots = np.flatnonzero(eligible)
-    distance = np.hypot(*(xy[slots, 0] - tracks.xyz[tracks.ego, now, :2]).T)
+    distance = np.hypot(*(xy[slots, 0] - log.xyz[now, :2]).T)
     chosen = slots[np.argsort(distance, kind="stable")[:most]]
     return [(int(slot), now + int(steps[slot]) - 1) for slot in chosen]
