@@ -14,6 +14,7 @@ from drivax.learning.self_play import SelfPlay, SelfPlayConfig
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 
 OBSERVATION = ObservationConfig(agents=24, steps=1, road=0, lights=1, route=2)
@@ -164,3 +165,52 @@ def test_padding_is_never_alive(bank):
     ends = np.asarray(rollout.terminated | rollout.truncated)
     assert totals["episodes"] == totals["steps/n"] == ends.sum() >= 4
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rollout.observation))
+
+
+def test_every_vehicle_keeps_the_schedule_of_its_own_route(bank):
+    """As logged, each is on its route and neither late nor early; on ego's route further egos would be."""
+    task = Task(
+        observation=OBSERVATION, rewards=RewardConfig(preset="pace"), metrics=("route_deviation_mean",)
+    )
+    environment = SelfPlay(Simulator(task), LATEST, EARLIEST)
+    now = jax.jit(environment.start, static_argnums=2)(bank, jax.random.key(0), 32)
+    facts, context = jax.device_get((now.state.facts, now.state.context))
+    further = (context.slot > 0) & ~np.asarray(now.over)
+    assert further.sum() > 10 and np.isin(context.slot[further], np.asarray(bank.egos)).all()
+    assert len({tuple(row) for row in context.slot.reshape(8, 4)}) > 3
+    driven = ~np.asarray(now.over)
+    assert facts.late_m[driven].max() < 0.5 and facts.early_m[driven].max() < 0.5
+    assert facts.route_deviation_m[driven].max() < 3.0
+    np.testing.assert_array_equal(facts.routed[driven], np.asarray(bank.on_lanes)[context.route[driven]])
+
+
+def test_scenarios_without_further_egos_are_refused(data):
+    words = r"self_play.vehicles is 4, but the scenarios have 1 with a route; generate or convert them with --egos 8"
+    with pytest.raises(UsageError, match=words):
+        SelfPlay(SIMULATOR).start(ScenarioBank.from_scenarios(data), jax.random.key(0), 4)
+
+
+@pytest.mark.slow
+def test_held_decision_of_a_group_takes_its_steps(bank, environment):
+    """Two steps of one action equal two single steps, of vehicles that drive on after their end, too."""
+    double = replace(environment, simulator=replace(SIMULATOR, task=replace(SIMULATOR.task, hold=2)))
+    steps = {name: jax.jit(each.step) for name, each in (("single", environment), ("double", double))}
+    now, waits = jax.jit(environment.start, static_argnums=2)(bank, jax.random.key(0), COUNT), 0
+    for number in range(60):
+        action, key = swerve(jax.random.key(number)), jax.random.key(number)
+        held, result = steps["double"](bank, now, (), action, key)
+        first, one = steps["single"](bank, now, (), action, key)
+        second, two = steps["single"](bank, first, (), action, key)
+        # A group that starts, or ends within the decision, takes no second step.
+        groups = (np.asarray(each.over).reshape(-1, VEHICLES).all(axis=1) for each in (now, first))
+        idle = np.repeat(np.logical_or(*groups), VEHICLES)
+        np.testing.assert_array_equal(held.over, np.where(idle, first.over, second.over))
+        expected = np.asarray(one.reward) + np.where(idle, 0.0, two.reward)
+        alive = ~np.asarray(now.over)
+        np.testing.assert_allclose(result.reward[alive], expected[alive], atol=1e-4)
+        motions = [each.state.context.history[:, -1] for each in (held, first, second)]
+        expected = np.where(idle[:, None], motions[1], motions[2])
+        np.testing.assert_allclose(motions[0], expected, atol=1e-3)
+        waits += int((np.asarray(now.over) & ~idle).sum())
+        now = held
+    assert waits > 20
