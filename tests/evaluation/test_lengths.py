@@ -19,7 +19,7 @@ from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.observation_statistics import observation_statistics
 from drivax.evaluation.runner import evaluate
-from drivax.learning.driving import Driving, _draw
+from drivax.learning.driving import Driving
 from drivax.learning.environment import collect
 from drivax.planners.functions import python_planner
 from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner
@@ -178,7 +178,9 @@ def test_training_episodes_lie_within_their_logs(logs):
     bank = ScenarioBank.from_scenarios([*padded, long[0]], trim=False)
     last = np.asarray(bank.last_step)
     for latest in (None, 60):
-        index, step = map(np.asarray, _draw(bank, jax.random.key(0), 4000, 10, latest)[:2])
+        index, step = map(
+            np.asarray, Driving(Simulator(Task()))._draw(bank, jax.random.key(0), 4000, 10, latest)[:2]
+        )
         for row in range(3):
             most = min(last[row] - 2, latest or 88)
             counts = np.bincount(step[index == row], minlength=91)[10 : most + 1]

@@ -11,7 +11,7 @@ from drivax.errors import UsageError
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
-from drivax.learning.driving import Driving, _draw
+from drivax.learning.driving import Driving
 from drivax.learning.environment import Environment, collect
 from drivax.learning.replay import ReplayConfig
 from drivax.networks.actor_critic import NetworkConfig
@@ -138,9 +138,10 @@ def test_new_episodes_begin_as_logged(experience, bank):
 
 def test_episodes_begin_at_requested_steps(bank):
     late = replace(bank, agents=bank.agents.at[1, :3, 0, AgentColumn.VALID].set(0.0))
-    index, step, _ = _draw(late, jax.random.key(2), 64, 0, 0)
+    logged = Driving(Simulator(Task()))
+    index, step, *_ = logged._draw(late, jax.random.key(2), 64, 0, 0)
     np.testing.assert_array_equal(step, np.where(index == 1, 10, 0))
-    step = _draw(bank, jax.random.key(2), 256, 0, LATEST)[1]
+    step = logged._draw(bank, jax.random.key(2), 256, 0, LATEST)[1]
     assert set(np.asarray(step)) == set(range(LATEST + 1))
     for earliest, latest, words in ((-1, 0, "use 0 or more"), (5, 4, r"use 5 \(earliest_start\) or more")):
         with pytest.raises(UsageError, match=words):

@@ -29,7 +29,7 @@ def bank(data_of_egos):
 
 @pytest.fixture(scope="module")
 def environment():
-    return SelfPlay(SIMULATOR, LATEST, EARLIEST, SelfPlayConfig(VEHICLES))
+    return SelfPlay(SIMULATOR, LATEST, EARLIEST, config=SelfPlayConfig(VEHICLES))
 
 
 def swerve(key):

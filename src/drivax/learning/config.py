@@ -14,7 +14,7 @@ from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig
-from drivax.learning.driving import Driving
+from drivax.learning.driving import Driving, Egos
 from drivax.learning.self_play import SelfPlay, SelfPlayConfig
 from drivax.learning.training_log import Rule
 from drivax.plugins import is_dotted
@@ -54,6 +54,8 @@ class TrainConfig:
             training drives them. A mixture gives the share of the environments of each, which sum to 1.
         self_play: Settings of the traffic ``self``.
         start: How training episodes begin; those of self-play and of validation begin as logged, the latter at step 10.
+        egos: Who drives in training: the recorded ego, or any vehicle of the set with a route and a goal (``moving``,
+            of a set made with ``--egos``). Validation episodes are those of the recorded ego.
         earliest_start, latest_start: Training episodes begin at a random step of the log between the two.
         begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are taken
             over, the rest of the state is fresh. All other settings may differ as long as the networks fit.
@@ -72,6 +74,7 @@ class TrainConfig:
     traffic: str | dict[str, float] = "log"
     self_play: SelfPlayConfig = field(default_factory=SelfPlayConfig)
     start: LogStart | NoisyStart = field(default_factory=LogStart)
+    egos: Egos = "recorded"
     earliest_start: int = CURRENT_STEP
     latest_start: int = CURRENT_STEP
     begin_from: str | None = None
@@ -109,7 +112,8 @@ class TrainConfig:
 
     def environment(self, traffic: Traffic) -> Driving:
         """Return an environment of training with a traffic model (``policies.find_traffic``)."""
-        return Driving(Simulator(self.task, traffic, self.start), self.latest_start, self.earliest_start)
+        simulator = Simulator(self.task, traffic, self.start)
+        return Driving(simulator, self.latest_start, self.earliest_start, self.egos)
 
     @property
     def shares(self) -> dict[str, float]:
@@ -125,7 +129,7 @@ class TrainConfig:
     def self_play_environment(self) -> SelfPlay:
         """Return the environment of the traffic ``self``."""
         simulator = Simulator(self.task)
-        return SelfPlay(simulator, self.latest_start, self.earliest_start, self.self_play)
+        return SelfPlay(simulator, self.latest_start, self.earliest_start, self.egos, self.self_play)
 
     @property
     def iterations(self) -> int:

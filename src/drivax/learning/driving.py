@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +23,13 @@ from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator, Step, map_where
 from drivax.simulator.starts import LogStart
 from drivax.simulator.traffic.bank_data import prepare_bank
-from drivax.simulator.types import AgentContext, EpisodeStart, Frame, SimState
+from drivax.simulator.types import AgentContext, Frame, SimState
 from drivax.tasks.actions import Discrete, Route
 from drivax.tasks.task import Task
 
-#: Scenarios that are replayed in one batch.
+#: Drivers of training episodes: the recorded ego, or any of the set's egos (``scenario.build.egos``).
+Egos = Literal["recorded", "moving"]
+#: Logs that are replayed in one batch.
 _BATCH = 64
 
 
@@ -38,11 +41,14 @@ class Driving:
         simulator: Task, traffic and kind of start.
         latest_start, earliest_start: Episodes begin at a random step of the log between the two, at most the third
             last, or at step 10 where the ego is not valid yet.
+        egos: Who drives: the recorded ego, or one of the egos of the scenario, with equal odds. Rows of logged steps
+            (:data:`~drivax.learning.experience.StepIndex`) are scenarios, or the rows of all egos in the bank.
     """
 
     simulator: Simulator
     latest_start: int = CURRENT_STEP
     earliest_start: int = CURRENT_STEP
+    egos: Egos = "recorded"
 
     def __post_init__(self) -> None:
         if self.earliest_start < 0:
@@ -105,9 +111,8 @@ class Driving:
 
     def _reset(self, data: ScenarioBank, key: Array, count: int) -> tuple[SimState, Bool[Array, " B"]]:
         """Return states at random steps of their logs, none of them over."""
-        index, step, keys = _draw(data, key, count, self.earliest_start)
-        state = jax.vmap(self.simulator.reset, (None, 0, 0, None, 0))(data, index, step, 0, keys)
-        return state, jnp.zeros(count, bool)
+        start = self._draw(data, key, count, self.earliest_start)
+        return jax.vmap(_of_agent(self.simulator.reset, data))(*start), jnp.zeros(count, bool)
 
     def stored(self, state: SimState) -> AgentContext:
         """Return the context: index, step, history, and reactive traffic."""
@@ -161,13 +166,9 @@ class Driving:
         self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
     ) -> Step:
         """Take the first step of a decision, or start a new episode where the last one is over."""
-
-        def new_episode(index: Array, step: Array, key: Array) -> EpisodeStart:
-            return self.simulator.new_episode(data, index, step, 0, key)
-
-        start = _draw(data, key, now.over.shape[0], self.earliest_start, self.latest_start)
+        start = self._draw(data, key, now.over.shape[0], self.earliest_start, self.latest_start)
         step_all = jax.vmap(self.simulator.step_or_reset, (None, 0, 0, 0, 0, 0))
-        fresh = map_where(now.over, new_episode, *start)
+        fresh = map_where(now.over, _of_agent(self.simulator.new_episode, data), *start)
         return step_all(data, now.state, action, now.over, fresh, cache)
 
     def _step_on(
@@ -189,26 +190,31 @@ class Driving:
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
         """
-        index, step, _ = _draw(data, key, count, CURRENT_STEP)
 
-        def demonstrate(index: Array, step: Array) -> tuple[dict[str, Array], Array, Array]:
-            context = self._logged_context(data, index, step)
-            return (dict(self._log_simulator.observe(data, context)), *self._expert_action(data, context))
+        def demonstrate(bank: ScenarioBank, *place: Any) -> tuple[dict[str, Array], Array, Array]:
+            context = self._logged_context(bank, *place)
+            return (dict(self._log_simulator.observe(bank, context)), *self._expert_action(bank, context))
 
-        return jax.vmap(demonstrate)(index, step)
+        *places, _ = self._draw(data, key, count, CURRENT_STEP)
+        return jax.vmap(_of_agent(demonstrate, data))(*places)
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
         """Observe logged steps as in :meth:`demonstrations`."""
-        contexts = partial(self._logged_context, data)
-        return jax.vmap(lambda *index: dict(self._log_simulator.observe(data, contexts(*index))))(*index)
+
+        def observe(row: Array, step: Array) -> dict[str, Array]:
+            scenario, slot = self._ego_of(data, row)
+            return dict(self._log_simulator.observe(data, self._logged_context(data, scenario, step, slot)))
+
+        return jax.vmap(observe)(*index)
 
     def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
         """Return the log as a rollout of the expert from the current step on, with the simulator's rewards and ends.
 
         All agents follow the log, because the outcome of the expert's actions is only known among these.
         """
-        scenarios = jnp.arange(len(data))
-        rollouts = jax.lax.map(partial(self._rollout, data), scenarios, batch_size=min(len(data), _BATCH))
+        egos = 1 if self.egos == "recorded" else data.most_egos
+        rows = jnp.arange(len(data) * egos)
+        rollouts = jax.lax.map(partial(self._rollout, data), rows, batch_size=min(len(rows), _BATCH))
         # Zeros before the current step and at the last step, which has no successor.
         action, reward, terminated, truncated, clipped = (
             jnp.pad(values, ((0, 0), (CURRENT_STEP, 1), *((0, 0),) * (values.ndim - 2)))
@@ -216,18 +222,49 @@ class Driving:
         )
         ends = terminated | truncated
         over = jnp.cumsum(ends, axis=1) > ends
-        usable = _has_expert_action(data) & ~over
-        return ExpertSteps(action, reward, terminated, truncated, usable, clipped, self.task.hold)
+        usable = _has_expert_action(data, egos) & ~over
+        return ExpertSteps(action, reward, terminated, truncated, usable, clipped, self.task.hold, egos)
 
     @property
     def _log_simulator(self) -> Simulator:
         """Simulator of log traffic without metrics."""
         return Simulator(replace(self.task, metrics="none"))
 
-    def _logged_context(self, bank: ScenarioBank, index: Array, step: Array) -> AgentContext:
+    def _ego_of(self, bank: ScenarioBank, row: Array) -> tuple[Array, Any]:
+        """Return scenario and slot of a row of logged steps; rows without an ego have that of the recorded one."""
+        if self.egos == "recorded":
+            return row, 0
+        return row // bank.most_egos, jnp.maximum(bank.ego_slot(row), 0)
+
+    def _draw(
+        self, bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int | None = None
+    ) -> tuple[Int[Array, " B"], Int[Array, " B"], Any, Array]:
+        """Draw scenarios, steps at which the ego is valid (else step 10), slots of egos, and keys for starts.
+
+        Steps are at most the third last. The slot is None if all egos are the recorded ones.
+        """
+        index_key, step_key = jax.random.split(key)
+        index = jax.random.randint(index_key, (count,), 0, len(bank))
+        slot, row = None, index * bank.most_egos
+        if self.egos == "moving":
+            number = jax.random.randint(
+                jax.random.fold_in(index_key, 1), (count,), 0, (bank.egos[index] >= 0).sum(axis=1)
+            )
+            slot, row = bank.egos[index, number], row + number
+        last = bank.last_step[row] - 2
+        last = last if latest is None else jnp.minimum(last, latest)
+        step = jax.random.randint(step_key, (count,), earliest, jnp.maximum(last, earliest) + 1)
+        # Egos are always valid at the current step.
+        is_valid = bank.agents[index, step, 0 if slot is None else slot, AgentColumn.VALID] > 0
+        step = jnp.where(is_valid & (step <= last), step, CURRENT_STEP)
+        # Unused, and not computed, with logged starts.
+        keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
+        return index, step, slot, keys
+
+    def _logged_context(self, bank: ScenarioBank, index: Array, step: Array, slot: Any = 0) -> AgentContext:
         """Return the context of a logged step as if the expert had driven there."""
         context, before = (
-            self._log_simulator.context(bank, index, t) for t in (step, jnp.maximum(step - 1, 0))
+            self._log_simulator.context(bank, index, t, slot) for t in (step, jnp.maximum(step - 1, 0))
         )
         action = expert_action(bank, before, self.task.actions)
         return replace(context, action=self.task.actuate(bank, before, action))
@@ -243,11 +280,11 @@ class Driving:
         target = jnp.clip(action, -1.0, 1.0) if is_route else self.task.actuate(bank, context, action)
         return target, space.exceeds_bounds(action)
 
-    def _rollout(self, bank: ScenarioBank, index: Int[Array, ""]) -> tuple[Array, ...]:
-        """Action, reward, terminated, truncated and clipped of the expert in one scenario from the current step on."""
-        simulator = self._log_simulator
-        first = simulator.reset(bank, index)
-        first = replace(first, context=self._logged_context(bank, index, first.start))
+    def _rollout(self, bank: ScenarioBank, row: Int[Array, ""]) -> tuple[Array, ...]:
+        """Action, reward, terminated, truncated and clipped of an expert from the current step on."""
+        simulator, (index, slot) = self._log_simulator, self._ego_of(bank, row)
+        first = simulator.reset(bank, index, slot=slot)
+        first = replace(first, context=self._logged_context(bank, index, first.start, slot))
 
         def step(state: SimState, _: None) -> tuple[SimState, tuple[Array, ...]]:
             action, clipped = self._expert_action(bank, state.context)
@@ -262,28 +299,26 @@ def keep(mask: Bool[Array, " B"], old: Any, new: Any) -> Any:
     return jax.vmap(lambda mask, old, new: jax.tree.map(partial(jnp.where, mask), old, new))(mask, old, new)
 
 
-def _draw(
-    bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int | None = None
-) -> tuple[Int[Array, " B"], Int[Array, " B"], Array]:
-    """Draw scenarios, steps up to the third last at which the ego is valid (else step 10), and keys for starts."""
-    index_key, step_key = jax.random.split(key)
-    index = jax.random.randint(index_key, (count,), 0, len(bank))
-    last = bank.last_step[index * bank.most_egos] - 2
-    last = last if latest is None else jnp.minimum(last, latest)
-    step = jax.random.randint(step_key, (count,), earliest, jnp.maximum(last, earliest) + 1)
-    # The ego is always valid at the current step.
-    is_valid = (bank.agents[index, step, 0, AgentColumn.VALID] > 0) & (step <= last)
-    step = jnp.where(is_valid, step, CURRENT_STEP)
-    # Unused, and not computed, with logged starts.
-    keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
-    return index, step, keys
+def _of_agent(function: Callable[..., Any], bank: ScenarioBank) -> Callable[..., Any]:
+    """Return ``function(bank, index, step, slot, ...)`` of one drawn agent, with slot 0 for None."""
+
+    def call(index: Array, step: Array, slot: Any, *rest: Array) -> Any:
+        return function(bank, index, step, 0 if slot is None else slot, *rest)
+
+    return call
 
 
-def _has_expert_action(bank: ScenarioBank) -> Bool[Array, "N T"]:
-    """Mask of steps with an expert action: from the current step on, with a valid ego then and for two more steps."""
-    valid = bank.agents[:, :, 0, AgentColumn.VALID] > 0
+def _has_expert_action(bank: ScenarioBank, egos: int) -> Bool[Array, "M T"]:
+    """Mask of steps with an expert action of the first egos of each scenario.
+
+    These are the steps from the current one on that are valid, as are the next two of the ego's log.
+    """
+    steps, slot = jnp.arange(bank.steps), bank.egos[:, :egos, None]
+    valid = bank.agents[jnp.arange(len(bank))[:, None, None], steps, slot, AgentColumn.VALID] > 0
+    last = bank.last_step.reshape(bank.egos.shape)[:, :egos, None]
+    valid = (valid & (slot >= 0) & (steps <= last)).reshape(-1, bank.steps)
     has_successors = jnp.pad(valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:], ((0, 0), (0, 2)))
-    return has_successors & (jnp.arange(bank.steps) >= CURRENT_STEP)
+    return has_successors & (steps >= CURRENT_STEP)
 
 
 def _totals(

@@ -26,7 +26,7 @@ from drivax.scenario.record import record, static
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.intervals import effective_size
 
-#: Scenarios and steps.
+#: Rows (scenarios, or egos of scenarios) and steps.
 StepIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
 #: Observations, expert actions within the bounds, and whether those were clipped.
 ExpertActions = tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]
@@ -98,19 +98,20 @@ def check_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 @record
 class ExpertSteps:
-    """Actions of an expert, within the bounds, at T steps of N scenarios, and their outcome.
+    """Actions of experts, within the bounds, at T steps of M logs, and their outcome.
 
     Steps that are not ``usable`` are undefined. An action that was ``clipped`` to the bounds does not lead to the next
-    state. ``hold`` is the number of steps per decision (``Task.hold``).
+    state. ``hold`` is the number of steps per decision (``Task.hold``), ``egos`` the number of logs per scenario.
     """
 
-    action: Float[Array, "N T D"]
-    reward: Float[Array, "N T"]
-    terminated: Bool[Array, "N T"]
-    truncated: Bool[Array, "N T"]
-    usable: Bool[Array, "N T"]
-    clipped: Bool[Array, "N T"]
+    action: Float[Array, "M T D"]
+    reward: Float[Array, "M T"]
+    terminated: Bool[Array, "M T"]
+    truncated: Bool[Array, "M T"]
+    usable: Bool[Array, "M T"]
+    clipped: Bool[Array, "M T"]
     hold: int = static(default=1)
+    egos: int = static(default=1)
 
 
 @runtime_checkable
@@ -153,7 +154,7 @@ class Experience:
 
     data: Any
     expert: ExpertSteps
-    usable: Bool[Array, "N T"]
+    usable: Bool[Array, "M T"]
     uniform: Sampler
     critic: Sampler
     policy: Sampler | None = None
@@ -179,6 +180,8 @@ class ExperienceConfig:
     def of(self, environment: Environment, data: Any, weights: np.ndarray | None = None) -> Experience:
         """Return the experience in an environment's data, drawn by ``weights`` ``[N, T]`` or uniformly.
 
+        All logs of a scenario have its weights.
+
         Raises UsageError if there is no expert or the weights do not fit the data, DataError if no step is usable.
         """
         expert = _expert_steps(require_log(environment), data)
@@ -186,7 +189,8 @@ class ExperienceConfig:
         uniform = sampler(np.asarray(usable, np.float64))
         if weights is None:
             return Experience(data, expert, usable, uniform, uniform)
-        weighted = sampler(np.asarray(usable) * check_weights(weights, usable.shape))
+        weights = check_weights(weights, (usable.shape[0] // expert.egos, usable.shape[1]))
+        weighted = sampler(np.asarray(usable) * np.repeat(weights, expert.egos, axis=0))
         if self.weighted == "all":
             return Experience(data, expert, usable, uniform, weighted)
         return Experience(data, expert, usable, uniform, uniform, weighted)

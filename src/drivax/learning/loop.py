@@ -154,14 +154,15 @@ class _Scenarios:
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
-    """Return which logged steps ``[N, T]`` an offline training draws from.
+    """Return which logged steps ``[N, T]`` an offline training draws from, of any ego.
 
     Raises:
         UsageError: The algorithm is not offline.
     """
     environment, bank = _environment(config, data)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
-    return np.asarray(experience.usable)
+    usable = np.asarray(experience.usable).reshape(len(data), -1, bank.steps)
+    return np.asarray(usable.any(axis=1))
 
 
 def hashes(validation: ScenarioSet | None, weights: np.ndarray | None) -> dict[str, Any]:
@@ -199,9 +200,16 @@ def _held_out_data(
 
 
 def _environment(config: TrainConfig, data: Iterable[Scenario]) -> tuple[Driving | Mixture, ScenarioBank]:
-    """Return the environment of a training, and its bank."""
-    environment = training_environment(config)
-    return environment, environment.prepare(ScenarioBank.from_scenarios(data))
+    """Return the environment of a training, and its bank.
+
+    Raises:
+        UsageError: ``egos`` is moving, but the set has no further egos.
+    """
+    environment, bank = training_environment(config), ScenarioBank.from_scenarios(data)
+    if config.egos == "moving" and bank.most_egos == 1:
+        cure = "convert or generate the set with --egos 8"
+        raise UsageError("egos is moving, but only the recorded ego of each scenario has a route", cure=cure)
+    return environment, environment.prepare(bank)
 
 
 def _create_folders(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any, NoReturn
 
@@ -107,11 +107,10 @@ class Mixture:
             stepped = self.blocks[number][1].step(data, block, cache[number], own, keys[number])
             after.append(stepped[0])
             outcomes.append(stepped[1])
-        batch = [(outcome.reward, outcome.terminated, outcome.truncated) for outcome in outcomes]
         totals = jax.tree.map(lambda *sums: sum(sums), *(outcome.totals for outcome in outcomes))
         caches = tuple(outcome.cache for outcome in outcomes)
-        outcome = Outcome(*jax.tree.map(_join, *batch), cache=caches, totals=totals)
-        return _concatenate(after), outcome
+        outcome = jax.tree.map(_join, *(replace(outcome, cache=(), totals={}) for outcome in outcomes))
+        return _concatenate(after), replace(outcome, cache=caches, totals=totals)
 
     def demonstrations(self, data: ScenarioBank, key: Array, count: int) -> ExpertActions:
         """Return the expert's actions at random steps of the log."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NoReturn
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.learning.driving import Driving, _draw, keep
+from drivax.learning.driving import Driving, keep
 from drivax.learning.environment import Environments
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -69,21 +69,21 @@ class SelfPlay(Driving):
         if size > data.most_egos:
             problem = f"self_play.vehicles is {size}, but the scenarios have {data.most_egos} with a route"
             raise UsageError(problem, cure="generate or convert them with --egos 8, or lower it")
-        index, step, keys = _draw(data, key, count // size, self.earliest_start)
-        slots = jax.vmap(partial(self._slots, data))(index, step, keys)
-        state = jax.vmap(self.simulator.reset_together, (None, 0, 0, 0))(data, index, slots, step)
-        state = _flatten(state)
+        index, step, keys = self._draw_groups(data, key, count // size)
+        slots, keys = jax.vmap(partial(self._slots, data))(index, step, keys)
+        reset = jax.vmap(self.simulator.reset_together, (None, 0, 0, 0, 0))
+        state = _flatten(reset(data, index, slots, step, keys))
         return state, ~is_driven(data, state)
 
     def _step_or_reset(
         self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
     ) -> Step:
         def new_episodes(index: Array, step: Array, key: Array) -> EpisodeStart:
-            slots = self._slots(data, index, step, key)
-            return jax.vmap(lambda slot: self.simulator.new_episode(data, index, step, slot))(slots)
+            slots, keys = self._slots(data, index, step, key)
+            return jax.vmap(partial(self.simulator.new_episode, data, index, step))(slots, keys)
 
         states, actions, over = self._groups((now.state, action, now.over))
-        start = _draw(data, key, len(over), self.earliest_start, self.latest_start)
+        start = self._draw_groups(data, key, len(over), self.latest_start)
         fresh = map_where(over.all(axis=1), new_episodes, *start)
         step_all = jax.vmap(self.simulator.step_together, (None, 0, 0, 0, 0))
         return _flatten(step_all(data, states, actions, over, fresh))
@@ -101,15 +101,26 @@ class SelfPlay(Driving):
         resets = jnp.repeat(self._groups(over).all(axis=1), self.config.vehicles)
         return jnp.where(resets, ~is_driven(data, state), over | ends)
 
-    def _slots(self, bank: ScenarioBank, index: Array, step: Array, key: Array) -> Int[Array, " K"]:
-        """Return the slots of ego and of random further egos whose log has at least two more steps; then padding."""
+    def _draw_groups(
+        self, bank: ScenarioBank, key: Array, count: int, latest: int | None = None
+    ) -> tuple[Int[Array, " G"], Int[Array, " G"], Array]:
+        """Draw scenario, step and key of each group."""
+        recorded = replace(self, egos="recorded")
+        index, step, _, keys = recorded._draw(bank, key, count, self.earliest_start, latest)
+        return index, step, keys
+
+    def _slots(
+        self, bank: ScenarioBank, index: Array, step: Array, key: Array
+    ) -> tuple[Int[Array, " K"], Array]:
+        """Return the slots of ego and of random further egos whose log has two more steps, then padding; and keys."""
         moving, further = bank.agents.shape[2], bank.egos[index, 1:]
         rows = index * bank.most_egos + jnp.arange(1, bank.most_egos)
         present = bank.agents[index, step, further, AgentColumn.VALID] > 0
         present &= (further >= 0) & (step <= bank.last_step[rows] - 2)
         rank = jnp.where(present, jax.random.uniform(key, further.shape), jnp.inf)
         slots = jnp.where(present, further, moving)[jnp.argsort(rank)[: self.config.vehicles - 1]]
-        return jnp.pad(slots, (1, 0)).astype(jnp.int32)
+        keys = jax.random.split(jax.random.fold_in(key, 1), self.config.vehicles)
+        return jnp.pad(slots, (1, 0)).astype(jnp.int32), keys
 
     def _groups(self, tree: Any) -> Any:
         """Return a batch of environments as groups."""

@@ -117,13 +117,14 @@ class Simulator:
         return self._drive(bank, state, action, motion)
 
     def reset_together(
-        self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP
-    ) -> SimState:
+        self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP,
+        keys: Any = None,
+    ) -> SimState:  # fmt: skip
         """Return the stacked states of K agents of one scenario, at slots from :func:`slots_of`.
 
         All start as logged: a noisy start supports a single driven agent.
         """
-        contexts = jax.vmap(lambda slot: self.context(bank, index, step, slot))(slots)
+        contexts = jax.vmap(partial(self.context, bank, index, step))(slots, keys)
         return jax.vmap(lambda context: self._initial_state(bank, context, contexts))(contexts)
 
     def step_together(

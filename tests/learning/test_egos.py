@@ -1,0 +1,133 @@
+"""Training with any moving vehicle as the ego: draws, logged steps, weights, and sets without further egos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.errors import UsageError
+from drivax.learning.config import TrainConfig
+from drivax.learning.driving import Driving
+from drivax.learning.experience import ExperienceConfig, sample_steps
+from drivax.learning.loop import train
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import with_ego
+from drivax.scenario.schema import CAPACITIES
+from drivax.simulator.simulator import Simulator
+from drivax.synthetic.world import generate_recording
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from scenes import car, straight_road
+
+SMALL = replace(CAPACITIES["default"], name="small", agents=40, parked=24)
+EGOS = 4
+TASK = Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=3), metrics=("steps",))
+MOVING = Driving(Simulator(TASK), latest_start=40, earliest_start=4, egos="moving")
+RECORDED = replace(MOVING, egos="recorded")
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """A bank in which the scenarios have 4, 3 and 1 egos, and the bank of the 5 further ones as recorded egos."""
+    recordings = [
+        generate_recording(0, 8),
+        straight_road([car(0, 0, 0, 10), car(-20, 0, 0, 9), car(10, 3.7, 0, 12, steps=range(6, 41))]),
+        straight_road([car(0, 0, 0, 10), car(30, 0)]),
+    ]
+    scenarios = [assemble(recording, SMALL.with_egos(EGOS)) for recording in recordings]
+    alone, rows = [], []
+    for index, (recording, scenario) in enumerate(zip(recordings, scenarios, strict=True)):
+        for number, slot in enumerate(scenario.ego_slot.tolist()):
+            if slot >= 0:
+                (row,) = np.flatnonzero(recording.tracks.track_id == scenario.agent_id[slot])
+                alone.append(assemble(with_ego(replace(recording, route_lanes=()), int(row)), SMALL))
+                rows.append(index * EGOS + number + 1)
+    banks = (ScenarioBank.from_scenarios(each, trim=False) for each in (scenarios, alone))
+    return *banks, np.array(rows)
+
+
+def test_scenarios_and_their_egos_are_drawn_uniformly(worlds):
+    bank, count = worlds[0], 24_000
+    index, step, slot = map(np.asarray, MOVING._draw(bank, jax.random.key(0), count, 4, 40)[:3])
+    egos = np.asarray(bank.egos)
+    assert (egos >= 0).sum(axis=1).tolist() == [4, 3, 1]
+    for scenario, slots in enumerate(egos):
+        drawn = slot[index == scenario]
+        assert abs(len(drawn) - count / 3) < 5 * np.sqrt(count * 2 / 9)
+        members = slots[slots >= 0]
+        share = len(drawn) / len(members)
+        assert set(drawn) == set(members)
+        for member in members:
+            assert abs((drawn == member).sum() - share) < 5 * np.sqrt(share)
+    assert np.asarray(bank.agents)[index, step, slot, 7].all()
+    last = np.asarray(bank.last_step)[np.asarray(jax.vmap(bank.row_of)(index, slot))]
+    assert (step <= last - 2).all()
+    # The third vehicle of the road is there from step 6 to 40.
+    short = slot[index == 1] == egos[1][np.asarray(bank.last_step)[4:8] == 40]
+    steps = step[index == 1][short]
+    assert steps.min() == 6 and steps.max() == 38
+
+
+def test_episodes_begin_with_the_drawn_ego(worlds):
+    now = jax.jit(MOVING.start, static_argnums=2)(worlds[0], jax.random.key(1), 16)
+    context, bank = now.state.context, worlds[0]
+    assert len(set(np.asarray(context.slot).tolist())) > 2
+    np.testing.assert_array_equal(context.route, jax.vmap(bank.row_of)(context.index, context.slot))
+    logged = bank.agents[context.index, context.step, context.slot, :2]
+    np.testing.assert_allclose(context.history[:, -1, :2], logged, atol=1e-4)
+    recorded = jax.jit(RECORDED.start, static_argnums=2)(bank, jax.random.key(1), 16)
+    assert not np.asarray(recorded.state.context.slot).any()
+
+
+def test_logged_steps_are_those_of_recorded_egos(worlds):
+    bank, alone, rows = worlds
+    steps, own = (jax.jit(each.expert_steps)(data) for each, data in ((MOVING, bank), (RECORDED, alone)))
+    assert steps.usable.shape == (len(bank) * EGOS, bank.steps) and steps.egos == EGOS and own.egos == 1
+    empty = np.asarray(bank.egos).reshape(-1) < 0
+    assert not np.asarray(steps.usable)[empty].any() and np.asarray(steps.usable)[~empty].any(axis=1).all()
+    for row, number in zip(rows, range(len(rows)), strict=True):
+        usable, last = np.asarray(steps.usable[row]), int(bank.last_step[row])
+        np.testing.assert_array_equal(usable[: last - 1], np.asarray(own.usable[number])[: last - 1])
+        assert not usable[last - 1 :].any()
+        np.testing.assert_allclose(steps.action[row][usable], own.action[number][usable], atol=5e-3)
+    index = np.repeat(rows, 2), np.tile([12, 20], len(rows))
+    seen = jax.jit(MOVING.observe_recorded)(bank, tuple(map(jnp.asarray, index)))
+    place = np.repeat(np.arange(len(rows)), 2), index[1]
+    own_seen = jax.jit(RECORDED.observe_recorded)(alone, tuple(map(jnp.asarray, place)))
+    for name in ("ego", "agents", "route"):
+        np.testing.assert_allclose(seen[name], own_seen[name], atol=2e-3, err_msg=name)
+
+
+def test_demonstrations_are_those_of_logged_steps(worlds):
+    """The actions that cloning draws are among the logged actions of all egos, and of no others."""
+    bank = worlds[0]
+    steps = jax.jit(MOVING.expert_steps)(bank)
+    action = np.asarray(jax.jit(MOVING.demonstrations, static_argnums=2)(bank, jax.random.key(2), 128)[1])
+    logged = np.asarray(steps.action).reshape(-1, 2)
+    row = np.abs(logged - action[:, None]).sum(axis=2)
+    assert (row.min(axis=1) < 1e-4).all()
+
+
+def test_weights_of_a_scenario_apply_to_all_its_egos(worlds):
+    bank, weights = worlds[0], np.zeros((3, worlds[0].steps))
+    weights[1, 20], weights[0, 30] = 3.0, 1.0
+    experience = ExperienceConfig(mask_clipped=False).of(MOVING, bank, weights)
+    row, step = map(np.asarray, sample_steps(experience.critic, jax.random.key(0), (4000,)))
+    egos = {index: [4 * index + k for k in range(EGOS) if bank.egos[index, k] >= 0] for index in (0, 1)}
+    assert set(zip(row.tolist(), step.tolist(), strict=True)) == {
+        *((each, 20) for each in egos[1]), *((each, 30) for each in egos[0]),
+    }  # fmt: skip
+    share = 9 / 13  # three egos of weight 3, four of weight 1
+    assert abs((step == 20).mean() - share) < 5 * np.sqrt(share * (1 - share) / 4000)
+    with pytest.raises(UsageError, match=r"weights of shape \(12, 91\) for 3 scenarios"):
+        ExperienceConfig().of(MOVING, bank, np.ones((12, 91)))
+
+
+def test_sets_without_further_egos_are_refused(data, tmp_path):
+    with pytest.raises(UsageError, match=r"only the recorded ego of each scenario has a route; .* --egos 8"):
+        train(TrainConfig(task=TASK, egos="moving"), data, tmp_path / "run", validation=None)
