@@ -9,13 +9,19 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.learning.environment import Environment, collect
+from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.driving import Driving
+from drivax.learning.environment import Environment, PastPolicy, collect, past_policy
+from drivax.learning.mixture import Mixture
 from drivax.learning.self_play import SelfPlay, SelfPlayConfig
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.encoders import MlpConfig
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
+from pendulum import Pendulum
 
 OBSERVATION = ObservationConfig(agents=24, steps=1, road=0, lights=1, route=2)
 SIMULATOR = Simulator(Task(observation=OBSERVATION, metrics=("steps", "collision")))
@@ -188,6 +194,72 @@ def test_scenarios_without_further_egos_are_refused(data):
     words = r"self_play.vehicles is 4, but the scenarios have 1 with a route; generate or convert them with --egos 8"
     with pytest.raises(UsageError, match=words):
         SelfPlay(SIMULATOR).start(ScenarioBank.from_scenarios(data), jax.random.key(0), 4)
+
+
+def test_past_policy_drives_all_but_ego_of_its_groups(environment):
+    half = replace(environment, config=SelfPlayConfig(VEHICLES, past=0.5, refresh=7))
+    assert half.past(COUNT).environments.tolist() == [1, 2, 4, 5] and half.past(COUNT).refresh == 7
+    assert past_policy(half, COUNT) is not None and past_policy(environment, COUNT) is None
+    log = Driving(SIMULATOR)
+    mixture = Mixture((("log", log), ("self", half), ("own", log)), (0.25, 0.5, 0.25))
+    assert mixture.sizes(24) == (6, 12, 6)
+    assert past_policy(mixture, 24).environments.tolist() == [7, 8, 10, 11]
+    assert past_policy(Mixture((("log", log), ("own", log)), (0.5, 0.5)), 24) is past_policy(log, 24) is None
+    with pytest.raises(UsageError, match=r"self_play.past is 2, self_play.refresh 50; use a share"):
+        SelfPlayConfig(past=2.0)
+
+
+class WithPast(Pendulum):
+    """Four pendulums, of which an older copy of the policy swings two."""
+
+    def past(self, count):
+        return PastPolicy(np.array([1, 3]), 2)
+
+
+def test_ppo_acts_with_the_past_policy_and_learns_nothing_of_it():
+    config = PpoConfig(
+        network=NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,)), environments=4, unroll=8,
+        epochs=1, minibatches=2, learning_rate=0.1,
+    )  # fmt: skip
+    learner = config.build(WithPast(), None, 8)
+    iterate, states = (
+        jax.jit(partial(learner.iterate, None)),
+        [jax.jit(learner.init)(None, jax.random.key(0))],
+    )
+    for _ in range(4):
+        states.append(iterate(states[-1])[0])
+
+    def same(one, other):
+        return all(jax.tree.leaves(jax.tree.map(np.array_equal, one, other)))
+
+    # Copies after iterations 2 and 4.
+    origin = [0, 0, 2, 2, 4]
+    assert all(
+        same(state.past, states[number].parameters) for state, number in zip(states, origin, strict=True)
+    )
+    state, seen = states[3], states[3].environments.observation
+    assert not same(state.past, state.parameters)
+    act = jax.jit(learner.sample_action)
+    mixed, current, older = (
+        act(replace(state, parameters=now, past=before), seen, jax.random.key(1)).action
+        for now, before in ((state.parameters, state.past), (state.parameters,) * 2, (state.past,) * 2)
+    )
+    np.testing.assert_array_equal(mixed[0::2], current[0::2])
+    np.testing.assert_array_equal(mixed[1::2], older[1::2])
+    assert not np.isclose(mixed[1::2], current[1::2]).any()
+    # What happened to the older copy changes no update.
+    _, rollout, _ = jax.jit(
+        lambda state: collect(
+            learner.environment, None, state.environments, partial(learner.sample_action, state),
+            learner.rollout_key(state), 8,
+        )
+    )(state)  # fmt: skip
+    update = jax.jit(partial(learner.update, None))
+    updated, other, changed = (
+        update(state, replace(rollout, reward=rollout.reward.at[:, column].add(5.0)))[0].parameters
+        for column in (jnp.array([], int), jnp.array([1, 3]), jnp.array([0]))
+    )
+    assert same(updated, other) and not same(updated, changed)
 
 
 @pytest.mark.slow

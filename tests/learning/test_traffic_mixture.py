@@ -13,11 +13,11 @@ from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.config import TrainConfig
-from drivax.learning.environment import Environment, collect
+from drivax.learning.environment import Environment
 from drivax.learning.loop import make_agent, mean_logs
 from drivax.learning.mixture import Mixture, divide, training_environment
 from drivax.learning.replay import ReplayConfig
-from drivax.learning.self_play import SelfPlay
+from drivax.learning.self_play import SelfPlay, SelfPlayConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -183,8 +183,8 @@ def test_mixture_equals_its_blocks_alone(bank):
 
 @pytest.mark.slow
 def test_ppo_trains_in_a_mixture_and_resumes_bit_for_bit(bank, tmp_path):
-    learner = make_agent(CONFIG, bank)
-    assert learner.environment.sizes(12) == (8, 2, 2)
+    learner = make_agent(replace(CONFIG, self_play=SelfPlayConfig(past=0.5, refresh=2)), bank)
+    assert learner.environment.sizes(12) == (8, 2, 2) and learner.past.environments.tolist() == [1, 2, 3]
     iterate = jax.jit(learner.iterate)
     states, rows = [jax.jit(learner.init)(bank, jax.random.key(0))], []
     for _ in range(4):
@@ -220,16 +220,3 @@ def test_logged_steps_are_those_of_the_log(bank):
         jax.jit(each.demonstrations, static_argnums=2)(bank, jax.random.key(0), 8) for each in (mixture, log)
     ]
     jax.tree.map(np.testing.assert_array_equal, *seen)
-
-
-def test_rows_of_a_mixture_are_a_rollout(bank):
-    mixture = training_environment(CONFIG)
-    environments = jax.eval_shape(lambda: mixture.start(bank, jax.random.key(0), 12))
-
-    def actor(observation, key):
-        return jnp.zeros((12, 2)), jnp.zeros((12, 2)), {}
-
-    _, rollout, totals = jax.eval_shape(
-        lambda now: collect(mixture, bank, now, actor, jax.random.key(1), 5), environments
-    )
-    assert rollout.alive.shape == (5, 12) and "reward/progress" in totals

@@ -108,6 +108,8 @@ class TrainConfig:
                 make_traffic(base)
                 if run is not None:
                     RunFolder.open(policy_folder(run))
+        if self.self_play.past and not isinstance(self.algorithm, PpoConfig | BcPpoConfig):
+            raise UsageError("self_play.past needs ppo or bc_ppo", cure="set self_play.past to 0")
         self.environment(LogTraffic())  # checks the steps at which episodes begin
 
     def environment(self, traffic: Traffic) -> Driving:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkab
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float
 
@@ -54,7 +55,10 @@ class Outcome:
 
 @runtime_checkable
 class Environment(Protocol):
-    """An environment that algorithms train in."""
+    """An environment that algorithms train in.
+
+    With a method ``past(count) -> PastPolicy`` it has environments that an older copy of the policy drives.
+    """
 
     @property
     def action_size(self) -> int:
@@ -98,6 +102,23 @@ class Environment(Protocol):
         A reset takes a step of its own, so every state that the policy sees, final states included, is observed once.
         """
         ...
+
+
+class PastPolicy(NamedTuple):
+    """Environments ``[n]`` that an older copy of the policy drives: their steps are not learned from.
+
+    The copy is taken every ``refresh`` iterations.
+    """
+
+    environments: np.ndarray
+    refresh: int
+
+
+def past_policy(environment: Environment, count: int) -> PastPolicy | None:
+    """Return which of ``count`` environments an older copy of the policy drives, None if it drives none."""
+    find: Callable[[int], PastPolicy] | None = getattr(environment, "past", None)
+    past = None if find is None else find(count)
+    return past if past is not None and len(past.environments) else None
 
 
 @record

@@ -10,12 +10,13 @@ from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
 from drivax.learning.config import SELF, TrainConfig
 from drivax.learning.driving import Driving
-from drivax.learning.environment import Environments, Outcome
+from drivax.learning.environment import Environments, Outcome, PastPolicy
 from drivax.learning.experience import ExpertActions, ExpertSteps, StepIndex
 from drivax.learning.policies import find_traffic
 from drivax.learning.self_play import SelfPlay, refuse_stored_states
@@ -65,6 +66,15 @@ class Mixture:
                 cure = "mix at most one trained policy, and one kind of reactive vehicles"
                 raise UsageError(f"traffic {name} replaces data of another traffic", cure=cure)
         return data
+
+    def past(self, count: int) -> PastPolicy:
+        """Return the environments that an older copy of the policy drives: of the block of self-play, if any."""
+        sizes = self.sizes(count)
+        for (_, block), size, first in zip(self.blocks, sizes, accumulate(sizes, initial=0), strict=False):
+            if isinstance(block, SelfPlay):
+                past = block.past(size)
+                return past._replace(environments=first + past.environments)
+        return PastPolicy(np.arange(0), 1)
 
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
         """Shapes of one observation by group."""

@@ -8,11 +8,12 @@ from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.learning.driving import Driving, keep
-from drivax.learning.environment import Environments
+from drivax.learning.environment import Environments, PastPolicy
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Step, is_driven, map_where
@@ -25,13 +26,20 @@ class SelfPlayConfig:
 
     Attributes:
         vehicles: Largest number of vehicles of a scenario that the policy drives, ego included.
+        past: Share of the groups in which an older copy of the policy drives all vehicles but ego (PPO only).
+        refresh: Iterations after which the current policy replaces the older copy.
     """
 
     vehicles: int = 4
+    past: float = 0.0
+    refresh: int = 50
 
     def __post_init__(self) -> None:
         if self.vehicles < 2:
             raise UsageError(f"self_play.vehicles is {self.vehicles}", cure="use 2 or more")
+        if not 0.0 <= self.past <= 1.0 or self.refresh < 1:
+            problem = f"self_play.past is {self.past:g}, self_play.refresh {self.refresh}"
+            raise UsageError(problem, cure="use a share from 0 to 1, and 1 iteration or more")
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,13 @@ class SelfPlay(Driving):
     """
 
     config: SelfPlayConfig = SelfPlayConfig()
+
+    def past(self, count: int) -> PastPolicy:
+        """Return the environments that an older copy of the policy drives: in the first groups, all but ego's."""
+        size, number = self.config.vehicles, np.arange(count)
+        groups = round(self.config.past * (count // size))
+        is_past = (number // size < groups) & (number % size > 0)
+        return PastPolicy(np.flatnonzero(is_past), self.config.refresh)
 
     def cache(self, data: ScenarioBank, state: SimState) -> Any:
         """Return nothing: a step computes a single frame per group."""
