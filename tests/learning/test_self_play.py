@@ -73,7 +73,7 @@ def test_self_play_is_an_environment(bank, environment):
         environment.start(bank, jax.random.key(0), 10)
     with pytest.raises(UsageError, match=r"vehicles is 1; use 2 or more"):
         SelfPlayConfig(1)
-    with pytest.raises(UsageError, match=r"cannot store the states of traffic self; set replay.store"):
+    with pytest.raises(UsageError, match=r"cannot store states of self-play; set replay.store"):
         environment.stored(())
 
 

@@ -125,15 +125,16 @@ def test_two_policies_are_refused(bank):
 
 def test_replay_of_states_is_refused(bank):
     sac = SacConfig(network=NETWORK, environments=12, unroll=8, batch=8, replay=ReplayConfig(240), warm_up=96)
-    words = "a replay buffer cannot store the states of traffic of a mixture; set replay.store to observation"
+    words = r"a replay buffer cannot store states of a mixture of traffic; set replay\.store to observation"
     with pytest.raises(UsageError, match=words):
         learner = make_agent(replace(CONFIG, algorithm=sac), bank)
         jax.eval_shape(learner.init, bank, jax.random.key(0))
-    learner = make_agent(
-        replace(CONFIG, algorithm=replace(sac, replay=ReplayConfig(240, "observation"))), bank
-    )
+    sac = replace(sac, replay=ReplayConfig(240, "observation"))
+    learner = make_agent(replace(CONFIG, algorithm=sac), bank)
     state = jax.eval_shape(learner.init, bank, jax.random.key(0))
     assert jax.eval_shape(learner.iterate, bank, state)[0].replay.reward.shape == (20, 12)
+    with pytest.raises(UsageError, match=r"self_play\.past needs ppo or bc_ppo"):
+        replace(CONFIG, algorithm=sac, self_play=SelfPlayConfig(past=0.5))
 
 
 def test_mixture_equals_its_blocks_alone(bank):

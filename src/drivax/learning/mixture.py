@@ -88,7 +88,7 @@ class Mixture:
 
     def stored(self, state: Any) -> NoReturn:
         """Refuse replay buffers of states: those of the blocks differ."""
-        refuse_stored_states("of a mixture")
+        refuse_stored_states("a mixture of traffic")
 
     def observe(self, data: ScenarioBank, stored: Any) -> NoReturn:
         """Refuse, as :meth:`stored`."""

@@ -66,7 +66,7 @@ class SelfPlay(Driving):
 
     def stored(self, state: Any) -> NoReturn:
         """Refuse replay buffers of states: an observation needs those of the whole group."""
-        refuse_stored_states("self")
+        refuse_stored_states("self-play")
 
     def observe_all(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
         """Observe the contexts of whole groups."""
@@ -150,5 +150,5 @@ def _flatten(groups: Any) -> Any:
 
 def refuse_stored_states(traffic: str) -> NoReturn:
     """Raise UsageError: a replay buffer cannot store the states of this traffic."""
-    problem = f"a replay buffer cannot store the states of traffic {traffic}"
+    problem = f"a replay buffer cannot store states of {traffic}"
     raise UsageError(problem, cure="set replay.store to observation")
