@@ -40,7 +40,7 @@ class Crowded:
 
 def goal(bank, context, frames):
     """The goal in the ego frame, in units of 50 m, clipped to 5."""
-    return jnp.clip(View.of(context).point(bank.goal[context.index])[None] / 50.0, -5.0, 5.0)
+    return jnp.clip(View.of(context).point(bank.goal[context.row])[None] / 50.0, -5.0, 5.0)
 
 
 def walkers(bank, context, frames):

@@ -71,8 +71,8 @@ def decide(recording, touched=False):
 
 def on_a_circle(bank, radius):
     """The bank with a route around a circle to the left, 1 m apart, that begins where ego is."""
-    angle = np.arange(bank.routes.shape[2]) / radius
-    rows = np.zeros(bank.routes.shape[2:], np.float32)
+    angle = np.arange(bank.routes.shape[1]) / radius
+    rows = np.zeros(bank.routes.shape[1:], np.float32)
     rows[:, 0], rows[:, 1] = radius * np.sin(angle), radius * (1 - np.cos(angle))
     rows[:, 3], rows[:, 4], rows[:, 5] = np.cos(angle), np.sin(angle), 10.0
     routes = jnp.asarray(np.broadcast_to(rows, bank.routes.shape))
@@ -160,7 +160,7 @@ def test_idm_is_unrolled_as_in_double_precision(stop):
     fractions = np.array([0.2, 0.6, 1.0]) * 13.4
 
     def proposals(bank, others, stop):
-        along = bank.routes[0, 0, :, 0]
+        along = bank.routes[0, :, 0]
         start = jnp.argmin(jnp.abs(along)).astype(jnp.float32)
         lines = Lines.along_route(bank, jnp.asarray(0), start, (0.0, -1.0, 1.0), me)
         first = lines.points[0, 0, 0]

@@ -24,7 +24,6 @@ from drivax.planners.simple import (
     logged_motion,
     logged_poses,
 )
-from drivax.scenario.schema import Flag
 from drivax.simulator.ahead import follow_route
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.simulator import Simulator
@@ -191,14 +190,14 @@ def test_rule_planners_execute_the_same_in_the_route_space(simulator):
 
 def test_route_space_steers_straight_on_beyond_the_route_and_without_one(simulator):
     bank = bank_of(straight_road([car(0, 0, 0.1, 9)]))
-    bank = replace(bank, flags=bank.flags & ~jnp.uint32(int(Flag.ROUTE)))
+    bank = replace(bank, on_lanes=jnp.zeros_like(bank.on_lanes))
     state = first_moment(simulator, bank)[0]
     assert float(follow_route(bank, state.context, jnp.zeros(()))) == pytest.approx(0.0, abs=1e-6)
     left = float(follow_route(bank, state.context, jnp.ones(())))
     assert left == pytest.approx(2 / (10.2**2 + 1), rel=1e-3)
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
     context = first_moment(simulator, bank)[0].context
-    end_m = float(bank.route_points[0, 0] - 1)
+    end_m = float(bank.route_points[0] - 1)
     place = context.history.at[-1].set(jnp.array([end_m - float(context.route_m), 1.0, 0.0, 9.0]))
     beyond = replace(context, history=place, route_m=jnp.asarray(end_m))
     assert float(follow_route(bank, beyond, jnp.zeros(()))) == pytest.approx(-2 / (10.2**2 + 1), rel=1e-2)

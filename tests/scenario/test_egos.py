@@ -27,7 +27,7 @@ EGOS = SMALL.with_egos(4)
 
 @pytest.fixture(scope="module")
 def recordings():
-    """A junction with lights, and a road where all lanes look alike but for a light."""
+    """A junction with lights, and a straight road with two lanes and a light."""
     cars = [car(0, 0, 0, 10), car(-20, 0, 0, 9), car(10, 3.7, 0, 12)]
     return [generate_recording(0, 8), straight_road(cars, RED)]
 

@@ -234,7 +234,7 @@ class Driving:
         """Return scenario and slot of a row of logged steps; rows without an ego have that of the recorded one."""
         if self.egos == "recorded":
             return row, 0
-        return row // bank.most_egos, jnp.maximum(bank.ego_slot(row), 0)
+        return bank.scenario_of(row), jnp.maximum(bank.ego_slot(row), 0)
 
     def _draw(
         self, bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int | None = None

@@ -50,17 +50,16 @@ class Ground:
 
 def ground_at(
     bank: ScenarioBank,
-    at: tuple[Integer, Integer],
+    row: Integer,
     box: Float[Array, " 6"],
     z: Scalar,
     on_route: Bool[Array, ""],
 ) -> Ground:
     """Return the position of ego's box at a hypothetical pose, on ground of height ``z``, relative to lanes and road.
 
-    ``at`` holds the scenario and the row of the route. Beyond the end of the route (not ``on_route``) only wrong-way
-    driving is astray.
+    ``row`` is that of the route. Beyond its end (not ``on_route``) only wrong-way driving is astray.
     """
-    (index, row), points = at, corners(box)
+    index, points = bank.scenario_of(row), corners(box)
     lanes = around_lanes(bank, index, box[:2], box[2:4], points, z, row=row)
     distance = offroad_distance(bank, index, box[:2], points, lanes.points_near, z).max()
     astray = jnp.where(bank.on_lanes[row] & on_route, ~lanes.on_corridor, lanes.wrong_way)
@@ -68,7 +67,7 @@ def ground_at(
 
 
 def ground_along(
-    bank: ScenarioBank, at: tuple[Integer, Integer], motion: Float[Array, "N T 4"], size: Vector,
+    bank: ScenarioBank, row: Integer, motion: Float[Array, "N T 4"], size: Vector,
     z: Float[Array, "N T"], on_route: Bool[Array, "N T"], needs_lanes: Bool[Array, "N T"], every: int,
 ) -> Ground:  # fmt: skip
     """Return :func:`ground_at` along N motions from one pose; ``several`` only where ``needs_lanes``, else false.
@@ -80,9 +79,9 @@ def ground_along(
     box, z, on_route = box.reshape(-1, 6), z.reshape(-1), on_route.reshape(-1)
     between = needs_lanes[:, 1:].reshape(count, -1, every).any(axis=2)
     needs_lanes = jnp.concatenate([needs_lanes[:, :1], between], axis=1).reshape(-1)
-    ground, is_exact = _look_up_sorted(bank, at, box, z, count)
-    queried = ~is_exact | ~(bank.on_lanes[at[1]] & on_route) | needs_lanes
-    exact = map_where(queried, partial(ground_at, bank, at), box, z, on_route)
+    ground, is_exact = _look_up_sorted(bank, row, box, z, count)
+    queried = ~is_exact | ~(bank.on_lanes[row] & on_route) | needs_lanes
+    exact = map_where(queried, partial(ground_at, bank, row), box, z, on_route)
 
     def each_step(value: Array, exact: Array) -> Array:
         value = jnp.where(queried, exact, value).reshape(count, -1)
@@ -93,7 +92,7 @@ def ground_along(
 
 def _look_up_sorted(
     bank: ScenarioBank,
-    at: tuple[Integer, Integer],
+    row: Integer,
     box: Float[Array, "P 6"],
     z: Float[Array, " P"],
     group: int,
@@ -104,7 +103,7 @@ def _look_up_sorted(
     """
     _, order = jax.lax.top_k(-norm(box[:, :2] - box[0, :2]), len(box))
     path = box[order, :2]
-    index, row = at
+    index = bank.scenario_of(row)
     lanes = bank.lanes[index]
     corridor = in_corridor(bank, lanes, row)
     lanes = jnp.where(corridor, lanes, _FAR_M)

@@ -181,8 +181,7 @@ class PdmPlanner:
         every = 1 if self._plans else config.scoring.ground_every
         contacts = jax.vmap(Contacts.along, in_axes=(0, None, None))(cars.motion, size, others)
         needs_lanes = jax.vmap(partial(Contacts.needs_lanes, steps=config.steps + 1))(contacts)
-        at = context.index, context.row
-        ground = ground_along(bank, at, cars.motion, size, z, on_route, needs_lanes, every)
+        ground = ground_along(bank, context.row, cars.motion, size, z, on_route, needs_lanes, every)
         ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
         yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
 

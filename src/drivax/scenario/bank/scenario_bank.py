@@ -257,6 +257,10 @@ class ScenarioBank:
             return index
         return index * self.most_egos + jnp.argmax(self.egos[index] == slot).astype(jnp.int32)
 
+    def scenario_of(self, row: Integer) -> Integer:
+        """Index of the scenario of a row."""
+        return row if self.most_egos == 1 else row // self.most_egos
+
     def ego_number(self, row: int | Integer) -> int | Integer:
         """Number of an ego in its scenario, 0 for the recorded one."""
         return 0 if self.most_egos == 1 else row % self.most_egos
