@@ -101,7 +101,7 @@ class Mixture:
     def cache(self, data: ScenarioBank, state: tuple[SimState, ...]) -> tuple[Any, ...]:
         """Return the cache of every block."""
         pairs = zip(self.blocks, state, strict=True)
-        return tuple(block.cache(data, own) for (_, block), own in pairs)
+        return tuple(block.cache(data, states) for (_, block), states in pairs)
 
     def step(
         self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
@@ -110,13 +110,12 @@ class Mixture:
         keys, sizes = jax.random.split(key, len(self.blocks)), self.sizes(len(action))
         after, outcomes = [], []
         for number, (start, end) in enumerate(pairwise(accumulate(sizes, initial=0))):
-            over, observation, own = jax.tree.map(
-                lambda leaf, start=start, end=end: leaf[start:end], (now.over, now.observation, action)
-            )
-            block = Environments(now.state[number], over, observation)
-            stepped = self.blocks[number][1].step(data, block, cache[number], own, keys[number])
-            after.append(stepped[0])
-            outcomes.append(stepped[1])
+            batch = (now.over, now.observation, action)
+            *rows, actions = jax.tree.map(lambda leaf, start=start, end=end: leaf[start:end], batch)
+            environments, block = Environments(now.state[number], *rows), self.blocks[number][1]
+            stepped, outcome = block.step(data, environments, cache[number], actions, keys[number])
+            after.append(stepped)
+            outcomes.append(outcome)
         totals = jax.tree.map(lambda *sums: sum(sums), *(outcome.totals for outcome in outcomes))
         caches = tuple(outcome.cache for outcome in outcomes)
         outcome = jax.tree.map(_join, *(replace(outcome, cache=(), totals={}) for outcome in outcomes))

@@ -144,10 +144,10 @@ class Ppo:
 
     def trained(self, state: PpoState) -> Any:
         """Return the parameters that are trained, at first those of the planner."""
-        return state.parameters if state.trained is None else self._at_first_planner(state, state.trained)
+        return state.parameters if state.trained is None else self._unless_first(state, state.trained)
 
-    def _at_first_planner(self, state: PpoState, parameters: Any) -> Any:
-        """Return the planner's parameters before the first iteration, which a pretraining may have set, then others."""
+    def _unless_first(self, state: PpoState, parameters: Any) -> Any:
+        """Return parameters, but before the first iteration those of the planner, which a pretraining may have set."""
         return jax.tree.map(partial(jnp.where, state.iteration == 0), state.parameters, parameters)
 
     def network(self, parameters: Any) -> ActorCritic:
@@ -195,7 +195,7 @@ class Ppo:
         if self.past is not None:
             index = self.past.environments
             seen = {name: rows[index] for name, rows in observation.items()}
-            older = self.distribution(self._at_first_planner(state, state.past), seen)
+            older = self.distribution(self._unless_first(state, state.past), seen)
             action = action.at[index].set(older.action(older.sample(jax.random.fold_in(key, 1))))
         return SampledAction(raw_action, action, extra)
 
@@ -262,7 +262,7 @@ class Ppo:
         if self.past is None:
             return None
         refresh = (state.iteration + 1) % self.past.refresh == 0
-        older = self._at_first_planner(state, state.past)
+        older = self._unless_first(state, state.past)
         return jax.tree.map(partial(jnp.where, refresh), parameters, older)
 
     def _batch(self, rollout: Rollout, last: Array) -> dict[str, Any]:
