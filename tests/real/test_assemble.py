@@ -10,7 +10,7 @@ from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.geometry.polylines import point_to_segment
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import with_ego
-from drivax.scenario.schema import AgentKind, Flag, Scenario
+from drivax.scenario.schema import CAPACITIES, AgentKind, Flag, Scenario
 
 FILES = {
     "scenario": (WomdScenario, "womd/motion_data_one_scenario.tfrecord"),
@@ -121,3 +121,23 @@ def test_other_vehicles_as_ego_have_routes(recording):
             moved = np.hypot(*(log[-1] - log[0]))
             assert other.log_progress[-1] - other.log_progress[0] >= 0.8 * moved - 3.0
     assert routed >= 3
+
+
+def test_further_egos_have_the_routes_of_their_own_recordings(recording):
+    """Seven moving cars; where a log is used to its end, the route is that of the recording with this ego."""
+    scenario = assemble(recording, CAPACITIES["default"].with_egos(8))
+    tracks, compared = recording.tracks, 0
+    assert (scenario.ego_slot > 0).all() and scenario.ego_on_lanes.sum() >= 4
+    for k, slot in enumerate(scenario.ego_slot):
+        (row,) = np.flatnonzero(tracks.track_id == scenario.agent_id[slot])
+        last, now = int(scenario.ego_last_step[k]), recording.current_step
+        assert tracks.valid[row, now : last + 1].all() and last >= now + 20
+        assert np.hypot(*(tracks.xy[row, now : last + 1] - tracks.xy[row, now]).T).max() > 2.0
+        if not tracks.valid[row, last + 1 :].any():
+            other = assemble(with_ego(recording, int(row)))
+            count, shift = int(other.route_points[0]), (other.origin - scenario.origin)[:2]
+            route = scenario.ego_route_xy[k, : scenario.ego_route_points[k]]
+            np.testing.assert_allclose(route, other.route_xy[0, :count] + shift, atol=0.02)
+            assert scenario.ego_on_lanes[k] == (Flag.ROUTE in other.has)
+            compared += 1
+    assert compared >= 4

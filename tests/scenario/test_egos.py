@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivax.datasets.conversion import Conversion
 from drivax.errors import UsageError
 from drivax.scenario.bank.columns import LaneRow, LightRow
 from drivax.scenario.bank.queries import in_corridor
@@ -18,6 +19,7 @@ from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import with_ego
 from drivax.scenario.schema import CAPACITIES, AgentKind, Capacity, Flag
 from drivax.scenario.store import ScenarioSet, ScenarioWriter, field_table
+from drivax.synthetic.generate import Generation, generate
 from drivax.synthetic.world import generate_recording
 from scenes import RED, car, straight_road
 
@@ -156,3 +158,13 @@ def test_sets_with_further_egos_are_read_as_written(scenarios, tmp_path):
     for stored, scenario in zip(opened, scenarios, strict=True):
         np.testing.assert_array_equal(stored.ego_route_xy, scenario.ego_route_xy)
         np.testing.assert_array_equal(stored.ego_slot, scenario.ego_slot)
+
+
+def test_conversion_and_generation_store_further_egos(tmp_path):
+    generated = generate(tmp_path / "set", 1, 0, Generation(egos=3))
+    (scenario,) = ScenarioSet.open(generated.path)
+    assert scenario.capacity == CAPACITIES["default"].with_egos(3) and len(scenario.ego_slot) == 2
+    assert Conversion(egos=3).sizes == scenario.capacity
+    for options in (Generation(egos=9), Conversion(egos=9)):
+        with pytest.raises(UsageError, match="egos is 9; use 1 to 8"):
+            options.check()
