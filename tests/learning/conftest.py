@@ -11,3 +11,11 @@ def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("learning") / "set"
     generate(path, 3, 11, Generation(workers=0))
     return ScenarioSet.open(path)
+
+
+@pytest.fixture(scope="session")
+def data_of_egos(tmp_path_factory):
+    """The scenarios of ``data``, with routes of further egos."""
+    path = tmp_path_factory.mktemp("egos") / "set"
+    generate(path, 3, 11, Generation(workers=0, egos=8))
+    return ScenarioSet.open(path)

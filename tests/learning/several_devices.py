@@ -15,9 +15,12 @@ from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.loop import train
+from drivax.learning.mixture import Mixture
 from drivax.learning.program import Program, Seeds
+from drivax.learning.self_play import SelfPlay, SelfPlayConfig
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
+from drivax.scenario.schema import CAPACITIES
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.log import LogTraffic
@@ -36,8 +39,13 @@ def problem(name):
     """The learner of a name, and its data: the pendulum's, or for ``driving_*`` a scenario."""
     if not name.startswith("driving_"):
         return ALGORITHMS[name].build(Pendulum(), SHOWN, 6), SHOWN
-    bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
+    capacity = CAPACITIES["default"].with_egos(3)
+    bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0), capacity)])
     environment = Driving(Simulator(Task(observation=SEEN, metrics=("steps",))), latest_start=60)
+    if name == "driving_self_ppo":
+        group = SelfPlay(environment.simulator, latest_start=60, config=SelfPlayConfig(2, past=1.0))
+        mixture = Mixture((("log", environment), ("self", group)), (0.5, 0.5))
+        return ALGORITHMS["ppo"].build(mixture, bank, 6), bank
     if name == "driving_iql":
         config = IqlConfig(batch=8, updates=2, network=TINY)
         return config.build(environment, bank, 6), config.experience(environment, bank, None)

@@ -10,6 +10,7 @@ CASES = [
     ("bc", "batches"), ("driving_bc", "batches"), ("driving_iql", "batches"), ("ppo", "two"), ("sac", "two"),
     ("ppo", "four_and_seeds"), ("sac", "four_and_seeds"), ("sac_observations", "two"), ("bc_sac", "two"),
     ("driving_ppo", "two"), ("driving_sac", "two"), ("bc_ppo", "two"), ("ppo", "runs"),
+    ("driving_self_ppo", "two"),
 ]  # fmt: skip
 
 

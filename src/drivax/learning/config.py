@@ -15,6 +15,7 @@ from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig
 from drivax.learning.driving import Driving, Egos
+from drivax.learning.self_play import SelfPlay, SelfPlayConfig
 from drivax.learning.training_log import Rule
 from drivax.plugins import is_dotted
 from drivax.scenario.schema import CURRENT_STEP
@@ -34,6 +35,11 @@ Algorithm = (
     | AlgorithmConfig
 )  # fmt: skip
 
+#: Name of the traffic in which the policy in training drives several vehicles.
+SELF = "self"
+#: Largest difference to 1 of a sum of shares.
+_ROUNDING = 1e-3
+
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -44,8 +50,10 @@ class TrainConfig:
         seed: Seed of networks, environments and exploration.
         task: Actions, observation, reward, termination, and the metrics that are logged during training.
         algorithm: Learning algorithm and its settings.
-        traffic: How other agents move in training and validation; see :func:`~drivax.learning.policies.find_traffic`.
-        start: How training episodes begin; validation episodes begin as logged, at step 10.
+        traffic: How other agents move; see :func:`~drivax.learning.policies.find_traffic`. ``self``: the policy in
+            training drives them. A mixture gives the share of the environments of each, which sum to 1.
+        self_play: Settings of the traffic ``self``.
+        start: How training episodes begin; those of self-play and of validation begin as logged, the latter at step 10.
         egos: Who drives in training: the recorded ego, or any vehicle of the set with a route and a goal (``moving``,
             of a set made with ``--egos``). Validation episodes are those of the recorded ego.
         earliest_start, latest_start: Training episodes begin at a random step of the log between the two.
@@ -63,7 +71,8 @@ class TrainConfig:
     seed: int = 0
     task: Task = field(default_factory=lambda: Task(metrics="training"))
     algorithm: Algorithm = field(default_factory=PpoConfig)
-    traffic: str = "log"
+    traffic: str | dict[str, float] = "log"
+    self_play: SelfPlayConfig = field(default_factory=SelfPlayConfig)
     start: LogStart | NoisyStart = field(default_factory=LogStart)
     egos: Egos = "recorded"
     earliest_start: int = CURRENT_STEP
@@ -89,16 +98,40 @@ class TrainConfig:
         if self.checkpoint_rule == "fitted_q" and not fitted_q:
             cure = "set algorithm.fitted_q.updates of cql, iql or td3_bc"
             raise UsageError("checkpoint_rule fitted_q needs fitted-Q evaluation", cure=cure)
-        run, base = split_traffic(self.traffic)
-        make_traffic(base)
-        if run is not None:
-            RunFolder.open(policy_folder(run))
+        shares = self.shares.values()
+        if min(shares, default=0.0) <= 0.0 or abs(sum(shares) - 1.0) > _ROUNDING:
+            problem = f"shares of traffic are {', '.join(f'{share:g}' for share in shares) or 'missing'}"
+            raise UsageError(problem, cure="use shares above 0 with a sum of 1")
+        for name in self.shares:
+            if name != SELF:
+                run, base = split_traffic(name)
+                make_traffic(base)
+                if run is not None:
+                    RunFolder.open(policy_folder(run))
+        if self.self_play.past and not isinstance(self.algorithm, PpoConfig | BcPpoConfig):
+            raise UsageError("self_play.past needs ppo or bc_ppo", cure="set self_play.past to 0")
         self.environment(LogTraffic())  # checks the steps at which episodes begin
 
     def environment(self, traffic: Traffic) -> Driving:
-        """Return the environment of training with :attr:`traffic` (``policies.find_traffic``)."""
+        """Return an environment of training with a traffic model (``policies.find_traffic``)."""
         simulator = Simulator(self.task, traffic, self.start)
         return Driving(simulator, self.latest_start, self.earliest_start, self.egos)
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Share of the environments of each traffic."""
+        return {self.traffic: 1.0} if isinstance(self.traffic, str) else self.traffic
+
+    @property
+    def validation_traffic(self) -> str:
+        """Traffic of validation: the log, or the largest share other than ``self`` of a training without it."""
+        others = {name: share for name, share in self.shares.items() if name != SELF}
+        return "log" if "log" in others else max(others, key=lambda name: others[name], default="log")
+
+    def self_play_environment(self) -> SelfPlay:
+        """Return the environment of the traffic ``self``."""
+        simulator = Simulator(self.task)
+        return SelfPlay(simulator, self.latest_start, self.earliest_start, self.egos, self.self_play)
 
     @property
     def iterations(self) -> int:

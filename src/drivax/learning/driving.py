@@ -20,8 +20,9 @@ from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
-from drivax.simulator.simulator import Simulator, map_where
+from drivax.simulator.simulator import Simulator, Step, map_where
 from drivax.simulator.starts import LogStart
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.types import AgentContext, Frame, SimState
 from drivax.tasks.actions import Discrete, Route
 from drivax.tasks.task import Task
@@ -89,6 +90,10 @@ class Driving:
         conditions = {condition.name for condition in self.task.conditions}
         return {name: x for name, x in self.task.rewards.penalties.items() if name not in conditions}
 
+    def prepare(self, data: ScenarioBank) -> ScenarioBank:
+        """Return the bank with the data that the traffic model needs."""
+        return prepare_bank(self.simulator.traffic, data)
+
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
         """Shapes of one observation by group."""
         # Starts change no shape; the logged start is the fastest to trace.
@@ -107,10 +112,13 @@ class Driving:
         if self.latest_start > data.steps - 3:
             cure = f"use {self.earliest_start} (earliest_start) to {data.steps - 3}"
             raise UsageError(f"latest_start is {self.latest_start}", cure=cure)
+        state, over = self._reset(data, key, count)
+        return Environments(state, over, self.observe_all(data, state.context))
+
+    def _reset(self, data: ScenarioBank, key: Array, count: int) -> tuple[SimState, Bool[Array, " B"]]:
+        """Return states at random steps of their logs, none of them over."""
         start = self._draw(data, key, count, self.earliest_start)
-        state = jax.vmap(_of_agent(self.simulator.reset, data))(*start)
-        observation = self.observe_all(data, state.context)
-        return Environments(state, jnp.zeros(count, bool), observation)
+        return jax.vmap(_of_agent(self.simulator.reset, data))(*start), jnp.zeros(count, bool)
 
     def stored(self, state: SimState) -> AgentContext:
         """Return the context: index, step, history, and reactive traffic."""
@@ -129,25 +137,20 @@ class Driving:
         return jax.vmap(self.simulator.now, (None, 0))(data, state.context)
 
     def step(
-        self, data: ScenarioBank, now: Environments, cache: Frame, action: Float[Array, "B D"], key: Array
+        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
     ) -> tuple[Environments, Outcome]:
         """Hold a decision for ``Task.hold`` steps in every environment, or reset it where its episode is over.
 
         An episode that ends while a decision is held does not step on. Rewards of the steps are added.
         """
-        start = self._draw(data, key, now.over.shape[0], self.earliest_start, self.latest_start)
-        step_all = jax.vmap(self.simulator.step_or_reset, (None, 0, 0, 0, 0, 0))
-        fresh = map_where(now.over, _of_agent(self.simulator.new_episode, data), *start)
-        state, result = step_all(data, now.state, action, now.over, fresh, cache)
+        state, result = self._step_or_reset(data, now, cache, action, key)
         summed = (result.reward, result.reward_terms, result.terminated, result.truncated)
 
         def step_on(carry: tuple[SimState, Any], _: None) -> tuple[tuple[SimState, Any], None]:
             """Take another step of the decision of every episode that neither ended nor started."""
             state, (reward, terms, terminated, truncated) = carry
             idle = now.over | terminated | truncated
-            after, result = jax.vmap(self.simulator.step, (None, 0, 0))(data, state, action)
-            keep = jax.vmap(lambda idle, old, new: jax.tree.map(partial(jnp.where, idle), old, new))
-            state = keep(idle, state, after)
+            state, result = self._step_on(data, state, action, idle)
             more = jax.tree.map(
                 lambda value: jnp.where(idle, 0.0, value), (result.reward, result.reward_terms)
             )
@@ -159,10 +162,33 @@ class Driving:
         if self.task.hold > 1:
             (state, summed), _ = jax.lax.scan(step_on, (state, summed), None, self.task.hold - 1)
         reward, terms, terminated, truncated = summed
-        over = terminated | truncated
-        totals = _totals(data, state, terms, over, now.over)
+        ends = terminated | truncated
+        totals = _totals(data, state, terms, ends, now.over)
         outcome = Outcome(reward, terminated, truncated, self.cache(data, state), totals, terms)
+        over = self._over(data, state, now.over, ends)
         return Environments(state, over, self.observe_all(data, state.context)), outcome
+
+    def _step_or_reset(
+        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
+    ) -> Step:
+        """Take the first step of a decision, or start a new episode where the last one is over."""
+        start = self._draw(data, key, now.over.shape[0], self.earliest_start, self.latest_start)
+        step_all = jax.vmap(self.simulator.step_or_reset, (None, 0, 0, 0, 0, 0))
+        fresh = map_where(now.over, _of_agent(self.simulator.new_episode, data), *start)
+        return step_all(data, now.state, action, now.over, fresh, cache)
+
+    def _step_on(
+        self, data: ScenarioBank, state: SimState, action: Float[Array, "B D"], idle: Bool[Array, " B"]
+    ) -> Step:
+        """Take another step of a decision, except where the environment is ``idle``."""
+        after, result = jax.vmap(self.simulator.step, (None, 0, 0))(data, state, action)
+        return keep(idle, state, after), result
+
+    def _over(
+        self, data: ScenarioBank, state: SimState, over: Bool[Array, " B"], ends: Bool[Array, " B"]
+    ) -> Bool[Array, " B"]:
+        """Return which episodes are over after a step, given those before and those that ended in it."""
+        return ends
 
     def demonstrations(self, data: ScenarioBank, key: Array, count: int) -> ExpertActions:
         """Return the expert's actions at random steps of the log.
@@ -272,6 +298,11 @@ class Driving:
             return after, (action, result.reward, result.terminated, result.truncated, clipped)
 
         return jax.lax.scan(step, first, None, bank.steps - 1 - CURRENT_STEP)[1]
+
+
+def keep(mask: Bool[Array, " B"], old: Any, new: Any) -> Any:
+    """Return a batch with its ``old`` elements where masked, else the ``new`` ones."""
+    return jax.vmap(lambda mask, old, new: jax.tree.map(partial(jnp.where, mask), old, new))(mask, old, new)
 
 
 def _of_agent(function: Callable[..., Any], bank: ScenarioBank) -> Callable[..., Any]:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkab
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float
 
@@ -20,7 +21,10 @@ from drivax.scenario.record import record
 
 @record
 class Environments:
-    """State and observation of a batch of environments; where an episode is ``over``, the next step resets it."""
+    """State and observation of a batch of environments.
+
+    Where an episode is ``over``, the next step resets it, or waits (self-play): it is no step to learn from.
+    """
 
     #: The axis that counts environments, which several devices divide.
     environment_axis: ClassVar[int] = 0
@@ -57,7 +61,8 @@ class Environment(Protocol):
     """An environment that algorithms train in.
 
     One whose reward algorithms may constrain has a mapping ``penalties``: the terms of its outcomes that are never
-    positive, with minus their weights.
+    positive, with minus their weights. With a method ``past(count) -> PastPolicy`` it has environments that an older
+    copy of the policy drives.
     """
 
     @property
@@ -97,16 +102,33 @@ class Environment(Protocol):
     def step(
         self, data: Any, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
     ) -> tuple[Environments, Outcome]:
-        """Step every environment, or reset it where its episode is over.
+        """Step every environment, or reset it (or wait) where its episode is over.
 
         A reset takes a step of its own, so every state that the policy sees, final states included, is observed once.
         """
         ...
 
 
+class PastPolicy(NamedTuple):
+    """Environments ``[n]`` that an older copy of the policy drives: their steps are not learned from.
+
+    The copy is taken every ``refresh`` iterations.
+    """
+
+    environments: np.ndarray
+    refresh: int
+
+
+def past_policy(environment: Environment, count: int) -> PastPolicy | None:
+    """Return which of ``count`` environments an older copy of the policy drives, None if it drives none."""
+    find: Callable[[int], PastPolicy] | None = getattr(environment, "past", None)
+    past = None if find is None else find(count)
+    return past if past is not None and len(past.environments) else None
+
+
 @record
 class Rollout:
-    """Experience ``[time, batch]``. ``alive`` is false for steps that only reset an environment; mask them out.
+    """Experience ``[time, batch]``. ``alive`` is false where an episode was over before the step; mask it out.
 
     The successor of row t is in row t + 1, final states included; that of the last row is the environments' current
     state. Either ``observation`` or ``state`` (for the replay buffer) is kept, the other is None. ``terms`` are the
@@ -178,7 +200,7 @@ def collect(
         sampled = actor(now.observation, act_key)
         after, outcome = environment.step(data, now, cache, sampled[1], step_key)
         row = transition(environment, now, sampled, outcome, keep, terms)
-        counts = {"episodes": after.over.sum(), "steps": row.alive.sum()}
+        counts = {"episodes": (after.over & row.alive).sum(), "steps": row.alive.sum()}
         totals = outcome.totals | {name: count.astype(jnp.float32) for name, count in counts.items()}
         return (after, outcome.cache, key), (row, totals)
 

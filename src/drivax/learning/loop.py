@@ -19,6 +19,7 @@ from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, train
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.experience import WeightedSet, check_weights
+from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.policies import POLICY_FILE, find_traffic, open_policy
 from drivax.learning.program import Program, Seeds
 from drivax.learning.training_log import Preempted, StopSignal, TrainingLog, Validation, validate
@@ -26,7 +27,6 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.select.splits import HoldOut, hold_out
 from drivax.scenario.store import ScenarioSet, check_lengths
-from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import RunFolder, run_and_step, seed_folders, trained_on
@@ -42,10 +42,10 @@ _RESUMED_WITH_OTHER = {
 def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
     """Return the :class:`Agent` that ``drivax train`` trains, in parts for a training loop of your own.
 
-    Only shapes of the bank are read, which ``simulator.traffic.bank_data.prepare_bank`` prepares. Raises UsageError if
+    Only shapes of the bank are read; ``agent.environment.prepare`` adds what the traffic needs. Raises UsageError if
     the algorithm does not interact with an environment (bc, cql, iql, td3_bc).
     """
-    environment = config.environment(find_traffic(config.traffic))
+    environment = training_environment(config)
     learner = config.algorithm.build(environment, bank, config.iterations)
     if not isinstance(learner, Agent):
         problem = f"{type(config.algorithm).__name__} has no parts for a loop of your own"
@@ -191,7 +191,7 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _held_out_data(
-    config: TrainConfig, environment: Driving, learner: Any, held_out: Validation | None
+    config: TrainConfig, environment: Driving | Mixture, learner: Any, held_out: Validation | None
 ) -> Any:
     """Return the data of a learner's held-out metrics; None without any."""
     if held_out is None or not isinstance(learner, HeldOutMetrics):
@@ -199,17 +199,17 @@ def _held_out_data(
     return training_data(config.algorithm, environment, held_out.bank)
 
 
-def _environment(config: TrainConfig, data: Iterable[Scenario]) -> tuple[Driving, ScenarioBank]:
+def _environment(config: TrainConfig, data: Iterable[Scenario]) -> tuple[Driving | Mixture, ScenarioBank]:
     """Return the environment of a training, and its bank.
 
     Raises:
         UsageError: ``egos`` is moving, but the set has no further egos.
     """
-    environment, bank = config.environment(find_traffic(config.traffic)), ScenarioBank.from_scenarios(data)
+    environment, bank = training_environment(config), ScenarioBank.from_scenarios(data)
     if config.egos == "moving" and bank.most_egos == 1:
         cure = "convert or generate the set with --egos 8"
         raise UsageError("egos is moving, but only the recorded ego of each scenario has a route", cure=cure)
-    return environment, prepare_bank(environment.simulator.traffic, bank)
+    return environment, environment.prepare(bank)
 
 
 def _create_folders(
@@ -340,7 +340,7 @@ def _validation(run: _Run, validation: Validation, state: LearnerState, number: 
     seeds, device = run.program.seeds, run.program.devices[0]
     parameters = jax.device_put(seeds.member(state.parameters, number), device)
     planner = seeds.learner.planner(parameters, "policy", samples=False)
-    row = validate(planner, validation, run.config.task, find_traffic(run.config.traffic))
+    row = validate(planner, validation, run.config.task, find_traffic(run.config.validation_traffic))
     if isinstance(seeds.learner, HeldOutMetrics):
         member = jax.device_put(seeds.member(state, number), device)
         metrics = seeds.learner.held_out_metrics(run.held_out_data, member)

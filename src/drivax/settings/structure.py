@@ -140,6 +140,20 @@ def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
     return tuple(result)
 
 
+def _to_mapping(value: Any, cls: Any) -> dict[str, Any]:
+    """Convert to a mapping from text to the values of its type."""
+    items = _parse_flag(value)
+    if not isinstance(items, Mapping):
+        raise _refusal(value, "a mapping")
+    result, item_type = {}, get_args(cls)[1]
+    for name, item in items.items():
+        try:
+            result[name] = _converter().structure(item, item_type)
+        except Exception as error:
+            raise _Problem(*_first_problem(error, str(name))) from error
+    return result
+
+
 def _to_union(value: Any, cls: Any) -> Any:
     """Convert to a user-defined object, to a record by its kind, or to the first scalar type that fits."""
     members = get_args(cls)
@@ -301,6 +315,7 @@ def _converter() -> cattrs.Converter:
         converter.register_structure_hook(cls, hook)
     converter.register_structure_hook_func(lambda cls: get_origin(cls) is Literal, _to_literal)
     converter.register_structure_hook_func(lambda cls: cls is tuple or get_origin(cls) is tuple, _to_tuple)
+    converter.register_structure_hook_func(lambda cls: get_origin(cls) is dict, _to_mapping)
     converter.register_structure_hook_func(lambda cls: get_origin(cls) in _UNIONS, _to_union)
     converter.register_structure_hook_func(_accepts_user_objects, _to_user_object)
     converter.register_structure_hook_factory(_is_record, _record_hook)

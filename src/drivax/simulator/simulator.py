@@ -118,32 +118,41 @@ class Simulator:
         return self._drive(bank, state, action, motion)
 
     def reset_together(
-        self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP
-    ) -> SimState:
+        self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP,
+        keys: Any = None,
+    ) -> SimState:  # fmt: skip
         """Return the stacked states of K agents of one scenario, at slots from :func:`slots_of`.
 
         All start as logged: a noisy start supports a single driven agent.
         """
-        contexts = jax.vmap(lambda slot: self.context(bank, index, step, slot))(slots)
+        contexts = jax.vmap(partial(self.context, bank, index, step))(slots, keys)
         return jax.vmap(lambda context: self._initial_state(bank, context, contexts))(contexts)
 
     def step_together(
-        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None
-    ) -> Step:
+        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None,
+        fresh: EpisodeStart | None = None,
+    ) -> Step:  # fmt: skip
         """Drive K agents of one scenario; they see each other, and traffic sees them.
 
         Slots beyond the moving agents are padding: never rewarded or terminated, with undefined facts. ``over`` is the
-        ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics.
+        ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics. Given ``fresh``, the
+        stacked :meth:`new_episode` of K agents, all start these once all are over; see :meth:`step_or_reset`.
         """
-        first = jax.tree.map(lambda leaf: leaf[0], states.context)
+        over = jnp.zeros(actions.shape[0], bool) if over is None else over
+        first = _first(states.context)
         seen = self.frame(bank, first, states.context, 0)
         traffic = self.traffic.advance(bank, first, seen)
         moved = jax.vmap(lambda s, a: self._move_agent(bank, s.context, a, None, traffic))(states, actions)
+        if fresh is not None:
+            moved = jax.tree.map(partial(jnp.where, over.all()), fresh.context, moved)
+            states = jax.vmap(_forget, (0, 0, None))(states, fresh, over.all())
         finish = jax.vmap(lambda s, m, a: self._finish_step(bank, s, m, moved, seen, a))
         after, transition = finish(states, moved, actions)
-        counts = is_driven(bank, states) & (True if over is None else ~over)
+        counts = is_driven(bank, after) & ~over
         choose = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
         after = replace(after, episode=choose(counts, after.episode, states.episode))
+        if fresh is not None:
+            after = jax.vmap(self._restart, (0, None))(after, over.all())
         terms = {name: jnp.where(counts, term, 0.0) for name, term in transition.reward_terms.items()}
         ends = {name: getattr(transition, name) & counts for name in ("terminated", "truncated")}
         reward = jnp.where(counts, transition.reward, 0.0)
@@ -162,9 +171,12 @@ class Simulator:
     def observe(
         self, bank: ScenarioBank, context: AgentContext, driven: AgentContext | None = None
     ) -> Mapping[str, Any]:
-        """Return the task's observation of a context, live or from a replay buffer."""
+        """Return the task's observation of a context, live or from a replay buffer.
+
+        ``driven`` stacks the contexts of all driven agents; it defaults to the agent alone.
+        """
         driven = alone(context) if driven is None else driven
-        frames = partial(self.frame, bank, context, driven)
+        frames = partial(self.frame, bank, _first(driven), driven)
         return self.task.observe(bank, context, frames, frames(0))
 
     def step_or_reset(
@@ -182,21 +194,18 @@ class Simulator:
         traffic = self.traffic.advance(bank, state.context, seen)
         moved = self._move_agent(bank, state.context, action, None, traffic)
         context = jax.tree.map(partial(jnp.where, over), fresh.context, moved)
-        # Nothing that the last episode remembers may reach the new one.
-        before = replace(
-            state,
-            facts=forget_strand(state.facts, over),
-            contacts=jnp.where(over, jnp.int8(Contact.ABSENT), state.contacts),
-            lights=jax.tree.map(partial(jnp.where, over), fresh.lights, state.lights),
-            start=jnp.where(over, fresh.context.step, state.start),
-        )
+        before = _forget(state, fresh, over)
         after, transition = self._finish_step(bank, before, context, alone(context), seen, action)
+        after = self._restart(after, over)
+        flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
+        return after, replace(transition, after=after, **flags)
+
+    def _restart(self, after: SimState, over: Bool[Array, ""]) -> SimState:
+        """Return the state after a step, as the first of a new episode where the last one is ``over``."""
         first = self.task.episode_start()
         episode = jax.tree.map(partial(jnp.where, over), first, after.episode)
         lights = jax.tree.map(partial(jnp.where, over), forget_crossings(after.lights), after.lights)
-        after = replace(after, episode=episode, lights=lights)
-        flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
-        return after, replace(transition, after=after, **flags)
+        return replace(after, episode=episode, lights=lights)
 
     def _drive(self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None) -> Step:
         """Drive one step by ``action``, or to ``motion`` if that is given."""
@@ -224,7 +233,7 @@ class Simulator:
 
         ``driven`` stacks the contexts of all driven agents; ``seen`` is the frame before the step.
         """
-        now = self.frame(bank, moved, driven, 0)
+        now = self.frame(bank, _first(driven), driven, 0)
         situation, contacts, lights = measure(
             bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
         )
@@ -235,6 +244,22 @@ class Simulator:
         after = SimState(situation.context, situation.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))
         return after, Transition(before, after, action, reward, terms, terminated, truncated)
+
+
+def _first(driven: AgentContext) -> AgentContext:
+    """Return the context of the first driven agent, whose frame is that of all: computed once where they are mapped."""
+    return jax.tree.map(lambda leaf: leaf[0], driven)
+
+
+def _forget(state: SimState, fresh: EpisodeStart, over: Bool[Array, ""]) -> SimState:
+    """Return the state before a step, without what may not reach the episode that starts where it is ``over``."""
+    return replace(
+        state,
+        facts=forget_strand(state.facts, over),
+        contacts=jnp.where(over, jnp.int8(Contact.ABSENT), state.contacts),
+        lights=jax.tree.map(partial(jnp.where, over), fresh.lights, state.lights),
+        start=jnp.where(over, fresh.context.step, state.start),
+    )
 
 
 def slots_of(

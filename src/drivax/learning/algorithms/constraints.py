@@ -59,9 +59,10 @@ class Constraints:
         reward, after, logs = rollout.reward, dict[str, Array](), dict[str, Array]()
         for name, limit in self.limits.items():
             multiplier, weight = multipliers[name], self.weights[name]
-            cost = rollout.terms[name] / -weight
+            cost = jnp.where(rollout.alive, rollout.terms[name] / -weight, 0.0)
             reward = reward - (multiplier - weight) * cost
-            episodes = jnp.sum(rollout.terminated | rollout.truncated).astype(jnp.float32)
+            ends = (rollout.terminated | rollout.truncated) & rollout.alive
+            episodes = jnp.sum(ends).astype(jnp.float32)
             excess = jnp.sum(cost) / jnp.maximum(episodes, 1.0) - limit
             step = jnp.where(episodes > 0.0, self.rate * excess, 0.0)
             after[name] = jnp.maximum(multiplier + step, 0.0)

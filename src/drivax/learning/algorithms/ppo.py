@@ -22,6 +22,7 @@ from drivax.learning.environment import (
     Rollout,
     SampledAction,
     collect,
+    past_policy,
     transition,
 )
 from drivax.learning.program import shard_axis
@@ -103,6 +104,7 @@ class PpoState:
     """State of a run: networks, optimiser, environments, key, step, and multipliers of constraints.
 
     ``parameters`` are those of the planner: the average, if there is one, of those that are ``trained`` (else None).
+    ``past`` are those of the older copy in environments of ``environment.PastPolicy``, else None.
     """
 
     networks: ClassVar[tuple[str, ...]] = ("parameters",)
@@ -114,6 +116,7 @@ class PpoState:
     key: Array
     iteration: Array
     multipliers: dict[str, Array] = field(default_factory=dict)
+    past: Any = None
 
 
 class Ppo:
@@ -123,6 +126,7 @@ class Ppo:
         self.config, self.environment = config, environment
         self.spec = environment.shapes(data)
         self.constraints = Constraints.of(config.constraints, config.multiplier_rate, environment)
+        self.past = past_policy(environment, config.environments)
         self.optimiser = clipped_adam(
             config.learning_rate,
             config.gradient_norm,
@@ -145,15 +149,17 @@ class Ppo:
         environments = self.environment.start(data, environment_key, self.config.environments)
         optimiser = self.optimiser.init(parameters)
         trained = parameters if self.config.average else None
+        past = None if self.past is None else parameters
         iteration, multipliers = jnp.zeros((), jnp.int32), self.constraints.init()
-        return PpoState(parameters, trained, optimiser, environments, key, iteration, multipliers)
+        return PpoState(parameters, trained, optimiser, environments, key, iteration, multipliers, past)
 
     def trained(self, state: PpoState) -> Any:
-        """Return the parameters that are trained, at first those of the planner, which a pretraining may have set."""
-        if state.trained is None:
-            return state.parameters
-        begins = state.iteration == 0
-        return jax.tree.map(partial(jnp.where, begins), state.parameters, state.trained)
+        """Return the parameters that are trained, at first those of the planner."""
+        return state.parameters if state.trained is None else self._unless_first(state, state.trained)
+
+    def _unless_first(self, state: PpoState, parameters: Any) -> Any:
+        """Return parameters, but before the first iteration those of the planner, which a pretraining may have set."""
+        return jax.tree.map(partial(jnp.where, state.iteration == 0), state.parameters, parameters)
 
     def network(self, parameters: Any) -> ActorCritic:
         """Return the network with these parameters."""
@@ -197,7 +203,13 @@ class Ppo:
         policy, value = self.network(self.trained(state)).policy_and_value(observation)
         raw_action = policy.sample(key)
         extra = {"log_prob": policy.log_prob(raw_action), "value": value}
-        return SampledAction(raw_action, policy.action(raw_action), extra)
+        action = policy.action(raw_action)
+        if self.past is not None:
+            index = self.past.environments
+            seen = {name: rows[index] for name, rows in observation.items()}
+            older = self.distribution(self._unless_first(state, state.past), seen)
+            action = action.at[index].set(older.action(older.sample(jax.random.fold_in(key, 1))))
+        return SampledAction(raw_action, action, extra)
 
     def transition(self, now: Environments, sampled: SampledAction, outcome: Outcome) -> Rollout:
         """Return one row of a rollout, with its observation."""
@@ -213,6 +225,8 @@ class Ppo:
         """
         config, first = self.config, self.trained(state)
         _, update_key, key = jax.random.split(state.key, 3)
+        if self.past is not None:
+            rollout = replace(rollout, alive=rollout.alive.at[:, self.past.environments].set(False))
         reward, multipliers, constraint_logs = self.constraints.update(state.multipliers, rollout)
         rollout = replace(rollout, reward=reward)
         batch = self._batch(rollout, self.network(first).value(state.environments.observation))
@@ -249,13 +263,21 @@ class Ppo:
             parameters = jax.tree.map(partial(jnp.where, settling), fixed, parameters)
         losses = {f"loss/{name}": value.mean() for name, value in (logs | constraint_logs).items()}
         after = replace(state, optimiser=optimiser, key=key, iteration=state.iteration + 1)
-        after = replace(after, multipliers=multipliers)
+        after = replace(after, multipliers=multipliers, past=self._past(state, parameters))
         if state.trained is None:
             return replace(after, parameters=parameters), losses
         # The mean of all, until the first ones are forgotten.
         rate = jnp.maximum(1.0 - config.average, 1.0 / after.iteration)
         average = optax.incremental_update(parameters, state.parameters, rate)
         return replace(after, parameters=average, trained=parameters), losses
+
+    def _past(self, state: PpoState, parameters: Any) -> Any:
+        """Return the older copy after an iteration, given the new parameters; None without any."""
+        if self.past is None:
+            return None
+        refresh = (state.iteration + 1) % self.past.refresh == 0
+        older = self._unless_first(state, state.past)
+        return jax.tree.map(partial(jnp.where, refresh), parameters, older)
 
     def _batch(self, rollout: Rollout, last: Array) -> dict[str, Any]:
         """Return the flattened rollout with advantages, given the values of the last observations."""
