@@ -166,14 +166,13 @@ def test_shipped_policies_drive_and_have_provenance(name, bank):
     )
     with pytest.raises(UsageError, match="without steps"):
         find_planner(f"{name}@5", bank)
-    if isinstance(task.actions, Route):
-        with pytest.raises(UsageError, match="who have no route"):
-            find_traffic(name)
-        return
     among = find_traffic(name)
-    assert (
-        among.task == task and data_of(prepare_bank(among, bank), TrafficPolicy).planner.name == planner.name
-    )
+    prepared = prepare_bank(among, bank)
+    assert among.task == task and data_of(prepared, TrafficPolicy).planner.name == planner.name
+    if isinstance(task.actions, Route):
+        # Only ego has a route in this bank.
+        with pytest.raises(UsageError, match="--egos 8"):
+            among.start(prepared, 0, 10)
 
 
 @pytest.mark.slow
