@@ -51,8 +51,8 @@ PLANNERS = ("expert", *ZOO, "pdm", "idm", "constant_speed", "constant_velocity",
 #: Columns of the page, with their short names.
 COLUMNS = {
     "success": "success", "accuracy": "accuracy", "collision": "collision", "at_fault_collision": "at fault",
-    "offroad": "off-road", "red_light": "red light", "progress": "progress (m)", "ttc_ok": "ttc",
-    "comfortable": "comfort", "vmax_score": "vmax score",
+    "offroad": "off-road", "red_light": "red light", "progress": "progress (m)", "log_lead": "lead (s)",
+    "ttc_ok": "ttc", "comfortable": "comfort", "vmax_score": "vmax score",
 }  # fmt: skip
 #: Planners to compare every learned planner with, and the metrics of the comparison.
 REFERENCES = ("constant_speed", "idm", "pdm")

@@ -9,15 +9,21 @@ import optax
 import pytest
 from jax.flatten_util import ravel_pytree
 
+from drivax.learning.algorithms.averaging import trained_parameters
 from drivax.learning.algorithms.behaviour_cloning import Cloning
 from drivax.learning.algorithms.optimisers import chunk_size, clip_per_network, clipped_adam
 from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.environment import Rollout
+from drivax.learning.replay import ReplayConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from pendulum import Pendulum
 
 NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,), activation="tanh"), head=(4,))
+SAC = SacConfig(
+    network=NETWORK, environments=8, unroll=4, batch=16, warm_up=32, replay=ReplayConfig(capacity=512)
+)
 CONFIG = PpoConfig(network=NETWORK, environments=8, unroll=6, epochs=2, minibatches=2)
 
 
@@ -236,10 +242,11 @@ def test_updates_are_skipped_beyond_the_target_divergence():
     assert int(states["near"].optimiser[1][0].count) == 1 and int(states["far"].optimiser[1][0].count) == 4
 
 
-def test_average_of_parameters():
+@pytest.mark.parametrize("config", [CONFIG, SAC], ids=["ppo", "sac"])
+def test_average_of_parameters(config):
     """By hand: the mean of the first iterations, then a moving average; training itself is not affected."""
     environment, decay = Pendulum(), 0.75
-    plain, averaged = (replace(CONFIG, average=value).build(environment, (), 6) for value in (0.0, decay))
+    plain, averaged = (replace(config, average=value).build(environment, (), 6) for value in (0.0, decay))
     first = state = plain.init((), jax.random.key(0))
     averaging = averaged.init((), jax.random.key(0))
     assert state.trained is None and averaging.trained is not None
@@ -253,7 +260,7 @@ def test_average_of_parameters():
         for later in history[4:]:
             expected = decay * expected + (1.0 - decay) * later
         np.testing.assert_allclose(ravel_pytree(averaging.parameters)[0], expected, rtol=2e-5, atol=1e-6)
+    assert np.abs(history[-1] - history[0]).max() > 1e-4
     # A pretraining sets the parameters alone: training goes on from them.
     pretrained = replace(averaging, parameters=state.parameters, iteration=first.iteration)
-    trained = averaged.trained(pretrained)
-    jax.tree.map(np.testing.assert_array_equal, trained, state.parameters)
+    jax.tree.map(np.testing.assert_array_equal, trained_parameters(pretrained), state.parameters)

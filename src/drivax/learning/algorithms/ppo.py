@@ -13,6 +13,12 @@ from flax import nnx
 from jaxtyping import Array, Bool
 
 from drivax.learning.algorithm import AuxiliaryLoss
+from drivax.learning.algorithms.averaging import (
+    average,
+    check_average,
+    trained_parameters,
+    unless_first,
+)
 from drivax.learning.algorithms.constraints import Constraints
 from drivax.learning.algorithms.optimisers import chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
@@ -79,8 +85,7 @@ class PpoConfig:
     def __post_init__(self) -> None:
         if min((self.multiplier_rate, *self.constraints.values())) < 0.0:
             raise ValueError("limits of constraints and multiplier_rate are at least 0")
-        if not 0.0 <= self.average < 1.0:
-            raise ValueError(f"average is {self.average}; choose at least 0 and less than 1")
+        check_average(self.average)
         if self.environments < 1 or self.unroll < 1 or self.minibatches < 1:
             raise ValueError("environments, unroll and minibatches are at least 1")
         steps, minibatches = self.steps_per_iteration, self.minibatches
@@ -153,14 +158,6 @@ class Ppo:
         iteration, multipliers = jnp.zeros((), jnp.int32), self.constraints.init()
         return PpoState(parameters, trained, optimiser, environments, key, iteration, multipliers, past)
 
-    def trained(self, state: PpoState) -> Any:
-        """Return the parameters that are trained, at first those of the planner."""
-        return state.parameters if state.trained is None else self._unless_first(state, state.trained)
-
-    def _unless_first(self, state: PpoState, parameters: Any) -> Any:
-        """Return parameters, but before the first iteration those of the planner, which a pretraining may have set."""
-        return jax.tree.map(partial(jnp.where, state.iteration == 0), state.parameters, parameters)
-
     def network(self, parameters: Any) -> ActorCritic:
         """Return the network with these parameters."""
         return nnx.merge(self.graph, parameters)
@@ -200,14 +197,14 @@ class Ppo:
 
     def sample_action(self, state: PpoState, observation: Any, key: Array) -> SampledAction:
         """Sample the policy, with log-probabilities and values as extras."""
-        policy, value = self.network(self.trained(state)).policy_and_value(observation)
+        policy, value = self.network(trained_parameters(state)).policy_and_value(observation)
         raw_action = policy.sample(key)
         extra = {"log_prob": policy.log_prob(raw_action), "value": value}
         action = policy.action(raw_action)
         if self.past is not None:
             index = self.past.environments
             seen = {name: rows[index] for name, rows in observation.items()}
-            older = self.distribution(self._unless_first(state, state.past), seen)
+            older = self.distribution(unless_first(state, state.past), seen)
             action = action.at[index].set(older.action(older.sample(jax.random.fold_in(key, 1))))
         return SampledAction(raw_action, action, extra)
 
@@ -223,7 +220,7 @@ class Ppo:
 
         The state is the one that the rollout was sampled with, with the environments after it.
         """
-        config, first = self.config, self.trained(state)
+        config, first = self.config, trained_parameters(state)
         _, update_key, key = jax.random.split(state.key, 3)
         if self.past is not None:
             rollout = replace(rollout, alive=rollout.alive.at[:, self.past.environments].set(False))
@@ -263,20 +260,15 @@ class Ppo:
             parameters = jax.tree.map(partial(jnp.where, settling), fixed, parameters)
         losses = {f"loss/{name}": value.mean() for name, value in (logs | constraint_logs).items()}
         after = replace(state, optimiser=optimiser, key=key, iteration=state.iteration + 1)
-        after = replace(after, multipliers=multipliers, past=self._past(state, parameters))
-        if state.trained is None:
-            return replace(after, parameters=parameters), losses
-        # The mean of all, until the first ones are forgotten.
-        rate = jnp.maximum(1.0 - config.average, 1.0 / after.iteration)
-        average = optax.incremental_update(parameters, state.parameters, rate)
-        return replace(after, parameters=average, trained=parameters), losses
+        past, averaged = self._past(state, parameters), average(state, parameters, config.average)
+        return replace(after, multipliers=multipliers, past=past, **averaged), losses
 
     def _past(self, state: PpoState, parameters: Any) -> Any:
         """Return the older copy after an iteration, given the new parameters; None without any."""
         if self.past is None:
             return None
         refresh = (state.iteration + 1) % self.past.refresh == 0
-        older = self._unless_first(state, state.past)
+        older = unless_first(state, state.past)
         return jax.tree.map(partial(jnp.where, refresh), parameters, older)
 
     def _batch(self, rollout: Rollout, last: Array) -> dict[str, Any]:

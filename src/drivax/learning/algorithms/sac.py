@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
+from drivax.learning.algorithms.averaging import average, check_average, trained_parameters
 from drivax.learning.algorithms.off_policy import Carry, OffPolicy, sample_each, target_entropy
 from drivax.learning.algorithms.optimisers import chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
@@ -69,6 +70,8 @@ class SacConfig:
         temperature: Initial temperature.
         target_entropy: Target entropy of the policy; by default minus the size of an action.
         gradient_norm: Maximum global norm of the gradients of policy and critics; None: no clipping.
+        average: Decay per iteration of an exponential moving average of the policy's parameters, which is validated
+            and exported in place of the newest ones; 0: no average.
     """
 
     kind: Literal["sac"] = "sac"
@@ -90,8 +93,10 @@ class SacConfig:
     temperature: float = 0.1
     target_entropy: float | None = None
     gradient_norm: float | None = 10.0
+    average: float = 0.0
 
     def __post_init__(self) -> None:
+        check_average(self.average)
         if min(self.environments, self.unroll, self.updates_per_step, self.batch, self.steps) < 1:
             raise ValueError("environments, unroll, updates_per_step, batch and steps are at least 1")
         if not 0.0 <= self.demonstrations < 1.0:
@@ -137,11 +142,16 @@ class SacParameters:
 
 @record
 class SacState:
-    """State of a run; ``parameters`` are the policy's."""
+    """State of a run.
+
+    ``parameters`` are those of the planner: the average, if there is one, of the policy's that are ``trained`` (else
+    None).
+    """
 
     networks: ClassVar[tuple[str, ...]] = ("parameters", "critic", "target")
 
     parameters: Any
+    trained: Any
     critic: Any
     log_temperature: Array
     target: Any
@@ -177,6 +187,7 @@ class Sac(OffPolicy[SacConfig]):
         trained: Any = SacParameters(policy, critic, log_temperature)
         return SacState(
             parameters=policy,
+            trained=policy if self.config.average else None,
             critic=critic,
             log_temperature=log_temperature,
             target=jax.tree.map(jnp.copy, critic),
@@ -214,7 +225,7 @@ class Sac(OffPolicy[SacConfig]):
     def sample_action(self, state: SacState, observation: Any, key: Array) -> SampledAction:
         """Sample the policy, or uniform actions during warm-up; the buffer stores the action as raw action."""
         sample_key, uniform_key = jax.random.split(key)
-        policy = self.distribution(state.parameters, observation)
+        policy = self.distribution(trained_parameters(state), observation)
         action = policy.action(policy.sample(sample_key))
         if self.config.explore == "uniform":
             uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0)
@@ -238,7 +249,7 @@ class Sac(OffPolicy[SacConfig]):
         config = self.config
         _, draw_key, update_key, key = jax.random.split(state.key, 4)
         before = state.iteration * config.steps_per_iteration
-        trained = SacParameters(state.parameters, state.critic, state.log_temperature)
+        trained = SacParameters(trained_parameters(state), state.critic, state.log_temperature)
         first: Carry = (trained, {"critic": state.target}, state.optimiser)
 
         @jax.jit  # so that the shapes of its logs do not trace it a second time
@@ -256,10 +267,16 @@ class Sac(OffPolicy[SacConfig]):
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(learn)[1])
         warm = any_across_learners(before + config.steps_per_iteration >= config.warm_up)
         (trained, target, optimiser), losses = jax.lax.cond(warm, learn, lambda: (first, zeros))
-        after = SacState(
-            trained.policy, trained.critic, trained.log_temperature, target["critic"], optimiser, state.replay,
-            state.environments, key, state.iteration + 1,
-        )  # fmt: skip
+        after = replace(
+            state,
+            **average(state, trained.policy, config.average),
+            critic=trained.critic,
+            log_temperature=trained.log_temperature,
+            target=target["critic"],
+            optimiser=optimiser,
+            key=key,
+            iteration=state.iteration + 1,
+        )
         return after, losses
 
     def _draw(self, data: Any, replay: Replay, key: Array, updates: int) -> _BatchIndex:

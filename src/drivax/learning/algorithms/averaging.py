@@ -1,0 +1,41 @@
+"""A moving average of parameters, which drives in place of those that are trained.
+
+States of averaging algorithms have fields ``parameters`` (of the planner), ``trained`` (None without an average) and
+``iteration``.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+
+def check_average(decay: float) -> None:
+    """Raise ValueError if the decay of an average is outside [0, 1)."""
+    if not 0.0 <= decay < 1.0:
+        raise ValueError(f"average is {decay}; choose at least 0 and less than 1")
+
+
+def unless_first(state: Any, parameters: Any) -> Any:
+    """Return parameters, but before the first iteration those of the planner, which a pretraining may have set."""
+    return jax.tree.map(partial(jnp.where, state.iteration == 0), state.parameters, parameters)
+
+
+def trained_parameters(state: Any) -> Any:
+    """Return the parameters that are trained."""
+    return state.parameters if state.trained is None else unless_first(state, state.trained)
+
+
+def average(state: Any, trained: Any, decay: float) -> dict[str, Any]:
+    """Return ``parameters`` and ``trained`` after an iteration that begins in ``state`` and ends with ``trained``.
+
+    The average is the mean of all iterations until the first ones are forgotten.
+    """
+    if state.trained is None:
+        return {"parameters": trained, "trained": None}
+    rate = jnp.maximum(1.0 - decay, 1.0 / (state.iteration + 1))
+    return {"parameters": optax.incremental_update(trained, state.parameters, rate), "trained": trained}
