@@ -166,11 +166,11 @@ def test_shipped_policies_drive_and_have_provenance(name, bank):
     )
     with pytest.raises(UsageError, match="without steps"):
         find_planner(f"{name}@5", bank)
-    if isinstance(task.actions, Route):
-        with pytest.raises(UsageError, match="who have no route"):
-            find_traffic(name)
-        return
     among = find_traffic(name)
+    if isinstance(task.actions, Route):
+        with pytest.raises(UsageError, match="cannot drive others without routes"):
+            prepare_bank(among, bank)
+        return
     assert (
         among.task == task and data_of(prepare_bank(among, bank), TrafficPolicy).planner.name == planner.name
     )
