@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,8 @@ from drivax.errors import UsageError
 from drivax.planners.functions import NetworkPlanner
 from drivax.planners.planner_traffic import PlannerTraffic, TrafficPolicy, with_driver
 from drivax.planners.simple import Expert
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.bank_data import data_of
@@ -19,7 +23,7 @@ from drivax.simulator.traffic.log import alone
 from drivax.tasks.actions import ROUTE
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
-from scenes import bank_of, car, straight_road
+from scenes import SMALL, bank_of, car, straight_road
 
 TASK = Task(
     observation=ObservationConfig(agents=3, steps=3, road=8, lights=0, route=2), metrics="none", ends=()
@@ -75,11 +79,21 @@ def test_the_nearest_moving_vehicles_are_driven(bank):
     assert slots[:3] == nearest(bank) and slots[4:] == [bank.agents.shape[2]] * 2
 
 
+def test_policies_of_the_space_route_drive_only_egos_with_a_route():
+    cars = [car(speed=8.0), car(-3, 3.7, 0, 9), car(25, 0, 0, 7), car(60, 3.7, 0, 10)]
+    bank = ScenarioBank.from_scenarios([assemble(straight_road(cars), SMALL.with_egos(3))], trim=False)
+    traffic = PlannerTraffic(replace(TASK, actions=ROUTE), count=4)
+    slots = traffic._slots(bank, 0, 10).tolist()
+    assert slots == [*bank.egos[0, 1:].tolist(), *[bank.agents.shape[2]] * 2]
+    without = replace(bank, on_lanes=bank.on_lanes.at[1].set(False))
+    assert traffic._slots(without, 0, 10).tolist()[0] == slots[1]
+
+
 def test_planners_unfit_for_traffic_are_refused(bank):
     with pytest.raises(
         UsageError, match="route cannot drive others without routes; convert or generate the set"
     ):
-        PlannerTraffic(Task(actions=ROUTE)).start(bank, 0, 10)
+        PlannerTraffic(Task(actions=ROUTE)).prepare(bank)
     with pytest.raises(UsageError, match="cannot drive others"):
         with_driver(bank, Expert())
     with pytest.raises(UsageError, match="the bank has no TrafficPolicy; use planners"):

@@ -41,6 +41,8 @@ class Train:
 
     Example: drivax train demo --data sets/train --out runs/ppo --algorithm.learning_rate 1e-3
 
+    Example: drivax train ppo --data sets/egos --out runs/all --egos moving
+
     Example: drivax train offline/cql --data sets/train --arm heuristic --out runs/cql-heuristic
 
     Example: drivax train offline/iql --data sets/train --scores scores.npz --out runs/iql-critical

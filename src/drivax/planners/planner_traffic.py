@@ -82,20 +82,23 @@ class PlannerTraffic:
         return "driven" if self.base.name == "log" else f"driven+{self.base.name}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """Return the bank with the data of ``base``."""
+        """Return the bank with the data of ``base``.
+
+        Raises:
+            UsageError: Only the recorded ego has the route that the planner's action space needs.
+        """
+        if isinstance(self.task.actions, Route) and bank.most_egos == 1:
+            cure = "convert or generate the set with --egos 8, or use a policy of another action space"
+            problem = "a policy of the action space route cannot drive others without routes"
+            raise UsageError(problem, cure=cure)
         return prepare_bank(self.base, bank)
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> PlannerTrafficState:
         """Return the logged traffic state at ``step``.
 
         Raises:
-            UsageError: The bank has no driver, or only the recorded ego has the route that its action space needs.
+            UsageError: The bank has no driver.
         """
-        if isinstance(self.task.actions, Route) and bank.most_egos == 1:
-            cure = "convert or generate the set with --egos 8, or use a policy of another action space"
-            raise UsageError(
-                "a policy of the action space route cannot drive others without routes", cure=cure
-            )
         data_of(bank, TrafficPolicy, "use planners.planner_traffic.with_driver")
         simulator, slots = Simulator(self.task), self._slots(bank, index, step)
         contexts = jax.vmap(lambda slot: simulator.context(bank, index, step, slot))(slots)
