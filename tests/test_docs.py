@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import re
 import shlex
@@ -17,7 +16,6 @@ import pytest
 
 from drivax import cli
 from drivax.curation.methods import METHODS
-from drivax.learning.config import TrainConfig
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md")])
@@ -68,8 +66,6 @@ def help_of(command: str) -> str:
     return out.getvalue()
 
 
-#: Settings of a training, which `drivax train` takes as flags.
-TRAIN_SETTINGS = {field.name for field in dataclasses.fields(TrainConfig)}
 #: Pages that take more than a few seconds; what they say is tested quickly elsewhere.
 SLOW_PAGES = (
     "docs/guide/custom.md", "docs/guide/dynamics.md", "docs/guide/evaluate.md", "docs/guide/gymnasium.md",
@@ -116,14 +112,13 @@ def test_commands_exist(block: Block):
             continue
         assert words[1] in cli.COMMANDS, f"{block.place}: there is no command {words[1]}"
         for flag in flags:
-            setting = words[1] == "train" and flag.removeprefix("--") in TRAIN_SETTINGS
             dotted = "." in flag and cli.COMMANDS[words[1]].overrides
             known = flag in ("--debug", "--help") or re.search(
                 rf"(?<![\w-]){flag}(?![\w-])", help_of(words[1])
             )
             if words[1] == "curate" and METHODS[words[2]].config is not None:
                 known = known or hasattr(METHODS[words[2]].config, flag.removeprefix("--"))
-            assert dotted or setting or known, f"{block.place}: drivax {words[1]} has no {flag}"
+            assert dotted or known, f"{block.place}: drivax {words[1]} has no {flag}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
