@@ -253,6 +253,9 @@ def test_average_of_parameters():
         for later in history[4:]:
             expected = decay * expected + (1.0 - decay) * later
         np.testing.assert_allclose(ravel_pytree(averaging.parameters)[0], expected, rtol=2e-5, atol=1e-6)
+    # A state may be donated: no array is in it twice.
+    donating = jax.jit(lambda state: averaged.iterate((), state), donate_argnums=0)
+    donating(averaged.init((), jax.random.key(0)))
     # A pretraining sets the parameters alone: training goes on from them.
     pretrained = replace(averaging, parameters=state.parameters, iteration=first.iteration)
     trained = averaged.trained(pretrained)
