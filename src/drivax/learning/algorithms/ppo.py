@@ -157,10 +157,10 @@ class Ppo:
 
     def trained(self, state: PpoState) -> Any:
         """Return the parameters that are trained, at first those of the planner."""
-        return state.parameters if state.trained is None else self._unless_first(state, state.trained)
+        return state.parameters if state.trained is None else self._choose(state, state.trained)
 
-    def _unless_first(self, state: PpoState, parameters: Any) -> Any:
-        """Return parameters, but before the first iteration those of the planner, which a pretraining may have set."""
+    def _choose(self, state: PpoState, parameters: Any) -> Any:
+        """Return parameters; before the first iteration those of the planner, which a pretraining may have set."""
         return jax.tree.map(partial(jnp.where, state.iteration == 0), state.parameters, parameters)
 
     def network(self, parameters: Any) -> ActorCritic:
@@ -209,7 +209,7 @@ class Ppo:
         if self.past is not None:
             index = self.past.environments
             seen = {name: rows[index] for name, rows in observation.items()}
-            older = self.distribution(self._unless_first(state, state.past), seen)
+            older = self.distribution(self._choose(state, state.past), seen)
             action = action.at[index].set(older.action(older.sample(jax.random.fold_in(key, 1))))
         return SampledAction(raw_action, action, extra)
 
@@ -278,7 +278,7 @@ class Ppo:
         if self.past is None:
             return None
         refresh = (state.iteration + 1) % self.past.refresh == 0
-        older = self._unless_first(state, state.past)
+        older = self._choose(state, state.past)
         return jax.tree.map(partial(jnp.where, refresh), parameters, older)
 
     def _batch(self, rollout: Rollout, last: Array) -> dict[str, Any]:
