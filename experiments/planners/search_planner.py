@@ -381,7 +381,7 @@ class SearchPlanner:
         context, frame = situation.context, situation.surroundings.frame
         ego_box, speed = frame.box[context.slot], context.history[-1, 3]
         offsets = jnp.arange(_POINTS) * _STEP_M
-        path, exists = route_ahead(bank, context.index, context.route_m, offsets)
+        path, exists = route_ahead(bank, context.row, context.route_m, offsets)
         desired_mps = jnp.where(exists[1], desired_speed(path, exists, offsets), 0.0)
         stop_m = stop_line_m(bank, context, frame)
         trend = carry.update(frame)
@@ -571,7 +571,8 @@ def _road_violations(
         return (known & (left < -OFFROAD_TOLERANCE_M / 2)).any()
 
     def leaves_lanes(point: Array) -> Array:
-        return around_lanes(bank, context.index, point[:2], point[3:5], point[None, :2], context.z).straddling
+        pose = (point[:2], point[3:5], point[None, :2])
+        return around_lanes(bank, context.index, *pose, context.z, row=context.row).straddling
 
     sample = slice(4, 17, 4)
     return jnp.mean(jax.vmap(is_offroad)(pose[1:12:2])), (

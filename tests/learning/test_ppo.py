@@ -261,6 +261,9 @@ def test_average_of_parameters(config):
             expected = decay * expected + (1.0 - decay) * later
         np.testing.assert_allclose(ravel_pytree(averaging.parameters)[0], expected, rtol=2e-5, atol=1e-6)
     assert np.abs(history[-1] - history[0]).max() > 1e-4
+    # A state may be donated: no array is in it twice.
+    donating = jax.jit(lambda state: averaged.iterate((), state), donate_argnums=0)
+    donating(averaged.init((), jax.random.key(0)))
     # A pretraining sets the parameters alone: training goes on from them.
     pretrained = replace(averaging, parameters=state.parameters, iteration=first.iteration)
     jax.tree.map(np.testing.assert_array_equal, trained_parameters(pretrained), state.parameters)

@@ -288,6 +288,10 @@ def test_held_decision_of_a_group_takes_its_steps(bank, environment):
         expected = np.asarray(one.reward) + np.where(idle, 0.0, two.reward)
         alive = ~np.asarray(now.over)
         np.testing.assert_allclose(result.reward[alive], expected[alive], atol=1e-4)
+        # Metrics end with the episode, not with the decision.
+        assert not (idle & np.asarray(two.terminated | two.truncated)).any()
+        for name in ("steps", "steps/n"):
+            assert result.totals[name] == one.totals[name] + two.totals[name]
         motions = [each.state.context.history[:, -1] for each in (held, first, second)]
         expected = np.where(idle[:, None], motions[1], motions[2])
         np.testing.assert_allclose(motions[0], expected, atol=1e-3)

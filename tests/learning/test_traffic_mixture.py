@@ -92,8 +92,11 @@ def test_traffic_is_a_name_or_shares():
 @pytest.mark.parametrize(
     ("traffic", "words"),
     [
-        ({"log": 0.5, "idm": 0.4}, "shares of traffic are 0.5, 0.4; use shares above 0 with a sum of 1"),
-        ({"log": 1.5, "idm": -0.5}, "shares of traffic are 1.5, -0.5; use"),
+        (
+            {"log": 0.5, "idm": 0.4},
+            "shares of traffic are log 0.5, idm 0.4; use shares above 0 with a sum of 1",
+        ),
+        ({"log": 1.5, "idm": -0.5}, "shares of traffic are log 1.5, idm -0.5; use"),
         ({}, "shares of traffic are missing"),
         ({"log": 0.5, "idn": 0.5}, "there is no traffic 'idn'; use log"),
         ({"log": "half"}, "'half' is not a number"),

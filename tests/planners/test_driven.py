@@ -13,7 +13,7 @@ from flax import nnx
 from drivax.errors import UsageError
 from drivax.planners.functions import NetworkPlanner
 from drivax.planners.planner_traffic import PlannerTraffic, TrafficPolicy, with_driver
-from drivax.planners.simple import Expert
+from drivax.planners.simple import Expert, RandomActions
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
@@ -98,6 +98,23 @@ def test_planners_unfit_for_traffic_are_refused(bank):
         with_driver(bank, Expert())
     with pytest.raises(UsageError, match="the bank has no TrafficPolicy; use planners"):
         TRAFFIC.start(bank_of(straight_road([car()])), 0, 10)
+
+
+def test_driven_traffic_holds_decisions(bank):
+    """Random actions differ from step to step, but the traffic executes each for two."""
+    simulator = Simulator(TASK, PlannerTraffic(replace(TASK, hold=2), count=3))
+
+    @jax.jit
+    def actions(bank):
+        def one(state, _):
+            after, _ = simulator.step(bank, state, jnp.zeros(2))
+            return after, after.context.traffic.contexts.action
+
+        return jax.lax.scan(one, simulator.reset(bank, 0, 11), None, 6)[1]
+
+    executed = np.asarray(actions(with_driver(bank, RandomActions())))
+    np.testing.assert_array_equal(executed[0::2], executed[1::2])
+    assert (executed[2::2] != executed[1:-1:2]).all()
 
 
 @pytest.mark.slow

@@ -100,7 +100,8 @@ class TrainConfig:
             raise UsageError("checkpoint_rule fitted_q needs fitted-Q evaluation", cure=cure)
         shares = self.shares.values()
         if min(shares, default=0.0) <= 0.0 or abs(sum(shares) - 1.0) > _ROUNDING:
-            problem = f"shares of traffic are {', '.join(f'{share:g}' for share in shares) or 'missing'}"
+            texts = [f"{name} {share:g}" for name, share in self.shares.items()]
+            problem = f"shares of traffic are {', '.join(texts) or 'missing'}"
             raise UsageError(problem, cure="use shares above 0 with a sum of 1")
         for name in self.shares:
             if name != SELF:

@@ -141,29 +141,33 @@ class Driving:
     ) -> tuple[Environments, Outcome]:
         """Hold a decision for ``Task.hold`` steps in every environment, or reset it where its episode is over.
 
-        An episode that ends while a decision is held does not step on. Rewards of the steps are added.
+        An episode that ends while a decision is held counts no further step. Rewards of the steps are added.
         """
         state, result = self._step_or_reset(data, now, cache, action, key)
         summed = (result.reward, result.reward_terms, result.terminated, result.truncated)
 
-        def step_on(carry: tuple[SimState, Any], _: None) -> tuple[tuple[SimState, Any], None]:
+        def step_on(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
             """Take another step of the decision of every episode that neither ended nor started."""
-            state, (reward, terms, terminated, truncated) = carry
+            state, last, (reward, terms, terminated, truncated) = carry
             idle = now.over | terminated | truncated
             state, result = self._step_on(data, state, action, idle)
+            last = jnp.where(idle, last, state.context.step)
             more = jax.tree.map(
                 lambda value: jnp.where(idle, 0.0, value), (result.reward, result.reward_terms)
             )
             reward, terms = jax.tree.map(jnp.add, (reward, terms), more)
             ends = (terminated | (result.terminated & ~idle), truncated | (result.truncated & ~idle))
-            return (state, (reward, terms, *ends)), None
+            return (state, last, (reward, terms, *ends)), None
 
+        last = state.context.step
         # Even a scan over nothing is traced and compiled.
         if self.task.hold > 1:
-            (state, summed), _ = jax.lax.scan(step_on, (state, summed), None, self.task.hold - 1)
+            (state, last, summed), _ = jax.lax.scan(step_on, (state, last, summed), None, self.task.hold - 1)
         reward, terms, terminated, truncated = summed
         ends = terminated | truncated
-        totals = _totals(data, state, terms, ends, now.over)
+        # Metrics end with the episode, although vehicles of self-play drive on.
+        episodes = replace(state, context=replace(state.context, step=last))
+        totals = _totals(data, episodes, terms, ends, now.over)
         outcome = Outcome(reward, terminated, truncated, self.cache(data, state), totals, terms)
         over = self._over(data, state, now.over, ends)
         return Environments(state, over, self.observe_all(data, state.context)), outcome
@@ -197,12 +201,12 @@ class Driving:
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
         """
 
-        def demonstrate(bank: ScenarioBank, *place: Any) -> tuple[dict[str, Array], Array, Array]:
-            context = self._logged_context(bank, *place)
+        def demonstrate(bank: ScenarioBank, *index: Any) -> tuple[dict[str, Array], Array, Array]:
+            context = self._logged_context(bank, *index)
             return (dict(self._log_simulator.observe(bank, context)), *self._expert_action(bank, context))
 
-        *places, _ = self._draw(data, key, count, CURRENT_STEP)
-        return jax.vmap(_of_agent(demonstrate, data))(*places)
+        *index, _ = self._draw(data, key, count, CURRENT_STEP)
+        return jax.vmap(_of_agent(demonstrate, data))(*index)
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
         """Observe logged steps as in :meth:`demonstrations`."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from drivax.errors import UsageError
-from drivax.planners.planner import Memoryless, Planner
+from drivax.planners.planner import Memoryless, Planner, hold
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
@@ -47,11 +47,13 @@ class PlannerTrafficState:
     Attributes:
         begin: First step of the episode; until then all agents moved as logged.
         contexts: One context per agent; a slot equal to the number of agents is empty.
+        carry: Carry of their planners, with the decisions that they hold (``Task.hold``); empty if for a single step.
         base: State of the traffic around them.
     """
 
     begin: Int[Array, "*batch"]
     contexts: AgentContext
+    carry: Any
     base: Any
 
 
@@ -60,9 +62,9 @@ class PlannerTraffic:
     """Traffic whose vehicles nearest to ego are driven by the planner of :func:`with_driver`, others by ``base``.
 
     It drives vehicles that the log has when the episode starts and that travel more than 2 m in the rest of it. They
-    see all agents and follow the task's dynamics to the end of the episode. Further egos of the set have a route,
-    others have none: train a policy for those to follow lanes. In the action space ``route`` only egos with a route on
-    lanes are driven.
+    see all agents, hold each decision for ``task.hold`` steps, and follow the task's dynamics to the end of the
+    episode. Further egos of the set have a route, others have none: train a policy for those to follow lanes. In the
+    action space ``route`` only egos with a route on lanes are driven.
 
     Attributes:
         task: Observation and action space of the planner.
@@ -102,19 +104,22 @@ class PlannerTraffic:
         data_of(bank, TrafficPolicy, "use planners.planner_traffic.with_driver")
         simulator, slots = Simulator(self.task), self._slots(bank, index, step)
         contexts = jax.vmap(lambda slot: simulator.context(bank, index, step, slot))(slots)
-        return PlannerTrafficState(jnp.asarray(step, jnp.int32), contexts, self.base.start(bank, index, step))
+        carry = () if self.task.hold == 1 else ((), jnp.zeros_like(contexts.action))
+        base = self.base.start(bank, index, step)
+        return PlannerTrafficState(jnp.asarray(step, jnp.int32), contexts, carry, base)
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> PlannerTrafficState:
         """Advance all agents by one step of 0.1 s from the present frame."""
         traffic = context.traffic
+        planner = hold(data_of(bank, TrafficPolicy).planner, self.task.hold)
 
         def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
             """Return the frame ``back`` steps ago, of all slots or of some."""
             rows = self.agents(bank, context, back)
             return frame_of(bank, context.index, context.step, rows, alone(context), back, slots)
 
-        def drive(agent: AgentContext) -> AgentContext:
-            """Return an agent's context one step later, after an action of the planner."""
+        def drive(agent: AgentContext, carry: Any) -> tuple[AgentContext, Any]:
+            """Return an agent's context one step later, after an action of the planner, and the planner's carry."""
             # Earlier contacts matter to metrics only, so none is kept.
             no_contact = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
             lights = remember_lights(bank, agent)
@@ -125,16 +130,16 @@ class PlannerTraffic:
             for number in (bank.identity[agent.index], agent.step, agent.slot):
                 key = jax.random.fold_in(key, number)
             observation = self.task.observe(bank, situation.context, frames, frame)
-            planner = data_of(bank, TrafficPolicy).planner
-            action, _ = planner.act((), bank, state, situation, observation, key)
+            action, carry = planner.act(carry, bank, state, situation, observation, key)
             action = self.task.actuate(bank, agent, action)
             length_m = bank.length_m(agent.index, agent.slot)
             motion = self.task.motion(agent.history[-1], action, length_m)
             history = jnp.concatenate([agent.history[1:], motion[None]])
-            return replace(situation.context, step=agent.step + 1, history=history, action=action)
+            return replace(situation.context, step=agent.step + 1, history=history, action=action), carry
 
         base = self.base.advance(bank, replace(context, traffic=traffic.base), frame)
-        return PlannerTrafficState(traffic.begin, jax.vmap(drive)(traffic.contexts), base)
+        contexts, carry = jax.vmap(drive)(traffic.contexts, traffic.carry)
+        return PlannerTrafficState(traffic.begin, contexts, carry, base)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Return the rows of ``base`` with the driven vehicles at their simulated poses."""

@@ -153,8 +153,10 @@ class Ppo:
         parameters = nnx.state(self._network(network_key), nnx.Param)
         environments = self.environment.start(data, environment_key, self.config.environments)
         optimiser = self.optimiser.init(parameters)
-        trained = parameters if self.config.average else None
-        past = None if self.past is None else parameters
+        # Copies, because a donated state must not hold an array twice.
+        copy = partial(jax.tree.map, jnp.copy, parameters)
+        trained = copy() if self.config.average else None
+        past = None if self.past is None else copy()
         iteration, multipliers = jnp.zeros((), jnp.int32), self.constraints.init()
         return PpoState(parameters, trained, optimiser, environments, key, iteration, multipliers, past)
 

@@ -187,7 +187,7 @@ class Sac(OffPolicy[SacConfig]):
         trained: Any = SacParameters(policy, critic, log_temperature)
         return SacState(
             parameters=policy,
-            trained=policy if self.config.average else None,
+            trained=jax.tree.map(jnp.copy, policy) if self.config.average else None,
             critic=critic,
             log_temperature=log_temperature,
             target=jax.tree.map(jnp.copy, critic),
