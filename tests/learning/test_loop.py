@@ -239,7 +239,7 @@ def test_training_holds_out_recordings_by_default(data, config, tmp_path, monkey
     lines = []
     short = replace(config, total_steps=20)
     run = train(short, data, tmp_path / "run", log=lines.append)
-    assert lines[0].startswith("trains on 2 scenarios, validates on 1 of 1 held-out recordings;")
+    assert lines[0].startswith("trains on 2 scenarios, validates on 1 (held-out recordings: 1);")
     recording = [data.entries[2][name] for name in ("dataset", "segment")]
     assert run.info["validation"] == {"recordings": [recording], "scenarios": 1}
     first, last = read_rows(run.metrics)

@@ -110,7 +110,7 @@ def test_a_tenth_is_held_out_in_the_order_of_the_digests():
     assert split.recordings == sorted(["womd", segment] for segment in first)
     assert split.validation == [i for i, row in enumerate(rows) if row["segment"] in first]
     assert split.training == [i for i, row in enumerate(rows) if row["segment"] not in first]
-    assert split.text().startswith("trains on 108 scenarios, validates on 12 of 4 held-out recordings;")
+    assert split.text().startswith("trains on 108 scenarios, validates on 12 (held-out recordings: 4);")
     assert split.note() == {"recordings": split.recordings, "scenarios": 12}
     assert hold_out(rows, split.recordings) == split, "recordings of run.json give the same split"
     same = hold_out(rows[::-1])

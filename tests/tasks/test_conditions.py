@@ -233,8 +233,8 @@ def test_command_line_changes_the_numbers_of_a_policy(tmp_path, capsys):
 
 WRONG = [
     ({"name": "collison", "low": 0.5, "high": 2}, "not in the reward; did you mean 'collision'"),
-    ({"name": "ttc", "low": 0.5, "high": 2}, "ttc: not in the reward"),
-    ({"name": "ttc_s", "low": 0.5, "high": 2}, "ttc_s: not in the reward"),
+    ({"name": "ttc", "low": 0.5, "high": 2}, "ttc: not in the reward; give ttc a weight"),
+    ({"name": "ttc_s", "low": 0.5, "high": 2}, "ttc_s: not in the reward; give ttc a weight"),
     ({"name": "desired_speed", "low": 0.5, "high": 3}, "use at most 2"),
     ({"name": "collision", "low": 2, "high": 0.5}, "0 <= low < high"),
     ({"name": "collision", "low": 2, "high": 3}, "value 1.0 is not in 2.0 to 3.0"),
@@ -258,7 +258,7 @@ def test_conditions_are_unique():
         replace(TASK, observation=replace(GLIMPSE, own=(group,)))
     with pytest.raises(UsageError, match=r"value 0\.5 is not in"):
         fix_conditions(CONDITIONS, {"desired_speed": 0.5})
-    with pytest.raises(UsageError, match="without conditions"):
+    with pytest.raises(UsageError, match="this planner has no conditions"):
         fix_conditions((), {"desired_speed": 0.5})
 
 

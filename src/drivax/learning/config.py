@@ -46,7 +46,8 @@ class TrainConfig:
     """Settings of ``drivax train``; every preset in ``configs/`` is one of these.
 
     Attributes:
-        total_steps: Environment steps; rounded up to whole iterations.
+        total_steps: Decisions in all environments (``task.hold`` steps each), or logged steps that offline algorithms
+            draw; rounded up to whole iterations.
         seed: Seed of networks, environments and exploration.
         task: Actions, observation, reward, termination, and the metrics that are logged during training.
         algorithm: Learning algorithm and its settings.

@@ -65,7 +65,10 @@ def check_conditions(conditions: Conditions, rewards: RewardConfig) -> None:
     options = {name: bound for name, bound in _OPTIONS.items() if name in active}
     for name, high in ((condition.name, condition.high) for condition in conditions):
         if name not in options and name not in weights:
-            cure = f"{did_you_mean(name, [*weights, *options])}, or add the term to rewards"
+            terms = [
+                t for t, term in TERMS.items() if name == t or (name == term.option and name in _OPTIONS)
+            ]
+            cure = f"give {terms[0]} a weight" if terms else did_you_mean(name, [*weights, *options])
             raise UsageError(f"condition {name}: not in the reward", cure=cure)
         if high > options.get(name, math.inf):
             raise UsageError(f"condition {name}: high is {high}", cure=f"use at most {options[name]:g}")
@@ -112,7 +115,7 @@ def fix_conditions(conditions: Conditions, values: Mapping[str, float] | None = 
     names = [condition.name for condition in conditions]
     for name in values:
         if name not in names:
-            cure = did_you_mean(name, names) if names else "the policy was trained without conditions"
+            cure = did_you_mean(name, names) if names else "this planner has no conditions"
             raise UsageError(f"there is no condition {name!r}", cure=cure)
     return tuple(replace(c, value=values.get(c.name, c.value), fixed=True) for c in conditions)
 

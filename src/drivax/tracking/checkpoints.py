@@ -124,7 +124,9 @@ class Checkpoints:
         if step is None:
             step = max(self.steps(), default=None)
         if step is None:
-            raise DataError("no checkpoint found", file=self.folder, cure="train without --resume")
+            raise DataError(
+                "no checkpoint found", file=self.folder, cure="start the training again, without --resume"
+            )
         stored_leaves, path = self.about(step)["leaves"], self._path(step)
         requested_leaves = [
             (part + name, leaf)

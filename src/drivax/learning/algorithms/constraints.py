@@ -33,7 +33,7 @@ class Constraints:
         """Return constraints in an environment.
 
         Raises:
-            UsageError: The environment's reward has no penalty of a name.
+            UsageError: The environment's reward has no penalty of a name with a constant weight.
         """
         weights = getattr(environment, "penalties", {})
         for name in limits:
@@ -41,7 +41,8 @@ class Constraints:
                 cure = did_you_mean(
                     name, weights, otherwise="give that term a weight below 0, and no condition"
                 )
-                raise UsageError(f"constraints: the reward has no penalty {name!r}", cure=cure)
+                problem = f"constraints: {name!r} is not a penalty with a constant weight"
+                raise UsageError(problem, cure=cure)
         return cls(limits, {name: weights[name] for name in limits}, rate)
 
     def init(self) -> dict[str, Array]:

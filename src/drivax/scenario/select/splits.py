@@ -78,7 +78,7 @@ class HoldOut:
             return "no validation: all scenarios are of one recording; pass --validation SET to validate"
         return (
             f"trains on {len(self.training)} scenarios, validates on {len(self.validation)} "
-            f"of {len(self.recordings)} held-out recordings; --validation none trains on all"
+            f"(held-out recordings: {len(self.recordings)}); --validation none trains on all"
         )
 
 
