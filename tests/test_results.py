@@ -89,7 +89,8 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "COLUMNS", few)
     for seed in ("seed-0", "seed-1"):
         (tmp_path / "policies" / "bc" / seed).mkdir(parents=True)
-    columns = dict.fromkeys((*benchmark.COLUMNS, *benchmark.FAILURE_METRICS), np.array([[0.0, 1.0, np.nan]]))
+    names = (*benchmark.COLUMNS, *benchmark.FAILURE_METRICS, "distance")
+    columns = dict.fromkeys(names, np.array([[0.0, 1.0, np.nan]]))
 
     def keep(name, kind, accuracy, test="a"):
         about = {"planner": name, "traffic": kind, "seeds": len(accuracy), "test": test}

@@ -66,7 +66,7 @@ CHANGED_METRICS = {
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
 #: Metrics of random actions until the first failure, where published episodes end.
 FAILURE_METRICS = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
-#: Kilometres driven until the first failure, per episode with an at-fault collision.
+#: Kilometres driven per episode with an at-fault collision.
 KM_PER_FAULT = "km_per_fault"
 
 Metrics = dict[str, np.ndarray[Any, Any]]
@@ -185,9 +185,9 @@ def mean_interval(episodes: Episodes, metric: str, against: Episodes | None = No
 
 
 def km_per_fault(episodes: Episodes) -> Interval:
-    """Return the kilometres until the first failure per at-fault collision, of all seeds together."""
+    """Return the kilometres per episode with an at-fault collision, of all seeds together."""
     faults = int(np.nansum(episodes.values["at_fault_collision"]))
-    return per_event(faults, float(np.nansum(episodes.values["metres_until_failure"])) / 1000.0)
+    return per_event(faults, float(np.nansum(episodes.values["distance"])) / 1000.0)
 
 
 def mean_change(episodes: Episodes, metric: str, reference: Episodes) -> Interval:
