@@ -202,6 +202,7 @@ def test_each_seed_has_its_own_multiplier():
     np.testing.assert_allclose(together, [float(own.multipliers["failure"]) for own in singles], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_terms_of_driving_sum_to_the_reward(data):
     """With held decisions, too; a penalty over its weight is the failure."""
     rewards = RewardConfig(preset="pace", scale=0.5, at_fault_collision=-2.0)

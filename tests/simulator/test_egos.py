@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -63,7 +62,7 @@ def worlds():
     return *banks, np.array(places)
 
 
-@partial(jax.jit, static_argnums=3)
+@jax.jit
 def roll(bank, index, slot, left_m):
     """States and transitions of an agent that follows its log, ever further to the left of it, and observations."""
 

@@ -183,7 +183,8 @@ def algorithm(kind):
     return (TINY["algorithm"] if kind == "ppo" else sac) | small
 
 
-@pytest.mark.parametrize("kind", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ppo", "sac"])
 def test_algorithms_train_with_conditions(kind, bank):
     values = TINY | {
         "task": TINY["task"] | YAML,
