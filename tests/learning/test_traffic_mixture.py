@@ -83,7 +83,7 @@ def test_traffic_is_a_name_or_shares():
     assert isinstance(training_environment(CONFIG), Mixture)
     for name, kind in (("log", LogTraffic), ("idm", IdmTraffic)):
         # A single name is the environment of that traffic itself.
-        for traffic in (name, {name: 1.0}):
+        for traffic in (name, {name: 1.0}, {name: 1.0, "self": 0.0}):
             config = replace(CONFIG, traffic=traffic)
             assert training_environment(config) == config.environment(kind())
     assert isinstance(training_environment(replace(CONFIG, traffic="self")), SelfPlay)
@@ -94,7 +94,7 @@ def test_traffic_is_a_name_or_shares():
     [
         (
             {"log": 0.5, "idm": 0.4},
-            "shares of traffic are log 0.5, idm 0.4; use shares above 0 with a sum of 1",
+            "shares of traffic are log 0.5, idm 0.4; use shares of at least 0 with a sum of 1",
         ),
         ({"log": 1.5, "idm": -0.5}, "shares of traffic are log 1.5, idm -0.5; use"),
         ({}, "shares of traffic are missing"),

@@ -103,7 +103,7 @@ class TrainConfig:
         if min(shares, default=0.0) <= 0.0 or abs(sum(shares) - 1.0) > _ROUNDING:
             texts = [f"{name} {share:g}" for name, share in self.shares.items()]
             problem = f"shares of traffic are {', '.join(texts) or 'missing'}"
-            raise UsageError(problem, cure="use shares above 0 with a sum of 1")
+            raise UsageError(problem, cure="use shares of at least 0 with a sum of 1")
         for name in self.shares:
             if name != SELF:
                 run, base = split_traffic(name)
@@ -121,8 +121,10 @@ class TrainConfig:
 
     @property
     def shares(self) -> dict[str, float]:
-        """Share of the environments of each traffic."""
-        return {self.traffic: 1.0} if isinstance(self.traffic, str) else self.traffic
+        """Share of the environments of each traffic, without shares of 0."""
+        if isinstance(self.traffic, str):
+            return {self.traffic: 1.0}
+        return {name: share for name, share in self.traffic.items() if share}
 
     @property
     def validation_traffic(self) -> str:
