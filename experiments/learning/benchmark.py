@@ -46,7 +46,7 @@ PAGE = DOCS / "results" / "benchmark.md"
 TRAFFIC = ("log", "idm")
 #: Random actions in the box of the published action space, shown in a separate table.
 BOX = "random in the published box"
-ZOO = ("zoo:ppo", "zoo:ppo_physical")
+ZOO = ("zoo:ppo", "zoo:sac", "zoo:ppo_physical")
 PLANNERS = ("expert", *ZOO, "pdm", "idm", "constant_speed", "constant_velocity", "random", BOX)
 #: Columns of the page, with their short names.
 COLUMNS = {
