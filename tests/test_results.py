@@ -84,6 +84,7 @@ def test_progress_until_failure(script):
 def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     benchmark = script("learning.benchmark")
     monkeypatch.setattr(benchmark, "EPISODES", tmp_path)
+    monkeypatch.setattr(benchmark, "FORMER_EPISODES", tmp_path / "former")
     monkeypatch.setattr(benchmark, "POLICIES", tmp_path / "policies")
     few = {name: name for name in (*benchmark.DIFFERENCE_METRICS, "collision", "offroad")}
     monkeypatch.setattr(benchmark, "COLUMNS", few)
@@ -112,6 +113,9 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     np.testing.assert_allclose(found["reactive"]["idm"]["accuracy"]["mean"], -1 / 3)
     assert list(found["differences"]["log"]) == ["bc - idm"] and not found["differences"]["idm"]
     np.testing.assert_allclose(found["differences"]["log"]["bc - idm"]["accuracy"]["mean"], 1 / 6)
+    # One of the three episodes is at fault, and 1 m is driven in all.
+    fault = found["planners"]["idm"]["log"][benchmark.KM_PER_FAULT]
+    assert fault["mean"] == pytest.approx(0.001) and fault["n"] == 1
     few, many = found["strata"][:2]
     assert (few["value"], few["scenarios"], few["planners"]["bc"]["mean"]) == ("few", 1, 1.0)
     assert (many["scenarios"], many["planners"]["idm"]["mean"]) == (2, 0.5)
@@ -248,6 +252,9 @@ def test_learning_tables(script, learning):
     assert shown[-1] == "No curves of preset `bc` are stored yet."
     there = lines("curves", page=tables.DOCS / "results" / "learning.md")
     assert there[0] == "![Learning curves of ppo](../algorithms/curve-ppo.png)" and len(there) == 3
+    # Kilometres per collision, without any collision.
+    assert tables.interval({"mean": None, "low": 18.04, "high": None}, digits=1) == "above 18.0"
+    assert tables.interval({"mean": None, "low": None, "high": None}) == "-"
 
 
 def test_curves_show_every_seed(script, learning):

@@ -46,16 +46,16 @@ from experiments.repository import RESULTS, fetch, save_picture
 
 RESULT = RESULTS / "learning.json"
 SPEEDS = RESULT.with_name("training.json")
-#: File with training time and curves, next to the policies.
-TRAINING = "training.json"
+#: File with training time and curves, next to the policies; processor time in ``run.json`` of a policy, s.
+TRAINING, CORE_SECONDS = "training.json", "training_core_s"
 REFERENCES = ("expert", "idm", "constant_speed", "constant_velocity")
 
 
 def train_preset(args: argparse.Namespace, overrides: list[str]) -> None:
     """Train the seeds of one preset in parallel, each on one core.
 
-    Store their policies in experiments/state/policies, with the time that each took and the curves. With --first, add
-    them to the policies of earlier seeds.
+    Store their policies in experiments/state/policies, each with the processor time that it took, and next to them the
+    longest of these times and the curves. With --first, add them to the policies of earlier seeds.
     """
     config = settings.load(TrainConfig, args.preset, overrides)
     name = args.preset.replace("/", "-")
@@ -66,30 +66,31 @@ def train_preset(args: argparse.Namespace, overrides: list[str]) -> None:
     seeds = range(config.seed + args.first, config.seed + args.first + args.seeds)
     agents = [replace(config, seed=seed) for seed in seeds]
     trained = one_core_each(partial(_train_seed, args.data, out), agents)
-    seconds = {f"seed-{agent.seed}": duration for agent, duration in trained}
-    record: dict[str, Any] = {"seconds": seconds, "curves": learning_curves(out)}
+    seconds = {agent.seed: duration for agent, duration in trained}
+    record: dict[str, Any] = {"seconds": max(seconds.values()), "curves": learning_curves(out)}
     if args.first:
         earlier = json.loads((policies / TRAINING).read_text())
-        record["seconds"] = earlier["seconds"] | seconds
+        record["seconds"] = max(record["seconds"], earlier["seconds"])
         record["curves"] = {
             metric: earlier["curves"][metric] | lines for metric, lines in record["curves"].items()
         }
     else:
         shutil.rmtree(policies, ignore_errors=True)
     bank = ScenarioBank.from_scenarios([data[0]])
-    for folder in seed_folders(out):
-        export_policy(folder, policies / folder.name, bank, overwrite=True)
+    for agent, folder in zip(agents, seed_folders(out), strict=True):
+        notes = {CORE_SECONDS: seconds[agent.seed]}
+        export_policy(folder, policies / folder.name, bank, notes, overwrite=True)
     (policies / TRAINING).write_text(
         json.dumps(record | {"seeds": len(learned_planners()[name])}, indent=1) + "\n"
     )
 
 
 def _train_seed(data: Path, out: Path, config: TrainConfig) -> int:
-    """Train one seed, and return the elapsed seconds."""
-    start = time.perf_counter()
+    """Train one seed, and return the seconds of processor time that it took: other work on the core does not count."""
+    start = time.process_time()
     splits = {split: ScenarioSet.open(data / split) for split in ("train", "validation")}
     train(config, splits["train"], out / f"seed-{config.seed}", validation=splits["validation"], log=print)
-    return round(time.perf_counter() - start)
+    return round(time.process_time() - start)
 
 
 def compute_results() -> dict[str, Any]:
@@ -114,8 +115,7 @@ def compute_results() -> dict[str, Any]:
         "command": "python -m experiments.learning.presets judge",
         "test": {"scenarios": len(next(iter(episodes.values())).segments), "hash": tests.pop()},
         "training": {
-            name: {"seconds": max(training["seconds"].values()), "seeds": training["seeds"]}
-            for name, training in trainings.items()
+            name: {key: training[key] for key in ("seconds", "seeds")} for name, training in trainings.items()
         },
         "planners": {
             name: {metric: _mean(planner_episodes, metric) for metric in COLUMNS}
@@ -178,7 +178,7 @@ def main() -> None:
     commands.add_parser("judge")
     commands.add_parser("table")
     args, overrides = parser.parse_known_args()
-    if args.command != "table":
+    if args.command == "judge":
         fetch("benchmarks/policies", POLICIES)
         fetch("benchmarks/results/benchmark", EPISODES)
     if args.command == "train":

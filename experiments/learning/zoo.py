@@ -19,8 +19,9 @@ from drivax.evaluation.runner import evaluate
 from drivax.learning.policies import export_policy, load_policy
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
+from drivax.tracking.run_folder import RunFolder
 from experiments.learning.benchmark import POLICIES
-from experiments.learning.presets import TRAINING
+from experiments.learning.presets import CORE_SECONDS
 from experiments.repository import ROOT
 
 ZOO = ROOT / "src" / "drivax" / "zoo"
@@ -54,10 +55,9 @@ def main() -> None:
         POLICIES / args.preset / f"seed-{args.seed}",
         ScenarioSet.open(args.data / "validation"),
     )
-    seconds = json.loads((seed.parent / TRAINING).read_text())["seconds"][seed.name]
     measured = {
         "validation": {"scenarios": len(validation), "hash": validation.hash},
-        "training_core_s": seconds,
+        CORE_SECONDS: RunFolder.open(seed).info[CORE_SECONDS],
         "ego": measure(seed, validation),
     }
     notes = {"command": COMMAND.format(args.preset, args.seed), "measured": measured}
