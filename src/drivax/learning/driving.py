@@ -249,7 +249,7 @@ class Driving:
     def _draw(
         self, bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int | None = None
     ) -> tuple[Int[Array, " B"], Int[Array, " B"], Any, Array]:
-        """Draw scenarios, steps at which the ego is valid (else step 10), slots of egos, and keys for starts.
+        """Draw scenarios, steps at which the ego is valid (else step 10), slots of egos, and keys of episodes.
 
         Steps are at most the third last. The slot is None if all egos are the recorded ones.
         """
@@ -267,7 +267,7 @@ class Driving:
         # Egos are always valid at the current step.
         is_valid = bank.agents[index, step, 0 if slot is None else slot, AgentColumn.VALID] > 0
         step = jnp.where(is_valid & (step <= last), step, CURRENT_STEP)
-        # Unused, and not computed, with logged starts.
+        # Unused, and not computed, with logged starts and without conditions.
         keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
         return index, step, slot, keys
 

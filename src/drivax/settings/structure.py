@@ -131,13 +131,8 @@ def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
         return tuple(items)
     if len(members) != len(items):
         raise ValueError(f"{len(items)} values, not {len(members)}")
-    result = []
-    for number, (item, member) in enumerate(zip(items, members, strict=True)):
-        try:
-            result.append(_converter().structure(item, member))
-        except Exception as error:
-            raise _Problem(*_first_problem(error, f"[{number}]")) from error
-    return tuple(result)
+    pairs = enumerate(zip(items, members, strict=True))
+    return tuple(_to_item(item, member, f"[{number}]") for number, (item, member) in pairs)
 
 
 def _to_mapping(value: Any, cls: Any) -> dict[str, Any]:
@@ -145,13 +140,16 @@ def _to_mapping(value: Any, cls: Any) -> dict[str, Any]:
     items = _parse_flag(value)
     if not isinstance(items, Mapping):
         raise _refusal(value, "a mapping")
-    result, item_type = {}, get_args(cls)[1]
-    for name, item in items.items():
-        try:
-            result[name] = _converter().structure(item, item_type)
-        except Exception as error:
-            raise _Problem(*_first_problem(error, str(name))) from error
-    return result
+    item_type = get_args(cls)[1]
+    return {name: _to_item(item, item_type, str(name)) for name, item in items.items()}
+
+
+def _to_item(value: Any, cls: Any, place: str) -> Any:
+    """Convert a value within a list or a mapping; problems name its place there."""
+    try:
+        return _converter().structure(value, cls)
+    except Exception as error:  # hooks and the converter raise errors of several types
+        raise _Problem(*_first_problem(error, place)) from error
 
 
 def _to_union(value: Any, cls: Any) -> Any:
