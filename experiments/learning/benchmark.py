@@ -5,7 +5,7 @@ python -m experiments.learning.benchmark judge     (means with intervals of the 
 python -m experiments.learning.benchmark table     (write the stored result to the page)
 
 `drive` stores the episodes of each planner and traffic in one file. Learned planners are those of the zoo (one seed)
-and those in experiments/state/policies, where `presets.py train` stores several seeds of each.
+and those in experiments/state/policies, where `presets.py collect` stores several seeds of each.
 """
 
 from __future__ import annotations
@@ -264,7 +264,8 @@ def compute_results() -> dict[str, Any]:
         "changes": {
             f"{name}, {kind}": compare_definitions(episodes, former_episodes)
             for (name, kind), episodes in all_episodes.items()
-            if (former_episodes := read_episodes(name, kind, FORMER_EPISODES)) is not None
+            if name in PLANNERS
+            and (former_episodes := read_episodes(name, kind, FORMER_EPISODES)) is not None
         },
         "driven": {
             f"{name}, {kind}": dict(episodes.about) for (name, kind), episodes in all_episodes.items()

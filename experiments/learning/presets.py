@@ -1,14 +1,15 @@
-"""Train the presets with several seeds and evaluate them on the built-in world's benchmark.
+"""Compare the presets, each trained with several seeds, on the built-in world's benchmark.
 
-python -m experiments.learning.presets train PRESET --data BENCHMARK --runs RUNS [--seeds 3] [--first 0]
-    [--key value ...]
+drivax train PRESET --seed N --data BENCHMARK/train --validation BENCHMARK/validation --out RUNS/PRESET/seed-N
+python -m experiments.learning.presets collect RUNS/PRESET --data BENCHMARK
+                                                 (the best checkpoints and curves of the seeds)
 python -m experiments.learning.benchmark drive --data BENCHMARK --planner PRESET --traffic log
 python -m experiments.learning.presets judge     (means with intervals of the evaluations)
 python -m experiments.learning.presets table     (the stored results into the pages, and the curves of docs/algorithms)
 
-BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`; RUNS holds a run folder per preset. Checkpoints are
-selected on the split `validation` and evaluated once on `test`. Intervals of means over seeds and differences
-resample seeds and segments of the world, both with replacement.
+BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. Checkpoints are selected on the split `validation`
+and evaluated once on `test`. Intervals of means over seeds and differences resample seeds and segments of the world,
+both with replacement.
 """
 
 from __future__ import annotations
@@ -16,25 +17,18 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import time
-from dataclasses import replace
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drivax import settings
-from drivax.learning.config import TrainConfig
-from drivax.learning.loop import train
 from drivax.learning.policies import export_policy
-from drivax.report.runs import read_runs
+from drivax.report.runs import Training, read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.tracking.run_folder import RunFolder, seed_folders, versions
-from drivax.tracking.workers import one_core_each
+from drivax.tracking.run_folder import versions
 from experiments.learning.benchmark import (
-    EPISODES,
     POLICIES,
     Episodes,
     learned_planners,
@@ -42,55 +36,36 @@ from experiments.learning.benchmark import (
     read_episodes,
 )
 from experiments.learning.tables import COLUMNS, CURVES, curve_file, draw_curves, fill_page, pages
-from experiments.repository import RESULTS, fetch, save_picture
+from experiments.repository import RESULTS, save_picture
 
 RESULT = RESULTS / "learning.json"
 SPEEDS = RESULT.with_name("training.json")
-#: File with training time and curves, next to the policies; processor time in ``run.json`` of a policy, s.
+#: File with training time and curves, next to the policies; training time in ``run.json`` of a policy, s.
 TRAINING, CORE_SECONDS = "training.json", "training_core_s"
 REFERENCES = ("expert", "idm", "constant_speed", "constant_velocity")
 
 
-def train_preset(args: argparse.Namespace, overrides: list[str]) -> None:
-    """Train the seeds of one preset in parallel, each on one core.
-
-    Store their policies in experiments/state/policies, each with the processor time that it took, and next to them the
-    longest of these times and the curves. With --first, add them to the policies of earlier seeds.
-    """
-    config = settings.load(TrainConfig, args.preset, overrides)
-    name = args.preset.replace("/", "-")
-    out, policies = args.runs / name, POLICIES / name
-    data, validation = (ScenarioSet.open(args.data / split) for split in ("train", "validation"))
-    notes: dict[str, Any] = {"kind": "seeds", "seeds": args.seeds, "validation": validation.hash}
-    RunFolder.create(out, config, [data], overwrite=True, **notes)
-    seeds = range(config.seed + args.first, config.seed + args.first + args.seeds)
-    agents = [replace(config, seed=seed) for seed in seeds]
-    trained = one_core_each(partial(_train_seed, args.data, out), agents)
-    seconds = {agent.seed: duration for agent, duration in trained}
-    record: dict[str, Any] = {"seconds": max(seconds.values()), "curves": learning_curves(out)}
-    if args.first:
-        earlier = json.loads((policies / TRAINING).read_text())
-        record["seconds"] = max(record["seconds"], earlier["seconds"])
-        record["curves"] = {
-            metric: earlier["curves"][metric] | lines for metric, lines in record["curves"].items()
-        }
-    else:
-        shutil.rmtree(policies, ignore_errors=True)
+def collect(run: Path, data: ScenarioSet) -> None:
+    """Store the policies of all seeds of a preset in experiments/state/policies, and next to them times and curves."""
+    policies = POLICIES / run.name
+    _, trainings = read_runs(sorted(run.glob("seed-*")))
+    seconds = [training_seconds(training) for training in trainings]
+    shutil.rmtree(policies, ignore_errors=True)
     bank = ScenarioBank.from_scenarios([data[0]])
-    for agent, folder in zip(agents, seed_folders(out), strict=True):
-        notes = {CORE_SECONDS: seconds[agent.seed]}
-        export_policy(folder, policies / folder.name, bank, notes, overwrite=True)
-    (policies / TRAINING).write_text(
-        json.dumps(record | {"seeds": len(learned_planners()[name])}, indent=1) + "\n"
-    )
+    for training, duration in zip(trainings, seconds, strict=True):
+        notes = {CORE_SECONDS: duration}
+        export_policy(training.folder, policies / training.folder.name, bank, notes, overwrite=True)
+    record = {"seconds": max(seconds), "seeds": len(trainings), "curves": learning_curves(trainings)}
+    (policies / TRAINING).write_text(json.dumps(record, indent=1) + "\n")
 
 
-def _train_seed(data: Path, out: Path, config: TrainConfig) -> int:
-    """Train one seed, and return the seconds of processor time that it took: other work on the core does not count."""
-    start = time.process_time()
-    splits = {split: ScenarioSet.open(data / split) for split in ("train", "validation")}
-    train(config, splits["train"], out / f"seed-{config.seed}", validation=splits["validation"], log=print)
-    return round(time.process_time() - start)
+def training_seconds(training: Training) -> int:
+    """Return the seconds that a training takes at its median speed, without compilation and validation.
+
+    Pauses, resumption and other work on the machine for less than half of the time do not count.
+    """
+    rates = training.curves["steps_per_second"]
+    return round(float(rates[-1, 0] / np.median(rates[:, 1])))
 
 
 def compute_results() -> dict[str, Any]:
@@ -139,15 +114,14 @@ def _mean(results: Episodes, metric: str) -> dict[str, Any]:
     return mean_interval(results, metric).as_dict() | {"by_seed": seed_means}
 
 
-def learning_curves(run: Path) -> dict[str, dict[str, list[list[float]]]]:
-    """Return quantity -> seed -> points (step, value) of all validations of a run and its seeds."""
-    _, agents = read_runs([run])
+def learning_curves(trainings: Sequence[Training]) -> dict[str, dict[str, list[list[float]]]]:
+    """Return quantity -> seed -> points (step, value) of all validations."""
     return {
         metric: {
-            agent.name: [
-                [int(step), round(float(value), 4)] for step, value in agent.curves[f"validation/{metric}"]
+            training.name: [
+                [int(step), round(float(value), 4)] for step, value in training.curves[f"validation/{metric}"]
             ]
-            for agent in agents
+            for training in trainings
         }
         for metric in CURVES
     }
@@ -164,25 +138,19 @@ def write_tables() -> None:
 
 
 def main() -> None:
-    """Train, compare, or write the stored results."""
+    """Collect policies, compare them, or write the stored results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    training = commands.add_parser("train")
-    training.add_argument("preset")
-    training.add_argument("--seeds", type=int, default=3)
-    training.add_argument("--first", type=int, default=0, help="how many seeds were trained before")
-    training.add_argument("--data", type=Path, required=True)
-    training.add_argument("--runs", type=Path, required=True)
+    collection = commands.add_parser("collect")
+    collection.add_argument("run", type=Path)
+    collection.add_argument("--data", type=Path, required=True)
     commands.add_parser("judge")
     commands.add_parser("table")
-    args, overrides = parser.parse_known_args()
-    if args.command == "judge":
-        fetch("benchmarks/policies", POLICIES)
-        fetch("benchmarks/results/benchmark", EPISODES)
-    if args.command == "train":
-        train_preset(args, overrides)
+    args = parser.parse_args()
+    if args.command == "collect":
+        collect(args.run, ScenarioSet.open(args.data / "train"))
     elif args.command == "judge":
         RESULT.write_text(json.dumps(compute_results(), indent=1) + "\n")
     else:

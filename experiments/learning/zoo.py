@@ -2,7 +2,7 @@
 
 python -m experiments.learning.zoo NAME PRESET --seed SEED --data BENCHMARK
 
-`presets.py train PRESET` has trained it and stored it in experiments/state/policies.
+`presets.py collect` has stored it in experiments/state/policies.
 """
 
 from __future__ import annotations
