@@ -29,7 +29,8 @@ METRICS = (
     "success", "accuracy", "at_fault_collision", "collision", "offroad", "red_light", "vmax_score",
     "progress_ratio", "comfortable", "ttc_ok", "lane_keeping",
 )  # fmt: skip
-COMMAND = "drivax train {} --seed {} --data BENCHMARK/train --validation BENCHMARK/validation --out RUN"
+#: ``config.yaml`` of the policy holds its seed and all settings.
+COMMAND = "drivax train config.yaml --data BENCHMARK/train --validation BENCHMARK/validation --out RUN"
 
 
 def measure(seed: Path, validation: ScenarioSet) -> dict[str, Any]:
@@ -60,7 +61,7 @@ def main() -> None:
         CORE_SECONDS: RunFolder.open(seed).info[CORE_SECONDS],
         "ego": measure(seed, validation),
     }
-    notes = {"command": COMMAND.format(args.preset, args.seed), "measured": measured}
+    notes = {"command": COMMAND, "measured": measured}
     bank = ScenarioBank.from_scenarios([validation[0]])
     export_policy(seed, ZOO / args.name, bank, notes, overwrite=True)
     print(json.dumps(measured["ego"]))
