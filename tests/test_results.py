@@ -62,7 +62,7 @@ def test_real_files_page_shows_each_planner(script, stored):
 def test_benchmark_page_shows_stored_results(script, stored):
     benchmark = script("learning.benchmark")
     text = benchmark.PAGE.read_text()
-    shown = benchmark.fill_page(text, stored("benchmark")) == text
+    shown = benchmark.fill_page(text, benchmark.page_tables(stored("benchmark"))) == text
     assert shown, "run python -m experiments.learning.benchmark table, and read what the page says about it"
     rows = stored("benchmark")["planners"]
     assert rows["expert"]["log"]["accuracy"]["mean"] == 1.0

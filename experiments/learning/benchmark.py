@@ -383,7 +383,7 @@ def format_cells(
         interval(
             intervals[metric],
             signed=signed,
-            digits=1 if "progress" in metric or metric in (*FAILURE_METRICS, KM_PER_FAULT) else 3,
+            digits=1 if "progress" in metric or metric in (*FAILURE_METRICS, KM_PER_FAULT, "distance") else 3,
         )
         for metric in metrics
     ]
@@ -396,9 +396,9 @@ def format_change(change: Mapping[str, float]) -> str:
     return f"{change['before']:.3f} to {change['after']:.3f} ({change['moved']:.1%})"
 
 
-def fill_page(text: str, result: Mapping[str, Any]) -> str:
-    """Return the page with the stored tables."""
-    for name, lines in page_tables(result).items():
+def fill_page(text: str, tables: Mapping[str, Sequence[str]]) -> str:
+    """Return the page with the lines of each table in its place."""
+    for name, lines in tables.items():
         begin, end = f"<!-- benchmark.py: {name} -->", "<!-- benchmark.py: end -->"
         before, rest = text.split(begin)
         content = "\n".join(lines)
@@ -429,7 +429,7 @@ def main() -> None:
         # Earlier policies observe what no longer exists, so their rows cannot be computed again.
         result["changes"] = json.loads(RESULT.read_text())["changes"] | result["changes"]
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
-    PAGE.write_text(fill_page(PAGE.read_text(), json.loads(RESULT.read_text())))
+    PAGE.write_text(fill_page(PAGE.read_text(), page_tables(json.loads(RESULT.read_text()))))
 
 
 if __name__ == "__main__":
