@@ -2,7 +2,7 @@
 
 A set is a folder::
 
-    manifest.json        schema version, capacity, field table, shards, one entry per scenario
+    manifest.json        schema version, capacity, field table, shards, one entry per scenario, digests of both
     shard-00000.npy      one-dimensional structured array of ``schema.record_dtype(capacity)``
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
     splits/              lists for training, validation and test (``scenario.select.splits``)
@@ -37,11 +37,22 @@ from drivax.files import (
     PartialFolder,
     check_output,
     check_space,
+    allow_open_files,
     explain_full_disk,
+    json_digest,
+    restore_folder,
     sync_and_close,
     write_json,
 )
-from drivax.scenario.schema import NAMES, SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
+from drivax.scenario.schema import (
+    NAMES,
+    SCHEMA_VERSION,
+    Capacity,
+    Scenario,
+    SourceCounts,
+    record_dtype,
+    stored_name,
+)
 from drivax.scenario.select.splits import Shares, write_splits
 
 MANIFEST = "manifest.json"
@@ -71,7 +82,7 @@ class ScenarioWriter:
         overwrite: Replace an existing scenario set; other folders are never replaced.
         shares: Percentages of train, validation and test for the files of ``splits/``; None writes no files.
         identity: Description of the content, for a set that can be resumed: closed shards survive an exception or a
-            kill, and the next writer with the same identity continues after them (:attr:`notes`).
+            kill, and the next writer with the same identity continues after the intact ones (:attr:`notes`).
         further: Writes additional files into the complete folder before it is published.
 
     Raises:
@@ -105,7 +116,7 @@ class ScenarioWriter:
         with explain_full_disk(self.path):
             parts = self._partial.open(restart=self.overwrite)
         for part in parts:
-            if part["shard"]["count"] < self._shard_size:  # The last shard of the data is written again.
+            if not self._is_finished(part):  # It and all that follow are written again.
                 break
             self._shards.append(part["shard"])
             self._entries += part["scenarios"]
@@ -116,6 +127,17 @@ class ScenarioWriter:
             if entry.name not in names:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         return self
+
+    def _is_finished(self, part: Mapping[str, Any]) -> bool:
+        """Whether a closed shard is full (the last one of the data is not) and exactly as it was written."""
+        shard = part["shard"]
+        if not shard["count"] == len(part["scenarios"]) == self._shard_size:
+            return False
+        try:
+            Shard(self._partial.content, shard, self._buffer.dtype).check_digest()
+        except DataError:
+            return False
+        return True
 
     @property
     def folder(self) -> Path:
@@ -174,9 +196,8 @@ class ScenarioWriter:
         with (folder / crc_name(name)).open("wb") as file:
             np.save(file, np.array(self._crcs, np.uint32))
             sync_and_close(file)
-        with (folder / name).open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        shard = {"file": name, "count": count, "sha256": digest}
+        digests = {key: file_digest(folder / file) for key, file in _files(name).items()}
+        shard = {"file": name, "count": count, **digests}
         summary = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
         self._partial.note(len(self._shards), summary)
         self._shards.append(shard)
@@ -209,6 +230,7 @@ class ScenarioWriter:
             "source": plain(self.source),
             "shards": self._shards,
             "scenarios": self._entries,
+            "scenarios_sha256": json_digest(self._entries),
         }
         if self._shares is not None:
             write_splits(self._partial.content, self._entries, self._shares)
@@ -221,9 +243,10 @@ class ScenarioWriter:
     def _refuse_existing(self) -> None:
         """Refuse a path that exists, except an empty folder, or a scenario set if it may be overwritten."""
         path = self.path
+        restore_folder(path)
         if path.is_dir() and not any(path.iterdir()):
             return
-        if (path.exists() or path.is_symlink()) and not (path / MANIFEST).is_file():
+        if path.exists() and not (path / MANIFEST).is_file():
             raise UsageError("exists and is not a scenario set", file=path, cure="choose another name")
         check_output(path, self.overwrite, folder=True)
 
@@ -239,15 +262,22 @@ class ScenarioSet(Sequence[Scenario]):
         self.capacity = Capacity(**manifest["capacity"])
         self.entries: list[dict[str, Any]] = manifest["scenarios"]
         self._dtype = record_dtype(self.capacity)
-        self._shards = [Shard(self.path, shard, self._dtype) for shard in manifest["shards"]]
-        self._starts = np.cumsum([0, *(shard.count for shard in self._shards)])
+        self._starts = np.cumsum([0, *(shard["count"] for shard in manifest["shards"])])
+        self._shards = [
+            Shard(self.path, shard, self._dtype, self.entries[start : start + shard["count"]])
+            for shard, start in zip(manifest["shards"], self._starts, strict=False)
+        ]
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = True) -> ScenarioSet:
         """Open a set.
 
+        Shards and entries are compared with the digests of the manifest (sets of earlier versions have none), and the
+        first and the last record of each shard with their entries; no record is read as a whole.
+
         Raises:
-            DataError: The manifest, or the size or layout of a shard, is wrong.
+            DataError: The manifest or a shard is damaged, or belongs to another set or to another place in this one.
+            UsageError: The system allows fewer open files than the set has shards.
         """
         result = cls(path, read_manifest(Path(path)), verify)
         if len(result) != int(result._starts[-1]):
@@ -255,6 +285,7 @@ class ScenarioSet(Sequence[Scenario]):
             raise DataError(problem, file=result.path / MANIFEST, cure=AGAIN)
         for shard in result._shards:
             shard.check_files()
+        allow_open_files(result.path, len(result._shards))  # each memory map is one
         return result
 
     def __len__(self) -> int:
@@ -292,7 +323,7 @@ class ScenarioSet(Sequence[Scenario]):
 
     @property
     def hash(self) -> str:
-        """SHA-256 (hex) over the checksums of the shards."""
+        """SHA-256 (hex) over those of the shards; entries (tags, audit) have one of their own in the manifest."""
         digests = "".join(shard["sha256"] for shard in self.manifest["shards"])
         return hashlib.sha256(digests.encode()).hexdigest()
 
@@ -339,26 +370,40 @@ def check_lengths(first: ScenarioSet, *others: ScenarioSet) -> None:
 
 
 class Shard:
-    """A shard file: expected layout, memory map, and a mask of the records that passed their checksum."""
+    """A shard file: expected layout, memory map, and a mask of the records that passed their checksum.
 
-    def __init__(self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any]) -> None:
+    ``entry`` is that of the shard in the manifest, ``scenarios`` are those of its records.
+    """
+
+    def __init__(
+        self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any],
+        scenarios: Sequence[Mapping[str, Any]] = (),
+    ) -> None:  # fmt: skip
         self.path = folder / entry["file"]
         self.crc_path = folder / crc_name(entry["file"])
         self.count = int(entry["count"])
-        self._sha256 = entry["sha256"]
-        self._dtype = dtype
+        self._entry, self._scenarios, self._dtype = entry, scenarios, dtype
         self._data: _Bytes | None = None
         self._crcs = np.zeros(0, np.uint32)
         self._intact = np.zeros(self.count, bool)
 
     def check_files(self) -> int:
-        """Test presence, layout and size; return the offset of the first record."""
+        """Test presence, layout, size, checksum file and ids; return the offset of the first record."""
         for path in (self.path, self.crc_path):
             if not path.is_file():
                 raise DataError("shard is missing", file=path, cure=f"restore the file or {AGAIN}")
+        self._check_file("crc_sha256")
         with self.path.open("rb") as file:
             shape, dtype = read_header(file, self.path)
             offset = file.tell()
+            self._check_layout(shape, dtype, offset)
+            if self._scenarios:
+                for row in {0, self.count - 1}:  # a half-copied file may have zeros at its end
+                    file.seek(offset + row * self._dtype.itemsize)
+                    self._check_names(row, np.frombuffer(file.read(_names_size(self._dtype)), np.uint8))
+        return offset
+
+    def _check_layout(self, shape: tuple[int, ...], dtype: np.dtype[Any], offset: int) -> None:
         if shape != (self.count,) or dtype != self._dtype:
             raise DataError("shard does not have the layout its manifest names", file=self.path, cure=AGAIN)
         size = self.path.stat().st_size
@@ -366,7 +411,17 @@ class Shard:
             whole = max(0, size - offset) // self._dtype.itemsize
             problem = f"shard is truncated or has trailing bytes: {whole} whole records of {self.count}"
             raise self._damage(problem, min(whole, self.count))
-        return offset
+
+    def _check_names(self, row: int, data: _Bytes) -> None:
+        """Compare the names at the beginning of a record with its entry in the manifest."""
+        fields = self._dtype.fields or {}
+        for name in NAMES:
+            size, begin = fields[name][0].itemsize, fields[name][1]
+            if data[begin : begin + size].tobytes().rstrip(b"\0") != stored_name(
+                self._scenarios[row][name], size
+            ):
+                problem = f"{name} is not {self._scenarios[row][name]!r} as in the manifest: another or a half-copied file"
+                raise self._damage(problem, row)
 
     def record(self, row: int, verify: bool) -> _Bytes:
         """Return a view of the bytes of a record; with ``verify``, test its checksum at first use."""
@@ -374,14 +429,24 @@ class Shard:
         if verify and not self._intact[row]:
             if zlib.crc32(data[row].data) != int(self._crcs[row]):
                 raise self._damage("checksum mismatch, the record is damaged", row)
+            if self._scenarios:
+                self._check_names(row, data[row])
             self._intact[row] = True
         return data[row]
 
     def check_digest(self) -> None:
-        """Compare the file's SHA-256 with the manifest's."""
-        with self.path.open("rb") as file:
-            if hashlib.file_digest(file, "sha256").hexdigest() != self._sha256:
-                raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
+        """Test the files as :meth:`check_files` does, and the SHA-256 of all records."""
+        self.check_files()
+        self._check_file("sha256")
+
+    def _check_file(self, key: str) -> None:
+        """Compare a file's SHA-256 with the manifest's; earlier versions stored none of the checksums."""
+        path = self.path.parent / _files(self.path.name)[key]
+        if self._entry.get(key) not in (None, file_digest(path)):
+            cure = f"copy the whole set again or {AGAIN}"
+            raise DataError(
+                "SHA-256 differs from the manifest's: damaged, or of another set", file=path, cure=cure
+            )
 
     def _map(self) -> _Bytes:
         with _HEADER_LOCK:
@@ -403,6 +468,23 @@ class Shard:
 
     def _damage(self, problem: str, record: int) -> DataError:
         return DataError(problem, file=self.path, record=record, cure=f"copy the file again or {AGAIN}")
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 (hex) of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _files(shard: str) -> dict[str, str]:
+    """Return the files of a shard by the names of their SHA-256 in the manifest."""
+    return {"sha256": shard, "crc_sha256": crc_name(shard)}
+
+
+def _names_size(dtype: np.dtype[Any]) -> int:
+    """Return the size of the beginning of a record that holds its names."""
+    fields = dtype.fields or {}
+    return max(fields[name][1] + fields[name][0].itemsize for name in NAMES)
 
 
 def _key(entry: Mapping[str, Any]) -> tuple[str, str]:
@@ -433,6 +515,7 @@ def field_table(capacity: Capacity) -> list[dict[str, Any]]:
 def read_manifest(path: Path) -> dict[str, Any]:
     """Read the manifest of the set at ``path``."""
     file = path / MANIFEST
+    restore_folder(path)
     if not path.is_dir():
         problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"
         raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
@@ -464,6 +547,9 @@ def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
         raise DataError(f"manifest is damaged ({error!r})", file=file, cure=AGAIN) from error
     if not fields_agree:
         raise DataError("field table is not this version's", file=file, cure=AGAIN)
+    if manifest.get("scenarios_sha256") not in (None, json_digest(manifest["scenarios"])):
+        cure = f"copy the whole set again or {AGAIN}"
+        raise DataError("entries of scenarios (ids, tags, audit) were changed", file=file, cure=cure)
 
 
 def shard_name(number: int) -> str:
