@@ -163,9 +163,10 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False))
 
 
-def json_digest(value: Any) -> str:
-    """Return the SHA-256 (hex) of a JSON value, whatever its form in a file."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 (hex) of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @contextlib.contextmanager
@@ -228,7 +229,7 @@ class PartialFolder:
         """Record that part ``number`` (from 0) is finished and on disk."""
         if self.identity is not None:
             sync_folder(self.content)
-            note = {"sha256": json_digest(value), "value": value}
+            note = {"sha256": _digest(value), "value": value}
             write_json(self.root / "progress" / f"{number:05d}.json", note)
 
     def publish(self) -> None:
@@ -281,7 +282,7 @@ class PartialFolder:
         notes: list[dict[str, Any]] = []
         while self.identity is not None and identity == self.identity and self.content.is_dir():
             note = _read_json(self.root / "progress" / f"{len(notes):05d}.json")
-            if not isinstance(note, dict) or json_digest(note.get("value")) != note.get("sha256"):
+            if not isinstance(note, dict) or _digest(note.get("value")) != note.get("sha256"):
                 break
             notes.append(note["value"])
         return notes
@@ -382,6 +383,11 @@ def _exchange(first: Path, second: Path) -> bool:
     if number not in _UNSUPPORTED:
         raise OSError(number, os.strerror(number), str(second))
     return False
+
+
+def _digest(value: Any) -> str:
+    """Return the SHA-256 (hex) of a JSON value, whatever its form in a file."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def _read_json(path: Path) -> Any:

@@ -35,14 +35,14 @@ from drivax.errors import DataError, UsageError
 from drivax.files import (
     FullDiskError,
     PartialFolder,
+    allow_open_files,
     check_output,
     check_space,
-    allow_open_files,
     explain_full_disk,
-    json_digest,
+    file_digest,
     restore_folder,
     sync_and_close,
-    write_json,
+    write_text,
 )
 from drivax.scenario.schema import (
     NAMES,
@@ -56,6 +56,8 @@ from drivax.scenario.schema import (
 from drivax.scenario.select.splits import Shares, write_splits
 
 MANIFEST = "manifest.json"
+#: Key of the SHA-256 of the scenarios' entries in the manifest.
+ENTRIES_DIGEST = "scenarios_sha256"
 #: The cure for a set that cannot be repaired.
 AGAIN = "convert or generate the set again"
 _HEADER_LIMIT = 100_000
@@ -229,12 +231,10 @@ class ScenarioWriter:
             "record_bytes": self._buffer.dtype.itemsize,
             "source": plain(self.source),
             "shards": self._shards,
-            "scenarios": self._entries,
-            "scenarios_sha256": json_digest(self._entries),
         }
         if self._shares is not None:
             write_splits(self._partial.content, self._entries, self._shares)
-        write_json(self._partial.content / MANIFEST, manifest)
+        write_text(self._partial.content / MANIFEST, _manifest_text(manifest, self._entries))
         if self._further is not None:
             self._further(self._partial.content)
         self._refuse_existing()  # Another process may have written it in the meantime.
@@ -417,10 +417,9 @@ class Shard:
         fields = self._dtype.fields or {}
         for name in NAMES:
             size, begin = fields[name][0].itemsize, fields[name][1]
-            if data[begin : begin + size].tobytes().rstrip(b"\0") != stored_name(
-                self._scenarios[row][name], size
-            ):
-                problem = f"{name} is not {self._scenarios[row][name]!r} as in the manifest: another or a half-copied file"
+            expected = stored_name(text := str(self._scenarios[row][name]), size)
+            if data[begin : begin + size].tobytes().rstrip(b"\0") != expected:
+                problem = f"{name} is not {text!r}, that of the manifest: half copied, or another shard"
                 raise self._damage(problem, row)
 
     def record(self, row: int, verify: bool) -> _Bytes:
@@ -470,12 +469,6 @@ class Shard:
         return DataError(problem, file=self.path, record=record, cure=f"copy the file again or {AGAIN}")
 
 
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 (hex) of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _files(shard: str) -> dict[str, str]:
     """Return the files of a shard by the names of their SHA-256 in the manifest."""
     return {"sha256": shard, "crc_sha256": crc_name(shard)}
@@ -523,7 +516,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
         raise DataError("no manifest.json, so this is not a complete scenario set", file=path, cure=cure)
     try:
-        manifest = json.loads(file.read_bytes())
+        manifest = json.loads(text := file.read_bytes())
         version = manifest["schema_version"]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"manifest is damaged ({error})", file=file, cure=AGAIN) from error
@@ -532,6 +525,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         problem = f"schema version {version}, this drivax reads {SCHEMA_VERSION}"
         raise DataError(problem, file=file, cure="upgrade drivax" if newer else AGAIN)
     _check_manifest(manifest, file)
+    _check_entries(manifest, text, file)
     return manifest
 
 
@@ -547,9 +541,32 @@ def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
         raise DataError(f"manifest is damaged ({error!r})", file=file, cure=AGAIN) from error
     if not fields_agree:
         raise DataError("field table is not this version's", file=file, cure=AGAIN)
-    if manifest.get("scenarios_sha256") not in (None, json_digest(manifest["scenarios"])):
-        cure = f"copy the whole set again or {AGAIN}"
-        raise DataError("entries of scenarios (ids, tags, audit) were changed", file=file, cure=cure)
+
+
+def _manifest_text(manifest: Mapping[str, Any], entries: Sequence[Any]) -> str:
+    """Return a manifest as JSON, with the SHA-256 of its last part: the entries of the scenarios."""
+    end = _entries_text(entries)
+    digest = hashlib.sha256(end.encode()).hexdigest()
+    return json.dumps({**manifest, ENTRIES_DIGEST: digest}, indent=1, allow_nan=False)[:-2] + "," + end
+
+
+def _entries_text(entries: Sequence[Any]) -> str:
+    return json.dumps({"scenarios": entries}, indent=1, allow_nan=False)[1:]
+
+
+def _check_entries(manifest: Mapping[str, Any], text: bytes, file: Path) -> None:
+    """Compare the entries of the scenarios with their digest, which sets of earlier versions do not have."""
+    if (digest := manifest.get(ENTRIES_DIGEST)) is None:
+        return
+    end = text[max(0, text.find(b'\n "scenarios": ')) :]
+    if digest != hashlib.sha256(end).hexdigest():  # of another program's JSON, compare the values
+        end = _entries_text(manifest["scenarios"]).encode()
+        if digest != hashlib.sha256(end).hexdigest():
+            problem, cure = (
+                "entries of scenarios (ids, tags, audit) were changed",
+                f"copy it again or {AGAIN}",
+            )
+            raise DataError(problem, file=file, cure=cure)
 
 
 def shard_name(number: int) -> str:
