@@ -108,12 +108,15 @@ def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
     """Raise a FullDiskError that names ``path``, and ``needed`` bytes if known, when the block fills the disk.
 
     The operating system's error for a write names no file. Of nested blocks, the outermost one names the output, and
-    the outermost one that knows them the bytes.
+    the outermost one that knows them the bytes. Other errors of the system get the name if they have none, or a hidden
+    one.
     """
     try:
         yield
     except Exception as error:
         if not _is_full_disk(error):
+            if isinstance(error, OSError) and ".partial" in str(error.filename or ".partial"):
+                error.filename = str(path)
             raise
         needed = needed or getattr(error, "needed", 0)
         need = f"of about {format_bytes(needed)} needed" if needed else "more needed"

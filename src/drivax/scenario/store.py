@@ -14,6 +14,7 @@ set appears under its name only when it is complete. This module needs no JAX.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -61,6 +62,8 @@ ENTRIES_DIGEST = "scenarios_sha256"
 #: The cure for a set that cannot be repaired.
 AGAIN = "convert or generate the set again"
 _HEADER_LIMIT = 100_000
+#: Bytes at the beginning of a record that hold its names.
+_PAGE = 4096
 #: Scenarios that an iteration reads at a time, and those of a task of a thread.
 _BATCH, _PART = 64, 8
 #: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
@@ -133,13 +136,10 @@ class ScenarioWriter:
     def _is_finished(self, part: Mapping[str, Any]) -> bool:
         """Whether a closed shard is full (the last one of the data is not) and exactly as it was written."""
         shard = part["shard"]
-        if not shard["count"] == len(part["scenarios"]) == self._shard_size:
-            return False
-        try:
-            Shard(self._partial.content, shard, self._buffer.dtype).check_digest()
-        except DataError:
-            return False
-        return True
+        with contextlib.suppress(DataError):
+            Shard(self._partial.content, shard, self._buffer.dtype, part["scenarios"]).check_digest()
+            return shard["count"] == len(part["scenarios"]) == self._shard_size
+        return False
 
     @property
     def folder(self) -> Path:
@@ -400,7 +400,7 @@ class Shard:
             if self._scenarios:
                 for row in {0, self.count - 1}:  # a half-copied file may have zeros at its end
                     file.seek(offset + row * self._dtype.itemsize)
-                    self._check_names(row, np.frombuffer(file.read(_names_size(self._dtype)), np.uint8))
+                    self._check_names(row, np.frombuffer(file.read(_PAGE), np.uint8))
         return offset
 
     def _check_layout(self, shape: tuple[int, ...], dtype: np.dtype[Any], offset: int) -> None:
@@ -472,12 +472,6 @@ class Shard:
 def _files(shard: str) -> dict[str, str]:
     """Return the files of a shard by the names of their SHA-256 in the manifest."""
     return {"sha256": shard, "crc_sha256": crc_name(shard)}
-
-
-def _names_size(dtype: np.dtype[Any]) -> int:
-    """Return the size of the beginning of a record that holds its names."""
-    fields = dtype.fields or {}
-    return max(fields[name][1] + fields[name][0].itemsize for name in NAMES)
 
 
 def _key(entry: Mapping[str, Any]) -> tuple[str, str]:
