@@ -653,6 +653,44 @@ def test_a_damaged_note_costs_its_shard_only(tmp_path: Path):
     assert contents(tmp_path / "set") == contents(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("damage", ["flip", "delete", "delete checksums", "truncate", "note counts less"])
+def test_damaged_shard_of_an_unfinished_set_is_written_again(tmp_path: Path, damage: str):
+    continued(tmp_path / "whole")
+    with pytest.raises(RuntimeError):
+        continued(tmp_path / "set", stop=6)
+    shard = tmp_path / ".set.partial" / "content" / "shard-00001.npy"
+    if damage == "flip":
+        flip_bit(shard, shard.stat().st_size - 100)
+    elif damage == "truncate":
+        shard.write_bytes(shard.read_bytes()[:-4096])
+    elif damage.startswith("delete"):
+        shard.with_suffix(".crc.npy" if "checksums" in damage else ".npy").unlink()
+    else:
+        note = tmp_path / ".set.partial" / "progress" / "00001.json"
+        note.write_text(note.read_text().replace('"count": 2', '"count": 1'))
+    assert continued(tmp_path / "set") == [2]
+    assert contents(tmp_path / "set") == contents(tmp_path / "whole")
+
+
+def test_set_of_a_writer_killed_between_renames_opens(scenario_set: Path):
+    hidden = scenario_set.parent / ".set.partial"
+    hidden.mkdir()
+    scenario_set.rename(hidden / "old")
+    assert len(ScenarioSet.open(scenario_set)) == 7
+    with pytest.raises(UsageError, match="already exists"):
+        ScenarioWriter(scenario_set, SMALL)
+
+
+def test_symbolic_link_to_a_set_is_followed(tmp_path: Path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "set").symlink_to(tmp_path / "disk" / "set")
+    for number in range(2):
+        with ScenarioWriter(tmp_path / "set", SMALL, overwrite=True) as writer:
+            writer.add(make_scenario(number))
+    assert (tmp_path / "set").is_symlink()
+    assert [scenario.id for scenario in ScenarioSet.open(tmp_path / "disk" / "set")] == ["scenario-1"]
+
+
 def test_two_writers_at_once_are_refused(tmp_path: Path):
     with ScenarioWriter(tmp_path / "set", SMALL, identity=IDENTITY) as writer:
         writer.add(make_scenario(0))

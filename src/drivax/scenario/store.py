@@ -135,10 +135,11 @@ class ScenarioWriter:
 
     def _is_finished(self, part: Mapping[str, Any]) -> bool:
         """Whether a closed shard is full (the last one of the data is not) and exactly as it was written."""
-        shard = part["shard"]
+        if not part["shard"]["count"] == len(part["scenarios"]) == self._shard_size:
+            return False
         with contextlib.suppress(DataError):
-            Shard(self._partial.content, shard, self._buffer.dtype, part["scenarios"]).check_digest()
-            return shard["count"] == len(part["scenarios"]) == self._shard_size
+            Shard(self._partial.content, part["shard"], self._buffer.dtype, part["scenarios"]).check_digest()
+            return True
         return False
 
     @property
@@ -198,8 +199,8 @@ class ScenarioWriter:
         with (folder / crc_name(name)).open("wb") as file:
             np.save(file, np.array(self._crcs, np.uint32))
             sync_and_close(file)
-        digests = {key: file_digest(folder / file) for key, file in _files(name).items()}
-        shard = {"file": name, "count": count, **digests}
+        shard = {"file": name, "count": count, "sha256": file_digest(folder / name)}
+        shard["crc_sha256"] = file_digest(folder / crc_name(name))
         summary = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
         self._partial.note(len(self._shards), summary)
         self._shards.append(shard)
@@ -376,8 +377,7 @@ class Shard:
     """
 
     def __init__(
-        self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any],
-        scenarios: Sequence[Mapping[str, Any]] = (),
+        self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any], scenarios: Sequence[Mapping[str, Any]]
     ) -> None:  # fmt: skip
         self.path = folder / entry["file"]
         self.crc_path = folder / crc_name(entry["file"])
@@ -397,10 +397,9 @@ class Shard:
             shape, dtype = read_header(file, self.path)
             offset = file.tell()
             self._check_layout(shape, dtype, offset)
-            if self._scenarios:
-                for row in {0, self.count - 1}:  # a half-copied file may have zeros at its end
-                    file.seek(offset + row * self._dtype.itemsize)
-                    self._check_names(row, np.frombuffer(file.read(_PAGE), np.uint8))
+            for row in {0, self.count - 1} if self.count else ():  # a half-copied file may end in zeros
+                file.seek(offset + row * self._dtype.itemsize)
+                self._check_names(row, np.frombuffer(file.read(_PAGE), np.uint8))
         return offset
 
     def _check_layout(self, shape: tuple[int, ...], dtype: np.dtype[Any], offset: int) -> None:
@@ -428,8 +427,7 @@ class Shard:
         if verify and not self._intact[row]:
             if zlib.crc32(data[row].data) != int(self._crcs[row]):
                 raise self._damage("checksum mismatch, the record is damaged", row)
-            if self._scenarios:
-                self._check_names(row, data[row])
+            self._check_names(row, data[row])
             self._intact[row] = True
         return data[row]
 
@@ -440,12 +438,10 @@ class Shard:
 
     def _check_file(self, key: str) -> None:
         """Compare a file's SHA-256 with the manifest's; earlier versions stored none of the checksums."""
-        path = self.path.parent / _files(self.path.name)[key]
+        path = self.crc_path if key == "crc_sha256" else self.path
         if self._entry.get(key) not in (None, file_digest(path)):
-            cure = f"copy the whole set again or {AGAIN}"
-            raise DataError(
-                "SHA-256 differs from the manifest's: damaged, or of another set", file=path, cure=cure
-            )
+            problem, cure = "SHA-256 differs from the manifest's", f"copy the whole set again or {AGAIN}"
+            raise DataError(f"{problem}: damaged, or of another set", file=path, cure=cure)
 
     def _map(self) -> _Bytes:
         with _HEADER_LOCK:
@@ -467,11 +463,6 @@ class Shard:
 
     def _damage(self, problem: str, record: int) -> DataError:
         return DataError(problem, file=self.path, record=record, cure=f"copy the file again or {AGAIN}")
-
-
-def _files(shard: str) -> dict[str, str]:
-    """Return the files of a shard by the names of their SHA-256 in the manifest."""
-    return {"sha256": shard, "crc_sha256": crc_name(shard)}
 
 
 def _key(entry: Mapping[str, Any]) -> tuple[str, str]:
