@@ -365,7 +365,9 @@ def test_changed_note_does_not_count(tmp_path: Path):
     started(tmp_path / "set", {"seed": 1})
     note = tmp_path / ".set.partial" / "progress" / "00000.json"
     note.write_text(note.read_text().replace("first", "other"))
-    assert PartialFolder(tmp_path / "set", {"seed": 1}).open() == []
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    assert folder.open() == []
+    folder.close()
 
 
 # --- Errors of the system.
