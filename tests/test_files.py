@@ -6,15 +6,18 @@ import errno
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from drivax.errors import DataError, UsageError
+from drivax import files
+from drivax.errors import DataError, UsageError, explain_system
 from drivax.files import (
     PartialFolder,
+    allow_open_files,
     atomic_write,
     can_resume,
     check_output,
@@ -23,6 +26,7 @@ from drivax.files import (
     format_bytes,
     free_bytes,
     replace_folder,
+    restore_folder,
     write_json,
     write_text,
 )
@@ -248,3 +252,178 @@ def test_space_is_checked_on_the_disk_of_a_folder_that_does_not_exist_yet(tmp_pa
 )
 def test_sizes_are_readable(size: float, text: str):
     assert format_bytes(size) == text
+
+
+# --- Kills and links.
+
+
+def run(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+#: Replaces a folder, and is killed after its first rename.
+REPLACE = """
+import os, sys
+from pathlib import Path
+from drivax import files
+rename = Path.rename
+def rename_and_die(self, target):
+    rename(self, target)
+    os.kill(os.getpid(), 9)
+Path.rename = rename_and_die
+if sys.argv[2] == "old disk":
+    files._exchange = lambda first, second: False
+with files.replace_folder(Path(sys.argv[1])) as partial:
+    (partial / "new").touch()
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux exchanges two folders")
+def test_exchange_needs_no_rename_after_which_the_folder_is_missing(tmp_path: Path):
+    write_text(tmp_path / "run" / "old", "")
+    assert run(REPLACE, tmp_path / "run", "new disk").returncode == 0
+    assert names(tmp_path / "run") == {"new"} and names(tmp_path) == {"run"}
+
+
+def test_folder_gets_its_name_back_after_a_kill_between_renames(tmp_path: Path):
+    write_text(tmp_path / "run" / "old", "")
+    assert run(REPLACE, tmp_path / "run", "old disk").returncode == -signal.SIGKILL
+    assert not (tmp_path / "run").exists()
+    restore_folder(tmp_path / "run")
+    assert names(tmp_path / "run") == {"old"}
+    with replace_folder(tmp_path / "run") as partial:
+        write_text(partial / "newer", "")
+    assert names(tmp_path / "run") == {"newer"} and names(tmp_path) == {"run"}
+
+
+def test_error_between_renames_keeps_the_old_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_text(tmp_path / "run" / "old", "")
+    monkeypatch.setattr(files, "_exchange", lambda first, second: False)
+    rename = Path.rename
+
+    def fail_second(self: Path, target: Path):
+        if self.name == "content":
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fail_second)
+    with pytest.raises(KeyboardInterrupt), replace_folder(tmp_path / "run") as partial:
+        write_text(partial / "new", "")
+    assert names(tmp_path / "run") == {"old"} and names(tmp_path) == {"run"}
+
+
+@pytest.mark.parametrize("kind", ["replace_folder", "atomic_write"])
+def test_next_success_takes_over_what_a_killed_process_left(tmp_path: Path, kind: str):
+    code = f"""
+import os, sys
+from pathlib import Path
+from drivax import files
+with files.{kind}(Path(sys.argv[1])) as partial:
+    (partial / "half").touch() if isinstance(partial, Path) else partial.write(b"a long half")
+    os.kill(os.getpid(), 9)
+"""
+    assert run(code, tmp_path / "out").returncode == -signal.SIGKILL
+    assert names(tmp_path) == {".out.partial"}
+    if kind == "atomic_write":
+        write_text(tmp_path / "out", "new")
+        assert (tmp_path / "out").read_text() == "new"
+    else:
+        with replace_folder(tmp_path / "out") as partial:
+            write_text(partial / "new", "")
+        assert names(tmp_path / "out") == {"new"}
+    assert names(tmp_path) == {"out"}
+
+
+def test_symbolic_links_to_outputs_are_followed(tmp_path: Path):
+    (tmp_path / "disk").mkdir()
+    for name in ("file", "run"):
+        (tmp_path / name).symlink_to(tmp_path / "disk" / name)
+    for text in ("old", "new"):
+        write_text(tmp_path / "file", text)
+        with replace_folder(tmp_path / "run") as partial:
+            write_text(partial / text, "")
+    assert (tmp_path / "file").is_symlink() and (tmp_path / "run").is_symlink()
+    assert (tmp_path / "disk" / "file").read_text() == "new"
+    assert names(tmp_path / "disk") == {"file", "run"} and names(tmp_path / "disk" / "run") == {"new"}
+
+
+def test_failure_removes_the_parents_that_it_created(tmp_path: Path):
+    with pytest.raises(ZeroDivisionError), replace_folder(tmp_path / "a" / "b" / "run"):
+        raise ZeroDivisionError
+    assert names(tmp_path) == set()
+
+
+def test_unfinished_output_of_another_command_is_not_discarded(tmp_path: Path):
+    started(tmp_path / "set", {"seed": 1})
+    with pytest.raises(UsageError, match=r"other options \(command\); finish it"):
+        PartialFolder(tmp_path / "set").open()
+    assert can_resume(tmp_path / "set")
+
+
+def test_changed_note_does_not_count(tmp_path: Path):
+    started(tmp_path / "set", {"seed": 1})
+    note = tmp_path / ".set.partial" / "progress" / "00000.json"
+    note.write_text(note.read_text().replace("first", "other"))
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    assert folder.open() == []
+    folder.close()
+
+
+# --- Errors of the system.
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [
+        (errno.EROFS, "x: read-only file system; choose a folder on a disk that can be written"),
+        (errno.EACCES, "x: permission denied; change the permissions"),
+        (errno.ENOENT, "x: no such file or directory; check the path"),
+        (errno.ESTALE, "x: stale file handle; mount the disk again"),
+        (errno.EIO, "x: input/output error; mount the disk again"),
+        (errno.ENOSPC, "x: no space left on device; make room"),
+    ],
+)
+def test_system_error_has_path_and_cure(number: int, text: str):
+    error = explain_system(OSError(number, os.strerror(number), "x"))
+    assert isinstance(error, DataError) and str(error).startswith(text)
+    assert str(explain_system(OSError(number, os.strerror(number)), "x")) == str(error)
+
+
+def test_limits_of_the_process_are_named_with_their_value(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("resource.getrlimit", lambda kind: (2048, 4096))
+    for error, text in (
+        (
+            OSError(errno.EMFILE, "x"),
+            "too many open files (limit of open files: 2048); raise the limit: ulimit -n",
+        ),
+        (MemoryError(), "cannot allocate memory (limit of memory in kB: 2); use fewer --workers"),
+        (
+            RuntimeError("can't start new thread"),
+            "(limit of processes and threads: 2048); raise the limit: ulimit -u",
+        ),
+    ):
+        explained = explain_system(error)
+        assert isinstance(explained, UsageError) and text in str(explained)
+    assert explain_system(ValueError("x")) is None and explain_system(RuntimeError("x")) is None
+
+
+def test_hidden_names_are_those_of_the_output(tmp_path: Path):
+    error = OSError(errno.EROFS, os.strerror(errno.EROFS), str(tmp_path / ".set.partial" / "lock"))
+    with pytest.raises(OSError, match=r"set'$"), explain_full_disk(tmp_path / "set"):
+        raise error
+
+
+def test_limit_of_open_files_is_raised_or_reported(tmp_path: Path):
+    code = """
+import resource, sys
+from pathlib import Path
+from drivax.files import allow_open_files
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, 300))
+allow_open_files(Path("set"), 100)
+assert resource.getrlimit(resource.RLIMIT_NOFILE) == (228, 300)
+allow_open_files(Path("set"), 1000)
+"""
+    result = run(code)
+    assert "set: needs 1128 open files, the limit is 300; raise it: ulimit -Hn 1128" in result.stderr
+    allow_open_files(tmp_path, 1)

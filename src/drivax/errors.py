@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import importlib
+import os
+import resource
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,40 @@ from typing import Any
 _EXTRAS = {
     "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
     "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
+}  # fmt: skip
+
+
+_UNREACHABLE = "mount the disk again or check it, then repeat the command"
+_NO_PERMISSION = "change the permissions of the file or of its folder, or choose another"
+#: Cures of failures of files and disks.
+_DISK_CURES = {
+    errno.ENOENT: "check the path, and that its disk is mounted",
+    errno.EACCES: _NO_PERMISSION,
+    errno.EPERM: _NO_PERMISSION,
+    errno.EROFS: "choose a folder on a disk that can be written",
+    **dict.fromkeys(
+        (
+            errno.ESTALE,
+            errno.EIO,
+            errno.ENXIO,
+            errno.ENOTCONN,
+            errno.ETIMEDOUT,
+            errno.EHOSTDOWN,
+            errno.ENODEV,
+        ),
+        _UNREACHABLE,
+    ),
+    errno.ENOSPC: "make room, or choose another disk",
+    errno.EDQUOT: "make room, or choose another disk",
+    errno.EFBIG: "raise the limit of file sizes: ulimit -f unlimited",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+_LESS_MEMORY = "use fewer --workers or a smaller --batch, or raise the limit: ulimit -v unlimited"
+#: Limits of a process (name, resource) and their cures.
+_LIMITS = {
+    errno.EMFILE: ("open files", resource.RLIMIT_NOFILE, "raise the limit: ulimit -n 4096, or use fewer --workers"),
+    errno.ENOMEM: ("memory in kB", resource.RLIMIT_AS, _LESS_MEMORY),
+    errno.EAGAIN: ("processes and threads", resource.RLIMIT_NPROC, "raise the limit: ulimit -u 4096"),
 }  # fmt: skip
 
 
@@ -61,6 +98,29 @@ class UsageError(DrivaxError):
     """The command, an option or a configuration value is invalid."""
 
     status = 2
+
+
+def explain_system(error: BaseException, file: str | Path | None = None) -> DrivaxError | None:
+    """Return the error that explains a failure of a file or disk (DataError) or a limit of this process (UsageError).
+
+    ``file`` counts if the system's error names none. Other errors are None.
+    """
+    number = getattr(error, "errno", None)
+    if isinstance(error, MemoryError):
+        number = errno.ENOMEM
+    elif isinstance(error, RuntimeError) and "can't start new thread" in str(error):
+        number = errno.EAGAIN
+    elif not isinstance(error, OSError) or number is None:
+        return None
+    file, problem = getattr(error, "filename", None) or file, os.strerror(number).lower()
+    if number in _LIMITS:
+        name, kind, cure = _LIMITS[number]
+        limit = resource.getrlimit(kind)[0]
+        shown = (
+            "none" if limit == resource.RLIM_INFINITY else limit // 1024 if number == errno.ENOMEM else limit
+        )
+        return UsageError(f"{problem} (limit of {name}: {shown})", file=file, cure=cure)
+    return DataError(problem, file=file, cure=_DISK_CURES[number]) if number in _DISK_CURES else None
 
 
 def missing_package(error: ImportError) -> UsageError | None:

@@ -6,23 +6,35 @@ While a process writes the folder ``sets/a``, ``sets/.a.partial`` has::
     identity.json  description of the content; only the same content is resumed
     progress/      one note per finished part
     content/       becomes ``sets/a``
+    old/           the replaced ``sets/a``, on disks that cannot exchange two folders
     spool*/        temporary files of the writer
+
+The next writer of ``sets/a`` takes over what a killed process left. Symbolic links to outputs are followed.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import fcntl
-import glob
+import hashlib
 import json
 import os
+import resource
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 from drivax.errors import DataError, UsageError
+
+#: Flags of renameat2 (Linux): relative to the current folder, exchange both names.
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+#: Errors of disks without locks or without exchange.
+_UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EXDEV)
+#: Files that a process opens besides those of its data.
+_OTHER_FILES = 128
 
 
 class FullDiskError(DataError):
@@ -96,12 +108,15 @@ def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
     """Raise a FullDiskError that names ``path``, and ``needed`` bytes if known, when the block fills the disk.
 
     The operating system's error for a write names no file. Of nested blocks, the outermost one names the output, and
-    the outermost one that knows them the bytes.
+    the outermost one that knows them the bytes. Other errors of the system get the name if they have none, or a hidden
+    one.
     """
     try:
         yield
     except Exception as error:
         if not _is_full_disk(error):
+            if isinstance(error, OSError) and ".partial" in str(error.filename or ".partial"):
+                error.filename = str(path)
             raise
         needed = needed or getattr(error, "needed", 0)
         need = f"of about {format_bytes(needed)} needed" if needed else "more needed"
@@ -124,16 +139,19 @@ def atomic_write(path: Path, needed: int = 0) -> Iterator[IO[bytes]]:
 
     A full disk is reported with the space that is free without the part that did fit, and the bytes ``needed``.
     """
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    with explain_full_disk(path, needed), contextlib.ExitStack() as cleanup:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cleanup.callback(partial.unlink, missing_ok=True)
-        with partial.open("wb") as file:
+    target = _follow(path)
+    partial = _hidden_path(target)
+    with explain_full_disk(path, needed), _open_locked(partial, wait=True) as file:
+        try:
+            file.truncate()  # a killed process may have left it
             yield file
             file.flush()
             os.fsync(file.fileno())
-        partial.replace(path)
-        sync_folder(path.parent)
+            partial.replace(target)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+        sync_folder(target.parent)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -148,19 +166,24 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False))
 
 
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 (hex) of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 @contextlib.contextmanager
 def replace_folder(path: Path, needed: int = 0) -> Iterator[Path]:
     """Yield a new folder that replaces ``path`` when the block ends; an error leaves ``path`` unchanged.
 
     A full disk is reported as by :func:`atomic_write`.
     """
-    partial = _hidden_path(path, f"partial-{os.getpid()}")
-    shutil.rmtree(partial, ignore_errors=True)
+    partial = PartialFolder(path)
     with explain_full_disk(path, needed), contextlib.ExitStack() as cleanup:
-        cleanup.callback(shutil.rmtree, partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        yield partial
-        _publish(partial, path)
+        partial.open(restart=True)
+        cleanup.callback(partial.close)
+        yield partial.content
+        partial.publish()
 
 
 class PartialFolder:
@@ -174,12 +197,14 @@ class PartialFolder:
     def __init__(self, path: Path, identity: Mapping[str, Any] | None = None) -> None:
         self.path = path
         self.identity = None if identity is None else json.loads(json.dumps(identity))
-        self.root = _hidden_path(path, "partial" if identity is not None else f"partial-{os.getpid()}")
-        self.content = self.root / "content"
+        self._target = _follow(path)
+        self.root = _hidden_path(self._target)
+        self.content, self._old = self.root / "content", self.root / "old"
         self._lock: IO[bytes] | None = None
+        self._new_parents: list[Path] = []
 
     def open(self, restart: bool = False) -> list[dict[str, Any]]:
-        """Lock the folder and return the notes of the parts that an earlier process finished, in order.
+        """Lock the folder and return the intact notes of the parts that an earlier process finished, in order.
 
         Args:
             restart: Discard unfinished content of another identity.
@@ -187,9 +212,10 @@ class PartialFolder:
         Raises:
             UsageError: Another process is writing the folder, or its unfinished content has another identity.
         """
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._new_parents = [parent for parent in self._target.parents if not parent.exists()]
         self._take_lock()
         try:
+            self._restore()
             notes = self._read_notes(restart)
         except BaseException:
             self._release()
@@ -206,41 +232,62 @@ class PartialFolder:
         """Record that part ``number`` (from 0) is finished and on disk."""
         if self.identity is not None:
             sync_folder(self.content)
-            write_json(self.root / "progress" / f"{number:05d}.json", value)
+            note = {"sha256": _digest(value), "value": value}
+            write_json(self.root / "progress" / f"{number:05d}.json", note)
 
     def publish(self) -> None:
-        """Rename the content to its final name, and replace an existing folder."""
+        """Rename the content to its final name; an existing folder keeps the name until that moment."""
         sync_folder(self.content)
-        _publish(self.content, self.path)
+        if not self._target.exists():
+            self.content.rename(self._target)
+        elif not _exchange(self.content, self._target):
+            # A process killed between these two lines is repaired by the next one that opens the folder.
+            self._target.rename(self._old)
+            self.content.rename(self._target)
+        sync_folder(self._target.parent)
+        self._new_parents = []
 
     def close(self) -> None:
         """Release the lock, and remove all files but finished parts that a later process can resume."""
+        self._restore()
         names = ("content", "progress", "identity.json", "lock")
         resumable = self.content.is_dir() and any((self.root / "progress").glob("*.json"))
         self._clear(names if resumable else ("lock",))
         if not resumable:  # The lock goes last: another process must not start while files are being removed.
             (self.root / "lock").unlink(missing_ok=True)
-            with contextlib.suppress(OSError):
-                self.root.rmdir()
+            for folder in (self.root, *self._new_parents):
+                with contextlib.suppress(OSError):  # not empty
+                    folder.rmdir()
         self._release()
 
+    def restore(self) -> None:
+        """Give a folder its name back if a process was killed while it replaced the folder."""
+        if not self._target.exists() and self._old.is_dir():
+            with contextlib.suppress(UsageError):  # the process still runs
+                self._take_lock()
+                self._restore()
+            self._release()
+
+    def _restore(self) -> None:
+        if self._old.is_dir() and not self._target.exists():
+            self._old.rename(self._target)
+
     def _read_notes(self, restart: bool) -> list[dict[str, Any]]:
-        if self.identity is None:
-            return []
         identity = _read_json(self.root / "identity.json")
-        if isinstance(identity, dict) and identity != self.identity and not restart:
-            different = [name for name in self.identity if identity.get(name) != self.identity[name]]
+        if isinstance(identity, dict) and identity != self.identity and not restart and can_resume(self.path):
+            own = self.identity or {}
+            different = ", ".join(name for name in own if identity.get(name) != own[name])
             raise UsageError(
-                f"an unfinished output was started with other data or other options ({', '.join(different)})",
+                f"an unfinished output was started with other data or other options ({different or 'command'})",
                 file=self.path,
                 cure="finish it with the same options, or pass --overwrite to start again",
             )
         notes: list[dict[str, Any]] = []
-        while identity == self.identity and self.content.is_dir():
+        while self.identity is not None and identity == self.identity and self.content.is_dir():
             note = _read_json(self.root / "progress" / f"{len(notes):05d}.json")
-            if note is None:
+            if not isinstance(note, dict) or _digest(note.get("value")) != note.get("sha256"):
                 break
-            notes.append(note)
+            notes.append(note["value"])
         return notes
 
     def _start(self) -> None:
@@ -260,28 +307,14 @@ class PartialFolder:
                 entry.unlink()
 
     def _take_lock(self) -> None:
-        while self._lock is None:
-            self.root.mkdir(exist_ok=True)
-            try:
-                file = (self.root / "lock").open("wb")
-            except FileNotFoundError:  # The last owner finished and removed the folder in between.
-                continue
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                is_current = os.fstat(file.fileno()).st_ino == (self.root / "lock").stat().st_ino
-            except BlockingIOError as error:
-                file.close()
-                raise UsageError(
-                    "another process is writing it",
-                    file=self.path,
-                    cure="wait for it, or choose another name",
-                ) from error
-            except FileNotFoundError:
-                is_current = False
-            if is_current:
-                self._lock = file
-            else:
-                file.close()
+        try:
+            self._lock = _open_locked(self.root / "lock")
+        except BlockingIOError as error:
+            raise UsageError(
+                "another process is writing it",
+                file=self.path,
+                cure="wait for it, or choose another name",
+            ) from error
 
     def _release(self) -> None:
         if self._lock is not None:
@@ -291,21 +324,73 @@ class PartialFolder:
 
 def can_resume(path: Path) -> bool:
     """Return whether ``path`` has finished parts that a later process can continue."""
-    return any((_hidden_path(path, "partial") / "progress").glob("*.json"))
+    return any((_hidden_path(_follow(path)) / "progress").glob("*.json"))
 
 
-def _hidden_path(path: Path, suffix: str) -> Path:
-    return path.parent / f".{path.name}.{suffix}"
+def restore_folder(path: Path) -> None:
+    """Give the folder ``path`` its name back if a process was killed while it replaced the folder."""
+    PartialFolder(path).restore()
 
 
-def _publish(content: Path, path: Path) -> None:
-    """Rename a complete folder to ``path``; remove the replaced folder, and leftovers of killed processes."""
-    if path.exists():
-        path.rename(_hidden_path(path, f"old-{os.getpid()}"))
-    content.rename(path)
-    sync_folder(path.parent)
-    for leftover in path.parent.glob(f".{glob.escape(path.name)}.old-*"):
-        shutil.rmtree(leftover, ignore_errors=True)
+def allow_open_files(path: Path, number: int) -> None:
+    """Raise the limit of open files so that ``number`` files of a folder can be open at a time.
+
+    Raises:
+        UsageError: The system allows fewer.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed, infinity = number + _OTHER_FILES, resource.RLIM_INFINITY
+    if soft == infinity or needed <= soft:
+        return
+    if hard != infinity and needed > hard:
+        problem = f"needs {needed} open files, the limit is {hard}"
+        raise UsageError(problem, file=path, cure=f"raise it: ulimit -Hn {needed}, or a larger shard size")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+
+
+def _follow(path: Path) -> Path:
+    """Return the path behind symbolic links; a rename of the path itself would replace the link."""
+    return Path(os.path.realpath(path))
+
+
+def _hidden_path(path: Path) -> Path:
+    return path.parent / f".{path.name}.partial"
+
+
+def _open_locked(path: Path, wait: bool = False) -> IO[bytes]:
+    """Open a file, create it if it is missing, and lock it; BlockingIOError if another process has it."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError), contextlib.ExitStack() as cleanup:
+            path.touch()
+            file = cleanup.enter_context(path.open("r+b"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            except OSError as error:
+                if error.errno not in _UNSUPPORTED:
+                    raise
+            # Its last owner may have renamed or removed it in between.
+            if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+                cleanup.pop_all()
+                return file
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Exchange the names of two folders in one step; return whether the disk can."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)  # of Linux
+    if rename is None:
+        return False
+    if rename(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(second), _RENAME_EXCHANGE) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number not in _UNSUPPORTED:
+        raise OSError(number, os.strerror(number), str(second))
+    return False
+
+
+def _digest(value: Any) -> str:
+    """Return the SHA-256 (hex) of a JSON value, whatever its form in a file."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def _read_json(path: Path) -> Any:

@@ -88,7 +88,11 @@ def test_overrides_reach_the_command(probe: Any):
         ),
         (UsageError("is wrong"), "is wrong", 2),
         (KeyboardInterrupt(), "interrupted", 130),
-        (PermissionError(13, "Permission denied", "/x"), "/x: Permission denied", 1),
+        (
+            PermissionError(13, "Permission denied", "/x"),
+            "/x: permission denied; change the permissions of the file or of its folder, or choose another",
+            1,
+        ),
         (OSError(28, "No space left on device"), "No space left on device", 1),
         (
             ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.pyplot"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -21,7 +22,7 @@ import pytest
 from drivax.cli import main
 from drivax.datasets.conversion import Conversion, convert, convert_file
 from drivax.datasets.doctor import estimate
-from drivax.datasets.formats import survey
+from drivax.datasets.formats import find_reader, survey
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
@@ -259,6 +260,48 @@ def test_interrupt_leaves_nothing(wire, write_records, tmp_path):
     # A worker caught while Python starts may complain before us.
     assert (process.returncode, errors.splitlines()[-1]) == (130, "drivax: interrupted")
     assert leftovers(tmp_path) == ["src"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_signal_to_the_process_leaves_nothing(wire, write_records, tmp_path, number):
+    """A batch system or a closed terminal sends it; workers get none and stop with their parent."""
+    shard = write_records("src/0.tfrecord", wire.scenario()).read_bytes() * 300
+    for name in "01":
+        (tmp_path / "src" / f"{name}.tfrecord").write_bytes(shard)
+    process = drivax_process("convert", tmp_path / "src", tmp_path / "new" / "set", "--workers", 2)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("new/.set.partial/spool-*/*")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(number)
+    process.send_signal(number)  # shells repeat SIGHUP
+    _, errors = process.communicate(timeout=120)
+    expected = (128 + number, f"drivax: stopped by {number.name}")
+    assert (process.returncode, errors.splitlines()[-1]) == expected
+    assert leftovers(tmp_path) == ["src"]
+
+
+def test_unreadable_file_is_skipped_and_a_full_process_stops(folder, tmp_path, monkeypatch):
+    reader = type(find_reader("womd-scenario"))
+    read = reader.read
+
+    def read_or_fail(number):
+        def fail(self, path):
+            if path.name == "a.tfrecord":
+                raise OSError(number, os.strerror(number))
+            yield from read(self, path)
+
+        return fail
+
+    monkeypatch.setattr(reader, "read", read_or_fail(errno.EIO))
+    result = convert(folder, tmp_path / "set")
+    bad = [bad for bad in result.skipped if "input/output error" in bad.problem]
+    assert [(bad.file.name, bad.cure.split(" or ")[0]) for bad in bad] == [
+        ("a.tfrecord", "mount the disk again")
+    ]
+    assert result.scenarios > 0
+    monkeypatch.setattr(reader, "read", read_or_fail(errno.EMFILE))
+    with pytest.raises(OSError):
+        convert(folder, tmp_path / "other")
 
 
 # --- What is left out, and what is written next to the scenarios.
@@ -551,6 +594,11 @@ def test_other_data_or_options_are_not_resumed(thirty, tmp_path):
         convert(thirty, tmp_path / "set", Conversion(shard_size=4), stop)
     with pytest.raises(UsageError, match=r"other options \(stride\).*--overwrite to start again"):
         convert(thirty, tmp_path / "set", Conversion(shard_size=4, stride=20))
+    content = (thirty / "2.tfrecord").read_bytes()
+    for place in (20, len(content) - 20):  # of the same size and name
+        (thirty / "2.tfrecord").write_bytes(content[:place] + b"?" + content[place + 1 :])
+        with pytest.raises(UsageError, match=r"other options \(files\)"):
+            convert(thirty, tmp_path / "set", Conversion(shard_size=4))
     (thirty / "2.tfrecord").unlink()
     with pytest.raises(UsageError, match=r"other options \(files\)"):
         convert(thirty, tmp_path / "set", Conversion(shard_size=4))

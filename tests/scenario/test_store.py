@@ -96,6 +96,16 @@ def test_round_trip(scenario_set: Path):
         opened[7]
 
 
+def as_earlier_version(path: Path) -> Path:
+    """The set without the digests that earlier versions did not write."""
+    manifest = json.loads((path / "manifest.json").read_text())
+    del manifest["scenarios_sha256"]
+    for shard in manifest["shards"]:
+        del shard["crc_sha256"]
+    (path / "manifest.json").write_text(json.dumps(manifest, indent=1))
+    return path
+
+
 def test_manifest(scenario_set: Path):
     manifest = json.loads((scenario_set / "manifest.json").read_text())
     assert [shard["count"] for shard in manifest["shards"]] == [3, 3, 1]
@@ -117,6 +127,8 @@ def test_manifest(scenario_set: Path):
     }  # fmt: skip
     for shard in manifest["shards"]:
         assert hashlib.sha256((scenario_set / shard["file"]).read_bytes()).hexdigest() == shard["sha256"]
+        crcs = scenario_set / shard["file"].replace(".npy", ".crc.npy")
+        assert hashlib.sha256(crcs.read_bytes()).hexdigest() == shard["crc_sha256"]
 
 
 def test_files_are_plain_numpy(scenario_set: Path):
@@ -365,14 +377,15 @@ def test_every_single_flipped_bit_is_found(scenario_set: Path):
     start = len(whole) - record_dtype(SMALL).itemsize
     for position in range(start, len(whole), 97):
         flip_bit(file, position)
-        with pytest.raises(DataError, match="checksum mismatch"):
+        with pytest.raises(DataError, match=r"checksum mismatch|_id is not|segment is not"):
             ScenarioSet.open(scenario_set)[6]
         file.write_bytes(whole)
     ScenarioSet.open(scenario_set).check()
 
 
 def test_check_compares_sha256(scenario_set: Path):
-    """A record changed together with its CRC passes the CRC, not the manifest."""
+    """A record changed together with its CRC passes the CRC of earlier versions, not the manifest."""
+    as_earlier_version(scenario_set)
     file = scenario_set / "shard-00002.npy"
     flip_bit(file, file.stat().st_size - 1)
     raw = file.read_bytes()[-record_dtype(SMALL).itemsize :]
@@ -402,15 +415,97 @@ def test_missing_shard(scenario_set: Path, name: str):
 @pytest.mark.parametrize("name", ["shard-00001.npy", "shard-00001.crc.npy"])
 @pytest.mark.parametrize("content", [b"", b"not numpy at all", b"\x93NUMPY\x01\x00\xff\xff"])
 def test_damaged_header(scenario_set: Path, name: str, content: bytes):
-    (scenario_set / name).write_bytes(content)
+    (as_earlier_version(scenario_set) / name).write_bytes(content)
     with pytest.raises(DataError, match=f"{name}: header is damaged"):
         ScenarioSet.open(scenario_set)[3]
 
 
 def test_checksums_of_another_shard(scenario_set: Path):
     (scenario_set / "shard-00002.crc.npy").write_bytes((scenario_set / "shard-00001.crc.npy").read_bytes())
+    with pytest.raises(DataError, match=r"shard-00002\.crc\.npy: SHA-256 differs .*; copy the whole set"):
+        ScenarioSet.open(scenario_set)
     with pytest.raises(DataError, match="checksum file does not fit"):
-        ScenarioSet.open(scenario_set)[6]
+        ScenarioSet.open(as_earlier_version(scenario_set))[6]
+
+
+def exchange(first: Path, second: Path) -> None:
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+@pytest.mark.parametrize("suffixes", [(".npy",), (".npy", ".crc.npy")])
+def test_exchanged_shards_are_refused_on_open(scenario_set: Path, earlier: bool, suffixes: tuple[str, ...]):
+    """With their checksums, each record passes its CRC but stands in another scenario's place."""
+    for suffix in suffixes:
+        exchange(scenario_set / f"shard-00000{suffix}", scenario_set / f"shard-00001{suffix}")
+    if earlier:
+        as_earlier_version(scenario_set)
+    with pytest.raises(
+        DataError, match=r"shard-0000\d\.(npy: record 0: scenario_id is not|crc\.npy: SHA-256)"
+    ):
+        ScenarioSet.open(scenario_set)
+
+
+def test_shards_of_another_set_with_the_same_ids_are_refused_on_open(tmp_path: Path, scenario_set: Path):
+    with ScenarioWriter(tmp_path / "other", SMALL, shard_size=3) as writer:
+        for number in range(7):
+            scenario = make_scenario(number)
+            scenario.record["agent_z"] += 1.0
+            writer.add(scenario)
+    for name in ("shard-00001.npy", "shard-00001.crc.npy"):
+        (scenario_set / name).write_bytes((tmp_path / "other" / name).read_bytes())
+    with pytest.raises(DataError, match=r"shard-00001\.crc\.npy: SHA-256 differs.*another set"):
+        ScenarioSet.open(scenario_set)
+
+
+def test_half_copied_shard_of_full_size_is_refused_on_open(scenario_set: Path):
+    file = scenario_set / "shard-00001.npy"
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2].ljust(len(content), b"\0"))
+    with pytest.raises(DataError, match=r"record 2: scenario_id is not 'scenario-5'.*half copied"):
+        ScenarioSet.open(scenario_set)
+
+
+def test_reordered_entries_are_found(scenario_set: Path):
+    manifest = json.loads((scenario_set / "manifest.json").read_text())
+    entries = manifest["scenarios"]
+    entries[3], entries[4] = entries[4], entries[3]
+    edit_manifest(scenario_set, scenarios=entries)
+    with pytest.raises(DataError, match=r"manifest\.json: entries of scenarios .* were changed; copy"):
+        ScenarioSet.open(scenario_set)
+    with pytest.raises(DataError, match="record 0: scenario_id is not 'scenario-4'"):
+        ScenarioSet.open(as_earlier_version(scenario_set))
+
+
+def test_reordered_entries_within_a_shard_of_an_earlier_version_are_found_when_read(scenario_set: Path):
+    entries = json.loads((scenario_set / "manifest.json").read_text())["scenarios"]
+    edit_manifest(
+        scenario_set, scenarios=[*entries[:3], entries[3], {**entries[4], "segment": "x"}, *entries[5:]]
+    )
+    opened = ScenarioSet.open(as_earlier_version(scenario_set))
+    with pytest.raises(DataError, match="record 1: segment is not 'x', that of the manifest"):
+        opened[4]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [('"domain": "urban"', '"domain": "rural"'), ('"collision": false', '"collision": true')]
+)
+def test_changed_tags_and_audit_are_refused_on_open(scenario_set: Path, old: str, new: str):
+    file = scenario_set / "manifest.json"
+    digest = ScenarioSet.open(scenario_set).hash
+    file.write_text(file.read_text().replace(old, new, 1))
+    with pytest.raises(DataError, match=r"entries of scenarios \(ids, tags, audit\) were changed"):
+        ScenarioSet.open(scenario_set)
+    assert ScenarioSet.open(as_earlier_version(scenario_set)).hash == digest
+
+
+@pytest.mark.parametrize("indent", [None, 4])
+def test_manifest_in_another_json_form_opens(scenario_set: Path, indent: int | None):
+    file = scenario_set / "manifest.json"
+    file.write_text(json.dumps(json.loads(file.read_text()), indent=indent))
+    assert len(ScenarioSet.open(scenario_set)) == 7
 
 
 def test_another_layout(scenario_set: Path):
@@ -556,6 +651,44 @@ def test_a_damaged_note_costs_its_shard_only(tmp_path: Path):
     (tmp_path / ".set.partial" / "progress" / "00001.json").write_text('{"shard": ')
     assert continued(tmp_path / "set") == [2]
     assert contents(tmp_path / "set") == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("damage", ["flip", "delete", "delete checksums", "truncate", "note counts less"])
+def test_damaged_shard_of_an_unfinished_set_is_written_again(tmp_path: Path, damage: str):
+    continued(tmp_path / "whole")
+    with pytest.raises(RuntimeError):
+        continued(tmp_path / "set", stop=6)
+    shard = tmp_path / ".set.partial" / "content" / "shard-00001.npy"
+    if damage == "flip":
+        flip_bit(shard, shard.stat().st_size - 100)
+    elif damage == "truncate":
+        shard.write_bytes(shard.read_bytes()[:-4096])
+    elif damage.startswith("delete"):
+        shard.with_suffix(".crc.npy" if "checksums" in damage else ".npy").unlink()
+    else:
+        note = tmp_path / ".set.partial" / "progress" / "00001.json"
+        note.write_text(note.read_text().replace('"count": 2', '"count": 1'))
+    assert continued(tmp_path / "set") == [2]
+    assert contents(tmp_path / "set") == contents(tmp_path / "whole")
+
+
+def test_set_of_a_writer_killed_between_renames_opens(scenario_set: Path):
+    hidden = scenario_set.parent / ".set.partial"
+    hidden.mkdir()
+    scenario_set.rename(hidden / "old")
+    assert len(ScenarioSet.open(scenario_set)) == 7
+    with pytest.raises(UsageError, match="already exists"):
+        ScenarioWriter(scenario_set, SMALL)
+
+
+def test_symbolic_link_to_a_set_is_followed(tmp_path: Path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "set").symlink_to(tmp_path / "disk" / "set")
+    for number in range(2):
+        with ScenarioWriter(tmp_path / "set", SMALL, overwrite=True) as writer:
+            writer.add(make_scenario(number))
+    assert (tmp_path / "set").is_symlink()
+    assert [scenario.id for scenario in ScenarioSet.open(tmp_path / "disk" / "set")] == ["scenario-1"]
 
 
 def test_two_writers_at_once_are_refused(tmp_path: Path):

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,6 +30,7 @@ from drivax.synthetic.generate import (
     portable_workers,
 )
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_many, generate_one
+from drivax.tracking.workers import worker_pool
 
 SCENARIOS = 7
 
@@ -327,3 +329,36 @@ def test_flags_override_the_configuration_file(tmp_path):
     file.write_text("rare_rat: 0.25\n")
     with pytest.raises(UsageError, match="rare_rate"):
         run(Generate(tmp_path / "other", config=file))
+
+
+def test_signal_leaves_nothing(tmp_path):
+    """SIGTERM while scenarios are drawn; the first shard would be full after 512."""
+    code = "from drivax.cli import main; raise SystemExit(main())"
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "generate",
+        tmp_path / "set",
+        "--scenarios",
+        "512",
+        "--workers",
+        "1",
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not (tmp_path / ".set.partial" / "content").is_dir() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.terminate()
+    _, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors.splitlines()[-1]) == (143, "drivax: stopped by SIGTERM")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_shared_memory_is_explained(monkeypatch):
+    def missing(*_, **__):
+        raise FileNotFoundError(2, "No such file or directory")  # as sem_open does, without a file
+
+    monkeypatch.setattr("multiprocessing.synchronize.SemLock.__init__", missing)
+    with pytest.raises(UsageError, match=r"^/dev/shm: no shared memory for worker processes.*--shm-size"):
+        worker_pool(1)

@@ -8,13 +8,16 @@ its configuration, which ``run`` gets as a second argument.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import shutil
+import signal
 import sys
 import textwrap
+import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from importlib import metadata
@@ -22,7 +25,7 @@ from inspect import getdoc
 from typing import Any, TypeVar
 
 from drivax.compilation import report_compilation, use_compilation_cache
-from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
+from drivax.errors import DrivaxError, UsageError, did_you_mean, explain_system, missing_package
 
 
 @dataclass(frozen=True)
@@ -90,13 +93,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments without the program's name; those of the process by default.
 
     Returns:
-        Exit status: 0 done, 1 failed, 2 usage, 130 interrupted.
+        Exit status: 0 done, 1 failed, 2 usage, 130 interrupted, 129 stopped by SIGHUP, 143 by SIGTERM.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug, use_cache = "--debug" in arguments, "--no-cache" not in arguments
     arguments = [argument for argument in arguments if argument not in ("--debug", "--no-cache")]
     try:
-        status = _dispatch(arguments, use_cache)
+        with _stop_at_signals():
+            status = _dispatch(arguments, use_cache)
         sys.stdout.flush()
     except SystemExit as stop:  # tyro's --help (0) and its usage errors (2)
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
@@ -108,16 +112,54 @@ def main(argv: Sequence[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         line, status = describe(error)
-        print(f"drivax: {line}", file=sys.stderr)
+        with contextlib.suppress(OSError):  # a terminal that hung up
+            print(f"drivax: {line}", file=sys.stderr)
     return status
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal that ends the process stopped the command."""
+
+    def __init__(self, signal: signal.Signals) -> None:
+        super().__init__(signal)
+        self.signal = signal
+
+
+@contextlib.contextmanager
+def _stop_at_signals() -> Iterator[None]:
+    """Raise Stopped at SIGTERM or SIGHUP, so that partial output is removed; ignore them from then on.
+
+    A signal that the process ignores already (nohup) stays so. Threads but the main one have no signals.
+    """
+    handled: list[signal.Signals] = []
+    if threading.current_thread() is threading.main_thread():
+        signals = (signal.SIGTERM, signal.SIGHUP)
+        handled = [number for number in signals if signal.getsignal(number) == signal.SIG_DFL]
+
+    def stop(number: int, _: Any) -> None:
+        for other in handled:
+            signal.signal(other, signal.SIG_IGN)
+        raise Stopped(signal.Signals(number))
+
+    try:
+        for number in handled:
+            signal.signal(number, stop)
+        yield
+    finally:
+        for number in handled:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def describe(error: BaseException) -> tuple[str, int]:
     """Return one line for the user, and the exit status, for an exception that ended a command."""
     if isinstance(error, DrivaxError):
         return str(error), error.status
+    if isinstance(error, Stopped):
+        return f"stopped by {error.signal.name}", 128 + error.signal
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", 130
+    if explained := explain_system(error):
+        return str(explained), 1
     if isinstance(error, ImportError) and (missing := missing_package(error)):
         return str(missing), 1
     if isinstance(error, OSError) and error.strerror:

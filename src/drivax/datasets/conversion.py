@@ -8,6 +8,7 @@ fraction of a second; an audit that needs it is passed in.
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
@@ -20,9 +21,9 @@ from typing import Any, TypeVar, get_args
 
 from drivax.datasets.doctor import Estimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
-from drivax.datasets.reader import BadRecord, of_length
+from drivax.datasets.reader import BadRecord, Reader, of_length
 from drivax.datasets.spool import convert_ahead
-from drivax.errors import DataError, DrivaxError, UsageError
+from drivax.errors import DataError, DrivaxError, UsageError, explain_system
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
 from drivax.scenario.recording import STRIDE, Recording, windows
@@ -34,6 +35,8 @@ from drivax.scenario.store import ScenarioWriter, manifest_entry
 _Result = TypeVar("_Result")
 #: Scenarios that are audited together.
 _BATCH = 64
+#: Bytes of the head and of the tail of a source that identify it.
+_ENDS = 1 << 16
 #: A scenario or bad record, and the place after it: file number, items read of that file.
 _Item = tuple[Scenario | BadRecord, tuple[int, int]]
 #: Called with (files done, files, scenarios so far).
@@ -117,12 +120,22 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
         yield BadRecord.of(error, path)
         return
     count = 0
-    for item in of_length(reader, options.sizes.steps).read(path):
+    for item in _read(of_length(reader, options.sizes.steps), path):
         for result in [item] if isinstance(item, BadRecord) else _scenarios(item, path, options):
             yield result
             count += isinstance(result, Scenario)
             if count == options.limit and not options.filters:
                 return
+
+
+def _read(reader: Reader, path: Path) -> Iterator[Recording | BadRecord]:
+    """Yield the recordings of a file; a file or disk that cannot be read is a bad record, unlike a full process."""
+    try:
+        yield from reader.read(path)
+    except OSError as error:
+        if (unreachable := explain_system(error, path)) is None or not isinstance(unreachable, DataError):
+            raise
+        yield BadRecord.of(unreachable, path)
 
 
 def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterator[Scenario | BadRecord]:
@@ -254,7 +267,8 @@ def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, A
     """All that the bytes of the set depend on; only a conversion with the same identity resumes another."""
     digest = hashlib.sha256()
     for entry in data.inputs:
-        digest.update(f"{data.relative(entry.path)}\t{entry.path.stat().st_size}\t{entry.format}\n".encode())
+        size, ends = _ends(entry.path)
+        digest.update(f"{data.relative(entry.path)}\t{size}\t{entry.format}\t{ends}\n".encode())
     names = (
         "format",
         "capacity",
@@ -274,6 +288,17 @@ def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, A
         "audit": has_audit,
         **{name: getattr(options, name) for name in names},
     }
+
+
+def _ends(path: Path) -> tuple[int, str]:
+    """Return the size of a file and the SHA-256 (hex) of its head and tail; a file that cannot be read has none."""
+    try:
+        with path.open("rb") as file:
+            head, size = file.read(_ENDS), file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - _ENDS))
+            return size, hashlib.sha256(head + file.read()).hexdigest()
+    except OSError:
+        return -1, ""
 
 
 class _Sink:

@@ -2,7 +2,7 @@
 
 A set is a folder::
 
-    manifest.json        schema version, capacity, field table, shards, one entry per scenario
+    manifest.json        schema version, capacity, field table, shards, one entry per scenario, digests of both
     shard-00000.npy      one-dimensional structured array of ``schema.record_dtype(capacity)``
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
     splits/              lists for training, validation and test (``scenario.select.splits``)
@@ -14,6 +14,7 @@ set appears under its name only when it is complete. This module needs no JAX.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -35,19 +36,34 @@ from drivax.errors import DataError, UsageError
 from drivax.files import (
     FullDiskError,
     PartialFolder,
+    allow_open_files,
     check_output,
     check_space,
     explain_full_disk,
+    file_digest,
+    restore_folder,
     sync_and_close,
-    write_json,
+    write_text,
 )
-from drivax.scenario.schema import NAMES, SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
+from drivax.scenario.schema import (
+    NAMES,
+    SCHEMA_VERSION,
+    Capacity,
+    Scenario,
+    SourceCounts,
+    record_dtype,
+    stored_name,
+)
 from drivax.scenario.select.splits import Shares, write_splits
 
 MANIFEST = "manifest.json"
+#: Key of the SHA-256 of the scenarios' entries in the manifest.
+ENTRIES_DIGEST = "scenarios_sha256"
 #: The cure for a set that cannot be repaired.
 AGAIN = "convert or generate the set again"
 _HEADER_LIMIT = 100_000
+#: Bytes at the beginning of a record that hold its names.
+_PAGE = 4096
 #: Scenarios that an iteration reads at a time, and those of a task of a thread.
 _BATCH, _PART = 64, 8
 #: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
@@ -71,7 +87,7 @@ class ScenarioWriter:
         overwrite: Replace an existing scenario set; other folders are never replaced.
         shares: Percentages of train, validation and test for the files of ``splits/``; None writes no files.
         identity: Description of the content, for a set that can be resumed: closed shards survive an exception or a
-            kill, and the next writer with the same identity continues after them (:attr:`notes`).
+            kill, and the next writer with the same identity continues after the intact ones (:attr:`notes`).
         further: Writes additional files into the complete folder before it is published.
 
     Raises:
@@ -105,7 +121,7 @@ class ScenarioWriter:
         with explain_full_disk(self.path):
             parts = self._partial.open(restart=self.overwrite)
         for part in parts:
-            if part["shard"]["count"] < self._shard_size:  # The last shard of the data is written again.
+            if not self._is_finished(part):  # It and all that follow are written again.
                 break
             self._shards.append(part["shard"])
             self._entries += part["scenarios"]
@@ -116,6 +132,15 @@ class ScenarioWriter:
             if entry.name not in names:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         return self
+
+    def _is_finished(self, part: Mapping[str, Any]) -> bool:
+        """Whether a closed shard is full (the last one of the data is not) and exactly as it was written."""
+        if not part["shard"]["count"] == len(part["scenarios"]) == self._shard_size:
+            return False
+        with contextlib.suppress(DataError):
+            Shard(self._partial.content, part["shard"], self._buffer.dtype, part["scenarios"]).check_digest()
+            return True
+        return False
 
     @property
     def folder(self) -> Path:
@@ -174,9 +199,8 @@ class ScenarioWriter:
         with (folder / crc_name(name)).open("wb") as file:
             np.save(file, np.array(self._crcs, np.uint32))
             sync_and_close(file)
-        with (folder / name).open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        shard = {"file": name, "count": count, "sha256": digest}
+        shard = {"file": name, "count": count, "sha256": file_digest(folder / name)}
+        shard["crc_sha256"] = file_digest(folder / crc_name(name))
         summary = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
         self._partial.note(len(self._shards), summary)
         self._shards.append(shard)
@@ -208,11 +232,10 @@ class ScenarioWriter:
             "record_bytes": self._buffer.dtype.itemsize,
             "source": plain(self.source),
             "shards": self._shards,
-            "scenarios": self._entries,
         }
         if self._shares is not None:
             write_splits(self._partial.content, self._entries, self._shares)
-        write_json(self._partial.content / MANIFEST, manifest)
+        write_text(self._partial.content / MANIFEST, _manifest_text(manifest, self._entries))
         if self._further is not None:
             self._further(self._partial.content)
         self._refuse_existing()  # Another process may have written it in the meantime.
@@ -221,9 +244,10 @@ class ScenarioWriter:
     def _refuse_existing(self) -> None:
         """Refuse a path that exists, except an empty folder, or a scenario set if it may be overwritten."""
         path = self.path
+        restore_folder(path)
         if path.is_dir() and not any(path.iterdir()):
             return
-        if (path.exists() or path.is_symlink()) and not (path / MANIFEST).is_file():
+        if path.exists() and not (path / MANIFEST).is_file():
             raise UsageError("exists and is not a scenario set", file=path, cure="choose another name")
         check_output(path, self.overwrite, folder=True)
 
@@ -239,15 +263,22 @@ class ScenarioSet(Sequence[Scenario]):
         self.capacity = Capacity(**manifest["capacity"])
         self.entries: list[dict[str, Any]] = manifest["scenarios"]
         self._dtype = record_dtype(self.capacity)
-        self._shards = [Shard(self.path, shard, self._dtype) for shard in manifest["shards"]]
-        self._starts = np.cumsum([0, *(shard.count for shard in self._shards)])
+        self._starts = np.cumsum([0, *(shard["count"] for shard in manifest["shards"])])
+        self._shards = [
+            Shard(self.path, shard, self._dtype, self.entries[start : start + shard["count"]])
+            for shard, start in zip(manifest["shards"], self._starts, strict=False)
+        ]
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = True) -> ScenarioSet:
         """Open a set.
 
+        Shards and entries are compared with the digests of the manifest (sets of earlier versions have none), and the
+        first and the last record of each shard with their entries; no record is read as a whole.
+
         Raises:
-            DataError: The manifest, or the size or layout of a shard, is wrong.
+            DataError: The manifest or a shard is damaged, or belongs to another set or to another place in this one.
+            UsageError: The system allows fewer open files than the set has shards.
         """
         result = cls(path, read_manifest(Path(path)), verify)
         if len(result) != int(result._starts[-1]):
@@ -255,6 +286,7 @@ class ScenarioSet(Sequence[Scenario]):
             raise DataError(problem, file=result.path / MANIFEST, cure=AGAIN)
         for shard in result._shards:
             shard.check_files()
+        allow_open_files(result.path, len(result._shards))  # each memory map is one
         return result
 
     def __len__(self) -> int:
@@ -292,7 +324,7 @@ class ScenarioSet(Sequence[Scenario]):
 
     @property
     def hash(self) -> str:
-        """SHA-256 (hex) over the checksums of the shards."""
+        """SHA-256 (hex) over those of the shards; entries (tags, audit) have one of their own in the manifest."""
         digests = "".join(shard["sha256"] for shard in self.manifest["shards"])
         return hashlib.sha256(digests.encode()).hexdigest()
 
@@ -339,26 +371,38 @@ def check_lengths(first: ScenarioSet, *others: ScenarioSet) -> None:
 
 
 class Shard:
-    """A shard file: expected layout, memory map, and a mask of the records that passed their checksum."""
+    """A shard file: expected layout, memory map, and a mask of the records that passed their checksum.
 
-    def __init__(self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any]) -> None:
+    ``entry`` is that of the shard in the manifest, ``scenarios`` are those of its records.
+    """
+
+    def __init__(
+        self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any], scenarios: Sequence[Mapping[str, Any]]
+    ) -> None:  # fmt: skip
         self.path = folder / entry["file"]
         self.crc_path = folder / crc_name(entry["file"])
         self.count = int(entry["count"])
-        self._sha256 = entry["sha256"]
-        self._dtype = dtype
+        self._entry, self._scenarios, self._dtype = entry, scenarios, dtype
         self._data: _Bytes | None = None
         self._crcs = np.zeros(0, np.uint32)
         self._intact = np.zeros(self.count, bool)
 
     def check_files(self) -> int:
-        """Test presence, layout and size; return the offset of the first record."""
+        """Test presence, layout, size, checksum file and ids; return the offset of the first record."""
         for path in (self.path, self.crc_path):
             if not path.is_file():
                 raise DataError("shard is missing", file=path, cure=f"restore the file or {AGAIN}")
+        self._check_file("crc_sha256")
         with self.path.open("rb") as file:
             shape, dtype = read_header(file, self.path)
             offset = file.tell()
+            self._check_layout(shape, dtype, offset)
+            for row in {0, self.count - 1} if self.count else ():  # a half-copied file may end in zeros
+                file.seek(offset + row * self._dtype.itemsize)
+                self._check_names(row, np.frombuffer(file.read(_PAGE), np.uint8))
+        return offset
+
+    def _check_layout(self, shape: tuple[int, ...], dtype: np.dtype[Any], offset: int) -> None:
         if shape != (self.count,) or dtype != self._dtype:
             raise DataError("shard does not have the layout its manifest names", file=self.path, cure=AGAIN)
         size = self.path.stat().st_size
@@ -366,7 +410,16 @@ class Shard:
             whole = max(0, size - offset) // self._dtype.itemsize
             problem = f"shard is truncated or has trailing bytes: {whole} whole records of {self.count}"
             raise self._damage(problem, min(whole, self.count))
-        return offset
+
+    def _check_names(self, row: int, data: _Bytes) -> None:
+        """Compare the names at the beginning of a record with its entry in the manifest."""
+        fields = self._dtype.fields or {}
+        for name in NAMES:
+            size, begin = fields[name][0].itemsize, fields[name][1]
+            expected = stored_name(text := str(self._scenarios[row][name]), size)
+            if data[begin : begin + size].tobytes().rstrip(b"\0") != expected:
+                problem = f"{name} is not {text!r}, that of the manifest: half copied, or another shard"
+                raise self._damage(problem, row)
 
     def record(self, row: int, verify: bool) -> _Bytes:
         """Return a view of the bytes of a record; with ``verify``, test its checksum at first use."""
@@ -374,14 +427,21 @@ class Shard:
         if verify and not self._intact[row]:
             if zlib.crc32(data[row].data) != int(self._crcs[row]):
                 raise self._damage("checksum mismatch, the record is damaged", row)
+            self._check_names(row, data[row])
             self._intact[row] = True
         return data[row]
 
     def check_digest(self) -> None:
-        """Compare the file's SHA-256 with the manifest's."""
-        with self.path.open("rb") as file:
-            if hashlib.file_digest(file, "sha256").hexdigest() != self._sha256:
-                raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
+        """Test the files as :meth:`check_files` does, and the SHA-256 of all records."""
+        self.check_files()
+        self._check_file("sha256")
+
+    def _check_file(self, key: str) -> None:
+        """Compare a file's SHA-256 with the manifest's; earlier versions stored none of the checksums."""
+        path = self.crc_path if key == "crc_sha256" else self.path
+        if self._entry.get(key) not in (None, file_digest(path)):
+            problem, cure = "SHA-256 differs from the manifest's", f"copy the whole set again or {AGAIN}"
+            raise DataError(f"{problem}: damaged, or of another set", file=path, cure=cure)
 
     def _map(self) -> _Bytes:
         with _HEADER_LOCK:
@@ -433,6 +493,7 @@ def field_table(capacity: Capacity) -> list[dict[str, Any]]:
 def read_manifest(path: Path) -> dict[str, Any]:
     """Read the manifest of the set at ``path``."""
     file = path / MANIFEST
+    restore_folder(path)
     if not path.is_dir():
         problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"
         raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
@@ -440,7 +501,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
         raise DataError("no manifest.json, so this is not a complete scenario set", file=path, cure=cure)
     try:
-        manifest = json.loads(file.read_bytes())
+        manifest = json.loads(text := file.read_bytes())
         version = manifest["schema_version"]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"manifest is damaged ({error})", file=file, cure=AGAIN) from error
@@ -449,6 +510,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         problem = f"schema version {version}, this drivax reads {SCHEMA_VERSION}"
         raise DataError(problem, file=file, cure="upgrade drivax" if newer else AGAIN)
     _check_manifest(manifest, file)
+    _check_entries(manifest, text, file)
     return manifest
 
 
@@ -464,6 +526,32 @@ def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
         raise DataError(f"manifest is damaged ({error!r})", file=file, cure=AGAIN) from error
     if not fields_agree:
         raise DataError("field table is not this version's", file=file, cure=AGAIN)
+
+
+def _manifest_text(manifest: Mapping[str, Any], entries: Sequence[Any]) -> str:
+    """Return a manifest as JSON, with the SHA-256 of its last part: the entries of the scenarios."""
+    end = _entries_text(entries)
+    digest = hashlib.sha256(end.encode()).hexdigest()
+    return json.dumps({**manifest, ENTRIES_DIGEST: digest}, indent=1, allow_nan=False)[:-2] + "," + end
+
+
+def _entries_text(entries: Sequence[Any]) -> str:
+    return json.dumps({"scenarios": entries}, indent=1, allow_nan=False)[1:]
+
+
+def _check_entries(manifest: Mapping[str, Any], text: bytes, file: Path) -> None:
+    """Compare the entries of the scenarios with their digest, which sets of earlier versions do not have."""
+    if (digest := manifest.get(ENTRIES_DIGEST)) is None:
+        return
+    end = text[max(0, text.find(b'\n "scenarios": ')) :]
+    if digest != hashlib.sha256(end).hexdigest():  # of another program's JSON, compare the values
+        end = _entries_text(manifest["scenarios"]).encode()
+        if digest != hashlib.sha256(end).hexdigest():
+            problem, cure = (
+                "entries of scenarios (ids, tags, audit) were changed",
+                f"copy it again or {AGAIN}",
+            )
+            raise DataError(problem, file=file, cure=cure)
 
 
 def shard_name(number: int) -> str:

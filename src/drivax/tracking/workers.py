@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -10,6 +11,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Any, TypeVar
+
+from drivax.errors import UsageError
+
+#: Errors of semaphores, which lie in /dev/shm on Linux.
+_NO_SHARED_MEMORY = (errno.ENOENT, errno.ENOSYS, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC)
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -22,11 +28,18 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> ProcessPool
     """
     processes = multiprocessing.get_context("spawn")
     core_queue: Any = None
-    if cores is not None:
-        core_queue = processes.SimpleQueue()
-        for core in cores:
-            core_queue.put(core)
-    return ProcessPoolExecutor(workers, processes, initializer=_start, initargs=(core_queue,))
+    try:
+        if cores is not None:
+            core_queue = processes.SimpleQueue()
+            for core in cores:
+                core_queue.put(core)
+        return ProcessPoolExecutor(workers, processes, initializer=_start, initargs=(core_queue,))
+    except OSError as error:  # it names no file
+        if error.errno not in _NO_SHARED_MEMORY:
+            raise
+        problem = f"no shared memory for worker processes ({os.strerror(error.errno)})"
+        cure = "mount it (docker run --shm-size 1g), or make room there"
+        raise UsageError(problem, file="/dev/shm", cure=cure) from error
 
 
 def one_core_each(
@@ -44,7 +57,10 @@ def one_core_each(
             for future in as_completed(futures):
                 yield futures[future], future.result()
         except BaseException:
+            running = list((pool._processes or {}).values())
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in running:  # a signal reached this process alone
+                process.terminate()
             raise
 
 
