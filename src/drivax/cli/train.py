@@ -122,14 +122,17 @@ def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
             return data
         table = read_scores(args.scores, data)
         return WeightedSet(
-            data, sampling_weights(table, weighting, args.scale or "step", usable_steps(config, data))
+            data,
+            sampling_weights(
+                table, weighting, args.scale or "step", usable_steps(config, data, args.trust_code)
+            ),
         )
     from drivax.studies.definition import load_study
 
     arm = load_study("longtail").arms[args.arm]
     _check_arm(args, arm, config)
     tables = partial(_table, args, data)
-    return arm.weigh(data, tables, weighting, usable_steps(config, data), config.seed)
+    return arm.weigh(data, tables, weighting, usable_steps(config, data, args.trust_code), config.seed)
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:

@@ -160,13 +160,13 @@ class _Scenarios:
         return cls(data, weights, None)
 
 
-def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
-    """Return which logged steps ``[N, T]`` an offline training draws from, of any ego.
+def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = ()) -> np.ndarray:
+    """Return which logged steps ``[N, T]`` an offline training draws from, of any ego; ``trust`` as for :func:`train`.
 
     Raises:
         UsageError: The algorithm is not offline.
     """
-    environment, bank = _environment(config, data)
+    environment, bank = _environment(config, data, trust)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
     usable = np.asarray(experience.usable).reshape(len(data), -1, bank.steps)
     return np.asarray(usable.any(axis=1))
@@ -206,13 +206,15 @@ def _held_out_data(
     return training_data(config.algorithm, environment, held_out.bank)
 
 
-def _environment(config: TrainConfig, data: Iterable[Scenario]) -> tuple[Driving | Mixture, ScenarioBank]:
+def _environment(
+    config: TrainConfig, data: Iterable[Scenario], trust: Sequence[str]
+) -> tuple[Driving | Mixture, ScenarioBank]:
     """Return the environment of a training, and its bank.
 
     Raises:
         UsageError: ``egos`` is moving, but the set has no further egos.
     """
-    environment, bank = training_environment(config), ScenarioBank.from_scenarios(data)
+    environment, bank = training_environment(config, trust), ScenarioBank.from_scenarios(data)
     if config.egos == "moving" and bank.most_egos == 1:
         cure = "convert or generate the set with --egos 8"
         raise UsageError("egos is moving, but only the recorded ego of each scenario has a route", cure=cure)
