@@ -75,12 +75,13 @@ def trust_cure(names: Collection[str]) -> str:
 def _may_be_named(thing: Any, module_name: str) -> bool:
     """Return whether data may name an object of a module: what its package defines, or a component of drivax.
 
-    A component is a dataclass, an instance of one, or a function with arguments, as terms and features are.
+    A component is a dataclass, an instance of one, or a function with arguments of ``drivax.tasks``, which is pure.
     """
-    origin = str(getattr(thing, "__module__", None)).partition(".")[0]
-    if origin != "drivax":
-        return origin == module_name.partition(".")[0]
-    return is_dataclass(thing) or (inspect.isfunction(thing) and not _accepts(thing, ()))
+    origin = str(getattr(thing, "__module__", None))
+    if origin.partition(".")[0] != "drivax":
+        return origin.partition(".")[0] == module_name.partition(".")[0]
+    is_term = inspect.isfunction(thing) and origin.startswith("drivax.tasks.") and not _accepts(thing, ())
+    return is_dataclass(thing) or is_term
 
 
 def _import(module_name: str, name: str) -> Any:

@@ -121,12 +121,8 @@ def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
                 raise UsageError("--scale without scores to weight", cure="pass --scores")
             return data
         table = read_scores(args.scores, data)
-        return WeightedSet(
-            data,
-            sampling_weights(
-                table, weighting, args.scale or "step", usable_steps(config, data, args.trust_code)
-            ),
-        )
+        usable = usable_steps(config, data, args.trust_code)
+        return WeightedSet(data, sampling_weights(table, weighting, args.scale or "step", usable))
     from drivax.studies.definition import load_study
 
     arm = load_study("longtail").arms[args.arm]
