@@ -80,7 +80,9 @@ def load(
     return Loaded(selection, ScenarioBank.from_scenarios(selection), scenario_names(selection), sizes)
 
 
-def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> Simulator:
+def make_simulator(
+    task: Task | None = None, traffic: str | Traffic = "log", *, trust: Sequence[str] = ()
+) -> Simulator:
     """Make a simulator.
 
     Args:
@@ -88,21 +90,22 @@ def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> 
         traffic: Traffic model: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
             ``zoo:NAME``), or a traffic object. All but ``log`` may need a prepared bank:
             ``bank = simulator.traffic.bank_data.prepare_bank(simulator.traffic, bank)``.
+        trust: Modules outside drivax whose code that policy may name.
     """
-    return Simulator(task or Task(), as_traffic(traffic))
+    return Simulator(task or Task(), as_traffic(traffic, trust))
 
 
-def as_traffic(traffic: str | Traffic) -> Traffic:
+def as_traffic(traffic: str | Traffic, trust: Sequence[str] = ()) -> Traffic:
     """Return the traffic of a name (:func:`make_simulator`); a traffic object stays as it is."""
     if not isinstance(traffic, str):
         return traffic
-    return make_traffic(traffic) if traffic in TRAFFIC else learning.find_traffic(traffic)
+    return make_traffic(traffic) if traffic in TRAFFIC else learning.find_traffic(traffic, trust)
 
 
 def evaluate(
     planner: str | Path | Planner | Callable[..., Any], data: str | Path | Loaded, *, task: Task | None = None,
     traffic: str | Traffic = "log", start: Start | None = None, sample: bool = False,
-    metrics: Sequence[str] = (), **options: Any,
+    metrics: Sequence[str] = (), trust: Sequence[str] = (), **options: Any,
 ) -> EpisodeTable:  # fmt: skip
     """Evaluate a planner, by name or as an object, on every scenario, without writing files.
 
@@ -114,11 +117,12 @@ def evaluate(
         start: Start of the episodes: as logged by default, or ``simulator.starts.NoisyStart()``.
         sample: Whether a policy by name samples its actions instead of taking the mode.
         metrics: User-defined metrics as ``module:name``, in addition to all built-in ones.
+        trust: Modules outside drivax whose code trained policies, as planner or traffic, may name.
         options: ``start_step``, ``seed``, ``batch`` and ``progress`` of :class:`drivax.evaluation.runner.Options`.
     """
     loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):
-        planner, task = find_planner(str(planner), loaded.bank, sample, task)
+        planner, task = find_planner(str(planner), loaded.bank, sample, task, trust)
     elif sample:
         raise UsageError("only a policy by name can sample", cure="leave out sample=")
     planner = as_planner(planner, getattr(planner, "__name__", "planner"))
@@ -126,7 +130,7 @@ def evaluate(
         planner,
         data.scenarios if isinstance(data, Loaded) else ScenarioSet.open(data),
         task=with_metrics(task or default_task(planner), tuple(metrics)),
-        traffic=as_traffic(traffic),
+        traffic=as_traffic(traffic, trust),
         start=start,
         sizes=loaded.sizes,
         **options,
@@ -134,7 +138,7 @@ def evaluate(
 
 
 def find_planner(
-    name: str, bank: ScenarioBank, sample: bool = False, task: Task | None = None
+    name: str, bank: ScenarioBank, sample: bool = False, task: Task | None = None, trust: Sequence[str] = ()
 ) -> tuple[Planner, Task]:
     """Return a planner by name, run folder or zoo policy, with its task.
 
@@ -143,9 +147,10 @@ def find_planner(
         bank: Scenarios of the evaluation, which determine the shapes of a policy.
         sample: Whether a trained policy samples its actions.
         task: Task of a named planner; None for the default task with the planner's own action space.
+        trust: Modules outside drivax whose code a trained policy may name.
 
     Raises:
-        UsageError: Unknown planner, folder or policy, or a task for a trained policy.
+        UsageError: Unknown planner, folder or policy, a task for a trained policy, or code that is not trusted.
     """
     if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
         planner = make_planner(name, task and task.actions)
@@ -156,7 +161,7 @@ def find_planner(
         raise UsageError(f"unknown planner {name!r}", cure=f"use {', '.join(kinds)}")
     if task is not None:
         raise UsageError(f"trained policy {name!r} has its own task", cure="leave out --task (task=)")
-    return learning.load_policy(folder, bank, step=step, samples=sample)
+    return learning.load_policy(folder, bank, step=step, samples=sample, trust=trust)
 
 
 def generate(

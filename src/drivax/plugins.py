@@ -1,4 +1,8 @@
-"""User-defined classes and functions by dotted name, ``package.module:name``, as in configuration files."""
+"""User-defined classes and functions by dotted name, ``package.module:name``, as in configuration files.
+
+A name that the user writes resolves anywhere. A name in data (a run folder, a policy, a score table) resolves only to a
+component of drivax, or within a module that the user trusts.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,17 @@ import importlib.util
 import inspect
 import re
 import sys
+import typing
+from collections.abc import Collection
+from dataclasses import is_dataclass
 from pathlib import Path
+from types import BuiltinFunctionType
 from typing import Any
 
 from drivax.errors import UsageError, did_you_mean
 
-_FORM = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
+#: ``zoo:NAME`` is a policy of the package, never a module.
+_FORM = re.compile(r"(?!zoo:)[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 
 
 def is_dotted(value: Any) -> bool:
@@ -20,16 +29,29 @@ def is_dotted(value: Any) -> bool:
     return isinstance(value, str) and _FORM.fullmatch(value) is not None
 
 
-def find_named(name: str) -> Any:
+def is_trusted(name: str, trust: Collection[str]) -> bool:
+    """Return whether a name leads into drivax, or into one of these modules and packages."""
+    module_name = name.partition(":")[0]
+    return any(f"{module_name}.".startswith(f"{module}.") for module in ("drivax", *trust))
+
+
+def find_named(name: str, trust: Collection[str] | None = None) -> Any:
     """Import the object with a dotted name.
 
     Modules are searched on Python's path first, then in the current folder.
 
+    Args:
+        name: ``package.module:name``.
+        trust: None for a name that the user wrote; for a name in data, the modules that the user trusts.
+
     Raises:
-        UsageError: The name is not dotted, its module cannot be imported, or the module lacks the object.
+        UsageError: The name is not dotted or not trusted, its module cannot be imported, or the module lacks the
+            object.
     """
     if not is_dotted(name):
         raise UsageError(f"{name!r} is not a dotted name", cure="write package.module:name")
+    if trust is not None and not is_trusted(name, trust):
+        raise UsageError(f"{name!r} is not part of drivax", cure=trust_cure([name]))
     module_name, _, path = name.partition(":")
     target = _import(module_name, name)
     for attribute in path.split("."):
@@ -38,7 +60,28 @@ def find_named(name: str) -> Any:
             cure = did_you_mean(attribute, names, otherwise=f"define {attribute} there")
             raise UsageError(f"{name!r}: {module_name!r} has no {attribute!r}", cure=cure)
         target = getattr(target, attribute)
+    if trust is not None and not _may_be_named(target, module_name):
+        raise UsageError(f"{name!r} is not a component of {module_name!r}", cure="do not use this file")
     return target
+
+
+def trust_cure(names: Collection[str]) -> str:
+    """Return the cure for names in data whose modules are not trusted."""
+    modules = sorted({name.partition(":")[0] for name in names})
+    flags = " ".join(f"--trust-code {module}" for module in modules)
+    return f"read the code, then pass {flags} (in Python trust={modules})"
+
+
+def _may_be_named(thing: Any, module_name: str) -> bool:
+    """Return whether data may name an object of a module: what its package defines, or a component of drivax.
+
+    A component is a dataclass, an instance of one, or a function with arguments of ``drivax.tasks``, which is pure.
+    """
+    origin = str(getattr(thing, "__module__", None))
+    if origin.partition(".")[0] != "drivax":
+        return origin.partition(".")[0] == module_name.partition(".")[0]
+    is_term = inspect.isfunction(thing) and origin.startswith("drivax.tasks.") and not _accepts(thing, ())
+    return is_dataclass(thing) or is_term
 
 
 def _import(module_name: str, name: str) -> Any:
@@ -86,27 +129,59 @@ def check_arguments(function: Any, name: str, arguments: tuple[Any, ...]) -> Non
     """Check that a callable accepts these positional arguments.
 
     Raises:
-        ValueError: The signature differs.
+        ValueError: The signature differs or, as of some builtins, is unknown.
     """
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
-        return  # builtins have no signature
-    try:
-        signature.bind(*arguments)
-    except TypeError as error:
+    if not _accepts(function, arguments):
         types = ", ".join(getattr(argument, "__name__", str(argument)) for argument in arguments)
-        raise ValueError(f"{name!r} takes {signature}; it is called with ({types})") from error
+        signature = _signature(function) or "unknown arguments"
+        raise ValueError(f"{name!r} takes {signature}; it is called with ({types})")
+
+
+def _accepts(function: Any, arguments: tuple[Any, ...]) -> bool:
+    """Return whether a callable is known to accept these positional arguments."""
+    signature = _signature(function)
+    try:
+        return signature is not None and signature.bind(*arguments) is not None
+    except TypeError:
+        return False
+
+
+def _signature(function: Any) -> inspect.Signature | None:
+    try:
+        return inspect.signature(function)
+    except (TypeError, ValueError):
+        return None
+
+
+def result_class(function: Any) -> type | None:
+    """Return the class of what a class or function makes, judged without a call; None if unknown."""
+    if isinstance(function, type):
+        return function
+    if isinstance(function, BuiltinFunctionType):
+        return type(None)
+    try:
+        result = typing.get_type_hints(function).get("return")
+    except Exception:  # annotations are any code
+        return None
+    return result if isinstance(result, type) else None
+
+
+def makes(function: Any, protocol: Any) -> bool:
+    """Return whether a class or function, called without arguments, may make an object of a protocol."""
+    cls = result_class(function)
+    methods = [name for name in protocol_members(protocol) if callable(getattr(protocol, name, None))]
+    has_methods = cls is None or all(callable(getattr(cls, name, None)) for name in methods)
+    return callable(function) and has_methods and _accepts(function, ())
 
 
 def check_protocol(thing: Any, name: str, protocol: Any) -> None:
-    """Check that an object has all members of a protocol.
+    """Check that an object, or a dataclass by its fields, has all members of a protocol.
 
     Raises:
         ValueError: A member is missing.
     """
     for member in protocol_members(protocol):
-        if not hasattr(thing, member):
+        if not hasattr(thing, member) and member not in getattr(thing, "__dataclass_fields__", ()):
             raise ValueError(f"{name!r} lacks {member!r}; see {protocol.__module__}.{protocol.__name__}")
 
 

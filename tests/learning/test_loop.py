@@ -71,7 +71,7 @@ def test_seeds_are_runs_of_their_own(data, config, tmp_path):
         for one, other in zip(numbers(last_state(path)), numbers(last_state(alone)), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-6)
     bank = ScenarioBank.from_scenarios(data)
-    assert load_policy(inside[0], bank)[1] == config.task
+    assert load_policy(inside[0], bank, trust=["toy_learner"])[1] == config.task
     with pytest.raises(UsageError, match=r"contains 3 seeds; name one, as .*seed-4"):
         load_policy(folder.path, bank)
     _, trainings = read_runs([folder.path])
@@ -111,7 +111,10 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
         assert learned_from(str(path)) == learned_from(str(former)), "each set once"
     # Without a step it is the best; whoever resumes from the very beginning finds the same.
     run = train(replace(onward, begin_from=str(former)), data, tmp_path / "best", validation=data)
-    assert run.config(TrainConfig).begin_from == f"{former}@60" and run.info["networks_from"]["step"] == 60
+    assert (
+        run.config(TrainConfig, trust=["toy_learner"]).begin_from == f"{former}@60"
+        and run.info["networks_from"]["step"] == 60
+    )
     before = numbers(last_state(run.path))
     shutil.rmtree(run.checkpoints)
     train(config, data, run.path, validation=data, resume=True)

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -40,6 +40,7 @@ class Bench(BenchConfig):
     """Scenario set to simulate."""
     scenarios: int = 1024
     """Number of scenarios to generate without --data."""
+    trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
     task: tyro.conf.Suppress[tyro.conf.Fixed[Task]] = field(default_factory=Task)
     metrics: bool = False
     """Compare the metric sets none, training and full at batch 32, 128 and the fastest, instead of timing parts."""

@@ -60,6 +60,8 @@ class Evaluate(EvaluationConfig):  # noqa: D101
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=NUMBER")
     ] = ()
     """Change a condition of a policy that was trained with conditions; repeat it to change several."""
+    trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
+    """Run code of this module of yours that a trained policy names; repeat it to trust several."""
     overwrite: bool = False
     """Replace OUT if it is a run folder."""
 
@@ -67,7 +69,7 @@ class Evaluate(EvaluationConfig):  # noqa: D101
 def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     """Evaluate, then print the headline metrics and crashes."""
     # Check names before the evaluation starts.
-    traffic = as_traffic(args.traffic)
+    traffic = as_traffic(args.traffic, args.trust_code)
     metrics = tuple(name for name in args.metrics if name != _DEVKIT)
     select_metrics(metrics)
     if _DEVKIT in args.metrics:
@@ -75,7 +77,7 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     requested_task = _requested_task(overrides)
     data = ScenarioSet.open(args.data)
     first = load(args.data, 1, filters=args.filter, scenarios=args.scenarios)
-    planner, task = find_planner(args.planner, first.bank, args.sample, requested_task)
+    planner, task = find_planner(args.planner, first.bank, args.sample, requested_task, args.trust_code)
     task = replace(task, conditions=fix_conditions(task.conditions, parse_values(args.condition)))
     config = record_of(EvaluationConfig, args, task=task, metrics=metrics)
     results = run_evaluation(

@@ -48,6 +48,8 @@ class Inspect:
     """Planner of --observations: a name, the run folder of a training run or zoo:NAME; the log by default."""
     traffic: str | None = None
     """Traffic of --observations: log (the default), idm, zoo:NAME, ... as for drivax evaluate."""
+    trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
+    """Run code of this module of yours that a trained policy names; repeat it to trust several."""
     task: str | None = None
     """Training configuration (file or preset) of the observations; a trained policy has its own."""
     draw: Path | None = None
@@ -148,11 +150,11 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     scenarios = list(inspection.sample(_OBSERVED_SCENARIOS))
     bank = ScenarioBank.from_scenarios(scenarios)
     requested_task = None if args.task is None else settings.load(TrainConfig, args.task).task
-    planner, task = find_planner(args.planner or "expert", bank)
+    planner, task = find_planner(args.planner or "expert", bank, trust=args.trust_code)
     task = requested_task or task
     if args.planner is None:
         planner = Expert(actions=task.actions)
-    traffic = find_traffic(args.traffic or "log")
+    traffic = find_traffic(args.traffic or "log", args.trust_code)
     statistics = observation_statistics(planner, bank, task, permute=not planner.replays, traffic=traffic)
     if args.json:
         json.dump(statistics.as_dict(), sys.stdout, indent=1)

@@ -69,6 +69,9 @@ class Train:
     """Number of consecutive seeds to train in one program; each has a folder in OUT."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
     """Start from the networks of another run, with a new replay buffer, optimisers and environments."""
+    trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
+    """Run code of this module of yours that the run to resume, or a policy in the traffic, names; repeat it to trust
+    several."""
     resume: bool = False
     """Continue the run in OUT from its newest checkpoint."""
     overwrite: bool = False
@@ -94,6 +97,7 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
         overwrite=args.overwrite,
         seeds=args.seeds,
         log=lambda line: print(line, file=sys.stderr),
+        trust=args.trust_code,
     )
     print(f"wrote {folder.path}")
     return 0
@@ -117,15 +121,14 @@ def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
                 raise UsageError("--scale without scores to weight", cure="pass --scores")
             return data
         table = read_scores(args.scores, data)
-        return WeightedSet(
-            data, sampling_weights(table, weighting, args.scale or "step", usable_steps(config, data))
-        )
+        usable = usable_steps(config, data, args.trust_code)
+        return WeightedSet(data, sampling_weights(table, weighting, args.scale or "step", usable))
     from drivax.studies.definition import load_study
 
     arm = load_study("longtail").arms[args.arm]
     _check_arm(args, arm, config)
     tables = partial(_table, args, data)
-    return arm.weigh(data, tables, weighting, usable_steps(config, data), config.seed)
+    return arm.weigh(data, tables, weighting, usable_steps(config, data, args.trust_code), config.seed)
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:

@@ -116,7 +116,10 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
     config = method.config if config is None else config
     current: dict[str, Any] = {} if method.config is None else plain(config)
     if method.config is not None:
-        stored |= _with_present_names(stored, config, current)
+        try:
+            stored |= _with_present_names(stored, config, current)
+        except UsageError as error:
+            raise DataError(error.problem, file=file, cure="score again with `drivax curate`") from error
     if table.components:
         current["combination"] = asdict(method.combination(config))
     # Convert tuples to lists, as in tables from files.
@@ -130,7 +133,7 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
 def _with_present_names(stored: Mapping[str, Any], config: Any, names: Collection[str]) -> dict[str, Any]:
     """Return stored settings ``names`` with the present names of their fields."""
     values = {name: stored[name] for name in names if name in stored}
-    present = plain(settings.load(type(config), json.loads(json.dumps(values))))
+    present = plain(settings.load(type(config), json.loads(json.dumps(values)), trust=()))
     return {name: value for name, value in present.items() if name in stored}
 
 

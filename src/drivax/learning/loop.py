@@ -27,6 +27,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.select.splits import HoldOut, hold_out
 from drivax.scenario.store import ScenarioSet, check_lengths
+from drivax.settings import modules_of
 from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import RunFolder, run_and_step, seed_folders, trained_on
@@ -39,13 +40,16 @@ _RESUMED_WITH_OTHER = {
 }
 
 
-def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
+def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] = ()) -> Any:
     """Return the :class:`Agent` that ``drivax train`` trains, in parts for a training loop of your own.
 
-    Only shapes of the bank are read; ``agent.environment.prepare`` adds what the traffic needs. Raises UsageError if
-    the algorithm does not interact with an environment (bc, cql, iql, td3_bc).
+    Only shapes of the bank are read; ``agent.environment.prepare`` adds what the traffic needs. ``trust`` is that of
+    :func:`~drivax.learning.policies.load_policy`, for policies in the traffic.
+
+    Raises:
+        UsageError: The algorithm does not interact with an environment (bc, cql, iql, td3_bc).
     """
-    environment = training_environment(config)
+    environment = training_environment(config, trust)
     learner = config.algorithm.build(environment, bank, config.iterations)
     if not isinstance(learner, Agent):
         problem = f"{type(config.algorithm).__name__} has no parts for a loop of your own"
@@ -57,6 +61,7 @@ def train(
     config: TrainConfig, data: ScenarioSet | WeightedSet, out: str | Path, *,
     validation: ScenarioSet | Literal["held_out"] | None = "held_out", resume: bool = False,
     overwrite: bool = False, seeds: int = 1, log: Callable[[str], None] = lambda line: None,
+    trust: Sequence[str] = (),
 ) -> RunFolder:  # fmt: skip
     """Train a policy and write the run folder: configuration, metrics, checkpoints of the full state.
 
@@ -70,6 +75,8 @@ def train(
         overwrite: Replace an existing run folder.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-0``, ...
         log: Called with lines about held-out scenarios, memory, pretrained networks, and early stopping.
+        trust: Modules, besides drivax and those that ``config`` names, whose code the run to resume and policies in the
+            traffic may name.
 
     Raises:
         UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
@@ -78,12 +85,12 @@ def train(
     """
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
     out, folders = Path(out), list[RunFolder]()
-    split = None
+    split, trust = None, (*trust, *modules_of(config))
     if isinstance(validation, str):
         split, validation = _hold_out(data, out, resume), None
     notes = hashes(validation, weights) | ({} if split is None else {"validation": split.note()})
     if resume:
-        config, folders = _resumed_folders(data, notes, out, seeds)
+        config, folders = _resumed_folders(data, notes, out, seeds, trust)
     else:
         RunFolder.check(out, overwrite, "training")
         if config.begin_from is not None:
@@ -92,7 +99,7 @@ def train(
     if seeds < 1:
         raise UsageError(f"{seeds} seeds", cure="use 1 or more")
     scenarios = _Scenarios.of(config, data, weights, split or validation)
-    environment, bank = _environment(config, scenarios.training)
+    environment, bank = _environment(config, scenarios.training, trust)
     learner = config.algorithm.build(environment, bank, config.iterations)
     held_out = None if scenarios.validation is None else Validation.of(scenarios.validation)
     held_out_data = _held_out_data(config, environment, learner, held_out)
@@ -111,7 +118,7 @@ def train(
         rules = (config.checkpoint_rule, config.keep, config.patience)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(explain_full_disk(out))
-        _learn(_Run(config, program, logs, held_out, held_out_data, networks, log))
+        _learn(_Run(config, program, logs, held_out, held_out_data, networks, log, trust))
     return RunFolder.open(out)
 
 
@@ -153,13 +160,13 @@ class _Scenarios:
         return cls(data, weights, None)
 
 
-def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
-    """Return which logged steps ``[N, T]`` an offline training draws from, of any ego.
+def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = ()) -> np.ndarray:
+    """Return which logged steps ``[N, T]`` an offline training draws from, of any ego; ``trust`` as for :func:`train`.
 
     Raises:
         UsageError: The algorithm is not offline.
     """
-    environment, bank = _environment(config, data)
+    environment, bank = _environment(config, data, trust)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
     usable = np.asarray(experience.usable).reshape(len(data), -1, bank.steps)
     return np.asarray(usable.any(axis=1))
@@ -199,13 +206,15 @@ def _held_out_data(
     return training_data(config.algorithm, environment, held_out.bank)
 
 
-def _environment(config: TrainConfig, data: Iterable[Scenario]) -> tuple[Driving | Mixture, ScenarioBank]:
+def _environment(
+    config: TrainConfig, data: Iterable[Scenario], trust: Sequence[str]
+) -> tuple[Driving | Mixture, ScenarioBank]:
     """Return the environment of a training, and its bank.
 
     Raises:
         UsageError: ``egos`` is moving, but the set has no further egos.
     """
-    environment, bank = training_environment(config), ScenarioBank.from_scenarios(data)
+    environment, bank = training_environment(config, trust), ScenarioBank.from_scenarios(data)
     if config.egos == "moving" and bank.most_egos == 1:
         cure = "convert or generate the set with --egos 8"
         raise UsageError("egos is moving, but only the recorded ego of each scenario has a route", cure=cure)
@@ -226,12 +235,12 @@ def _create_folders(
 
 
 def _resumed_folders(
-    data: ScenarioSet, notes: Mapping[str, Any], out: Path, seeds: int
+    data: ScenarioSet, notes: Mapping[str, Any], out: Path, seeds: int, trust: Sequence[str]
 ) -> tuple[TrainConfig, list[RunFolder]]:
     """Return the configuration of a run, and the folder of each of its seeds.
 
     Raises:
-        UsageError: Data or options differ from those of the run.
+        UsageError: Data or options differ from those of the run, or it names code that is not trusted.
     """
     folder = RunFolder.open(out)
     previous = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
@@ -245,7 +254,7 @@ def _resumed_folders(
         raise UsageError(
             f"contains {len(folders)} seeds, not {seeds}", file=out, cure="resume without --seeds"
         )
-    return folder.config(TrainConfig), folders
+    return folder.config(TrainConfig, trust=trust), folders
 
 
 @dataclass(frozen=True)
@@ -258,6 +267,7 @@ class _Run:
     #: Pretrained networks; None: not read yet, since a resumed run rarely needs them.
     networks: Mapping[str, Any] | None
     log: Callable[[str], None]
+    trust: Sequence[str]
 
     def steps(self, iteration: int) -> int:
         """Environment steps of each seed after an iteration."""
@@ -340,7 +350,8 @@ def _validation(run: _Run, validation: Validation, state: LearnerState, number: 
     seeds, device = run.program.seeds, run.program.devices[0]
     parameters = jax.device_put(seeds.member(state.parameters, number), device)
     planner = seeds.learner.planner(parameters, "policy", samples=False)
-    row = validate(planner, validation, run.config.task, find_traffic(run.config.validation_traffic))
+    traffic = find_traffic(run.config.validation_traffic, run.trust)
+    row = validate(planner, validation, run.config.task, traffic)
     if isinstance(seeds.learner, HeldOutMetrics):
         member = jax.device_put(seeds.member(state, number), device)
         metrics = seeds.learner.held_out_metrics(run.held_out_data, member)
@@ -365,7 +376,7 @@ class PretrainedRun:
             DataError: It is not a training run, or has no checkpoint.
         """
         run, step = run_and_step(name)
-        folder, _ = open_policy(run)
+        folder = open_policy(run)
         if (folder.path / POLICY_FILE).is_file():
             problem = "is an exported policy, which cannot be fine-tuned"
             raise UsageError(problem, file=run, cure="name the training run")

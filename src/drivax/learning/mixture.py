@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any, NoReturn
@@ -154,11 +154,16 @@ class Mixture:
         return tuple(sizes.values())
 
 
-def training_environment(config: TrainConfig) -> Driving | Mixture:
-    """Return the environment of a training: one block, or a mixture of several."""
+def training_environment(config: TrainConfig, trust: Sequence[str] = ()) -> Driving | Mixture:
+    """Return the environment of a training: one block, or a mixture of several.
+
+    ``trust`` are the modules whose code policies in the traffic may name.
+    """
 
     def block(name: str) -> Driving:
-        return config.self_play_environment() if name == SELF else config.environment(find_traffic(name))
+        return (
+            config.self_play_environment() if name == SELF else config.environment(find_traffic(name, trust))
+        )
 
     blocks = tuple((name, block(name)) for name in config.shares)
     return blocks[0][1] if len(blocks) == 1 else Mixture(blocks, tuple(config.shares.values()))

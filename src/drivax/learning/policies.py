@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,8 @@ _PROVENANCE = ("command", "started", "versions", "git", "validation", "step")
 _AS_LOGGED = ("--traffic", "log", "--start.kind", "log_start")
 
 
-def open_policy(run: str | Path) -> tuple[RunFolder, TrainConfig]:
-    """Open the folder of a trained policy and its configuration, with traffic and starts as logged.
+def open_policy(run: str | Path) -> RunFolder:
+    """Open the folder of a trained policy.
 
     ``run`` is a run folder of ``drivax train``, a folder of :func:`export_policy`, or ``zoo:NAME``.
 
@@ -42,12 +42,13 @@ def open_policy(run: str | Path) -> tuple[RunFolder, TrainConfig]:
     if folder.info.get("kind") == "seeds":
         inside = seed_folders(folder.path)
         raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
-    return folder, folder.config(TrainConfig, _AS_LOGGED)
+    return folder
 
 
 def load_policy(
-    run: str | Path, bank: ScenarioBank, *, step: int | None = None, samples: bool = False
-) -> tuple[Planner, Task]:
+    run: str | Path, bank: ScenarioBank, *, step: int | None = None, samples: bool = False,
+    trust: Sequence[str] = (),
+) -> tuple[Planner, Task]:  # fmt: skip
     """Load a trained policy as a planner, and the task that it was trained for.
 
     Args:
@@ -56,8 +57,11 @@ def load_policy(
         step: Step of the checkpoint, shown in the planner's name; None: the best, or the newest without a validation.
             UsageError for a step of an exported policy.
         samples: Whether to sample actions instead of taking the mode.
+        trust: Modules outside drivax whose code the policy may name (own features, rewards, ...); UsageError for
+            others.
     """
-    folder, config = open_policy(run)
+    folder = open_policy(run)
+    config = folder.config(TrainConfig, _AS_LOGGED, trust)
     learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
     template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
 
@@ -78,7 +82,7 @@ def load_policy(
 
 def export_policy(
     run: str | Path, out: str | Path, bank: ScenarioBank, notes: Mapping[str, Any] | None = None, *,
-    overwrite: bool = False,
+    overwrite: bool = False, trust: Sequence[str] = (),
 ) -> RunFolder:  # fmt: skip
     """Write the best policy of a run (the newest without a validation) to a folder that loads like the run.
 
@@ -91,16 +95,17 @@ def export_policy(
         bank: Any bank; only shapes of its observations are read.
         notes: More entries for ``run.json``, plain JSON values.
         overwrite: Replace ``out`` if it is a run folder.
+        trust: As for :func:`load_policy`.
     """
-    folder, _ = open_policy(run)
+    folder = open_policy(run)
     step = Checkpoints(folder.checkpoints).best_or_newest()
-    planner, _ = load_policy(run, bank, step=step)
+    planner, _ = load_policy(run, bank, step=step, trust=trust)
     about = {name: folder.info.get(name) for name in _PROVENANCE}
     data = [{name: entry[name] for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
     about |= {"kind": "policy", "data": data, "machine": None, **(notes or {})}
     if step is not None:
         about["step"] = step
-    config = replace(folder.config(TrainConfig), begin_from=None)
+    config = replace(folder.config(TrainConfig, trust=trust), begin_from=None)
     exported = RunFolder.create(out, config, overwrite=overwrite).note(**about)
     pack(exported.path / POLICY_FILE, planner)
     return exported
@@ -112,6 +117,7 @@ class PolicyTraffic(PlannerTraffic):
 
     run: str = ""
     samples: bool = False
+    trust: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -122,12 +128,13 @@ class PolicyTraffic(PlannerTraffic):
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
         """Return the bank with the policy, and with what ``base`` needs; DataError if the checkpoint is damaged."""
         bank = super().prepare(bank)
-        return with_driver(bank, load_policy(self.run, bank, samples=self.samples)[0])
+        return with_driver(bank, load_policy(self.run, bank, samples=self.samples, trust=self.trust)[0])
 
 
 def policy_traffic(
-    run: str | Path, *, count: int = 4, base: Traffic | None = None, samples: bool = False
-) -> PolicyTraffic:
+    run: str | Path, *, count: int = 4, base: Traffic | None = None, samples: bool = False,
+    trust: Sequence[str] = (),
+) -> PolicyTraffic:  # fmt: skip
     """Return traffic in which the best policy of a training run drives up to ``count`` vehicles nearest to ego.
 
     Args:
@@ -135,17 +142,23 @@ def policy_traffic(
         count: Largest number of vehicles that it drives.
         base: Traffic of all other agents; the log by default.
         samples: Whether to sample actions instead of taking the mode.
+        trust: As for :func:`load_policy`.
     """
-    folder, config = open_policy(run)
-    return PolicyTraffic(config.task, count, base or LogTraffic(), run=str(folder.path), samples=samples)
+    folder, trust = open_policy(run), tuple(trust)
+    task, base = folder.config(TrainConfig, _AS_LOGGED, trust).task, base or LogTraffic()
+    return PolicyTraffic(task, count, base, run=str(folder.path), samples=samples, trust=trust)
 
 
-def find_traffic(name: str) -> Traffic:
+def find_traffic(name: str, trust: Sequence[str] = ()) -> Traffic:
     """Return the traffic of a name in a command line or a configuration.
 
     It is one of ``simulator.traffic.reactive.TRAFFIC``; ``package.module:name``; or the folder of a trained policy or
     ``zoo:NAME``, which drives the vehicles nearest to ego while all others follow the log, or the traffic named after a
-    plus sign: ``zoo:NAME+idm``. Raises UsageError if there is none, DataError if a folder is no training run.
+    plus sign: ``zoo:NAME+idm``. ``trust`` is that of :func:`load_policy`.
+
+    Raises:
+        UsageError: There is no such traffic.
+        DataError: The folder is no training run.
     """
     run, base = split_traffic(name)
-    return make_traffic(base) if run is None else policy_traffic(run, base=make_traffic(base))
+    return make_traffic(base) if run is None else policy_traffic(run, base=make_traffic(base), trust=trust)

@@ -11,7 +11,7 @@ from drivax.planners.nuplan.planner import Host, NuplanPlanner, is_nuplan
 from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
 from drivax.planners.simple import ConstantSpeed, ConstantVelocity, Expert, IdmPlanner, RandomActions
-from drivax.plugins import check_arguments, find_named, is_dotted
+from drivax.plugins import check_arguments, find_named, is_dotted, makes, result_class
 from drivax.tasks.actions import ActionSpace
 from drivax.tasks.task import Task
 
@@ -63,7 +63,8 @@ def as_planner(candidate: Any, name: str) -> Planner:
             if is_nuplan(candidate):
                 cure = f"name a function that makes {name} without arguments"
             raise UsageError(str(error), cure=cure) from None
-        return _adapt(candidate if is_nuplan(candidate) else candidate(), name)
+        if not is_nuplan(candidate) and (is_nuplan(result_class(candidate)) or makes(candidate, Planner)):
+            return _adapt(candidate(), name)
     return _adapt(candidate, name)
 
 

@@ -10,19 +10,23 @@ valid name. A class variable ``renamed`` maps former keys to present ones.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from drivax.errors import UsageError, did_you_mean
 from drivax.settings.structure import Flag, kind_of, parse_yaml, plain, structure, write_yaml
+from drivax.settings.trust import check_names, modules_of
 
-__all__ = ["dump", "kind_of", "load", "parse_yaml", "plain", "preset", "presets"]
+__all__ = ["dump", "kind_of", "load", "modules_of", "parse_yaml", "plain", "preset", "presets"]
 
 Record = TypeVar("Record")
 
 
-def load(cls: type[Record], source: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> Record:
+def load(
+    cls: type[Record], source: str | Path | Mapping[str, Any], overrides: Sequence[str] = (), *,
+    trust: Collection[str] | None = None,
+) -> Record:  # fmt: skip
     """Return a configuration record from YAML and command-line overrides.
 
     Args:
@@ -30,16 +34,21 @@ def load(cls: type[Record], source: str | Path | Mapping[str, Any], overrides: S
         source: A YAML file, the name of a preset, or a mapping.
         overrides: ``["--optimizer.lr", "1e-3", "--resume"]`` or ``["--optimizer.lr=1e-3"]``; hyphens in names
             count as underscores. A new ``kind`` discards the settings of the previous one.
+        trust: None for a source that the user wrote. Otherwise it is data, as of a run: its names lead only to drivax
+            and to these modules, and it extends no other file.
 
     Raises:
-        UsageError: File or preset not found, invalid YAML, a cycle, unknown key, or a value of the wrong type.
+        UsageError: File or preset not found, invalid YAML, a cycle, unknown key, a value of the wrong type, or a name
+            that is not trusted.
     """
     if isinstance(source, Mapping):
         file, values = None, _copy(source)
     else:
         file = _find_file(source)
-        values = _read_settings(file)
+        values = _read_settings(file, extends=trust is None)
     values = _override(values, overrides)
+    if trust is not None:
+        check_names(values, trust, file)
     try:
         return structure(values, cls)
     except ValueError as error:
@@ -88,8 +97,8 @@ def _find_file(source: str | Path) -> Path:
     return preset(source)
 
 
-def _read_settings(file: Path, extensions: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return the settings of a file, merged over those of the file that it ``extends``.
+def _read_settings(file: Path, extensions: tuple[Path, ...] = (), extends: bool = True) -> dict[str, Any]:
+    """Return the settings of a file, merged over those of the file that it ``extends`` (unless that key is data).
 
     ``extensions`` are the files that extend this one, from the first one that was read.
     """
@@ -97,7 +106,7 @@ def _read_settings(file: Path, extensions: tuple[Path, ...] = ()) -> dict[str, A
     values = {} if values is None else values
     if not isinstance(values, dict):
         raise UsageError("not a mapping of settings", file=file, cure="write 'name: value' lines")
-    if "extends" not in values:
+    if not extends or "extends" not in values:
         return values
     base, extensions = _find_base(file, values.pop("extends")), (*extensions, file.resolve())
     if base.resolve() in extensions:

@@ -194,19 +194,26 @@ def _to_user_object(value: Any, cls: Any) -> Any:
     options = (
         {key: item for key, item in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
     )
-    if _is_record(user_object):
-        user_object = _converter().structure(options, user_object)
-    elif options:
+    if options and not _is_record(user_object):
         raise ValueError(f"{name!r} takes no settings; make it a frozen dataclass")
     if _is_protocol(cls):
         check_protocol(user_object, name, cls)
-        return user_object
-    if not callable(user_object):
+    else:
+        _check_callable(user_object, name, cls)
+    return _converter().structure(options, user_object) if _is_record(user_object) else user_object
+
+
+def _check_callable(user_object: Any, name: str, cls: Any) -> None:
+    """Check that a function, or an instance of a dataclass, can be called with the arguments of ``cls``."""
+    function, instance = user_object, ()
+    if isinstance(user_object, type):
+        has_call = _is_record(user_object) and any("__call__" in vars(base) for base in user_object.__mro__)
+        function, instance = (user_object.__call__ if has_call else None), (user_object,)
+    if not callable(function):
         raise ValueError(f"{name!r} is not callable; name a function")
     arguments = get_args(cls)[0] if get_args(cls) else ...
     if arguments is not ...:
-        check_arguments(user_object, name, tuple(arguments))
-    return user_object
+        check_arguments(function, name, (*instance, *arguments))
 
 
 def _rank_member(member: Any) -> int:

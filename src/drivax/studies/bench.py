@@ -61,6 +61,7 @@ class BenchConfig:
         repeats: Timed calls; the median is reported.
         task: Observation, reward, metrics.
         traffic: Traffic model: log, idm, package.module:name, a run folder or zoo:NAME.
+        trust_code: Run code of this module of yours that a policy in the traffic names; repeat it to trust several.
     """
 
     batch: int = 256
@@ -68,6 +69,7 @@ class BenchConfig:
     repeats: int = 7
     task: Task = field(default_factory=Task)
     traffic: str = "log"
+    trust_code: tuple[str, ...] = ()
 
 
 def use_all_cores() -> None:
@@ -206,7 +208,7 @@ def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, Scen
             f"batch size {config.batch} is not a multiple of the {jax.device_count()} devices",
             cure="choose a multiple",
         )
-    traffic = find_traffic(config.traffic)
+    traffic = find_traffic(config.traffic, config.trust_code)
     return Simulator(config.task, traffic), replicate(prepare_bank(traffic, bank))
 
 

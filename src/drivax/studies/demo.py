@@ -141,7 +141,9 @@ def run_demo(
     stages.start("evaluation", "evaluating on the held-out scenarios")
     runs, results = [], {}
     planners: dict[str, tuple[Planner, Task]] = {name: (make_planner(name), Task()) for name in REFERENCES}
-    planners["policy"] = load_policy(run, ScenarioBank.from_scenarios(held_out[:1]))
+    planners["policy"] = load_policy(
+        run, ScenarioBank.from_scenarios(held_out[:1]), trust=settings.modules_of(training_config)
+    )
     for name, (planner, task) in planners.items():
         folder = out / "evaluation" / name
         folder.parent.mkdir(exist_ok=True)

@@ -174,7 +174,8 @@ def _open_folder(study: Study) -> None:
         return
     folder = RunFolder.open(study.folder)
     sources = [entry["hash"] for entry in folder.info.get("data", [])]
-    if folder.config(StudyConfig) != study.config or sources != [scenarios.hash for scenarios in data]:
+    config = folder.config(StudyConfig, trust=settings.modules_of(study.config))
+    if config != study.config or sources != [scenarios.hash for scenarios in data]:
         raise UsageError(
             "contains a study with other settings or scenarios",
             file=study.folder,
@@ -253,7 +254,8 @@ def _is_finished(job: Job) -> bool:
     folder = RunFolder.open(run)
     evaluations = [job.study.evaluation(name, job.seed) for name in job.study.evaluations(job.arm)]
     job_hashes = hashes(ScenarioSet.open(job.study.sets.validation), job.training_set().weights)
-    if folder.config(TrainConfig) != job.study.train_config(job.arm, job.seed) or any(
+    config = job.study.train_config(job.arm, job.seed)
+    if folder.config(TrainConfig, trust=settings.modules_of(config)) != config or any(
         folder.info.get(name) != value for name, value in job_hashes.items()
     ):
         raise UsageError(
@@ -296,7 +298,7 @@ def _run_job(job: Job) -> float:
         folder = study.evaluation(name, job.seed)
         if not folder.is_dir():
             step = None if name == job.arm else _best_step(job)
-            planner, task = load_policy(run, bank, step=step)
+            planner, task = load_policy(run, bank, step=step, trust=settings.modules_of(config))
             planner_name = str(run) if step is None else f"{run}@{step}"
             run_evaluation(EvaluationConfig(planner_name, task=task), planner, test, folder)
     return time.perf_counter() - start

@@ -13,7 +13,7 @@ import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -118,14 +118,17 @@ class RunFolder:
         """Kind of the run: ``training``, ``seeds``, ``evaluation``, ``policy``, ..."""
         return self.info.get("kind")
 
-    def config(self, cls: type[Record], overrides: Sequence[str] = ()) -> Record:
+    def config(self, cls: type[Record], overrides: Sequence[str] = (), trust: Collection[str] = ()) -> Record:
         """Return the run's configuration as a record, with overrides as on a command line.
+
+        ``trust`` are the modules outside drivax whose code it may name.
 
         Raises:
             DataError: ``config.yaml`` is missing.
-            UsageError: It does not match ``cls``.
+            UsageError: It does not match ``cls``, or names code that is not trusted.
         """
-        return settings.load(cls, existing(self.path / CONFIG_FILE, "run the command again"), overrides)
+        file = existing(self.path / CONFIG_FILE, "run the command again")
+        return settings.load(cls, file, overrides, trust=trust)
 
     @property
     def settings(self) -> dict[str, Any]:

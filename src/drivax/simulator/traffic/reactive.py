@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
-from drivax.plugins import find_named, is_dotted
+from drivax.plugins import find_named, is_dotted, makes
 from drivax.scenario.bank.columns import SizeColumn
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -247,13 +247,21 @@ TRAFFIC: dict[str, Callable[[], Traffic]] = {"log": LogTraffic, "idm": IdmTraffi
 
 
 def make_traffic(name: str) -> Traffic:
-    """Return the traffic model of a name in :data:`TRAFFIC`, or of ``package.module:name`` (a class or function)."""
+    """Return the traffic model of a name in :data:`TRAFFIC`, or of ``package.module:name``.
+
+    The latter is a model, its class, or a function that makes one without arguments.
+
+    Raises:
+        UsageError: There is no such traffic, or the name leads to something else, which is not called.
+    """
     if name in TRAFFIC:
         return TRAFFIC[name]()
     if not is_dotted(name):
         cure = f"use {', '.join(TRAFFIC)}, or package.module:name"
         raise UsageError(f"there is no traffic {name!r}", cure=cure)
-    traffic = find_named(name)()
+    traffic = find_named(name)
+    if isinstance(traffic, type) or not isinstance(traffic, Traffic):
+        traffic = traffic() if makes(traffic, Traffic) else None
     if not isinstance(traffic, Traffic):
         raise UsageError(f"{name!r} makes no traffic", cure="see drivax.simulator.types.Traffic")
     return traffic
