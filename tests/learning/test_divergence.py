@@ -56,8 +56,7 @@ FAST = {"bc": replace(BC, learning_rate=RATE), "ppo": replace(PPO, learning_rate
 SLOW = {
     "ppo_average": replace(PPO, learning_rate=RATE, average=0.9),
     "bc_ppo": BcPpoConfig(warm_start=WarmStart(iterations=1, settle=1), ppo=replace(PPO, learning_rate=RATE)),
-    "sac": replace(SAC, policy_rate=RATE, critic_rate=RATE),
-    "sac_temperature": replace(SAC, temperature_rate=RATE, average=0.9),
+    "sac": replace(SAC, policy_rate=RATE, critic_rate=RATE, average=0.9),
 }
 SHOWN = Demonstrations({"angle": jnp.linspace(-3, 3, 50), "rate": jnp.zeros(50)}, jnp.zeros((50, 1)))
 
