@@ -149,13 +149,7 @@ class Leaves:
 
 
 def test_flags_are_those_of_each_seed():
-    class Constant:
-        def init(self, data, key):
-            return Leaves(
-                {"a": jnp.zeros(2), "b": jnp.zeros(3), "n": jnp.zeros(2, int)}, jnp.full(2, jnp.nan)
-            )
-
-    seeds = Seeds(Constant(), (0, 1, 2))
+    seeds = Seeds(Toy(ToyConfig()), (0, 1, 2))
     leaves = [jnp.array([[0.0, 1.0], [jnp.inf, 0.0], [2.0, 3.0]]), jnp.zeros((3, 3)).at[2, 1].set(jnp.nan)]
     assert seeds.all_finite(leaves).tolist() == [True, False, False]
     state = Leaves({"a": leaves[0][2], "b": leaves[1][2], "n": jnp.zeros(2, int)}, jnp.full(2, jnp.nan))
