@@ -17,13 +17,22 @@ class ToyState:
     parameters: Any
     key: Any
     iteration: Any
+    seed: Any
 
 
 @dataclass(frozen=True)
 class ToyConfig:
-    """Ten steps an iteration."""
+    """Ten steps an iteration.
+
+    ``nan_at`` is an iteration from which on ``nan_in`` (``parameters``, ``loss`` or ``reward``) is NaN; 0: never. It
+    affects only the seed ``nan_seed``, or with -1 all.
+    """
 
     size: int = 3
+    nan_at: int = 0
+    nan_in: str = "parameters"
+    nan_seed: int = -1
+    kl: float = 0.0
 
     @property
     def steps_per_iteration(self):
@@ -38,13 +47,27 @@ class Toy:
         self.config = config
 
     def init(self, data, key):
-        return ToyState(jnp.zeros(self.config.size), key, jnp.zeros((), jnp.int32))
+        seed = jax.random.key_data(key)[-1].astype(jnp.int32)
+        return ToyState(jnp.zeros(self.config.size), key, jnp.zeros((), jnp.int32), seed)
 
     def iterate(self, data, state):
+        config, iteration = self.config, state.iteration + 1
         key, use = jax.random.split(state.key)
         parameters = state.parameters + jax.random.normal(use, state.parameters.shape)
-        logs = {"loss/toy": parameters.sum(), "loss/sum": 2 * parameters[0], "loss/sum/n": jnp.asarray(2.0)}
-        return ToyState(parameters, key, state.iteration + 1), logs
+        fails = (config.nan_at > 0) & (iteration >= config.nan_at)
+        fails &= (config.nan_seed < 0) | (state.seed == config.nan_seed)
+        nan = {name: jnp.where(fails & (config.nan_in == name), jnp.nan, 0.0) for name in ("loss", "reward")}
+        logs = {
+            "loss/toy": parameters.sum() + nan["loss"],
+            "loss/sum": 2 * parameters[0],
+            "loss/sum/n": jnp.asarray(2.0),
+            "loss/kl": jnp.asarray(config.kl),
+            "rollout/reward/hurry": nan["reward"],
+            "rollout/steps": jnp.asarray(10.0),
+        }
+        if config.nan_in == "parameters":
+            parameters = parameters.at[-1].add(jnp.where(fails, jnp.nan, 0.0))
+        return ToyState(parameters, key, iteration, state.seed), logs
 
     def planner(self, parameters, name, samples):
         return ConstantVelocity()

@@ -187,25 +187,90 @@ def test_unknown_step_is_refused(tmp_path: Path):
         checkpoints.restore({"a": 0}, 7)
 
 
-def test_damage_is_reported(tmp_path: Path):
-    checkpoints = Checkpoints(tmp_path)
-    state = {"w": jax.random.normal(jax.random.key(0), (1000,))}
-    path = checkpoints.save(1, state)
+def write_former(path: Path, **changes: Any) -> dict[str, Any]:
+    """Write ``about.json`` as version 0.1.0 did, without checksums of files."""
     about = json.loads((path / "about.json").read_text())
-    about["leaves"][0]["crc"] ^= 1
+    about = {name: about[name] for name in ("step", "score", "leaves")} | changes
     (path / "about.json").write_text(json.dumps(about))
-    with pytest.raises(DataError, match=r"checksum mismatch in \['w'\]"):
+    return about
+
+
+def test_checkpoints_without_checksums_of_files_are_read(tmp_path: Path):
+    checkpoints, state = Checkpoints(tmp_path), make_state(2)
+    path = checkpoints.save(1, state, 0.25)
+    about = write_former(path)
+    assert bits(checkpoints.restore(make_state(0))) == bits(state) and checkpoints.best() == 1
+    about["leaves"][0]["crc"] ^= 1
+    write_former(path, leaves=about["leaves"])
+    with pytest.raises(DataError, match=r"checksum mismatch in \.key; use another checkpoint"):
         checkpoints.restore(state)
-    checkpoints.save(1, state)
-    for file in (path / "arrays").rglob("*"):
-        if file.is_file() and file.parent.name == "d":
-            os.truncate(file, file.stat().st_size // 2)
-    with pytest.raises(DataError, match="use another checkpoint") as error:
+    about["leaves"][0]["stored"][0] = "ant32"
+    write_former(path, leaves=about["leaves"])
+    with pytest.raises(DataError, match="arrays cannot be read"):
         checkpoints.restore(state)
-    assert "\n" not in str(error.value)
-    (path / "about.json").write_text("{")
-    with pytest.raises(DataError, match=r"about\.json: is damaged"):
-        checkpoints.restore(state)
+
+
+def test_damage_is_found_before_orbax_reads(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """Flips, truncations and deletions of each file, twelve of each; Orbax would print tracebacks of its threads."""
+    checkpoints, rng = Checkpoints(tmp_path), np.random.default_rng(5)
+    state = {"w": rng.normal(size=(50, 40)).astype(np.float32), "n": np.int32(4)}
+    path = checkpoints.save(1, state, 0.5)
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    for number in range(36):
+        file = files[number % len(files)]
+        whole = file.read_bytes()
+        if number % 3 == 0:
+            spoilt = bytearray(whole)
+            spoilt[rng.integers(len(whole))] ^= 1 << int(rng.integers(8))
+            file.write_bytes(spoilt)
+        elif number % 3 == 1:
+            file.write_bytes(whole[: rng.integers(len(whole))])
+        else:
+            file.unlink()
+        with pytest.raises(DataError, match="use another checkpoint, or train again") as raised:
+            checkpoints.restore(state)
+        assert raised.value.file == file and "\n" not in str(raised.value)
+        if file.name == "about.json":
+            with pytest.raises(DataError, match=r"about\.json: is"):
+                checkpoints.best()
+        file.write_bytes(whole)
+    restored = checkpoints.restore(state)
+    assert all((restored[name] == state[name]).all() for name in state)
+    assert capfd.readouterr().err == ""
+
+
+def test_edited_score_is_found(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path)
+    about = checkpoints.save(1, {"a": 1}, 0.25) / "about.json"
+    about.write_text(about.read_text().replace('"score": 0.25', '"score": 0.95'))
+    with pytest.raises(DataError, match=r"about\.json: is damaged .*checksum mismatch"):
+        checkpoints.best()
+
+
+def test_files_are_on_disk_before_the_checkpoint_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    synced, checked = set(), []
+    fsync = os.fsync
+
+    def note_sync(handle: int) -> None:
+        synced.add(os.fstat(handle).st_ino)
+        fsync(handle)
+
+    def check(rename: Any) -> Any:
+        def checked_rename(source: Any, target: Any, **options: Any) -> None:
+            if Path(target).name == "step-000000001":
+                paths = [*Path(source).rglob("*"), Path(source)]
+                checked.append([path for path in paths if path.stat().st_ino not in synced])
+            rename(source, target, **options)
+
+        return checked_rename
+
+    monkeypatch.setattr(os, "fsync", note_sync)
+    for name in ("rename", "replace"):
+        monkeypatch.setattr(os, name, check(getattr(os, name)))
+    path = Checkpoints(tmp_path / "checkpoints").save(1, {"w": np.ones(1000)})
+    assert checked == [[]] and {tmp_path.stat().st_ino, path.parent.stat().st_ino} <= synced
 
 
 def test_scores_of_several_numbers_compare_by_the_first_that_differs(tmp_path: Path):
@@ -213,6 +278,13 @@ def test_scores_of_several_numbers_compare_by_the_first_that_differs(tmp_path: P
     for step, score in ((1, (0.5, 0.9)), (2, (0.75, 0.1)), (3, (0.75, 0.05)), (4, (float("nan"), 1.0))):
         checkpoints.save(step, {"step": step}, score)
     assert checkpoints.best() == 2 and checkpoints.about(4)["score"] is None
+
+
+def test_folder_of_another_step_is_refused(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"a": 1}).rename(tmp_path / "step-000000009")
+    with pytest.raises(DataError, match=r"about\.json: is damaged .*of step 1"):
+        checkpoints.restore({"a": 0})
 
 
 def test_later_checkpoints_are_dropped(tmp_path: Path):

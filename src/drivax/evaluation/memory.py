@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import jax
 
 from drivax.errors import DrivaxError
+from drivax.files import format_bytes
 
 #: Maximum number of scenarios loaded at a time; their bank takes about 6 GB.
 MOST = 10_000
@@ -60,15 +62,19 @@ def scenarios_at_a_time(scenario_bytes: int, lanes: int, free: int | None) -> in
 
 
 @contextmanager
-def report_out_of_memory(count: int) -> Iterator[None]:
-    """Turn an out-of-memory error with ``count`` scenarios loaded into a :class:`DrivaxError`."""
+def report_out_of_memory(use: str, cure: str) -> Iterator[None]:
+    """Turn an out-of-memory error of Python or XLA into a :class:`DrivaxError` that names the use of memory.
+
+    XLA states the size of the array that did not fit.
+    """
     try:
         yield
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        cure = "load fewer at a time (--batch), evaluate fewer (--limit), or free memory"
-        raise DrivaxError(f"out of memory with {count:,} scenarios loaded", cure=cure) from error
+        size = re.search(r"allocat\w+ (\d+) bytes", str(error))
+        array = f": no room for an array of {format_bytes(int(size[1]))}" if size else ""
+        raise DrivaxError(f"out of memory {use}{array}", cure=cure) from error
 
 
 def _group_limits(groups: Path = _GROUPS, process: Path = _PROCESS_GROUPS) -> list[tuple[int, int]]:

@@ -250,7 +250,9 @@ def evaluate(
         size = min(batch or _batch_size(simulator.traffic, scenarios, sizes), len(scenarios))
         banks = _banks(scenarios, identity, size, sizes)
     episodes, done = [], 0
-    with collect_errors() as errors, report_out_of_memory(size):
+    cure = "load fewer at a time (--batch), evaluate fewer (--limit), or free memory"
+    out_of_memory = report_out_of_memory(f"with {size:,} scenarios loaded", cure)
+    with collect_errors() as errors, out_of_memory:
         for bank in banks:
             for batch_episodes in evaluation.episodes(bank):
                 episodes.append(batch_episodes)

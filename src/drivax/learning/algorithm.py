@@ -21,7 +21,8 @@ class LearnerState(Protocol):
     """A pytree with all that a run needs to continue: a ``scenario.record.record``, so that leaves have names.
 
     A class attribute ``networks`` names the fields that fine-tuning takes over from another run, by default
-    ``parameters``; a field may be such a state itself.
+    ``parameters``; a field may be such a state itself. Training stops if a number is not finite, other than in fields
+    ``environments`` and ``replay``.
     """
 
     @property

@@ -14,9 +14,11 @@ import jax
 import numpy as np
 
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.memory import report_out_of_memory
 from drivax.files import explain_full_disk
 from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
+from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.learning.driving import Driving
 from drivax.learning.experience import WeightedSet, check_weights
 from drivax.learning.mixture import Mixture, training_environment
@@ -30,7 +32,7 @@ from drivax.scenario.store import ScenarioSet, check_lengths
 from drivax.settings import modules_of
 from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RunFolder, run_and_step, seed_folders, trained_on
+from drivax.tracking.run_folder import RUN_FILE, RunFolder, run_and_step, trained_on
 
 #: Problem and option, where inputs of a resumed run differ.
 _RESUMED_WITH_OTHER = {
@@ -38,6 +40,9 @@ _RESUMED_WITH_OTHER = {
     "weights": ("was trained with other weights", "weights"),
     "data": ("was trained on other scenarios", "--data"),
 }
+
+#: Entries of ``run.json`` that the folders of several seeds share.
+_INHERITED_NOTES = ("validation", "weights", "networks_from")
 
 
 def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] = ()) -> Any:
@@ -71,7 +76,7 @@ def train(
         out: Run folder.
         validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings with about a tenth
             of its scenarios (at most 256). None trains on all scenarios without validation.
-        resume: Continue the run in ``out`` from its newest checkpoint, with its own configuration and seeds.
+        resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-0``, ...
         log: Called with lines about held-out scenarios, memory, pretrained networks, and early stopping.
@@ -80,7 +85,9 @@ def train(
 
     Raises:
         UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
-        DataError: The run to fine-tune is not a training run, or its networks do not fit.
+        DataError: The run to fine-tune is not a training run, its networks do not fit, or no checkpoint can be read.
+        DivergenceError: Rewards, losses, parameters or actions of a seed are not finite; other seeds were trained.
+        DrivaxError: Memory ran out.
         Preempted: SIGTERM stopped it, after a checkpoint.
     """
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
@@ -118,6 +125,7 @@ def train(
         rules = (config.checkpoint_rule, config.keep, config.patience)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(explain_full_disk(out))
+        stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
         _learn(_Run(config, program, logs, held_out, held_out_data, networks, log, trust))
     return RunFolder.open(out)
 
@@ -230,8 +238,17 @@ def _create_folders(
     if len(seeds) == 1:
         return [RunFolder.create(out, config, [data], overwrite, kind="training", **notes)]
     RunFolder.create(out, config, [data], overwrite, kind="seeds", seeds=len(seeds), **notes)
-    configs = {out / f"seed-{seed}": replace(config, seed=seed) for seed in seeds}
-    return [RunFolder.create(path, own, [data], kind="training", **notes) for path, own in configs.items()]
+    return [_seed_folder(config, data, notes, out, seed) for seed in seeds]
+
+
+def _seed_folder(
+    config: TrainConfig, data: ScenarioSet, notes: Mapping[str, Any], out: Path, seed: int
+) -> RunFolder:
+    """Open the folder of one of several seeds, or create it."""
+    path = out / f"seed-{seed}"
+    if (path / RUN_FILE).is_file():
+        return RunFolder.open(path)
+    return RunFolder.create(path, replace(config, seed=seed), [data], kind="training", **notes)
 
 
 def _resumed_folders(
@@ -249,12 +266,15 @@ def _resumed_folders(
         if previous[name] != value:
             problem, option = _RESUMED_WITH_OTHER[name]
             raise UsageError(problem, file=out, cure=f"resume with the same {option}")
-    folders = [RunFolder.open(path) for path in seed_folders(out)]
-    if seeds not in (1, len(folders)):
-        raise UsageError(
-            f"contains {len(folders)} seeds, not {seeds}", file=out, cure="resume without --seeds"
-        )
-    return folder.config(TrainConfig, trust=trust), folders
+    config, count = folder.config(TrainConfig, trust=trust), folder.info.get("seeds", 1)
+    if seeds not in (1, count):
+        raise UsageError(f"contains {count} seeds, not {seeds}", file=out, cure="resume without --seeds")
+    if folder.kind != "seeds":
+        return config, [folder]
+    # A process that was killed at its start may not have created all of them.
+    notes = {name: folder.info[name] for name in _INHERITED_NOTES if name in folder.info}
+    numbers = range(config.seed, config.seed + count)
+    return config, [_seed_folder(config, data, notes, out, number) for number in numbers]
 
 
 @dataclass(frozen=True)
@@ -275,7 +295,12 @@ class _Run:
 
 
 def _learn(run: _Run) -> None:
-    """Run the remaining iterations."""
+    """Run the remaining iterations.
+
+    Raises:
+        DivergenceError: A seed diverged; the others ran to the end.
+        Preempted: SIGTERM stopped the run.
+    """
     config, program = run.config, run.program
     done, state = _start(run)
     with Progress("training", "steps", run.steps(config.iterations)) as progress, StopSignal() as stop:
@@ -285,12 +310,13 @@ def _learn(run: _Run) -> None:
                 break
             started = time.perf_counter()
             state, values = program.step(state)
-            values = jax.device_get(values)
+            values, finite = jax.device_get((values, program.all_finite(state)))
             rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
             # Read once, so that all seeds write a checkpoint of the same iteration.
             preempted = stop.received and iteration < config.iterations
             means = (mean_logs(program.seeds.member(values, number)) for number in range(len(run.logs)))
             rows = [row | {"steps_per_second": rate} for row in means]
+            _check(run, iteration, state, rows, np.atleast_1d(finite))
             _record(run, iteration, state, rows, preempted)
             success = [row["rollout/success"] for row in rows if "rollout/success" in row]
             note = f"success {sum(success) / len(success):.2f}" if success else ""
@@ -298,30 +324,101 @@ def _learn(run: _Run) -> None:
             if preempted:
                 problem = f"SIGTERM stopped the training after {run.steps(iteration):,} steps"
                 raise Preempted(problem, cure="continue it with --resume")
+    for log in run.logs:
+        if log.divergence is not None:
+            raise log.divergence
 
 
 def _start(run: _Run) -> tuple[int, Any]:
     """Return the number of finished iterations and the state: of the newest checkpoint of all seeds, or initial."""
-    program, logs = run.program, run.logs
-    steps = [set(log.checkpoints.steps()) for log in logs if not log.stopped]
-    if not steps:
+    program = run.program
+    unfinished = [log for log in run.logs if not log.out_of_patience]
+    if all(log.divergence is not None for log in unfinished):
+        # The user may have corrected a reward term.
+        for log in unfinished:
+            log.retry()
+    active = [number for number, log in enumerate(run.logs) if not log.stopped]
+    if not active:
         return run.config.iterations, None
-    step = max(set.intersection(*steps), default=None)
+    logs = [run.logs[number] for number in active]
+    step, states = _restore(run, logs)
+    for log in logs:
+        log.start(step)
     if step is None:
-        for log in logs:
-            log.start(None)
         networks = run.networks
         if networks is None:
             networks = pretrained_networks(run.config.begin_from, program, run.log)
         return 0, initial_state(program, networks)
-    template = program.seeds.member_shapes(program.shapes)
-    states = []
-    for log in logs:
-        # A seed that stopped early resumes from its last checkpoint, but writes nothing more.
-        last = log.newest if log.stopped else step
-        log.start(last)
-        states.append(log.checkpoints.restore(template, last))
+    # Seeds that stopped write nothing more: they take the state of another.
+    restored = dict(zip(active, states, strict=True))
+    states = [restored.get(number, states[0]) for number in range(len(run.logs))]
     return step // run.config.algorithm.steps_per_iteration, program.state_of(states)
+
+
+def _restore(run: _Run, logs: Sequence[TrainingLog]) -> tuple[int | None, list[Any]]:
+    """Return the newest step of which each seed has a healthy checkpoint, and their states; None without any.
+
+    Raises:
+        DataError: All checkpoints are damaged, or seeds have none of the same step.
+    """
+    template = run.program.seeds.member_shapes(run.program.shapes)
+    steps = [set(log.checkpoints.steps()) for log in logs]
+    errors: list[DataError] = []
+    for step in sorted(set.intersection(*steps), reverse=True):
+        try:
+            states = [_healthy_state(log.checkpoints, template, step) for log in logs]
+        except DataError as error:
+            errors.append(error)
+            continue
+        for error in errors:
+            run.log(f"warning: {error.file}: {error.problem}; resumes from step {step:,}")
+        return step, states
+    if errors:
+        raise errors[0]
+    if any(steps):
+        problem = "the seeds have no checkpoint of the same step"
+        raise DataError(problem, file=logs[0].folder.path.parent, cure="start again with --overwrite")
+    return None, []
+
+
+def _healthy_state(checkpoints: Checkpoints, template: Any, step: int) -> Any:
+    """Restore a state.
+
+    Raises:
+        DataError: The checkpoint is damaged, does not match, or contains a number that is not finite.
+    """
+    state = checkpoints.restore(template, step)
+    if problem := nonfinite_leaf(state):
+        cure = "start again with --overwrite and a lower learning rate"
+        raise DataError(f"checkpoint of step {step}: {problem}", file=checkpoints.folder, cure=cure)
+    return state
+
+
+def _check(
+    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], finite: np.ndarray
+) -> None:
+    """Stop each seed whose rewards, losses or trained leaves are not finite; warn of large values."""
+    seeds, steps = run.program.seeds, run.steps(iteration)
+    for number, log in enumerate(run.logs):
+        if log.stopped:
+            continue
+        problem = nonfinite_log(rows[number])
+        if problem is None and not finite[number]:
+            problem = nonfinite_leaf(seeds.member(state, number))
+        if problem is not None:
+            log.write(steps, rows[number])
+            _stop_diverged(run, number, steps, problem)
+            continue
+        for warning in log.new_warnings(rows[number]):
+            run.log(
+                f"warning: seed {seeds.seeds[number]}: {warning} at {steps:,} steps: training may diverge"
+            )
+
+
+def _stop_diverged(run: _Run, number: int, steps: int, problem: str) -> None:
+    run.logs[number].diverge(steps, problem)
+    if len(run.logs) > 1:
+        run.log(f"seed {run.program.seeds.seeds[number]}: diverged at {steps:,} steps: {problem}")
 
 
 def _record(
@@ -331,18 +428,24 @@ def _record(
     config, steps = run.config, run.steps(iteration)
     last = iteration == config.iterations
     evaluates = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
-    for number, log in enumerate(run.logs):
-        if log.stopped:
-            continue
+    saves = last or evaluates or preempted or iteration % config.checkpoint_every == 0
+    logs = [(number, log) for number, log in enumerate(run.logs) if not log.stopped]
+    for number, log in logs:
         row = rows[number]
         if evaluates and run.validation is not None:
-            row |= _validation(run, run.validation, state, number)
+            try:
+                row |= _validation(run, run.validation, state, number)
+            except DivergenceError as error:
+                _stop_diverged(run, number, steps, error.problem)
         rank = log.write(steps, row)
-        if last or evaluates or preempted or iteration % config.checkpoint_every == 0:
-            log.checkpoints.save(steps, run.program.seeds.member(state, number), rank)
-        if log.stopped and not last:
+        if saves and log.divergence is None:
+            log.save(steps, run.program.seeds.member(state, number), rank)
+        if log.out_of_patience and not last:
             seed, patience = run.program.seeds.seeds[number], config.patience
             run.log(f"seed {seed}: no better for {patience} validations, stopped at {steps:,} steps")
+    # Not before all seeds have a checkpoint of this step, so that a killed run can resume.
+    for _, log in logs if saves else ():
+        log.checkpoints.delete_superseded()
 
 
 def _validation(run: _Run, validation: Validation, state: LearnerState, number: int) -> dict[str, float]:

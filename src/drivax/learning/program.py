@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array
+from jax.tree_util import keystr
+from jaxtyping import Array, Bool
 
 from drivax.errors import UsageError
 from drivax.evaluation.memory import memory_of
@@ -76,6 +77,10 @@ class Seeds:
             return self.learner.iterate(data, state)
         return jax.vmap(self.learner.iterate, (None, 0))(data, state)
 
+    def all_finite(self, leaves: Sequence[Array]) -> Bool[Array, "*seeds"]:
+        """Return whether all numbers of these leaves of the state are finite, for each seed."""
+        return jax.vmap(all_finite)(leaves) if self.is_stacked else all_finite(leaves)
+
     def member_shapes(self, shapes: Any) -> Any:
         """Return shapes of the state of one seed, given those of all."""
         rank = int(self.is_stacked)
@@ -120,6 +125,10 @@ class Program:
         within_seeds = len(self.devices) > 1 and len(seeds.seeds) % len(self.devices)
         with jax.set_mesh(self._mesh) if within_seeds else contextlib.nullcontext():
             self.compiled = iterate.lower(data, shapes).compile()
+        trained = trained_leaves(shapes)
+        self._is_trained = [keystr(path) in trained for path, _ in jax.tree.leaves_with_path(shapes)]
+        # A program of its own, because fusions with it could round the parameters differently.
+        self._all_finite = jax.jit(seeds.all_finite).lower(list(trained.values())).compile()
 
     def account(self, validation: Any = None) -> MemoryAccount:
         """Return the memory of the fullest device, with ``validation`` held next to the data."""
@@ -137,6 +146,33 @@ class Program:
     def step(self, state: Any) -> tuple[Any, Any]:
         """Return the state after one iteration, and the logs of each seed; the old state is donated."""
         return self.compiled(self.data, state)
+
+    def all_finite(self, state: Any) -> Bool[Array, "*seeds"]:
+        """Return whether all trained leaves of the state after an iteration are finite, for each seed."""
+        leaves = zip(jax.tree.leaves(state), self._is_trained, strict=True)
+        return self._all_finite([leaf for leaf, is_trained in leaves if is_trained])
+
+
+def trained_leaves(state: Any) -> dict[str, Any]:
+    """Return the floating-point leaves of a state (or its shapes) by name, except environments and replay buffer.
+
+    Environments hold NaN and infinity for values that are not defined yet.
+    """
+    return {
+        keystr(path): leaf
+        for path, leaf in jax.tree.leaves_with_path(state)
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and _listed_field(path) is None
+    }
+
+
+def all_finite(leaves: Sequence[Array]) -> Bool[Array, ""]:
+    """Return whether all numbers are finite."""
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]).all() if leaves else jnp.asarray(True)
+
+
+def _listed_field(path: Sequence[Any]) -> str | None:
+    """Return the listed field that contains a leaf; None without one."""
+    return next((key.name for key in path if getattr(key, "name", "") in _LISTED_FIELDS), None)
 
 
 def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | None = None) -> list[Any]:
@@ -242,11 +278,15 @@ class MemoryAccount:
         limit = "" if self.limit is None else f" of {_readable(self.limit)}"
         return f"memory: {_readable(self.total)}{limit} on {self.device}: {sizes}"
 
+    @property
+    def cure(self) -> str:
+        """What makes the largest part smaller."""
+        return _CURES[max(self.sizes, key=lambda name: self.sizes[name])]
+
     def check(self) -> None:
         """Raise UsageError if the run does not fit, with a cure for its largest part."""
         if self.limit is not None and self.total > self.limit:
-            largest = max(self.sizes, key=lambda name: self.sizes[name])
-            raise UsageError(f"training does not fit; {self.text()}", cure=_CURES[largest])
+            raise UsageError(f"training does not fit; {self.text()}", cure=self.cure)
 
 
 def account(
@@ -260,8 +300,7 @@ def account(
         (*_LISTED_FIELDS, _NETWORKS), 0
     )
     for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
-        names = [getattr(key, "name", "") for key in path]
-        sizes[next((name for name in names if name in _LISTED_FIELDS), _NETWORKS)] += _leaf_bytes(leaf)
+        sizes[_listed_field(path) or _NETWORKS] += _leaf_bytes(leaf)
     sizes["program"] = _program_bytes(compiled)
     device = devices[0]
     return MemoryAccount(sizes, memory_of(device, len(devices)), f"{device.platform}:{device.id}")

@@ -15,6 +15,7 @@ import numpy as np
 from drivax.errors import DrivaxError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
+from drivax.learning.divergence import DivergenceError, cure, large_logs
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
@@ -51,15 +52,18 @@ class Validation:
 
 
 def validate(planner: Planner, validation: Validation, task: Task, traffic: Traffic) -> dict[str, float]:
-    """Evaluate a planner in closed loop on held-out scenarios; DrivaxError if actions are not finite.
+    """Evaluate a planner in closed loop on held-out scenarios.
 
     Returns ``validation/<metric>``: means over the scenarios that define it. With ``success``, the shares ``late`` (the
     goal is not reached), ``at_fault`` and ``not_at_fault`` (a failure) sum to 1 over the scenarios that define it.
+
+    Raises:
+        DivergenceError: Actions are not finite.
     """
     results = evaluate(planner, validation.bank, validation.names, task=task, traffic=traffic)
     if results.crashes:
         problem = f"actions of the policy are not finite in {len(results.crashes)} of {len(results)} episodes"
-        raise DrivaxError(problem, cure="lower the learning rate, or resume from an earlier checkpoint")
+        raise DivergenceError(problem)
     values = {name: x for name, x in results.metrics.items() if np.isfinite(x).any()}
     # Prefer full scores, and never mix them with partial ones.
     score = next(name for name in _SCORES if name in values)
@@ -96,7 +100,7 @@ def rank(rule: Rule, row: Mapping[str, Any]) -> tuple[float, ...] | None:
 
 
 def _or_last(value: float | None, last: float = -1.0) -> float:
-    return last if value is None or math.isnan(value) else float(value)
+    return float(value) if value is not None and math.isfinite(value) else last
 
 
 def patience_exceeded(ranks: Sequence[tuple[float, ...]], patience: int) -> bool:
@@ -146,6 +150,7 @@ class TrainingLog:
         self._rule: Rule = rule
         self._patience = patience
         self._ranks: list[tuple[float, ...]] = []
+        self._warnings = set[str]()
         self._log: MetricLog | None = None
         newest = self.newest
         if newest is not None and folder.metrics.is_file():
@@ -157,16 +162,59 @@ class TrainingLog:
         return max(self.checkpoints.steps(), default=None)
 
     @property
-    def stopped(self) -> bool:
-        """Whether patience is exceeded, after which nothing is written."""
+    def out_of_patience(self) -> bool:
+        """Whether patience is exceeded."""
         return patience_exceeded(self._ranks, self._patience)
 
+    @property
+    def divergence(self) -> DivergenceError | None:
+        """The error of a seed that diverged, also in an earlier process; None for a healthy one."""
+        info = self.folder.info.get("divergence")
+        if info is None:
+            return None
+        path, problem = self.folder.path, info["problem"]
+        checkpoint = None if self.newest is None else f"{path}@{self.newest}"
+        text = f"training diverged at step {info['step']:,}: {problem}"
+        return DivergenceError(text, file=path, cure=cure(problem, checkpoint))
+
+    @property
+    def stopped(self) -> bool:
+        """Whether patience is exceeded or the seed diverged, after which nothing is written."""
+        return self.folder.info.get("divergence") is not None or self.out_of_patience
+
     def start(self, step: int | None) -> None:
-        """Open a new log, or the log of the run up to a step; later rows and checkpoints are dropped."""
+        """Open a new log, or the log of the run up to a step.
+
+        Later rows and checkpoints, and files of killed processes, are deleted.
+        """
+        self.checkpoints.drop_after(-1 if step is None else step)
+        for leftover in self.folder.path.glob(".*.partial-*"):
+            leftover.unlink()
         if step is not None:
-            self.checkpoints.drop_after(step)
             self._read_ranks(step)
         self._log = MetricLog(self.folder.path, resume_step=step)
+
+    def save(self, step: int, state: Any, score: tuple[float, ...] | None) -> None:
+        """Write a checkpoint, after the rows of the log up to it."""
+        if self._log is None:
+            raise RuntimeError("call start first")
+        self._log.sync()
+        self.checkpoints.write(step, state, score)
+
+    def diverge(self, step: int, problem: str) -> None:
+        """Note in ``run.json`` that the seed diverged."""
+        self.folder = self.folder.note(divergence={"step": step, "problem": problem})
+
+    def retry(self) -> None:
+        """Forget that the seed diverged."""
+        self.folder = self.folder.note(divergence=None)
+
+    def new_warnings(self, row: Mapping[str, float]) -> list[str]:
+        """Return what is too large in an iteration, each value only once per process."""
+        texts = large_logs(row)
+        warnings = [text for name, text in texts.items() if name not in self._warnings]
+        self._warnings |= set(texts)
+        return warnings
 
     def _read_ranks(self, step: int) -> None:
         """Read the ranks of the validations up to a step."""

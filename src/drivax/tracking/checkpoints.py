@@ -1,12 +1,14 @@
 """Checkpoints of complete training states, restored bit for bit.
 
 Orbax stores the arrays. ``about.json`` contains name, dtype, shape and CRC-32 of every leaf, so that errors name the
-leaf that is damaged or does not match. Checkpoint folders appear only when they are complete. Exported policies are
-single files without training state (:func:`pack`).
+leaf that does not match, and the CRC-32 of each file and of itself, so that damage is found before Orbax reads it.
+Checkpoint folders appear only when they are complete and on disk. Exported policies are single files without training
+state (:func:`pack`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -16,19 +18,21 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from drivax.errors import DataError
-from drivax.files import atomic_write, replace_folder, write_text
+from drivax.files import atomic_write, replace_folder, sync_folder, write_text
 
 ABOUT = "about.json"
 #: Former names of fields of training states, in checkpoints of version 0.1.0.
 _RENAMED_FIELDS = {"scene": "context", "scenes": "contexts"}
 _ARRAYS = "arrays"
+_OTHER = "use another checkpoint, or train again"
+_CHUNK_BYTES = 1 << 24
 _CURE = "use the configuration that the checkpoint was trained with"
 _SCALARS: tuple[type, ...] = (bool, int, float)
 
@@ -49,10 +53,12 @@ class Checkpoints:
         return sorted(int(name) for name in names if name.isdecimal())
 
     def best(self) -> int | None:
-        """Return the step with the highest score, the latest if several are equal; None without scores."""
-        scores = [(self.about(step)["score"], step) for step in self.steps()]
-        candidates = [(tuple(np.atleast_1d(score)), step) for score, step in scores if score is not None]
-        return max(candidates)[1] if candidates else None
+        """Return the step with the highest score, the latest if several are equal; None without scores.
+
+        Raises:
+            DataError: A checkpoint is damaged.
+        """
+        return _best({step: self.about(step)["score"] for step in self.steps()})
 
     def best_or_newest(self) -> int | None:
         """Return the best step, or without scores the newest; None without checkpoints."""
@@ -60,47 +66,73 @@ class Checkpoints:
         return max(self.steps(), default=None) if best is None else best
 
     def about(self, step: int) -> dict[str, Any]:
-        """Return ``step``, ``score`` (None without one) and ``leaves`` of a checkpoint, the content of ``about.json``.
+        """Return the content of ``about.json`` of a checkpoint.
 
-        Leaves have their current names.
+        It has ``step``, ``score`` (None without one), ``leaves`` with their current names, and ``files`` with their
+        checksums (not in checkpoints of former versions).
 
         Raises:
             DataError: The checkpoint is missing or damaged.
         """
-        file = self._path(step) / ABOUT
-        if not file.is_file():
-            cure = f"available steps: {', '.join(map(str, self.steps())) or 'none'}"
+        path, available = self._path(step), ", ".join(map(str, self.steps()))
+        if not path.is_dir():
+            cure = f"available steps: {available or 'none'}"
             raise DataError(f"no checkpoint of step {step}", file=self.folder, cure=cure)
         try:
-            about = json.loads(file.read_bytes())
-            for leaf in about.get("leaves", ()):
+            about = json.loads((path / ABOUT).read_bytes())
+            crc = about.pop("crc", None)
+            if (crc is not None or "files" in about) and crc != _checksum(about):
+                raise ValueError("checksum mismatch")
+            for leaf in about["leaves"]:
                 leaf["name"] = _current_name(leaf["name"])
+            if about["step"] != step or "score" not in about:
+                raise ValueError(f"it has no score, or is of step {about['step']}")
             return about
-        except ValueError as error:
-            raise DataError(f"is damaged ({error})", file=file, cure="use another checkpoint") from error
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+            reason = "missing" if isinstance(error, FileNotFoundError) else f"damaged ({error!r})"
+            raise DataError(f"is {reason}", file=path / ABOUT, cure=_OTHER) from error
 
     def save(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
-        """Store a pytree of numbers and JAX or NumPy arrays, delete superseded checkpoints, and return the folder.
+        """Write a checkpoint as :meth:`write` does, and delete superseded ones."""
+        path = self.write(step, state, score)
+        self.delete_superseded()
+        return path
+
+    def write(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
+        """Store a pytree of numbers and JAX or NumPy arrays, and return the folder, which is on disk.
 
         Higher scores are better; sequences are compared lexicographically. A NaN score counts as no score.
         """
         arrays, leaves = _describe(state)
         score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
         final = self._path(step)
-        about = json.dumps({"step": step, "score": score, "leaves": leaves}, indent=1)
-        size_bytes = len(about) + sum(array.nbytes for array in arrays.values())
+        size_bytes = sum(array.nbytes for array in arrays.values())
         with replace_folder(final, size_bytes) as partial:
             if arrays:
                 _save_arrays(partial / _ARRAYS, arrays)
-            write_text(partial / ABOUT, about)
-        self._delete_superseded()
+            about = {"step": step, "score": score, "leaves": leaves, "files": _sync(partial)}
+            write_text(partial / ABOUT, json.dumps({**about, "crc": _checksum(about)}, indent=1))
+        sync_folder(self.folder.parent)
         return final
 
+    def delete_superseded(self) -> None:
+        """Delete all but the newest ``keep`` checkpoints and the best one; damaged ones have no score."""
+        steps, scores = self.steps(), dict[int, Any]()
+        for step in steps:
+            with contextlib.suppress(DataError):
+                scores[step] = self.about(step)["score"]
+        current = {*steps[-self.keep :], *([_best(scores)] if self.keep_best else [])}
+        for step in steps:
+            if step not in current:
+                self._delete(step)
+
     def drop_after(self, step: int) -> None:
-        """Delete the checkpoints of later steps, which belong to an interrupted run."""
+        """Delete what an interrupted run left: checkpoints of later steps, and hidden folders."""
         for other in self.steps():
             if other > step:
                 self._delete(other)
+        for leftover in self.folder.glob(".step-*"):
+            shutil.rmtree(leftover, ignore_errors=True)
 
     def restore(self, template: State, step: int | None = None, part: str = "") -> State:
         """Return the stored state, or a part of it (for example ``.parameters``).
@@ -127,7 +159,8 @@ class Checkpoints:
             raise DataError(
                 "no checkpoint found", file=self.folder, cure="start the training again, without --resume"
             )
-        stored_leaves, path = self.about(step)["leaves"], self._path(step)
+        about, path = self.about(step), self._path(step)
+        stored_leaves = about["leaves"]
         requested_leaves = [
             (part + name, leaf)
             for part, template in templates.items()
@@ -135,6 +168,7 @@ class Checkpoints:
         ]
         part_leaves = [leaf for leaf in stored_leaves if is_part(leaf["name"], templates)]
         _compare(path, part_leaves, requested_leaves, cure)
+        _check_files(path, about.get("files", {}))
         names = [leaf["name"] for leaf in stored_leaves]
         arrays = dict(zip(names, _load_arrays(path, stored_leaves), strict=True))
         values = iter([_rebuild(arrays[name], leaf) for name, leaf in requested_leaves])
@@ -143,18 +177,18 @@ class Checkpoints:
     def _path(self, step: int) -> Path:
         return self.folder / f"step-{step:09d}"
 
-    def _delete_superseded(self) -> None:
-        steps = self.steps()
-        current = {*steps[-self.keep :], *([self.best()] if self.keep_best else [])}
-        for step in steps:
-            if step not in current:
-                self._delete(step)
-
     def _delete(self, step: int) -> None:
         # Rename it first, so that a partially deleted folder does not look like a checkpoint.
         hidden_folder = self.folder / f".step-{step}.old-{os.getpid()}"
+        shutil.rmtree(hidden_folder, ignore_errors=True)
         self._path(step).rename(hidden_folder)
         shutil.rmtree(hidden_folder, ignore_errors=True)
+
+
+def _best(scores: Mapping[int, Any]) -> int | None:
+    """Return the step with the highest score, the latest if several are equal; None without scores."""
+    ranked = [(tuple(np.atleast_1d(score)), step) for step, score in scores.items() if score is not None]
+    return max(ranked)[1] if ranked else None
 
 
 def is_part(leaf: str, parts: Iterable[str]) -> bool:
@@ -166,6 +200,42 @@ def is_part(leaf: str, parts: Iterable[str]) -> bool:
 def _current_name(leaf: str) -> str:
     """Return the name of a leaf, with the current names of renamed fields."""
     return re.sub(r"\.(\w+)", lambda field: f".{_RENAMED_FIELDS.get(field[1], field[1])}", leaf)
+
+
+def _checksum(about: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps(about, sort_keys=True).encode())
+
+
+def _sync(folder: Path) -> dict[str, int]:
+    """Flush a folder with all that it contains to disk, and return the CRC-32 of each file."""
+    checksums = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_dir():
+            sync_folder(path)
+            continue
+        with path.open("rb") as file:
+            checksums[path.relative_to(folder).as_posix()] = _file_crc(file)
+            os.fsync(file.fileno())
+    return checksums
+
+
+def _file_crc(file: IO[bytes]) -> int:
+    crc = 0
+    while chunk := file.read(_CHUNK_BYTES):
+        crc = zlib.crc32(chunk, crc)
+    return crc
+
+
+def _check_files(path: Path, checksums: Mapping[str, int]) -> None:
+    """Raise DataError for the first file of a checkpoint that is missing or damaged."""
+    for name, expected in checksums.items():
+        try:
+            with (path / name).open("rb") as file:
+                crc = _file_crc(file)
+        except OSError as error:
+            raise DataError(f"cannot be read ({error.strerror})", file=path / name, cure=_OTHER) from error
+        if crc != expected:
+            raise DataError("is damaged (checksum mismatch)", file=path / name, cure=_OTHER)
 
 
 def pack(file: Path, tree: Any) -> None:
@@ -263,22 +333,21 @@ def _load_arrays(path: Path, leaves: list[dict[str, Any]]) -> list[np.ndarray[An
     """Read the arrays of all leaves, and verify their checksums."""
     import orbax.checkpoint as ocp
 
-    templates = [np.zeros(tuple(leaf["stored"][1]), jnp.dtype(leaf["stored"][0])) for leaf in leaves]
-    nonempty = {f"{number:05d}": array for number, array in enumerate(templates) if array.size}
     restored_arrays: dict[str, Any] = {}
-    if nonempty:
-        try:
+    try:
+        templates = [np.zeros(tuple(leaf["stored"][1]), jnp.dtype(leaf["stored"][0])) for leaf in leaves]
+        nonempty = {f"{number:05d}": array for number, array in enumerate(templates) if array.size}
+        if nonempty:
             with ocp.StandardCheckpointer() as checkpointer:
                 restored_arrays = checkpointer.restore((path / _ARRAYS).resolve(), nonempty)
-        except Exception as error:
-            problem = f"arrays cannot be read ({error})"
-            raise DataError(problem, file=path, cure="use another checkpoint") from error
+    except Exception as error:
+        raise DataError(f"arrays cannot be read ({error})", file=path, cure=_OTHER) from error
     arrays = [
         np.asarray(restored_arrays.get(f"{number:05d}", array)) for number, array in enumerate(templates)
     ]
     for array, leaf in zip(arrays, leaves, strict=True):
         if zlib.crc32(array.tobytes()) != leaf["crc"]:
-            raise DataError(f"checksum mismatch in {leaf['name']}", file=path, cure="use another checkpoint")
+            raise DataError(f"checksum mismatch in {leaf['name']}", file=path, cure=_OTHER)
     return arrays
 
 

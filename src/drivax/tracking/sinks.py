@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -36,6 +37,10 @@ class JsonLines:
             row[name] = float(value) if math.isfinite(value) else None
         self._file.write(f"{json.dumps(row)}\n".encode())
         self._file.flush()
+
+    def sync(self) -> None:
+        """Flush to disk, so that a crash of the machine does not lose the rows of a checkpoint."""
+        os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Flush to disk."""
@@ -72,7 +77,8 @@ class MetricLog:
         self, folder: str | Path, resume_step: int | None = None, tensorboard: bool | None = None
     ) -> None:
         folder = Path(folder)
-        self.sinks: list[JsonLines | TensorBoard] = [JsonLines(folder / "metrics.jsonl", resume_step)]
+        self._rows = JsonLines(folder / "metrics.jsonl", resume_step)
+        self.sinks: list[JsonLines | TensorBoard] = [self._rows]
         if tensorboard is None:
             tensorboard = importlib.util.find_spec("tensorboardX") is not None
         if tensorboard:
@@ -82,6 +88,10 @@ class MetricLog:
         """Log the numbers of one step."""
         for sink in self.sinks:
             sink.write(step, values)
+
+    def sync(self) -> None:
+        """Flush ``metrics.jsonl`` to disk."""
+        self._rows.sync()
 
     def close(self) -> None:
         """Flush to disk."""
