@@ -18,6 +18,7 @@ from drivax.evaluation.runner import evaluate
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
+from drivax.seal import seal, unseal
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
@@ -166,6 +167,7 @@ class TrainingLog:
         if step is not None:
             self.checkpoints.drop_after(step)
             self._read_ranks(step)
+        unseal(self.folder.path, self.folder.metrics.name)
         self._log = MetricLog(self.folder.path, resume_step=step)
 
     def _read_ranks(self, step: int) -> None:
@@ -186,6 +188,8 @@ class TrainingLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if self._log is not None:
             self._log.close()
+            if kind is None:
+                seal(self.folder.path, self.folder.metrics.name)

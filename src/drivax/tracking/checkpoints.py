@@ -24,6 +24,7 @@ import numpy as np
 
 from drivax.errors import DataError
 from drivax.files import atomic_write, replace_folder, write_text
+from drivax.seal import check_seal, seal
 
 ABOUT = "about.json"
 #: Former names of fields of training states, in checkpoints of version 0.1.0.
@@ -65,12 +66,13 @@ class Checkpoints:
         Leaves have their current names.
 
         Raises:
-            DataError: The checkpoint is missing or damaged.
+            DataError: The checkpoint is missing, damaged or edited.
         """
         file = self._path(step) / ABOUT
         if not file.is_file():
             cure = f"available steps: {', '.join(map(str, self.steps())) or 'none'}"
             raise DataError(f"no checkpoint of step {step}", file=self.folder, cure=cure)
+        check_seal(file)
         try:
             about = json.loads(file.read_bytes())
             for leaf in about.get("leaves", ()):
@@ -93,6 +95,7 @@ class Checkpoints:
             if arrays:
                 _save_arrays(partial / _ARRAYS, arrays)
             write_text(partial / ABOUT, about)
+            seal(partial, ABOUT)
         self._delete_superseded()
         return final
 
@@ -179,8 +182,9 @@ def unpack(file: Path, template: State) -> State:
     """Return the pytree that :func:`pack` wrote, given a template with its structure and shapes.
 
     Raises:
-        DataError: The file is damaged or does not match the template.
+        DataError: The file is damaged, edited, or does not match the template.
     """
+    check_seal(file)
     try:
         with zipfile.ZipFile(file) as archive:
             # Only reading a member to its end verifies its checksum.
