@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivax import settings
 from drivax.cli import main
 from drivax.errors import DataError
 from drivax.evaluation.comparison import compare
@@ -23,7 +22,6 @@ from drivax.learning.policies import open_policy
 from drivax.learning.training_log import TrainingLog
 from drivax.metrics.catalogue import EVENTS
 from drivax.report.pages.comparison import comparison_text
-from drivax.report.pages.report import write_report
 from drivax.report.runs import read_runs
 from drivax.seal import SEAL, allow_edited, check_seal, edited_files, seal, unseal
 from drivax.studies.definition import StudyConfig
@@ -42,7 +40,9 @@ def evaluation(folder: Path, planner: str, seed: int = 0) -> Path:
     keys = {"planner": (planner,), "dataset": ("d",), "seed": ("0",), "traffic": ("log",)}
     info = {"planner": planner, "traffic": "log"}
     rollouts = Trajectories(
-        rng.normal(size=(EPISODES, 3, 4)).astype(np.float32), rng.normal(size=(EPISODES, 2, 2)), np.zeros(EPISODES, int),
+        rng.normal(size=(EPISODES, 3, 4)).astype(np.float32),
+        rng.normal(size=(EPISODES, 2, 2)),
+        np.zeros(EPISODES, int),
         {name: np.full(EPISODES, -1) for name in EVENTS},
     )  # fmt: skip
     table = EpisodeTable(
@@ -155,3 +155,126 @@ def test_no_flip_in_a_text_file_changes_a_result_silently(folders):
             file.write_bytes(content)
     print(f"{flips} flips, {seen} seen, {flips - seen - len(silent)} without effect, {len(silent)} silent")
     assert flips >= 500 and seen > flips / 2 and silent == []
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def test_edited_runs_are_refused_or_marked_in_every_table(tmp_path, capsys):
+    ours, other = evaluation(tmp_path / "a", "ours"), evaluation(tmp_path / "b", "other", 1)
+    plan = ["--primary", "success", "--secondary", "[progress_ratio]", "--minimum_scenarios", "5"]
+    command = ["compare", str(ours), str(other), *plan, "--resamples", "100"]
+    assert main(command) == 0
+    clean = capsys.readouterr()
+    assert "edited" not in clean.out + clean.err
+    edit(ours / "config.yaml", "start_step: 10", "start_step: 11")
+    assert main(command) == 1
+    refused = capsys.readouterr()
+    assert refused.out == "" and refused.err.count("\n") == 1
+    assert refused.err == (
+        f"drivax: {ours}/config.yaml: changed since drivax wrote it; restore it, run the command again, or use the "
+        "edited file with --edited\n"
+    )
+    edit(ours / "config.yaml", "start_step: 11", "start_step: 10  # ")
+    page = tmp_path / "page.html"
+    assert main([*command, "--edited", "--html", str(page)]) == 0
+    marked = capsys.readouterr()
+    assert f"A  ours (edited)  ({ours})" in marked.out and "B  other  (" in marked.out
+    assert marked.err == f"drivax: made with edited files: {ours}/config.yaml\n"
+    assert "ours (edited) against other" in page.read_text()
+    assert f"edited after drivax wrote them:</b> {ours}/config.yaml" in page.read_text()
+    report = ["report", str(other), str(ours), "--episodes", "0", "--out", str(tmp_path / "report.html")]
+    assert main(report) == 1 and main([*report, "--edited"]) == 0
+    assert "ours (edited)" in (tmp_path / "report.html").read_text()
+    with allow_edited():
+        tables, _ = read_runs([other, ours])
+        assert "ours (edited)" in transfer_table(tables, "success").csv()
+
+
+def test_edited_rollouts_and_added_or_deleted_crashes_are_seen(tmp_path):
+    run = evaluation(tmp_path / "run", "ours")
+    content = (run / "crashes.json").read_bytes()
+    (run / "crashes.json").unlink()
+    with pytest.raises(DataError, match=r"crashes\.json: is missing; restore it"):
+        EpisodeTable.read(run)
+    (run / "crashes.json").write_bytes(content)
+    table = EpisodeTable.read(run)
+    with (run / "trajectories.npz").open("ab") as file:
+        file.write(b"x")
+    with pytest.raises(DataError, match=r"trajectories\.npz: changed since drivax wrote it"):
+        _ = table.trajectories
+    crashes, seal_file = run / "crashes.json", run / SEAL
+    crashes.unlink()
+    seal(run, "crashes.json")
+    assert json.loads(seal_file.read_text())["crashes.json"] is None and EpisodeTable.read(run).crashes == ()
+    crashes.write_bytes(content)
+    with pytest.raises(DataError, match=r"crashes\.json: changed since"):
+        EpisodeTable.read(run)
+
+
+def test_folders_of_earlier_versions_and_unfinished_trainings_open(tmp_path):
+    run = evaluation(tmp_path / "run", "ours")
+    (run / SEAL).unlink()
+    edit(run / "episodes.csv", "ours,d,s0", "ours,d,s00")
+    assert EpisodeTable.read(run).name == "ours"
+    folder = RunFolder.open(training(tmp_path / "training"))
+    with pytest.raises(DataError, match=r"metrics\.jsonl: changed"):
+        edit(folder.metrics, "100", "101")
+        folder.read_metrics()
+    edit(folder.metrics, "101", "100")
+    with pytest.raises(KeyboardInterrupt), TrainingLog(folder, "score", 2, 0) as log:
+        log.start(200)
+        log.write(300, {"loss": 0.5})
+        assert len(folder.read_metrics()) == 3
+        raise KeyboardInterrupt
+    assert "metrics.jsonl" not in json.loads((folder.path / SEAL).read_text())
+    assert len(folder.read_metrics()) == 3 and folder.config(TrainConfig) == TrainConfig()
+
+
+def test_edits_are_noted_in_later_runs_and_stay_edits(tmp_path):
+    policy = RunFolder.create(tmp_path / "policy", TrainConfig(), kind="policy")
+    edit(policy.path / "run.json", '"policy"', '"policy" ')
+    with allow_edited():
+        opened = RunFolder.open(policy.path).note(step=3)
+        made = RunFolder.create(tmp_path / "made", EvaluationConfig("policy"))
+        assert made.info["edited"] == edited_files() == [str(policy.path / "run.json")]
+    assert opened.info["step"] == 3
+    with pytest.raises(DataError, match="changed"):
+        RunFolder.open(policy.path)
+    with allow_edited(False):
+        RunFolder.open(made.path)
+        assert edited_files() == [str(policy.path / "run.json")]
+    assert edited_files() == []
+
+
+def test_damaged_seals_are_refused_in_one_line(tmp_path):
+    file = tmp_path / "a.txt"
+    file.write_text("a")
+    for content in (b"", b"{", b"[]", b"3", b"\xff", b"[" * 100_000):
+        (tmp_path / SEAL).write_bytes(content)
+        with pytest.raises(DataError, match=r"seal\.json: is damaged; restore it") as caught:
+            check_seal(file)
+        assert "\n" not in str(caught.value)
+        with allow_edited():
+            check_seal(file)
+            assert edited_files() == [str(tmp_path / SEAL)]
+    (tmp_path / SEAL).write_text('{"a.txt": 5}')
+    with pytest.raises(DataError, match=r"a\.txt: changed"):
+        check_seal(file)
+    seal(tmp_path, "a.txt", "b.txt")
+    # The digest of "a" by sha256sum.
+    digest = "ca978112ca1bbdcafac231b39a23dc4da786eff8147c4e72b9807785afee48bb"
+    assert json.loads((tmp_path / SEAL).read_text()) == {"a.txt": digest, "b.txt": None}
+    unseal(tmp_path, "a.txt")
+    assert json.loads((tmp_path / SEAL).read_text()) == {"b.txt": None}
+
+
+@pytest.mark.parametrize("name", zoo())
+def test_policies_of_the_zoo_are_sealed(name):
+    entries = json.loads((policy_folder(name) / SEAL).read_text())
+    assert sorted(entries) == ["config.yaml", "policy.npz", "run.json"]
+    for file in entries:
+        check_seal(policy_folder(name) / file)

@@ -194,6 +194,9 @@ def test_damage_is_reported(tmp_path: Path):
     about = json.loads((path / "about.json").read_text())
     about["leaves"][0]["crc"] ^= 1
     (path / "about.json").write_text(json.dumps(about))
+    with pytest.raises(DataError, match=r"about\.json: changed since drivax wrote it; .* --edited"):
+        checkpoints.restore(state)
+    (path / "seal.json").unlink()
     with pytest.raises(DataError, match=r"checksum mismatch in \['w'\]"):
         checkpoints.restore(state)
     checkpoints.save(1, state)
@@ -204,6 +207,7 @@ def test_damage_is_reported(tmp_path: Path):
         checkpoints.restore(state)
     assert "\n" not in str(error.value)
     (path / "about.json").write_text("{")
+    (path / "seal.json").unlink()
     with pytest.raises(DataError, match=r"about\.json: is damaged"):
         checkpoints.restore(state)
 

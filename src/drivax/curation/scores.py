@@ -228,11 +228,11 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
             _check_source(header["version"], header["set_hash"], file, data)
             arrays = {name: archive[name] for name in archive.files if name != "header"}
             digest = _digest(header, arrays)
+            del arrays["scenario_id"]
+            _check_shapes(ids, arrays, file, data)
             if header.get("sha256", digest) != digest:
                 refuse_edited(file, "changed since drivax wrote it")
             note_edited(*map(str, header.get("edited", ())))
-            del arrays["scenario_id"]
-            _check_shapes(ids, arrays, file, data)
             valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
             component_names = [name for name in arrays if name.startswith(_COMPONENT)]
             components = {name.removeprefix(_COMPONENT): arrays[name] for name in component_names}

@@ -25,6 +25,7 @@ from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.subset import top_rows
 from drivax.curation.weights import draw_statistics
 from drivax.errors import UsageError
+from drivax.escaping import show
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.files import write_json
@@ -83,7 +84,7 @@ class Job:
 
 
 def run_study(
-    study: Study, *, cores: int | None = None, anyway: bool = False, log: Log = print
+    study: Study, *, cores: int | None = None, anyway: bool = False, log: Log = show
 ) -> dict[str, Any]:
     """Run a study, or resume it.
 
