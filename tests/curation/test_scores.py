@@ -188,7 +188,7 @@ def test_edited_tables_need_permission_and_are_noted(data, table, tmp_path):
     assert read_scores(file, data).method == "kinematic"  # written again, with the same content
     arrays["scenario_score"] = arrays["scenario_score"][::-1]
     np.savez(file, allow_pickle=False, **arrays)
-    with pytest.raises(DataError, match="changed since drivax wrote it; .* --edited"):
+    with pytest.raises(DataError, match=r"changed since drivax wrote it; .* --edited"):
         read_scores(file, data)
     with allow_edited():
         edited = read_scores(file, data)
