@@ -51,7 +51,7 @@ def evaluation(folder: Path, planner: str, seed: int = 0) -> Path:
         {"success": rng.integers(0, 2, EPISODES).astype(float), "progress_ratio": rng.random(EPISODES)},
         (Crash("d", "s3", 17, "ValueError: no lane"),), rollouts,
     )  # fmt: skip
-    RunFolder.create(folder, EvaluationConfig(planner), kind="evaluation", **info)
+    RunFolder.create(folder, EvaluationConfig(planner), kind="evaluation", planner=planner, traffic="log")
     table.write(folder)
     return folder
 
@@ -169,7 +169,7 @@ def test_edited_runs_are_refused_or_marked_in_every_table(tmp_path, capsys):
     command = ["compare", str(ours), str(other), *plan, "--resamples", "100"]
     assert main(command) == 0
     clean = capsys.readouterr()
-    assert "edited" not in clean.out + clean.err
+    assert "(edited)" not in clean.out and clean.err == ""
     edit(ours / "config.yaml", "start_step: 10", "start_step: 11")
     assert main(command) == 1
     refused = capsys.readouterr()

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from drivax.errors import DataError
 from drivax.files import write_json
@@ -112,7 +113,7 @@ def _digest(file: Path) -> str | None:
         return None
 
 
-def _read(file: Path) -> dict[str, str | None]:
+def _read(file: Path) -> dict[str, Any]:
     """Return the entries of a seal; none without one."""
     with contextlib.suppress(ValueError, RecursionError):
         entries = json.loads(file.read_bytes()) if file.exists() else {}
