@@ -1,6 +1,6 @@
 """Seals: ``seal.json`` in a folder holds the SHA-256 of the files that decide results, and is written last.
 
-A seal detects accidents and edits, not forgery: whoever writes a file can write its seal. Files without an entry, such
+A seal detects accidents and edits, not forgery: a forger can write the seal, too. Files without an entry, such
 as the metrics of an unfinished training, and folders without a seal, are not checked.
 """
 
