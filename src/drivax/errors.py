@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from drivax.escaping import escape_controls
+
 #: Extra that installs a package, by its import name.
 _EXTRAS = {
     "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
@@ -83,11 +85,11 @@ class DrivaxError(Exception):
         return type(self), (self.problem,), {"file": self.file, "record": self.record, "cure": self.cure}
 
     def __str__(self) -> str:
-        location = "" if self.file is None else f"{self.file}: "
+        location = "" if self.file is None else f"{escape_controls(self.file)}: "
         if self.record is not None:
-            location += f"record {self.record}: "
+            location += f"record {escape_controls(self.record)}: "
         cure = "" if self.cure is None else f"; {self.cure}"
-        return " ".join(f"{location}{self.problem}{cure}".split())
+        return escape_controls(" ".join(f"{location}{self.problem}{cure}".split()))
 
 
 class DataError(DrivaxError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 import re
@@ -12,6 +11,7 @@ from html import escape
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from drivax.escaping import csv_text, escape_controls
 from drivax.stats.intervals import Interval
 
 if TYPE_CHECKING:
@@ -100,17 +100,18 @@ class Table:
         )
         for column in (self.columns[i] for i in visible):
             grid.add_column(
-                column.heading, justify="left" if column.label or column.left else "right", no_wrap=column.label,
+                escape_controls(column.heading), no_wrap=column.label,
+                justify="left" if column.label or column.left else "right",
                 max_width=column.max_width, overflow="ellipsis" if column.label else "fold",
                 style="bold" if column.label and not has_headings else "",
             )  # fmt: skip
         for table in (self, *below):
             if table is not self:
                 grid.add_row()
-                grid.add_row(*(table.columns[i].heading for i in visible), style="bold")
+                grid.add_row(*(escape_controls(table.columns[i].heading) for i in visible), style="bold")
             for row in table.rows:
-                lines = ("\n".join(filter(None, (row[i].text, row[i].bounds))) for i in visible)
-                grid.add_row(*lines, style="bold" if row[0].style == "group" else "")
+                texts = (map(escape_controls, filter(None, (row[i].text, row[i].bounds))) for i in visible)
+                grid.add_row(*map("\n".join, texts), style="bold" if row[0].style == "group" else "")
         return grid
 
     def text(self, *below: Table, width: int = 100) -> str:
@@ -146,12 +147,10 @@ class Table:
 
     def csv(self) -> str:
         """Return one line per number: labels, metric, mean, low, high, n; undefined numbers are empty."""
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
         labels = [i for i, column in enumerate(self.columns) if column.label and column.key != "metric"]
         keys = [self.columns[i].key or self.columns[i].heading for i in labels]
         keys += [] if self.across == "metric" else [self.across]
-        writer.writerow([*(key.replace(" ", "_") for key in keys), *_INTERVAL_COLUMNS])
+        lines: list[list[Any]] = [[*(key.replace(" ", "_") for key in keys), *_INTERVAL_COLUMNS]]
         for row in self.rows:
             for column, cell in zip(self.columns, row, strict=True):
                 if (interval := cell.interval) is not None:
@@ -159,8 +158,8 @@ class Table:
                     row_labels += [] if self.across == "metric" else [column.key]
                     numbers = (interval.mean, interval.low, interval.high)
                     digits = ("" if value is None else repr(value) for value in numbers)
-                    writer.writerow([*row_labels, cell.metric, *digits, interval.n])
-        return stream.getvalue()
+                    lines.append([*row_labels, cell.metric, *digits, interval.n])
+        return csv_text(lines)
 
     def html(self) -> str:
         """Return HTML that scrolls horizontally on narrow screens."""

@@ -14,6 +14,7 @@ from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Capacity
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.seal import allow_edited, edited_files
 from scenes import car, straight_road
 
 
@@ -176,6 +177,30 @@ def test_tables_of_other_shapes_are_refused(data, table, tmp_path, name, wrong):
     np.savez(file, allow_pickle=False, **arrays)
     with pytest.raises(DataError, match="does not score every scenario and step of its set"):
         read_scores(file, data)
+
+
+def test_edited_tables_need_permission_and_are_noted(data, table, tmp_path):
+    file = tmp_path / "scores.npz"
+    write_scores(table, file)
+    with np.load(file) as stored:
+        arrays = dict(stored)
+    np.savez(file, allow_pickle=False, **arrays)
+    assert read_scores(file, data).method == "kinematic"  # written again, with the same content
+    arrays["scenario_score"] = arrays["scenario_score"][::-1]
+    np.savez(file, allow_pickle=False, **arrays)
+    with pytest.raises(DataError, match=r"changed since drivax wrote it; .* --edited"):
+        read_scores(file, data)
+    with allow_edited():
+        edited = read_scores(file, data)
+        assert edited_files() == [str(file)]
+        write_scores(edited, tmp_path / "next.npz")
+    with allow_edited(False):
+        read_scores(tmp_path / "next.npz", data)
+        assert edited_files() == [str(file)]
+    header = json.loads(str(arrays["header"]))
+    del header["sha256"]  # as tables of earlier versions
+    np.savez(file, allow_pickle=False, **arrays | {"header": np.array(json.dumps(header))})
+    assert read_scores(file, data).method == "kinematic"
 
 
 @pytest.mark.parametrize("value", [np.nan, -0.1, 1.1])

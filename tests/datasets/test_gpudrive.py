@@ -139,6 +139,19 @@ def test_item_3_implausible_sizes_are_those_of_the_class(scene):
     row = stored.agent_id.tolist().index(78)
     np.testing.assert_allclose(stored.agent_size[row], (4.1, 1.9, 1.6))
     assert Flag.DEFAULT_SIZES in stored.has
+    assert stored.source.lost["implausible_sizes"] == 1
+
+
+@pytest.mark.parametrize("value", [0, -4.5, 1e6, 1e-9, math.nan, math.inf])
+def test_item_3_implausible_sizes_are_counted(scene, value):
+    assert "implausible_sizes" not in decode(scene).lost
+    scene["objects"][0]["width"] = scene["objects"][2]["length"] = value
+    recording = decode(scene)
+    assert recording.lost["implausible_sizes"] == 2
+    assert not recording.tracks.size[0, :, 1].any() and not recording.tracks.size[2, :, 0].any()
+    for row in scene["objects"]:
+        del row["height"]  # absent in other converters' files, which is no loss
+    assert decode(scene).lost["implausible_sizes"] == 2
 
 
 def test_lights_as_the_converter_writes_them(scene):

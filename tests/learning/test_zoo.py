@@ -64,7 +64,9 @@ def test_exported_policy_is_the_best_of_its_run(run, bank, tmp_path):
 
 def test_exported_policy_has_provenance_without_paths(run, bank, tmp_path):
     packed = export_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
-    assert sorted(path.name for path in packed.path.iterdir()) == ["config.yaml", POLICY_FILE, "run.json"]
+    assert sorted(path.name for path in packed.path.iterdir()) == [
+        "config.yaml", POLICY_FILE, "run.json", "seal.json",
+    ]  # fmt: skip
     assert packed.config(TrainConfig) == settings.load(TrainConfig, TINY)
     info = json.loads((packed.path / "run.json").read_text())
     assert info["data"] == [{"hash": "f00d", "scenarios": 3}] and info["machine"] is None
@@ -86,6 +88,9 @@ def test_exported_policies_have_no_steps_or_checkpoints(run, bank, tmp_path):
         export_policy(run.path, packed.path, bank)
     wider = {**TINY, "algorithm": {**TINY["algorithm"], "network": {"encoder": {"rows": [4], "hidden": [9]}}}}
     (packed.path / "config.yaml").write_text(settings.dump(settings.load(TrainConfig, wider)))
+    with pytest.raises(DataError, match=r"config\.yaml: changed since drivax wrote it"):
+        load_policy(packed.path, bank)
+    (packed.path / "seal.json").unlink()
     with pytest.raises(DataError, match=r"parameters.* in the checkpoint, not"):
         load_policy(packed.path, bank)
     (packed.path / POLICY_FILE).write_bytes(b"PK")
@@ -97,6 +102,7 @@ def test_policies_load_without_their_training_traffic(run, bank, tmp_path):
     text = (run.path / "config.yaml").read_text()
     moved = RunFolder.create(tmp_path / "moved", settings.load(TrainConfig, TINY), kind="training")
     (moved.path / "config.yaml").write_text(text.replace("traffic: idm", "traffic: runs/gone"))
+    (moved.path / "seal.json").unlink()
     run.checkpoints.rename(moved.checkpoints)
     try:
         assert weights(load_policy(moved.path, bank)[0])

@@ -59,7 +59,7 @@ def test_notes(tmp_path: Path):
     run = RunFolder.create(tmp_path / "run", Config()).note(result=0.5)
     assert RunFolder.open(tmp_path / "run").info["result"] == 0.5
     assert run.info["result"] == 0.5
-    assert sorted(path.name for path in run.path.iterdir()) == ["config.yaml", "run.json"]
+    assert sorted(path.name for path in run.path.iterdir()) == ["config.yaml", "run.json", "seal.json"]
 
 
 def test_existing_folders(tmp_path: Path):
@@ -96,6 +96,7 @@ def test_folders_without_a_run_are_refused(tmp_path: Path):
         RunFolder.open(tmp_path)
     run = RunFolder.create(tmp_path / "run", Config())
     (run.path / "run.json").write_text("{")
+    (run.path / "seal.json").unlink()
     with pytest.raises(DataError, match=r"run\.json: not valid JSON"):
         RunFolder.open(run.path)
 

@@ -26,6 +26,8 @@ from typing import Any, TypeVar
 
 from drivax.compilation import report_compilation, use_compilation_cache
 from drivax.errors import DrivaxError, UsageError, did_you_mean, explain_system, missing_package
+from drivax.escaping import escape_controls, show
+from drivax.seal import allow_edited, edited_files
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class Command:
     overrides: bool = False
 
 
+#: Flags of all commands.
+_FLAGS = ("--debug", "--no-cache", "--edited")
 #: Width of help that is not printed to a terminal.
 _COLUMNS = 100
 COMMANDS = {
@@ -96,11 +100,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 failed, 2 usage, 130 interrupted, 129 stopped by SIGHUP, 143 by SIGTERM.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    debug, use_cache = "--debug" in arguments, "--no-cache" not in arguments
-    arguments = [argument for argument in arguments if argument not in ("--debug", "--no-cache")]
+    debug, without_cache, edited = (flag in arguments for flag in _FLAGS)
+    arguments = [argument for argument in arguments if argument not in _FLAGS]
     try:
-        with _stop_at_signals():
-            status = _dispatch(arguments, use_cache)
+        with _stop_at_signals(), allow_edited(edited):
+            status = _dispatch(arguments, not without_cache)
+            if files := edited_files():
+                show(f"drivax: made with edited files: {', '.join(files)}", sys.stderr)
         sys.stdout.flush()
     except SystemExit as stop:  # tyro's --help (0) and its usage errors (2)
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
@@ -113,7 +119,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         line, status = describe(error)
         with contextlib.suppress(OSError):  # a terminal that hung up
-            print(f"drivax: {line}", file=sys.stderr)
+            show(f"drivax: {escape_controls(line)}", sys.stderr)
     return status
 
 
@@ -183,6 +189,7 @@ def overview() -> str:
             "",
             "  --version  print the version      --debug  show the traceback of an error",
             "  --no-cache  compile all programs again, and store none",
+            "  --edited    use files that were edited after drivax wrote them; results say so",
         )
     )
 
@@ -190,11 +197,11 @@ def overview() -> str:
 def _dispatch(arguments: list[str], use_cache: bool) -> int:
     """Run the command that the first argument names, or print the overview or the version."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(overview())
+        show(overview())
         return 0
     name, rest = arguments[0], arguments[1:]
     if name in ("-V", "--version"):
-        print(f"drivax {metadata.version('drivax')}")
+        show(f"drivax {metadata.version('drivax')}")
         return 0
     if name not in COMMANDS:
         kind = "option" if name.startswith("-") else "command"
@@ -215,7 +222,7 @@ def _run(name: str, command: Command, arguments: list[str], use_cache: bool) -> 
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
     module = importlib.import_module(command.module)
     if cache and "jax" in sys.modules:
-        report_compilation(partial(print, file=sys.stderr, flush=True))
+        report_compilation(partial(show, file=sys.stderr))
     config = getattr(module, command.config)
     parse: Any = partial(tyro.cli, return_unknown_args=True) if command.overrides else tyro.cli
     parsed = parse(

@@ -14,6 +14,7 @@ import tyro
 
 from drivax import settings
 from drivax.cli import record_of
+from drivax.escaping import show
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.studies.bench import BenchConfig, bench, bench_metrics, use_all_cores
@@ -54,7 +55,7 @@ def run(args: Bench, overrides: Sequence[str] = ()) -> int:
     """Run the benchmark and print its results."""
     if args.encoders:
         times = bench_encoders(settings.load(EncoderBench, {"repeats": args.repeats}, overrides))
-        print(json.dumps(times, indent=1) if args.json else _encoders_text(times))
+        show(json.dumps(times, indent=1) if args.json else _encoders_text(times))
         return 0
     config = settings.load(BenchConfig, settings.plain(record_of(BenchConfig, args)), overrides)
     use_all_cores()
@@ -66,7 +67,7 @@ def run(args: Bench, overrides: Sequence[str] = ()) -> int:
         result, format_text = bench_metrics(bank, config), _metric_sets_text
     else:
         result, format_text = bench(bank, config), _parts_text
-    print(json.dumps(result, indent=1) if args.json else format_text(result))
+    show(json.dumps(result, indent=1) if args.json else format_text(result))
     return 0
 
 

@@ -10,6 +10,8 @@ from typing import Annotated
 
 import tyro
 
+from drivax.escaping import show
+
 
 @dataclass(frozen=True)
 class Compare:
@@ -61,14 +63,14 @@ def run(args: Compare, overrides: Sequence[str] = ()) -> int:
             check_output(out, args.overwrite)
     if args.save is not None:
         write_text(args.save, settings.dump(plan))
-        print(f"wrote {args.save}")
+        show(f"wrote {args.save}")
         return 0
     if plan.a is None or plan.b is None:
         raise UsageError("no runs are named", cure="write drivax compare A B, or name a and b in the plan")
     a, b = EpisodeTable.read_seeds(plan.a), EpisodeTable.read_seeds(plan.b)
     entries = a[0].open_set(args.data).entries if plan.split == "stratified" else ()
     comparison = compare(plan, a, b, entries)
-    print(
+    show(
         json.dumps(comparison.as_dict(), indent=1, allow_nan=False)
         if args.json
         else comparison_text(comparison)
@@ -76,5 +78,5 @@ def run(args: Compare, overrides: Sequence[str] = ()) -> int:
     if args.html is not None:
         write_comparison(comparison, args.html, args.overwrite)
         if not args.json:
-            print(f"wrote {args.html}")
+            show(f"wrote {args.html}")
     return 0

@@ -15,6 +15,7 @@ from drivax.datasets.conversion import Conversion, Converted, Plan, convert
 from drivax.datasets.doctor import count_text
 from drivax.datasets.formats import READERS
 from drivax.errors import UsageError
+from drivax.escaping import show
 from drivax.evaluation.audit import audit
 from drivax.files import can_resume
 from drivax.scenario.schema import CAPACITIES
@@ -60,13 +61,13 @@ def run(args: Convert) -> int:
             result = convert(args.src, args.out, options, report, audit, _announce)
         except BaseException as error:
             if not isinstance(error, UsageError) and can_resume(args.out):
-                print("drivax: finished parts are kept; the same command resumes", file=sys.stderr)
+                show("drivax: finished parts are kept; the same command resumes", sys.stderr)
             raise
-    print(summary(result))
+    show(summary(result))
     for record in result.skipped[:_MAX_LISTED]:
-        print(f"skipped {record.error()}", file=sys.stderr)
+        show(f"skipped {record.error()}", sys.stderr)
     if len(result.skipped) > _MAX_LISTED:
-        print(f"skipped {len(result.skipped) - _MAX_LISTED} more; manifest.json lists all", file=sys.stderr)
+        show(f"skipped {len(result.skipped) - _MAX_LISTED} more; manifest.json lists all", sys.stderr)
     return 0
 
 
@@ -76,9 +77,9 @@ def _announce(plan: Plan) -> None:
     unknown = len(plan.data.inputs) - plan.data.formats.total()
     if unknown:
         texts.append(f"{count_text(unknown, 'file')} of unknown format")
-    print(f"found {', '.join(texts)}: {plan.estimate}", flush=True)
+    show(f"found {', '.join(texts)}: {plan.estimate}")
     if plan.written:
-        print(f"continuing after {count_text(plan.written, 'scenario')}", flush=True)
+        show(f"continuing after {count_text(plan.written, 'scenario')}")
 
 
 def summary(result: Converted) -> str:

@@ -11,6 +11,7 @@ import tyro
 
 from drivax.curation.methods import METHODS
 from drivax.errors import UsageError
+from drivax.escaping import escape_controls, show
 from drivax.files import check_output
 
 if TYPE_CHECKING:
@@ -171,11 +172,12 @@ def _export(
     file = top / OWN_SCORES
     subset_scores = read_scores(file, ScenarioSet.open(top))
     limit = "" if all_windows else ", at most one per recording"
-    print(f"{top}: the {count:,} most critical scenarios{limit}")
-    print(f"{file}: their scores")
-    print("  rank  score  scenario")
+    show(f"{top}: the {count:,} most critical scenarios{limit}")
+    show(f"{file}: their scores")
+    show("  rank  score  scenario")
     for rank, row in enumerate(subset_scores.order[:_PRINTED_SCENARIOS], start=1):
-        print(f"  {rank:>4}  {subset_scores.scenarios[row]:.3f}  {subset_scores.scenario_ids[row]}")
+        name = escape_controls(subset_scores.scenario_ids[row])
+        show(f"  {rank:>4}  {subset_scores.scenarios[row]:.3f}  {name}")
 
 
 def _print_statistics(table: ScoreTable, out: Path) -> None:
@@ -185,20 +187,20 @@ def _print_statistics(table: ScoreTable, out: Path) -> None:
     from drivax.curation.weights import WeightConfig, draw_statistics, sampling_weights
 
     low, median, high, maximum = np.quantile(table.scenarios, (0.05, 0.5, 0.95, 1.0))
-    first = table.scenario_ids[table.order[0]]
-    print(f"{out}: {len(table.scenario_ids):,} scenarios, {table.method}")
+    first = escape_controls(table.scenario_ids[table.order[0]])
+    show(f"{out}: {len(table.scenario_ids):,} scenarios, {table.method}")
     if "error_rank_correlation" in table.config:
-        print(
+        show(
             f"  rank correlation of scores and errors over steps: {table.config['error_rank_correlation']:.2f}"
         )
-    print(f"  scores: 5 % {low:.3f}, median {median:.3f}, 95 % {high:.3f}, largest {maximum:.3f} ({first})")
+    show(f"  scores: 5 % {low:.3f}, median {median:.3f}, 95 % {high:.3f}, largest {maximum:.3f} ({first})")
     for scale in ("step", "scenario"):
         draws = draw_statistics(sampling_weights(table, WeightConfig(), scale), table.drawable)
-        print(
+        show(
             f"  weights by {scale}: effective sample {draws.effective:.0%} of the steps, "
             f"{draws.effective_scenarios:.0%} of the scenarios"
         )
-        print(
+        show(
             f"    tilt {draws.tilt:.2f} (99 % over mean), largest {draws.largest:.2f}, "
             f"{draws.concentration:.0%} of draws from 5 % of the steps"
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 
 from drivax.cli import record_of
+from drivax.escaping import show
 from drivax.studies.demo import DemoConfig, run_demo
 
 
@@ -35,7 +36,7 @@ def run(args: Demo) -> int:
     start_s = time.monotonic()
     overrides = () if args.steps is None else ("--total_steps", str(args.steps))
     config = record_of(DemoConfig, args, overrides=overrides)
-    result = run_demo(args.out, config, lambda line: print(line, flush=True), overwrite=args.overwrite)
-    print(result.text())
-    print(f"report: {result.report.resolve()}  ({time.monotonic() - start_s:.0f} s in total)")
+    result = run_demo(args.out, config, show, overwrite=args.overwrite)
+    show(result.text())
+    show(f"report: {result.report.resolve()}  ({time.monotonic() - start_s:.0f} s in total)")
     return 0

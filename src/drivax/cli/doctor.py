@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from drivax.datasets.doctor import Diagnosis, Part, count_text, diagnose
+from drivax.escaping import escape_controls
 from drivax.files import format_bytes, free_bytes
 from drivax.tracking.run_folder import zoo
 
@@ -160,5 +161,5 @@ def _table(rows: Iterator[tuple[str, str]]) -> Table:
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in rows:
-        table.add_row(name, Text(value))
+        table.add_row(name, Text(escape_controls(value)))
     return table

@@ -13,6 +13,7 @@ from drivax import settings
 from drivax.api import as_traffic, find_planner, load
 from drivax.cli import judge, record_of
 from drivax.errors import UsageError, did_you_mean, import_extra
+from drivax.escaping import show
 from drivax.evaluation.runner import (
     EvaluationConfig,
     format_crashes,
@@ -83,12 +84,12 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     results = run_evaluation(
         config, planner, data, args.out, traffic=traffic, sizes=first.sizes, overwrite=args.overwrite
     )
-    print(format_summary([results.summary()]))
+    show(format_summary([results.summary()]))
     if metrics:
-        print(format_metrics(results.summary(), metrics))
+        show(format_metrics(results.summary(), metrics))
     if crashes := format_crashes(results):
-        print(crashes)
-    print(f"wrote {args.out}")
+        show(crashes)
+    show(f"wrote {args.out}")
     if _DEVKIT in args.metrics:
         judge.run(judge.Judge(args.out, data=args.data))
     return 0

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from drivax.escaping import show
+
 
 @dataclass(frozen=True)
 class Export:
@@ -61,5 +63,5 @@ def run(args: Export) -> int:
     lost = ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in sorted(result.lost.items()))
     files = "1 file" if result.files == 1 else f"{result.files:,} files"
     scenarios = "1 scenario" if result.scenarios == 1 else f"{result.scenarios:,} scenarios"
-    print(f"{result.path}: {scenarios} in {files}" + (f"; no room for {lost}" if lost else ""))
+    show(f"{result.path}: {scenarios} in {files}" + (f"; no room for {lost}" if lost else ""))
     return 0

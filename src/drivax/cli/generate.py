@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from drivax.errors import UsageError
+from drivax.escaping import show
 from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.select.splits import parse_shares, write_splits
 from drivax.scenario.store import ScenarioSet
@@ -100,8 +101,8 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
     if shares is not None:
         write_splits(args.out, ScenarioSet.open(args.out).entries, shares)
     if args.benchmark:
-        print(f"benchmark {BENCHMARK_VERSION} of world {WORLD_VERSION}, domain {options.world.domain}")
-    print("\n".join(map(summary, sets.values())))
+        show(f"benchmark {BENCHMARK_VERSION} of world {WORLD_VERSION}, domain {options.world.domain}")
+    show("\n".join(map(summary, sets.values())))
     return 0
 
 

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from drivax.escaping import show
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -77,11 +79,11 @@ def run(args: Inspect) -> int:
         sets = [{"scenarios": inspection.describe()} for inspection in inspections]
         named_sets = [{"set": str(path), **content} for path, content in zip(args.sets, sets, strict=True)]
         json.dump(sets[0] if len(sets) == 1 else named_sets, sys.stdout, indent=1)
-        print()
+        show()
     elif args.html is not None:
         from drivax.report.pages.inspection import write_histograms
 
-        print(write_histograms(inspections, args.html, args.overwrite))
+        show(write_histograms(inspections, args.html, args.overwrite))
     else:
         _print(inspections)
     return 0
@@ -158,13 +160,13 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     statistics = observation_statistics(planner, bank, task, permute=not planner.replays, traffic=traffic)
     if args.json:
         json.dump(statistics.as_dict(), sys.stdout, indent=1)
-        print()
+        show()
     else:
         _print_observations(statistics)
     if args.draw is not None:
         title = f"{scenarios[0].id}, step {int(scenarios[0].current_step)}"
         draw_log_observation(task, bank, title).savefig(args.draw)
-        print(args.draw, file=sys.stderr if args.json else sys.stdout)
+        show(args.draw, sys.stderr if args.json else sys.stdout)
 
 
 def _print_observations(statistics: ObservationStatistics) -> None:

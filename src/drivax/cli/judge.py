@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from drivax.escaping import show
+
 
 @dataclass(frozen=True)
 class Judge:
@@ -41,6 +43,6 @@ def run(args: Judge) -> int:
     with Progress("evaluating", "episodes", len(table)) as bar:
         rows = devkit_rows(table, table.open_set(args.data), lambda done, _: bar.update(done))
     write_rows(rows, out)
-    print(format_rows(rows))
-    print(f"wrote {out}")
+    show(format_rows(rows))
+    show(f"wrote {out}")
     return 0

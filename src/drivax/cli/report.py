@@ -8,6 +8,8 @@ from typing import Literal
 
 from tyro.conf import Positional
 
+from drivax.escaping import show
+
 
 @dataclass(frozen=True)
 class Report:
@@ -70,15 +72,15 @@ def run(args: Report) -> int:
                 args.runs, out, episodes, args.side_by_side is not None, args.data, args.theme, args.overwrite,
                 progress=lambda done, _: bar.update(done),
             )  # fmt: skip
-        print(f"{out} ({len(files)} videos)")
+        show(f"{out} ({len(files)} videos)")
         return 0
     if args.tables:
         out = args.out or args.runs[-1] / "tables"
         files = write_tables(args.runs, out, args.data, args.overwrite, args.metrics)
-        print(f"{out} ({', '.join(file.name for file in files)})")
+        show(f"{out} ({', '.join(file.name for file in files)})")
         return 0
     path = write_report(
         args.runs, args.out or args.runs[-1] / "report.html", args.data, args.episodes, args.overwrite
     )
-    print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
+    show(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
     return 0

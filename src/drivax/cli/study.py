@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from drivax import settings
+from drivax.escaping import show
 from drivax.studies.definition import Study as Plan
 from drivax.studies.definition import StudyConfig, StudySets, load_study
 from drivax.studies.study import run_study
@@ -59,10 +60,10 @@ def run(args: Study, overrides: Sequence[str] = ()) -> int:
         Plan(load_study(args.study), config, sets, args.out),
         cores=args.cores,
         anyway=args.anyway,
-        log=lambda line: print(line, file=sys.stderr),
+        log=lambda line: show(line, sys.stderr),
     )
     for claim in results["claims"]:
         note = f" ({claim['needed']})" if claim["needed"] else ""
-        print(f"{claim['verdict']:<12} {claim['claim']['words']}{note}")
-    print(f"{args.out / 'report.html'}")
+        show(f"{claim['verdict']:<12} {claim['claim']['words']}{note}")
+    show(f"{args.out / 'report.html'}")
     return 0

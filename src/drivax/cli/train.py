@@ -15,6 +15,7 @@ from drivax import settings
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, sampling_weights
 from drivax.errors import UsageError
+from drivax.escaping import show
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train, usable_steps
@@ -96,10 +97,10 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
         resume=args.resume,
         overwrite=args.overwrite,
         seeds=args.seeds,
-        log=lambda line: print(line, file=sys.stderr),
+        log=lambda line: show(line, sys.stderr),
         trust=args.trust_code,
     )
-    print(f"wrote {folder.path}")
+    show(f"wrote {folder.path}")
     return 0
 
 

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from drivax.escaping import show
+
 
 @dataclass(frozen=True)
 class View:
@@ -59,5 +61,5 @@ def run(args: View) -> int:
         title=folder.name,
         details=details,
     )
-    print(f"{path} ({len(scenarios)} of {len(data)} scenarios, {path.stat().st_size / 1e6:.1f} MB)")
+    show(f"{path} ({len(scenarios)} of {len(data)} scenarios, {path.stat().st_size / 1e6:.1f} MB)")
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import zipfile
@@ -19,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.files import atomic_write, check_output
 from drivax.scenario.store import ScenarioSet
+from drivax.seal import edited_files, note_edited, refuse_edited
 
 Steps = Float[np.ndarray[Any, Any], "N T"]
 Valid = Bool[np.ndarray[Any, Any], "N T"]
@@ -193,28 +195,27 @@ def write_scores(table: ScoreTable, out: Path, overwrite: bool = False) -> None:
     """
     check_output(out, overwrite)
     _check_range(table, None, "report this as a defect of drivax")
-    header = {
+    header: dict[str, Any] = {
         "version": SCORES_VERSION, "method": table.method, "config": dict(table.config), "set_hash": table.set_hash,
-        "drivax_version": metadata.version("drivax"),
+        "drivax_version": metadata.version("drivax"), "edited": edited_files(),
     }  # fmt: skip
+    arrays = {
+        "scenario_id": np.array(table.scenario_ids),
+        "valid": table.valid,
+        "step_score": table.steps.astype(np.float32),
+        "scenario_score": table.scenarios.astype(np.float32),
+        **{_COMPONENT + name: values.astype(np.float32) for name, values in table.components.items()},
+    }
+    header["sha256"] = _digest(header, arrays)
     with atomic_write(out) as file:
-        np.savez_compressed(
-            file,
-            allow_pickle=False,
-            header=np.array(json.dumps(header)),
-            scenario_id=np.array(table.scenario_ids),
-            valid=table.valid,
-            step_score=table.steps.astype(np.float32),
-            scenario_score=table.scenarios.astype(np.float32),
-            **{_COMPONENT + name: values.astype(np.float32) for name, values in table.components.items()},
-        )
+        np.savez_compressed(file, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
 
 
 def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
     """Read the scores of a set.
 
     Raises:
-        DataError: The table is missing or damaged, has another version, or belongs to another set.
+        DataError: The table is missing, damaged or edited, has another version, or belongs to another set.
     """
     if not file.is_file():
         cure = "write it with `drivax curate METHOD --data SET --out FILE`"
@@ -225,8 +226,13 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
             header = json.loads(str(archive["header"][()]))
             ids = tuple(str(name) for name in archive["scenario_id"])
             _check_source(header["version"], header["set_hash"], file, data)
-            arrays = {name: archive[name] for name in archive.files if name not in ("header", "scenario_id")}
+            arrays = {name: archive[name] for name in archive.files if name != "header"}
+            digest = _digest(header, arrays)
+            del arrays["scenario_id"]
             _check_shapes(ids, arrays, file, data)
+            if header.get("sha256", digest) != digest:
+                refuse_edited(file, "changed since drivax wrote it")
+            note_edited(*map(str, header.get("edited", ())))
             valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
             component_names = [name for name in arrays if name.startswith(_COMPONENT)]
             components = {name.removeprefix(_COMPONENT): arrays[name] for name in component_names}
@@ -237,6 +243,16 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
         raise DataError(problem, file=file, cure=_RERUN) from error
     _check_range(table, file, _RERUN)
     return table
+
+
+def _digest(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:
+    """Return the SHA-256 (hex) of a table; tables of earlier versions lack it."""
+    described = {name: value for name, value in header.items() if name != "sha256"}
+    digest = hashlib.sha256(json.dumps(described).encode())
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
+        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return digest.hexdigest()
 
 
 def _check_source(version: object, set_hash: object, file: Path, data: ScenarioSet) -> None:

@@ -151,7 +151,7 @@ def decode(scene: Any) -> Recording:
     if not isinstance(scenario_id, str) or not scenario_id.isprintable():
         raise DataError("has no scenario_id", cure=_SKIP)
     objects, roads = _rows(scene, "objects"), _rows(scene, "roads")
-    tracks = _tracks(objects)
+    tracks, unusable_sizes = _tracks(objects)
     count, steps = tracks.valid.shape
     ego = _row_numbers([metadata["sdc_track_index"]], count, "sdc_track_index")[0]
     if tracks.kind[ego] != AgentKind.VEHICLE:
@@ -184,6 +184,7 @@ def decode(scene: Any) -> Recording:
             unknown_roads=unknown,
             one_point_features=parsing.one_point_features(features),
             lights_without_place=lost_lights,
+            implausible_sizes=unusable_sizes,
             unknown_fields=len({str(key) for row in (*objects, *roads) for key in row} - _FIELDS),
         ),
         # In files whose points were thinned a jump looks like any other gap.
@@ -250,17 +251,23 @@ def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
     return ids
 
 
-def _tracks(objects: Sequence[Mapping[str, Any]]) -> Tracks:
-    """Return the tracks; implausible sizes are 0, which stands for that of the class."""
+def _tracks(objects: Sequence[Mapping[str, Any]]) -> tuple[Tracks, int]:
+    """Return the tracks, and the number of those with an implausible size.
+
+    Implausible sizes are 0, which stands for that of the class.
+    """
     table, valid = _states(objects)
     valid &= ~(table[..., :2] == _INVALID).all(axis=-1)
     table = np.where(valid[..., None], table, 0.0)
     if not (np.abs(table) <= _LARGEST).all():
         raise DataError("valid states contain numbers that are not finite or implausibly large", cure=_SKIP)
     size = _table(objects, ("length", "width", "height"), "the size of objects")
-    size = np.where((size >= _SMALLEST_SIZE_M) & (size <= _LARGEST_SIZE_M), size, 0.0)
+    plausible = (size >= _SMALLEST_SIZE_M) & (size <= _LARGEST_SIZE_M)
+    size = np.where(plausible, size, 0.0)
+    measured = slice(None if "height" in objects[0] else -1)
+    lost = int((~plausible[:, measured].all(axis=1) & valid.any(axis=1)).sum())
     kinds = [str(row.get("type")) for row in objects]
-    return Tracks(
+    tracks = Tracks(
         xy=table[..., 0:2].copy(),
         z=table[..., 2].copy(),
         size=np.where(valid[..., None], size[:, None], 0.0),
@@ -270,6 +277,7 @@ def _tracks(objects: Sequence[Mapping[str, Any]]) -> Tracks:
         kind=np.array([_AGENTS.get(kind, AgentKind.OTHER) for kind in kinds], np.int8),
         track_id=np.array(_ids(objects, "objects"), np.int64),
     )
+    return tracks, lost
 
 
 def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:

@@ -21,6 +21,7 @@ from drivax.evaluation import pairing
 from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interval_of
 from drivax.evaluation.pairing import Pairs, Split
 from drivax.evaluation.plan import ComparisonPlan, Decision, MetricComparison, Sensitivity, decide
+from drivax.seal import MARK, mark_edited
 from drivax.stats import effects, significance
 from drivax.stats.clusters import design_effect, drop_undefined
 from drivax.stats.intervals import Interval, interquartile_bootstrap, paired_bootstrap, split_bootstrap
@@ -100,8 +101,10 @@ class _Side:
 
     @property
     def name(self) -> str:
-        folder = self.folder
-        return self.tables[0].name if folder is None or len(self.tables) == 1 else folder.name
+        folder, names = self.folder, [table.name for table in self.tables]
+        if folder is None or len(names) == 1:
+            return names[0]
+        return mark_edited(folder.name, any(name.endswith(MARK) for name in names))
 
     @property
     def recordings(self) -> int:

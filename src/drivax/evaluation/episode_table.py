@@ -18,11 +18,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Int16, Int64
 
 from drivax.errors import DataError
+from drivax.escaping import csv_rows, csv_text
 from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
 from drivax.scenario.store import ScenarioSet
+from drivax.seal import check_seal, edited_files, mark_edited, seal
 from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate
-from drivax.tracking.run_folder import RunFolder, existing
+from drivax.tracking.run_folder import CONFIG_FILE, RunFolder, existing
 
 #: Key columns of ``episodes.csv``, before the metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
@@ -109,7 +111,7 @@ class EpisodeTable:
         """Read the episodes of a run folder of ``drivax evaluate``; trajectories are read on first access.
 
         Raises:
-            DataError: The folder or a file is missing or damaged, or the run is not an evaluation.
+            DataError: The folder or a file is missing, damaged or edited, or the run is not an evaluation.
         """
         run = RunFolder.open(path)
         if run.kind != "evaluation":
@@ -118,8 +120,10 @@ class EpisodeTable:
                 f"run is of kind {run.kind!r}, not evaluation", file=run.path / "run.json", cure=cure
             )
         keys, metrics = _read_columns(run.path / "episodes.csv")
-        name = str(run.info.get("planner", run.path.name))
-        return cls(run.path, name, run.info, keys, metrics, _read_crashes(run.path / "crashes.json"))
+        crashes = _read_crashes(run.path / "crashes.json")
+        check_seal(run.path / CONFIG_FILE)
+        name = mark_edited(str(run.info.get("planner", run.path.name)), edited_files(run.path))
+        return cls(run.path, name, run.info | {"planner": name}, keys, metrics, crashes)
 
     @classmethod
     def read_seeds(cls, path: str | Path) -> tuple[EpisodeTable, ...]:
@@ -221,16 +225,14 @@ class EpisodeTable:
         return [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
 
     def write(self, folder: Path) -> None:
-        """Write ``episodes.csv``, ``summary.json``, ``trajectories.npz`` and, after crashes, ``crashes.json``."""
+        """Write and seal ``episodes.csv``, ``summary.json``, ``trajectories.npz`` and, if any, ``crashes.json``."""
         records: dict[str, Any] = {"summary.json": self.summary()}
         if self.crashes:
             records["crashes.json"] = [asdict(crash) for crash in self.crashes]
         for name, record in records.items():
             (folder / name).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-        with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [*KEYS, *self.metrics], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(self.rows())
+        lines = [[*KEYS, *self.metrics], *(list(row.values()) for row in self.rows())]
+        (folder / "episodes.csv").write_text(csv_text(lines), encoding="utf-8", newline="")
         trajectories = self.trajectories
         arrays = {f"{name}_step": trajectories.events[name].astype(np.int16) for name in EVENTS}
         arrays |= {} if trajectories.others is None else {"others": trajectories.others}
@@ -243,6 +245,7 @@ class EpisodeTable:
             start=trajectories.start.astype(np.int32),
             **arrays,
         )
+        seal(folder, "episodes.csv", "summary.json", "crashes.json", "trajectories.npz")
 
     def open_set(self, data: Path | None = None) -> ScenarioSet:
         """Open the scenario set of this evaluation; ``data`` is its path if it has moved.
@@ -295,8 +298,10 @@ def _cell(value: Any) -> str:
 
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
     """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
-    with existing(path, _RERUN).open(newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(file))
+    try:
+        rows = csv_rows(existing(path, _RERUN).read_bytes().decode())
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
     header = rows[0] if rows else []
     missing = [key for key in KEYS if key not in header]
     if missing or len(set(header)) < len(header):
@@ -331,6 +336,7 @@ def _read_metric(path: Path, name: str, cells: Sequence[str]) -> Array:
 
 def _read_crashes(path: Path) -> tuple[Crash, ...]:
     """Read ``crashes.json``, which exists only after crashes."""
+    check_seal(path)
     if not path.is_file():
         return ()
     try:

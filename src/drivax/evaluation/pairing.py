@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.episode_table import NOT_SUMMARISED, EpisodeTable, ScenarioKey
+from drivax.seal import MARK
 from drivax.stats.clusters import cluster_strata, dense_labels
 
 #: Settings of an evaluation that must agree between paired episodes.
@@ -77,7 +78,8 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
         raise UsageError("A and B are the same run", file=a[0].folder, cure="name two runs")
     for side in (a, b):
         # A name ends with the seed's number and the checkpoint. Another checkpoint is another planner.
-        planners = {re.sub(r"^(.*?)[0-9]*(@[0-9]+)?$", r"\1\2", table.name): table.name for table in side}
+        names = [table.name.removesuffix(MARK) for table in side]
+        planners = {re.sub(r"^(.*?)[0-9]*(@[0-9]+)?$", r"\1\2", name): name for name in names}
         if len(planners) > 1:
             problem = f"contains evaluations of several planners ({', '.join(sorted(planners.values()))})"
             folder = side[0].folder

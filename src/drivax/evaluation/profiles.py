@@ -6,8 +6,6 @@ The only such profile is ``devkit``, nuPlan's closed-loop score as its devkit co
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,7 @@ import shapely
 from jaxtyping import Array, Bool, Float
 
 from drivax.errors import DataError
+from drivax.escaping import csv_text
 from drivax.evaluation.devkit import DevkitVerdict, EgoMotion, Road, RoadObject, Tracks, devkit_verdict
 from drivax.evaluation.episode_table import EpisodeTable, Trajectories
 from drivax.evaluation.rollout import unpack_poses
@@ -30,6 +29,7 @@ from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M, ScenarioBan
 from drivax.scenario.roadblocks import lane_lines, roadblocks
 from drivax.scenario.schema import DT_S, AgentKind, Scenario
 from drivax.scenario.store import ScenarioSet
+from drivax.seal import edited_files
 from drivax.simulator.contact import REAR_AXLE
 from drivax.table import Cell, Column, Table
 
@@ -132,15 +132,15 @@ def devkit_episode(scenario: Scenario, trajectories: Trajectories, row: int, siz
 
 def write_rows(rows: Sequence[ProfileRow], path: Path) -> None:
     """Write both values of every term, and the names of the terms that differ, as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     columns = (f"{side}_{name}" for name in TERMS for side in ("drivax", "devkit"))
-    writer.writerow(["dataset", "scenario_id", *columns, "differ"])
+    # A column for edited files, if any were read.
+    edited = {f"edited: {name}": "1" for name in edited_files()}
+    lines = [["dataset", "scenario_id", *columns, "differ", *edited]]
     for row in rows:
         values = (value for name in TERMS for value in (row.ours[name], row.devkit[name]))
         cells = ("" if np.isnan(value) else f"{value:.6g}" for value in values)
-        writer.writerow([row.dataset, row.scenario_id, *cells, " ".join(row.differing)])
-    write_text(path, text.getvalue())
+        lines.append([row.dataset, row.scenario_id, *cells, " ".join(row.differing), *edited.values()])
+    write_text(path, csv_text(lines))
 
 
 def format_rows(rows: Sequence[ProfileRow]) -> str:

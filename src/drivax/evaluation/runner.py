@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, UInt32
 
 from drivax.errors import DataError, DrivaxError, UsageError
+from drivax.escaping import escape_controls
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import ADDED, KEYS, Crash, EpisodeTable, Trajectories, fail_crashed
 from drivax.evaluation.memory import free_memory, report_out_of_memory, scenarios_at_a_time
@@ -34,6 +35,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities, 
 from drivax.scenario.schema import CURRENT_STEP, LEAST_STEPS, STEPS, Scenario
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
+from drivax.seal import edited_files, mark_edited
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart, Start
 from drivax.simulator.traffic.bank_data import prepare_bank
@@ -183,7 +185,8 @@ def format_crashes(table: EpisodeTable) -> str:
     count = len(table.crashes)
     lines = [f"{table.planner} crashed in {count} of {len(table)} episodes, which count as failed:"]
     lines += [
-        f"  {crash.scenario_id}, step {crash.step}: {crash.error}" for crash in table.crashes[:_MAX_LISTED]
+        escape_controls(f"  {crash.scenario_id}, step {crash.step}: {crash.error}")
+        for crash in table.crashes[:_MAX_LISTED]
     ]
     if count > _MAX_LISTED:
         lines.append(f"  and {count - _MAX_LISTED} more, in crashes.json")
@@ -348,7 +351,8 @@ class _Evaluation:
     ) -> EpisodeTable:
         """Tabulate episodes; ``errors`` are the planner's exceptions by identity and step."""
         _check_finite(episodes, names)
-        n, planner, traffic = len(names), self.planner.name, self.simulator.traffic.name
+        n, traffic = len(names), self.simulator.traffic.name
+        planner = mark_edited(self.planner.name, edited_files())
         values, crash_step = episodes.metrics, np.asarray(episodes.crashed)
         actions = until_crash(np.asarray(episodes.actions), crash_step, self.start_step)
         in_log = self.start_step + np.arange(actions.shape[1]) < values["last_step"].value[:, None]

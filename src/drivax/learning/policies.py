@@ -14,6 +14,7 @@ from drivax.learning.config import TrainConfig, split_traffic
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import PlannerTraffic, with_driver
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.seal import seal
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
@@ -108,6 +109,7 @@ def export_policy(
     config = replace(folder.config(TrainConfig, trust=trust), begin_from=None)
     exported = RunFolder.create(out, config, overwrite=overwrite).note(**about)
     pack(exported.path / POLICY_FILE, planner)
+    seal(exported.path, POLICY_FILE)
     return exported
 
 

@@ -19,6 +19,7 @@ from drivax.learning.divergence import DivergenceError, cure, large_logs
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
+from drivax.seal import seal, unseal
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
@@ -192,6 +193,7 @@ class TrainingLog:
             leftover.unlink()
         if step is not None:
             self._read_ranks(step)
+        unseal(self.folder.path, self.folder.metrics.name)
         self._log = MetricLog(self.folder.path, resume_step=step)
 
     def save(self, step: int, state: Any, score: tuple[float, ...] | None) -> None:
@@ -234,6 +236,8 @@ class TrainingLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if self._log is not None:
             self._log.close()
+            if kind is None:
+                seal(self.folder.path, self.folder.metrics.name)

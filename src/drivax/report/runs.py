@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.episode_table import EpisodeTable
+from drivax.seal import edited_files, mark_edited
 from drivax.tracking.run_folder import RunFolder, seed_folders
 
 Array = np.ndarray[Any, Any]
@@ -52,13 +53,15 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
     for folder in folders:
         run = RunFolder.open(folder)
         if run.kind == "training":
-            name = _unique_name(folder.name, folder, chart_names)
-            trainings.append(Training(folder, name, run.info, _curves(run)))
+            curves = _curves(run)
+            name = mark_edited(folder.name, edited_files(folder) or run.info.get("edited"))
+            name = _unique_name(name, folder, chart_names)
+            trainings.append(Training(folder, name, run.info, curves))
         elif run.kind == "evaluation":
             table = EpisodeTable.read(folder)
-            table = replace(table, name=_unique_name(table.name, folder, table_names))
             _ = table.trajectories  # reads the file, to report damage before any work
-            evaluations.append(table)
+            name = mark_edited(table.name, edited_files(folder))
+            evaluations.append(replace(table, name=_unique_name(name, folder, table_names)))
         else:
             problem = f"is of kind {run.kind!r}, not evaluation or training"
             cure = "give folders written by drivax evaluate or drivax train"

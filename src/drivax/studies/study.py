@@ -25,6 +25,7 @@ from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.subset import top_rows
 from drivax.curation.weights import draw_statistics
 from drivax.errors import UsageError
+from drivax.escaping import show
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.files import write_json
@@ -37,6 +38,7 @@ from drivax.planners.catalogue import make_planner
 from drivax.report.pages.viewer import criticality_html, write_player
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_lengths
+from drivax.seal import allow_edited, edited_files, is_edited_allowed, seal
 from drivax.stats.clusters import recordings_of
 from drivax.studies.definition import Study, StudyConfig
 from drivax.studies.report import write_report
@@ -52,7 +54,6 @@ from drivax.studies.verdicts import (
 )
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder
-from drivax.tracking.sinks import read_rows
 from drivax.tracking.workers import one_core_each
 
 _PROGRESS = "validation/progress_ratio"
@@ -63,12 +64,13 @@ Log = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Job:
-    """A training run of a study, with a mask of the logged steps to draw from."""
+    """A training run of a study, with a mask of the logged steps to draw from; ``edited``: edited files are used."""
 
     study: Study
     arm: str
     seed: int
     usable: Bool[np.ndarray, "N T"]
+    edited: bool = False
 
     def training_set(self) -> WeightedSet:
         """Return the training set with the arm's weights."""
@@ -82,7 +84,7 @@ class Job:
 
 
 def run_study(
-    study: Study, *, cores: int | None = None, anyway: bool = False, log: Log = print
+    study: Study, *, cores: int | None = None, anyway: bool = False, log: Log = show
 ) -> dict[str, Any]:
     """Run a study, or resume it.
 
@@ -109,7 +111,8 @@ def run_study(
         if not study.evaluation(name).is_dir():
             log(f"evaluating {name} on the test set")
             run_evaluation(EvaluationConfig(name), make_planner(name), test, study.evaluation(name))
-    jobs = [Job(study, arm, seed, usable) for seed in range(config.seeds) for arm in config.arms]
+    edited = is_edited_allowed()
+    jobs = [Job(study, arm, seed, usable, edited) for seed in range(config.seeds) for arm in config.arms]
     _train_and_evaluate([job for job in jobs if job.arm in definition.baselines], cores, log)
     baseline_conditions, strata = _conditions(study, definition.baselines), _strata(study, test)
     first_group = next(iter(definition.groups))
@@ -129,8 +132,10 @@ def run_study(
     results = _results(study, test, strata, tables, usable) | {
         "conditions": [asdict(condition) for condition in _conditions(study, config.arms)],
         "detectable": smallest,
+        "edited": edited_files(),
     }
     write_json(study.results, results)
+    seal(study.folder, study.results.name)
     _write_pages(study, data, results, tables)
     log(f"wrote {study.folder / 'report.html'}")
     return results
@@ -284,7 +289,12 @@ def _start_time(run: Path) -> datetime:
 
 
 def _run_job(job: Job) -> float:
-    """Train and evaluate an arm; return the elapsed seconds."""
+    """Train and evaluate an arm in a process of its own; return the elapsed seconds."""
+    with allow_edited(job.edited):
+        return _train_and_evaluate_arm(job)
+
+
+def _train_and_evaluate_arm(job: Job) -> float:
     start, study = time.perf_counter(), job.study
     config, run = study.train_config(job.arm, job.seed), study.run(job.arm, job.seed)
     steps = Checkpoints(run / "checkpoints").steps()
@@ -319,11 +329,11 @@ def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:
 
 def _best_step(job: Job) -> int:
     """Return the step of the validation at which ``checkpoints_by`` is largest."""
-    metric, file = job.study.definition.checkpoints_by, job.study.run(job.arm, job.seed) / "metrics.jsonl"
-    rows = [row for row in read_rows(file) if _PROGRESS in row and row.get(metric) is not None]
+    metric, run = job.study.definition.checkpoints_by, RunFolder(job.study.run(job.arm, job.seed), {})
+    rows = [row for row in run.read_metrics() if _PROGRESS in row and row.get(metric) is not None]
     if not rows:
         raise UsageError(
-            f"has no {metric!r} at a validation", file=file, cure="choose another checkpoints_by"
+            f"has no {metric!r} at a validation", file=run.metrics, cure="choose another checkpoints_by"
         )
     return int(max(rows, key=lambda row: row[metric])["step"])
 
@@ -338,7 +348,8 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
     """Return ``score``, ``progress`` and, if logged, ``rule`` (``checkpoints_by``) at each seed's validations."""
     metric, curves = study.definition.checkpoints_by, []
     for seed in range(study.config.seeds):
-        rows = [row for row in read_rows(study.run(arm, seed) / "metrics.jsonl") if _PROGRESS in row]
+        run = RunFolder(study.run(arm, seed), {})
+        rows = [row for row in run.read_metrics() if _PROGRESS in row]
         curves.append(
             {
                 "score": [_validation_score(row) for row in rows],

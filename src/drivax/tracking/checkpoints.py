@@ -72,7 +72,7 @@ class Checkpoints:
         checksums (not in checkpoints of former versions).
 
         Raises:
-            DataError: The checkpoint is missing or damaged.
+            DataError: The checkpoint is missing, damaged or edited.
         """
         path, available = self._path(step), ", ".join(map(str, self.steps()))
         if not path.is_dir():
@@ -249,8 +249,9 @@ def unpack(file: Path, template: State) -> State:
     """Return the pytree that :func:`pack` wrote, given a template with its structure and shapes.
 
     Raises:
-        DataError: The file is damaged or does not match the template.
+        DataError: The file is damaged, edited, or does not match the template.
     """
+    check_seal(file)
     try:
         with zipfile.ZipFile(file) as archive:
             # Only reading a member to its end verifies its checksum.

@@ -5,7 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Self
+
+from drivax.escaping import escape_controls
 
 #: Seconds between two lines in a log.
 INTERVAL_S = 10.0
@@ -27,7 +30,7 @@ class Progress:
         self, what: str, unit: str, total: int | None = None, *, stream: Any = None,
         interval_s: float = INTERVAL_S, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
-        self.what, self.unit, self.total = what, unit, total
+        self.what, self.unit, self.total = escape_controls(what), unit, total
         self.done = 0
         self._stream = sys.stderr if stream is None else stream
         self._interval_s = interval_s
@@ -95,7 +98,8 @@ class Progress:
         from rich.progress import Progress as Bar
 
         description, rate, note = map(
-            TextColumn, ("{task.description}", "{task.fields[rate]}", "{task.fields[note]}")
+            partial(TextColumn, markup=False),
+            ("{task.description}", "{task.fields[rate]}", "{task.fields[note]}"),
         )
         columns = (description, BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn(), note)
         self._bar = Bar(*columns, console=Console(file=self._stream), transient=True)

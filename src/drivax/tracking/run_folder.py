@@ -1,7 +1,8 @@
 """Run folders: configuration, data, versions, machine and outputs of a run.
 
 A run folder contains ``config.yaml`` (the complete configuration with defaults), ``run.json`` (all other information
-that reproduces the run), and outputs: ``metrics.jsonl``, ``checkpoints/``, ``episodes.csv``, reports.
+that reproduces the run), outputs (``metrics.jsonl``, ``checkpoints/``, ``episodes.csv``, reports), and ``seal.json``
+(:mod:`drivax.seal`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from drivax import settings
 from drivax.errors import DataError, UsageError
 from drivax.files import check_output, replace_folder, write_text
 from drivax.scenario.store import ScenarioSet
+from drivax.seal import allow_edited, check_seal, edited_files, note_edited, seal, unseal
 from drivax.tracking.sinks import read_rows
 
 CONFIG_FILE = "config.yaml"
@@ -67,6 +69,7 @@ class RunFolder:
         with replace_folder(path) as partial:
             write_text(partial / CONFIG_FILE, settings.dump(config))
             write_text(partial / RUN_FILE, _json(info))
+            seal(partial, CONFIG_FILE, RUN_FILE)
         return cls(path, info)
 
     @staticmethod
@@ -98,19 +101,21 @@ class RunFolder:
         """Open a run folder.
 
         Raises:
-            DataError: The folder or its ``run.json`` is missing or damaged.
+            DataError: The folder or its ``run.json`` is missing, damaged or edited.
         """
         path, cure = Path(path), "give a folder written by drivax evaluate or drivax train"
         file = path / RUN_FILE
         if not file.is_file():
             problem = f"not a run folder: no {RUN_FILE}" if path.is_dir() else "run folder not found"
             raise DataError(problem, file=path, cure=cure)
+        check_seal(file)
         try:
             info = json.loads(file.read_bytes())
         except ValueError as error:
             raise DataError(f"not valid JSON ({error})", file=file, cure="run the command again") from error
         if not isinstance(info, dict):
             raise DataError("not a JSON object", file=file, cure="run the command again")
+        note_edited(*map(str, info.get("edited") or ()))
         return cls(path, info)
 
     @property
@@ -124,7 +129,7 @@ class RunFolder:
         ``trust`` are the modules outside drivax whose code it may name.
 
         Raises:
-            DataError: ``config.yaml`` is missing.
+            DataError: ``config.yaml`` is missing or edited.
             UsageError: It does not match ``cls``, or names code that is not trusted.
         """
         file = existing(self.path / CONFIG_FILE, "run the command again")
@@ -134,13 +139,16 @@ class RunFolder:
     def settings(self) -> dict[str, Any]:
         """Content of ``config.yaml`` as plain values; empty if there is no such file."""
         file = self.path / CONFIG_FILE
+        check_seal(file)
         values = settings.parse_yaml(file.read_text(encoding="utf-8"), file) if file.is_file() else {}
         return values if isinstance(values, dict) else {}
 
     def note(self, **info: Any) -> RunFolder:
         """Add entries to ``run.json``, and return the updated run folder."""
         updated_info = self.info | info
+        unseal(self.path, RUN_FILE)
         write_text(self.path / RUN_FILE, _json(updated_info))
+        seal(self.path, RUN_FILE)
         return RunFolder(self.path, updated_info)
 
     @property
@@ -166,8 +174,9 @@ def existing(path: Path, cure: str) -> Path:
     """Return the path of a file.
 
     Raises:
-        DataError: The file is missing.
+        DataError: The file is missing or edited.
     """
+    check_seal(path)
     if not path.is_file():
         raise DataError("file not found", file=path, cure=cure)
     return path
@@ -188,7 +197,7 @@ def seed_folders(path: str | Path) -> list[Path]:
 
 def _kind(path: Path) -> str | None:
     """Return the kind of the run in a folder, or None if the run cannot be read or has no kind."""
-    with contextlib.suppress(DataError, OSError):
+    with contextlib.suppress(DataError, OSError), allow_edited():
         return RunFolder.open(path).kind
     return None
 
@@ -250,7 +259,7 @@ def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
-    """Return command, start, versions, commit, data and machine of this process as plain JSON values."""
+    """Return command, start, versions, commit, data, machine and edited inputs of this process as JSON values."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -258,6 +267,7 @@ def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
         "git": git_state(Path(__file__).resolve().parent),
         "data": [{"path": str(d.path.resolve()), "hash": d.hash, "scenarios": len(d)} for d in data],
         "machine": machine(),
+        **({"edited": edited} if (edited := edited_files()) else {}),
     }
 
 

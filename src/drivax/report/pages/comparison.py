@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 from drivax import settings
+from drivax.escaping import escape_controls
 from drivax.evaluation.comparison import Comparison
 from drivax.evaluation.plan import MetricComparison
 from drivax.evaluation.result_tables import MetricLabel, metric_label
@@ -24,7 +25,7 @@ def comparison_text(comparison: Comparison) -> str:
     """Return a comparison as text of at most 100 columns, the recommendation last."""
     tables = comparison_tables(comparison)
     arms = zip("AB", comparison.names, comparison.folders, strict=True)
-    lines = [f"{arm}  {name}  ({folder})" for arm, name, folder in arms]
+    lines = [escape_controls(f"{arm}  {name}  ({folder})") for arm, name, folder in arms]
     lines += [conditions(comparison), "", tables[0].text(*tables[1:]), ""]
     lines += [f"recommendation: {title(comparison)}", *(f"  {reason}" for reason in reasons(comparison))]
     return "\n".join([*lines, *(f"  ({note})" for note in notes(comparison))])

@@ -12,6 +12,7 @@ from typing import Any
 from drivax.report.charts import COMMANDS, SIGNALS
 from drivax.report.pictures.drawing import EVENT_WORDS, GOAL_M, LIGHTS, STOP_M, WIDTHS
 from drivax.report.pictures.palette import LEGEND, STROKES, THEMES
+from drivax.seal import edited_files
 from drivax.table import Cell, Column, Table
 
 KEYS = (
@@ -38,10 +39,18 @@ def page(
         title=escape(title),
         version=escape(metadata.version("drivax")),
         style=_colours() + asset("player.css") + style,
-        lead=lead,
+        lead=lead + _edited_html(),
         sections="\n".join(filter(None, sections)),
         data="\n".join(data),
         script="\n".join(scripts),
+    )
+
+
+def _edited_html() -> str:
+    """Return the warning of a page that is made with edited files."""
+    files = ", ".join(map(escape, edited_files()))
+    return (
+        f"<p><b>Made with files that were edited after drivax wrote them:</b> {files}.</p>" if files else ""
     )
 
 

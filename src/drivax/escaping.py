@@ -1,0 +1,44 @@
+"""Text from files made inert: cells that a spreadsheet would compute, and characters that a terminal would obey."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+#: Begins a formula in spreadsheets, or hides the character that does; numbers are safe.
+_FORMULA = r"(?=[=+\-@\t\r\n])(?![+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\Z)"
+_ACTIVE, _NEUTRAL = re.compile(f"'*{_FORMULA}"), re.compile(f"'+{_FORMULA}")
+_QUOTED = re.compile(r'[,"\r\n]')
+#: Controls (C0, DEL, C1), marks and overrides of direction, line separators, and undecodable bytes of file names.
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def escape_controls(text: Any) -> str:
+    r"""Return a name for a terminal: control characters as ``\x1b``, ``\n`` or ``\u202e``."""
+    return _CONTROL.sub(lambda match: match[0].encode("unicode_escape").decode(), str(text))
+
+
+def show(text: object = "", file: Any = None) -> None:
+    """Print lines with :func:`escape_controls`, and flush."""
+    print("\n".join(map(escape_controls, str(text).split("\n"))), file=file, flush=True)
+
+
+def csv_text(rows: Iterable[Sequence[Any]]) -> str:
+    """Return rows as CSV; an apostrophe precedes each text that a spreadsheet would compute (:func:`csv_rows`)."""
+    return "".join(",".join(_csv_cell(str(cell)) for cell in row) + "\n" for row in rows)
+
+
+def csv_rows(text: str) -> list[list[str]]:
+    """Return the rows of :func:`csv_text`, with the cells as they were."""
+    rows = list(csv.reader(io.StringIO(text, newline="")))
+    if "'" not in text:
+        return rows
+    return [[cell[1:] if _NEUTRAL.match(cell) else cell for cell in row] for row in rows]
+
+
+def _csv_cell(cell: str) -> str:
+    cell = f"'{cell}" if _ACTIVE.match(cell) else cell
+    return '"' + cell.replace('"', '""') + '"' if _QUOTED.search(cell) else cell

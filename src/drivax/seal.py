@@ -1,0 +1,123 @@
+"""Seals: ``seal.json`` in a folder holds the SHA-256 of the files that decide results, and is written last.
+
+A seal detects accidents and edits, not forgery: a forger can write the seal, too. Files without an entry, such
+as the metrics of an unfinished training, and folders without a seal, are not checked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Iterator
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from drivax.errors import DataError
+from drivax.files import write_json
+
+SEAL = "seal.json"
+#: Ends the name of a planner in tables that are made with edited files.
+MARK = " (edited)"
+_CURE = "restore it, run the command again, or use the edited file with --edited"
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Whether edited files are used, and those that were read, in order."""
+
+    allowed: bool
+    files: dict[str, None] = field(default_factory=dict)
+
+
+_block: ContextVar[_Block | None] = ContextVar("block", default=None)
+
+
+def seal(folder: Path, *names: str) -> None:
+    """Seal files of a folder in their present state: their content, or that they do not exist."""
+    edited = edited_files(folder)  # An edited file stays one: its entry does not change.
+    digests = {name: _digest(folder / name) for name in names if str(folder / name) not in edited}
+    write_json(folder / SEAL, {**_read(folder / SEAL), **digests})
+
+
+def unseal(folder: Path, name: str) -> None:
+    """Remove the entry of a file that is going to change."""
+    entries = _read(folder / SEAL)
+    if name in entries and str(folder / name) not in edited_files(folder):
+        del entries[name]
+        write_json(folder / SEAL, entries)
+
+
+def check_seal(file: Path) -> None:
+    """Check that a file is as it was sealed, before it is read.
+
+    Raises:
+        DataError: The file changed, appeared or disappeared since, or the seal is damaged; not in :func:`allow_edited`.
+    """
+    entries = _read(file.parent / SEAL)
+    if file.name in entries and (digest := _digest(file)) != entries[file.name]:
+        refuse_edited(file, "is missing" if digest is None else "changed since drivax wrote it")
+
+
+def refuse_edited(file: Path, problem: str) -> None:
+    """Raise a DataError about an edited file, or note the file where edited files are allowed."""
+    if not is_edited_allowed():
+        raise DataError(problem, file=file, cure=_CURE)
+    note_edited(str(file))
+
+
+@contextlib.contextmanager
+def allow_edited(allowed: bool = True) -> Iterator[None]:
+    """Use edited files in the block instead of refusing them; all tables, pages and runs of the block say so.
+
+    Without ``allowed``, edited files are refused, and only the edited files behind earlier runs are noted.
+    """
+    token = _block.set(_Block(allowed))
+    try:
+        yield
+    finally:
+        _block.reset(token)
+
+
+def is_edited_allowed() -> bool:
+    """Return whether edited files are used (:func:`allow_edited`)."""
+    return (block := _block.get()) is not None and block.allowed
+
+
+def note_edited(*files: str) -> None:
+    """Note edited files that results of this block of :func:`allow_edited` depend on."""
+    if (block := _block.get()) is not None:
+        block.files.update(dict.fromkeys(files))
+
+
+def edited_files(folder: Path | None = None) -> list[str]:
+    """Return the edited files that this block of :func:`allow_edited` noted, of one folder if it is given."""
+    block = _block.get()
+    files = [] if block is None else block.files
+    return [file for file in files if folder is None or Path(file).parent == folder]
+
+
+def mark_edited(name: str, edited: object) -> str:
+    """Return a name for tables, with :data:`MARK` if ``edited`` is true."""
+    return f"{name}{MARK}" if edited and not name.endswith(MARK) else name
+
+
+def _digest(file: Path) -> str | None:
+    """Return the SHA-256 of a file (hex); None without the file."""
+    try:
+        with file.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
+    except FileNotFoundError:
+        return None
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """Return the entries of a seal; none without one."""
+    with contextlib.suppress(ValueError, RecursionError):
+        entries = json.loads(file.read_bytes()) if file.exists() else {}
+        if isinstance(entries, dict):
+            return entries
+    refuse_edited(file, "is damaged")
+    return {}

@@ -1,0 +1,92 @@
+"""Text from files does nothing: not in a spreadsheet, not in a terminal, not in a page."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import io
+import random
+from pathlib import Path
+
+import pytest
+
+from drivax.errors import DataError
+from drivax.escaping import csv_rows, csv_text, escape_controls, show
+from drivax.report.pages.page import data_element, facts_html
+from drivax.stats.intervals import Interval
+from drivax.table import Cell, Column, Table, interval_cell
+from drivax.tracking.progress import Progress
+
+HOSTILE = '=HYPERLINK("http://x")\x1b]0;owned\x07\x1b[2J\u202e<script>alert(1)</script>'
+
+
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+cmd|' /C calc'!A0", "-1+1", "@SUM(A1)", "\t=1", "\r=1", "\n=1", "'=1", "''@x"]
+)
+def test_formulas_become_text_and_are_read_back(text):
+    written = csv_text([[text, "0.5"]])
+    (cells,) = csv.reader(io.StringIO(written, newline=""))
+    assert cells == [f"'{text}", "0.5"]
+    assert csv_rows(written) == [[text, "0.5"]]
+
+
+@pytest.mark.parametrize(
+    "text", ["-0.5", "+3", "-1e-05", "-.5", "-12", "", "a=b", "it's", "'quoted'", "x,y", 'say "x"']
+)
+def test_numbers_and_other_text_are_written_as_before(text):
+    expected = io.StringIO()
+    csv.writer(expected, lineterminator="\n").writerow(["x", text])
+    assert csv_text([["x", text]]) == expected.getvalue()
+    assert csv_rows(csv_text([["x", text]])) == [["x", text]]
+
+
+def test_any_cells_are_read_back_and_none_begins_a_formula():
+    rng = random.Random(0)
+    rows = [
+        ["".join(rng.choices("=+-@\t\r\n'\",0.e a\u00e9", k=rng.randrange(6))) for _ in range(5)]
+        for _ in range(2000)
+    ]
+    rows = [["key", *row] for row in rows]
+    assert csv_rows(csv_text(rows)) == rows
+    for row in csv.reader(io.StringIO(csv_text(rows), newline="")):
+        for cell in row:
+            if cell[:1] in tuple("=+-@\t\r\n"):
+                float(cell)
+
+
+def test_names_cannot_control_a_terminal(capsys, tmp_path):
+    assert escape_controls("a\x1b[2J\n\x9b1m\u202e\udcff\x7f") == r"a\x1b[2J\n\x9b1m\u202e\udcff\x7f"
+    assert escape_controls("größe · 車–\u00a0°") == "größe · 車–\u00a0°"
+    table = Table("t", (Column(HOSTILE, label=True), Column("n")), ((Cell(HOSTILE + "\nB"), Cell("1")),))
+    error = DataError(HOSTILE, file=tmp_path / "a\x1b[31m\nb", record="r\x07", cure="none")
+    stream = io.StringIO()
+    with Progress(f"evaluating {HOSTILE}[/]", "scenarios", 2, stream=stream) as bar:
+        bar.update(2)
+    show(f"wrote {HOSTILE}")
+    texts = (table.text(width=400), str(error), stream.getvalue(), capsys.readouterr().out)
+    for text in texts:
+        assert "x1b]0;owned" in text or "x1b[31m" in text
+        assert all(letter == "\n" or letter.isprintable() for letter in text), text
+    assert "\n" not in str(error) and r"a\x1b[31m\nb: record r\x07:" in str(error)
+
+
+def test_every_output_of_the_command_line_is_escaped(repository: Path):
+    """Only ``show`` and tables write to the terminal."""
+    places = []
+    for file in (repository / "src" / "drivax").rglob("*.py"):
+        text = file.read_text()
+        for node in ast.walk(ast.parse(text)) if "print" in text else ():
+            if isinstance(node, ast.Name) and node.id == "print" and file.name != "escaping.py":
+                places.append(f"{file.name}:{node.lineno}")
+    assert places == []
+
+
+def test_pages_and_tables_escape_names():
+    interval = Interval(0.5, 0.4, 0.6, 10)
+    table = Table(
+        "t", (Column("planner", label=True), Column(HOSTILE, HOSTILE)),
+        ((Cell(HOSTILE, title='" onload="x'), interval_cell(interval, "rate", "success", link={"run": HOSTILE})),),
+    )  # fmt: skip
+    for html in (table.html(), data_element({"name": HOSTILE}), facts_html([HOSTILE], [(HOSTILE, [])])):
+        assert "<script>alert" not in html and 'title="" onload' not in html
+    assert csv_rows(table.csv())[1][0] == HOSTILE and "\n\"'=HYPERLINK" in table.csv()
