@@ -63,16 +63,22 @@ def _cause(error: Exception) -> str:
     return text or type(error).__name__
 
 
+def check_regular(file: Path, cure: str) -> None:
+    """Raise a DataError if a path is a pipe or device, which might never end, or a folder; a missing file passes."""
+    with explain_damage(file, cure):
+        if file.exists() and not file.is_file():
+            raise ValueError("not a regular file")
+
+
 def read_bytes(file: Path, cure: str, most: int = MOST_TEXT) -> bytes:
     """Return the content of a file.
 
     Raises:
         DataError: It is missing, larger than ``most`` bytes, or no regular file, which might never end.
     """
+    check_regular(file, cure)
     with explain_damage(file, cure):
         size = file.stat().st_size
-        if not file.is_file():
-            raise ValueError("not a regular file")
         if size > most:
             problem = f"has {format_bytes(size)}, more than the {format_bytes(most)} that are read"
             raise DataError(problem, file=file, cure=cure)

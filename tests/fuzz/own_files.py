@@ -1,6 +1,6 @@
 """Damages the files that drivax writes: detected in one line, or harmless and the same content.
 
-    python -m fuzz.own_files KIND --files 200 --seed 0       (from the folder tests)
+    python -m fuzz.own_files KIND ... --files 200 --seed 0       (from the folder tests)
 
 Exit status 1 when a file ended in anything else. Valid text of another content is accepted for the files of
 :data:`SEALED`, which have no checksum of their own, and counted.
@@ -46,10 +46,31 @@ from scenes import car, straight_road
 
 #: Files of text without a checksum in them: the seal of their folder, or the digests of a set, find valid edits.
 SMALL_CAPACITY = replace(
-    Capacity(), name="small", agents=4, parked=4, segments=512, features=32, lanes=16, lights=4, stops=2, routes=2
+    Capacity(),
+    name="small",
+    agents=4,
+    parked=4,
+    segments=512,
+    features=32,
+    lanes=16,
+    lights=4,
+    stops=2,
+    routes=2,
 )
-SEALED = ("manifest.json", "run.json", "config.yaml", "episodes.csv", "crashes.json", "metrics.jsonl", "study.yaml", ".txt")
-TREE = {"head": np.arange(12, dtype=np.float32).reshape(3, 4), "body": [np.ones(5, np.float32), np.zeros(0, np.int32)]}
+SEALED = (
+    "manifest.json",
+    "run.json",
+    "config.yaml",
+    "episodes.csv",
+    "crashes.json",
+    "metrics.jsonl",
+    "study.yaml",
+    ".txt",
+)
+TREE = {
+    "head": np.arange(12, dtype=np.float32).reshape(3, 4),
+    "body": [np.ones(5, np.float32), np.zeros(0, np.int32)],
+}
 
 
 def content(value: Any) -> str:
@@ -77,10 +98,14 @@ def content(value: Any) -> str:
 
 def write_set(folder: Path) -> Path:
     """A set of three scenarios in two shards, with lists."""
-    with ScenarioWriter(folder / "set", SMALL_CAPACITY, {"command": "test"}, 2, shares=(34, 33, 33)) as writer:
+    with ScenarioWriter(
+        folder / "set", SMALL_CAPACITY, {"command": "test"}, 2, shares=(34, 33, 33)
+    ) as writer:
         for row in range(3):
             recording = straight_road([car(speed=2.0 + row), car(x=40.0)])
-            writer.add(assemble(replace(recording, scenario_id=f"drive-{row}", segment=f"r-{row}"), SMALL_CAPACITY))
+            writer.add(
+                assemble(replace(recording, scenario_id=f"drive-{row}", segment=f"r-{row}"), SMALL_CAPACITY)
+            )
     return folder / "set"
 
 
@@ -89,7 +114,12 @@ def read_set(folder: Path) -> Any:
     data = ScenarioSet.open(folder / "set")
     lists = [select_scenarios(data, (), [file]) for file in sorted((folder / "set" / "splits").glob("*.txt"))
              if file.stat().st_size]  # fmt: skip
-    return [[s.record.tobytes(), s.id, s.tags, s.audit, s.overflow] for s in data], data.entries, data.hash, lists
+    return (
+        [[s.record.tobytes(), s.id, s.tags, s.audit, s.overflow] for s in data],
+        data.entries,
+        data.hash,
+        lists,
+    )
 
 
 def write_table(folder: Path) -> None:
@@ -98,7 +128,9 @@ def write_table(folder: Path) -> None:
     shape = (len(data), data.capacity.steps)
     steps = np.random.default_rng(0).random(shape).astype(np.float32)
     ids = tuple(entry["scenario_id"] for entry in data.entries)
-    table = ScoreTable("kinematic", {"a": 1}, data.hash, ids, np.ones(shape, bool), steps, steps[:, 0], {"urgency": steps})
+    table = ScoreTable(
+        "kinematic", {"a": 1}, data.hash, ids, np.ones(shape, bool), steps, steps[:, 0], {"urgency": steps}
+    )
     write_scores(table, folder / "scores.npz")
 
 
@@ -115,7 +147,9 @@ def write_run(folder: Path) -> None:
         "kind": "evaluation", "planner": "p", "traffic": "idm", "data": [{"path": "s", "hash": "ab", "scenarios": 2}],
         "own_metrics": {"mine": {"unit": "m", "better": "low", "text": "t"}}, "versions": {"numpy": "2"},
     }))  # fmt: skip
-    (folder / "config.yaml").write_text("planner: p\nnoisy_start: false\nseeds: [1, 2]\ntask: {a: 1.5, b: null}\n")
+    (folder / "config.yaml").write_text(
+        "planner: p\nnoisy_start: false\nseeds: [1, 2]\ntask: {a: 1.5, b: null}\n"
+    )
     head = "planner,dataset,scenario_id,segment,seed,traffic,success,mine"
     (folder / "episodes.csv").write_text(f"{head}\np,d,s1,,0,idm,1,0.25\np,d,s2,r,0,idm,0,\n")
     crash = {"dataset": "d", "scenario_id": "s2", "step": 3, "error": "ValueError: x"}
@@ -203,14 +237,19 @@ def outcome(read: Callable[[Path], Any], folder: Path, expected: str, path: Path
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the files of one kind."""
+    """Run the files of some kinds."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kind", choices=KINDS)
+    parser.add_argument("kinds", nargs="+", choices=KINDS)
     parser.add_argument("--files", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(argv)
-    write, read = KINDS[args.kind]
     signal.signal(signal.SIGALRM, alarm)
+    return max(try_kind(kind, args.files, args.seed) for kind in args.kinds)
+
+
+def try_kind(kind: str, files: int, seed: int) -> int:
+    """Damage files of one kind, and print how reading them ends; return 1 if one ends badly, else 0."""
+    write, read = KINDS[kind]
     ends: Counter[str] = Counter()
     changed: Counter[str] = Counter()
     wrong: list[str] = []
@@ -220,23 +259,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         write(whole)
         expected = content(read(whole))
         limit_memory()
-        for number in range(args.files):
-            rng = random.Random(f"{args.seed} {args.kind} {number}")
+        for number in range(files):
+            rng = random.Random(f"{seed} {kind} {number}")
             shutil.copytree(whole, folder)
             path, how = damage(folder, rng)
             signal.alarm(SECONDS_PER_FILE)
-            kind, problem = outcome(read, folder, expected, path)
+            end, problem = outcome(read, folder, expected, path)
             signal.alarm(0)
-            ends[kind] += 1
-            if kind == "changed":
-                changed[path.name] += 1
+            ends[end] += 1
+            changed[path.name] += end == "changed"
             if problem is not None:
-                wrong.append(f"file {number} ({how} of {path.name}): {kind}: {problem}")
+                wrong.append(f"file {number} ({how} of {path.name}): {end}: {problem}")
             shutil.rmtree(folder)
-    print(json.dumps({"kind": args.kind, "ends": ends, "changed": changed, "wrong": len(wrong)}))
+    print(json.dumps({"kind": kind, "ends": ends, "changed": +changed, "wrong": len(wrong)}))
     for line in wrong[:12]:
         print(line)
-    return 1 if wrong else 0
+    return int(bool(wrong))
 
 
 if __name__ == "__main__":

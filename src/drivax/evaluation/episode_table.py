@@ -147,9 +147,10 @@ class EpisodeTable:
     def own_metrics(self) -> Mapping[str, Column]:
         """Unit, direction and definition of user-defined metrics."""
         columns = {}
-        for name, metric in (self.info.get("own_metrics") or {}).items():
-            unit, better, definition = (str(metric[key]) for key in ("unit", "better", "text"))
-            columns[name] = Column(unit, cast(Direction, better), definition)
+        with explain_damage((self.folder or Path()) / "run.json", _RERUN):
+            for name, metric in (self.info.get("own_metrics") or {}).items():
+                unit, better, definition = (str(metric[key]) for key in ("unit", "better", "text"))
+                columns[name] = Column(unit, cast(Direction, better), definition)
         return columns
 
     @property
