@@ -248,7 +248,7 @@ def test_files(tmp_path: Path):
     with pytest.raises(UsageError, match="not a mapping of settings"):
         settings.load(Training, file)
     file.write_bytes(b"\xff\xfe\x00a")
-    with pytest.raises(UsageError, match="not a text file"):
+    with pytest.raises(UsageError, match="is not text"):
         settings.load(Training, file)
     with pytest.raises(UsageError, match=r"none\.yaml: file not found"):
         settings.load(Training, str(tmp_path / "none.yaml"))

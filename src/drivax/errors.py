@@ -18,6 +18,8 @@ _EXTRAS = {
     "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
     "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
 }  # fmt: skip
+#: Characters of the longest problem that is kept in full; of others, which quote a value, only the ends.
+_LONGEST = 1000
 
 
 _UNREACHABLE = "mount the disk again or check it, then repeat the command"
@@ -74,7 +76,7 @@ class DrivaxError(Exception):
         record: int | str | None = None,
         cure: str | None = None,
     ) -> None:
-        self.problem = problem
+        self.problem = problem if len(problem) <= _LONGEST else f"{problem[:700]} ... {problem[-200:]}"
         self.file = None if file is None else Path(file)
         self.record = record
         self.cure = cure

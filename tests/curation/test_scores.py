@@ -155,7 +155,7 @@ def test_damaged_tables_are_refused(data, table, tmp_path):
     others = [(tmp_path / name).read_bytes() for name in ("other.npz", "array.npy")]
     for content in (b"", b"text", half, bytes(flipped), *others):
         file.write_bytes(content)
-        with pytest.raises(DataError, match=r"not a score table, or damaged .*; run `drivax curate` again"):
+        with pytest.raises(DataError, match=r"or damaged \(.*; run `drivax curate` again"):
             read_scores(file, data)
 
 

@@ -220,7 +220,7 @@ def test_a_missing_map_is_named(sample, tmp_path):
     path = tmp_path / sample.name
     path.write_bytes(sample.read_bytes())
     (bad,) = READER.read(path)
-    assert bad.file.name == f"log_map_archive_{av2_motion.SCENARIO}.json" and bad.problem == "is missing"
+    assert bad.file.name == f"log_map_archive_{av2_motion.SCENARIO}.json" and bad.problem == "file not found"
     assert READER.describe(path).missing == (bad.file.name,)
     assert READER.describe(sample).missing == ()
 

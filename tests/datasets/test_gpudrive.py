@@ -265,12 +265,12 @@ def test_other_files_are_refused(tmp_path, content):
 
 def test_missing_and_oversized_files(tmp_path):
     (bad,) = GpuDrive().read(tmp_path / "none.json")
-    assert "No such file" in bad.problem
+    assert "file not found" in bad.problem
     large = tmp_path / "large.json"
     with large.open("wb") as file:
         file.truncate(300_000_000)  # sparse: takes no space
     (bad,) = GpuDrive().read(large)
-    assert "300,000,000 bytes" in bad.problem
+    assert "has 300 MB, more than the 67 MB" in bad.problem
 
 
 def test_recognises_by_content(tmp_path, scene):

@@ -114,7 +114,7 @@ def limit_memory() -> None:
     """Refuse this process more than 1 GB beyond what it has now."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + MEMORY
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
 
 
 def _sample(write: Callable[[Path], Path], scratch: Path) -> tuple[Path, Path]:

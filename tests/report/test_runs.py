@@ -106,10 +106,13 @@ def _lacks(folder):
         (_edit("episodes.csv", "log,0", "log,yes"), "record 1: collision is 'yes'"),
         (_edit("episodes.csv", "log,0", "log,inf"), "record 1: collision is infinite"),
         (_edit("episodes.csv", "log,0", "log,0,0"), "record 1: has"),
-        (_cut("trajectories.npz"), "cannot be read"),
-        (_write("crashes.json", '[{"dataset": "hand"}]'), "crashes.json: cannot be read ('scenario_id')"),
+        (_cut("trajectories.npz"), "not an .npz file, or damaged"),
+        (
+            _write("crashes.json", '[{"dataset": "hand"}]'),
+            "crashes.json: cannot be read (lacks 'scenario_id')",
+        ),
         (_shapes, "disagree in shape"),
-        (_lacks, "lacks an array"),
+        (_lacks, "lacks 'offroad_step'"),
     ],
 )
 def test_damaged_files_are_errors_with_a_cure(runs, damage, words):

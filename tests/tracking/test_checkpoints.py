@@ -328,11 +328,11 @@ def test_a_damaged_packed_tree_is_reported(tmp_path: Path):
     file = tmp_path / "tree.npz"
     pack(file, {"w": jnp.arange(100.0)})
     whole = bytearray(file.read_bytes())
-    with pytest.raises(DataError, match="is damaged"):
+    with pytest.raises(DataError, match=r"or damaged|not found"):
         unpack(tmp_path / "none.npz", {})
     for damage in (slice(300, 304), slice(len(whole) // 2, None)):
         spoilt = whole.copy()
         spoilt[damage] = b"" if damage.stop is None else bytes(255 - byte for byte in whole[damage])
         file.write_bytes(spoilt)
-        with pytest.raises(DataError, match="is damaged"):
+        with pytest.raises(DataError, match=r"or damaged|not found"):
             unpack(file, {"w": jnp.zeros(100)})

@@ -97,7 +97,7 @@ def test_folders_without_a_run_are_refused(tmp_path: Path):
     run = RunFolder.create(tmp_path / "run", Config())
     (run.path / "run.json").write_text("{")
     (run.path / "seal.json").unlink()
-    with pytest.raises(DataError, match=r"run\.json: not valid JSON"):
+    with pytest.raises(DataError, match=r"run\.json: is not valid JSON"):
         RunFolder.open(run.path)
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import zipfile
-import zlib
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -19,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.files import atomic_write, check_output
+from drivax.reading import explain_damage, read_arrays
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import edited_files, note_edited, refuse_edited
 
@@ -134,6 +133,8 @@ SCORES_VERSION = 3
 OWN_SCORES = "scores.npz"
 _RERUN = "run `drivax curate` again"
 _COMPONENT = "component_"
+#: Largest table: bytes beyond its columns (ids, header), and columns of float32 per step.
+_MOST_BYTES, _MOST_COLUMNS = 64 << 20, 64
 
 
 @dataclass(frozen=True)
@@ -220,27 +221,21 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
     if not file.is_file():
         cure = "write it with `drivax curate METHOD --data SET --out FILE`"
         raise DataError("score table not found", file=file, cure=cure)
-    try:
-        # np.load would not close a damaged file.
-        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"][()]))
-            ids = tuple(str(name) for name in archive["scenario_id"])
-            _check_source(header["version"], header["set_hash"], file, data)
-            arrays = {name: archive[name] for name in archive.files if name != "header"}
-            digest = _digest(header, arrays)
-            del arrays["scenario_id"]
-            _check_shapes(ids, arrays, file, data)
-            if header.get("sha256", digest) != digest:
-                refuse_edited(file, "changed since drivax wrote it")
-            note_edited(*map(str, header.get("edited", ())))
-            valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
-            component_names = [name for name in arrays if name.startswith(_COMPONENT)]
-            components = {name.removeprefix(_COMPONENT): arrays[name] for name in component_names}
-            method, config, set_hash = (header[name] for name in ("method", "config", "set_hash"))
-            table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        problem = f"not a score table, or damaged ({type(error).__name__})"
-        raise DataError(problem, file=file, cure=_RERUN) from error
+    arrays = read_arrays(file, _RERUN, _MOST_BYTES + len(data) * _MOST_COLUMNS * data.capacity.steps * 4)
+    with explain_damage(file, _RERUN, "not a score table, or damaged"):
+        header = json.loads(str(arrays.pop("header")[()]))
+        _check_source(header["version"], header["set_hash"], file, data)
+        digest = _digest(header, arrays)
+        ids = tuple(str(name) for name in arrays.pop("scenario_id"))
+        _check_shapes(ids, arrays, file, data)
+        if header.get("sha256", digest) != digest:
+            refuse_edited(file, "changed since drivax wrote it")
+        note_edited(*map(str, header.get("edited", ())))
+        valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
+        component_names = [name for name in arrays if name.startswith(_COMPONENT)]
+        components = {name.removeprefix(_COMPONENT): arrays[name] for name in component_names}
+        method, config, set_hash = (header[name] for name in ("method", "config", "set_hash"))
+        table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components)
     _check_range(table, file, _RERUN)
     return table
 

@@ -24,6 +24,7 @@ from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
 from drivax.datasets.reader import BadRecord, Reader, of_length
 from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError, explain_system
+from drivax.reading import check_regular
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
 from drivax.scenario.recording import STRIDE, Recording, windows
@@ -115,6 +116,7 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
             ``limit`` are used.
     """
     try:
+        check_regular(path, "name a file")
         reader = detect(path) if options.format == AUTO else find_reader(options.format)
     except DataError as error:
         yield BadRecord.of(error, path)

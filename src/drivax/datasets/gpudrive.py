@@ -34,8 +34,6 @@ from drivax.scenario.schema import (
 _Array = np.ndarray[Any, Any]
 
 _SKIP = "skip this file, or make it again from the Waymo protos"
-#: Published files have 1 to 10 MB; parsing takes many times the size in memory.
-_LARGEST_BYTES = 200_000_000
 _HEAD_BYTES = 4096
 _MOST_STEPS = 1000
 #: Value of invalid states.
@@ -98,7 +96,7 @@ class GpuDrive:
 
     def describe(self, path: Path) -> Description:
         """Describe the content of the file."""
-        recording = decode(_load(path))
+        recording = decode(parsing.load_json(path))
         notes = [
             f"{len(recording.tracks.kind)} objects, {len(recording.features)} road elements",
             "no lane graph (lanes are chained by geometry) and no speed limits",
@@ -116,21 +114,9 @@ class GpuDrive:
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """Yield the recording of a file, or the bad record in its place."""
         try:
-            yield decode(_load(path))
+            yield decode(parsing.load_json(path))
         except DataError as error:
             yield BadRecord.of(error, path)
-
-
-def _load(path: Path) -> Any:
-    """Parse a JSON file of plausible size."""
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise DataError(error.strerror or "cannot be opened", file=path, cure="check the path") from error
-    if size > _LARGEST_BYTES:
-        problem = f"has {size:,} bytes, more than a GPUDrive scene"
-        raise DataError(problem, file=path, cure="name the folder of single scenes")
-    return parsing.load_json(path)
 
 
 def decode(scene: Any) -> Recording:

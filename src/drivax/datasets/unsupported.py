@@ -5,7 +5,6 @@ Detection reads the beginning of a file, its first record, or file names.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,8 @@ from pathlib import Path
 from drivax.datasets.womd.messages import parse
 from drivax.datasets.womd.tfrecord import read_records
 from drivax.errors import DataError, UsageError
-from drivax.scenario.store import MANIFEST
+from drivax.reading import read_json
+from drivax.scenario.store import AGAIN, MANIFEST
 
 #: Kinds of files by their first bytes (of a tar archive those from ``_TAR_BYTE`` on), and cures.
 _TAR, _TAR_BYTE = b"ustar", 257
@@ -153,9 +153,10 @@ def _first_match(folder: Path, known: _Folders) -> DataError | None:
 def _is_scenario_set(folder: Path, names: set[str]) -> bool:
     """Whether a folder is a scenario set of drivax, of any version."""
     try:
-        return "schema_version" in json.loads((folder / MANIFEST).read_bytes())
-    except (OSError, ValueError, TypeError):
+        manifest = read_json(folder / MANIFEST, AGAIN)
+    except DataError:
         return False
+    return isinstance(manifest, dict) and "schema_version" in manifest
 
 
 def _inside(folder: Path, *patterns: str) -> bool:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
-import zipfile
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -20,6 +18,7 @@ from jaxtyping import Float, Float32, Int16, Int64
 from drivax.errors import DataError
 from drivax.escaping import csv_rows, csv_text
 from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
+from drivax.reading import explain_damage, read_arrays, read_json, read_text
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import check_seal, edited_files, mark_edited, seal
 from drivax.stats.clusters import recordings
@@ -44,6 +43,8 @@ NOT_SUMMARISED = tuple(name for name, column in _COLUMNS.items() if not column.s
 #: Columns that are 0 if the planner crashed.
 FAILED = tuple(name for name, column in _COLUMNS.items() if column.fails_on_crash)
 _RERUN = "run drivax evaluate again"
+#: Largest ``episodes.csv``, and largest trajectories: bytes of all, and more per episode than any capacity takes.
+_MOST_TABLE, _MOST_BYTES, _MOST_EPISODE_BYTES = 256 << 20, 16 << 20, 1 << 20
 
 Array = np.ndarray[Any, Any]
 #: ``(dataset, scenario_id)``.
@@ -148,9 +149,10 @@ class EpisodeTable:
     def own_metrics(self) -> Mapping[str, Column]:
         """Unit, direction and definition of user-defined metrics."""
         columns = {}
-        for name, metric in (self.info.get("own_metrics") or {}).items():
-            unit, better, definition = (str(metric[key]) for key in ("unit", "better", "text"))
-            columns[name] = Column(unit, cast(Direction, better), definition)
+        with explain_damage((self.folder or Path()) / "run.json", _RERUN):
+            for name, metric in (self.info.get("own_metrics") or {}).items():
+                unit, better, definition = (str(metric[key]) for key in ("unit", "better", "text"))
+                columns[name] = Column(unit, cast(Direction, better), definition)
         return columns
 
     @property
@@ -298,10 +300,9 @@ def _cell(value: Any) -> str:
 
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
     """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
-    try:
-        rows = csv_rows(existing(path, _RERUN).read_bytes().decode())
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
+    text = read_text(existing(path, _RERUN), _RERUN, _MOST_TABLE)
+    with explain_damage(path, _RERUN, "cannot be read"):
+        rows = csv_rows(text)
     header = rows[0] if rows else []
     missing = [key for key in KEYS if key not in header]
     if missing or len(set(header)) < len(header):
@@ -339,29 +340,23 @@ def _read_crashes(path: Path) -> tuple[Crash, ...]:
     check_seal(path)
     if not path.is_file():
         return ()
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
+    rows = read_json(path, _RERUN)
+    with explain_damage(path, _RERUN, "cannot be read"):
         return tuple(
             Crash(row["dataset"], row["scenario_id"], int(row["step"]), str(row["error"])) for row in rows
         )
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
 
 
 def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: bool) -> Trajectories:
     """Read ``trajectories.npz`` in the order of ``scenario_ids``; repeated ids are matched by their order."""
-    try:
-        with existing(path, _RERUN).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            ids = [_text(value) for value in archive["scenario_id"]]
-            ego = archive["ego"].astype(np.float32)
-            action = (archive["action"] if "action" in archive else ego[:, 1:, :0]).astype(np.float32)
-            start = archive["start"].astype(np.int64)
-            events = {name: archive[f"{name}_step"].astype(np.int64) for name in EVENTS}
-            others = None if log_traffic else archive["others"]
-    except KeyError as error:
-        raise DataError(f"lacks an array: {error.args[0]}", file=path, cure=_RERUN) from error
-    except (ValueError, IndexError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
+    archive = read_arrays(path, _RERUN, _MOST_BYTES + len(scenario_ids) * _MOST_EPISODE_BYTES)
+    with explain_damage(path, _RERUN, "cannot be read"):
+        ids = [_text(value) for value in archive["scenario_id"]]
+        ego = archive["ego"].astype(np.float32)
+        action = (archive["action"] if "action" in archive else ego[:, 1:, :0]).astype(np.float32)
+        start = archive["start"].astype(np.int64)
+        events = {name: archive[f"{name}_step"].astype(np.int64) for name in EVENTS}
+        others = None if log_traffic else archive["others"]
     if not _has_consistent_shapes(len(ids), ego, action, (start, *events.values()), others):
         raise DataError("its arrays disagree in shape", file=path, cure=_RERUN)
     row_of = {key: row for row, key in enumerate(_with_occurrence(ids))}

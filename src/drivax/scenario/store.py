@@ -25,6 +25,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
+from io import BufferedIOBase
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -45,6 +46,7 @@ from drivax.files import (
     sync_and_close,
     write_text,
 )
+from drivax.reading import MOST_TEXT, explain_damage, read_array_header, read_bytes
 from drivax.scenario.schema import (
     NAMES,
     SCHEMA_VERSION,
@@ -61,13 +63,14 @@ MANIFEST = "manifest.json"
 ENTRIES_DIGEST = "scenarios_sha256"
 #: The cure for a set that cannot be repaired.
 AGAIN = "convert or generate the set again"
-_HEADER_LIMIT = 100_000
 #: Bytes at the beginning of a record that hold its names.
 _PAGE = 4096
 #: Scenarios that an iteration reads at a time, and those of a task of a thread.
 _BATCH, _PART = 64, 8
-#: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
-_HEADER_LOCK = threading.Lock()
+#: Threads map a shard once.
+_MAP_LOCK = threading.Lock()
+#: Types of the values of a manifest entry.
+_ENTRY = {**dict.fromkeys(NAMES, str), "flags": list, "overflow": dict, "audit": dict, "tags": dict}
 _Bytes = np.ndarray[Any, Any]
 
 
@@ -444,7 +447,7 @@ class Shard:
             raise DataError(f"{problem}: damaged, or of another set", file=path, cure=cure)
 
     def _map(self) -> _Bytes:
-        with _HEADER_LOCK:
+        with _MAP_LOCK:
             return self._read_map() if self._data is None else self._data
 
     def _read_map(self) -> _Bytes:
@@ -500,31 +503,35 @@ def read_manifest(path: Path) -> dict[str, Any]:
     if not file.is_file():
         cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
         raise DataError("no manifest.json, so this is not a complete scenario set", file=path, cure=cure)
-    try:
-        manifest = json.loads(text := file.read_bytes())
+    # A manifest is shorter than the records that it lists.
+    most = sum(shard.stat().st_size for shard in path.glob("shard-*.npy") if shard.is_file())
+    text = read_bytes(file, AGAIN, max(MOST_TEXT, most))
+    with explain_damage(file, AGAIN, "manifest is damaged"):
+        manifest = json.loads(text)
         version = manifest["schema_version"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"manifest is damaged ({error})", file=file, cure=AGAIN) from error
     if version != SCHEMA_VERSION:
         newer = isinstance(version, int) and version > SCHEMA_VERSION
         problem = f"schema version {version}, this drivax reads {SCHEMA_VERSION}"
         raise DataError(problem, file=file, cure="upgrade drivax" if newer else AGAIN)
-    _check_manifest(manifest, file)
+    with explain_damage(file, AGAIN, "manifest is damaged"):
+        _check_manifest(manifest, file)
     _check_entries(manifest, text, file)
     return manifest
 
 
 def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
-    try:
-        fields_agree = manifest["fields"] == field_table(Capacity(**manifest["capacity"]))
-        for shard in manifest["shards"]:
-            itemgetter("file", "count", "sha256")(shard)
-        for entry in manifest["scenarios"]:
-            itemgetter(*NAMES, "flags", "overflow", "audit", "tags")(entry)
-            SourceCounts(**entry["source"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"manifest is damaged ({error!r})", file=file, cure=AGAIN) from error
-    if not fields_agree:
+    most = len(manifest["scenarios"])
+    for number, shard in enumerate(manifest["shards"]):
+        name, count, digest = itemgetter("file", "count", "sha256")(shard)
+        if name != shard_name(number) or type(count) is not int or not 0 <= count <= most:
+            raise ValueError(f"shard {number} is {name!r} with {count!r} of {most} records")
+        if not isinstance(digest, str):
+            raise ValueError(f"shard {number} has no checksum")
+    for number, entry in enumerate(manifest["scenarios"]):
+        SourceCounts(**entry["source"])
+        if tuple(map(type, itemgetter(*_ENTRY)(entry))) != tuple(_ENTRY.values()):
+            raise ValueError(f"scenario {number} has a value of another type")
+    if manifest["fields"] != field_table(Capacity(**manifest["capacity"])):
         raise DataError("field table is not this version's", file=file, cure=AGAIN)
 
 
@@ -571,14 +578,11 @@ def write_header(file: IO[bytes], dtype: np.dtype[Any], count: int) -> None:
     np.lib.format.write_array_header_1_0(file, header)
 
 
-def read_header(file: IO[bytes], path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def read_header(file: BufferedIOBase, path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Read shape and dtype of a ``.npy`` file, up to the first byte of data."""
-    try:
-        np.lib.format.read_magic(file)
-        shape, _, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=_HEADER_LIMIT)
-    except (ValueError, SyntaxError, TypeError) as error:
-        raise DataError("header is damaged, not a .npy shard", file=path, cure=AGAIN) from error
-    return shape, dtype
+    with explain_damage(path, AGAIN, "header is damaged, not a .npy shard"):
+        shape, _, dtype = read_array_header(file)
+        return shape, dtype
 
 
 def plain(value: Any) -> Any:

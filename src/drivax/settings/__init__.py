@@ -14,7 +14,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from drivax.errors import UsageError, did_you_mean
+from drivax.errors import DataError, UsageError, did_you_mean
+from drivax.reading import read_text
 from drivax.settings.structure import Flag, kind_of, parse_yaml, plain, structure, write_yaml
 from drivax.settings.trust import check_names, modules_of
 
@@ -138,9 +139,9 @@ def _merge(base: Any, values: Any) -> Any:
 
 def _read(file: Path) -> str:
     try:
-        return file.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise UsageError("not a text file", file=file, cure="name a YAML file") from error
+        return read_text(file, "name a YAML file")
+    except DataError as error:
+        raise UsageError(error.problem, file=file, cure=error.cure) from error
 
 
 def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:

@@ -22,8 +22,11 @@ from cattrs.gen import make_dict_structure_fn
 
 from drivax.errors import DrivaxError, UsageError, did_you_mean
 from drivax.plugins import check_arguments, check_protocol, dotted_name, find_named, is_dotted
+from drivax.reading import DAMAGE
 
 _UNIONS = (Union, types.UnionType)
+#: Largest YAML text, its deepest value, and its values with aliases in full.
+_MOST_CHARACTERS, _MOST_LEVELS, _MOST_VALUES = 1 << 20, 64, 50_000
 #: Accepted types of values by scalar type, and its name in messages.
 _SCALARS: dict[Any, tuple[Any, str]] = {
     bool: (bool, "true or false"),
@@ -396,15 +399,19 @@ def parse_yaml(text: str, file: Path | None = None) -> Any:
     """Return the plain values of a YAML text.
 
     Raises:
-        UsageError: Invalid YAML or a duplicate key, with its line.
+        UsageError: Invalid YAML, a duplicate key, or too large a value, with its line.
     """
     try:
+        if len(text) > _MOST_CHARACTERS:
+            raise ValueError(f"has more than {_MOST_CHARACTERS:,} characters")
         return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or "invalid"
         location = "YAML" if mark is None else f"line {mark.line + 1}"
         raise UsageError(f"{location}: {problem}", file=file, cure="fix the file") from error
+    except DAMAGE as error:  # a value that its tag does not allow, such as an integer of 5,000 digits
+        raise UsageError(f"YAML: invalid ({error})", file=file, cure="fix the file") from error
 
 
 def write_yaml(values: Any) -> str:
@@ -414,7 +421,32 @@ def write_yaml(values: Any) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Loader of YAML 1.2 core scalars that refuses duplicate keys."""
+    """Loader of YAML 1.2 core scalars that refuses duplicate keys, and deep or large values."""
+
+    def __init__(self, stream: Any) -> None:
+        super().__init__(stream)
+        #: Current depth, number of values with aliases in full, and that number within each value.
+        self._depth, self._count, self._counts = 0, 0, dict[int, int]()
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event, before = self.peek_event(), self._count
+        self._depth += 1
+        self._count += 1
+        if self._depth > _MOST_LEVELS:
+            self._refuse(f"more than {_MOST_LEVELS} levels", event)
+        node = super().compose_node(parent, index)
+        if isinstance(event, yaml.AliasEvent):
+            if id(node) not in self._counts:
+                self._refuse("a value that contains itself", event)
+            self._count = before + self._counts[id(node)]
+        self._counts[id(node)] = self._count - before
+        if self._count > _MOST_VALUES:
+            self._refuse(f"more than {_MOST_VALUES:,} values", event)
+        self._depth -= 1
+        return node
+
+    def _refuse(self, problem: str, event: Any) -> None:
+        raise yaml.MarkedYAMLError(None, None, problem, event.start_mark)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         keys: set[Any] = set()

@@ -9,12 +9,10 @@ state (:func:`pack`).
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import re
 import shutil
-import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -26,6 +24,8 @@ import numpy as np
 
 from drivax.errors import DataError
 from drivax.files import atomic_write, replace_folder, sync_folder, write_text
+from drivax.reading import read_arrays
+from drivax.seal import check_seal
 
 ABOUT = "about.json"
 #: Former names of fields of training states, in checkpoints of version 0.1.0.
@@ -252,16 +252,10 @@ def unpack(file: Path, template: State) -> State:
         DataError: The file is damaged, edited, or does not match the template.
     """
     check_seal(file)
-    try:
-        with zipfile.ZipFile(file) as archive:
-            # Only reading a member to its end verifies its checksum.
-            members = {name: io.BytesIO(archive.read(name)) for name in archive.namelist()}
-        arrays = {
-            name.removesuffix(".npy"): np.load(member, allow_pickle=False) for name, member in members.items()
-        }
-    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise DataError(f"is damaged ({error})", file=file, cure="use another copy") from error
     requested_leaves = _named_leaves(template)
+    # Every array has a header and an entry in the archive's directory.
+    most = sum(leaf.size * leaf.dtype.itemsize + 4096 for _, leaf in requested_leaves) + 4096
+    arrays = read_arrays(file, "use another copy", 2 * most)
     stored_leaves = [
         {"name": name, "type": str(array.dtype), "shape": array.shape} for name, array in arrays.items()
     ]

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 from drivax import settings
 from drivax.errors import DataError, UsageError
 from drivax.files import check_output, replace_folder, write_text
+from drivax.reading import explain_damage, read_json, read_text
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import allow_edited, check_seal, edited_files, note_edited, seal, unseal
 from drivax.tracking.sinks import read_rows
@@ -33,6 +34,12 @@ RUN_FILE = "run.json"
 #: Prefix of policies that are part of the package.
 ZOO = "zoo:"
 _ZOO_FOLDER = Path(__file__).resolve().parent.parent / "zoo"
+_RERUN = "run the command again"
+#: Types of the entries of ``run.json`` that are read again.
+_ENTRIES: dict[str, Any] = {
+    **dict.fromkeys(("kind", "planner", "traffic", "started", "command"), str),
+    **dict.fromkeys(("own_metrics", "networks_from", "versions"), dict), "data": list | dict, "trained_on": list,
+}  # fmt: skip
 _TRAINING_KINDS = ("training", "seeds")
 _PACKAGES = ("drivax", "jax", "jaxlib", "flax", "optax", "numpy")
 
@@ -109,13 +116,10 @@ class RunFolder:
             problem = f"not a run folder: no {RUN_FILE}" if path.is_dir() else "run folder not found"
             raise DataError(problem, file=path, cure=cure)
         check_seal(file)
-        try:
-            info = json.loads(file.read_bytes())
-        except ValueError as error:
-            raise DataError(f"not valid JSON ({error})", file=file, cure="run the command again") from error
-        if not isinstance(info, dict):
-            raise DataError("not a JSON object", file=file, cure="run the command again")
-        note_edited(*map(str, info.get("edited") or ()))
+        info = read_json(file, _RERUN)
+        with explain_damage(file, _RERUN):
+            _check_info(info)
+            note_edited(*map(str, info.get("edited") or ()))
         return cls(path, info)
 
     @property
@@ -132,7 +136,7 @@ class RunFolder:
             DataError: ``config.yaml`` is missing or edited.
             UsageError: It does not match ``cls``, or names code that is not trusted.
         """
-        file = existing(self.path / CONFIG_FILE, "run the command again")
+        file = existing(self.path / CONFIG_FILE, _RERUN)
         return settings.load(cls, file, overrides, trust=trust)
 
     @property
@@ -140,7 +144,7 @@ class RunFolder:
         """Content of ``config.yaml`` as plain values; empty if there is no such file."""
         file = self.path / CONFIG_FILE
         check_seal(file)
-        values = settings.parse_yaml(file.read_text(encoding="utf-8"), file) if file.is_file() else {}
+        values = settings.parse_yaml(read_text(file, _RERUN), file) if file.is_file() else {}
         return values if isinstance(values, dict) else {}
 
     def note(self, **info: Any) -> RunFolder:
@@ -180,6 +184,19 @@ def existing(path: Path, cure: str) -> Path:
     if not path.is_file():
         raise DataError("file not found", file=path, cure=cure)
     return path
+
+
+def _check_info(info: Any) -> None:
+    """Check the types of the entries of ``run.json`` that are read again."""
+    if not isinstance(info, dict):
+        raise ValueError("not a JSON object")
+    for name, kind in _ENTRIES.items():
+        if not isinstance(info.get(name), kind | None):
+            raise ValueError(f"{name} is not of type {kind}")
+    for data in (info.get("data"), info.get("trained_on"), (info.get("networks_from") or {}).get("data")):
+        for entry in [data] if isinstance(data, dict) else data or ():
+            if not isinstance(entry, dict) or not isinstance(entry.get("hash"), str | None):
+                raise ValueError("a data set without its hash")
 
 
 def _json(info: Mapping[str, Any]) -> str:

@@ -12,6 +12,9 @@ from typing import Any, Self
 
 from drivax.errors import DataError
 from drivax.files import sync_and_close, write_text
+from drivax.reading import DAMAGE, read_text
+
+_MOST_LOG = 256 << 20
 
 
 class JsonLines:
@@ -117,12 +120,13 @@ def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
 
 def _rows(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield every line with its row; an incomplete last line is ignored."""
-    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    lines = read_text(file, "train again", _MOST_LOG).splitlines(keepends=True)
     for number, line in enumerate(lines):
         try:
             row = json.loads(line)
-            row["step"]
-        except (ValueError, KeyError, TypeError) as error:
+            if not isinstance(row["step"], int):
+                raise ValueError("a step that is no integer")
+        except DAMAGE as error:
             if number == len(lines) - 1 and not line.endswith("\n"):
                 return
             cure = "delete the row"

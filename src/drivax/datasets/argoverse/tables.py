@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Int
 
 from drivax.errors import DataError, import_extra
+from drivax.reading import check_regular
 
 DATASET = "av2"
 #: The recording car, a Ford Fusion: length, width and height of its box in the sensor logs, metres.
@@ -71,6 +72,7 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
     ``optional`` columns, which not every version of the format has, may be missing.
     """
     pa = import_extra("pyarrow")
+    check_regular(path, _AGAIN)
     try:
         table, others = _load(path, list(columns), optional)
         if table.num_rows == 0:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from drivax.errors import DataError, import_extra
+from drivax.reading import check_regular
 
 Array = np.ndarray[Any, Any]
 
@@ -93,6 +94,7 @@ class Database:
 @contextlib.contextmanager
 def open_database(path: Path) -> Iterator[Database]:
     """Open a SQLite file read-only and as immutable: no lock, no journal, nothing is written next to it."""
+    check_regular(path, _CURE)
     try:
         with path.open("rb") as file:
             head = file.read(len(_MAGIC))

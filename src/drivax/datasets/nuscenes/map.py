@@ -48,6 +48,8 @@ class Box:
 
 
 _AGAIN = "unpack the map expansion again"
+#: Largest map of a city, bytes.
+_MOST_BYTES = 256 << 20
 #: Layers that are read, row by row, and others of the map expansion.
 _LAYERS = (
     "line", "polygon", "drivable_area", "lane", "lane_connector", "lane_divider", "road_divider", "ped_crossing",
@@ -107,7 +109,7 @@ class City:
 @lru_cache(maxsize=4)
 def city(path: Path) -> City:
     """The map in a file of the map expansion (v1.2 or later)."""
-    content = load_json(path)
+    content = load_json(path, _MOST_BYTES)
     try:
         return _Layers(content).city()
     except DataError as error:

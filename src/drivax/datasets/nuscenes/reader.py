@@ -19,6 +19,7 @@ from drivax.datasets.parsing import box_centre, check_finite, flatten, nonzero, 
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
+from drivax.reading import check_regular
 from drivax.scenario.recording import Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag
 
@@ -422,6 +423,7 @@ def _table(folder: Path, name: str) -> Iterator[_Row]:
 
 def rows(path: Path) -> Iterator[dict[str, Any]]:
     """The objects of a file that holds one array of objects; it is never held in memory as a whole."""
+    check_regular(path, _AGAIN)
     decoder = json.JSONDecoder()
     number = 0
     try:

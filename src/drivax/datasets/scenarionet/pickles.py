@@ -29,6 +29,9 @@ _NUMBER = (int, float)
 MOST_BYTES = 64 << 20
 MOST_OPERATIONS = 4_000_000
 MOST_AXES = 4
+#: Types of keys; integers below this bound differ in their hashes (but -1 and -2), tuples of few parts in most.
+_PLAIN = (str, int, float, bytes, type(None))
+_LARGEST_KEY, _MOST_PARTS = 1 << 60, 4
 _DAMAGED = "copy or generate the file again"
 _DISTRUST = "do not open this file with pickle: it could run anything"
 _TYPE_CODE = re.compile(r"[<>|=]?([biu]1|[iu][248]|f[248]|[SU]\d{1,4}|O8?)")
@@ -204,11 +207,18 @@ _SKIPPED = frozenset(("PROTO", "FRAME", "STOP"))
 
 
 def _hashable(key: Any) -> Any:
-    """A key or a member of a set: a plain value or a flat tuple of them, since hashing deep tuples ends the process."""
-    plain = (str, int, float, bytes, type(None))
-    if isinstance(key, plain) or (type(key) is tuple and all(isinstance(part, plain) for part in key)):
+    """A key or a member of a set: a plain value or a short flat tuple of them.
+
+    Hashing deep tuples ends the process. Keys of one hash take quadratic time: large integers, tuples of many parts
+    or of floats.
+    """
+    if type(key) is str:
         return key
-    raise ValueError(f"a key of type {type(key).__name__}")
+    is_flat = type(key) is tuple and len(key) <= _MOST_PARTS and float not in map(type, key)
+    for part in key if is_flat else (key,):
+        if not isinstance(part, _PLAIN) or (isinstance(part, int) and abs(part) >= _LARGEST_KEY):
+            raise ValueError(f"a key of type {type(key).__name__}, or one too large")
+    return key
 
 
 def _members(items: Any = ()) -> list[Any]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from drivax.errors import DataError, DrivaxError, UsageError, did_you_mean
+from drivax.reading import read_text
 from drivax.scenario.schema import Flag
 from drivax.scenario.select.tags import TAGS
 
@@ -245,12 +246,7 @@ def select_scenarios(
 
 def read_names(file: Path) -> list[_Name]:
     """Read names from a text file, one per line; empty lines are skipped."""
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise DataError(error.strerror or "cannot be read", file=file, cure="check the path") from error
-    except UnicodeDecodeError as error:
-        raise DataError("is not text", file=file, cure="give one scenario id per line") from error
+    lines = read_text(file, "give a file with one scenario id per line").splitlines()
     return [_Name(text, file, row) for row, line in enumerate(lines, start=1) if (text := line.strip())]
 
 

@@ -1,0 +1,159 @@
+"""Read files of a stranger: sizes are bounded before memory is taken, and damage is one line."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import lzma
+import math
+import struct
+import threading
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.errors import DataError
+from drivax.files import format_bytes
+
+Array = np.ndarray[Any, Any]
+
+#: Errors by which libraries report bytes that they cannot read. RuntimeError includes RecursionError (deep nesting) and
+#: NotImplementedError, and is what ``zipfile`` raises for encrypted members.
+DAMAGE = (
+    ValueError, TypeError, LookupError, AttributeError, ArithmeticError, EOFError, SyntaxError, RuntimeError,
+    SystemError, MemoryError, BufferError, csv.Error, struct.error, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
+    tokenize.TokenError,
+)  # fmt: skip
+#: Largest text file, in bytes; values of JSON take up to 25 times as much memory as their text.
+MOST_TEXT = 64 << 20
+_HEADER_LIMIT = 100_000
+#: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
+_HEADER_LOCK = threading.Lock()
+
+
+@contextlib.contextmanager
+def explain_damage(file: Path, cure: str, problem: str = "is damaged") -> Iterator[None]:
+    """Raise a DataError with file, cause and cure when the block, which reads ``file``, cannot use its bytes."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise DataError("file not found", file=file, cure=cure) from error
+    except OSError as error:
+        raise DataError(f"cannot be read ({_cause(error)})", file=file, cure=cure) from error
+    except DAMAGE as error:
+        raise DataError(f"{problem} ({_cause(error)})", file=file, cure=cure) from error
+
+
+def _cause(error: Exception) -> str:
+    """Return the message of an error, which may be missing (EOFError) or a bare key."""
+    if isinstance(error, RecursionError):
+        return "nested too deeply"
+    if isinstance(error, MemoryError):
+        return "does not fit into memory"
+    if isinstance(error, KeyError):
+        return f"lacks {error}"
+    text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return text or type(error).__name__
+
+
+def check_regular(file: Path, cure: str) -> None:
+    """Raise a DataError if a path is a pipe or device, which might never end, or a folder; a missing file passes."""
+    with explain_damage(file, cure):
+        if file.exists() and not file.is_file():
+            raise ValueError("not a regular file")
+
+
+def read_bytes(file: Path, cure: str, most: int = MOST_TEXT) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        DataError: It is missing, larger than ``most`` bytes, or no regular file, which might never end.
+    """
+    check_regular(file, cure)
+    with explain_damage(file, cure):
+        size = file.stat().st_size
+        if size > most:
+            problem = f"has {format_bytes(size)}, more than the {format_bytes(most)} that are read"
+            raise DataError(problem, file=file, cure=cure)
+        return file.read_bytes()
+
+
+def read_text(file: Path, cure: str, most: int = MOST_TEXT) -> str:
+    """Return the content of a UTF-8 file.
+
+    Raises:
+        DataError: It is missing, larger than ``most`` bytes, or not text.
+    """
+    data = read_bytes(file, cure, most)
+    with explain_damage(file, cure, "is not text"):
+        return data.decode()
+
+
+def read_json(file: Path, cure: str, most: int = MOST_TEXT) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        DataError: It is missing, larger than ``most`` bytes, nested too deeply, or not JSON.
+    """
+    data = read_bytes(file, cure, most)
+    with explain_damage(file, cure, "is not valid JSON"):
+        return json.loads(data)
+
+
+def read_arrays(file: Path, cure: str, most: int) -> dict[str, Array]:
+    """Return the arrays of an ``.npz`` file by name; checksums are tested, objects are refused.
+
+    Raises:
+        DataError: It is missing or damaged, or its arrays have more than ``most`` bytes.
+    """
+    content = io.BytesIO(read_bytes(file, cure, most))
+    with explain_damage(file, cure, "not an .npz file, or damaged"), zipfile.ZipFile(content) as archive:
+        members = archive.infolist()
+        if (size := sum(member.file_size for member in members)) > most:
+            raise ValueError(f"unpacks to {format_bytes(size)}, more than the {format_bytes(most)} expected")
+        if len({member.filename for member in members}) < len(members):
+            raise ValueError("a name occurs twice")
+        if any(member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for member in members):
+            raise ValueError("compressed by another method than deflate")
+        # Only reading a member to its end tests its checksum.
+        return {member.filename.removesuffix(".npy"): parse_array(archive.read(member)) for member in members}
+
+
+def parse_array(data: bytes) -> Array:
+    """Return the read-only array of ``.npy`` bytes; its shape can ask for no more memory than they have.
+
+    Raises:
+        Exception: Of :data:`DAMAGE`.
+    """
+    stream = io.BytesIO(data)
+    shape, is_fortran, dtype = read_array_header(stream)
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects")
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
+        raise ValueError("an array of another length than its header says")
+    if not math.prod(shape) or not dtype.itemsize:
+        return np.zeros(shape, dtype)
+    flat = np.frombuffer(data, dtype, offset=stream.tell())
+    return flat.reshape(shape, order="F" if is_fortran else "C")
+
+
+def read_array_header(file: io.BufferedIOBase) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read shape, whether the order is Fortran's, and dtype of a ``.npy`` file, up to the first byte of data.
+
+    Raises:
+        Exception: Of :data:`DAMAGE`.
+    """
+    with _HEADER_LOCK:
+        version = np.lib.format.read_magic(file)
+        if version == (1, 0):
+            return np.lib.format.read_array_header_1_0(file, max_header_size=_HEADER_LIMIT)
+        if version == (2, 0):
+            return np.lib.format.read_array_header_2_0(file, max_header_size=_HEADER_LIMIT)
+    raise ValueError(f"version {version} of the .npy format")

@@ -1,0 +1,150 @@
+"""Files of a stranger: bounds before memory is taken, and damage in one line."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import tokenize
+import zipfile
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from drivax import reading
+from drivax.errors import DataError, UsageError
+from drivax.reading import explain_damage, parse_array, read_arrays, read_bytes, read_json, read_text
+from drivax.settings import parse_yaml
+
+
+def header(text: str) -> bytes:
+    return b"\x93NUMPY\1\0" + struct.pack("<H", len(text) + 1) + text.encode() + b"\n"
+
+
+def test_arrays_are_those_of_numpy(tmp_path):
+    file = tmp_path / "a.npz"
+    arrays = {
+        "ids": np.array(["a", "bb"]), "none": np.zeros((0, 3)), "scalar": np.array(2.5),
+        "fortran": np.asfortranarray(np.arange(6).reshape(2, 3)), "flags": np.array([True, False]),
+    }  # fmt: skip
+    np.savez_compressed(file, **arrays)
+    result = read_arrays(file, "again", 10_000)
+    assert list(result) == list(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(result[name], array)
+        assert result[name].dtype == array.dtype
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (header("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}"), "Python objects"),
+        (header("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}"), "another length"),
+        (header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, -8)}") + bytes(64), "another length"),
+        (header("(" * 60_000), "damaged"),
+        (header("{'descr': '<f8', 'shape': (1L, \"\"\""), "damaged"),
+        (b"\x93NUMPY\x09\0", "version"),
+        (b"", "damaged"),
+    ],
+)
+def test_hostile_array_is_refused_in_one_line(tmp_path, content, words):
+    file = tmp_path / "a.npz"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("a.npy", content)
+    with pytest.raises(DataError, match=words) as caught:
+        read_arrays(file, "write it again", 1 << 20)
+    assert "\n" not in str(caught.value) and str(caught.value).startswith(str(file))
+    assert caught.value.cure == "write it again"
+
+
+def test_archive_that_unpacks_to_more_than_expected_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    file = tmp_path / "a.npz"
+    np.savez_compressed(file, a=np.zeros(1 << 20))
+    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("unpacked"))
+    with pytest.raises(DataError, match=r"unpacks to 8\.4 MB, more than the 1\.0 MB expected"):
+        read_arrays(file, "again", 1_000_000)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        zlib.error("x"), tokenize.TokenError("x", (1, 2)), NotImplementedError("x"), RuntimeError("encrypted"),
+        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "x"), RecursionError("x"), SystemError("x"), MemoryError(),
+        EOFError(), zipfile.BadZipFile("x"), KeyError("x"), OverflowError("x"), OSError("x"), struct.error("x"),
+    ],
+)  # fmt: skip
+def test_each_kind_of_damage_becomes_one_line(tmp_path, error):
+    with pytest.raises(DataError) as caught, explain_damage(tmp_path / "a", "copy it again"):
+        raise error
+    line = str(caught.value)
+    assert line.startswith(f"{tmp_path / 'a'}: ") and line.endswith("); copy it again") and "()" not in line
+
+
+def test_sizes_and_kinds_of_files_are_bounded(tmp_path):
+    file = tmp_path / "a"
+    file.touch()
+    os.truncate(file, 20 << 30)  # sparse
+    with pytest.raises(DataError, match="has 21 GB, more than the 67 MB that are read"):
+        read_json(file, "again")
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe"):
+        with pytest.raises(DataError, match="not a regular file"):
+            read_bytes(path, "again")
+    (tmp_path / "b").write_bytes(b"\xff")
+    with pytest.raises(DataError, match="is not text"):
+        read_text(tmp_path / "b", "again")
+    (tmp_path / "c").write_text("[" * 100_000)
+    with pytest.raises(DataError, match=r"c: is not valid JSON \(nested too deeply\); again"):
+        read_json(tmp_path / "c", "again")
+
+
+def test_threads_parse_headers_in_turn(monkeypatch):
+    """Python's ``ast`` raises SystemError in several threads at a time (3.11)."""
+    stream = io.BytesIO()
+    np.save(stream, np.arange(3))
+    inside = []
+
+    def magic(file):
+        inside.append(reading._HEADER_LOCK.locked())
+        return original(file)
+
+    original = np.lib.format.read_magic
+    monkeypatch.setattr(np.lib.format, "read_magic", magic)
+    with ThreadPoolExecutor(4) as pool:
+        arrays = list(pool.map(parse_array, [stream.getvalue()] * 20))
+    assert inside == [True] * 20 and all(array.tolist() == [0, 1, 2] for array in arrays)
+
+
+LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n"
+    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (LAUGHS, "line 5: more than 50,000 values"),
+        ("a: &a [*a]", "line 1: a value that contains itself"),
+        ("[" * 10_000, "more than 64 levels"),
+        ("a: " + "9" * 5000, "digits"),
+        ("a: !!timestamp x", "invalid"),
+        ("a: !!bool x", "invalid"),
+        ("a: '" + "x" * (1 << 20) + "'", "more than 1,048,576 characters"),
+    ],
+)
+def test_yaml_is_bounded(text, words):
+    with pytest.raises(UsageError, match=words) as caught:
+        parse_yaml(text)
+    assert len(str(caught.value)) < 1200
+
+
+def test_yaml_aliases_are_values():
+    assert parse_yaml("a: &x [1, 2]\nb: [*x, *x]") == {"a": [1, 2], "b": [[1, 2], [1, 2]]}
+
+
+def test_messages_keep_the_ends_of_long_values():
+    line = str(DataError(f"{'x' * 10**6} is not a number", file="a", cure="again"))
+    assert len(line) < 1000 and line.startswith("a: xxx") and line.endswith("xxx is not a number; again")
