@@ -12,7 +12,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.ego_view import Track
 from drivax.synthetic.roads import curves
 from drivax.synthetic.roads.curves import Curve
-from drivax.synthetic.traffic.roles import Motion, Scripted
+from drivax.synthetic.traffic.roles import Motion, ScriptedUser
 
 #: A number for each time; length, width and height, m.
 Times = Float64[np.ndarray, " time"]
@@ -58,7 +58,7 @@ def gait(
 def along_track(
     track: Track, station: Times, left_m: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
-) -> Scripted:  # fmt: skip
+) -> ScriptedUser:  # fmt: skip
     """Actor at stations and lateral offsets of ego's path, headed along its motion."""
     valid = valid & (station >= 0.0) & (station <= track.length_m - 1.0)
     xy, heading = track.pose(station, left_m)
@@ -68,7 +68,7 @@ def along_track(
 def scripted_motion(
     xy: Float64[np.ndarray, "time 2"], heading: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
-) -> Scripted:  # fmt: skip
+) -> ScriptedUser:  # fmt: skip
     """Actor at positions, headed along its motion; at rest it keeps its last heading, or the given one."""
     step = np.gradient(xy, DT_S, axis=0)
     speed = np.hypot(step[:, 0], step[:, 1])
@@ -78,25 +78,25 @@ def scripted_motion(
         index = np.maximum.accumulate(np.where(drives, np.arange(len(xy)), -1))
         index = np.where(index < 0, int(np.argmax(drives)), index)
         heading = angle[index]
-    return Scripted(kind, size_m, xy, heading, speed, valid)
+    return ScriptedUser(kind, size_m, xy, heading, speed, valid)
 
 
-def along_curve(curve: Curve, distance_m: Times, kind: AgentKind, size_m: Size) -> Scripted:
+def along_curve(curve: Curve, distance_m: Times, kind: AgentKind, size_m: Size) -> ScriptedUser:
     """Actor that drives along a curve and is valid while it is on it."""
     xy, heading = curve.at(distance_m)
     speed = np.maximum(np.gradient(distance_m, DT_S), 0.0)
     valid = (distance_m >= size_m[0] / 2) & (distance_m <= curve.arc_m[-1] - size_m[0] / 2)
-    return Scripted(kind, size_m, xy, heading, speed, valid)
+    return ScriptedUser(kind, size_m, xy, heading, speed, valid)
 
 
-def user_of(motion: Motion, row: int) -> Scripted:
+def user_of(motion: Motion, row: int) -> ScriptedUser:
     """Trajectory of a user of the traffic."""
     length, width, height = map(float, motion.size_m[row])
     track = motion.xy[row], motion.heading[row], motion.speed[row], motion.valid[row].copy()
-    return Scripted(AgentKind(int(motion.kind[row])), (length, width, height), *track)
+    return ScriptedUser(AgentKind(int(motion.kind[row])), (length, width, height), *track)
 
 
-def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
+def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> ScriptedUser:
     """Vehicle of the traffic that brakes from a step to a halt on its path."""
     user = user_of(motion, row)
     arc = Curve(user.xy, user.heading).arc_m

@@ -23,7 +23,7 @@ from drivax.synthetic.events.actors import user_of
 from drivax.synthetic.events.ego_view import EgoView
 from drivax.synthetic.events.kinds import StagedEvent
 from drivax.synthetic.roads.curves import STEP_M
-from drivax.synthetic.traffic.roles import Motion, Scripted
+from drivax.synthetic.traffic.roles import Motion, ScriptedUser
 
 #: Largest time to collision of an event, s: as proposed, and as simulated; and by how much ego's box is smaller in
 #: both, m. The margins exclude events that perception noise could undo.
@@ -70,12 +70,12 @@ def boxes(
     return np.concatenate([xy, direction, np.broadcast_to(size_m, xy.shape)], axis=-1)
 
 
-def actor_boxes(actor: Scripted) -> Float64[np.ndarray, "time 6"]:
+def actor_boxes(actor: ScriptedUser) -> Float64[np.ndarray, "time 6"]:
     """Boxes of an actor at all steps."""
     return boxes(actor.xy, actor.heading, actor.size_m[:2])
 
 
-def first_blocked_station(view: EgoView, adversary: Scripted, step: int) -> Float64[np.ndarray, " time"]:
+def first_blocked_station(view: EgoView, adversary: ScriptedUser, step: int) -> Float64[np.ndarray, " time"]:
     """First station ahead at which ego would touch the actor, for each step from ``step`` on, m (infinite: none)."""
     track, last = view.track, view.last_step
     box = actor_boxes(adversary)[step : last + 1]
@@ -92,7 +92,7 @@ def first_blocked_station(view: EgoView, adversary: Scripted, step: int) -> Floa
     return result
 
 
-def severity(view: EgoView, adversary: Scripted, step: int) -> float:
+def severity(view: EgoView, adversary: ScriptedUser, step: int) -> float:
     """Constant deceleration from a given step on with which ego just avoids the actor, m/s2."""
     room = first_blocked_station(view, adversary, step) - view.track.at[step]
     return required_by_samples(float(view.motion.speed[0, step]), room)
@@ -112,7 +112,7 @@ def required_by_samples(speed_mps: float, room_m: Float64[np.ndarray, " step"]) 
 
 
 def least_ttc(
-    view: EgoView, actor: Scripted, ego: tuple[float, float, float], hold_from: int, since: int
+    view: EgoView, actor: ScriptedUser, ego: tuple[float, float, float], hold_from: int, since: int
 ) -> float:
     """Least time to collision with an actor ahead from ``since`` on, s (at most 5).
 
@@ -142,7 +142,7 @@ def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
     return least_ttc(view, user_of(motion, staged.actors[0]), ego, begin, begin) < SURELY_S
 
 
-def comes_close(view: EgoView, adversary: Scripted, step: int) -> bool:
+def comes_close(view: EgoView, adversary: ScriptedUser, step: int) -> bool:
     """Whether an ego at constant speed comes close to collision: from the event's first step, and from the current one.
 
     Where ego's speed changes in between (a turn, a queue) only the first counts.
@@ -157,7 +157,7 @@ def comes_close(view: EgoView, adversary: Scripted, step: int) -> bool:
     return close(step) and (not steady or close(current))
 
 
-def vehicles_in_lane(view: EgoView, extra: Scripted, until: int) -> tuple[int, ...]:
+def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[int, ...]:
     """Rows of vehicles in the lane of a new actor, near it and with its heading, up to a step."""
     motion, steps = view.motion, np.arange(until + 1)
     rows = np.arange(1, motion.vehicles)
@@ -167,7 +167,7 @@ def vehicles_in_lane(view: EgoView, extra: Scripted, until: int) -> tuple[int, .
     return tuple(rows[met.any(axis=1)].tolist())
 
 
-def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
+def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
     """Rows of vehicles that would collide with an actor that crosses their path."""
     motion, last = view.motion, view.last_step
     rows, moves = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
@@ -182,7 +182,9 @@ def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
     return tuple(np.unique(rows[row[hit]]).tolist())
 
 
-def enter_when_clear(view: EgoView, extra: Scripted, until: int, removed: tuple[int, ...]) -> Scripted | None:
+def enter_when_clear(
+    view: EgoView, extra: ScriptedUser, until: int, removed: tuple[int, ...]
+) -> ScriptedUser | None:
     """Let a new actor appear when it has no collision ahead; None where it has, or where ego would see it appear.
 
     Other agents see it and keep behind it: only agents ahead of it and pedestrians count, until ego may meet it at step

@@ -21,7 +21,7 @@ from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventScript, Proposal
 from drivax.synthetic.roads.curves import Curve, join_curves
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
-from drivax.synthetic.traffic.roles import Scripted, Staging
+from drivax.synthetic.traffic.roles import ScriptedUser, Staging
 
 #: Length of an actor's path before and beyond the junction, m.
 _FROM_M, _BEYOND_M = 180.0, 60.0
@@ -157,13 +157,13 @@ class CrossTraffic(EventScript):
 
     def _schedule(
         self, view: EgoView, lane: int, path: _ActorPath, pace: tuple[float, int], requested: float
-    ) -> tuple[int, Scripted, float] | None:
+    ) -> tuple[int, ScriptedUser, float] | None:
         """The entry step of the actor at which it requires about this deceleration, its motion, and its severity."""
         (fastest, decides), steps = pace, np.arange(view.steps)
         first = view.first_step + EARLIEST + decides
         last = min(view.first_step + LATEST + decides, view.last_step - 15)
 
-        def entering(entry: int) -> Scripted:
+        def entering(entry: int) -> ScriptedUser:
             distance = path.distances(fastest, DT_S * (steps - entry))
             return along_curve(path.curve, distance, AgentKind.VEHICLE, CAR_M)
 

@@ -14,7 +14,7 @@ from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoVie
 from drivax.synthetic.events.kinds import EventScript, Proposal
 from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.roles import Scripted, Staging
+from drivax.synthetic.traffic.roles import ScriptedUser, Staging
 
 _PEDESTRIAN_M, _BICYCLE_M, _OBJECT_M = (0.5, 0.6, 1.75), (1.8, 0.65, 1.7), (1.0, 1.0, 0.9)
 #: Highest limit of streets with such events, m/s.
@@ -53,7 +53,9 @@ def _entry(
     return gait(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
 
 
-def _crossing_actor(view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size) -> Scripted:
+def _crossing_actor(
+    view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size
+) -> ScriptedUser:
     """Actor that moves at a right angle to ego's path at a station; at rest it faces the path."""
     xy, heading = view.track.pose(np.full(view.steps, station), left_m)
     toward = heading - math.copysign(math.pi / 2, float(left_m[0]))
@@ -204,7 +206,7 @@ class ReversingCar(_StreetScript):
             return None
         xy, heading = view.track.pose(np.full(view.steps, station), profile[0] - (rear + CAR_M[0] / 2))
         valid = np.ones(view.steps, bool)
-        adversary = Scripted(AgentKind.VEHICLE, CAR_M, xy, heading - math.pi / 2, -profile[1], valid)
+        adversary = ScriptedUser(AgentKind.VEHICLE, CAR_M, xy, heading - math.pi / 2, -profile[1], valid)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, view.last_step)
 
 

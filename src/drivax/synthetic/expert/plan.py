@@ -254,8 +254,8 @@ def _smooth(state: _State, option: _Option) -> SpeedProfile:
     lost = hard[np.arange(len(hard)), own]
     low = np.where((below >= 0) & ~lost, (below + 1) * SPACING_M, -np.inf)
     high = np.where(lost, np.inf, (above - 1) * SPACING_M)
-    around = np.clip(own[:, None] + np.arange(-4, 5), 0, len(index) - 1)
-    top = np.maximum(option.candidate.limit_mps[around].min(axis=1), speed[1:])
+    window = np.clip(own[:, None] + np.arange(-4, 5), 0, len(index) - 1)
+    top = np.maximum(option.candidate.limit_mps[window].min(axis=1), speed[1:])
     drive = None
     for acceleration, jerk in _BOUNDS:
         bounds = Bounds(low, np.maximum(high, low), top, acceleration, jerk)

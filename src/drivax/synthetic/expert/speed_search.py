@@ -158,10 +158,10 @@ class _OccupiedStates:
     def cost(self, step: int) -> Float32[np.ndarray, "speed place"]:
         """Cost of all states around a step."""
         first = (step - COARSE // 2) * self._places
-        around = self._price[first : first + COARSE * self._places].take(self._flat).sum(axis=0)
+        contact = self._price[first : first + COARSE * self._places].take(self._flat).sum(axis=0)
         free = self._ahead[min(step, len(self._ahead) - 1)][self._column]
         close = np.maximum(1.0 - (free - 1.0) / self._preferred_gap, 0.0) ** 2
-        return around * self._pace + close * self._following
+        return contact * self._pace + close * self._following
 
     def touches(self, step: int, v: int, s: int) -> bool:
         """Whether something is touched around a step."""

@@ -36,7 +36,7 @@ _AFTER_M, _BEFORE_M = 12.0, 25.0
 #: Half the length of a static obstacle, m.
 _HALF_OBSTACLE_M = 2.4
 #: Largest braking to make room for others, m/s2.
-HELP_MPS2 = 1.8
+MAKE_ROOM_MPS2 = 1.8
 
 #: A number, a flag and an index per candidate.
 _Values = Float64[np.ndarray, " k"]
@@ -104,8 +104,8 @@ class LaneChains:
         chains = [lane_chains(network) for network in worlds.networks]
         first = np.cumsum([0, *(len(chain.length_m) for chain in chains)])
         result = {name: np.concatenate([getattr(c, name) for c in chains]) for name in vars(chains[0])}
-        world = np.repeat(np.arange(len(worlds)), np.diff(worlds.lane))
-        for name, offset in (("chain", first), ("left", worlds.lane), ("right", worlds.lane)):
+        world = np.repeat(np.arange(len(worlds)), np.diff(worlds.first_lane))
+        for name, offset in (("chain", first), ("left", worlds.first_lane), ("right", worlds.first_lane)):
             result[name] = np.where(result[name] < 0, -1, result[name] + offset[world])
         ends = {"length_m": np.append(result["length_m"], 0.0), "ends": np.append(result["ends"], False)}
         return cls(**result | ends)
@@ -134,7 +134,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Helped:
+class GapPairs:
     """Pairs of vehicles on adjacent lanes of which the one behind opens a gap for a mandatory change.
 
     ``gap_m`` is the bumper-to-bumper gap along the lane less the difference of path positions, which is constant.
@@ -145,11 +145,11 @@ class Helped:
     gap_m: Float64[np.ndarray, " pair"]
 
 
-NO_HELP = Helped(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+NO_GAP_PAIRS = GapPairs(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 
 
 @dataclass(frozen=True)
-class Situation:
+class VehicleState:
     """State of all vehicles, with the fastest speed and the preferred acceleration on the own path.
 
     ``free`` is a mask of vehicles that may change (neither ego nor vehicles that are changing).
@@ -195,31 +195,31 @@ class LaneChanges:
         self._half_of_column = self._half.take(worlds.rows)
         blocked = [
             (self.chains.chain[first + lane], self.chains.offset_m[first + lane] + position)
-            for first, network, boxes in zip(worlds.lane[:-1], worlds.networks, standing, strict=True)
+            for first, network, boxes in zip(worlds.first_lane[:-1], worlds.networks, standing, strict=True)
             for lane, position in _blocked_lanes(network, boxes)
         ]
         self._obstacle_chain = np.array([chain for chain, _ in blocked], int)
         self._obstacle_m = np.array([position for _, position in blocked])
 
-    def decide(self, now: Situation, tables: PathTables) -> tuple[list[Change], Helped]:
+    def decide(self, now: VehicleState, tables: PathTables) -> tuple[list[Change], GapPairs]:
         """Return lane changes that begin now, and pairs that open gaps for mandatory ones."""
-        lane, along = tables.on(now.at_m)
+        lane, along = tables.lanes_at(now.at_m)
         own, chains = lane[:, 0], self.chains
         candidates = now.free & now.active & (own >= 0) & ~self._drivers.cyclist
         candidates &= (chains.left[own] >= 0) | (chains.right[own] >= 0)
         vehicles = np.flatnonzero(candidates)
         if not len(vehicles):
-            return [], NO_HELP
+            return [], NO_GAP_PAIRS
         target = np.concatenate([chains.left[own[vehicles]], chains.right[own[vehicles]]])
         sides = np.flatnonzero(target >= 0)
         vehicles = vehicles[sides % len(vehicles)]
         options = self._options(now, vehicles, target[sides], (own[vehicles], along[vehicles, 0]))
         if not len(options.vehicles):
-            return [], NO_HELP
+            return [], NO_GAP_PAIRS
         chain = np.where((lane >= 0) & now.active[:, None], chains.chain[lane], -1)
         return self._choose(now, options, (chain, chains.offset_m[lane] + along))
 
-    def _options(self, now: Situation, vehicles: _Indices, target: _Indices, current: _Place) -> _Options:
+    def _options(self, now: VehicleState, vehicles: _Indices, target: _Indices, current: _Place) -> _Options:
         """Changes for which the lanes have room, and mandatory ones; ``current`` is the lane and the position on it."""
         own, along = current
         chains = self.chains
@@ -241,7 +241,9 @@ class LaneChanges:
         return _Options(vehicles[k], target[k], length[k], possible[k], mandatory[k], limit[k], left[k],
                         (chain[k], position[k]), (own_chain[k], own_at[k]))  # fmt: skip
 
-    def _choose(self, now: Situation, options: _Options, occupied: _Occupied) -> tuple[list[Change], Helped]:
+    def _choose(
+        self, now: VehicleState, options: _Options, occupied: _Occupied
+    ) -> tuple[list[Change], GapPairs]:
         """Apply MOBIL to each option; take mandatory changes first, then those with the largest gain."""
         o, vehicles = options, options.vehicles
         speed = now.speed[vehicles]
@@ -264,10 +266,10 @@ class LaneChanges:
         accepted &= o.mandatory | (gain > _THRESHOLD_MPS2)
         changes = self._drop_contested(now, options, accepted, gain)
         changing = {change.vehicle for change in changes}
-        return changes, _help_accelerations(now, options, changing, new_leader, new_follower)
+        return changes, _gap_pairs(now, options, changing, new_leader, new_follower)
 
     def _follower_accelerations(
-        self, now: Situation, vehicles: _Indices, follower: _Neighbour, leader: _Neighbour
+        self, now: VehicleState, vehicles: _Indices, follower: _Neighbour, leader: _Neighbour
     ) -> tuple[_Values, _Values]:
         """Return followers' accelerations behind the vehicle and behind its leader; 0 without a follower."""
         row, gap, _ = follower
@@ -285,11 +287,11 @@ class LaneChanges:
         return idm_acceleration(speed, preferred, gap, leader_speed, self._drivers.idm(rows))
 
     def _neighbours(
-        self, now: Situation, vehicles: _Indices, place: _Place, occupied: _Occupied
+        self, now: VehicleState, vehicles: _Indices, place: _Place, occupied: _Occupied
     ) -> tuple[_Neighbour, _Neighbour]:
         """The nearest vehicle or obstacle ahead of each place on its chain, and the nearest vehicle behind."""
         chain, position = place
-        pair, world = np.arange(len(vehicles)), self._worlds.of[vehicles]
+        pair, world = np.arange(len(vehicles)), self._worlds.world[vehicles]
         rows = self._worlds.rows[world]
         separation = occupied[1].take(rows, axis=0) - position[:, None, None]
         seen = (occupied[0].take(rows, axis=0) == chain[:, None, None]) & (rows >= 0)[..., None]
@@ -313,7 +315,7 @@ class LaneChanges:
         half = self._half[vehicles]
         return (row, nearest - half, speed), (behind, behind_gap - half, behind_speed)
 
-    def _drop_contested(self, now: Situation, options: _Options, ok: _Mask, gain: _Values) -> list[Change]:
+    def _drop_contested(self, now: VehicleState, options: _Options, ok: _Mask, gain: _Values) -> list[Change]:
         """Return the best option of each vehicle; only one vehicle enters a gap at a time."""
         changes: dict[int, Change] = {}
         entries: list[tuple[int, float]] = []
@@ -331,9 +333,9 @@ class LaneChanges:
         return list(changes.values())
 
 
-def _help_accelerations(
-    now: Situation, options: _Options, changing: set[int], leader: _Neighbour, follower: _Neighbour
-) -> Helped:
+def _gap_pairs(
+    now: VehicleState, options: _Options, changing: set[int], leader: _Neighbour, follower: _Neighbour
+) -> GapPairs:
     """Pairs that adjust to each other because a mandatory change has found no room yet."""
     pairs: list[tuple[int, int, float]] = []
     for k in np.flatnonzero(options.mandatory):
@@ -346,7 +348,7 @@ def _help_accelerations(
             pairs.append((behind, row, float(follower[1][k])))
     behind, ahead = np.array([pair[:2] for pair in pairs], int).reshape(-1, 2).T
     gap = np.array([pair[2] for pair in pairs]) - (now.at_m[ahead] - now.at_m[behind])
-    return Helped(behind, ahead, gap)
+    return GapPairs(behind, ahead, gap)
 
 
 def _blocked_lanes(network: RoadNetwork, boxes: Boxes) -> list[tuple[int, float]]:

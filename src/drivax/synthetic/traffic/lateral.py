@@ -147,7 +147,7 @@ def positions_along(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np
     return result
 
 
-def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tuple[Path, float]:
+def lane_change_path(target: Path, present: Path, at_m: float, length_m: float) -> tuple[Path, float]:
     """A lane change: the path from a position on the present path onto a parallel one.
 
     Returns the path, and the vehicle's position on it. The old lanes stay occupied for most of the change.
@@ -173,7 +173,7 @@ def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tu
     return path, float(np.interp(along, old, new))
 
 
-def around(
+def detour_path(
     path: Path, at_m: tuple[float, float, float, float], aside_m: float, adjacent: tuple[LaneSpan, ...] = ()
 ) -> Path:
     """A detour to the left by ``aside_m``: out between the first two positions, back between the last two.
@@ -201,11 +201,11 @@ def detour_request(
     tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
 ) -> DetourRequest:
     """Build the request of a vehicle at a path position and speed."""
-    position, adjacent, world = float(now[0]), [], tables.worlds.of[row]
+    position, adjacent, world = float(now[0]), [], tables.worlds.world[row]
     network = tables.worlds.networks[world]
-    lane, along = tables.on(np.array([position]), slice(row, row + 1))
+    lane, along = tables.lanes_at(np.array([position]), slice(row, row + 1))
     if lane[0, 0] >= 0:
-        current = network.lanes[lane[0, 0] - tables.worlds.lane[world]]
+        current = network.lanes[lane[0, 0] - tables.worlds.first_lane[world]]
         for other in (current.left, current.right):
             if other >= 0:
                 scale = current.length_m / network.lanes[other].length_m
@@ -247,7 +247,7 @@ class Detours:
         for lateral in sorted([left, right], key=abs):
             positions = _detour_positions(request, first, last, lateral)
             if positions is not None and self._is_free(request, positions, lateral, seen, moving):
-                return around(request.path, positions, lateral, request.adjacent), positions[3]
+                return detour_path(request.path, positions, lateral, request.adjacent), positions[3]
         return None
 
     def _is_free(

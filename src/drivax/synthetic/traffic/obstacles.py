@@ -76,8 +76,8 @@ class Extents:
 def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, Int64[np.ndarray, " box"]]:
     """Extents of the boxes near a path, which counts as straight over the length of a box, and their rows."""
     coarse = path.curve.xy[::8]
-    around = (boxes.xy > coarse.min(axis=0) - within_m) & (boxes.xy < coarse.max(axis=0) + within_m)
-    inside = np.flatnonzero(around[:, 0] & around[:, 1])
+    in_box = (boxes.xy > coarse.min(axis=0) - within_m) & (boxes.xy < coarse.max(axis=0) + within_m)
+    inside = np.flatnonzero(in_box[:, 0] & in_box[:, 1])
     near, rough = np.zeros(0, int), np.zeros(0, int)
     for first in range(0, len(inside), _BATCH):
         batch = inside[first : first + _BATCH]
@@ -144,7 +144,7 @@ class StaticObstacles:
 
     def replace(self, row: int, path: Path) -> None:
         """Enter the path of one vehicle."""
-        boxes = self.boxes[self._worlds.of[row]]
+        boxes = self.boxes[self._worlds.world[row]]
         if len(boxes):
             self._seen[row], _ = extents(path, boxes)
             self._enter(row)
@@ -225,7 +225,7 @@ def _nearby_pairs(
     columns = np.concatenate((worlds.rows, np.where(by_world < 0, -1, by_world + len(vehicles))), axis=1)
     xy = pad_last(users.xy.T, np.nan)
     xy[:, : len(vehicles)][:, ~active] = np.nan
-    dx, dy = xy.take(columns, axis=1).take(worlds.of, axis=1)
+    dx, dy = xy.take(columns, axis=1).take(worlds.world, axis=1)
     dx -= vehicles.xy[:, 0, None]
     dy -= vehicles.xy[:, 1, None]
     cos, sin = (component[:, None] for component in vehicles.direction)
@@ -243,14 +243,14 @@ def _nearby_pairs(
     ahead += 3.0
     near &= np.abs(dy, out=dy) < np.minimum(ahead, _ASIDE_M, out=ahead)
     viewer, column = np.divmod(near.ravel().nonzero()[0], near.shape[1])
-    return viewer, columns[worlds.of[viewer], column]
+    return viewer, columns[worlds.world[viewer], column]
 
 
 def _nearest(
     tables: PathTables, at_m: PerVehicle, viewer: _Indices, xy: Float64[np.ndarray, "k 2"]
 ) -> tuple[Float64[np.ndarray, "k 4"], _Values, _Values]:
     """The sample of a vehicle's path ahead that is nearest to a point, its position, and the squared distance."""
-    points, index = tables.ahead(at_m, viewer, _LOOKS_M)
+    points, index = tables.samples_ahead(at_m, viewer, _LOOKS_M)
     dx, dy = points[..., 0] - xy[:, 0, None], points[..., 1] - xy[:, 1, None]
     separation = dx * dx + dy * dy
     pair = np.arange(len(viewer)), separation.argmin(axis=1)

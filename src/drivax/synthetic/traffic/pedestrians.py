@@ -145,7 +145,7 @@ class Pedestrians:
         self._speed = self._free_speed.copy()
         self._crossing = np.array([pedestrian.crossing for pedestrian in pedestrians], int)
         self._crosses = self._crossing >= 0
-        self._crossing += worlds.crossing[self.world]
+        self._crossing += worlds.first_crossing[self.world]
         self._any_crosses = bool(self._crosses.any())
         # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
         marked = np.concatenate([conflicts.marked for conflicts in self._conflicts])
@@ -167,7 +167,7 @@ class Pedestrians:
         rows = index + self._begin
         low = self._table.take(rows, axis=0)
         pose = low + (sample - index)[:, None] * (self._table.take(rows + 1, axis=0) - low)
-        occupied = np.zeros(self._worlds.crossing[-1], bool)
+        occupied = np.zeros(self._worlds.first_crossing[-1], bool)
         if t % _DECISION_STEPS == 0:
             self._is_blocked = self._blocked_by_vehicles(pose, vehicles, active)
             self._release(t, vehicles, active)
@@ -215,7 +215,7 @@ class Pedestrians:
     def _release_in(self, world: int, waiting: _Indices, crossing_s: _Values, vehicles: Boxes) -> None:
         """Release pedestrians of one world before its active vehicles."""
         conflicts, crossing = self._conflicts[world], self._crossing[waiting]
-        local, place = np.unique(crossing - self._worlds.crossing[world], return_inverse=True)
+        local, place = np.unique(crossing - self._worlds.first_crossing[world], return_inverse=True)
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
         any_s, hard_s = (s[place] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
         gap = np.where(

@@ -13,7 +13,7 @@ from drivax.scenario.schema import AgentKind, RoadKind
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.roads.network import Bay, Lane, RoadNetwork
 from drivax.synthetic.traffic.paths import Path, Sway, lane_path
-from drivax.synthetic.traffic.roles import Drivers, Scripted
+from drivax.synthetic.traffic.roles import Drivers, ScriptedUser
 
 #: Width left next to a double-parked car where it can be passed within the lane, m.
 _PASSAGE_M = 2.3
@@ -54,7 +54,7 @@ _Places = list[_Place]
 
 def parked_cars(
     network: RoadNetwork, share: float, double_share: float, rng: np.random.Generator, steps: int
-) -> tuple[Scripted, ...]:
+) -> tuple[ScriptedUser, ...]:
     """Draw parked cars in bays, and sometimes a double-parked one.
 
     A bay is occupied with probability ``share``. With probability ``double_share`` a car is double-parked next to a bay
@@ -71,13 +71,13 @@ def parked_cars(
             clearance = (bay.length_m - size[0]) / 2
             pose = bay.pose.ahead(float(np.clip(along, -clearance, clearance)))
             pose = replace(pose.aside(float(np.clip(lateral, -0.15, 0.15))), heading=pose.heading + turn)
-            result.append(Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
+            result.append(ScriptedUser.standing(AgentKind.VEHICLE, size, pose, steps))
     has_double_parked, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
     for index in rng.permutation(len(network.bays)).tolist() if has_double_parked else ():
         bay, size = network.bays[index], _size(rng, network.bays[index].length_m)
         if _can_double_park(network, bay, size[1], gap_m):
             pose = _double_parked_pose(network, bay, size[1], gap_m)
-            return (*result, Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
+            return (*result, ScriptedUser.standing(AgentKind.VEHICLE, size, pose, steps))
     return tuple(result)
 
 
@@ -157,7 +157,7 @@ class Placement:
 
 def place_vehicles(
     network: RoadNetwork, ego_lane: int, ego_along_m: float, density: Density, rng: np.random.Generator,
-    parked: tuple[Scripted, ...] = (), busy: Collection[int] = (),
+    parked: tuple[ScriptedUser, ...] = (), busy: Collection[int] = (),
 ) -> Placement:  # fmt: skip
     """Draw initial positions off connectors, with safe gaps to ego, other vehicles and parked cars.
 
@@ -211,7 +211,7 @@ def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _
     return result[1:]
 
 
-def _is_blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
+def _is_blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[ScriptedUser, ...]) -> bool:
     """Whether a parked car is in the lane at or close to a position."""
     curve = network.lanes[lane].curve
     index = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)

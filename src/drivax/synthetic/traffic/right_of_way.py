@@ -194,12 +194,12 @@ class RightOfWay:
         return stop
 
     def _world(self, request: _Request) -> int:
-        return int(self._worlds.of[request.row])
+        return int(self._worlds.world[request.row])
 
     def _requests(self, state: TrafficState, rows: _Requests, place: VehicleRows) -> list[_Request]:
         """Requests of some vehicles for the connectors at an index of their paths."""
         place = place[rows]
-        connector = state.tables.connector[rows, place] - self._worlds.lane[self._worlds.of[rows]]
+        connector = state.tables.connector[rows, place] - self._worlds.first_lane[self._worlds.world[rows]]
         line = state.tables.connector_begin[rows, place]
         columns = (rows, connector, place, line, line - state.front_m[rows], state.speed[rows])
         return [_Request(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
@@ -210,8 +210,8 @@ class RightOfWay:
         is_held = np.arange(tables.connector.shape[1]) < self._granted[:, None]
         is_held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
         row, slot = np.nonzero(is_held & (tables.connector >= 0))
-        world = self._worlds.of[row]
-        connector = tables.connector[row, slot] - self._worlds.lane[world]
+        world = self._worlds.world[row]
+        connector = tables.connector[row, slot] - self._worlds.first_lane[world]
         result: list[_Holders] = [[] for _ in self._rules]
         for w, *holder in zip(world.tolist(), row.tolist(), connector.tolist(), strict=True):
             result[w].append((holder[0], holder[1]))
@@ -335,7 +335,7 @@ class RightOfWay:
     def _accepts_gap(self, state: TrafficState, rules: Rules, request: _Request) -> bool:
         """Whether the gap to vehicles with priority is large enough."""
         i, connector, tables = request.row, request.connector, state.tables
-        world = int(self._worlds.of[i])
+        world = int(self._worlds.world[i])
         others, vehicles = rules.yields[connector], self._worlds.vehicles(world)
         begin, scale = tables.begin[vehicles][:, others], tables.scale[vehicles][:, others]
         reach = begin + scale * rules.zone_begin[others, connector] - state.front_m[vehicles, None]
@@ -343,7 +343,7 @@ class RightOfWay:
         coming = (clear > 0) & state.active[vehicles, None]
         coming[i - vehicles.start] = False
         # Vehicles at a red light or with a denied request are not coming.
-        is_red = state.colour[self._worlds.lane[world] + others] == _RED
+        is_red = state.colour[self._worlds.first_lane[world] + others] == _RED
         waits = is_red | (self._denied & (state.speed < 0.5))[vehicles, None]
         coming &= ~(waits & (reach > 0))
         if not coming.any():
@@ -352,7 +352,7 @@ class RightOfWay:
         speed, own = state.speed[vehicles][rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         departure = clear[rows, columns] / np.maximum(speed, 0.3)
-        top = float(tables.at(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
+        top = float(tables.interpolate(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
         own_speed, push = request.speed, float(self._drivers.acceleration_mps2[i])
         to_zone = request.distance_m + rules.zone_begin[connector, own]
         through_zone = request.distance_m + rules.zone_end[connector, own] + self._length[i]

@@ -95,7 +95,7 @@ class Pedestrian:
 
 
 @dataclass(frozen=True)
-class Scripted:
+class ScriptedUser:
     """A road user with a fixed trajectory: parked, or part of an event; speeds are negative when reversing."""
 
     kind: AgentKind
@@ -108,7 +108,7 @@ class Scripted:
     @classmethod
     def standing(
         cls, kind: AgentKind, size_m: tuple[float, float, float], pose: Pose, steps: int
-    ) -> Scripted:
+    ) -> ScriptedUser:
         """Return a user that never moves."""
         xy = np.tile([pose.x, pose.y], (steps, 1))
         return cls(kind, size_m, xy, np.full(steps, pose.heading), np.zeros(steps), np.ones(steps, bool))
@@ -137,7 +137,7 @@ class Roles:
     speed_mps: Float64[np.ndarray, " vehicle"]
     route: tuple[int, ...]
     pedestrians: tuple[Pedestrian, ...] = ()
-    parked: tuple[Scripted, ...] = ()
+    parked: tuple[ScriptedUser, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class Staging:
     """Changes of an event to traffic; vehicles that would prevent it (``removed``) do not take part."""
 
     overrides: tuple[Override, ...] = ()
-    extras: tuple[Scripted, ...] = ()
+    extras: tuple[ScriptedUser, ...] = ()
     tailgates: tuple[Tailgate, ...] = ()
     removed: tuple[int, ...] = ()
 

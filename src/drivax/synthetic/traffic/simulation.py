@@ -17,13 +17,19 @@ from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.idm import idm_acceleration
-from drivax.synthetic.traffic.lane_changes import HELP_MPS2, NO_HELP, Change, LaneChanges, Situation
+from drivax.synthetic.traffic.lane_changes import (
+    MAKE_ROOM_MPS2,
+    NO_GAP_PAIRS,
+    Change,
+    LaneChanges,
+    VehicleState,
+)
 from drivax.synthetic.traffic.lateral import (
     DETOUR_MARGIN_M,
     LOOK_M,
     Detours,
-    change_onto,
     detour_request,
+    lane_change_path,
     positions_along,
 )
 from drivax.synthetic.traffic.obstacles import (
@@ -47,7 +53,7 @@ from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, next_la
 from drivax.synthetic.traffic.pedestrians import Pedestrians
 from drivax.synthetic.traffic.placement import join_drivers
 from drivax.synthetic.traffic.right_of_way import RightOfWay, TrafficState
-from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Scripted, Staging
+from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, ScriptedUser, Staging
 
 #: Half the lane width that passing a cyclist takes, m: half a bicycle, its distance from the kerb, and 1.5 m to a car.
 _PASS_CYCLIST_M = 0.35 + 0.55 + 1.5
@@ -77,7 +83,7 @@ _TOGETHER = 6
 _T = TypeVar("_T")
 
 
-def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
+def boxes_at(scripted: tuple[ScriptedUser, ...], step: int) -> Boxes:
     """Boxes of scripted users at a step."""
     return Boxes(
         np.array([user.xy[step] for user in scripted]).reshape(-1, 2),
@@ -160,8 +166,8 @@ class Leaders:
         self, tables: PathTables, at_m: PerVehicle, active: VehicleMask
     ) -> tuple[PerVehicle, VehicleRows]:
         """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and its row."""
-        own, world = at_m[:, None], self._worlds.of
-        lane, along = tables.on(at_m)
+        own, world = at_m[:, None], self._worlds.world
+        lane, along = tables.lanes_at(at_m)
         lane[~active] = -1
         # The k-th occupied (vehicle, lane) of each world, and its position on the path of each vehicle.
         slots = (lane.ravel() >= 0).nonzero()[0]
@@ -169,7 +175,7 @@ class Leaders:
             return self._nearest
         vehicle, lane = slots // SLOTS, lane.ravel().take(slots)
         k = group_indices(world[vehicle], len(self._worlds))
-        lanes = np.where(k < 0, self._worlds.lane[:-1, None], lane[k])
+        lanes = np.where(k < 0, self._worlds.first_lane[:-1, None], lane[k])
         index = lanes.take(world, axis=0)
         index += tables.column[:, None]
         position = tables.scale.take(index)
@@ -279,7 +285,7 @@ class _Simulation:
         self._runs, traffics = runs, [run.traffic for run in runs]
         roles = [traffic.roles for traffic in traffics]
         self._worlds = worlds = Worlds([r.network for r in roles], [len(r.paths) for r in roles])
-        self._ego_rows = worlds.row[:-1]
+        self._ego_rows = worlds.first_row[:-1]
         drivers = join_drivers(*(r.drivers for r in roles))
         self._half_m, self._width_m = drivers.size_m[:, 0] / 2, drivers.size_m[:, 1]
         count = len(self._half_m)
@@ -299,27 +305,29 @@ class _Simulation:
         self._delay = np.rint(drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
         for world, run in enumerate(runs):
             for tailgate in run.staging.tailgates:
-                drivers = drivers.with_headway(int(worlds.row[world]) + tailgate.vehicle, tailgate.headway_s)
+                drivers = drivers.with_headway(
+                    int(worlds.first_row[world]) + tailgate.vehicle, tailgate.headway_s
+                )
         self._drivers, self._idm = drivers, drivers.idm()
         pedestrians = [r.pedestrians for r in roles]
         times_s = [traffic.times_s for traffic in traffics]
         self._pedestrians = Pedestrians(worlds, pedestrians, times_s) if any(pedestrians) else None
         self._pedestrian_world = np.repeat(np.arange(len(runs)), list(map(len, pedestrians)))
         self._pedestrians_of = group_indices(self._pedestrian_world, len(runs))
-        self._occupied_crossings = np.zeros(worlds.crossing[-1], bool)
-        self._crossing_world = np.repeat(np.arange(len(runs)), np.diff(worlds.crossing))
+        self._occupied_crossings = np.zeros(worlds.first_crossing[-1], bool)
+        self._crossing_world = np.repeat(np.arange(len(runs)), np.diff(worlds.first_crossing))
         self._halting = np.zeros(self._tables.crossing.shape, bool)  # per vehicle and crossing on its path
         self._gather_scripts(runs)
         self._at = np.concatenate([r.distance_m for r in roles])
         self._speed = np.concatenate([r.speed_mps for r in roles])
         for world, run in enumerate(runs):
-            removed = worlds.row[world] + np.array(run.staging.removed, int)
+            removed = worlds.first_row[world] + np.array(run.staging.removed, int)
             self._at[removed] = self._tables.length_m[removed]
         self._last = np.zeros(count)
         self._memory = np.zeros((_SLOWEST + 1, count))
         self._busy_m = np.full(count, -np.inf)  # path position at which a lane change or detour ends
         self._rest = np.zeros(count, int)  # first step of the next decision
-        self._helped = NO_HELP
+        self._helped = NO_GAP_PAIRS
         # Gap to and speed of the next leader, line and obstacle.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
         self._moving_users = self._vehicles = _NO_BOXES
@@ -328,12 +336,12 @@ class _Simulation:
             np.concatenate(pad_steps(series), axis=1)
             for series in ([t.colour for t in traffics], [t.to_red for t in traffics])
         )
-        self._steps = np.array([len(times) for times in times_s])[worlds.of]
+        self._steps = np.array([len(times) for times in times_s])[worlds.world]
         self._log = _Log.empty(max(map(len, times_s)), count, len(self._pedestrian_world))
 
     def _gather_scripts(self, runs: Sequence[Run]) -> None:
         """Gather scripted users that move, overrides, and planned egos with their positions along their paths."""
-        row = self._worlds.row
+        row = self._worlds.first_row
         self._movers = [
             (world, user) for world, run in enumerate(runs) for user in run.staging.extras if not user.is_static
         ]  # fmt: skip
@@ -371,7 +379,7 @@ class _Simulation:
             self._at[row], self._speed[row] = at[k], plan.speed[k]
         active = self._at + self._half_m < self._tables.length_m
         soon = self._at + self._speed * _SPEED_TIME_S
-        sample = self._tables.at(np.concatenate((self._at, soon)).reshape(2, -1))
+        sample = self._tables.interpolate(np.concatenate((self._at, soon)).reshape(2, -1))
         pose, fastest, fastest_soon = sample[0, :, :3], sample[0, :, 3], sample[1, :, 3]
         for row, plan, k, _ in plans:
             active[row] = True
@@ -386,7 +394,7 @@ class _Simulation:
 
     def _swap(self, t: int, row: int, path: Path, at: float, end_m: float) -> None:
         """Put a vehicle on another path, which it follows undisturbed up to a position."""
-        world = int(self._worlds.of[row])
+        world = int(self._worlds.world[row])
         crossings = self._tables.crossings[world]
         self._tables.replace(row, path)
         self._standing.replace(row, path)
@@ -446,7 +454,7 @@ class _Simulation:
             idm, speed = self._drivers.idm(h.behind), self._speed[h.behind]
             helpful = idm_acceleration(speed, fastest[h.behind], gap, self._speed[h.ahead], idm)
             # Vehicles that are already past need no gap, and slow ones open none.
-            helpful = np.where((gap > -2.0) & (speed > 1.5), np.maximum(helpful, -HELP_MPS2), np.inf)
+            helpful = np.where((gap > -2.0) & (speed > 1.5), np.maximum(helpful, -MAKE_ROOM_MPS2), np.inf)
             np.minimum.at(preferred, h.behind, helpful)
         return preferred
 
@@ -490,8 +498,8 @@ class _Simulation:
             halting = np.pad(halting, ((0, 0), (0, crossing.shape[1] - halting.shape[1])))
         halt &= to_stop < np.where(halting, _HARDEST_MPS2, _YIELD_MPS2)
         # A world without an occupied crossing keeps its state.
-        occupied_in = self._worlds.with_any(self._crossing_world[self._occupied_crossings])
-        self._halting = np.where(occupied_in[self._worlds.of, None], halt, halting)
+        occupied_in = self._worlds.mask(self._crossing_world[self._occupied_crossings])
+        self._halting = np.where(occupied_in[self._worlds.world, None], halt, halting)
         return np.where(halt, away, np.inf).min(axis=1)
 
     def _apply_reaction_times(self, t: int, preferred: PerVehicle) -> PerVehicle:
@@ -529,7 +537,7 @@ class _Simulation:
             calm[row] &= t < override.first_step
         free = calm.copy()
         free[self._ego_rows] = False
-        state = Situation(self._at, self._speed, active, free, fastest, preferred)
+        state = VehicleState(self._at, self._speed, active, free, fastest, preferred)
         changes, self._helped = self._changes.decide(state, self._tables)
         for change in changes:
             self._change(t, change)
@@ -542,11 +550,11 @@ class _Simulation:
         """Start a lane change; beyond it the vehicle keeps to its old lanes where it can."""
         row, world, present = (
             change.vehicle,
-            self._worlds.of[change.vehicle],
+            self._worlds.world[change.vehicle],
             self._tables.paths[change.vehicle],
         )
-        network, number = self._worlds.networks[world], row - int(self._worlds.row[world])
-        lanes = [change.lane - int(self._worlds.lane[world])]
+        network, number = self._worlds.networks[world], row - int(self._worlds.first_row[world])
+        lanes = [change.lane - int(self._worlds.first_lane[world])]
         ahead = {span.lane for span in present.spans}
         while network.lanes[lanes[-1]].successors:
             after = next_lanes(network, lanes)
@@ -555,7 +563,7 @@ class _Simulation:
             lanes.append(on_path[0] if on_path else after[(number + len(lanes)) % len(after)])
         sway = Sway((0.08,), (0.07,), (float(number),))
         target = lane_path(network, tuple(lanes), sway)
-        path, position = change_onto(target, present, self._at[row], change.length_m)
+        path, position = lane_change_path(target, present, self._at[row], change.length_m)
         self._swap(t, row, path, position, position + change.length_m)
 
     def _pass(self, t: int, calm: VehicleMask) -> None:
@@ -566,17 +574,17 @@ class _Simulation:
             stuck[row] |= state and self._speed[row] < 0.05
         halts = np.abs(self._moving_users.speed) < 0.05
         big = halts & (self._moving_users.size_m[:, 0] > 1.2)
-        stuck_in = worlds.with_any(worlds.of[stuck])
-        halted_in = stuck_in | worlds.with_any(self._user_world[big])
+        stuck_in = worlds.mask(worlds.world[stuck])
+        halted_in = stuck_in | worlds.mask(self._user_world[big])
         considered = halted_in | self._has_standing
         if not considered.any():
             return
-        slow_only = (stuck_in | worlds.with_any(self._user_world[halts]))[worlds.of]
+        slow_only = (stuck_in | worlds.mask(self._user_world[halts]))[worlds.world]
         near = np.where(slow_only, self._speed < 3.0, self._standing.gap(self._at + self._half_m) < 45.0)
-        near &= calm & considered[worlds.of] & (self._speed < 9.0)
+        near &= calm & considered[worlds.world] & (self._speed < 9.0)
         for row in near.nonzero()[0].tolist():
             front, half = self._at[row] + self._half_m[row], self._width_m[row] / 2
-            meets = halted_in[worlds.of[row]] or self._standing.meets(
+            meets = halted_in[worlds.world[row]] or self._standing.meets(
                 row, front, half + DETOUR_MARGIN_M, LOOK_M
             )
             if meets:
@@ -584,12 +592,12 @@ class _Simulation:
 
     def _start_detour(self, t: int, row: int, stuck: VehicleMask, big: Bool[np.ndarray, " user"]) -> None:
         """Start a detour around an obstacle ahead, if there is one."""
-        world, worlds = int(self._worlds.of[row]), self._worlds
+        world, worlds = int(self._worlds.world[row]), self._worlds
         own_users, moves = self._user_world == world, np.abs(self._moving_users.speed) >= 0.05
-        other = (self._at > 0.0) & ~stuck & (worlds.of == world)
+        other = (self._at > 0.0) & ~stuck & (worlds.world == world)
         other[row] = False
         standing = self._standing.boxes[world].concatenate(
-            self._vehicles.select(stuck & (worlds.of == world))
+            self._vehicles.select(stuck & (worlds.world == world))
         )
         standing = standing.concatenate(self._moving_users.select(big & own_users))
         moving = self._vehicles.select(other).concatenate(self._moving_users.select(own_users & moves))
