@@ -18,7 +18,7 @@ def leaders(ways, at, table, active=None, **roads):
     worlds = Worlds([network], [len(ways)])
     tables = PathTables(worlds, [lane_path(network, way, Sway()) for way in ways], table)
     there = np.ones(len(at), bool) if active is None else np.array(active)
-    return Leaders(worlds, table).ahead(tables, np.array(at, float), there)
+    return Leaders(worlds, table).find(tables, np.array(at, float), there)
 
 
 @pytest.mark.parametrize("seed", range(5))

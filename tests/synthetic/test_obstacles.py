@@ -115,7 +115,7 @@ def test_obstacles_in_the_band_ahead_are_detected(x, y, meets):
     path = lane_path(street(), (0,), Sway())
     boxes = boxes_at((parked(x, y, 1),), 0)
     standing = StaticObstacles(Worlds([street()], [1]), [boxes], [extents(path, boxes)[0]], np.array([1.9]))
-    assert standing.meets(0, 22.0, 1.2, 45.0) == meets
+    assert standing.is_blocked(0, 22.0, 1.2, 45.0) == meets
 
 
 def test_cars_next_to_the_lane_change_nothing():
