@@ -106,7 +106,7 @@ def test_only_one_vehicle_takes_a_contested_gap():
 
 def test_chains_span_sections_and_end_at_forks():
     network, columns = road(lanes=2, sections=3)
-    chains = LaneChains.of(network)
+    chains = LaneChains.from_network(network)
     assert [chains.offset_m[k] for k in columns[0]] == pytest.approx([0.0, 200.0, 400.0])
     assert len({int(chains.chain[k]) for k in columns[0]}) == 1
     assert chains.chain[columns[1][0]] != chains.chain[columns[0][0]]

@@ -9,7 +9,13 @@ import pytest
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Line, RoadKind, RoadNetwork
-from drivax.synthetic.traffic.lateral import detour_path, displace_path, lane_change_path, quintic_step
+from drivax.synthetic.traffic.lateral import (
+    DetourPositions,
+    detour_path,
+    displace_path,
+    lane_change_path,
+    quintic_step,
+)
 from drivax.synthetic.traffic.obstacles import Boxes, StaticObstacles, extents
 from drivax.synthetic.traffic.path_arrays import Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
@@ -159,7 +165,7 @@ def test_quintic_starts_with_value_and_slope_and_ends_level():
 def test_displaced_path_keeps_its_offset():
     network, _ = road(200.0)
     path = lane_path(network, (0,), Sway())
-    shifted = detour_path(path, (40.0, 60.0, 90.0, 115.0), 2.0)
+    shifted = detour_path(path, DetourPositions(40.0, 60.0, 90.0, 115.0), 2.0)
     y = np.interp([20.0, 75.0, 150.0], shifted.curve.xy[:, 0], shifted.curve.xy[:, 1])
     assert y == pytest.approx([0.0, 2.0, 0.0], abs=1e-6)
     # Longer by what the detour costs, and what lies beyond is still where it was in the world.

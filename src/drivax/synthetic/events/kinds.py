@@ -89,4 +89,4 @@ class EventScript(ABC):
 
     @abstractmethod
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """Propose an event of about this severity, or None where this draw fails."""
+        """Propose an event of about this severity, or return None if this draw fails."""

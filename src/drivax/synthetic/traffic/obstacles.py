@@ -151,8 +151,8 @@ class StaticObstacles:
 
     def _enter(self, row: int) -> None:
         """Enter the near ends of the obstacles in the corridor of a vehicle."""
-        seen, half = self._extents[row], self._half[row] + _SIDE_MARGIN_M
-        near_m = np.sort(seen.near_m[(seen.right_m < half) & (seen.left_m > -half)])
+        path_extents, half = self._extents[row], self._half[row] + _SIDE_MARGIN_M
+        near_m = np.sort(path_extents.near_m[(path_extents.right_m < half) & (path_extents.left_m > -half)])
         extra = len(near_m) - self.near_m.shape[1]
         if extra > 0:
             self.near_m = np.pad(self.near_m, ((0, 0), (0, extra)), constant_values=np.inf)
@@ -161,9 +161,9 @@ class StaticObstacles:
 
     def is_blocked(self, row: int, front_m: float, half_m: float, within_m: float) -> bool:
         """Whether an obstacle lies within a distance ahead of a vehicle's front, in a band of this half width."""
-        seen = self._extents[row]
-        blocks = (seen.right_m < half_m) & (seen.left_m > -half_m)
-        blocks &= (seen.near_m > front_m - 0.5) & (seen.near_m < front_m + within_m)
+        path_extents = self._extents[row]
+        blocks = (path_extents.right_m < half_m) & (path_extents.left_m > -half_m)
+        blocks &= (path_extents.near_m > front_m - 0.5) & (path_extents.near_m < front_m + within_m)
         return bool(blocks.any())
 
     def gap(self, front_m: PerVehicle) -> PerVehicle:

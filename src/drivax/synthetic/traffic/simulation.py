@@ -481,7 +481,7 @@ class _Simulation:
             leader_speed=self._leads[0],
             committed=committed,
         )
-        room = self._right_of_way.lines(state) + 2.0 - _LINE_GAP_M
+        room = self._right_of_way.stop_line_m(state) + 2.0 - _LINE_GAP_M
         if np.count_nonzero(self._occupied_crossings):
             room = np.minimum(room, self._crossing_gap(front) + 2.0 - _LINE_GAP_M)
         room = np.minimum(room, tables.stop_m - front - _LANE_END_GAP_M)
