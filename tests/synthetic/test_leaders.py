@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
+from drivax.synthetic.traffic.leaders import Leaders
 from drivax.synthetic.traffic.path_arrays import PathTables, Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.simulation import Leaders
 
 from .traffic_scenes import drivers, road
 

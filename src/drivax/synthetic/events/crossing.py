@@ -65,9 +65,9 @@ class _ActorPath:
         speed = np.sqrt(np.minimum.accumulate(down - ramp) + ramp)
         clock = np.concatenate([[0.0], np.cumsum(np.diff(arc) * 2 / (speed[1:] + speed[:-1]))])
         zero = float(np.interp(self.line_m - CAR_M[0] / 2, arc, clock))
-        before = np.minimum(times_s + zero, 0.0) * speed[0]
+        before_m = np.minimum(times_s + zero, 0.0) * speed[0]
         after_m = np.maximum(times_s + zero - clock[-1], 0.0) * speed[-1]
-        return np.interp(times_s + zero, clock, arc) + before + after_m
+        return np.interp(times_s + zero, clock, arc) + before_m + after_m
 
 
 def _chain(

@@ -111,18 +111,18 @@ def drive_ego(
     if (not violation.cause and is_comfortable(motion)) or violation.cause in unfixable:
         return motion, violation.cause
     # A safe but uncomfortable motion is the fallback.
-    uncomfortable = None if violation.cause else motion
+    fallback = None if violation.cause else motion
     unreactive: frozenset[int] = frozenset()
     for begin in _first_steps(roles, motion, violation, first_step, aware_step):
         plan = plan_ego(roles, motion, times_s, begin, unreactive)
         motion = yield Run(traffic, staging, plan)
         violation = check_motion(motion)
         unreactive |= set(violation.users)
-        if not violation.cause and (uncomfortable is None or is_comfortable(motion)):
+        if not violation.cause and (fallback is None or is_comfortable(motion)):
             return motion, ""
         if violation.cause in ("", *unfixable):
             break
-    return (motion, violation.cause) if uncomfortable is None else (uncomfortable, "")
+    return (motion, violation.cause) if fallback is None else (fallback, "")
 
 
 def _first_steps(

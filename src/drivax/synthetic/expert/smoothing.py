@@ -153,6 +153,6 @@ def _integrate(speed: float, a: Float64[np.ndarray, " step"], excess: float) -> 
     """Integrate accelerations; speeds below 3 cm/s become 0."""
     after = speed + np.cumsum(a) * DT_S
     after = np.where(after < 0.03, 0.0, after)
-    blocks = np.concatenate([[speed], after])
-    travelled = np.concatenate([[0.0], np.cumsum((blocks[1:] + blocks[:-1]) * DT_S / 2)])
-    return SpeedProfile(travelled, blocks, excess)
+    speeds = np.concatenate([[speed], after])
+    travelled = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) * DT_S / 2)])
+    return SpeedProfile(travelled, speeds, excess)

@@ -149,7 +149,7 @@ def inside(
     for ring in rings:
         a, b = ring, np.roll(ring, -1, axis=0)
         near = (np.minimum(a, b) <= points.max(axis=0)) & (np.maximum(a, b) >= points.min(axis=0))
-        # A ray to the right meets no side that ends left of all points.
+        # Rays to the right meet only sides at the height of a point that reach beyond the leftmost one.
         keep = near[:, 1] & (np.maximum(a, b)[:, 0] >= points[:, 0].min())
         (ax, ay), (bx, by) = a[keep].T, b[keep].T
         across = (ay > y) != (by > y)

@@ -32,6 +32,7 @@ from drivax.synthetic.traffic.lateral import (
     lane_change_path,
     positions_along,
 )
+from drivax.synthetic.traffic.leaders import Leaders
 from drivax.synthetic.traffic.obstacles import (
     NO_EXTENTS,
     Boxes,
@@ -49,14 +50,12 @@ from drivax.synthetic.traffic.path_arrays import (
     group_indices,
     pad_steps,
 )
-from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, next_lanes
+from drivax.synthetic.traffic.paths import Path, Sway, lane_path, next_lanes
 from drivax.synthetic.traffic.pedestrians import Pedestrians
 from drivax.synthetic.traffic.placement import join_drivers
 from drivax.synthetic.traffic.right_of_way import RightOfWay, TrafficState
-from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, ScriptedUser, Staging
+from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, ScriptedUser, Staging
 
-#: Half of the lane width that passing a cyclist takes, m: half a bicycle, its distance from the kerb, 1.5 m to a car.
-_CYCLIST_PASSING_M = 0.35 + 0.55 + 1.5
 #: Distance between the front bumper and a stop line at standstill, m.
 _LINE_GAP_M = 1.0
 #: Distance kept to an obstacle in the lane, which leaves room for passing it, and to the end of a lane, m.
@@ -146,59 +145,6 @@ class _Log:
         )
 
 
-class Leaders:
-    """Search for the leader of every vehicle."""
-
-    def __init__(self, worlds: Worlds, drivers: Drivers) -> None:
-        self._worlds = worlds
-        self._half_m, self._half_width_m = drivers.size_m[:, :2].T / 2
-        self._rows = np.arange(len(self._half_m))
-        self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
-        # Half the width of the widest car that may pass a cyclist within each lane.
-        widths = [lane.width_m for network in worlds.networks for lane in network.lanes]
-        self._passing_half_m = np.array(widths) / 2 - _CYCLIST_PASSING_M
-        self._nearest = np.full(len(self._rows), np.inf), np.zeros(len(self._rows), int)
-
-    def find(
-        self, tables: PathTables, at_m: PerVehicle, active: VehicleMask
-    ) -> tuple[PerVehicle, VehicleRows]:
-        """Return the gap to the nearest vehicle ahead on the own lanes (infinite: none), and its row."""
-        own, world = at_m[:, None], self._worlds.world
-        lane, along = tables.lanes_at(at_m)
-        lane[~active] = -1
-        # The k-th occupied (vehicle, lane) of each world, and its position on the path of each vehicle.
-        slots = (lane.ravel() >= 0).nonzero()[0]
-        if not len(slots):
-            return self._nearest
-        vehicle, lane = slots // SLOTS, lane.ravel().take(slots)
-        k = group_indices(world[vehicle], len(self._worlds))
-        lanes = np.where(k < 0, self._worlds.first_lane[:-1, None], lane[k])
-        index = lanes.take(world, axis=0)
-        index += tables.column[:, None]
-        position = tables.scale.take(index)
-        position *= along.ravel().take(slots)[k].take(world, axis=0)
-        # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
-        position += tables.present_begin(at_m).take(index)
-        vehicle_ahead = vehicle[k]
-        seen = (position > own) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
-        if self._any_cyclist:
-            # Cyclists are overtaken within lanes that are wide enough.
-            limit_m = np.where(self._cyclist[vehicle_ahead], self._passing_half_m[lanes], -np.inf)
-            seen &= limit_m.take(world, axis=0) < self._half_width_m[:, None]
-        position -= np.where(k < 0, -np.inf, self._half_m[vehicle_ahead]).take(world, axis=0)
-        gap = np.where(seen, position, np.inf)
-        gap -= own
-        gap -= self._half_m[:, None]
-        nearest = gap.argmin(axis=1)
-        result = gap[self._rows, nearest], vehicle_ahead[world, nearest]
-        # A world without a vehicle on a lane keeps the last result.
-        empty = (k[:, 0] < 0)[world]
-        for values, last in zip(result, self._nearest, strict=True):
-            values[empty] = last[empty]
-        self._nearest = result
-        return result
-
-
 class Traffic:
     """Traffic of all users of a world, which can be run several times."""
 
@@ -279,46 +225,54 @@ class _Simulation:
     """State of runs that are simulated together."""
 
     def __init__(self, runs: Sequence[Run]) -> None:
-        self._runs, traffics = runs, [run.traffic for run in runs]
-        roles = [traffic.roles for traffic in traffics]
+        self._runs, roles = runs, [run.traffic.roles for run in runs]
         self._worlds = worlds = Worlds([r.network for r in roles], [len(r.paths) for r in roles])
         self._ego_rows = worlds.first_row[:-1]
         drivers = join_drivers(*(r.drivers for r in roles))
         self._half_m, self._width_m = drivers.size_m[:, 0] / 2, drivers.size_m[:, 1]
-        count = len(self._half_m)
-        self._rows, self._size_m = np.arange(count), drivers.size_m[:, :2]
+        self._rows, self._size_m = np.arange(len(self._half_m)), drivers.size_m[:, :2]
         self._tables = PathTables(worlds, [path for r in roles for path in r.paths], drivers)
-        static = [tuple(user for user in run.staging.extras if user.is_static) for run in runs]
-        boxes = [t.parked.concatenate(boxes_at(s, 0)) for t, s in zip(traffics, static, strict=True)]
-        seen = [
-            traffic.extents(standing) if extras else traffic.parked_extents
-            for traffic, standing, extras in zip(traffics, boxes, static, strict=True)
-        ]
-        self._standing = StaticObstacles(worlds, boxes, [e for group in seen for e in group], self._width_m)
-        self._has_standing = np.array([len(standing) > 0 for standing in boxes])
+        self._gather_obstacles(runs)
         self._right_of_way = RightOfWay(worlds, drivers)
-        self._changes = LaneChanges(worlds, drivers, boxes)
+        self._changes = LaneChanges(worlds, drivers, self._standing.boxes)
         self._leaders = Leaders(worlds, drivers)
         self._delay = np.rint(drivers.reaction_s / DT_S).astype(int).clip(0, _MAX_REACTION_STEPS)
-        for world, run in enumerate(runs):
+        for first_row, run in zip(self._ego_rows.tolist(), runs, strict=True):
             for tailgate in run.staging.tailgates:
-                drivers = drivers.with_headway(
-                    int(worlds.first_row[world]) + tailgate.vehicle, tailgate.headway_s
-                )
+                drivers = drivers.with_headway(first_row + tailgate.vehicle, tailgate.headway_s)
         self._drivers, self._idm = drivers, drivers.idm()
-        pedestrians = [r.pedestrians for r in roles]
-        times_s = [traffic.times_s for traffic in traffics]
+        self._gather_pedestrians(runs)
+        self._gather_scripts(runs)
+        self._initialise(runs)
+
+    def _gather_obstacles(self, runs: Sequence[Run]) -> None:
+        """Gather parked cars and static scripted users."""
+        boxes, path_extents = [], []
+        for run in runs:
+            static = tuple(user for user in run.staging.extras if user.is_static)
+            boxes.append(run.traffic.parked.concatenate(boxes_at(static, 0)))
+            path_extents += run.traffic.extents(boxes[-1]) if static else run.traffic.parked_extents
+        self._standing = StaticObstacles(self._worlds, boxes, path_extents, self._width_m)
+        self._has_standing = np.array([len(standing) > 0 for standing in boxes])
+
+    def _gather_pedestrians(self, runs: Sequence[Run]) -> None:
+        """Gather pedestrians and the state of crossings."""
+        worlds, pedestrians = self._worlds, [run.traffic.roles.pedestrians for run in runs]
+        times_s = [run.traffic.times_s for run in runs]
         self._pedestrians = Pedestrians(worlds, pedestrians, times_s) if any(pedestrians) else None
         self._pedestrian_world = np.repeat(np.arange(len(runs)), list(map(len, pedestrians)))
         self._pedestrians_by_world = group_indices(self._pedestrian_world, len(runs))
         self._occupied_crossings = np.zeros(worlds.first_crossing[-1], bool)
         self._crossing_world = np.repeat(np.arange(len(runs)), np.diff(worlds.first_crossing))
         self._brakes_for_crossing = np.zeros(self._tables.crossing.shape, bool)
-        self._gather_scripts(runs)
-        self._position_m = np.concatenate([r.distance_m for r in roles])
-        self._speed = np.concatenate([r.speed_mps for r in roles])
-        for world, run in enumerate(runs):
-            removed = worlds.first_row[world] + np.array(run.staging.removed, int)
+
+    def _initialise(self, runs: Sequence[Run]) -> None:
+        """Set the initial state of all vehicles and allocate the log."""
+        traffics, count = [run.traffic for run in runs], len(self._rows)
+        self._position_m = np.concatenate([traffic.roles.distance_m for traffic in traffics])
+        self._speed = np.concatenate([traffic.roles.speed_mps for traffic in traffics])
+        for first_row, run in zip(self._ego_rows, runs, strict=True):
+            removed = first_row + np.array(run.staging.removed, int)
             self._position_m[removed] = self._tables.length_m[removed]
         self._last_acceleration = np.zeros(count)
         self._preferred_memory = np.zeros((_MAX_REACTION_STEPS + 1, count))
@@ -331,8 +285,9 @@ class _Simulation:
         self._user_world, self._users_by_world = self._pedestrian_world, self._pedestrians_by_world
         self._colour = np.concatenate(pad_steps([traffic.colour for traffic in traffics]), axis=1)
         self._to_red = np.concatenate(pad_steps([traffic.to_red for traffic in traffics]), axis=1)
-        self._steps = np.array([len(times) for times in times_s])[worlds.world]
-        self._log = _Log.empty(max(map(len, times_s)), count, len(self._pedestrian_world))
+        steps = [len(traffic.times_s) for traffic in traffics]
+        self._steps = np.array(steps)[self._worlds.world]
+        self._log = _Log.empty(max(steps), count, len(self._pedestrian_world))
 
     def _gather_scripts(self, runs: Sequence[Run]) -> None:
         """Gather moving scripted users, overrides, and planned egos with their positions along their paths."""
