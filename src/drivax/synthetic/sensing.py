@@ -43,11 +43,7 @@ class SensorConfig:
     above_roof_m: float = 0.2
 
     def check(self) -> None:
-        """Check the settings.
-
-        Raises:
-            UsageError: A setting is wrong.
-        """
+        """Raise a UsageError for the first wrong setting."""
         _refuse_negative("sensor", self)
 
 
@@ -77,11 +73,7 @@ class NoiseConfig:
     speed_correlation: float = 0.0
 
     def check(self) -> None:
-        """Check the settings.
-
-        Raises:
-            UsageError: A setting is wrong.
-        """
+        """Raise a UsageError for the first wrong setting."""
         _refuse_negative("noise", self)
         for name, value in vars(self).items():
             if name.endswith("_correlation") and value >= 1.0:

@@ -47,17 +47,10 @@ _Indices = Int64[np.ndarray, " k"]
 
 
 class _ChainPositions(NamedTuple):
-    """Chain of lanes and position along it of each candidate."""
+    """Chains of lanes (-1: none) and positions along them, per candidate or per lane that a vehicle occupies."""
 
-    chain: _Indices
-    position_m: _Values
-
-
-class _Occupancy(NamedTuple):
-    """Chain of each lane that a vehicle occupies (-1: none), and position along it."""
-
-    chain: Int64[np.ndarray, "v slot"]
-    position_m: Float64[np.ndarray, "v slot"]
+    chain: Int64[np.ndarray, "*k"]
+    position_m: _Stack
 
 
 class _Neighbours(NamedTuple):
@@ -243,7 +236,7 @@ class LaneChanges:
         if not len(options.vehicles):
             return [], NO_GAP_PAIRS
         chain = np.where((lane >= 0) & now.active[:, None], chains.chain[lane], -1)
-        return self._choose(now, options, _Occupancy(chain, chains.offset_m[lane] + along))
+        return self._choose(now, options, _ChainPositions(chain, chains.offset_m[lane] + along))
 
     def _options(
         self, now: VehicleState, vehicles: _Indices, target: _Indices, own: _Indices, along: _Values
@@ -279,7 +272,7 @@ class LaneChanges:
         )
 
     def _choose(
-        self, now: VehicleState, options: _Options, occupancy: _Occupancy
+        self, now: VehicleState, options: _Options, occupancy: _ChainPositions
     ) -> tuple[list[Change], GapPairs]:
         """Apply MOBIL to each option; take mandatory changes first, then those with the largest gain."""
         o, vehicles = options, options.vehicles
@@ -321,7 +314,7 @@ class LaneChanges:
         return idm_acceleration(speed, preferred, gap, leader_speed, self._drivers.idm(rows))
 
     def _neighbours(
-        self, now: VehicleState, vehicles: _Indices, positions: _ChainPositions, occupancy: _Occupancy
+        self, now: VehicleState, vehicles: _Indices, positions: _ChainPositions, occupancy: _ChainPositions
     ) -> tuple[_Neighbours, _Neighbours]:
         """Return the nearest vehicle or obstacle ahead of each position on its chain, and the nearest one behind."""
         chain, position = positions

@@ -55,7 +55,7 @@ def displace_path(
     stretch = np.maximum(1.0 - aside_m * np.gradient(curve.heading, step), 0.1)
     moved_curve = Curve(curve.xy + aside_m[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
     old = step * np.arange(len(moved_curve.xy))
-    new = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(moved_curve.xy, axis=0).T))])
+    new = moved_curve.arc_m
     count = max(2, round(float(new[-1]) / STEP_M) + 1)
     position = np.linspace(0.0, new[-1], count)
     source = np.interp(position, new, old)
