@@ -212,9 +212,8 @@ def enter_when_clear(
         appears = max(appears, int(meets.max()) + 5)
     if appears >= last or not extra.valid[appears]:
         return None
-    is_visible = (
-        appears > view.first_step and np.hypot(*(extra.xy[appears] - motion.xy[0, appears])) < _APPEARANCE_M
-    )
+    distance = np.hypot(*(extra.xy[appears] - motion.xy[0, appears]))
+    is_visible = appears > view.first_step and distance < _APPEARANCE_M
     scene = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
     if is_visible or not _is_clear(*scene):
         return None

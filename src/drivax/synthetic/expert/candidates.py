@@ -261,9 +261,7 @@ def arrivals(
                 position, half = distance_m[vehicle], half_m[vehicle]
                 end = span.begin_m + span.scale * network.lanes[span.lane].length_m
                 on_lane = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
-                lead_steps = round(_YIELD_S / 0.1)
-                coming = (
-                    np.convolve(on_lane[::-1], np.ones(lead_steps + 1), mode="full")[: len(on_lane)][::-1] > 0
-                )
+                window = np.ones(round(_YIELD_S / 0.1) + 1)
+                coming = np.convolve(on_lane[::-1], window, mode="full")[: len(on_lane)][::-1] > 0
                 result[span.lane] = result.get(span.lane, np.zeros(len(on_lane), bool)) | coming
     return result

@@ -269,16 +269,12 @@ class Detours:
         begin, out_end, back, end = positions
         half = request.size_m[1] / 2
         low, high = lateral - half - _EDGE_M, lateral + half + _EDGE_M
-        adjacent = (
-            (obstacles.near_m < back)
-            & (obstacles.far_m > out_end)
-            & (obstacles.right_m < high)
-            & (obstacles.left_m > low)
-        )
+        blocks = (obstacles.near_m < back) & (obstacles.far_m > out_end)
+        blocks &= (obstacles.right_m < high) & (obstacles.left_m > low)
         edges, _ = _extents(request, self._edge, (out_end + back) / 2, (end - begin) / 2 + 15.0)
         sweep = (edges.near_m > out_end) & (edges.near_m < back)
         sweep &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
-        if adjacent.any() or sweep.any():
+        if blocks.any() or sweep.any():
             return False
         path, position = request.path, request.at_m
         duration_s = (end - position) / max(request.speed, _PASS_MPS) + 1.0
@@ -307,11 +303,9 @@ def _detour_positions(
     back = last_m + half_length + _GAP_BEHIND_M
     end = back + max(_MIN_RATIO * _BACK_FACTOR * offset_m, _BACK_S * min(request.speed, _PASS_MPS))
     is_steep, is_short = out_end - begin < _MIN_RATIO * offset_m, end > request.path.length_m - _END_MARGIN_M
-    return (
-        None
-        if offset_m > _MAX_OFFSET_M or is_steep or is_short
-        else DetourPositions(begin, out_end, back, end)
-    )
+    if offset_m > _MAX_OFFSET_M or is_steep or is_short:
+        return None
+    return DetourPositions(begin, out_end, back, end)
 
 
 def _densify(ring: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "dense 2"]:

@@ -178,11 +178,8 @@ class Pedestrians:
             self._is_blocked = self._blocked_by_vehicles(pose, vehicles, active)
             self._release(t, vehicles, active)
         if self._any_crosses:
-            users = (
-                self._crosses
-                & (self._position_m < self._across)
-                & (self._position_m > self._kerb - _OCCUPY_M)
-            )
+            users = self._crosses & (self._position_m < self._across)
+            users &= self._position_m > self._kerb - _OCCUPY_M
             users &= self._released | self._has_priority | (self._position_m > self._kerb)
             occupied[self._crossing[users]] = True
         result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)

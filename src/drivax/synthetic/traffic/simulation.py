@@ -557,7 +557,7 @@ class _Simulation:
         moving = self._vehicles.select(other).concatenate(self._moving_users.select(own_users & moves))
         position, size = (
             float(self._position_m[row]),
-            (float(2 * self._half_m[row]), float(self._width_m[row])),
+            (2 * float(self._half_m[row]), float(self._width_m[row])),
         )
         request = detour_request(self._tables, row, (position, self._speed[row]), size)
         detour = self._runs[world].traffic.detours.find(request, standing, moving)

@@ -291,10 +291,8 @@ class Highway(StreetFamily):
         line = street.draft.lanes[auxiliary].curve
         gore = line.start.turned() if direction < 0 else line.end
         # Seen from the highway, an on-ramp bends to the left and an off-ramp to the right.
-        side = (
-            np.gradient(street.middle.heading, STEP_M)[cut::direction][: round(length / STEP_M) + 1]
-            * direction
-        )
+        curvature = np.gradient(street.middle.heading, STEP_M)[cut::direction] * direction
+        side = curvature[: round(length / STEP_M) + 1]
         bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
         outward = from_curvature(side - direction * bend, STEP_M, gore)
         curve = outward if direction > 0 else outward.reversed()
